@@ -177,3 +177,38 @@ fn systemd_finds_nothing_wrong() {
     }
     std::fs::remove_dir_all(&folder).expect("removed");
 }
+
+/// What the unit, the scripts of the package and the page of the mock name is what the package holds.
+#[test]
+fn the_package_holds_what_its_parts_name() {
+    let make = packaged("make");
+    for placed in [
+        "place packaging/dpm.service 644 usr/lib/systemd/system",
+        "place packaging/dpm-sysusers.conf 644 usr/lib/sysusers.d dpm.conf",
+        "place packaging/60-dpm.rules 644 usr/lib/udev/rules.d",
+        "place packaging/99-dpm-limits.conf 644 etc/security/limits.d",
+        "strip -o \"$tree/usr/bin/$program\"",
+    ] {
+        assert!(make.contains(placed), "{placed}");
+    }
+    assert!(packaged("debian/postinst").contains("systemd-sysusers dpm.conf"));
+    let unit = unit();
+    assert_eq!(value(&unit, "Unit", "Documentation"), "file:/usr/share/doc/dpm/README.md");
+    assert!(make.contains("for page in README.md") && make.contains("usr/share/doc/dpm; done"));
+    // A purge takes the rig file that the unit runs, and the folder of its state.
+    let rig = value(&unit, "Service", "ExecStart").split(' ').next_back().expect("a rig file").to_owned();
+    let purge = packaged("debian/postrm");
+    assert!(purge.contains(&format!("rm -f {rig} ")), "{rig}");
+    assert!(purge.contains(&format!("/var/lib/{}", value(&unit, "Service", "StateDirectory"))));
+    let devices =
+        std::fs::read_dir(concat!(env!("CARGO_MANIFEST_DIR"), "/../hil-mock/src/serve")).expect("a folder");
+    let page = packaged("hil-mock.1").replace('\\', "");
+    for device in devices {
+        let name =
+            device.expect("an entry").file_name().to_string_lossy().trim_end_matches(".rs").replace('_', "-");
+        // What several devices share.
+        if !["mod", "bodies", "orders", "usb"].contains(&name.as_str()) {
+            assert!(page.contains(&format!("fB{name}fR")), "hil-mock.1 does not name {name}");
+        }
+    }
+}

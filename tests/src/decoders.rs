@@ -39,7 +39,7 @@ use std::path::Path;
 pub type Entry = fn(&[u8]);
 
 /// Every entry with the name of its fuzz target, which is also the name of its folder of seeds.
-pub const ALL: [(&str, Entry); 34] = [
+pub const ALL: [(&str, Entry); 35] = [
     ("link_stream", link_stream),
     ("link_rle", link_rle),
     ("cobs_stream", cobs_stream),
@@ -73,6 +73,7 @@ pub const ALL: [(&str, Entry); 34] = [
     ("usbip_server", usb::usbip_server),
     ("gltf", crate::files::gltf),
     ("gltf_parts", crate::files::gltf_parts),
+    ("mesh", crate::files::mesh),
     ("environment", crate::files::environment),
 ];
 

@@ -1,12 +1,33 @@
-//! Files: scenes and environments. No bytes make the reader panic. The readers run in the thread of the caller, not in
+//! Files: scenes of every format and environments. No bytes make the reader panic. The readers run in the thread of the caller, not in
 //! the one that the program gives them, so that a panic and a loop without end are seen as such.
 
-use dpm_scene::{decode_environment, load_bytes_here, LoadOptions, SceneError};
+use dpm_scene::{
+    decode_environment, load_bytes_here, load_mesh_here, LoadOptions, MeshFormat, Scene, SceneError,
+};
 
 /// A glTF file as it is.
 pub fn gltf(bytes: &[u8]) {
-    match load_bytes_here(bytes, &LoadOptions::default()) {
-        Ok(scene) => assert!(!scene.bodies.is_empty()),
+    judge(load_bytes_here(bytes, &LoadOptions::default()));
+}
+
+/// A file of meshes; the first byte chooses the format.
+pub fn mesh(bytes: &[u8]) {
+    let Some((first, rest)) = bytes.split_first() else { return };
+    let format = [MeshFormat::Obj, MeshFormat::Ply, MeshFormat::Stl][usize::from(first % 3)];
+    judge(load_mesh_here(rest, format, &LoadOptions::default()));
+}
+
+/// A scene has a body with triangles that lie within it; a refusal says why.
+fn judge(read: Result<Scene, SceneError>) {
+    match read {
+        Ok(scene) => {
+            assert!(!scene.bodies.is_empty());
+            for mesh in scene.bodies.iter().map(|body| &body.mesh) {
+                let vertices = mesh.positions.len();
+                assert!(mesh.triangles.iter().flatten().all(|i| (*i as usize) < vertices));
+                assert!(mesh.materials.iter().all(|m| (*m as usize) < scene.materials.len()));
+            }
+        }
         Err(e @ (SceneError::Internal(_) | SceneError::TimedOut(_))) => panic!("{e}"),
         Err(e) => assert!(!e.to_string().is_empty()),
     }

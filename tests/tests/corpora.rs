@@ -222,6 +222,7 @@ fn files() -> Vec<(&'static str, &'static str, Vec<u8>)> {
         "KHR_materials_transmission":{"transmissionFactor":0.5},"KHR_materials_ior":{"ior":1.4}}}],"accessors":[{"bufferView":0,
         "componentType":5126,"type":"VEC3","count":4}],"bufferViews":[{"buffer":0,"byteLength":48}],"buffers":[{"byteLength":48}]}"#;
     seeds.push(("gltf_parts", "lit", [lit.as_bytes(), &[0], &tetrahedra().bin[..48]].concat()));
+    seeds.extend(meshes().into_iter().map(|(name, bytes)| ("mesh", name, bytes)));
     let floats = |v: &[f32]| v.iter().flat_map(|x| x.to_le_bytes()).collect::<Vec<_>>();
     let pfm = [&b"PF\n2 1\n-1.0\n"[..], &floats(&[0.5, 1.0, 2.0, 0.0, 3.0, 4.0])].concat();
     seeds.push(("environment", "pfm", pfm));
@@ -244,6 +245,42 @@ fn files() -> Vec<(&'static str, &'static str, Vec<u8>)> {
         .unwrap();
     seeds.push(("environment", "jpeg", jpeg.into_inner()));
     seeds
+}
+
+/// A triangle in every format of meshes, after the byte that chooses it.
+fn meshes() -> Vec<(&'static str, Vec<u8>)> {
+    let obj = "mtllib a.mtl\no a\nv 0 0 0 1 0 0\nv 1 0 0 0 1 0\nv 0 1 0\nvt 0 1\nvn 0 0 1\nusemtl m\ns 1\nf 1/1/1 2//1 -1 -2/-1\nl 1 2\n";
+    let header = |form: &str| {
+        format!("ply\nformat {form} 1.0\nelement vertex 3\nproperty float x\nproperty float y\nproperty float z\nproperty uchar red\n\
+                 property uchar green\nproperty uchar blue\nelement face 1\nproperty list uchar int vertex_indices\nend_header\n")
+    };
+    let text = header("ascii") + "0 0 0 255 0 0\n1 0 0 0 255 0\n0 1 0 0 0 255\n3 0 1 2\n";
+    let binary = |big: bool| {
+        let float = |x: f32| if big { x.to_be_bytes() } else { x.to_le_bytes() };
+        let index = |i: i32| if big { i.to_be_bytes() } else { i.to_le_bytes() };
+        let mut bytes = header(if big { "binary_big_endian" } else { "binary_little_endian" }).into_bytes();
+        for [x, y] in [[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]] {
+            bytes.extend([x, y, 0.0].map(float).concat());
+            bytes.extend([255, 0, 0]);
+        }
+        bytes.push(3);
+        bytes.extend([0, 1, 2].map(index).concat());
+        bytes
+    };
+    let stl = "solid a\nfacet normal 0 0 1\nouter loop\nvertex 0 0 0\nvertex 1 0 0\nvertex 0 1 0\nendloop\nendfacet\nendsolid a\n";
+    let corners = [[0.0f32, 0.0], [1.0, 0.0], [0.0, 1.0]]
+        .map(|[x, y]| [x, y, 0.0].map(f32::to_le_bytes).concat())
+        .concat();
+    let stl_binary = [&[b' '; 80][..], &1u32.to_le_bytes(), &[0; 12], &corners, &[0; 2]].concat();
+    let all = [
+        ("obj", 0, obj.as_bytes().to_vec()),
+        ("ply_text", 1, text.into_bytes()),
+        ("ply_little", 1, binary(false)),
+        ("ply_big", 1, binary(true)),
+        ("stl_text", 2, stl.as_bytes().to_vec()),
+        ("stl_binary", 2, stl_binary),
+    ];
+    all.into_iter().map(|(name, first, bytes)| (name, [&[first][..], &bytes].concat())).collect()
 }
 
 #[test]

@@ -7,10 +7,14 @@ use std::process::Command;
 
 #[test]
 fn version_and_help_go_to_standard_output() {
-    let version = dpm(&["--version"], &[]);
+    let version = dpm(&["-V"], &[]);
     let told = out(&version);
     let begins = format!("dpm {} (", env!("CARGO_PKG_VERSION"));
     assert!(code(&version) == 0 && told.starts_with(&begins) && told.ends_with(")\n"), "{told}");
+    let long = out(&dpm(&["--version"], &[]));
+    let features = long.strip_prefix(&told).unwrap_or_else(|| panic!("{long} begins otherwise than {told}"));
+    assert!(features.starts_with("features: usb, "), "{long}");
+    assert_eq!(features.contains("vendored-libusb"), cfg!(feature = "vendored-libusb"), "{long}");
     let help = dpm(&["--help"], &[]);
     assert_eq!(code(&help), 0);
     for word in ["doctor", "Exit codes", "--set a.b=c"] {
@@ -20,7 +24,7 @@ fn version_and_help_go_to_standard_output() {
 
 #[test]
 fn a_program_knows_its_commit_wherever_it_lies() {
-    let known = out(&dpm(&["--version"], &[]));
+    let known = out(&dpm(&["-V"], &[]));
     // In another project's work tree, far from the one in which it was built.
     let folder = std::env::temp_dir().join(format!("dpm-elsewhere-{}", std::process::id()));
     std::fs::create_dir_all(folder.join(".git")).unwrap();
@@ -30,7 +34,7 @@ fn a_program_knows_its_commit_wherever_it_lies() {
     // Another test that starts a program keeps the copy open for writing until that program runs.
     let mut tries = 0;
     let there = loop {
-        match command_of(&program, &["--version"]).current_dir(&folder).output() {
+        match command_of(&program, &["-V"]).current_dir(&folder).output() {
             Err(e) if e.kind() == std::io::ErrorKind::ExecutableFileBusy && tries < 100 => {
                 tries += 1;
                 std::thread::sleep(std::time::Duration::from_millis(20));

@@ -1,7 +1,9 @@
 //! Builds the parts of a rig from a checked configuration: scene, projector, bodies with their motions, tracker.
 
 use crate::calibrated::{calibrated_camera, measured, measured_camera, CameraFileError};
-use crate::config::{BodyConfig, BuiltinScene, EnvironmentConfig, GazeConfig, RigConfig, TrackerConfig};
+use crate::config::{
+    BodyConfig, BuiltinScene, EnvironmentConfig, FileAxis, GazeConfig, RigConfig, TrackerConfig,
+};
 use crate::drive::{albedo_of, drive, DriveError};
 use crate::mock::{Motion, MotionError, MotionSpec};
 use dpm_device::planes::{PlaneSchedule, Raster};
@@ -9,7 +11,7 @@ use dpm_device::pose::Pose;
 use dpm_device::time::FrameRate;
 use dpm_render::drive::Drive;
 use dpm_scene::geometry::projector::{ProjectorCamera, ProjectorError};
-use dpm_scene::{BodySelector, Environment, LoadOptions, Scene, SceneError, SceneFeatures};
+use dpm_scene::{BodySelector, Environment, LoadOptions, Scene, SceneError, SceneFeatures, UpAxis};
 use glam::{DAffine3, DQuat, DVec3, Vec3};
 
 /// Why a rig cannot be built from a configuration that passed its own checks.
@@ -252,6 +254,12 @@ fn load_scene(config: &RigConfig) -> Result<Scene, SceneError> {
             .map(|b| BodySelector { name: b.name.clone(), node: b.node.clone(), projected: true })
             .collect(),
         virtual_nodes: c.virtual_nodes.clone(),
+        scale: c.scale,
+        up: c.up.map(|axis| match axis {
+            FileAxis::X => UpAxis::X,
+            FileAxis::Y => UpAxis::Y,
+            FileAxis::Z => UpAxis::Z,
+        }),
         ..LoadOptions::default()
     };
     dpm_scene::load(file, &options)

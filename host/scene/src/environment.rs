@@ -8,6 +8,7 @@ use image::{ImageFormat, ImageReader};
 use super::gltf_file::read_file;
 use super::limits::Limits;
 use super::load::contained;
+use super::srgb::to_linear;
 use super::{Environment, SceneError};
 
 /// Maximum number of texels of an environment: 8192 x 4096.
@@ -342,14 +343,7 @@ fn read_srgb(bytes: &[u8], format: ImageFormat) -> Result<Pixels, SceneError> {
     memory.max_alloc = Some(texels as u64 * 8 + (16 << 20));
     bounded.limits(memory);
     let rgb = bounded.decode().map_err(failed)?.into_rgb16();
-    let linear = |x: u16| {
-        let x = f32::from(x) / 65535.0;
-        if x <= 0.04045 {
-            x / 12.92
-        } else {
-            ((x + 0.055) / 1.055).powf(2.4)
-        }
-    };
+    let linear = |x: u16| to_linear(f32::from(x) / 65535.0);
     Ok((
         width,
         height,

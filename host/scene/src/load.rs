@@ -1,10 +1,12 @@
-//! Loads a [`Scene`] from a glTF file, such that nothing in the file can crash or block the caller.
+//! Loads a [`Scene`] from a glTF, OBJ, PLY or STL file, such that nothing in the file can crash or block the caller.
 
 use crossbeam::channel::{bounded, RecvTimeoutError};
+use glam::DMat3;
 use std::path::Path;
 
 use super::limits::{Cancel, Limits};
-use super::{gltf_file, Scene, SceneError};
+use super::mesh_file::MeshFormat;
+use super::{gltf_file, mesh_file, Scene, SceneError};
 
 /// The node of the file for a rigid body of the rig file. The node and its descendants move as one.
 #[derive(Clone, Debug, PartialEq, Eq)]
@@ -19,6 +21,38 @@ pub struct BodySelector {
     pub projected: bool,
 }
 
+/// An axis of a file that points up.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub enum UpAxis {
+    /// +X.
+    X,
+    /// +Y, as in glTF and in the world of a rig.
+    #[default]
+    Y,
+    /// +Z, as in most CAD programs.
+    Z,
+}
+
+impl UpAxis {
+    /// Its letter.
+    pub fn word(self) -> &'static str {
+        match self {
+            Self::X => "x",
+            Self::Y => "y",
+            Self::Z => "z",
+        }
+    }
+
+    /// The rotation of a file's axes into those of the world, in which +Y is up.
+    pub(crate) fn to_world(self) -> DMat3 {
+        match self {
+            Self::X => DMat3::from_rotation_z(std::f64::consts::FRAC_PI_2),
+            Self::Y => DMat3::IDENTITY,
+            Self::Z => DMat3::from_rotation_x(-std::f64::consts::FRAC_PI_2),
+        }
+    }
+}
+
 /// How to read a scene file.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct LoadOptions {
@@ -26,11 +60,16 @@ pub struct LoadOptions {
     pub bodies: Vec<BodySelector>,
     /// Names of nodes (with their descendants) that exist only in the virtual world: lamps, surroundings.
     pub virtual_nodes: Vec<String>,
+    /// Metres in a unit of the file, above 0. `None`: 1 for glTF, a guess that a warning tells for other formats.
+    pub scale: Option<f64>,
+    /// The axis of the file that points up. `None`: Y for glTF, a guess that a warning tells for other formats.
+    pub up: Option<UpAxis>,
     /// Limits on size and time.
     pub limits: Limits,
 }
 
-/// Reads a `.glb` or `.gltf` file.
+/// Reads a `.glb`, `.gltf`, `.obj`, `.ply` or `.stl` file. The bodies of formats without nodes are their objects; a file
+/// without named objects has one, with the file's name.
 ///
 /// # Errors
 /// Whatever the file contains, the result is a scene or a [`SceneError::InFile`] that names the place and the problem,
@@ -40,7 +79,7 @@ pub fn load(path: &Path, options: &LoadOptions) -> Result<Scene, SceneError> {
     let (owned_path, owned_options) = (path.to_path_buf(), options.clone());
     let work = move |cancel: &Cancel| {
         let bytes = gltf_file::read_file(&owned_path, owned_options.limits.bytes)?;
-        gltf_file::read(&bytes, Some(&owned_path), &owned_options, cancel)
+        read(&bytes, Some(&owned_path), &owned_options, cancel)
     };
     contained(&options.limits, work).map_err(|e| e.in_file(path))
 }
@@ -51,13 +90,34 @@ pub fn load(path: &Path, options: &LoadOptions) -> Result<Scene, SceneError> {
 /// As [`load`], without the path.
 pub fn load_bytes(bytes: &[u8], options: &LoadOptions) -> Result<Scene, SceneError> {
     let (bytes, owned_options) = (bytes.to_vec(), options.clone());
-    contained(&options.limits, move |cancel| gltf_file::read(&bytes, None, &owned_options, cancel))
+    contained(&options.limits, move |cancel| read(&bytes, None, &owned_options, cancel))
 }
 
 /// [`load_bytes`] in this thread, where a panic is a panic and nothing stops it when time is up: for fuzzers.
 #[doc(hidden)]
 pub fn load_bytes_here(bytes: &[u8], options: &LoadOptions) -> Result<Scene, SceneError> {
-    gltf_file::read(bytes, None, options, &Cancel::default())
+    read(bytes, None, options, &Cancel::default())
+}
+
+/// A mesh file of `format` in this thread, as [`load_bytes_here`]: an OBJ file cannot be told by its bytes.
+///
+/// # Errors
+/// As [`load`], without the path.
+#[doc(hidden)]
+pub fn load_mesh_here(bytes: &[u8], format: MeshFormat, options: &LoadOptions) -> Result<Scene, SceneError> {
+    mesh_file::read(bytes, format, None, options, &Cancel::default())
+}
+
+fn read(
+    bytes: &[u8],
+    beside: Option<&Path>,
+    options: &LoadOptions,
+    cancel: &Cancel,
+) -> Result<Scene, SceneError> {
+    match MeshFormat::of(beside, bytes) {
+        Some(format) => mesh_file::read(bytes, format, beside, options, cancel),
+        None => gltf_file::read(bytes, beside, options, cancel),
+    }
 }
 
 /// Runs `work` in a helper thread for at most `limits.time`.

@@ -2,6 +2,7 @@
 
 use glam::{Vec2, Vec3};
 
+use super::srgb::from_linear;
 use super::{Texture, Wrap};
 
 const SIZE: u32 = 256;
@@ -60,9 +61,7 @@ fn linear_image(texel: impl Fn(Vec2) -> Vec3) -> Texture {
 }
 
 fn srgb_image(linear: impl Fn(Vec2) -> Vec3) -> Texture {
-    image(true, |p| {
-        linear(p).map(|x| if x <= 0.0031308 { 12.92 * x } else { 1.055 * x.powf(1.0 / 2.4) - 0.055 })
-    })
+    image(true, |p| linear(p).map(from_linear))
 }
 
 /// Tangent-space normals of a height field in tile coordinates; green points up in the image.

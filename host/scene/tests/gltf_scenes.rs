@@ -2,7 +2,7 @@
 
 mod common;
 
-use common::{base64, png, tetrahedra, Glb};
+use common::{base64, png, tetrahedra, with_image, Glb};
 use dpm_scene::{BodySelector, LoadOptions, PunctualKind, Scene, TextureRef, Wrap};
 use glam::{DVec3, Vec2, Vec3};
 use serde_json::json;
@@ -357,20 +357,27 @@ fn damaged_vertices_are_dropped_and_counted() {
 #[test]
 fn what_is_not_reproduced_is_said() {
     let glb = tetrahedra()
-        .set("/meshes/0/primitives/0/attributes/COLOR_0", json!(0))
         .set("/materials/0/alphaMode", json!("BLEND"))
         .set("/materials/0/extensions", json!({"KHR_materials_sheen": {}, "KHR_materials_unlit": {}}))
         .set("/animations", json!([{"channels": [], "samplers": []}]));
     let warnings = load(&glb).warnings.join("\n");
-    for words in [
-        "primitive 0: vertex colours",
-        "alphaMode BLEND",
-        "KHR_materials_sheen",
-        "KHR_materials_unlit",
-        "animations",
-    ] {
+    for words in ["alphaMode BLEND", "KHR_materials_sheen", "KHR_materials_unlit", "animations"] {
         assert!(warnings.contains(words), "{words} is missing in\n{warnings}");
     }
+}
+
+#[test]
+fn colours_of_vertices_are_painted_unless_a_texture_is_there() {
+    let coloured = |glb: Glb| glb.set("/meshes/0/primitives/0/attributes/COLOR_0", json!(0));
+    let scene = load(&coloured(tetrahedra()));
+    let painted = |scene: &Scene| {
+        let used = scene.bodies[0].mesh.materials[0] as usize;
+        scene.materials[used].base_color_texture.map(|t| scene.textures[t.texture as usize].height)
+    };
+    assert_eq!((painted(&scene), scene.warnings.len()), (Some(2), 0), "{:?}", scene.warnings);
+    let textured = load(&coloured(with_image(&png(4, 4, &[[200, 100, 50, 255]; 16]))));
+    assert_eq!(painted(&textured), Some(4), "the texture of the file");
+    assert!(textured.warnings.iter().any(|w| w.contains("colours of vertices")), "{:?}", textured.warnings);
 }
 
 #[test]

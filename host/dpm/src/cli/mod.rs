@@ -12,6 +12,7 @@ mod error_files;
 mod keys;
 mod link_test;
 mod live_page;
+mod manual;
 mod order;
 mod os;
 mod osc;
@@ -109,6 +110,12 @@ enum Command {
     Dlpc900(dlpc900::Dlpc900Args),
     /// List the displays that can serve as projectors, and what to write in a rig file for each mode
     Display(display::DisplayArgs),
+    /// Print the completions of a shell: bash, zsh, fish and others
+    ///
+    /// For bash: dpm completions bash > ~/.local/share/bash-completion/completions/dpm
+    Completions(manual::CompletionsArgs),
+    /// Write a man page for the program and one for each command
+    Man(manual::ManArgs),
 }
 
 /// Runs the program with the process's arguments. `commit`: the commit from which it was compiled, see
@@ -117,10 +124,7 @@ pub fn main(commit: &'static str) -> ExitCode {
     dpm_common::commit::set(commit);
     // https://no-color.org: set and not empty.
     let plain = std::env::var_os("NO_COLOR").is_some_and(|v| !v.is_empty());
-    // Leaked once per process; the parser keeps it for as long.
-    let version: &'static str = format!("{} ({commit})", env!("CARGO_PKG_VERSION")).leak();
-    let command =
-        Cli::command().version(version).color(if plain { ColorChoice::Never } else { ColorChoice::Auto });
+    let command = command().color(if plain { ColorChoice::Never } else { ColorChoice::Auto });
     let parsed = command.try_get_matches().and_then(|m| Cli::from_arg_matches(&m));
     let cli = match parsed {
         Ok(cli) => cli,
@@ -148,6 +152,23 @@ pub fn main(commit: &'static str) -> ExitCode {
     ExitCode::from(code)
 }
 
+/// What this program was built with: features of Cargo, and those of `dpm-device` that it always asks for.
+fn features() -> &'static str {
+    if cfg!(feature = "vendored-libusb") {
+        "usb, serial, net, alp, display, vendored-libusb"
+    } else {
+        "usb, serial, net, alp, display"
+    }
+}
+
+/// The command line. `-V` tells version and commit; `--version` adds the features.
+fn command() -> clap::Command {
+    let version = format!("{} ({})", env!("CARGO_PKG_VERSION"), dpm_common::commit::get());
+    let long = format!("{version}\nfeatures: {}", features());
+    // Leaked once or twice per process; the parser keeps them for as long.
+    Cli::command().version(&*version.leak()).long_version(&*long.leak())
+}
+
 fn dispatch(command: &Command) -> Result<(), Failure> {
     match command {
         Command::Demo(args) => run::execute_demo(args),
@@ -170,5 +191,7 @@ fn dispatch(command: &Command) -> Result<(), Failure> {
         Command::Plan(args) => plan::execute(args),
         Command::Dlpc900(args) => dlpc900::execute(args),
         Command::Display(args) => display::execute(args),
+        Command::Completions(args) => manual::completions(args),
+        Command::Man(args) => manual::man(args),
     }
 }

@@ -8,7 +8,7 @@ use std::path::{Path, PathBuf};
 /// Flags that override the rig file. Each is a short form of `--set`.
 #[derive(clap::Args, Clone, Debug, Default)]
 pub(crate) struct RigArgs {
-    /// glTF 2.0 file (.glb or .gltf) to show instead of the rig's scene
+    /// glTF 2.0, OBJ, PLY or STL file to show instead of the rig's scene
     #[arg(long, value_name = "FILE")]
     pub scene: Option<PathBuf>,
 

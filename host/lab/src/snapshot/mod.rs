@@ -142,6 +142,7 @@ pub fn snapshot(
     let mut warnings = Vec::new();
     let raster = traced_raster(config, &gpu, &mut warnings);
     let rig = Rig::build(config, raster)?;
+    warnings.extend(rig.scene.warnings.iter().cloned());
     let raster = rig.camera.raster;
     // What surfaces are like is of interest out of the light too.
     let keep = Keep { every_pixel: true, ..Keep::default() };

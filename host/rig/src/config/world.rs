@@ -254,8 +254,14 @@ section! {
 section! {
     /// What is shown.
     pub struct SceneConfig {
-        /// A glTF 2.0 file (`.glb` or `.gltf`); replaces `builtin`.
+        /// A glTF 2.0 file (`.glb` or `.gltf`), or an OBJ, PLY or STL file; replaces `builtin`.
         file: Option<PathBuf> = None, "", NotEmpty;
+        /// Length that a unit of `file` stands for. If left out, it is 1 for glTF. OBJ, PLY and STL name no unit: there it
+        /// is guessed from the size, and the program says what it took.
+        scale: Option<f64> = None, "m", Within(1e-9, 1e6);
+        /// The axis of `file` that points up. If left out, it is `y` for glTF, OBJ and PLY, and `z` for STL; the program
+        /// says so for formats that name none.
+        up: Option<FileAxis> = None, "", Any;
         /// A scene that the program generates.
         builtin: BuiltinScene = BuiltinScene::Demo, "", Any;
         /// Light from the surroundings.
@@ -271,6 +277,18 @@ section! {
         /// Radiance that the real surfaces already send to the eye because of the light in the room. It is subtracted
         /// from the picture.
         ambient: [f64; 3] = [0.0, 0.0, 0.0], "scene units", Within(0.0, 1e6);
+    }
+}
+
+words! {
+    /// An axis of a file.
+    pub enum FileAxis {
+        /// +X.
+        X = "x",
+        /// +Y.
+        Y = "y",
+        /// +Z.
+        Z = "z",
     }
 }
 

@@ -170,10 +170,6 @@ fn check_mesh(
         let attributes =
             primitive.object("attributes")?.ok_or_else(|| primitive.error("has no 'attributes'"))?;
         let vertices = check_attributes(&primitive, &attributes, data, quantized)?;
-        if attributes.keys().any(|k| k.starts_with("COLOR_")) {
-            warnings
-                .push(format!("{}: vertex colours are ignored: bake them into a texture", primitive.name));
-        }
         let corners = match primitive.index("indices", data.accessors.len(), "accessor")? {
             Some(i) => {
                 let a = &data.accessors[i];
@@ -221,12 +217,16 @@ fn check_attributes(
         let dimensions = match key.as_str() {
             "POSITION" | "NORMAL" => 3,
             "TANGENT" => 4,
+            // With alpha or without.
+            "COLOR_0" if a.dimensions == 4 => 4,
+            "COLOR_0" => 3,
             _ if texture_set => 2,
-            _ => continue, // colours, joints, weights and private attributes are not read
+            _ => continue, // joints, weights and private attributes are not read
         };
         let plain = a.component == Component::F32;
-        let normalized_uv =
-            texture_set && a.normalized && matches!(a.component, Component::U8 | Component::U16);
+        let normalized_uv = (texture_set || key == "COLOR_0")
+            && a.normalized
+            && matches!(a.component, Component::U8 | Component::U16);
         let small = a.component != Component::U32 && (a.normalized || key == "POSITION" || texture_set);
         if a.dimensions != dimensions || !(plain || normalized_uv || quantized && small) {
             return Err(SceneError::broken(
@@ -236,7 +236,7 @@ fn check_attributes(
                     primitive.name,
                     a.dimensions,
                     a.component,
-                    if texture_set { ", or be normalized and unsigned" } else { "" }
+                    if texture_set || key == "COLOR_0" { ", or be normalized and unsigned" } else { "" }
                 ),
             ));
         }

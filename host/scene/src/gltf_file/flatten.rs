@@ -14,6 +14,7 @@ use super::accessor::Data;
 use super::instancing::Instances;
 use super::look::Look;
 use super::primitive::read_primitive;
+use super::vertex_paint::Paint;
 
 /// Bodies that [`choose_bodies`] makes movable when the rig file names none.
 const AUTO_BODIES: usize = 2;
@@ -205,6 +206,14 @@ pub(super) struct Source<'a> {
     pub look: &'a Look,
     /// The places of the meshes of instanced nodes.
     pub instances: &'a Instances,
+    /// The world's unit and axes from those of the file.
+    pub world: DAffine3,
+}
+
+/// What the options say about unit and upward axis.
+pub(super) fn world_from_file(options: &LoadOptions) -> DAffine3 {
+    let scale = options.scale.unwrap_or(1.0);
+    DAffine3::from_mat3(options.up.unwrap_or_default().to_world() * DMat3::from_diagonal(DVec3::splat(scale)))
 }
 
 /// Walks the tree and gathers geometry and lights by body.
@@ -214,7 +223,7 @@ pub(super) fn flatten(
     limits: &Limits,
     cancel: &Cancel,
     warnings: &mut Vec<String>,
-) -> Result<Flat, SceneError> {
+) -> Result<(Flat, Paint), SceneError> {
     let mut gatherer = Gatherer {
         source,
         claims,
@@ -224,9 +233,12 @@ pub(super) fn flatten(
         meshes: BTreeMap::new(),
         lights: vec![],
         dropped: Dropped::default(),
+        paint: Paint::new(source.look, limits),
     };
     gatherer.walk(warnings)?;
-    gatherer.into_flat(warnings)
+    let paint = std::mem::take(&mut gatherer.paint);
+    paint.warn(warnings);
+    Ok((gatherer.into_flat(warnings)?, paint))
 }
 
 /// What is gathered on the walk through the tree.
@@ -240,6 +252,7 @@ struct Gatherer<'a> {
     meshes: BTreeMap<Group, TriangleMesh>,
     lights: Vec<(Option<usize>, PunctualLight)>,
     dropped: Dropped,
+    paint: Paint,
 }
 
 impl Gatherer<'_> {
@@ -251,7 +264,7 @@ impl Gatherer<'_> {
         let mut walk: Vec<Step> = roots(document)
             .into_iter()
             .rev()
-            .map(|node| Step { node, world: DAffine3::IDENTITY, claim: None, is_virtual: false })
+            .map(|node| Step { node, world: self.source.world, claim: None, is_virtual: false })
             .collect();
         while let Some(step) = walk.pop() {
             self.cancel.check(self.limits)?;
@@ -264,7 +277,9 @@ impl Gatherer<'_> {
                 None => step.is_virtual,
             } || claims.virtual_nodes.binary_search(&step.node).is_ok();
             if let Some(c) = claimed_here {
-                self.rest[c] = rigid_part(&world).ok_or_else(|| {
+                // The body's own axes are turned with the file's: without its node's transform the body lies as the world does.
+                let turned = world * self.source.world.inverse();
+                self.rest[c] = rigid_part(&turned).ok_or_else(|| {
                     SceneError::broken(
                         format!("body '{}'", claims.bodies[c].name),
                         "its node has a scale of zero or a position beyond any room",
@@ -297,18 +312,16 @@ impl Gatherer<'_> {
         group: Group,
         body_from_node: &DAffine3,
     ) -> Result<(), SceneError> {
-        let Source { document, data, look, instances } = *self.source;
+        let Source { document, data, look, instances, .. } = *self.source;
         let into = self.meshes.entry(group).or_default();
         let here = [DAffine3::IDENTITY];
         let places = instances.get(&node).map_or(&here[..], Vec::as_slice);
         for primitive in &document.as_json().meshes[mesh].primitives {
             self.cancel.check(self.limits)?;
             let material = primitive.material.map_or(look.materials.len() - 1, |m| m.value());
-            let Some((part, lost)) =
-                read_primitive(primitive, data, material as u32, look.uv_sets[material])?
-            else {
-                continue;
-            };
+            let uv_set = look.uv_sets[material];
+            let read = read_primitive(primitive, data, material as u32, uv_set, &mut self.paint)?;
+            let Some((part, lost)) = read else { continue };
             for place in places {
                 self.cancel.check(self.limits)?;
                 self.dropped.add(lost);

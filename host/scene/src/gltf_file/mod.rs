@@ -10,6 +10,7 @@ mod instancing;
 mod json;
 mod look;
 mod primitive;
+mod vertex_paint;
 
 use std::path::Path;
 
@@ -21,6 +22,11 @@ use container::Folder;
 use json::Item;
 
 pub(super) use container::read_file;
+
+/// The content of a URI: inline, or a file in the folder of `beside`.
+pub(super) fn fetch_beside(uri: &str, beside: Option<&Path>, limit: u64) -> Result<Vec<u8>, SceneError> {
+    container::fetch(uri, beside.map(Folder::of).transpose()?.as_ref(), limit)
+}
 
 /// Maximum number of warnings of one kind from a hostile file.
 const MAX_WARNINGS: usize = 100;
@@ -48,9 +54,13 @@ pub(super) fn read(
         serde_json::from_value(reduced(&tree)).map_err(|e| SceneError::broken("JSON", e.to_string()))?;
     let document = gltf::Document::from_json_without_validation(typed);
     let claims = flatten::choose_bodies(&document, options, &mut warnings)?;
-    let look = look::read_look(&document, &root, &data, folder.as_ref(), limits, cancel, &mut warnings)?;
-    let source = flatten::Source { document: &document, data: &data, look: &look, instances: &instances };
-    let flat = flatten::flatten(&source, &claims, limits, cancel, &mut warnings)?;
+    let mut look = look::read_look(&document, &root, &data, folder.as_ref(), limits, cancel, &mut warnings)?;
+    let world = flatten::world_from_file(options);
+    let source =
+        flatten::Source { document: &document, data: &data, look: &look, instances: &instances, world };
+    let (flat, paint) = flatten::flatten(&source, &claims, limits, cancel, &mut warnings)?;
+    paint.add_to(&mut look);
+    let mut warnings = grouped(warnings);
     if warnings.len() > MAX_WARNINGS {
         let more = warnings.len() - MAX_WARNINGS;
         warnings.truncate(MAX_WARNINGS);
@@ -64,6 +74,29 @@ pub(super) fn read(
         environment: Environment::default(),
         warnings,
     })
+}
+
+/// Warnings that say the same of several objects as one that names the first of them.
+fn grouped(warnings: Vec<String>) -> Vec<String> {
+    let mut told: Vec<(String, String, usize)> = vec![];
+    for warning in warnings {
+        // "material 3 'glass': ..." names an object, other lines with a colon do not.
+        let named =
+            |object: &str| ["material ", "mesh ", "node "].iter().any(|kind| object.starts_with(kind));
+        let (object, what) =
+            warning.split_once(": ").filter(|(object, _)| named(object)).unwrap_or(("", &warning));
+        match told.iter_mut().find(|(first, said, _)| !first.is_empty() && !object.is_empty() && said == what)
+        {
+            Some((_, _, times)) => *times += 1,
+            None => told.push((object.to_owned(), what.to_owned(), 1)),
+        }
+    }
+    let line = |(object, what, times): (String, String, usize)| match (object.as_str(), times) {
+        ("", _) => what,
+        (_, 1) => format!("{object}: {what}"),
+        _ => format!("{object} and {} more: {what}", times - 1),
+    };
+    told.into_iter().map(line).collect()
 }
 
 /// The document without the parts that are read elsewhere or not at all, so that the crate never sees them.
@@ -106,4 +139,26 @@ fn reduced(tree: &Value) -> Value {
         extensions.retain(|key, _| key == "KHR_lights_punctual");
     }
     Value::Object(top)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::grouped;
+
+    #[test]
+    fn what_is_said_of_several_objects_is_said_once() {
+        let said = [
+            "material 0 'a': x is ignored",
+            "y",
+            "material 1: x is ignored",
+            "mesh 2: z",
+            "note: x is ignored",
+            "y",
+        ];
+        let told = grouped(said.map(String::from).into());
+        assert_eq!(
+            told,
+            ["material 0 'a' and 1 more: x is ignored", "y", "mesh 2: z", "note: x is ignored", "y"]
+        );
+    }
 }

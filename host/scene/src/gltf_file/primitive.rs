@@ -9,6 +9,7 @@ use gltf::json::validation::Checked;
 use super::super::mesh::Dropped;
 use super::super::{SceneError, TriangleMesh};
 use super::accessor::{Accessor, Data};
+use super::vertex_paint::Paint;
 
 /// Reads a primitive's triangles with their material; decodes only vertices that a triangle uses. `None` if there is
 /// nothing to see (points, lines, no positions), about which the check has warned.
@@ -17,6 +18,7 @@ pub(crate) fn read_primitive(
     data: &Data,
     material: u32,
     uv_set: u32,
+    paint: &mut Paint,
 ) -> Result<Option<(TriangleMesh, Dropped)>, SceneError> {
     let attribute = |semantic: Semantic| {
         primitive.attributes.get(&Checked::Valid(semantic)).map(|i| &data.accessors[i.value()])
@@ -37,27 +39,25 @@ pub(crate) fn read_primitive(
         _ => return Ok(None),
     };
 
-    let mut used = vec![];
-    let mut new_index = HashMap::new();
-    let triangles: Vec<[u32; 3]> = faces
-        .iter()
-        .map(|face| {
-            face.map(|i| {
-                *new_index.entry(i).or_insert_with(|| {
-                    used.push(i);
-                    used.len() as u32 - 1
-                })
-            })
-        })
-        .collect();
+    let colours = attribute(Semantic::Colors(0));
+    let painted = match colours {
+        Some(a) => paint.faces(&faces, material, |i| Vec3::from(data.floats::<3>(a, i)))?,
+        None => None,
+    };
+    let (used, triangles) = match painted {
+        Some(_) => apart(&faces),
+        None => shared(&faces),
+    };
     let floats3 = |a: &Accessor| used.iter().map(|&i| Vec3::from(data.floats::<3>(a, i))).collect::<Vec<_>>();
-    let uvs = match attribute(Semantic::TexCoords(uv_set)) {
+    let (material, painted_uvs) = painted.map_or((material, None), |(material, uvs)| (material, Some(uvs)));
+    let uvs = match (painted_uvs, attribute(Semantic::TexCoords(uv_set))) {
+        (Some(uvs), _) => uvs,
         // A NaN texture coordinate would spoil whole pixels; zero spoils only the texture.
-        Some(a) => used
+        (None, Some(a)) => used
             .iter()
             .map(|&i| Vec2::from(data.floats::<2>(a, i).map(|x| if x.is_finite() { x } else { 0.0 })))
             .collect(),
-        None => vec![Vec2::ZERO; used.len()],
+        (None, None) => vec![Vec2::ZERO; used.len()],
     };
     let normals = attribute(Semantic::Normals).map(floats3);
     let has_normals = normals.is_some();
@@ -85,6 +85,26 @@ pub(crate) fn read_primitive(
         mesh.repair_tangents();
     }
     Ok(Some((mesh, dropped)))
+}
+
+/// The vertices that triangles use, each once, and the triangles in their numbers.
+fn shared(faces: &[[u64; 3]]) -> (Vec<u64>, Vec<[u32; 3]>) {
+    let mut used = vec![];
+    let mut new_index = HashMap::new();
+    let mut number = |i: u64| {
+        *new_index.entry(i).or_insert_with(|| {
+            used.push(i);
+            used.len() as u32 - 1
+        })
+    };
+    let triangles = faces.iter().map(|face| face.map(&mut number)).collect();
+    (used, triangles)
+}
+
+/// The same with vertices of its own for each triangle.
+fn apart(faces: &[[u64; 3]]) -> (Vec<u64>, Vec<[u32; 3]>) {
+    let triangles = (0..faces.len() as u32).map(|t| [3 * t, 3 * t + 1, 3 * t + 2]).collect();
+    (faces.as_flattened().to_vec(), triangles)
 }
 
 /// Vertex numbers in the order of the file, each below `vertices`.
