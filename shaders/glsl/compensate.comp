@@ -72,6 +72,39 @@ float real_cosine(vec4 rows[3], vec3 n0, vec3 n1, vec3 n2, vec2 b, vec3 d) {
     return cosine;
 }
 
+// The place among the texels of one axis of an albedo map: the texels below and above, and the way from one to the other.
+void albedo_axis(float t, float size, out uint low, out uint high, out float way) {
+    precise float x = t * size - 0.5;
+    // Coordinates that are very large must not overflow the conversion to integers.
+    x = clamp(x, -1.0e6, 1.0e6);
+    float below = floor(x);
+    precise float rest = x - below;
+    way = rest;
+    int n = int(size), at = int(below);
+    // The remainder of a negative number is not defined.
+    int turns = at >= 0 ? at / n : -((n - 1 - at) / n);
+    low = uint(at - turns * n);
+    high = low + 1u == uint(n) ? 0u : low + 1u;
+}
+
+vec3 albedo_texel(uint map, uint width, uint x, uint y) {
+    uint at = map + 2u + 3u * (y * width + x);
+    return vec3(optics[at], optics[at + 1u], optics[at + 2u]);
+}
+
+// Albedo of the real surface at texture coordinates, which the picture repeats beyond 0..1. Equals the CPU's `AlbedoMap::at` bit for bit.
+vec3 albedo_at(uint map, vec2 uv) {
+    uint width = uint(optics[map]), x0, x1, y0, y1;
+    float fx, fy;
+    albedo_axis(uv.x, optics[map], x0, x1, fx);
+    albedo_axis(uv.y, optics[map + 1u], y0, y1, fy);
+    vec3 a = albedo_texel(map, width, x0, y0), b = albedo_texel(map, width, x0, y1);
+    precise vec3 above = a + (albedo_texel(map, width, x1, y0) - a) * fx;
+    precise vec3 below = b + (albedo_texel(map, width, x1, y1) - b) * fx;
+    precise vec3 albedo = above + (below - above) * fy;
+    return albedo;
+}
+
 layout(set = 0, binding = B_TILES, scalar) readonly buffer Tiles { uint tiles[]; };
 
 void main() {
@@ -89,6 +122,13 @@ void main() {
                                    vertex_at(ref.vertices.z).normal, b, ray_of(pixel));
         precise float geometry = (surface.distance * surface.distance) * (1.0 / max(cosine, 1e-3));
         precise vec3 drive = (shown[index].rgb - frame.ambient) * (instance_at(instance).drive_gain * geometry);
+        uint map = instance_at(instance).albedo_map;
+        if (HAS_ALBEDO_MAPS && map != NO_ALBEDO_MAP) {
+            precise float w = (1.0 - b.x) - b.y;
+            precise vec2 uv = (vertex_at(ref.vertices.x).uv * w + vertex_at(ref.vertices.y).uv * b.x) + vertex_at(ref.vertices.z).uv * b.y;
+            precise vec3 reflected = drive * (1.0 / albedo_at(map, uv));
+            drive = reflected;
+        }
         if (HAS_FLAT_FIELD) {
             uint at = frame.flat_field_at + 3u * index;
             precise vec3 even = drive * vec3(optics[at], optics[at + 1u], optics[at + 2u]);

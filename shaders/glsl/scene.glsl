@@ -44,7 +44,8 @@ bool finite3(vec3 v) { return finite(v.x) && finite(v.y) && finite(v.z); }
 // The same for counts that are nearly always 0. It avoids a sum over the lanes, which costs software Vulkan half as much as a node of the traversal.
 #define COUNT_RARE(counter, value) { if ((value) != 0u) atomicAdd(counters.counter, value); }
 
-// What differs from pixel to pixel and does not change while the rig runs: thresholds of the response, flat field, straight rays.
+// What differs from pixel to pixel and does not change while the rig runs: thresholds of the response, flat field, straight rays;
+// and albedo maps.
 layout(set = 0, binding = B_OPTICS, scalar) readonly buffer Optics { float optics[]; };
 
 // The straight ray of a pixel's centre: x / z to the right and y / z down, before the lens.

@@ -48,7 +48,7 @@ Instance instance_at(uint i) {
         instance_table[i].extent,
         instance_table[i].mover,
         instance_table[i].drive_gain,
-        instance_table[i].reserved_too);
+        instance_table[i].albedo_map);
 }
 #endif
 

@@ -84,6 +84,8 @@ specialization_constants! {
     HAS_RESPONSE: bool = false;
     /// The projector's pixels are not equally bright.
     HAS_FLAT_FIELD: bool = false;
+    /// The albedo of some body's real surface is a picture over its texture coordinates.
+    HAS_ALBEDO_MAPS: bool = false;
     /// Planes of equal light of each channel.
     HALFTONE_PLANES: uint = 8;
     /// They are white, and show the green code value.

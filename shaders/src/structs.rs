@@ -272,10 +272,11 @@ gpu_structs! {
         extent: f32,
         /// 0 if the body is shown as it was drawn, else the number of its mover, from 1 on.
         mover: u32,
-        /// drive = radiance * this * l_P^2 / cos, per channel: pi * exposure * white / (albedo * max_intensity).
+        /// drive = radiance * this * l_P^2 / cos, per channel: pi * exposure * white / (albedo * max_intensity). Without the albedo where the
+        /// body has an albedo map.
         drive_gain: [f32; 3],
-        /// 0.
-        reserved_too: u32,
+        /// Where the body's albedo map is in the table of optics: its width, its height, then three numbers a texel. `NO_ALBEDO_MAP`: it has none.
+        albedo_map: u32,
     }
 
     /// Attributes of one vertex.
@@ -430,6 +431,7 @@ pub const CONSTANTS: &[(&str, u32)] = &[
     ("NO_HIT", NO_HIT),
     ("NO_TEXTURE", NO_TEXTURE),
     ("NO_INSTANCE", NO_INSTANCE),
+    ("NO_ALBEDO_MAP", NO_ALBEDO_MAP),
     ("NO_LIGHT", NO_LIGHT),
     ("NO_FRAME", NO_FRAME),
     ("INSTANCE_PROJECTED", INSTANCE_PROJECTED),
@@ -475,6 +477,8 @@ pub const CONSTANTS: &[(&str, u32)] = &[
 pub const NO_HIT: u32 = u32::MAX;
 /// No texture.
 pub const NO_TEXTURE: u32 = u32::MAX;
+/// A body whose albedo is the same everywhere.
+pub const NO_ALBEDO_MAP: u32 = u32::MAX;
 /// Not a light.
 pub const NO_LIGHT: u32 = u32::MAX;
 /// No frame has this number: what the history holds before the first.

@@ -3,8 +3,8 @@
 
 use dpm_calibration::projector::{Known, Priors, Volume};
 use dpm_calibration::sensor::{
-    decode_pairs, solve_latency_of_pairs, solve_pairs, Block, DecodeError, DecodedPairs, InverseCode, Mapped,
-    SensorError, Settings, Solution, Timing,
+    decode_pairs, solve_latency_of_pairs, solve_pairs, Block, DecodeError, DecodedPairs, FrameLight,
+    InverseCode, Mapped, SensorError, Settings, Solution, Timing,
 };
 use dpm_calibration::trajectory::{Stamped, Trajectory};
 use dpm_common::so3::so3_exp;
@@ -35,6 +35,8 @@ struct Rig {
     light_lag_ns: i64,
     tracker_latency_ns: i64,
     seed: u64,
+    /// Planes of a frame; one is held for all of it.
+    schedule: PlaneSchedule,
 }
 
 impl Rig {
@@ -43,7 +45,17 @@ impl Rig {
         let optics = ProjectorOptics { brown: [-0.06, 0.02, 0.0005, -0.0003, 0.0], ..straight };
         let raster = Raster::new(width, height).unwrap();
         let (light_lag_ns, tracker_latency_ns) = (43_700_000, 5_300_000);
-        Self { raster, frame_ns: 1e9 / hz, optics, light_lag_ns, tracker_latency_ns, seed }
+        let schedule = PlaneSchedule::new(&[PlaneSpec { channel: Channel::White, bit: 7 }]).unwrap();
+        Self { raster, frame_ns: 1e9 / hz, optics, light_lag_ns, tracker_latency_ns, seed, schedule }
+    }
+
+    fn is_held(&self) -> bool {
+        self.schedule.planes().len() == 1
+    }
+
+    /// How bright each plane of a white frame is.
+    fn lights(&self) -> Vec<f64> {
+        self.schedule.planes().iter().map(|plane| f64::from(1u32 << plane.bit)).collect()
     }
 
     fn timing(&self) -> Timing {
@@ -57,7 +69,7 @@ impl Rig {
             seed: self.seed,
             tip_m: TIP,
             samples_per_second: SAMPLES,
-            is_held: true,
+            is_held: self.is_held(),
             obstructed: 0.0,
             ..SensorWandConfig::new(self.optics)
         };
@@ -65,7 +77,6 @@ impl Rig {
         let mut wand = SensorWand::new(config, still, self.raster).unwrap().held_by(hand.clone());
         // Full white fills two thirds of the converter's range.
         wand.set_gain(0.25);
-        let schedule = PlaneSchedule::new(&[PlaneSpec { channel: Channel::White, bit: 7 }]).unwrap();
         let pictures: Vec<[Arc<[u8]>; 2]> =
             (0..code.pairs()).map(|i| [false, true].map(|inverse| self.picture(code, i, inverse))).collect();
         let mut samples = Vec::new();
@@ -81,7 +92,8 @@ impl Rig {
                 last_photon_at: at(1.0),
             };
             let picture = &pictures[code.index(slot / 2)][usize::from(code.is_inverse(slot))];
-            let shown = Shown { event, planes_end_at: at(1.0), schedule, planes: picture.clone() };
+            let shown =
+                Shown { event, planes_end_at: at(1.0), schedule: self.schedule, planes: picture.clone() };
             wand.shine(&shown, &mut |sample| samples.push(sample));
         }
         let mut blocks = Vec::new();
@@ -105,7 +117,7 @@ impl Rig {
                 planes[y as usize * row_bytes + x as usize / 8] |= 0x80 >> (x % 8);
             }
         }
-        planes.into()
+        planes.repeat(self.schedule.planes().len()).into()
     }
 
     fn poses(&self, hand: &Hand, seconds: f64) -> Vec<Stamped> {
@@ -164,40 +176,55 @@ fn visiting() -> Arc<Hand> {
 }
 
 fn decoded(rig: &Rig, code: &InverseCode, blocks: &[Mapped]) -> Result<DecodedPairs, DecodeError> {
-    decode_pairs(code, &rig.timing(), blocks, &|slot| slot)
+    let lights = rig.lights();
+    let light = if rig.is_held() { FrameLight::Held } else { FrameLight::Planes(&lights) };
+    decode_pairs(code, (&rig.timing(), light), blocks, &|slot| slot)
 }
 
 /// The last word is what a display of this size and rate reaches with a tracker's noise of 0.1 mm and 0.05 degrees.
 #[test]
 fn a_display_is_found_from_pictures_and_their_inverse() {
     for (width, height, hz, seconds) in [(1024, 768, 60.0, 60.0), (960, 540, 120.0, 36.0)] {
-        let rig = Rig::new(width, height, hz, 3);
-        let code = InverseCode::new(rig.raster);
-        let (blocks, poses) = rig.record(&code, &visiting(), seconds);
-        let decoded = decoded(&rig, &code, &blocks).unwrap();
-        let late = (decoded.lag_ns - rig.light_lag_ns as f64).abs();
-        assert!(late < 1e5, "the display's lag is off by {late} ns");
-        let path = Trajectory::new(&poses);
-        let solution = solve_pairs(&code, &decoded, &path, &rig.settings()).unwrap();
-        let [p50, p99] = rig.errors(&solution);
-        let predicted = solution.predicted.p99_px;
-        let both_ns = rig.light_lag_ns + rig.tracker_latency_ns;
-        let late_us = 1e-3 * (solution.latency_ns - both_ns) as f64;
-        println!(
-            "{width} x {height} at {hz} Hz: {p50:.3} px median, {p99:.3} px 99th percentile, {predicted:.3} px \
-             predicted; latency off by {late_us:.0} us, rms {:.3} px",
-            solution.rms_px
-        );
-        assert!(p99 < predicted && predicted < 1.5, "{p99} px, predicted {predicted} px");
-        assert!(late_us.abs() < 200.0 && solution.latency_sigma_ns < 2e5, "{late_us} us");
-        let known = solve_latency_of_pairs(&code, &decoded, &path, &rig.settings(), &solution.model).unwrap();
-        assert!((known.latency_ns - solution.latency_ns).abs() < 100_000, "{known:?}");
-        // A projector that was moved is not taken for a latency.
-        let mut moved = solution.model;
-        moved.centre.x += 25.0;
-        let told = solve_latency_of_pairs(&code, &decoded, &path, &rig.settings(), &moved).unwrap_err();
-        assert!(matches!(told, SensorError::OtherProjector { .. }), "{told}");
+        is_found(&Rig::new(width, height, hz, 3), seconds);
     }
+}
+
+/// Half of the light lies in the first eighth of the frame there, and three quarters in the first quarter.
+#[test]
+fn a_projector_of_binary_planes_is_found_from_them_too() {
+    is_found(&Rig { schedule: PlaneSchedule::rgb24(), ..Rig::new(512, 384, 120.0, 3) }, 36.0);
+}
+
+/// Asserts that lens, pose and latency of a projector are found.
+fn is_found(rig: &Rig, seconds: f64) {
+    let code = InverseCode::new(rig.raster);
+    let (blocks, poses) = rig.record(&code, &visiting(), seconds);
+    let decoded = decoded(rig, &code, &blocks).unwrap();
+    let late = (decoded.lag_ns - rig.light_lag_ns as f64).abs();
+    assert!(late < 1e5, "the display's lag is off by {late} ns");
+    let path = Trajectory::new(&poses);
+    let solution = solve_pairs(&code, &decoded, &path, &rig.settings()).unwrap();
+    let [p50, p99] = rig.errors(&solution);
+    let predicted = solution.predicted.p99_px;
+    let both_ns = rig.light_lag_ns + rig.tracker_latency_ns;
+    let late_us = 1e-3 * (solution.latency_ns - both_ns) as f64;
+    println!(
+        "{} x {} at {:.0} Hz: {p50:.3} px median, {p99:.3} px 99th percentile, {predicted:.3} px \
+             predicted; latency off by {late_us:.0} us, rms {:.3} px",
+        rig.raster.width(),
+        rig.raster.height(),
+        1e9 / rig.frame_ns,
+        solution.rms_px
+    );
+    assert!(p99 < predicted && predicted < 1.5, "{p99} px, predicted {predicted} px");
+    assert!(late_us.abs() < 200.0 && solution.latency_sigma_ns < 2e5, "{late_us} us");
+    let known = solve_latency_of_pairs(&code, &decoded, &path, &rig.settings(), &solution.model).unwrap();
+    assert!((known.latency_ns - solution.latency_ns).abs() < 100_000, "{known:?}");
+    // A projector that was moved is not taken for a latency.
+    let mut moved = solution.model;
+    moved.centre.x += 25.0;
+    let told = solve_latency_of_pairs(&code, &decoded, &path, &rig.settings(), &moved).unwrap_err();
+    assert!(matches!(told, SensorError::OtherProjector { .. }), "{told}");
 }
 
 #[test]

@@ -2,7 +2,8 @@
 
 use bytemuck::Zeroable;
 use dpm_lab::reference::Sampler;
-use dpm_lab::twins::compensation::{ray_of, real_cosine, Compensation};
+use dpm_lab::twins::compensation::{interpolated, on_albedo, ray_of, real_cosine, Compensation};
+use dpm_render::albedo_map::AlbedoMap;
 use dpm_render::drive::Response;
 use dpm_render::gpu::{
     BindingKind, BindingSet, BindingTable, Buffer, CommandList, ComputePipeline, FrameFence, Gpu, MemoryKind,
@@ -11,8 +12,8 @@ use dpm_render::pack::{quantise, QuantiseCounts};
 use dpm_render::scene_data::SceneNeeds;
 use dpm_shaders::specialization as ids;
 use dpm_shaders::structs::{
-    Counters, Frame, Instance, Rows, Surface, TriangleRef, Vertex, BINDINGS, LENS_BROWN, LENS_NONE, NO_HIT,
-    TEXEL_BINDINGS,
+    Counters, Frame, Instance, Rows, Surface, TriangleRef, Vertex, BINDINGS, LENS_BROWN, LENS_NONE,
+    NO_ALBEDO_MAP, NO_HIT, TEXEL_BINDINGS,
 };
 use dpm_tests::gpu::with_gpu;
 use std::mem::size_of;
@@ -39,11 +40,13 @@ struct Optics {
     response: Option<Response>,
     flat_field: Option<Vec<[f32; 3]>>,
     straight: Option<Vec<[f32; 2]>>,
+    /// Of each instance, or none.
+    maps: Vec<Option<AlbedoMap>>,
 }
 
 impl Optics {
-    /// The table that the shader reads, with the places of its parts written into `frame`, and the constants that compile them in.
-    fn table(&self, frame: &mut Frame) -> (Vec<f32>, [(u32, u32); 3]) {
+    /// The table that the shader reads, with the places of its parts written into `frame` and `instances`, and the constants that compile them in.
+    fn table(&self, frame: &mut Frame, instances: &mut [Instance]) -> (Vec<f32>, [(u32, u32); 4]) {
         let mut table = vec![0.0; 4];
         if let Some(response) = &self.response {
             table = (0..3).flat_map(|c| *response.thresholds(c)).collect();
@@ -52,10 +55,17 @@ impl Optics {
         table.extend(self.flat_field.iter().flatten().flatten());
         frame.rays_at = table.len() as u32;
         table.extend(self.straight.iter().flatten().flatten());
+        for (instance, map) in instances.iter_mut().zip(&self.maps) {
+            let Some(map) = map else { continue };
+            instance.albedo_map = table.len() as u32;
+            table.extend([map.width() as f32, map.height() as f32]);
+            table.extend(map.texels().iter().flatten());
+        }
         let constants = [
             (ids::LENS, if self.straight.is_some() { LENS_BROWN } else { LENS_NONE }),
             (ids::HAS_RESPONSE, u32::from(self.response.is_some())),
             (ids::HAS_FLAT_FIELD, u32::from(self.flat_field.is_some())),
+            (ids::HAS_ALBEDO_MAPS, u32::from(!self.maps.is_empty())),
         ];
         (table, constants)
     }
@@ -85,11 +95,11 @@ fn on_gpu_through(gpu: &Arc<Gpu>, input: &Input, texel: bool) -> (Vec<u32>, Coun
     let device = |what, bytes| Buffer::new(gpu, what, bytes, MemoryKind::Device).unwrap();
     let host = |what, bytes| Buffer::new(gpu, what, bytes, MemoryKind::Readback).unwrap();
     let unused = rows("unused", &[0; 16]);
-    let mut frame = input.frame;
-    let (optics, optics_constants) = input.optics.table(&mut frame);
+    let (mut frame, mut instances) = (input.frame, input.instances.clone());
+    let (optics, optics_constants) = input.optics.table(&mut frame, &mut instances);
     let frame = uploaded("frame", bytemuck::bytes_of(&frame));
     let optics = uploaded("optics", bytemuck::cast_slice(&optics));
-    let instances = rows("instances", bytemuck::cast_slice(&input.instances));
+    let instances = rows("instances", bytemuck::cast_slice(&instances));
     let refs = rows("refs", bytemuck::cast_slice(&input.refs));
     let vertices = rows("vertices", bytemuck::cast_slice(&input.vertices));
     let surfaces = rows("surfaces", bytemuck::cast_slice(&input.surfaces));
@@ -155,7 +165,8 @@ fn twin(input: &Input) -> (Vec<u32>, QuantiseCounts, u32) {
                 return [0.0; 4];
             }
             lit += 1;
-            let instance = &input.instances[(s.id >> 24) as usize];
+            let body = (s.id >> 24) as usize;
+            let instance = &input.instances[body];
             let corners = input.refs[(instance.triangle_offset + (s.id & 0xff_ffff)) as usize].vertices;
             let normals = corners.map(|v| input.vertices[v as usize].normal);
             let straight = input.optics.straight.as_ref().map(|rays| rays[i]);
@@ -164,6 +175,10 @@ fn twin(input: &Input) -> (Vec<u32>, QuantiseCounts, u32) {
             let [r, g, b, _] = input.radiance[i];
             let k = Compensation { gain: instance.drive_gain, ambient: input.frame.ambient };
             let mut drive = k.unlimited_drive([r, g, b], s.distance, cos);
+            if let Some(Some(map)) = input.optics.maps.get(body) {
+                let uvs = corners.map(|v| input.vertices[v as usize].uv);
+                drive = on_albedo(drive, map.at(interpolated(uvs, s.barycentric)));
+            }
             if let Some(flat_field) = &input.optics.flat_field {
                 (0..3).for_each(|c| drive[c] *= flat_field[i][c]);
             }
@@ -197,6 +212,7 @@ fn random_input(seed: u64) -> Input {
             world_from_object: rows(&mut random),
             triangle_offset: i * 8,
             drive_gain: [0.3, 0.3 + 0.01 * i as f32, 0.3],
+            albedo_map: NO_ALBEDO_MAP,
             ..Zeroable::zeroed()
         })
         .collect();
@@ -204,7 +220,7 @@ fn random_input(seed: u64) -> Input {
     let vertices: Vec<Vertex> = (0..96)
         .map(|_| {
             let n = glam::Vec3::new(u() - 0.5, u() - 0.5, u() - 0.5).normalize();
-            Vertex { normal: n.into(), ..Zeroable::zeroed() }
+            Vertex { normal: n.into(), uv: [3.0 * u() - 1.0, 3.0 * u() - 1.0], ..Zeroable::zeroed() }
         })
         .collect();
     let refs = (0..32u32)
@@ -254,6 +270,30 @@ fn assert_same(gpu: &Arc<Gpu>, input: &Input) -> Counters {
     counters
 }
 
+/// Albedo maps of all bodies but the second: of one texel, and with sides that are no powers of two.
+fn maps(u: &mut impl FnMut() -> f32) -> Vec<Option<AlbedoMap>> {
+    let mut map = |width: u32, height: u32| {
+        let texels = (0..width * height).map(|_| [0.02 + 0.9 * u(), 0.02 + 0.9 * u(), 0.3 + 0.7 * u()]);
+        AlbedoMap::new(width, height, texels.collect())
+    };
+    vec![map(7, 5), None, map(1, 1), map(13, 2)]
+}
+
+/// Texture coordinates far beyond the picture, where a texel is all of f32's precision, must still be the twin's.
+#[test]
+fn texture_coordinates_far_outside_equal_the_twin() {
+    with_gpu(|gpu| {
+        let mut input = random_input(13);
+        let mut random = Sampler::new(13, 9);
+        input.optics.maps = maps(&mut || random.uniform() as f32);
+        for (i, vertex) in input.vertices.iter_mut().enumerate() {
+            let far = [1e3, -1e3, 1e7, -1e30, 0.0, -0.0][i % 6];
+            vertex.uv = vertex.uv.map(|t| t * far);
+        }
+        assert_same(gpu, &input);
+    });
+}
+
 #[test]
 fn codes_equal_the_twin_bit_for_bit() {
     with_gpu(|gpu| {
@@ -269,10 +309,10 @@ fn codes_equal_the_twin_bit_for_bit() {
 }
 
 #[test]
-fn lens_response_and_flat_field_equal_the_twin_bit_for_bit() {
+fn lens_response_flat_field_and_albedo_maps_equal_the_twin_bit_for_bit() {
     with_gpu(|gpu| {
         let plain = twin(&random_input(11)).0;
-        for parts in 1..8u32 {
+        for parts in 1..16u32 {
             let mut input = random_input(11);
             let mut random = Sampler::new(u64::from(parts), 9);
             let mut u = || random.uniform() as f32;
@@ -282,6 +322,7 @@ fn lens_response_and_flat_field_equal_the_twin_bit_for_bit() {
                 flat_field: (parts & 2 > 0)
                     .then(|| (0..PIXELS).map(|_| [1.0 + u(), 1.0 + u(), 1.0 + u()]).collect()),
                 straight: (parts & 4 > 0).then(|| (0..PIXELS).map(|_| [u() - 0.5, u() - 0.5]).collect()),
+                maps: if parts & 8 > 0 { maps(&mut u) } else { Vec::new() },
             };
             // What is no number must stay black behind each part as well.
             (0..PIXELS).step_by(17).for_each(|i| input.radiance[i][i % 3] = f32::NAN);

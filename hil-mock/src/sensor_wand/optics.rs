@@ -47,6 +47,8 @@ pub struct ProjectorOptics {
     pub centre_px: [f64; 2],
     /// Brown's coefficients k1, k2, p1, p2, k3, as OpenCV has them, for normalized coordinates x right and y down.
     pub brown: [f64; 5],
+    /// k4, k5, k6 of OpenCV's rational model: the radial factor is divided by `1 + k4 r^2 + k5 r^4 + k6 r^6`.
+    pub quotient: [f64; 3],
 }
 
 impl ProjectorOptics {
@@ -58,7 +60,22 @@ impl ProjectorOptics {
             focal_px: [focal_px; 2],
             centre_px: [f64::from(width) / 2.0, f64::from(height) / 2.0],
             brown: [0.0; 5],
+            quotient: [0.0; 3],
         }
+    }
+
+    /// The factor by which a point at this squared radius moves away from the axis; `None` from the radius on at which the
+    /// lens folds the picture back.
+    fn radial(&self, r2: f64) -> Option<f64> {
+        let [k1, k2, _, _, k3] = self.brown;
+        // 1 + a r^2 + b r^4 + c r^6, and r times its slope.
+        let polynomial = |[a, b, c]: [f64; 3]| {
+            (1.0 + r2 * (a + r2 * (b + r2 * c)), r2 * (2.0 * a + r2 * (4.0 * b + r2 * 6.0 * c)))
+        };
+        let ((above, above_slope), (below, below_slope)) =
+            (polynomial([k1, k2, k3]), polynomial(self.quotient));
+        let grows = below > 0.0 && (above + above_slope) * below > above * below_slope;
+        grows.then_some(above / below)
     }
 
     /// The point in the projector's space.
@@ -75,12 +92,9 @@ impl ProjectorOptics {
             return None;
         }
         let (x, y) = (x / -z, -y / -z);
-        let [k1, k2, p1, p2, k3] = self.brown;
+        let [_, _, p1, p2, _] = self.brown;
         let r2 = x * x + y * y;
-        if 1.0 + r2 * (3.0 * k1 + r2 * (5.0 * k2 + r2 * 7.0 * k3)) <= 0.0 {
-            return None;
-        }
-        let radial = 1.0 + r2 * (k1 + r2 * (k2 + r2 * k3));
+        let radial = self.radial(r2)?;
         let bent_x = x * radial + 2.0 * p1 * x * y + p2 * (r2 + 2.0 * x * x);
         let bent_y = y * radial + p1 * (r2 + 2.0 * y * y) + 2.0 * p2 * x * y;
         let [[fx, fy], [cx, cy]] = [self.focal_px, self.centre_px];
@@ -158,6 +172,14 @@ mod tests {
         let y = 0.2 * radial + 0.001 * (0.13 + 0.08) + 2.0 * -0.002 * 0.06;
         let at = bent.pixel_of([0.3, -0.2, -1.0]).expect("ahead");
         assert!((at[0] - (1000.0 * x + 500.0)).abs() < 1e-9 && (at[1] - (1000.0 * y + 400.0)).abs() < 1e-9);
+        // The same above 1 + 0.2 r2 + 0.1 r2^2 - 0.05 r2^3.
+        let rational = ProjectorOptics { quotient: [0.2, 0.1, -0.05], ..bent };
+        let shrunk = radial / (1.0 + 0.2 * 0.13 + 0.1 * 0.13 * 0.13 - 0.05 * 0.13f64.powi(3));
+        let at = rational.pixel_of([0.3, -0.2, -1.0]).expect("ahead");
+        assert!((at[0] - (1000.0 * (x + 0.3 * (shrunk - radial)) + 500.0)).abs() < 1e-9, "{at:?}");
+        // r / (1 + r^2) has its maximum at 1.
+        let turned = ProjectorOptics { quotient: [1.0, 0.0, 0.0], ..plain };
+        assert!(turned.pixel_of([0.99, 0.0, -1.0]).is_some() && turned.pixel_of([1.01, 0.0, -1.0]).is_none());
         // Where r (1 + k1 r^2) has its maximum, the picture folds.
         let folded = ProjectorOptics { brown: [-1.0, 0.0, 0.0, 0.0, 0.0], ..plain };
         assert!(folded.pixel_of([0.57, 0.0, -1.0]).is_some() && folded.pixel_of([0.58, 0.0, -1.0]).is_none());

@@ -35,8 +35,10 @@ fn line_of(text: &str) -> Option<Line> {
     let order = words.next()?;
     let words: Vec<&str> = words.collect();
     let place = |words: &[&str]| -> Option<[f64; 3]> {
+        // A place may be copied as dpm prints it: (1.0, 2.0, 3.0).
+        let number = |word: &str| word.trim_matches(['(', ',', ')']).parse().ok();
         let all: Option<Vec<f64>> =
-            words.iter().map(|w| w.parse().ok().filter(|v: &f64| v.abs() <= 1000.0)).collect();
+            words.iter().map(|w| number(w).filter(|v: &f64| v.abs() <= 1000.0)).collect();
         all?.try_into().ok()
     };
     match order {
@@ -176,6 +178,8 @@ mod tests {
         assert_eq!(line_of("dot 0 0 1e-1"), Some(Line::Dot(None, [0.0, 0.0, 0.1])));
         assert_eq!(line_of("dot box 0 0 1"), Some(Line::Dot(Some("box".into()), [0.0, 0.0, 1.0])));
         assert_eq!(line_of("touch left foot 0 1 0"), Some(Line::Touch("left foot".into(), [0.0, 1.0, 0.0])));
+        let copied = line_of("touch bunny (-0.0156, 0.0990, 0.0015)");
+        assert_eq!(copied, Some(Line::Touch("bunny".into(), [-0.0156, 0.099, 0.0015])));
         for bad in [
             "",
             "tip",

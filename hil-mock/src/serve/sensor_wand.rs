@@ -64,9 +64,9 @@ pub(crate) struct SensorWandArguments {
     /// Focal length of the projector, pixels
     #[arg(long, value_name = "PX", default_value_t = 1800.0)]
     focal: f64,
-    /// Brown's coefficients of its lens: k1,k2,p1,p2,k3
-    #[arg(long, value_name = "K", default_value = "-0.06,0.02,0.0005,-0.0003,0", value_parser = five, allow_hyphen_values = true)]
-    lens: [f64; 5],
+    /// Coefficients of its lens as OpenCV has them: k1,k2,p1,p2,k3, and k4,k5,k6 of the rational model if it has them
+    #[arg(long, value_name = "K", default_value = "-0.06,0.02,0.0005,-0.0003,0", value_parser = lens, allow_hyphen_values = true)]
+    lens: [f64; 8],
     /// Diameter of the sensor's aperture, millimetres
     #[arg(long, default_value_t = 3.0)]
     aperture_mm: f64,
@@ -135,8 +135,9 @@ fn three(text: &str) -> Result<[f64; 3], String> {
     numbers(text)
 }
 
-fn five(text: &str) -> Result<[f64; 5], String> {
-    numbers(text)
+fn lens(text: &str) -> Result<[f64; 8], String> {
+    let brown = numbers::<5>(text).map(|[k1, k2, p1, p2, k3]| [k1, k2, p1, p2, k3, 0.0, 0.0, 0.0]);
+    brown.or_else(|_| numbers(text)).map_err(|_| "write 5 or 8 numbers with commas between them".into())
 }
 
 fn body(text: &str) -> Result<(String, [f64; 3]), String> {
@@ -162,7 +163,8 @@ impl SensorWandArguments {
         }
         let straight =
             ProjectorOptics::along_z(self.projector_at, self.focal, raster.width(), raster.height());
-        Ok(ProjectorOptics { brown: self.lens, ..straight })
+        let [k1, k2, p1, p2, k3, k4, k5, k6] = self.lens;
+        Ok(ProjectorOptics { brown: [k1, k2, p1, p2, k3], quotient: [k4, k5, k6], ..straight })
     }
 
     fn wand(&self, motion: Motion) -> Result<SensorWand, Box<dyn Error>> {

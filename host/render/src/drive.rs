@@ -1,6 +1,8 @@
 //! From radiance to code values: what the surfaces reflect and what the projector can give.
 
+use crate::albedo_map::AlbedoMap;
 use dpm_shaders::structs::RESPONSE_CODES;
+use std::sync::Arc;
 
 /// Code values of a channel.
 const CODES: usize = RESPONSE_CODES as usize;
@@ -12,12 +14,15 @@ pub struct Drive {
     pub gain: [f32; 3],
     /// The same for each body of the scene, where its surface differs. Bodies beyond the end have `gain`.
     pub gain_of_body: Vec<[f32; 3]>,
+    /// Albedo over the texture coordinates of each body of the scene, where a body has a map; its gain is then that of albedo 1. Bodies beyond the
+    /// end have none.
+    pub albedo_maps: Vec<Option<Arc<AlbedoMap>>>,
     /// Radiance that the surfaces show without the projector.
     pub ambient: [f32; 3],
     /// How much light a code value gives; `None`: in proportion.
     pub response: Option<Response>,
     /// One over the relative brightness of each pixel and channel, row by row; `None`: 1 everywhere.
-    pub flat_field: Option<std::sync::Arc<Vec<[f32; 3]>>>,
+    pub flat_field: Option<Arc<Vec<[f32; 3]>>>,
 }
 
 impl Drive {

@@ -16,6 +16,7 @@
 //! assert_eq!(back, codes, "nothing is lost");
 //! ```
 
+pub mod albedo_map;
 pub mod blue_noise;
 pub mod drive;
 mod fill;

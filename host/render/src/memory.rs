@@ -148,7 +148,7 @@ pub(super) struct SharedBuffers {
     pub rates: Buffer,
     pub rate_table: Buffer,
     pub noise: Buffer,
-    /// Response, flat field and rays of the projector's pixels.
+    /// Response, flat field and rays of the projector's pixels, and albedo maps.
     pub optics: Buffer,
     /// Groups of planes that follow the bodies.
     pub plane_groups: Buffer,

@@ -1,20 +1,24 @@
-//! The table of what differs from pixel to pixel and never changes: thresholds of the response, flat field, and the straight rays of the lens.
+//! The table of what differs from pixel to pixel or over a surface and never changes: thresholds of the response, flat field, the straight rays of
+//! the lens, and albedo maps.
 
+use super::albedo_map::AlbedoMap;
 use super::drive::Drive;
 use dpm_device::planes::Raster;
 use dpm_scene::geometry::lens::LensModel;
 use dpm_scene::geometry::projector::ProjectorCamera;
 use dpm_shaders::specialization as ids;
-use dpm_shaders::structs::{Frame, LENS_BROWN, LENS_FISHEYE, LENS_NONE, RESPONSE_CODES};
+use dpm_shaders::structs::{Frame, LENS_BROWN, LENS_FISHEYE, LENS_NONE, NO_ALBEDO_MAP, RESPONSE_CODES};
 use glam::DVec2;
 
 /// Where each part of the table begins, and which parts there are.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[derive(Clone, Debug, PartialEq, Eq)]
 pub(super) struct OpticsLayout {
     response: bool,
     flat_field: bool,
     lens: u32,
     pixels: u32,
+    /// Of each body of the scene that has an albedo map or comes before one that has: the map's numbers; 0: it has none.
+    maps: Vec<u32>,
 }
 
 impl OpticsLayout {
@@ -29,6 +33,7 @@ impl OpticsLayout {
                 LensModel::Fisheye(_) => LENS_FISHEYE,
             }),
             pixels: raster.pixel_count() as u32,
+            maps: drive.albedo_maps.iter().map(|m| m.as_ref().map_or(0, |m| numbers_of(m))).collect(),
         }
     }
 
@@ -44,18 +49,30 @@ impl OpticsLayout {
         self.flat_field_at() + if self.flat_field { 3 * self.pixels } else { 0 }
     }
 
+    fn maps_at(&self) -> u32 {
+        self.rays_at() + if self.lens == LENS_NONE { 0 } else { 2 * self.pixels }
+    }
+
+    /// Where the albedo map of a body of the scene begins; `NO_ALBEDO_MAP` if it has none.
+    pub(super) fn albedo_map_at(&self, body: usize) -> u32 {
+        match self.maps.get(body) {
+            None | Some(0) => NO_ALBEDO_MAP,
+            Some(_) => self.maps_at() + self.maps[..body].iter().sum::<u32>(),
+        }
+    }
+
     /// Size of the table.
     pub(super) fn len_bytes(&self) -> usize {
-        let rays = if self.lens == LENS_NONE { 0 } else { 2 * self.pixels as usize };
-        4 * (self.rays_at() as usize + rays)
+        4 * (self.maps_at() as usize + self.maps.iter().map(|&n| n as usize).sum::<usize>())
     }
 
     /// The specialization constants that leave out the parts that are not there.
-    pub(super) fn constants(&self) -> [(u32, u32); 3] {
+    pub(super) fn constants(&self) -> [(u32, u32); 4] {
         [
             (ids::LENS, self.lens),
             (ids::HAS_RESPONSE, u32::from(self.response)),
             (ids::HAS_FLAT_FIELD, u32::from(self.flat_field)),
+            (ids::HAS_ALBEDO_MAPS, u32::from(self.maps.iter().any(|&n| n > 0))),
         ]
     }
 
@@ -70,6 +87,11 @@ impl OpticsLayout {
         }
         if let Some(camera) = lens.filter(|_| self.lens != LENS_NONE) {
             table.extend(straight_rays(camera).flat_map(|p| [p.x as f32, p.y as f32]));
+        }
+        for map in drive.albedo_maps.iter().flatten() {
+            // Both sides are exact in f32.
+            table.extend([map.width() as f32, map.height() as f32]);
+            table.extend(map.texels().iter().flatten());
         }
         if table.is_empty() {
             table.push(0.0);
@@ -91,6 +113,11 @@ impl OpticsLayout {
         let tilt = camera.lens.tilt_matrix().transpose();
         frame.lens_tilt = [tilt.x_axis, tilt.y_axis, tilt.z_axis].map(|r| r.as_vec3().extend(0.0).to_array());
     }
+}
+
+/// How many numbers of the table an albedo map takes: its sides, and three for each texel.
+fn numbers_of(map: &AlbedoMap) -> u32 {
+    2 + 3 * map.texels().len() as u32
 }
 
 /// The straight rays of the pixels' centres, row by row.

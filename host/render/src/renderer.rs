@@ -129,6 +129,13 @@ impl Renderer {
         (n[0] * (1.0 - u - v) + n[1] * u + n[2] * v).normalize_or_zero()
     }
 
+    /// Texture coordinates of what a projector pixel sees.
+    pub fn texture_coordinates(&self, surface: &Surface) -> [f32; 2] {
+        let [u, v] = surface.barycentric;
+        let [a, b, c] = self.corners(surface).map(|i| self.data.vertices[i as usize].uv);
+        std::array::from_fn(|k| (a[k] * ((1.0 - u) - v) + b[k] * u) + c[k] * v)
+    }
+
     /// Indices of the corners of a surface's triangle, among the vertices of all bodies in their order.
     pub fn corners(&self, surface: &Surface) -> [u32; 3] {
         let body = &self.data.bodies[(surface.id >> 24) as usize];
@@ -342,7 +349,7 @@ impl Renderer {
             extent: body.extent,
             mover: self.movers.number_of(i),
             drive_gain: self.settings.drive.gain_of(i).map(|gain| gain * inputs.brighter),
-            reserved_too: 0,
+            albedo_map: self.optics.albedo_map_at(i),
         }
     }
 

@@ -1,5 +1,6 @@
 //! What the rig file says of surfaces and of the projector's light, as the renderer's [`Drive`].
 
+use crate::albedo::{albedo_maps, albedo_of};
 use crate::calibrated::measured_response;
 use crate::config::{ResponseConfig, RigConfig, TableResponseConfig};
 use dpm_calibration::file::{CalibrationFile, LightSection};
@@ -13,8 +14,8 @@ use std::sync::Arc;
 
 /// Largest table of a response, bytes.
 const MAX_TABLE_BYTES: u64 = 1 << 20;
-/// Largest picture of a flat field, bytes.
-const MAX_PICTURE_BYTES: u64 = 256 << 20;
+/// Largest picture of a flat field or of an albedo, bytes.
+pub(crate) const MAX_PICTURE_BYTES: u64 = 256 << 20;
 /// Pixels darker than this share of the brightest cannot be compensated.
 const LEAST_BRIGHTNESS: f32 = 0.02;
 
@@ -55,12 +56,13 @@ pub(crate) fn drive(
             (wanted / (albedo[c] * intensity[c])) as f32
         })
     };
-    let differs = config.scene.bodies.iter().any(|b| b.albedo.is_some());
+    let differs = config.scene.bodies.iter().any(|b| b.albedo.is_some() || b.albedo_map.is_some());
     let gain_of_body = if differs {
         scene.bodies.iter().map(|b| gain_with(albedo_of(config, b.tracked))).collect()
     } else {
         Vec::new()
     };
+    let albedo_maps = albedo_maps(config, scene)?;
     let (response, flat_field) = match &measured.light {
         Some(light) => measured_light(light, raster)?,
         None => {
@@ -71,6 +73,7 @@ pub(crate) fn drive(
     Ok(Drive {
         gain: gain_with(config.scene.surface_albedo.0),
         gain_of_body,
+        albedo_maps,
         ambient: config.scene.ambient.map(|v| v as f32),
         response,
         flat_field,
@@ -106,12 +109,6 @@ fn measured_light(
     Ok((Some(response), Some(Arc::new(inverse))))
 }
 
-/// Albedo of the real surface of a body of the scene, by the tracked body that carries it.
-pub(crate) fn albedo_of(config: &RigConfig, tracked: Option<u16>) -> [f64; 3] {
-    let own = tracked.and_then(|i| config.scene.bodies.get(usize::from(i))?.albedo);
-    own.unwrap_or(config.scene.surface_albedo).0
-}
-
 fn response(config: &ResponseConfig) -> Result<Option<Response>, DriveError> {
     let wrong = |message: String| DriveError { key: "projector.response", message };
     Ok(match config {
@@ -133,7 +130,7 @@ fn response(config: &ResponseConfig) -> Result<Option<Response>, DriveError> {
 }
 
 /// Light of a code value of sRGB, both as shares of the greatest (IEC 61966-2-1).
-fn srgb_light(code: f64) -> f64 {
+pub(crate) fn srgb_light(code: f64) -> f64 {
     if code <= 0.04045 {
         code / 12.92
     } else {

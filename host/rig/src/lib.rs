@@ -28,6 +28,7 @@
 //! # }
 //! ```
 
+mod albedo;
 pub mod calibrated;
 pub mod config;
 pub mod control;

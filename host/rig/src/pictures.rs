@@ -103,7 +103,7 @@ pub fn pictures(
         let to_projector = projector - seen.position;
         let d2 = to_projector.length_squared();
         let cos = seen.normal.dot(to_projector).abs() / d2.sqrt();
-        let albedo = Vec3::from_array(rig.albedo_of(seen.body).map(|a| a as f32));
+        let albedo = rig.albedo_at(seen.body, seen.uv);
         ambient + drive * albedo * intensity * (cos / (std::f64::consts::PI * d2)) as f32
     })?;
     Ok(Pictures { light, viewer: Ok(viewer) })
@@ -140,6 +140,8 @@ struct Seen {
     body: usize,
     position: DVec3,
     normal: DVec3,
+    /// Texture coordinates.
+    uv: [f32; 2],
 }
 
 fn integrate(
@@ -189,7 +191,7 @@ fn integrate(
         let in_body = poses[body].inverse().transform_point3(position);
         let normal =
             poses[body].transform_vector3(renderer.shading_normal(surface).as_dvec3()).normalize_or_zero();
-        let seen = Seen { body, position, normal };
+        let seen = Seen { body, position, normal, uv: renderer.texture_coordinates(surface) };
         let mut sum = Vec3::ZERO;
         for ((frame, _), all) in window.frames.iter().zip(&window_poses) {
             if let Some(p) = rig.camera.project(all[body].transform_point3(in_body)) {

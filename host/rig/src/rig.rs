@@ -1,10 +1,11 @@
 //! Builds the parts of a rig from a checked configuration: scene, projector, bodies with their motions, tracker.
 
+use crate::albedo::albedo_of;
 use crate::calibrated::{calibrated_camera, measured, measured_camera, CameraFileError};
 use crate::config::{
     BodyConfig, BuiltinScene, EnvironmentConfig, FileAxis, GazeConfig, RigConfig, TrackerConfig,
 };
-use crate::drive::{albedo_of, drive, DriveError};
+use crate::drive::{drive, DriveError};
 use crate::mock::{Motion, MotionError, MotionSpec};
 use dpm_device::planes::{PlaneSchedule, Raster};
 use dpm_device::pose::Pose;
@@ -220,9 +221,15 @@ impl Rig {
         self.config.projector.frame_rate
     }
 
-    /// Albedo of the real surface of a body of the scene.
-    pub fn albedo_of(&self, body: usize) -> [f64; 3] {
-        albedo_of(&self.config, self.scene.bodies.get(body).and_then(|b| b.tracked))
+    /// Albedo of the real surface of a body of the scene at texture coordinates of its mesh.
+    pub fn albedo_at(&self, body: usize, uv: [f32; 2]) -> Vec3 {
+        match self.drive.albedo_maps.get(body) {
+            Some(Some(map)) => Vec3::from_array(map.at(uv)),
+            _ => {
+                let albedo = albedo_of(&self.config, self.scene.bodies.get(body).and_then(|b| b.tracked));
+                Vec3::from_array(albedo.map(|a| a as f32))
+            }
+        }
     }
 
     /// The true world-from-mesh transform of every tracked body at an instant; `None` unless the tracker is the mock.

@@ -1,7 +1,7 @@
 //! Repairs raw vertices and indices to a [`TriangleMesh`] that keeps its guarantees: unit normals, finite tangents, no
 //! empty triangle.
 
-use glam::{DAffine3, DMat3, DVec3, Vec3, Vec4};
+use glam::{DAffine3, DMat3, DVec3, Vec2, Vec3, Vec4};
 
 use super::TriangleMesh;
 
@@ -198,6 +198,22 @@ impl TriangleMesh {
         }
     }
 
+    /// Share of the surface, 0 to 1, that has no texture coordinates: all three corners of its triangles have (0, 0), which is what a file without
+    /// coordinates is read as. 1 without triangles.
+    pub fn share_without_uvs(&self) -> f64 {
+        let area = |t: &[u32; 3]| {
+            let [a, b, c] = t.map(|i| self.positions[i as usize].as_dvec3());
+            (b - a).cross(c - a).length()
+        };
+        let bare = |t: &&[u32; 3]| t.iter().all(|&i| self.uvs[i as usize] == Vec2::ZERO);
+        let all: f64 = self.triangles.iter().map(area).sum();
+        if all > 0.0 {
+            self.triangles.iter().filter(bare).map(area).sum::<f64>() / all
+        } else {
+            1.0
+        }
+    }
+
     /// Unit direction of +u on a face and the sign of its bitangent; `None` if the coordinates span no area.
     fn face_tangent(&self, t: [u32; 3]) -> Option<(DVec3, f32)> {
         let [p0, p1, p2] = t.map(|i| self.positions[i as usize].as_dvec3());
@@ -289,7 +305,7 @@ fn cofactor(m: DMat3) -> DMat3 {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use glam::{DQuat, Vec2};
+    use glam::DQuat;
 
     fn quad() -> TriangleMesh {
         // An upright image on the XY plane facing +Z: u to the right, v down.

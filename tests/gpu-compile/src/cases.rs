@@ -1,5 +1,6 @@
 //! The scenes and methods whose pipelines are compiled: what a rig file gives, with the constants that the renderer would set.
 
+use dpm_render::albedo_map::AlbedoMap;
 use dpm_render::drive::Response;
 use dpm_render::pack::Halftone;
 use dpm_render::{Keep, Output, RendererPlan, RendererSettings};
@@ -30,12 +31,14 @@ fn bunny_venus() -> Scene {
     scene
 }
 
-/// Every part of the shaders, with tables for all that may have one: a sky from a picture, a lens, a response, a flat field and halftones.
+/// Every part of the shaders, with tables for all that may have one: a sky from a picture, a lens, a response, a flat field, a map of albedo
+/// and halftones.
 fn with_everything(settings: RendererSettings, camera: ProjectorCamera) -> Result<RendererSettings, String> {
     let lens = Lens::opencv(&[-0.1, 0.01, 1e-3, 1e-3, 1e-3]).map_err(|e| e.to_string())?;
     let mut drive = settings.drive.clone();
     drive.response = Some(Response::gamma([2.2; 3], [0.0; 3]).map_err(|e| e.to_string())?);
     drive.flat_field = Some(Arc::new(vec![[1.0; 3]; settings.raster.pixel_count()]));
+    drive.albedo_maps = vec![AlbedoMap::new(1, 1, vec![[0.5; 3]]).map(Arc::new)];
     Ok(RendererSettings {
         drive,
         lens: Some(ProjectorCamera { lens, ..camera }),

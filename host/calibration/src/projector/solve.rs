@@ -84,8 +84,7 @@ pub fn solve(
     let solved = judge(raster, sights, &fitted, inliers.clone(), options, volume, moving)?;
     if options.priors.is_beyond_brown() {
         let priors = options.priors.with_lens(LensTerms::Brown);
-        let used: Vec<Sight> = sights.iter().zip(&inliers).filter(|(_, i)| **i).map(|(s, _)| *s).collect();
-        let simple = fit(&start, &used, &Task { priors: &priors, ..task });
+        let simple = fit(&start, &chosen(sights, &inliers), &Task { priors: &priors, ..task });
         check_terms(raster, &solved.model, simple.map(|f| f.model), &solved.predicted, volume)?;
     }
     Ok(solved)
@@ -194,6 +193,11 @@ fn near_brown(
     Ok((model, inliers))
 }
 
+/// The points that are used.
+fn chosen(sights: &[Sight], inliers: &[bool]) -> Vec<Sight> {
+    sights.iter().zip(inliers).filter(|(_, is_used)| **is_used).map(|(s, _)| *s).collect()
+}
+
 /// Fits, leaves out what is far off, and fits again.
 fn fit_inliers(
     start: &ProjectorModel,
@@ -201,11 +205,8 @@ fn fit_inliers(
     mut inliers: Vec<bool>,
     task: &Task,
 ) -> Result<(Fit, Vec<bool>), Refusal> {
-    let chosen = |inliers: &[bool]| -> Vec<Sight> {
-        sights.iter().zip(inliers).filter(|(_, i)| **i).map(|(s, _)| *s).collect()
-    };
     let failed = Refusal::NotConverged { rms_px: f64::INFINITY };
-    let mut best = fit(start, &chosen(&inliers), task).ok_or(failed.clone())?;
+    let mut best = fit(start, &chosen(sights, &inliers), task).ok_or(failed.clone())?;
     for _ in 0..3 {
         let off = misses(&best.model, best.offset_s, sights);
         let usual = percentile(off.iter().copied().filter(|m| m.is_finite()).collect(), 0.5);
@@ -216,7 +217,7 @@ fn fit_inliers(
             break;
         }
         inliers = next;
-        best = fit(&best.model, &chosen(&inliers), task).ok_or(failed.clone())?;
+        best = fit(&best.model, &chosen(sights, &inliers), task).ok_or(failed.clone())?;
     }
     if !best.converged {
         return Err(Refusal::NotConverged { rms_px: best.rms_px });
@@ -267,8 +268,8 @@ fn judge(
     moving: bool,
 ) -> Result<Solved, Refusal> {
     let model = &fitted.model;
-    let used = sights.iter().zip(&inliers).filter(|(_, i)| **i).map(|(s, _)| model.local(s.world).z);
-    let (mean, range) = check_result(raster, model, &used.collect::<Vec<_>>(), &options.known)?;
+    let depths: Vec<f64> = chosen(sights, &inliers).iter().map(|s| model.local(s.world).z).collect();
+    let (mean, range) = check_result(raster, model, &depths, &options.known)?;
     if fitted.offset_s.abs() > MOST_OFFSET_S {
         return Err(Refusal::TimeShifted { offset_ms: 1e3 * fitted.offset_s });
     }

@@ -21,8 +21,8 @@ pub use coverage::Coverage;
 pub use decode::{decode, DecodeError, Decoded, Frame};
 pub use fit::{solve, Brightness, SensorError, Settings, Solution};
 pub use inverse::{
-    decode_pairs, places_rested, solve_latency_of_pairs, solve_pairs, DecodedPairs, InverseCode, Mapped,
-    Pair, Stripe, FEWEST_PLACES,
+    decode_pairs, places_rested, solve_latency_of_pairs, solve_pairs, DecodedPairs, FrameLight, InverseCode,
+    Mapped, Pair, Stripe, FEWEST_PLACES,
 };
 pub use latency::{solve_latency, Latency};
 pub use lock::{Block, Lock};

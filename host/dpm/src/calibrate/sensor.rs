@@ -14,12 +14,12 @@ use dpm_calibration::pivot::trace;
 use dpm_calibration::projector::{Known, LensTerms, Priors, Volume};
 use dpm_calibration::sensor::{
     decode, decode_pairs, places_rested, solve, solve_latency, solve_latency_of_pairs, solve_pairs, Block,
-    Code, Coverage, Decoded, DecodedPairs, InverseCode, Latency, Mapped, Settings, Solution, Timing,
-    FEWEST_PLACES,
+    Code, Coverage, Decoded, DecodedPairs, FrameLight, InverseCode, Latency, Mapped, Settings, Solution,
+    Timing, FEWEST_PLACES,
 };
 use dpm_calibration::trajectory::{Stamped, Trajectory};
 use dpm_common::clock::MonotonicClock;
-use dpm_rig::config::RigConfig;
+use dpm_rig::config::{PlaneTiming, RigConfig};
 use dpm_rig::failure::{Failure, FailureKind};
 use dpm_rig::pack::source::PatternSource;
 use dpm_rig::telemetry::monitor::RunMonitor;
@@ -60,6 +60,8 @@ struct Recording {
 
 /// Frames of a sweep that are worth solving: fewer tell the projector badly, however long they took.
 const FRAMES: f64 = 1200.0;
+/// A sweep lasts at least so many frames: the solvers need 500 with light, and some are without.
+const LEAST_FRAMES: f64 = 700.0;
 
 /// What was recorded, ready for a solver.
 struct Sweep {
@@ -149,7 +151,9 @@ fn sweep(
             let mapped: Vec<Mapped> =
                 blocks.filter_map(|t| Some((t.block, t.sensor_minus_host_ns?))).collect();
             let shown = |slot| showing.made_for(slot);
-            let decoded = decode_pairs(&code, &showing.timing, &mapped, &shown).map_err(refused)?;
+            let light = plane_light(config);
+            let light = light.as_deref().map_or(FrameLight::Held, FrameLight::Planes);
+            let decoded = decode_pairs(&code, (&showing.timing, light), &mapped, &shown).map_err(refused)?;
             let settings = settings(showing.timing, &recording.poses)?;
             let seen = SeenCode::Frames(code.clone(), decoded);
             Ok(Sweep { seen, path: Trajectory::new(&recording.poses), settings })
@@ -169,6 +173,13 @@ fn sweep(
     })
 }
 
+/// How bright each plane of a white frame is, one after the other; `None` where a frame's light is even.
+fn plane_light(config: &RigConfig) -> Option<Vec<f64>> {
+    let schedule = config.projector.schedule();
+    let is_uneven = config.projector.plane_timing() == PlaneTiming::Equal;
+    is_uneven.then(|| schedule.planes().iter().map(|plane| f64::from(1u32 << plane.bit)).collect())
+}
+
 fn record(
     config: &RigConfig,
     setup: &Setup,
@@ -182,7 +193,7 @@ fn record(
     let recorder = Recorder::start(&setup.port, clock)?;
     poses.wait_until_seen()?;
     let rate = config.projector.frame_rate;
-    let frames = FRAMES.min(setup.seconds * setup.rate_hz);
+    let frames = (setup.seconds * setup.rate_hz).clamp(LEAST_FRAMES, FRAMES);
     let seconds = setup.seconds.max(frames / rate.hz());
     let moved = || {
         wait_until_up(monitor)?;
@@ -287,7 +298,7 @@ impl Sweeping<'_> {
                 let fresh = self.recorder.take();
                 let next = match clipped {
                     0 => guide.next(frame_ns, &fresh, &path),
-                    _ => format!("{clipped} blocks are saturated: turn the sensor's gain down"),
+                    _ => format!("{clipped} blocks are saturated: choose a lower --gain, or go further away"),
                 };
                 blocks.extend(fresh);
                 self.dialogue.tell(&format!("{:3} of {seconds:.0} s: {next}", 5 * fives));

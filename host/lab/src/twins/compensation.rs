@@ -3,6 +3,7 @@
 //! `drive = pi (L - L_amb) l^2 / (rho max(cos, 1e-3) I_max)`, clamped to 0..1, per channel: linear in light, no display gamma
 //! (`docs/RENDERING.md`). The f32 form performs the shader's operations in the shader's order; the f64 form is its oracle.
 
+use dpm_render::albedo_map::AlbedoMap;
 use dpm_shaders::structs::{Frame, Rows};
 
 /// Smallest cosine between surface and projector that is still compensated: beyond it the drive would be full anyway.
@@ -72,6 +73,37 @@ impl Compensation {
     }
 }
 
+/// Values at the corners of a triangle, interpolated at the weights of the second and third, in the shader's operations and order.
+pub fn interpolated<const N: usize>(corners: [[f32; N]; 3], barycentric: [f32; 2]) -> [f32; N] {
+    let [b1, b2] = barycentric;
+    let w = (1.0 - b1) - b2;
+    std::array::from_fn(|k| (corners[0][k] * w + corners[1][k] * b1) + corners[2][k] * b2)
+}
+
+/// Drive for a surface of this albedo instead of albedo 1, in the shader's operations and order.
+pub fn on_albedo(drive: [f32; 3], albedo: [f32; 3]) -> [f32; 3] {
+    std::array::from_fn(|c| drive[c] * (1.0 / albedo[c]))
+}
+
+/// Albedo at texture coordinates in f64, the oracle of [`AlbedoMap::at`]: every texel counts by its distance, and comes again in every repetition
+/// of the picture.
+pub fn albedo_f64(map: &AlbedoMap, uv: [f64; 2]) -> [f64; 3] {
+    let sides = [map.width(), map.height()].map(f64::from);
+    let at = [0, 1].map(|k| uv[k].rem_euclid(1.0) * sides[k]);
+    // The tent of a texel on one axis. A picture of one texel comes into the tent three times.
+    let weight = |k: usize, texel: usize| -> f64 {
+        let distance = |turn: f64| (at[k] - (texel as f64 + 0.5) - turn * sides[k]).abs();
+        [-1.0, 0.0, 1.0].map(|turn| (1.0 - distance(turn)).max(0.0)).iter().sum()
+    };
+    let mut sum = [0.0; 3];
+    for (i, texel) in map.texels().iter().enumerate() {
+        let (x, y) = (i % map.width() as usize, i / map.width() as usize);
+        let share = weight(0, x) * weight(1, y);
+        (0..3).for_each(|c| sum[c] += share * f64::from(texel[c]));
+    }
+    sum
+}
+
 /// The ray of a pixel's centre before the pose, of any length, in the shader's operations. `straight`: the pixel's straight ray where the
 /// projector has a lens.
 pub fn ray_of(frame: &Frame, pixel: [u32; 2], straight: Option<[f32; 2]>) -> [f32; 3] {
@@ -92,9 +124,7 @@ pub fn real_cosine(
     frame: &Frame,
     ray: [f32; 3],
 ) -> f32 {
-    let [b1, b2] = barycentric;
-    let w = (1.0 - b1) - b2;
-    let n: [f32; 3] = std::array::from_fn(|k| (normals[0][k] * w + normals[1][k] * b1) + normals[2][k] * b2);
+    let n = interpolated(normals, barycentric);
     let turn = |row: &[f32; 4], v: [f32; 3]| (row[0] * v[0] + row[1] * v[1]) + row[2] * v[2];
     let (mut dot, mut nn, mut dd) = (0.0f32, 0.0f32, 0.0f32);
     for (row, projector_row) in rows.iter().zip(&frame.world_from_projector) {
@@ -140,6 +170,28 @@ mod tests {
             let b = k.drive_f64(radiance, l, cos);
             for c in 0..3 {
                 assert!((f64::from(a[c]) - b[c]).abs() <= 6e-7 * b[c], "{} {}", a[c], b[c]);
+            }
+        }
+    }
+
+    #[test]
+    fn the_albedo_of_a_map_is_that_of_its_texels_by_their_distance() {
+        let mut value = 0.11f32;
+        let mut next = || {
+            value = (value * 7.31).fract().max(AlbedoMap::LEAST);
+            value
+        };
+        for (width, height) in [(1, 1), (1, 4), (5, 1), (7, 3), (16, 9)] {
+            let texels = (0..width * height).map(|_| [next(), next(), next()]).collect();
+            let map = AlbedoMap::new(width, height, texels).unwrap();
+            for i in 0..4000 {
+                let t = f64::from(i) / 4000.0;
+                let uv = [5.0 * (t * 71.0).fract() - 2.0, 5.0 * t - 2.0].map(|v| v as f32);
+                let (is, should) = (map.at(uv), albedo_f64(&map, uv.map(f64::from)));
+                for c in 0..3 {
+                    let off = (f64::from(is[c]) - should[c]).abs();
+                    assert!(off < 2e-5, "{width} x {height} at {uv:?}: {} {}", is[c], should[c]);
+                }
             }
         }
     }

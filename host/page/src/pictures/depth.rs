@@ -13,6 +13,8 @@ pub(super) struct Surface {
     pub position: Vec3,
     /// Unit normal, which looks to either side.
     pub normal: Vec3,
+    /// Texture coordinates.
+    pub uv: [f32; 2],
 }
 
 /// The nearest surface of every pixel.
@@ -104,7 +106,9 @@ impl DepthBuffer {
         let blend = |of: &[Vec3]| of[a] * (1.0 - u - v) + of[b] * u + of[c] * v;
         let position = pose.transform_point3(blend(&mesh.positions).as_dvec3()).as_vec3();
         let normal = pose.transform_vector3(blend(&mesh.normals).as_dvec3()).as_vec3().normalize_or_zero();
-        Some(Surface { body: usize::from(body), position, normal })
+        let [p, q, r] = mesh.uvs[triangle as usize];
+        let uv = (p * (1.0 - u - v) + q * u + r * v).to_array();
+        Some(Surface { body: usize::from(body), position, normal, uv })
     }
 
     /// One over the distance of the nearest surface at a pixel position; 0 where nothing is.
@@ -129,6 +133,7 @@ pub(super) fn small(raster: Raster) -> Raster {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use glam::Vec2;
 
     fn quad(z: f32, half: f32) -> CoarseMesh {
         let at = |x: f32, y: f32| Vec3::new(x * half, y * half, z);
@@ -136,6 +141,7 @@ mod tests {
             positions: vec![at(-1.0, -1.0), at(1.0, -1.0), at(1.0, 1.0), at(-1.0, 1.0)],
             normals: vec![Vec3::Z; 4],
             triangles: vec![[0, 1, 2], [0, 2, 3]],
+            uvs: vec![[Vec2::ZERO, Vec2::X, Vec2::ONE], [Vec2::ZERO, Vec2::ONE, Vec2::Y]],
             ..CoarseMesh::default()
         }
     }
@@ -171,6 +177,9 @@ mod tests {
                 let there = hit(if s.body == 1 { 0.5 } else { 0.0 });
                 assert!((s.position.as_dvec3() - there).length() < 0.02, "{} {there}", s.position);
                 assert!((s.normal - Vec3::Z).length() < 1e-5);
+                let (x, half) = if s.body == 1 { (0.1, 0.2) } else { (0.0, 0.6) };
+                let uv = [(there.x - x) / half, there.y / half].map(|t| 0.5 + 0.5 * t as f32);
+                assert!((0..2).all(|k| (s.uv[k] - uv[k]).abs() < 0.05), "{:?} {uv:?}", s.uv);
             }
         }
         assert!(counts.iter().all(|n| *n > 200), "{counts:?}");

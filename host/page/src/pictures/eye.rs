@@ -104,11 +104,6 @@ impl Eye {
         self.from_projector.draw(&projector, &bodies);
         self.from_eye.draw(&camera, &bodies);
         let (origin, axis) = (projector.position(), projector.world_from_projector.matrix3 * DVec3::NEG_Z);
-        let albedos: Vec<Vec3> = self
-            .meshes
-            .iter()
-            .map(|(i, _)| Vec3::from_array(self.rig.albedo_of(*i).map(|a| a as f32)))
-            .collect();
         let shade = |at: usize| {
             let Some(seen) = self.from_eye.surface(at, &bodies) else { return Vec3::ZERO };
             let position = seen.position.as_dvec3();
@@ -122,7 +117,8 @@ impl Eye {
             let d2 = to_projector.length_squared();
             let cos = seen.normal.dot(to_projector).abs() / d2.sqrt();
             let drive = bilinear(light, x, y);
-            ambient + drive * albedos[seen.body] * intensity * (cos / (std::f32::consts::PI * d2))
+            let albedo = self.rig.albedo_at(self.meshes[seen.body].0, seen.uv);
+            ambient + drive * albedo * intensity * (cos / (std::f32::consts::PI * d2))
         };
         let pixels = (0..self.raster.pixel_count()).map(shade).collect();
         Some(Linear { raster: self.raster, pixels })

@@ -1,7 +1,7 @@
 //! A body's mesh with few triangles, for small pictures.
 
 use dpm_scene::TriangleMesh;
-use glam::{DVec3, Vec3};
+use glam::{DVec3, Vec2, Vec3};
 use std::collections::HashMap;
 
 /// Cells along the longest side of a mesh: about half a pixel of the picture where the body fills it.
@@ -13,6 +13,8 @@ pub(super) struct CoarseMesh {
     pub positions: Vec<Vec3>,
     pub normals: Vec<Vec3>,
     pub triangles: Vec<[u32; 3]>,
+    /// Texture coordinates of the corners of each triangle.
+    pub uvs: Vec<[Vec2; 3]>,
     /// A sphere around all of it.
     pub centre: DVec3,
     pub radius_m: f64,
@@ -47,28 +49,27 @@ impl CoarseMesh {
                 cell
             })
             .collect();
-        let mut triangles: Vec<[u32; 3]> = mesh
+        let mut triangles: Vec<([u32; 3], [Vec2; 3])> = mesh
             .triangles
             .iter()
-            .map(|t| t.map(|v| cell_of[v as usize]))
-            .filter(|[a, b, c]| a != b && b != c && c != a)
-            .map(|[a, b, c]| {
-                if a < b && a < c {
-                    [a, b, c]
-                } else if b < c {
-                    [b, c, a]
-                } else {
-                    [c, a, b]
-                }
+            .map(|t| (t.map(|v| cell_of[v as usize]), t.map(|v| mesh.uvs[v as usize])))
+            .filter(|([a, b, c], _)| a != b && b != c && c != a)
+            .map(|(mut cells, mut uvs)| {
+                // The least cell comes first, so that equal triangles are equal.
+                let first = (0..3).min_by_key(|&i| cells[i]).unwrap_or(0);
+                cells.rotate_left(first);
+                uvs.rotate_left(first);
+                (cells, uvs)
             })
             .collect();
-        triangles.sort_unstable();
-        triangles.dedup();
+        triangles.sort_by_key(|(cells, _)| *cells);
+        triangles.dedup_by_key(|(cells, _)| *cells);
         let centre = (lower + upper).as_dvec3() * 0.5;
         Self {
             positions: sums.iter().map(|(p, _, n)| *p / *n).collect(),
             normals: sums.iter().map(|(_, n, _)| n.normalize_or(Vec3::Y)).collect(),
-            triangles,
+            uvs: triangles.iter().map(|(_, uvs)| *uvs).collect(),
+            triangles: triangles.into_iter().map(|(cells, _)| cells).collect(),
             centre,
             radius_m: f64::from((upper - lower).length()) * 0.5,
         }
@@ -92,6 +93,7 @@ mod tests {
                 let p = Vec3::new(theta.sin() * phi.cos(), theta.cos(), theta.sin() * phi.sin());
                 mesh.positions.push(p);
                 mesh.normals.push(p);
+                mesh.uvs.push(Vec2::new(s as f32 / sectors as f32, r as f32 / rings as f32));
             }
         }
         for r in 0..rings {
@@ -113,6 +115,14 @@ mod tests {
         assert!(coarse.triangles.len() < fine.triangles.len() / 2);
         assert!(coarse.positions.iter().all(|p| (p.length() - 1.0).abs() < 2.0 / CELLS));
         assert!(coarse.positions.iter().zip(&coarse.normals).all(|(p, n)| p.normalize().dot(*n) > 0.99));
+        // Every corner keeps the texture coordinates of a vertex of its cell.
+        for (cells, uvs) in coarse.triangles.iter().zip(&coarse.uvs) {
+            for (cell, uv) in cells.iter().zip(uvs) {
+                let (theta, phi) = (std::f32::consts::PI * uv.y, std::f32::consts::TAU * uv.x);
+                let p = Vec3::new(theta.sin() * phi.cos(), theta.cos(), theta.sin() * phi.sin());
+                assert!((coarse.positions[*cell as usize] - p).length() < 4.0 / CELLS);
+            }
+        }
         let area = |positions: &[Vec3], t: &[[u32; 3]]| -> f32 {
             let of = |t: &[u32; 3]| {
                 let [a, b, c] = t.map(|v| positions[v as usize]);

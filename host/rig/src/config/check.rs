@@ -550,6 +550,11 @@ pub(super) fn resolve_files(rig: &mut RigConfig, base: &Path, purpose: Purpose, 
     if let ResponseConfig::Table(table) = &mut rig.projector.response {
         input(&mut table.file, "projector.response.file", false);
     }
+    for (i, body) in rig.scene.bodies.iter_mut().enumerate() {
+        if let Some(file) = &mut body.albedo_map {
+            input(file, &format!("scene.bodies.{i}.albedo_map"), false);
+        }
+    }
     if let EnvironmentConfig::Image(image) = &mut rig.scene.environment {
         input(&mut image.file, "scene.environment.file", false);
     }

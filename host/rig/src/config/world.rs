@@ -359,12 +359,29 @@ section! {
         /// axes are seldom those of the glTF node. `dpm calibrate body` measures it. The mock tracker reports the mesh
         /// itself and ignores it.
         mesh_to_body: PoseConfig = PoseConfig::default(), "", Any;
-        /// Albedo of its real surface, if it differs from `scene.surface_albedo`: one number, or one for each channel.
+        /// Albedo of its real surface, if it differs from `scene.surface_albedo`: one number, or one for each channel. With
+        /// `albedo_map` it is a factor for the picture, 1 if left out.
         albedo: Option<PerChannel> = None, "", Each(0.01, 1.0);
+        /// A picture of the albedo of its real surface, for example of what is printed on it: PNG with 8 or 16 bits, or PFM.
+        /// It lies over the texture coordinates that the textures of its mesh use, as these do, and repeats. Values below
+        /// 0.01 count as 0.01. All pictures of a rig together may have 8 million pixels (8388608).
+        albedo_map: Option<PathBuf> = None, "", NotEmpty;
+        /// What the numbers of a PNG in `albedo_map` mean; those of a PFM are linear.
+        albedo_map_encoding: AlbedoEncoding = AlbedoEncoding::Srgb, "", Any;
         /// How it moves if the tracker is the mock, for example `{ kind = "translate", speed_m_s = 1.0 }`; the kinds
         /// are listed below. If left out, the first body moves back and forth at 1 m/s, the second rotates in place,
         /// and the others stand still.
         motion: MotionValue = MotionValue::default(), "", Any;
+    }
+}
+
+words! {
+    /// Encodings of a picture of albedo.
+    pub enum AlbedoEncoding {
+        /// The curve of sRGB, as of pictures for screens and of the base colours of glTF.
+        Srgb = "srgb",
+        /// In proportion to the reflected light; full values are albedo 1.
+        Linear = "linear",
     }
 }
 

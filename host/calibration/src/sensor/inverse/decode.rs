@@ -16,6 +16,8 @@ pub(super) const TICKS: usize = 8;
 const TICK_NS: f64 = 2e6;
 /// Lags that are tried, nanoseconds: a display may be a quarter of a second late.
 const LAGS_NS: [f64; 2] = [-40e6, 300e6];
+/// The lag is found to within this, nanoseconds: it is a part of the latency.
+const LAG_STEP_NS: f64 = 2e3;
 /// Share of an instant's time at either end that is left out: clocks are known to a tenth of a millisecond.
 const GUARD: f64 = 0.1;
 /// Light of an instant of the frame counts if it reaches this share of the brightest one's.
@@ -60,10 +62,47 @@ pub struct DecodedPairs {
     pub lag_ns: f64,
     /// Pairs of a hundred whose sign agrees with that of their stripes in the next round.
     pub identity_percent: f64,
-    /// Instants of a frame.
-    pub ticks: usize,
+    /// When light came at each instant of a frame, nanoseconds after its begin.
+    pub instants_ns: [f64; TICKS],
     /// Length of a frame, nanoseconds.
     pub frame_ns: f64,
+}
+
+/// How a projector's light lies in a frame.
+#[derive(Clone, Copy, Debug)]
+pub enum FrameLight<'a> {
+    /// Evenly, as a display holds a picture.
+    Held,
+    /// In equal parts of the frame, each as bright as its number says.
+    Planes(&'a [f64]),
+}
+
+impl FrameLight<'_> {
+    /// Where the brightest light lies in one piece, as shares of the frame: its ends are seen best.
+    fn brightest(&self) -> [f64; 2] {
+        let Self::Planes(parts) = self else { return [0.0, 1.0] };
+        let most = parts.iter().copied().fold(0.0, f64::max);
+        let first = parts.iter().position(|p| *p >= most).unwrap_or(0);
+        let count = parts[first..].iter().take_while(|p| **p >= most).count();
+        [first, first + count].map(|i| i as f64 / parts.len().max(1) as f64)
+    }
+
+    /// The middle of the light between two shares of a frame, as a share of the frame.
+    fn middle(&self, from: f64, until: f64) -> f64 {
+        let Self::Planes(parts) = self else { return 0.5 * (from + until) };
+        let count = parts.len() as f64;
+        let within = |i: usize| {
+            let (low, high) = ((i as f64 / count).max(from), ((i + 1) as f64 / count).min(until));
+            (0.5 * (low + high), (high - low).max(0.0) * parts[i])
+        };
+        let (sum, light) =
+            (0..parts.len()).map(within).fold((0.0, 0.0), |(s, l), (at, w)| (s + at * w, l + w));
+        if light > 0.0 {
+            sum / light
+        } else {
+            0.5 * (from + until)
+        }
+    }
 }
 
 /// When the two frames of a pair began by the projector's report, nanoseconds after the first sample.
@@ -73,7 +112,7 @@ struct Shown {
     begins_ns: [f64; 2],
 }
 
-/// Decodes a recording. `shown` tells which frame's picture each slot showed: the slot's own, unless that frame was late or
+/// Decodes a recording. `light` is that of a white frame; `shown` tells which frame's picture each slot showed: the slot's own, unless that frame was late or
 /// never came.
 ///
 /// # Errors
@@ -81,7 +120,7 @@ struct Shown {
 /// the samples are not those of the code.
 pub fn decode_pairs(
     code: &InverseCode,
-    timing: &Timing,
+    (timing, light): (&Timing, FrameLight<'_>),
     blocks: &[Mapped],
     shown: &dyn Fn(u64) -> u64,
 ) -> Result<DecodedPairs, DecodeError> {
@@ -90,13 +129,30 @@ pub fn decode_pairs(
     }
     let record = Record::new(blocks).ok_or(DecodeError::NoSamples)?;
     let pairs = shown_pairs(timing, &record, shown);
-    let search = Search { code, record: &record, pairs: &pairs, frame_ns: timing.frame_ns };
+    let brightest = light.brightest();
+    let search = Search { code, record: &record, pairs: &pairs, frame_ns: timing.frame_ns, brightest };
     let (lag_ns, identity_percent) = search.lag()?;
     let ticks = ((timing.frame_ns / TICK_NS).round() as usize).clamp(2, TICKS);
     let raw: Vec<(Shown, [Option<f64>; TICKS])> =
         pairs.iter().map(|p| (*p, search.differences(p, lag_ns, ticks))).collect();
     let (levels, dropped) = levels(code, &record, &raw);
-    Ok(DecodedPairs { pairs: levels, dropped, lag_ns, identity_percent, ticks, frame_ns: timing.frame_ns })
+    let instants_ns = std::array::from_fn(|i| {
+        let [from, until] = within_tick(i).map(|t| t / ticks as f64);
+        light.middle(from, until) * timing.frame_ns
+    });
+    Ok(DecodedPairs {
+        pairs: levels,
+        dropped,
+        lag_ns,
+        identity_percent,
+        instants_ns,
+        frame_ns: timing.frame_ns,
+    })
+}
+
+/// The part of an instant's time that is looked at, in ticks from the frame's begin.
+fn within_tick(tick: usize) -> [f64; 2] {
+    [tick as f64 + GUARD, tick as f64 + 1.0 - GUARD]
 }
 
 /// The pairs of which both frames were shown, with the first slot of each.
@@ -125,6 +181,8 @@ struct Search<'a> {
     record: &'a Record,
     pairs: &'a [Shown],
     frame_ns: f64,
+    /// The part of a frame by which the lag is found.
+    brightest: [f64; 2],
 }
 
 impl Search<'_> {
@@ -137,8 +195,8 @@ impl Search<'_> {
 
     /// Sum over pairs of the product of their differences in one round and in the next, and the sum of its sizes.
     fn agreement(&self, lag_ns: f64) -> (f64, f64) {
-        let all: Vec<Option<f64>> =
-            self.pairs.iter().map(|p| self.difference(p, lag_ns, lag_ns + self.frame_ns)).collect();
+        let [from, until] = self.brightest.map(|share| lag_ns + share * self.frame_ns);
+        let all: Vec<Option<f64>> = self.pairs.iter().map(|p| self.difference(p, from, until)).collect();
         let round = self.code.pairs() as u64;
         let mut next = 0;
         let mut sums = (0.0, 0.0);
@@ -157,18 +215,7 @@ impl Search<'_> {
 
     /// The lag, and the agreement at it, percent.
     fn lag(&self) -> Result<(f64, f64), DecodeError> {
-        let best = |from: f64, until: f64, step: f64| {
-            let count = ((until - from) / step) as usize + 1;
-            let all = (0..count).map(|i| from + i as f64 * step);
-            let scored = all.map(|lag| (self.agreement(lag).0, lag));
-            scored.max_by(|a, b| a.0.total_cmp(&b.0)).map_or(0.0, |(_, lag)| lag)
-        };
-        let coarse = self.frame_ns / 6.0;
-        let mut lag = best(LAGS_NS[0], LAGS_NS[1], coarse);
-        let mut step = coarse;
-        while step > 1e5 {
-            (lag, step) = (best(lag - step, lag + step, 0.25 * step), 0.25 * step);
-        }
+        let lag = self.best_lag();
         let (sum, size) = self.agreement(lag);
         if size <= 0.0 {
             return Err(DecodeError::NoLight);
@@ -180,12 +227,30 @@ impl Search<'_> {
         Ok((lag, percent))
     }
 
+    /// The lag at which the rounds agree best.
+    fn best_lag(&self) -> f64 {
+        let best = |from: f64, until: f64, step: f64| {
+            let count = ((until - from) / step) as usize + 1;
+            let all = (0..count).map(|i| from + i as f64 * step);
+            let scored = all.map(|lag| (self.agreement(lag).0, lag));
+            scored.max_by(|a, b| a.0.total_cmp(&b.0)).map_or(0.0, |(_, lag)| lag)
+        };
+        let [from, until] = self.brightest;
+        let coarse = (until - from) * self.frame_ns / 6.0;
+        let mut lag = best(LAGS_NS[0], LAGS_NS[1], coarse);
+        let mut step = coarse;
+        while step > LAG_STEP_NS {
+            (lag, step) = (best(lag - step, lag + step, 0.25 * step), 0.25 * step);
+        }
+        lag
+    }
+
     /// Stripes less inverse at each instant of the frame.
     fn differences(&self, pair: &Shown, lag_ns: f64, ticks: usize) -> [Option<f64>; TICKS] {
         let tick = self.frame_ns / ticks as f64;
         std::array::from_fn(|i| {
-            let begin = lag_ns + i as f64 * tick;
-            let seen = || self.difference(pair, begin + GUARD * tick, begin + (1.0 - GUARD) * tick);
+            let [from, until] = within_tick(i).map(|t| lag_ns + t * tick);
+            let seen = || self.difference(pair, from, until);
             (i < ticks).then(seen).flatten()
         })
     }
@@ -250,4 +315,23 @@ fn between(all: &[(u64, f64)], pair: u64, most: u64) -> Option<f64> {
     let (a, first) = *all.get(after.checked_sub(1)?)?;
     let share = (pair - a) as f64 / (b - a) as f64;
     (b - a <= most).then_some(first + share * (last - first))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_middle_of_light_lies_where_its_planes_are_bright() {
+        assert_eq!(FrameLight::Held.middle(0.2, 0.6), 0.4);
+        let first = [1.0, 0.0, 0.0, 0.0];
+        assert_eq!(FrameLight::Planes(&first).middle(0.0, 1.0), 0.125);
+        // Half of the first part and half of the second, which is half as bright.
+        let falling = [2.0, 1.0];
+        assert!((FrameLight::Planes(&falling).middle(0.25, 0.75) - 0.34375 / 0.75).abs() < 1e-12);
+        assert_eq!(FrameLight::Held.brightest(), [0.0, 1.0]);
+        assert_eq!(FrameLight::Planes(&[1.0, 4.0, 4.0, 2.0]).brightest(), [0.25, 0.75]);
+        // Where there is no light, any instant will do.
+        assert_eq!(FrameLight::Planes(&first).middle(0.5, 1.0), 0.75);
+    }
 }

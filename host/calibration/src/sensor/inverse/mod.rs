@@ -10,6 +10,6 @@ mod record;
 mod solve;
 
 pub use code::{InverseCode, Stripe};
-pub use decode::{decode_pairs, DecodedPairs, Pair};
+pub use decode::{decode_pairs, DecodedPairs, FrameLight, Pair};
 pub use record::Mapped;
 pub use solve::{places_rested, solve_latency_of_pairs, solve_pairs, FEWEST_PLACES};

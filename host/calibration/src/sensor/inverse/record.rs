@@ -61,12 +61,17 @@ impl Record {
 
     /// The mean level between two instants, nanoseconds after the first sample; `None` if it was not sampled whole.
     pub(super) fn mean(&self, from_ns: f64, until_ns: f64) -> Option<f64> {
-        let bin = |ns: f64| (ns / BIN_NS).round();
-        let (a, b) = (bin(from_ns), bin(until_ns));
-        if !(a >= 0.0 && b > a && b < self.sums.len() as f64) {
+        let (a, b) = (from_ns / BIN_NS, until_ns / BIN_NS);
+        if !(a >= 0.0 && b > a && b < (self.sums.len() - 1) as f64) {
             return None;
         }
-        let (before, after) = (self.sums[a as usize], self.sums[b as usize]);
+        // The instants that are looked for are finer than a bin.
+        let until = |bin: f64| {
+            let (low, high) = (self.sums[bin as usize], self.sums[bin as usize + 1]);
+            let share = bin.fract();
+            (low.0 + share * (high.0 - low.0), low.1 + share * (high.1 - low.1))
+        };
+        let (before, after) = (until(a), until(b));
         let count = after.1 - before.1;
         (count >= LEAST_SAMPLED * (b - a) * self.usual).then(|| (after.0 - before.0) / count)
     }
@@ -89,6 +94,8 @@ mod tests {
         assert!((record.mean(1e6, 4e6).unwrap() - 249.5).abs() < 1e-9);
         assert_eq!(record.mean(7e6, 9e6), None);
         assert!((record.mean(10e6, 11e6).unwrap() - 1049.5).abs() < 1e-9);
+        // A tenth of a bin later, half a sample of 10 us more.
+        assert!((record.mean(1.005e6, 4.005e6).unwrap() - 250.0).abs() < 1e-6);
         for (from, until) in [(-1e6, 1e6), (2e6, 2e6), (11e6, 20e6), (f64::NAN, 1e6)] {
             assert_eq!(record.mean(from, until), None);
         }

@@ -195,12 +195,8 @@ fn prepare(
     let middle_ns = first / 2 + last / 2;
     let [early, late] = LATENCIES_S.map(|s| (1e9 * s) as i64);
     let seen = |pair: &Pair| {
-        let tick_ns = decoded.frame_ns / decoded.ticks as f64;
         let tick = |(i, level): (usize, &Option<f64>)| {
-            let at = |begin: i64| {
-                let whole = begin as f64;
-                moment(path, middle_ns, whole + (i as f64 + 0.5) * tick_ns)
-            };
+            let at = |begin: i64| moment(path, middle_ns, begin as f64 + decoded.instants_ns[i]);
             let [a, b] = pair.begins_ns.map(at);
             Some(([a?, b?], (*level)?))
         };

@@ -12,15 +12,29 @@ use dpm_rig::failure::{Failure, FailureKind};
 use glam::DVec3;
 use std::sync::{Arc, Mutex, PoisonError};
 
+/// A wand that has a light sensor.
 #[derive(clap::Args, Clone, Debug)]
-pub(super) struct LightArgs {
+struct SensorWand {
     #[command(flatten)]
     common: Common,
     /// Serial port of the wand's light sensor
     #[arg(long, value_name = "PORT")]
     sensor: String,
     #[command(flatten)]
-    sensor_args: SensorArgs,
+    args: SensorArgs,
+}
+
+impl SensorWand {
+    /// How its sensor is recorded in coded light for so many seconds.
+    fn setup(&self, config: &RigConfig, seconds: f64) -> sensor::Setup {
+        self.args.setup(&self.sensor, (&self.common, config), seconds, Known::default())
+    }
+}
+
+#[derive(clap::Args, Clone, Debug)]
+pub(super) struct LightArgs {
+    #[command(flatten)]
+    wand: SensorWand,
     /// Measure the flat field anew by moving the sensor through the beam for so many seconds, before it is put down; without
     /// this the last sweep of `dpm calibrate projector --sensor` serves
     #[arg(long, value_name = "S", value_parser = seconds)]
@@ -39,12 +53,7 @@ pub(super) struct LightArgs {
 #[derive(clap::Args, Clone, Debug)]
 pub(super) struct LatencyArgs {
     #[command(flatten)]
-    common: Common,
-    /// Serial port of the wand's light sensor
-    #[arg(long, value_name = "PORT")]
-    sensor: String,
-    #[command(flatten)]
-    sensor_args: SensorArgs,
+    wand: SensorWand,
     /// Seconds of motion
     #[arg(long, value_name = "S", default_value_t = 10.0, value_parser = seconds)]
     seconds: f64,
@@ -57,16 +66,16 @@ fn direction(text: &str) -> Result<DVec3, String> {
 
 impl LightArgs {
     pub(super) fn execute(&self) -> Result<(), Failure> {
-        let (config, mut results) = self.common.open()?;
+        let (config, mut results) = self.wand.common.open()?;
         let sweep = match self.sweep {
             Some(seconds) => Some(self.sweep(&config, &results, seconds)?),
             None => light::load_sweep(&results.sweep())?,
         };
         let ways = Ways {
-            port: self.sensor_args.port(&self.sensor),
+            port: self.wand.args.port(&self.wand.sensor),
             flicker_hz: 2.0 * f64::from(self.mains),
             codes: self.codes,
-            in_tiles: self.sensor_args.is_held(&config),
+            in_tiles: self.wand.args.is_held(&config),
         };
         let progress = Arc::new(Mutex::new(light::Progress::default()));
         let mut paced = config.clone();
@@ -88,7 +97,7 @@ impl LightArgs {
 
     fn sweep(&self, config: &RigConfig, results: &Results, seconds: f64) -> Result<Vec<Brightness>, Failure> {
         let tip = tip_and_sigma(results)?;
-        let setup = self.sensor_args.setup(&self.sensor, (&self.common, config), seconds, Known::default());
+        let setup = self.wand.setup(config, seconds);
         let solution = at_a_rate_that_is_carried(&mut config.clone(), move |config, monitor| {
             sensor::calibrate(config, &setup, tip, monitor)
         })?;
@@ -99,7 +108,7 @@ impl LightArgs {
 
 impl LatencyArgs {
     pub(super) fn execute(&self) -> Result<(), Failure> {
-        let (config, mut results) = self.common.open()?;
+        let (config, mut results) = self.wand.common.open()?;
         let bad = |told: &str| Failure::new(FailureKind::BadInput, told);
         let section = results.file.projector.as_ref().ok_or_else(|| {
             bad("the projector is not known yet: run `dpm calibrate projector` first, with --sensor if you can")
@@ -118,12 +127,11 @@ impl LatencyArgs {
             bad("the projector's lens has more than twelve coefficients; run `dpm calibrate projector`")
         })?;
         let tip = tip_and_sigma(&results)?;
-        let setup =
-            self.sensor_args.setup(&self.sensor, (&self.common, &config), self.seconds, Known::default());
+        let setup = self.wand.setup(&config, self.seconds);
         let latency = at_a_rate_that_is_carried(&mut config.clone(), move |config, monitor| {
             sensor::latency(config, &setup, tip, &model, monitor)
         })?;
-        sensor::keep_latency(&mut results, &config, &self.common.wand, &latency);
+        sensor::keep_latency(&mut results, &config, &self.wand.common.wand, &latency);
         print(&format!("{}\n{}\n", sensor::told_of_latency(&latency), results.save(&config)?));
         Ok(())
     }
