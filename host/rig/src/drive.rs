@@ -1,6 +1,5 @@
 //! What the rig file says of surfaces and of the projector's light, as the renderer's [`Drive`].
 
-use crate::albedo::{albedo_maps, albedo_of};
 use crate::calibrated::measured_response;
 use crate::config::{ResponseConfig, RigConfig, TableResponseConfig};
 use dpm_calibration::file::{CalibrationFile, LightSection};
@@ -12,10 +11,15 @@ use glam::DVec2;
 use std::path::Path;
 use std::sync::Arc;
 
+mod albedo;
+
+use albedo::albedo_maps;
+pub(crate) use albedo::albedo_of;
+
 /// Largest table of a response, bytes.
 const MAX_TABLE_BYTES: u64 = 1 << 20;
 /// Largest picture of a flat field or of an albedo, bytes.
-pub(crate) const MAX_PICTURE_BYTES: u64 = 256 << 20;
+const MAX_PICTURE_BYTES: u64 = 256 << 20;
 /// Pixels darker than this share of the brightest cannot be compensated.
 const LEAST_BRIGHTNESS: f32 = 0.02;
 
@@ -130,7 +134,7 @@ fn response(config: &ResponseConfig) -> Result<Option<Response>, DriveError> {
 }
 
 /// Light of a code value of sRGB, both as shares of the greatest (IEC 61966-2-1).
-pub(crate) fn srgb_light(code: f64) -> f64 {
+fn srgb_light(code: f64) -> f64 {
     if code <= 0.04045 {
         code / 12.92
     } else {

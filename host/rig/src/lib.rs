@@ -28,7 +28,6 @@
 //! # }
 //! ```
 
-mod albedo;
 pub mod calibrated;
 pub mod config;
 pub mod control;

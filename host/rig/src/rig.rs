@@ -1,11 +1,10 @@
 //! Builds the parts of a rig from a checked configuration: scene, projector, bodies with their motions, tracker.
 
-use crate::albedo::albedo_of;
 use crate::calibrated::{calibrated_camera, measured, measured_camera, CameraFileError};
 use crate::config::{
     BodyConfig, BuiltinScene, EnvironmentConfig, FileAxis, GazeConfig, RigConfig, TrackerConfig,
 };
-use crate::drive::{drive, DriveError};
+use crate::drive::{albedo_of, drive, DriveError};
 use crate::mock::{Motion, MotionError, MotionSpec};
 use dpm_device::planes::{PlaneSchedule, Raster};
 use dpm_device::pose::Pose;

@@ -1,7 +1,7 @@
 //! What the rig file says of the real surfaces' albedo: a number for each body, or a picture over its texture coordinates.
 
+use super::{srgb_light, DriveError, MAX_PICTURE_BYTES};
 use crate::config::{AlbedoEncoding, BodyConfig, RigConfig};
-use crate::drive::{srgb_light, DriveError, MAX_PICTURE_BYTES};
 use dpm_device::regular_file;
 use dpm_render::albedo_map::AlbedoMap;
 use dpm_scene::{LinearPicture, Scene, TriangleMesh};
