@@ -143,7 +143,7 @@ fn the_program_serves_projector_tracker_and_sensor() {
     let _ = child.wait();
     assert!(levels.len() >= 50_000 && (mean / 4095.0 - 0.1).abs() < 0.01, "{mean}: {status}");
     for (arguments, says) in [
-        (["--lens", "1,2"], "5 numbers"),
+        (["--lens", "1,2"], "5 or 8 numbers"),
         (["--aperture-mm", "0"], "`aperture_m`"),
         (["--motion", "{}"], "--motion"),
         (["--focal", "0"], "--focal 0"),
