@@ -62,20 +62,8 @@ fn frame(gpu: &Arc<Gpu>, rig: &Rig) -> Vec<Lit> {
     let mut slot = renderer.create_slot(true).unwrap();
     let mut poses = Vec::new();
     rig.scene_poses(&rig.true_poses(0).unwrap(), &mut poses);
-    let (eye, gaze) = rig.observer.eye_and_gaze(&poses);
-    let inputs = FrameInputs {
-        frame: 0,
-        spp: 2,
-        budget_spp: 2.0,
-        camera: &rig.camera,
-        eye,
-        gaze,
-        widen_deg: 0.0,
-        poses: &poses,
-        sweep: None,
-        lost: &[],
-        brighter: 1.0,
-    };
+    let still = FrameInputs::new(&rig.camera, rig.observer.eye_and_gaze(&poses), &poses);
+    let inputs = FrameInputs { spp: 2, budget_spp: 2.0, ..still };
     renderer.submit(&mut slot, &inputs).unwrap();
     slot.wait(60_000_000_000).unwrap();
     let width = rig.camera.raster.width() as usize;

@@ -32,20 +32,8 @@ fn wider_zones_are_the_zones_of_a_rig_file_with_wider_angles() {
             let tracked: Vec<_> = rig.bodies.iter().map(|b| dpm_rig::rig::affine(&b.rest)).collect();
             let mut poses = Vec::new();
             rig.scene_poses(&tracked, &mut poses);
-            let (eye, gaze) = rig.observer.eye_and_gaze(&tracked);
-            let inputs = FrameInputs {
-                frame: 0,
-                spp: 1,
-                budget_spp: 1.0,
-                camera: &rig.camera,
-                brighter: 1.0,
-                eye,
-                gaze,
-                widen_deg,
-                poses: &poses,
-                sweep: None,
-                lost: &[],
-            };
+            let still = FrameInputs::new(&rig.camera, rig.observer.eye_and_gaze(&tracked), &poses);
+            let inputs = FrameInputs { widen_deg, ..still };
             renderer.submit(&mut slot, &inputs).unwrap();
             let counters = slot.wait(60_000_000_000).unwrap().counters();
             (counters.samples, counters.lit_pixels)

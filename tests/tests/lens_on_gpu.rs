@@ -61,19 +61,9 @@ fn draw(
     let mut renderer = Renderer::keeping(gpu, scene, shot.settings(), keep).unwrap();
     let mut slot = renderer.create_slot(true).unwrap();
     for (frame, pose) in poses.iter().enumerate() {
-        let inputs = FrameInputs {
-            frame: frame as u32,
-            spp: 1,
-            budget_spp: 1.0,
-            camera,
-            brighter: 1.0,
-            eye: camera.position() + DVec3::X * 0.1,
-            gaze: DVec3::ZERO,
-            widen_deg: 0.0,
-            poses: &[*pose],
-            sweep: None,
-            lost: &[],
-        };
+        let poses = [*pose];
+        let still = FrameInputs::new(camera, (camera.position() + DVec3::X * 0.1, DVec3::ZERO), &poses);
+        let inputs = FrameInputs { frame: frame as u32, ..still };
         renderer.submit(&mut slot, &inputs).unwrap();
         slot.wait(60_000_000_000).unwrap();
         each(&slot);

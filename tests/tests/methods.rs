@@ -160,20 +160,8 @@ fn what_a_frame_shows_does_not_depend_on_the_slot_that_draws_it() {
             let x = 0.16 * ((k / 3) as f64 * 1.9).sin();
             let moved: Vec<_> = rest.iter().map(|m| DAffine3::from_translation(DVec3::X * x) * *m).collect();
             rig.scene_poses(&moved, &mut poses);
-            let (eye, gaze) = rig.observer.eye_and_gaze(&moved);
-            let inputs = FrameInputs {
-                frame: k as u32,
-                spp: 2,
-                budget_spp: 2.0,
-                camera: &camera,
-                brighter: 1.0,
-                eye,
-                gaze,
-                widen_deg: 0.0,
-                poses: &poses,
-                sweep: None,
-                lost: &[],
-            };
+            let still = FrameInputs::new(&camera, rig.observer.eye_and_gaze(&moved), &poses);
+            let inputs = FrameInputs { frame: k as u32, spp: 2, budget_spp: 2.0, ..still };
             let slot = &mut slots[order(k)];
             renderer.submit(slot, &inputs).unwrap();
             slot.wait(60_000_000_000).unwrap();

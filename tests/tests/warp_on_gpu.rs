@@ -70,19 +70,8 @@ fn draw(
     sweep: Option<(&[DAffine3], &[DAffine3])>,
 ) -> Shown {
     let mut slot = renderer.create_slot(true).unwrap();
-    let inputs = FrameInputs {
-        frame: 0,
-        spp: 1,
-        budget_spp: 1.0,
-        camera,
-        brighter: 1.0,
-        eye: camera.position() + DVec3::X * 0.02,
-        gaze: DVec3::ZERO,
-        widen_deg: 0.0,
-        poses,
-        sweep: sweep.map(|(first, last)| Sweep { first, last }),
-        lost: &[],
-    };
+    let still = FrameInputs::new(camera, (camera.position() + DVec3::X * 0.02, DVec3::ZERO), poses);
+    let inputs = FrameInputs { sweep: sweep.map(|(first, last)| Sweep { first, last }), ..still };
     renderer.submit(&mut slot, &inputs).unwrap();
     slot.wait(60_000_000_000).unwrap();
     Shown {

@@ -320,23 +320,8 @@ pub fn draw(
     budget_spp: f32,
 ) -> Result<FrameCost, GpuError> {
     let tracked = tracked_poses(rig, poses);
-    let (eye, gaze) = rig.observer.eye_and_gaze(&tracked);
-    renderer.submit(
-        slot,
-        &FrameInputs {
-            frame,
-            spp,
-            budget_spp,
-            camera: &rig.camera,
-            brighter: 1.0,
-            eye,
-            gaze,
-            widen_deg: 0.0,
-            poses,
-            sweep: None,
-            lost: &[],
-        },
-    )?;
+    let still = FrameInputs::new(&rig.camera, rig.observer.eye_and_gaze(&tracked), poses);
+    renderer.submit(slot, &FrameInputs { frame, spp, budget_spp, ..still })?;
     slot.wait(120_000_000_000)
 }
 

@@ -135,24 +135,13 @@ mod tests {
     fn steady_with(pose: DAffine3, eye: DVec3, lost: bool) -> bool {
         let body = BodyData::of_20_cm();
         let camera = camera();
-        let inputs = FrameInputs {
-            frame: 7,
-            spp: 1,
-            budget_spp: 1.0,
-            camera: &camera,
-            brighter: 1.0,
-            eye: EYE,
-            gaze: DVec3::ZERO,
-            widen_deg: 0.0,
-            poses: &[DAffine3::IDENTITY],
-            sweep: None,
-            lost: &[],
-        };
+        let (at_rest, moved) = ([DAffine3::IDENTITY], [pose]);
+        let inputs = FrameInputs { frame: 7, ..FrameInputs::new(&camera, (EYE, DVec3::ZERO), &at_rest) };
         let mut last = LastFrame::none(1);
         let bodies = [body];
         assert!(!last.is_steady(&bodies, &inputs, |_| false), "the first frame");
         last.becomes(&inputs, 1, [false].into_iter());
-        last.is_steady(&bodies, &FrameInputs { eye, poses: &[pose], ..inputs }, |_| lost)
+        last.is_steady(&bodies, &FrameInputs { eye, poses: &moved, ..inputs }, |_| lost)
     }
 
     fn steady(pose: DAffine3) -> bool {
@@ -176,19 +165,7 @@ mod tests {
         let mut last = LastFrame::none(0);
         let mut next = |frame: u32, spp: u32| {
             let turn = last.turn_of(frame);
-            let inputs = FrameInputs {
-                frame,
-                spp,
-                budget_spp: 1.0,
-                camera: &camera,
-                brighter: 1.0,
-                eye: EYE,
-                gaze: DVec3::ZERO,
-                widen_deg: 0.0,
-                poses: &[],
-                sweep: None,
-                lost: &[],
-            };
+            let inputs = FrameInputs { frame, spp, ..FrameInputs::new(&camera, (EYE, DVec3::ZERO), &[]) };
             last.becomes(&inputs, 0, std::iter::empty());
             (turn.drawn, turn.first_sample)
         };

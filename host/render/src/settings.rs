@@ -88,6 +88,31 @@ pub struct FrameInputs<'a> {
     pub lost: &'a [bool],
 }
 
+impl<'a> FrameInputs<'a> {
+    /// Frame 0 with one sample a pixel: bodies that stand still at `poses` and that no tracker has lost, lit by `camera` and
+    /// seen by an eye at the first of `eye_and_gaze` that looks at the second. Callers change what differs.
+    pub const fn new(
+        camera: &'a ProjectorCamera,
+        eye_and_gaze: (DVec3, DVec3),
+        poses: &'a [DAffine3],
+    ) -> Self {
+        let (eye, gaze) = eye_and_gaze;
+        Self {
+            frame: 0,
+            spp: 1,
+            budget_spp: 1.0,
+            camera,
+            brighter: 1.0,
+            eye,
+            gaze,
+            widen_deg: 0.0,
+            poses,
+            sweep: None,
+            lost: &[],
+        }
+    }
+}
+
 /// A raster that has a buffer larger than the device can bind.
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
 #[error(

@@ -156,19 +156,7 @@ fn integrate(
     let mut poses = Vec::new();
     rig.scene_poses(tracked, &mut poses);
     let mut slot = renderer.create_slot(true)?;
-    let inputs = FrameInputs {
-        frame: 0,
-        spp: 1,
-        budget_spp: 1.0,
-        camera,
-        brighter: 1.0,
-        eye: other,
-        gaze: other,
-        widen_deg: 0.0,
-        poses: &poses,
-        sweep: None,
-        lost: &[],
-    };
+    let inputs = FrameInputs::new(camera, (other, other), &poses);
     renderer.submit(&mut slot, &inputs)?;
     slot.wait(60_000_000_000)?;
     let surfaces = slot.surfaces().unwrap_or(&[]);

@@ -258,18 +258,10 @@ impl Frames {
     /// Code values of the card at `pose`, which moves from the first to the last pose of `sweep`.
     fn draw(&mut self, pose: DAffine3, sweep: Option<[DAffine3; 2]>) -> Result<Vec<u32>, GpuError> {
         let ends = sweep.map(|ends| ends.map(|end| [end]));
+        let poses = [pose];
         let inputs = FrameInputs {
-            frame: 0,
-            spp: 1,
-            budget_spp: 1.0,
-            camera: &self.camera,
-            brighter: 1.0,
-            eye: self.camera.position(),
-            gaze: DVec3::ZERO,
-            widen_deg: 0.0,
-            poses: &[pose],
             sweep: ends.as_ref().map(|[first, last]| Sweep { first, last }),
-            lost: &[],
+            ..FrameInputs::new(&self.camera, (self.camera.position(), DVec3::ZERO), &poses)
         };
         self.renderer.submit(&mut self.slot, &inputs)?;
         self.slot.wait(TIMEOUT_NS)?;

@@ -153,14 +153,8 @@ impl<'a> Shot<'a> {
                 frame: frame * self.step,
                 spp: self.spp,
                 budget_spp: self.spp as f32,
-                camera: &self.camera,
-                brighter: 1.0,
-                eye,
-                gaze: self.gaze.unwrap_or(eye),
-                widen_deg: 0.0,
-                poses: &poses,
-                sweep: None,
                 lost: &self.lost,
+                ..FrameInputs::new(&self.camera, (eye, self.gaze.unwrap_or(eye)), &poses)
             };
             renderer.submit(&mut slot, &inputs).expect("submit");
             let cost = slot.wait(TIMEOUT_NS).expect("the frame ends");

@@ -82,21 +82,8 @@ pub(crate) fn submit(renderer: &mut Renderer, slot: &mut FrameSlot, frame: u32) 
     let tracked: Vec<_> = rig.bodies.iter().map(|b| along * affine(&b.rest)).collect();
     let mut poses = Vec::new();
     rig.scene_poses(&tracked, &mut poses);
-    let (eye, gaze) = rig.observer.eye_and_gaze(&tracked);
-    let inputs = FrameInputs {
-        frame,
-        spp: 2,
-        budget_spp: 2.0,
-        camera: &rig.camera,
-        brighter: 1.0,
-        eye,
-        gaze,
-        widen_deg: 0.0,
-        poses: &poses,
-        sweep: None,
-        lost: &[],
-    };
-    renderer.submit(slot, &inputs)
+    let still = FrameInputs::new(&rig.camera, rig.observer.eye_and_gaze(&tracked), &poses);
+    renderer.submit(slot, &FrameInputs { frame, spp: 2, budget_spp: 2.0, ..still })
 }
 
 /// The first frames as a device without faults makes them.
