@@ -5,4 +5,5 @@ pub mod conversations;
 pub mod decoders;
 pub mod files;
 pub mod gpu;
+pub mod programs;
 pub mod rigs;

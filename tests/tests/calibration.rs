@@ -1,47 +1,30 @@
 //! `dpm calibrate` as an operator uses it, with the projector, the tracker and the light sensor in a process of their own.
 
 use dpm_calibration::file::{self, CalibrationFile};
+use dpm_tests::programs::{program, RunFolder};
 use glam::{DAffine3, DQuat, DVec3};
 use hil_mock::sensor_wand::ProjectorOptics;
 use std::io::{Read, Write};
-use std::path::{Path, PathBuf};
 use std::process::{Child, ChildStdin, Command, Output, Stdio};
 use std::sync::mpsc::{channel, Receiver};
 use std::time::{Duration, Instant};
 
-/// A program of this workspace that the build of all tests has made.
-fn program(name: &str) -> PathBuf {
-    let here = std::env::current_exe().unwrap();
-    let path = here.parent().and_then(Path::parent).unwrap().join(name);
-    assert!(path.exists(), "{} is missing: cargo build -p dpm -p hil-mock", path.display());
-    path
-}
-
-/// A folder that is removed afterwards.
-struct Folder(PathBuf);
+/// A folder for the commands of `dpm`.
+struct Folder(RunFolder);
 
 impl Folder {
     fn new(name: &str) -> Self {
-        let path = std::env::temp_dir().join(format!("dpm-calibration-{name}-{}", std::process::id()));
-        let _ = std::fs::remove_dir_all(&path);
-        for part in ["run", "state"] {
-            std::fs::create_dir_all(path.join(part)).unwrap();
-            let private = <std::fs::Permissions as std::os::unix::fs::PermissionsExt>::from_mode(0o700);
-            std::fs::set_permissions(path.join(part), private).unwrap();
-        }
-        Self(path)
+        Self(RunFolder::new(&format!("calibration-{name}")))
     }
 
     fn write(&self, name: &str, text: &str) {
-        std::fs::write(self.0.join(name), text).unwrap();
+        std::fs::write(self.0.path().join(name), text).unwrap();
     }
 
     fn spawn(&self, arguments: &[&str]) -> Child {
-        Command::new(program("dpm"))
+        self.0
+            .command(program("dpm"))
             .args(arguments)
-            .current_dir(&self.0)
-            .env("DPM_RUNTIME_DIR", self.0.join("run"))
-            .env("DPM_STATE_DIR", self.0.join("state"))
             .stdin(Stdio::piped())
             .stdout(Stdio::piped())
             .stderr(Stdio::piped())
@@ -73,13 +56,7 @@ impl Folder {
     }
 
     fn calibration(&self) -> CalibrationFile {
-        file::load(&self.0.join("calibration.toml")).unwrap_or_else(|e| panic!("{e}"))
-    }
-}
-
-impl Drop for Folder {
-    fn drop(&mut self) {
-        let _ = std::fs::remove_dir_all(&self.0);
+        file::load(&self.0.path().join("calibration.toml")).unwrap_or_else(|e| panic!("{e}"))
     }
 }
 
@@ -357,7 +334,7 @@ fn a_rational_lens_is_kept_where_the_points_tell_it_and_refused_where_they_do_no
         "--set",
         "calibration.file=\"calibration.toml\"",
     ]);
-    let out = std::fs::read_to_string(folder.0.join("out.yml")).unwrap();
+    let out = std::fs::read_to_string(folder.0.path().join("out.yml")).unwrap();
     let k6 = folder.calibration().projector.unwrap().lens[7];
     assert!(out.contains(&format!("{k6:?}")), "{k6} is not in {out}");
 }
@@ -396,7 +373,7 @@ fn points_become_a_projector_that_the_rig_uses_and_flat_ones_are_refused() {
     assert!(again.contains("calibration.toml.1.old"), "the old file is kept: {again}");
     folder.done(&["calibrate", "export", "rig.toml", "out.yml"]);
     let camera = folder.calibration().projector.unwrap().camera().unwrap();
-    let written = std::fs::read_to_string(folder.0.join("out.yml")).unwrap();
+    let written = std::fs::read_to_string(folder.0.path().join("out.yml")).unwrap();
     assert!(
         written.contains(&format!("{:?}", camera.fx)),
         "the rig's projector is the measured one: {written}"

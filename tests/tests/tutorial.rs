@@ -1,6 +1,7 @@
 //! `docs/TUTORIAL.md`: its commands are executed as they stand, and what the page says they print is what they print.
 
-use std::path::{Path, PathBuf};
+use dpm_tests::programs::{program, RunFolder};
+use std::path::Path;
 use std::process::{Command, Stdio};
 use std::time::{Duration, Instant};
 
@@ -29,47 +30,21 @@ fn without_figures(line: &str) -> String {
     kept
 }
 
-/// A folder of its own, which is removed afterwards.
-struct Folder(PathBuf);
-
-impl Folder {
-    fn new() -> Self {
-        let path = std::env::temp_dir().join(format!("dpm-tutorial-{}", std::process::id()));
-        let _ = std::fs::remove_dir_all(&path);
-        for part in ["run", "state"] {
-            std::fs::create_dir_all(path.join(part)).unwrap();
-            let private = <std::fs::Permissions as std::os::unix::fs::PermissionsExt>::from_mode(0o700);
-            std::fs::set_permissions(path.join(part), private).unwrap();
-        }
-        Self(path)
-    }
-}
-
-impl Drop for Folder {
-    fn drop(&mut self) {
-        let _ = std::fs::remove_dir_all(&self.0);
-    }
-}
-
 /// Runs a script in a process group of its own, presses Enter whenever something waits for it, and gives all that was
 /// printed. A script that goes on for too long is ended with all that it has started.
-fn told_by(script: &Path, folder: &Path) -> (bool, String) {
+fn told_by(script: &Path, folder: &RunFolder) -> (bool, String) {
     use std::os::unix::process::CommandExt;
-    let programs = std::env::current_exe().unwrap().parent().and_then(Path::parent).unwrap().to_owned();
-    for name in ["dpm", "hil-mock"] {
-        assert!(programs.join(name).exists(), "{name} is missing: cargo build -p dpm -p hil-mock");
-    }
+    let [programs, _] = ["dpm", "hil-mock"].map(|name| program(name).parent().unwrap().to_owned());
     let path = format!("{}:{}", programs.display(), std::env::var("PATH").unwrap_or_default());
-    let log = std::fs::File::create(folder.join("told.txt")).unwrap();
-    let mut child = Command::new("bash")
+    let told = folder.path().join("told.txt");
+    let log = std::fs::File::create(&told).unwrap();
+    let mut child = folder
+        .command("bash")
         .arg("-c")
         .arg("yes '' | bash -eu \"$0\"")
         .arg(script)
-        .current_dir(folder)
         .env("PATH", path)
         .env("RIGS", Path::new(env!("CARGO_MANIFEST_DIR")).join("../rigs").canonicalize().unwrap())
-        .env("DPM_RUNTIME_DIR", folder.join("run"))
-        .env("DPM_STATE_DIR", folder.join("state"))
         // Tests share the machine with others; a projector that hears nothing for 50 ms goes dark.
         .env("DPM_SET_SAFETY__WATCHDOG_MS", "5000")
         .stdin(Stdio::null())
@@ -94,7 +69,7 @@ fn told_by(script: &Path, folder: &Path) -> (bool, String) {
         .stderr(Stdio::null())
         .status();
     let _ = child.wait();
-    (status, std::fs::read_to_string(folder.join("told.txt")).unwrap_or_default())
+    (status, std::fs::read_to_string(told).unwrap_or_default())
 }
 
 #[test]
@@ -103,10 +78,10 @@ fn the_tutorial_does_what_it_says() {
     let commands = blocks(&page, "sh");
     let promised: Vec<&str> = blocks(&page, "text").into_iter().flat_map(str::lines).collect();
     assert!(commands.len() >= 10 && promised.len() >= 10, "the page was not understood");
-    let folder = Folder::new();
-    let script = folder.0.join("tutorial.sh");
+    let folder = RunFolder::new("tutorial");
+    let script = folder.path().join("tutorial.sh");
     std::fs::write(&script, commands.join("\n") + "\n").unwrap();
-    let (done, told) = told_by(&script, &folder.0);
+    let (done, told) = told_by(&script, &folder);
     assert!(done, "a command failed:\n{told}");
     let mut lines = told.lines().map(without_figures);
     for line in promised {
@@ -117,7 +92,7 @@ fn the_tutorial_does_what_it_says() {
             "the page promises \"{line}\", but what came was:\n{told}"
         );
     }
-    let calibration = dpm_calibration::file::load(&folder.0.join("first-rig/calibration.toml"));
+    let calibration = dpm_calibration::file::load(&folder.path().join("first-rig/calibration.toml"));
     let projector = calibration.unwrap_or_else(|e| panic!("{e}")).projector.expect("measured");
     for focal in projector.focal {
         assert!((focal - 450.0).abs() < 5.0, "{focal}");
