@@ -212,8 +212,7 @@ fn sample(drive: &Drive, frame: &LightFrame, raster: Raster, at: DVec2) -> Vec3 
 /// Linear values as 8-bit sRGB.
 pub fn to_srgb(linear: &[Vec3], scale: f32) -> Vec<u8> {
     let encode = |v: f32| {
-        let v = (v * scale).clamp(0.0, 1.0);
-        let s = if v <= 0.003_130_8 { 12.92 * v } else { 1.055 * v.powf(1.0 / 2.4) - 0.055 };
+        let s = dpm_scene::srgb::from_linear((v * scale).clamp(0.0, 1.0));
         (s * 255.0 + 0.5) as u8
     };
     linear.iter().flat_map(|v| [encode(v.x), encode(v.y), encode(v.z)]).collect()

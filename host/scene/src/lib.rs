@@ -33,7 +33,7 @@ mod mesh_file;
 mod polygonise;
 mod procedural;
 pub mod shapes;
-mod srgb;
+pub mod srgb;
 mod stats;
 mod studio;
 

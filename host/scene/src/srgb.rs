@@ -1,7 +1,7 @@
 //! The curve of sRGB (IEC 61966-2-1), both ways, for components 0 to 1.
 
 /// Linear light of a display's value.
-pub(crate) fn to_linear(value: f32) -> f32 {
+pub fn to_linear(value: f32) -> f32 {
     if value <= 0.04045 {
         value / 12.92
     } else {
@@ -10,7 +10,7 @@ pub(crate) fn to_linear(value: f32) -> f32 {
 }
 
 /// A display's value for linear light.
-pub(crate) fn from_linear(light: f32) -> f32 {
+pub fn from_linear(light: f32) -> f32 {
     if light <= 0.003_130_8 {
         12.92 * light
     } else {
