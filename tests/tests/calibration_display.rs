@@ -37,6 +37,8 @@ struct Rig {
     seed: u64,
     /// Planes of a frame; one is held for all of it.
     schedule: PlaneSchedule,
+    /// Share of the frames that never come; the frame before is shown again.
+    lost: f64,
 }
 
 impl Rig {
@@ -46,7 +48,22 @@ impl Rig {
         let raster = Raster::new(width, height).unwrap();
         let (light_lag_ns, tracker_latency_ns) = (43_700_000, 5_300_000);
         let schedule = PlaneSchedule::new(&[PlaneSpec { channel: Channel::White, bit: 7 }]).unwrap();
-        Self { raster, frame_ns: 1e9 / hz, optics, light_lag_ns, tracker_latency_ns, seed, schedule }
+        Self {
+            raster,
+            frame_ns: 1e9 / hz,
+            optics,
+            light_lag_ns,
+            tracker_latency_ns,
+            seed,
+            schedule,
+            lost: 0.0,
+        }
+    }
+
+    /// The frame that a slot shows.
+    fn frame_of(&self, slot: u64) -> u64 {
+        let draws = Draws::new(self.seed).stream(17);
+        (1..=slot).rev().find(|frame| !draws.happens(*frame, self.lost)).unwrap_or(0)
     }
 
     fn is_held(&self) -> bool {
@@ -83,15 +100,16 @@ impl Rig {
         let timing = self.timing();
         for slot in 0..(1e9 * seconds / self.frame_ns) as u64 {
             let at = |frames: f64| HostTime(timing.instant(slot, 24.0 * frames).0 + self.light_lag_ns);
+            let frame = self.frame_of(slot);
             let event = LightEvent {
                 slot,
-                frame: Some(slot as u32),
+                frame: Some(frame as u32),
                 kind: LightKind::Lit,
                 lit_at: DeviceTicks(0),
                 first_photon_at: at(0.0),
                 last_photon_at: at(1.0),
             };
-            let picture = &pictures[code.index(slot / 2)][usize::from(code.is_inverse(slot))];
+            let picture = &pictures[code.index(frame / 2)][usize::from(code.is_inverse(frame))];
             let shown =
                 Shown { event, planes_end_at: at(1.0), schedule: self.schedule, planes: picture.clone() };
             wand.shine(&shown, &mut |sample| samples.push(sample));
@@ -178,7 +196,7 @@ fn visiting() -> Arc<Hand> {
 fn decoded(rig: &Rig, code: &InverseCode, blocks: &[Mapped]) -> Result<DecodedPairs, DecodeError> {
     let lights = rig.lights();
     let light = if rig.is_held() { FrameLight::Held } else { FrameLight::Planes(&lights) };
-    decode_pairs(code, (&rig.timing(), light), blocks, &|slot| slot)
+    decode_pairs(code, (&rig.timing(), light), blocks, &|slot| rig.frame_of(slot))
 }
 
 /// The last word is what a display of this size and rate reaches with a tracker's noise of 0.1 mm and 0.05 degrees.
@@ -193,6 +211,12 @@ fn a_display_is_found_from_pictures_and_their_inverse() {
 #[test]
 fn a_projector_of_binary_planes_is_found_from_them_too() {
     is_found(&Rig { schedule: PlaneSchedule::rgb24(), ..Rig::new(512, 384, 120.0, 3) }, 36.0);
+}
+
+/// A machine with other work sends a tenth of the frames too late, so that hardly any round of the code is whole.
+#[test]
+fn a_display_that_loses_a_tenth_of_the_frames_is_found_too() {
+    is_found(&Rig { lost: 0.1, ..Rig::new(256, 192, 120.0, 3) }, 45.0);
 }
 
 /// Asserts that lens, pose and latency of a projector are found.

@@ -106,7 +106,7 @@ pub enum SensorError {
     #[error(transparent)]
     Projector(#[from] Refusal),
     /// The wand was not held still often enough.
-    #[error("sensor: the wand was held still at {places} places for long enough, {need} are needed: rest for two seconds at each of twenty places, near and far, and go slowly from one to the next")]
+    #[error("sensor: at {places} places the wand was held still until every stripe had been seen, {need} are needed: rest for two seconds at each of twenty places, near and far, and go slowly from one to the next")]
     TooFewPlaces {
         /// Places there are.
         places: usize,

@@ -20,6 +20,8 @@ const FEWEST: usize = 300;
 pub const FEWEST_PLACES: usize = 8;
 /// The tip is held still if it moves by no more than this, metres.
 const STILL_M: f64 = 2e-3;
+/// Rounds of the code within which all stripes must be seen at a place.
+const MOST_ROUNDS: u64 = 3;
 /// Places that are nearer than this to each other are one, metres.
 const APART_M: f64 = 0.03;
 /// Latencies of a display and a tracker together, seconds.
@@ -218,40 +220,61 @@ fn prepare(
     }
 }
 
-/// Moments at which the wand was held still for a whole round, with the pixel of its bits.
+/// Moments at which the wand was held still until all stripes had been seen, with the pixel of their bits.
 fn still(code: &InverseCode, decoded: &DecodedPairs, path: &Trajectory, tip: DVec3) -> Vec<Fix> {
-    let round = code.pairs();
     let Some((first, last)) = path.span_ns() else { return Vec::new() };
     let middle_ns = first / 2 + last / 2;
-    let place = |ns: i64| path.at(ns, 0.0).map(|p| p.position + p.rotation * tip);
     let (mut fixes, mut from) = (Vec::new(), 0);
-    while let Some(pairs) = decoded.pairs.get(from..from + round) {
+    while from < decoded.pairs.len() {
+        let pairs = &decoded.pairs[from..];
         from += 1;
-        if pairs[round - 1].number - pairs[0].number != round as u64 - 1 {
+        let Some((count, is_lit)) = whole_round(code, pairs) else { continue };
+        let (a, b) = (pairs[0].begins_ns, pairs[count - 1].begins_ns);
+        let (begin, end) = (a[0].min(a[1]), b[0].max(b[1]) + decoded.frame_ns as i64);
+        if !is_still(path, tip, [begin, end]) {
             continue;
-        }
-        let begin = pairs[0].begins_ns[0].min(pairs[0].begins_ns[1]);
-        let end = pairs[round - 1].begins_ns[0].max(pairs[round - 1].begins_ns[1]) + decoded.frame_ns as i64;
-        let [early, late] = [begin + (1e9 * LATENCIES_S[0]) as i64, end + (1e9 * LATENCIES_S[1]) as i64];
-        let steps = (0..=8).map(|i| place(early + (late - early) / 8 * i));
-        let Some(places) = steps.collect::<Option<Vec<DVec3>>>() else { continue };
-        if places.iter().any(|p| p.distance(places[4]) > STILL_M) {
-            continue;
-        }
-        let mut is_lit = vec![false; round];
-        for pair in pairs {
-            is_lit[code.index(pair.number)] = pair.level() > 0.5;
         }
         let pixel = code.pixel(&is_lit);
-        let at = begin / 2 + end / 2;
         if is_inside(code.raster(), pixel) {
+            let at = begin / 2 + end / 2;
             let from_middle_s = 1e-9 * at.saturating_sub(middle_ns) as f64;
             fixes.push(Fix { instant: (at, 0.0), from_middle_s, pixel });
         }
         // Half a round further on, half of the bits are new.
-        from += round / 2;
+        from += count / 2;
     }
     fixes
+}
+
+/// The first pairs among which are all stripes: how many they are, and which stripes were lit. A pair that was lost is
+/// waited for in the next rounds, but not for ever.
+fn whole_round(code: &InverseCode, pairs: &[Pair]) -> Option<(usize, Vec<bool>)> {
+    let round = code.pairs();
+    let first = pairs.first()?.number;
+    // Sums of how far each stripe's levels are from the middle.
+    let mut seen: Vec<Option<f64>> = vec![None; round];
+    let mut missing = round;
+    for (i, pair) in pairs.iter().enumerate() {
+        if pair.number - first >= MOST_ROUNDS * round as u64 {
+            return None;
+        }
+        let sum = &mut seen[code.index(pair.number)];
+        missing -= usize::from(sum.is_none());
+        *sum = Some(sum.unwrap_or(0.0) + pair.level() - 0.5);
+        if missing == 0 {
+            return Some((i + 1, seen.into_iter().map(|sum| sum.is_some_and(|s| s > 0.0)).collect()));
+        }
+    }
+    None
+}
+
+/// Whether the tip stayed in its place from the first instant to the last one, whatever the latency is.
+fn is_still(path: &Trajectory, tip: DVec3, [begin, end]: [i64; 2]) -> bool {
+    let [early, late] = LATENCIES_S.map(|s| (1e9 * s) as i64);
+    let (from, until) = (begin + early, end + late);
+    let place = |ns: i64| path.at(ns, 0.0).map(|p| p.position + p.rotation * tip);
+    let places: Option<Vec<DVec3>> = (0..=8).map(|i| place(from + (until - from) / 8 * i)).collect();
+    places.is_some_and(|places| places.iter().all(|p| p.distance(places[4]) <= STILL_M))
 }
 
 fn places(fixes: &[Fix], path: &Trajectory, tip: DVec3) -> usize {
