@@ -71,7 +71,7 @@ impl Pivot {
     pub fn advice(&self) -> String {
         match self.solve() {
             Ok(tip) => format!(
-                "the tip is known to {:.3} mm; stop, or turn on to make it better",
+                "the tip is known to {:.3} mm, and better the longer you tilt the wand",
                 1e3 * trace(&tip.covariance).sqrt()
             ),
             Err(why) => why.to_string(),

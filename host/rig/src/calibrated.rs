@@ -84,6 +84,30 @@ pub(crate) fn measured(config: &RigConfig) -> Result<CalibrationFile, CameraFile
     })
 }
 
+/// What a run uses of the calibration file, one sentence; `None` if the rig file names none. `placed` are the names of the
+/// bodies whose measured places are used.
+pub(crate) fn told_of_measured(
+    measured: &CalibrationFile,
+    config: &RigConfig,
+    placed: &[&str],
+) -> Option<String> {
+    let path = config.calibration.file.as_ref()?;
+    let mut parts = Vec::new();
+    if let Some(projector) = &measured.projector {
+        let (px, date) = (projector.predicted_p99_px, &projector.provenance.date);
+        parts.push(format!("the projector of {date}, light within {px:.2} px"));
+    }
+    parts.extend(placed.iter().map(|name| format!("the place of the mesh in \"{name}\"")));
+    if let Some(latency) = &measured.latency {
+        parts.push(format!("a latency of {:.3} ms", 1e-3 * latency.latency_us));
+    }
+    if measured.light.is_some() {
+        parts.push("the light of each code value".into());
+    }
+    let used = if parts.is_empty() { "nothing, since nothing was measured".into() } else { parts.join("; ") };
+    Some(format!("{}: {used}", path.display()))
+}
+
 /// The measured projector at the rig's raster, and then at the one that is traced.
 ///
 /// # Errors
@@ -312,6 +336,11 @@ mod tests {
         assert_eq!(rig.bodies[0].mesh_to_body, DAffine3::IDENTITY);
         assert!((rig.bodies[1].mesh_to_body.translation - DVec3::new(0.01, 0.0, 0.02)).length() < 1e-12);
         assert_eq!(rig.latency_ns, Some(2_500_000));
+        let used = rig.calibration.as_deref().unwrap();
+        let parts = ["all.toml: ", "light within 0.20 px", "mesh in \"venus\"", "2.500 ms", "each code value"];
+        assert!(parts.iter().all(|part| used.contains(part)) && !used.contains("bunny"), "{used}");
+        let nothing = measured_rig(&CalibrationFile::new(), "nothing", &[]).unwrap();
+        assert!(nothing.calibration.unwrap().ends_with("nothing was measured"));
         // Half of full code gives a quarter of the light and the black level; green is twice as bright as the others.
         let drive = &rig.drive;
         let at = |x: usize, codes| drive.light_of(codes, 384 * 1024 + x);

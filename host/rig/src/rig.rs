@@ -1,6 +1,6 @@
 //! Builds the parts of a rig from a checked configuration: scene, projector, bodies with their motions, tracker.
 
-use crate::calibrated::{calibrated_camera, measured, measured_camera, CameraFileError};
+use crate::calibrated::{calibrated_camera, measured, measured_camera, told_of_measured, CameraFileError};
 use crate::config::{
     BodyConfig, BuiltinScene, EnvironmentConfig, FileAxis, GazeConfig, RigConfig, TrackerConfig,
 };
@@ -150,6 +150,8 @@ pub struct Rig {
     /// How much older the tracker's samples are than they say, if it was measured, nanoseconds. It takes the place of
     /// `tracker.latency_us`.
     pub latency_ns: Option<i64>,
+    /// What is used of the calibration file, one sentence; `None` without such a file.
+    pub calibration: Option<String>,
 }
 
 /// A rigid transform from a pose.
@@ -187,17 +189,20 @@ impl Rig {
         };
         let mut bodies = rig_bodies(config, &scene)?;
         // The mock tracker reports the mesh itself.
+        let mut placed = Vec::new();
         for body in bodies.iter_mut().filter(|b| b.motion.is_none()) {
-            if let Some(section) = measured.bodies.get(&body.name) {
+            if let Some((name, section)) = measured.bodies.get_key_value(&body.name) {
                 body.mesh_to_body = section.mesh_to_body.to_affine();
+                placed.push(name.as_str());
             }
         }
         let observer = observer(config, &bodies)?;
         let drive = drive(config, &measured, &scene, raster)?;
-        let latency_ns = measured.latency.map(|l| (l.latency_us * 1e3).round() as i64);
+        let latency_ns = measured.latency.as_ref().map(|l| (l.latency_us * 1e3).round() as i64);
+        let calibration = told_of_measured(&measured, config, &placed);
         let schedule = config.projector.schedule();
         let config = config.clone();
-        Ok(Self { config, scene, camera, bodies, observer, schedule, drive, latency_ns })
+        Ok(Self { config, scene, camera, bodies, observer, schedule, drive, latency_ns, calibration })
     }
 
     /// The projector of a rig alone, without scene, bodies or calibration: for light that nothing is traced for.
@@ -212,7 +217,8 @@ impl Rig {
         let observer = observer(&config, &[])?;
         let (scene, bodies) = (Scene::default(), Vec::new());
         let (schedule, drive) = (config.projector.schedule(), Drive::default());
-        Ok(Self { config, scene, camera, bodies, observer, schedule, drive, latency_ns: None })
+        let (latency_ns, calibration) = (None, None);
+        Ok(Self { config, scene, camera, bodies, observer, schedule, drive, latency_ns, calibration })
     }
 
     /// Frames per second.

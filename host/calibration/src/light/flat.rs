@@ -48,11 +48,11 @@ impl FlatField {
 #[derive(Clone, Copy, Debug, PartialEq, Error)]
 pub enum FlatError {
     /// Too few readings.
-    #[error("flat field: {0} readings are too few, {FEWEST} are needed; move the sensor through the picture for longer")]
+    #[error("{0} readings are too few for a flat field, {FEWEST} are needed; move the sensor through the picture for longer")]
     TooFew(usize),
     /// The sweep does not cover the raster.
     #[error(
-        "flat field: uncertain by {percent:.1} % near pixel ({x:.0}, {y:.0}): move the sensor there too"
+        "the flat field is uncertain by {percent:.1} % near pixel ({x:.0}, {y:.0}); move the sensor there too"
     )]
     Uncovered {
         /// Standard deviation, percent.
@@ -63,7 +63,7 @@ pub enum FlatError {
         y: f64,
     },
     /// The field is dark or negative somewhere.
-    #[error("flat field: {percent:.0} % of the middle's light near pixel ({x:.0}, {y:.0}): is the sensor shaded there, is the aperture of the lens cut off?")]
+    #[error("near pixel ({x:.0}, {y:.0}) the light is {percent:.0} % of that in the middle; is the sensor shaded there, is the aperture of the lens cut off?")]
     Dark {
         /// Brightness, percent of the middle.
         percent: f64,

@@ -62,7 +62,7 @@ impl Coverage {
         let share = self.share();
         let seen = format!("{:.0} % of the picture is seen", 100.0 * share);
         if share >= MOST {
-            return format!("{seen}; go on through its whole depth");
+            return format!("{seen}; move through its whole depth");
         }
         let (DVec2 { x, y }, size) = (self.emptiest(), self.code.raster());
         let third = |at: f64, side: u32, words: [&'static str; 3]| {

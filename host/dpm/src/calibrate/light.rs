@@ -129,7 +129,7 @@ fn room_light(
     dialogue.ask("Press Enter to begin.")?;
     recorder.take();
     std::thread::sleep(DARK);
-    let dark: Vec<Block> = recorder.take().into_iter().map(|timed| timed.block).collect();
+    let dark: Vec<Block> = recorder.take().0.into_iter().map(|timed| timed.block).collect();
     steady(&dark, flicker_hz).map_err(refused)
 }
 
@@ -195,7 +195,7 @@ fn watch(
             dialogue.tell(&format!("{:3} of {:.0} s", 10 * tens, levels.seconds()));
         }
     }
-    Ok(Paced::Done(recorder.take()))
+    Ok(Paced::Done(recorder.take().0))
 }
 
 /// Writes the brightness along a sweep: column, row, distance in metres, direction to the lens in the wand's body, level.
@@ -264,7 +264,7 @@ pub fn keep(results: &mut Results, config: &RigConfig, channels: Channels, sourc
         // The levels are good all the same, and took a minute.
         (Some(Err(why)), former) => {
             let kept = if former.is_some() { "kept as it was" } else { "taken as even" };
-            let told = format!("flat field {kept}, since the sweep does not tell it: {why}");
+            let told = format!("flat field {kept}: {why}");
             (former.unwrap_or_else(|| FlatField::even(raster)), told)
         }
         (None, Some(flat)) => (flat, "flat field kept from the calibration file".to_owned()),

@@ -119,11 +119,12 @@ impl Recorder {
         self.shared.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
-    /// Takes what has been sampled since the last call.
-    pub fn take(&self) -> Vec<Timed> {
+    /// Takes the blocks that have been sampled since the last call; the number says how many of them are saturated.
+    pub fn take(&self) -> (Vec<Timed>, usize) {
         let mut shared = self.locked();
-        (shared.samples, shared.saturated) = (0, 0);
-        std::mem::take(&mut shared.blocks)
+        shared.samples = 0;
+        let saturated = std::mem::take(&mut shared.saturated);
+        (std::mem::take(&mut shared.blocks), saturated)
     }
 
     /// Samples, and blocks of them that are saturated, since the last [`Recorder::take`].

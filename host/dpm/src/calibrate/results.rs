@@ -70,7 +70,7 @@ impl Results {
         }
         if config.calibration.file.is_none() {
             told += &format!(
-                "\nname it in the rig file:\n[calibration]\nfile = {:?}",
+                "\ncommands of `dpm calibrate` find it there; for `dpm run`, name it in the rig file:\n[calibration]\nfile = {:?}",
                 self.path.display().to_string()
             );
         }

@@ -54,6 +54,7 @@ pub struct Setup {
 /// Everything that was recorded while the wand moved.
 struct Recording {
     blocks: Vec<Timed>,
+    clipped: Clipped,
     sensor_minus_host_ns: i64,
     poses: Vec<Stamped>,
 }
@@ -68,6 +69,28 @@ struct Sweep {
     seen: SeenCode,
     path: Trajectory,
     settings: Settings,
+    clipped: Clipped,
+}
+
+/// How many of the sensor's blocks of samples were saturated.
+#[derive(Clone, Copy)]
+struct Clipped {
+    blocks: usize,
+    of: usize,
+}
+
+impl Clipped {
+    /// Why a sweep is refused; a saturated sensor spoils what all solvers see.
+    fn refused(self, error: impl std::fmt::Display) -> Failure {
+        let Self { blocks, of } = self;
+        match blocks {
+            0 => refused(error),
+            _ => refused(format!(
+                "{error}; {blocks} of {of} blocks of the sensor's samples were saturated: choose a lower --gain, or go \
+                 further away"
+            )),
+        }
+    }
 }
 
 /// A code, and what the sensor saw of it.
@@ -91,7 +114,7 @@ pub fn calibrate(
             SeenCode::Planes(code, decoded) => solve(code, decoded, &s.path, &s.settings),
             SeenCode::Frames(code, decoded) => solve_pairs(code, decoded, &s.path, &s.settings),
         };
-        solved.map_err(refused)
+        solved.map_err(|e| s.clipped.refused(e))
     })
 }
 
@@ -113,7 +136,7 @@ pub fn latency(
                 solve_latency_of_pairs(code, decoded, &s.path, &s.settings, model)
             }
         };
-        solved.map_err(refused)
+        solved.map_err(|e| s.clipped.refused(e))
     })
 }
 
@@ -147,16 +170,18 @@ fn sweep(
         let guide = Guide::Rests { hold_s: code.hold_s(1e9 / config.projector.frame_rate.hz()), tip };
         let source = Arc::new(InverseSource::new(code.clone()));
         return record(config, setup, (source, guide), monitor)?.and_then(|(recording, showing)| {
+            let clipped = recording.clipped;
             let blocks = recording.blocks.into_iter();
             let mapped: Vec<Mapped> =
                 blocks.filter_map(|t| Some((t.block, t.sensor_minus_host_ns?))).collect();
             let shown = |slot| showing.made_for(slot);
             let light = plane_light(config);
             let light = light.as_deref().map_or(FrameLight::Held, FrameLight::Planes);
-            let decoded = decode_pairs(&code, (&showing.timing, light), &mapped, &shown).map_err(refused)?;
+            let decoded = decode_pairs(&code, (&showing.timing, light), &mapped, &shown)
+                .map_err(|e| clipped.refused(e))?;
             let settings = settings(showing.timing, &recording.poses)?;
             let seen = SeenCode::Frames(code.clone(), decoded);
-            Ok(Sweep { seen, path: Trajectory::new(&recording.poses), settings })
+            Ok(Sweep { seen, path: Trajectory::new(&recording.poses), settings, clipped })
         });
     }
     let code = Code::new(raster).map_err(refused)?;
@@ -166,10 +191,11 @@ fn sweep(
         let (offset_ns, timing) = (recording.sensor_minus_host_ns, showing.timing);
         let shown = |slot| showing.made_for(slot);
         let blocks: Vec<Block> = recording.blocks.into_iter().map(|timed| timed.block).collect();
-        let decoded = decode(&code, &timing, &blocks, offset_ns, &shown).map_err(refused)?;
+        let clipped = recording.clipped;
+        let decoded = decode(&code, &timing, &blocks, offset_ns, &shown).map_err(|e| clipped.refused(e))?;
         let settings = settings(timing, &recording.poses)?;
         let seen = SeenCode::Planes(Box::new(code.clone()), decoded);
-        Ok(Sweep { seen, path: Trajectory::new(&recording.poses), settings })
+        Ok(Sweep { seen, path: Trajectory::new(&recording.poses), settings, clipped })
     })
 }
 
@@ -211,10 +237,13 @@ fn record(
         recorder.take();
         let pace = Pace::of(config, monitor);
         let sweeping = Sweeping { poses: &poses, recorder: &recorder, dialogue: &dialogue };
-        sweeping.follow((seconds, 1e9 / rate.hz()), guide, pace, monitor)?.and_then(|(blocks, poses)| {
-            let sensor_minus_host_ns = recorder.sensor_minus_host_ns()?;
-            Ok(Recording { blocks, sensor_minus_host_ns, poses })
-        })
+        sweeping.follow((seconds, 1e9 / rate.hz()), guide, pace, monitor)?.and_then(
+            |(blocks, clipped, poses)| {
+                let sensor_minus_host_ns = recorder.sensor_minus_host_ns()?;
+                let clipped = Clipped { blocks: clipped, of: blocks.len() };
+                Ok(Recording { blocks, clipped, sensor_minus_host_ns, poses })
+            },
+        )
     };
     let (recording, lights) = while_stamped(config, source, (clock, seconds), monitor, moved)?;
     recording.and_then(|recording| Ok((recording, Showing::of(&lights, rate)?)))
@@ -261,8 +290,8 @@ impl Guide {
     }
 }
 
-/// Samples and poses.
-type Collected = (Vec<Timed>, Vec<Stamped>);
+/// Samples, how many blocks of them are saturated, and poses.
+type Collected = (Vec<Timed>, usize, Vec<Stamped>);
 
 /// What a sweep goes on with.
 struct Sweeping<'a> {
@@ -281,7 +310,7 @@ impl Sweeping<'_> {
         monitor: &RunMonitor,
     ) -> Result<Paced<Collected>, Failure> {
         let (begin, mut told) = (Instant::now(), 0);
-        let (mut path, mut blocks) = (Vec::new(), Vec::new());
+        let (mut path, mut blocks, mut clipped) = (Vec::new(), Vec::new(), 0);
         while begin.elapsed().as_secs_f64() < seconds {
             if monitor.stop_requested() {
                 return Err(refused("the measurement was interrupted; run the same command again"));
@@ -294,19 +323,20 @@ impl Sweeping<'_> {
             let fives = begin.elapsed().as_secs() / 5;
             if fives > told {
                 told = fives;
-                let (_, clipped) = self.recorder.counts();
-                let fresh = self.recorder.take();
-                let next = match clipped {
+                let (fresh, fresh_clipped) = self.recorder.take();
+                clipped += fresh_clipped;
+                let next = match fresh_clipped {
                     0 => guide.next(frame_ns, &fresh, &path),
-                    _ => format!("{clipped} blocks are saturated: choose a lower --gain, or go further away"),
+                    n => format!("{n} blocks are saturated: choose a lower --gain, or go further away"),
                 };
                 blocks.extend(fresh);
                 self.dialogue.tell(&format!("{:3} of {seconds:.0} s: {next}", 5 * fives));
             }
         }
         path.extend(self.poses.take().into_iter().flatten());
-        blocks.extend(self.recorder.take());
-        Ok(Paced::Done((blocks, path)))
+        let (fresh, fresh_clipped) = self.recorder.take();
+        blocks.extend(fresh);
+        Ok(Paced::Done((blocks, clipped + fresh_clipped, path)))
     }
 }
 

@@ -80,6 +80,9 @@ fn run_from(
     monitor: &Arc<RunMonitor>,
 ) -> Result<RunOutcome, PipelineError> {
     monitor.live().set_rig(&rig);
+    if let Some(used) = &rig.calibration {
+        monitor.note(format!("calibration: {used}"));
+    }
     if matches!(origin, Origin::Pattern(..)) {
         monitor.parameters().close();
     }
@@ -122,6 +125,7 @@ impl Ran {
                 Origin::Pattern(..) => "pattern",
             },
             prediction: config.prediction.on,
+            calibration: rig.calibration.clone(),
             light_hash: recorder.as_ref().and_then(LightRecorder::hash).unwrap_or_default(),
             projector: Some(carried),
             slots_per_frame: facts.stride_milli.load(Ordering::Relaxed) as f64 / 1e3,

@@ -196,6 +196,9 @@ pub struct Report {
     pub method: &'static str,
     /// Whether poses were predicted to the time of light.
     pub prediction: bool,
+    /// What was used of the calibration file, one sentence; absent without such a file.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub calibration: Option<String>,
     /// Distance in projector pixels between where the light of a surface point fell and where that point was at that
     /// instant; null without ground truth.
     pub registration_error_px: Option<Spread>,
@@ -292,6 +295,7 @@ impl Default for Report {
             software_gpu: false,
             method: "full",
             prediction: false,
+            calibration: None,
             registration_error_px: None,
             registration_error_unpredicted_px: None,
             registration_error_in_time_px: None,

@@ -69,6 +69,9 @@ impl Report {
         let software = if self.software_gpu { " (software)" } else { "" };
         table.row("GPU", format!("{}{software}", self.gpu));
         table.row("method", self.method.to_string());
+        if let Some(used) = &self.calibration {
+            table.row("calibration", used.clone());
+        }
     }
 
     fn registration_rows(&self, table: &mut Table) {
