@@ -209,3 +209,22 @@ fn a_tilted_panel_lights_what_opencv_projects() {
 fn a_fisheye_lens_lights_what_opencv_projects() {
     check("fisheye", "xml", "full");
 }
+
+/// The rays of such a lens cross inside the raster, so no single ray belongs to a mirror there.
+#[test]
+fn a_lens_that_folds_is_refused_before_there_is_light() {
+    let folder = Folder::new("fold");
+    let text = std::fs::read_to_string(asset("brown5.yml")).expect("an asset");
+    let k1 = "data: [ -0.23999999999999999,";
+    assert!(text.contains(k1), "{text}");
+    let file = folder.path("fold.yml");
+    std::fs::write(&file, text.replace(k1, "data: [ -2.0,")).expect("a file");
+    let calibration = format!("projector.calibration={:?}", file.display().to_string());
+    let keys = ["--set", &calibration, "--set", "projector.calibration_unit=metre"];
+    for command in [&["plan"][..], &["demo", "--frames", "2"], &["snapshot"]] {
+        let output = dpm(&[command, &keys].concat(), &[]);
+        assert_eq!(code(&output), 2, "{command:?}: {}", err(&output));
+        let told = err(&output);
+        assert!(told.contains("cannot be inverted") && told.contains("projector.calibration"), "{told}");
+    }
+}

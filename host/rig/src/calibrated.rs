@@ -337,7 +337,8 @@ mod tests {
         assert!((rig.bodies[1].mesh_to_body.translation - DVec3::new(0.01, 0.0, 0.02)).length() < 1e-12);
         assert_eq!(rig.latency_ns, Some(2_500_000));
         let used = rig.calibration.as_deref().unwrap();
-        let parts = ["all.toml: ", "light within 0.20 px", "mesh in \"venus\"", "2.500 ms", "each code value"];
+        let parts =
+            ["all.toml: ", "light within 0.20 px", "mesh in \"venus\"", "2.500 ms", "each code value"];
         assert!(parts.iter().all(|part| used.contains(part)) && !used.contains("bunny"), "{used}");
         let nothing = measured_rig(&CalibrationFile::new(), "nothing", &[]).unwrap();
         assert!(nothing.calibration.unwrap().ends_with("nothing was measured"));
