@@ -7,6 +7,7 @@ use hil_mock::sensor_wand::ProjectorOptics;
 use std::io::{Read, Write};
 use std::process::{Child, ChildStdin, Command, Output, Stdio};
 use std::sync::mpsc::{channel, Receiver};
+use std::sync::{Mutex, MutexGuard, PoisonError};
 use std::time::{Duration, Instant};
 
 /// A folder for the commands of `dpm`.
@@ -145,15 +146,21 @@ impl Drop for Talk {
     }
 }
 
-/// `hil-mock serve sensor-wand`, ended with this.
+/// Projector, host and sensor run at real pace. Two such chains at once are more than two cores carry in time, and a
+/// sweep with half of its frames is refused.
+static TURN: Mutex<()> = Mutex::new(());
+
+/// `hil-mock serve sensor-wand`, ended with this. There is one at a time.
 struct Mock {
     talk: Talk,
+    _turn: MutexGuard<'static, ()>,
     projector: String,
     sensor: String,
 }
 
 impl Mock {
     fn start(arguments: &[&str]) -> Self {
+        let turn = TURN.lock().unwrap_or_else(PoisonError::into_inner);
         let child = Command::new(program("hil-mock"))
             .args(["serve", "sensor-wand", "--port", "pty", "--orders"])
             .args(arguments)
@@ -168,7 +175,7 @@ impl Mock {
         };
         let sensor = after("light sensor on ");
         let projector = after("bit-plane projector on ");
-        Self { talk, projector, sensor }
+        Self { talk, _turn: turn, projector, sensor }
     }
 
     /// Gives an order to the hand with the wand, again while it cannot be followed, and waits until the hand is there.
