@@ -1,14 +1,13 @@
 //! `dpm calibrate` as an operator uses it, with the projector, the tracker and the light sensor in a process of their own.
 
 use dpm_calibration::file::{self, CalibrationFile};
-use dpm_tests::programs::{program, RunFolder};
+use dpm_tests::programs::{program, RunFolder, Talk};
 use glam::{DAffine3, DQuat, DVec3};
 use hil_mock::sensor_wand::ProjectorOptics;
-use std::io::{Read, Write};
-use std::process::{Child, ChildStdin, Command, Output, Stdio};
-use std::sync::mpsc::{channel, Receiver};
+use std::io::Write;
+use std::process::{Child, Command, Output, Stdio};
 use std::sync::{Mutex, MutexGuard, PoisonError};
-use std::time::{Duration, Instant};
+use std::time::Duration;
 
 /// A folder for the commands of `dpm`.
 struct Folder(RunFolder);
@@ -63,87 +62,6 @@ impl Folder {
 
 fn text(output: &Output) -> String {
     String::from_utf8_lossy(&output.stdout).into_owned() + &String::from_utf8_lossy(&output.stderr)
-}
-
-/// A program that one talks with, killed with this.
-struct Talk {
-    child: Child,
-    input: ChildStdin,
-    heard: Receiver<Vec<u8>>,
-    text: String,
-    /// What was read by [`Talk::until`] so far.
-    read: usize,
-}
-
-/// Longer than any answer takes on a machine with other work.
-const PATIENCE: Duration = Duration::from_secs(120);
-
-impl Talk {
-    fn with(mut child: Child) -> Self {
-        let input = child.stdin.take().unwrap();
-        let (send, heard) = channel();
-        let outputs: [Option<Box<dyn Read + Send>>; 2] = [
-            child.stdout.take().map(|o| Box::new(o) as Box<dyn Read + Send>),
-            child.stderr.take().map(|e| Box::new(e) as Box<dyn Read + Send>),
-        ];
-        for mut output in outputs.into_iter().flatten() {
-            let send = send.clone();
-            std::thread::spawn(move || {
-                let mut bytes = [0; 4096];
-                while let Ok(n @ 1..) = output.read(&mut bytes) {
-                    if send.send(bytes[..n].to_vec()).is_err() {
-                        return;
-                    }
-                }
-            });
-        }
-        Self { child, input, heard, text: String::new(), read: 0 }
-    }
-
-    /// Reads on until `words` come; gives what came before them.
-    fn until(&mut self, words: &str) -> String {
-        self.until_one(&[words]).1
-    }
-
-    /// Reads on until one of several comes; gives its number and what came before it.
-    fn until_one(&mut self, words: &[&str]) -> (usize, String) {
-        let begin = Instant::now();
-        loop {
-            let fresh = &self.text[self.read..];
-            let found = words.iter().enumerate().filter_map(|(i, w)| Some((fresh.find(w)?, i))).min();
-            if let Some((at, which)) = found {
-                let before = fresh[..at].to_owned();
-                self.read += at + words[which].len();
-                return (which, before);
-            }
-            let left = PATIENCE.saturating_sub(begin.elapsed());
-            match self.heard.recv_timeout(left) {
-                Ok(bytes) => self.text += &String::from_utf8_lossy(&bytes),
-                Err(why) => panic!("none of {words:?} came ({why}):\n{}", self.text),
-            }
-        }
-    }
-
-    fn say(&mut self, line: &str) {
-        self.input.write_all(format!("{line}\n").as_bytes()).unwrap();
-        self.input.flush().unwrap();
-    }
-
-    /// Waits for the end: the exit code and all that was said.
-    fn end(mut self) -> (Option<i32>, String) {
-        while let Ok(bytes) = self.heard.recv_timeout(PATIENCE) {
-            self.text += &String::from_utf8_lossy(&bytes);
-        }
-        let code = self.child.wait().unwrap().code();
-        (code, std::mem::take(&mut self.text))
-    }
-}
-
-impl Drop for Talk {
-    fn drop(&mut self) {
-        let _ = self.child.kill();
-        let _ = self.child.wait();
-    }
 }
 
 /// Projector, host and sensor run at real pace. Two such chains at once are more than two cores carry in time, and a

@@ -418,6 +418,25 @@ pub fn utc(at: SystemTime) -> String {
     format!("{year:04}-{month:02}-{day:02}T{:02}:{:02}:{:02}Z", second / 3600, second / 60 % 60, second % 60)
 }
 
+/// Seconds from 1970 to a time in the form that [`utc`] writes; `None` for another text and for times before 1970.
+pub fn seconds_of_utc(text: &str) -> Option<u64> {
+    let (date, time) = text.strip_suffix('Z')?.split_once('T')?;
+    let numbers = |part: &str, sign| {
+        let mut each = part.split(sign).map(|n| n.parse::<u64>().ok());
+        let three = [each.next()??, each.next()??, each.next()??];
+        each.next().is_none().then_some(three)
+    };
+    let ([year, month, day], [hour, minute, second]) = (numbers(date, '-')?, numbers(time, ':')?);
+    let is_date = (1970..=9999).contains(&year) && (1..=12).contains(&month) && (1..=31).contains(&day);
+    if !is_date || hour > 23 || minute > 59 || second > 60 {
+        return None;
+    }
+    // As above, a year begins with March.
+    let (year, month) = if month > 2 { (year, month - 3) } else { (year - 1, month + 9) };
+    let days = 365 * year + year / 4 - year / 100 + year / 400 + (153 * month + 2) / 5 + day - 1;
+    Some((days - 719_468) * 86_400 + 3600 * hour + 60 * minute + second)
+}
+
 #[cfg(test)]
 #[path = "standing_tests.rs"]
 mod tests;

@@ -153,6 +153,17 @@ fn utc_knows_leap_years_and_ends_of_months() {
         (4_107_542_400, "2100-03-01T00:00:00Z"),
     ] {
         assert_eq!(utc(UNIX_EPOCH + Duration::from_secs(seconds)), wanted);
+        assert_eq!(seconds_of_utc(wanted), Some(seconds));
+    }
+    // Every day of eight centuries there and back.
+    for day in 0..292_194 {
+        let seconds = 86_400 * day + 43_210;
+        assert_eq!(seconds_of_utc(&utc(UNIX_EPOCH + Duration::from_secs(seconds))), Some(seconds));
+    }
+    for none in
+        ["", "Z", "2024-02-29", "2024-13-01T00:00:00Z", "2024-01-01T24:00:00Z", "1969-12-31T23:59:59Z"]
+    {
+        assert_eq!(seconds_of_utc(none), None, "{none}");
     }
     assert_eq!(utc(UNIX_EPOCH - Duration::from_secs(1)), "1970-01-01T00:00:00Z");
 }

@@ -5,7 +5,6 @@ mod calibrate;
 mod display;
 mod dlpc900;
 mod doctor;
-mod doctor_alp;
 mod error;
 mod error_experiments;
 mod error_files;

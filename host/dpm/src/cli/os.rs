@@ -1,5 +1,5 @@
-//! Access rights to files, as the kernel sees them rather than guessed from mode bits; and an end of the process that
-//! waits for nothing.
+//! Access rights to files, as the kernel sees them rather than guessed from mode bits; free space; and an end of the
+//! process that waits for nothing.
 #![allow(unsafe_code)]
 
 use std::ffi::CString;
@@ -11,6 +11,17 @@ pub(crate) fn may_read_and_write(path: &Path) -> bool {
     let Ok(path) = CString::new(path.as_os_str().as_bytes()) else { return false };
     // SAFETY: a NUL-terminated string that outlives the call.
     unsafe { libc::access(path.as_ptr(), libc::R_OK | libc::W_OK) == 0 }
+}
+
+/// Bytes that the user of this process may still write to the file system of `path`; `None` where it does not say.
+pub(crate) fn free_bytes(path: &Path) -> Option<u64> {
+    let path = CString::new(path.as_os_str().as_bytes()).ok()?;
+    let mut stat = std::mem::MaybeUninit::<libc::statvfs>::zeroed();
+    // SAFETY: a NUL-terminated string and a place for the answer, both of which outlive the call.
+    let told = unsafe { libc::statvfs(path.as_ptr(), stat.as_mut_ptr()) };
+    // SAFETY: all of it was zeroed, and the call succeeded.
+    let stat = (told == 0).then(|| unsafe { stat.assume_init() })?;
+    Some(stat.f_bavail.saturating_mul(stat.f_frsize))
 }
 
 /// Ends the process at once, without destructors, whatever its other threads do.

@@ -1,7 +1,11 @@
-//! `dpm doctor`: what this machine can do, line by line, and how to fix what is missing.
+//! `dpm doctor`: what this machine can do, line by line, and how to fix what is missing; with a rig file also whether that
+//! rig can run here.
+
+mod alp;
+mod devices;
+mod rig;
 
 use super::display::{self, Seen};
-use super::doctor_alp;
 use super::os;
 use super::rig_args::RigArgs;
 use super::watch::print;
@@ -15,7 +19,8 @@ use std::path::PathBuf;
 /// Flags of `dpm doctor`.
 #[derive(clap::Args, Clone, Debug)]
 pub(crate) struct DoctorArgs {
-    /// A rig file: its ALP, if it has one, is opened and asked whether it can show the rig's frames
+    /// A rig file: its scene and calibration are read, its tracker is listened to for three seconds, and its projector
+    /// is asked whether it can show the rig's frames; it stays dark
     #[arg(value_name = "RIG.toml")]
     rig: Option<PathBuf>,
     #[command(flatten)]
@@ -63,6 +68,9 @@ impl Finding {
 pub(super) struct Findings {
     /// True if the main task can run, which needs a Vulkan device.
     pub can_render: bool,
+    /// True if nothing is missing that the rig needs; absent without a rig file.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub can_run: Option<bool>,
     /// Findings in the order of a frame's path.
     pub findings: Vec<Finding>,
 }
@@ -70,8 +78,12 @@ pub(super) struct Findings {
 /// Runs the command.
 ///
 /// # Errors
-/// [`FailureKind::NoGpu`] if there is no usable Vulkan device. Everything else that is missing is only reported.
+/// [`FailureKind::NoGpu`] if there is no usable Vulkan device. [`FailureKind::CheckFailed`] if something is missing that
+/// the rig of the file needs, [`FailureKind::BadInput`] if the file is wrong. What else is missing on this machine is only
+/// reported.
 pub(super) fn execute(args: &DoctorArgs) -> Result<(), Failure> {
+    args.flags.refuse("dpm doctor", &["--frames", "--seconds", "--no-prediction"])?;
+    let config = args.rig.as_deref().map(|path| args.flags.rig_at_rest(Some(path))).transpose()?;
     let system = System { root: PathBuf::from("/") };
     let mut findings = Vec::new();
     let can_render = vulkan(&mut findings);
@@ -86,19 +98,26 @@ pub(super) fn execute(args: &DoctorArgs) -> Result<(), Failure> {
     findings.extend(system.usb());
     findings.push(system.serial_ports());
     findings.extend(displays(&display::look()));
-    findings.push(doctor_alp::libraries(&system.root));
-    if let Some(rig) = &args.rig {
-        findings.extend(doctor_alp::device(&args.flags.rig_of_projector(rig, true)?));
-    }
-    let all = Findings { can_render, findings };
+    findings.push(alp::libraries(&system.root));
+    let of_rig = config.as_ref().map(rig::findings);
+    let missing = |of: &[Finding]| {
+        of.iter().filter(|f| f.state == State::Missing).map(|f| f.name.clone()).collect::<Vec<_>>()
+    };
+    let missing = of_rig.as_deref().map(missing);
+    findings.extend(of_rig.into_iter().flatten());
+    let can_run = missing.as_ref().map(|names| can_render && names.is_empty());
+    let all = Findings { can_render, can_run, findings };
     print(&if args.json { to_json(&all) + "\n" } else { table(&all.findings) });
-    if all.can_render {
-        Ok(())
-    } else {
-        Err(Failure::new(
-            FailureKind::NoGpu,
-            "no usable Vulkan device: nothing can be rendered on this machine",
-        ))
+    if !all.can_render {
+        let told = "no usable Vulkan device: nothing can be rendered on this machine";
+        return Err(Failure::new(FailureKind::NoGpu, told));
+    }
+    match missing {
+        Some(names) if !names.is_empty() => {
+            let told = format!("this rig cannot run yet: {} (see MISSING above)", names.join(", "));
+            Err(Failure::new(FailureKind::CheckFailed, told))
+        }
+        _ => Ok(()),
     }
 }
 

@@ -1,11 +1,7 @@
-//! What `dpm doctor` says of a ViALUX ALP: the vendor's libraries, and the device of a rig file.
+//! What `dpm doctor` says of the vendor's libraries for a ViALUX ALP.
 
-use super::doctor::{Finding, State};
-use dpm_common::clock::{Clock, MonotonicClock};
-use dpm_rig::config::{ProjectorBackend, RigConfig};
-use dpm_rig::pipeline::projector::{self, Surroundings};
+use super::{Finding, State};
 use std::path::Path;
-use std::sync::Arc;
 
 /// Where systems keep libraries.
 const FOLDERS: [&str; 6] = [
@@ -33,28 +29,6 @@ pub(super) fn libraries(root: &Path) -> Finding {
         return Finding::new("ALP library", State::Info, "none", remedy);
     }
     Finding::new("ALP library", State::Ok, found.join(", "), "")
-}
-
-/// Opens the ALP of `config`, if it has one, and says whether it can show the rig's frames. It stays dark.
-pub(super) fn device(config: &RigConfig) -> Option<Finding> {
-    if !matches!(config.projector.backend, ProjectorBackend::Alp(_)) {
-        return None;
-    }
-    let clock = MonotonicClock::new(0);
-    let around = Surroundings::plain(Arc::new(move || clock.now()));
-    let name = "ALP";
-    Some(match projector::open(config, config.projector.raster(), &around) {
-        Ok(medium) => {
-            let told: Vec<String> = medium.into_iter().flat_map(|medium| medium.warnings).collect();
-            let frames = format!(
-                "{} frames/s of {} planes are within its limits",
-                config.projector.frame_rate.hz(),
-                config.projector.planes
-            );
-            Finding::new(name, State::Ok, told.into_iter().chain([frames]).collect::<Vec<_>>().join("; "), "")
-        }
-        Err(e) => Finding::new(name, State::Missing, e.to_string(), ""),
-    })
 }
 
 #[cfg(test)]

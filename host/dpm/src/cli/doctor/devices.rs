@@ -1,0 +1,158 @@
+//! What `dpm doctor RIG.toml` says of the rig's tracker and projector: each is opened, listened to and closed. The
+//! projector stays dark.
+
+use super::super::watch::take_locks;
+use super::{Finding, State};
+use dpm_common::clock::{Clock, MonotonicClock};
+use dpm_device::dlpc900::driver::Dlpc900;
+use dpm_device::dlpc900::usb::{describe, UsbHid, UsbPlace};
+use dpm_device::link::{faults, DeviceHello, HostLink, LinkState};
+use dpm_device::transport::Transport;
+use dpm_rig::config::{Dlpc900Config, ProjectorBackend, RigConfig, TrackerConfig};
+use dpm_rig::pipeline::connect;
+use dpm_rig::pipeline::projector::{self, Surroundings};
+use dpm_rig::rig::Rig;
+use dpm_rig::standing::Identity;
+use dpm_rig::telemetry::monitor::RunMonitor;
+use std::sync::Arc;
+use std::time::Duration;
+
+/// How long the tracker is listened to, nanoseconds.
+const LISTEN_NS: i64 = 3_000_000_000;
+/// Time between two polls of the tracker, nanoseconds.
+const POLL_EVERY_NS: i64 = 500_000;
+
+/// Which bodies the tracker reports, and how often.
+pub(super) fn tracker(rig: &Rig) -> Finding {
+    let name = "tracker";
+    if matches!(rig.config.tracker, TrackerConfig::Mock(_)) {
+        return Finding::new(name, State::Info, "the mock in this process", "");
+    }
+    if rig.bodies.is_empty() {
+        return Finding::new(name, State::Info, "no body is tracked", "");
+    }
+    let clock = MonotonicClock::new(0);
+    let start = clock.now();
+    let mut tracker = match dpm_rig::tracks::open_for(rig, Arc::new(move || clock.now()), start) {
+        Ok(tracker) => tracker,
+        Err(e) => return Finding::new(name, State::Missing, e.to_string(), "see docs/TRACKERS.md"),
+    };
+    let mut seen = vec![0u32; rig.bodies.len()];
+    let failed = loop {
+        let now = clock.now();
+        if now.ns_since(start) > LISTEN_NS {
+            break None;
+        }
+        let polled = tracker.poll(now, &mut |sample| {
+            if let Some(count) = seen.get_mut(usize::from(sample.body.0)).filter(|_| sample.tracked) {
+                *count += 1;
+            }
+        });
+        if let Err(e) = polled {
+            break Some(e.to_string());
+        }
+        clock.wait_until(now.plus_ns(POLL_EVERY_NS));
+    };
+    let seconds = 1e-9 * LISTEN_NS as f64;
+    let told = rig.bodies.iter().zip(&seen).map(|(body, count)| match count {
+        0 => format!("\"{}\" is not seen", body.name),
+        _ => format!("\"{}\" {:.0} times a second", body.name, f64::from(*count) / seconds),
+    });
+    let found = told.collect::<Vec<_>>().join(", ");
+    match failed {
+        Some(why) => Finding::new(name, State::Missing, format!("{found}; {why}"), "see docs/TRACKERS.md"),
+        None if seen.contains(&0) => {
+            let state = if seen.iter().all(|count| *count == 0) { State::Missing } else { State::Warning };
+            let remedy = format!("{}; a body that is not seen stays dark", tracker.status());
+            Finding::new(name, state, found, remedy)
+        }
+        None => Finding::new(name, State::Ok, found, ""),
+    }
+}
+
+/// Whether the projector answers, and whether it can show the rig's frames.
+pub(super) fn projector(config: &RigConfig) -> Finding {
+    let identity = Identity::of(&config.projector.backend).to_string();
+    let failed = |why: String| Finding::new("projector", State::Missing, why, "see docs/PROJECTORS.md");
+    // A projector that another run lights is left alone.
+    let _locks = match take_locks(config) {
+        Ok(locks) => locks,
+        Err(e) => return failed(e.message),
+    };
+    let answered = match &config.projector.backend {
+        ProjectorBackend::Mock(_) => {
+            return Finding::new("projector", State::Info, "the mock in this process", "");
+        }
+        ProjectorBackend::Dlpc900(dlpc900) => controller(dlpc900),
+        _ => linked(config),
+    };
+    match answered {
+        Ok((state, found, remedy)) => {
+            Finding::new("projector", state, format!("{identity}: {found}"), remedy)
+        }
+        Err(why) => failed(why),
+    }
+}
+
+/// State, what was found, and what to do.
+type Answer = (State, String, String);
+
+fn controller(config: &Dlpc900Config) -> Result<Answer, String> {
+    let place = match &config.device {
+        None => None,
+        Some(text) => Some(text.parse::<UsbPlace>().map_err(|e| format!("{text}: {e}"))?),
+    };
+    let named = |e: String| format!("{}: {e}", describe(place));
+    let port = UsbHid::open(place).map_err(|e| named(e.to_string()))?;
+    let mut controller = Dlpc900::new(port).map_err(|e| named(e.to_string()))?;
+    let status = controller.status().map_err(|e| named(e.to_string()))?;
+    let lines: Vec<String> =
+        crate::dlpc900::status_text(&status).lines().map(|l| l.trim().to_owned()).collect();
+    Ok((State::Ok, lines.join("; "), String::new()))
+}
+
+/// Says HELLO and CONFIG to a projector of the link, and ends the session before it was armed.
+fn linked(config: &RigConfig) -> Result<Answer, String> {
+    let clock = MonotonicClock::new(0);
+    let around = Surroundings::plain(Arc::new(move || clock.now()));
+    let raster = config.projector.raster();
+    let medium = projector::open(config, raster, &around).map_err(|e| e.to_string())?;
+    let mut medium = medium.ok_or("it has no link")?;
+    let mut link = HostLink::new(projector::link_settings(config, raster));
+    // A link for which dark is ordered comes up without being armed.
+    let monitor = RunMonitor::default();
+    monitor.request_stop();
+    let mut now = || {
+        std::thread::sleep(Duration::from_micros(200));
+        clock.now()
+    };
+    let transport: &mut dyn Transport = &mut *medium.transport;
+    connect(&mut link, transport, 0, &monitor, &mut now, &|| false).map_err(|e| e.to_string())?;
+    let mut found = medium.warnings;
+    found.extend(link.device().map(told_of_device));
+    let p = &config.projector;
+    found.push(format!("{} frames/s of {} planes are within its limits", p.frame_rate.hz(), p.planes));
+    let bytes = projector::frame_bytes(raster, p.schedule().len()) as f64 * p.frame_rate.hz();
+    found.push(format!(
+        "raw frames are {:.1} MB/s, `dpm link-test` measures what the link carries",
+        1e-6 * bytes
+    ));
+    let latched = link.status().map_or(0, |status| status.faults);
+    if link.state() == LinkState::Faulted {
+        found.push(format!("latched faults: {}", faults::names(latched)));
+        let remedy =
+            "`dpm arm` acknowledges them while the rig runs; a run acknowledges a watchdog by itself";
+        return Ok((State::Warning, found.join("; "), remedy.into()));
+    }
+    Ok((State::Ok, found.join("; "), String::new()))
+}
+
+fn told_of_device(device: &DeviceHello) -> String {
+    let [major, minor] = device.firmware.to_be_bytes();
+    format!(
+        "firmware {major}.{minor}, {} frame buffers, {} planes at most, each {:.1} us or longer",
+        device.frame_buffers,
+        device.max_planes,
+        1e-3 * f64::from(device.min_plane_ns)
+    )
+}

@@ -1,0 +1,234 @@
+//! What `dpm doctor RIG.toml` says of the rig: its parts one by one, those without devices here, the tracker and the
+//! projector in [`super::devices`]. Nothing is lit.
+
+use super::super::os;
+use super::devices;
+use super::{Finding, State};
+use dpm_calibration::file;
+use dpm_rig::config::{ProjectorBackend, RigConfig, TrackerConfig};
+use dpm_rig::rig::Rig;
+use dpm_rig::standing::{seconds_of_utc, standing_in, state_folder, Identity};
+use std::net::{SocketAddr, TcpListener};
+use std::path::Path;
+use std::time::{SystemTime, UNIX_EPOCH};
+
+/// A calibration that is older than this, days, is worth a check.
+const OLD_DAYS: u64 = 30;
+/// Less free space than this, bytes, is soon used up by pictures and traces.
+const LITTLE_SPACE: u64 = 1 << 30;
+/// Most warnings of a scene that are told.
+const MOST_WARNINGS: usize = 4;
+
+/// Everything that can be said of the rig of `config`.
+pub(super) fn findings(config: &RigConfig) -> Vec<Finding> {
+    let mut all = vec![set_up(config)];
+    match Rig::build(config, None) {
+        Err(e) => all.push(Finding::new("scene", State::Missing, e.to_string(), "correct the rig file")),
+        Ok(rig) => all.extend([scene(&rig), devices::tracker(&rig)]),
+    }
+    all.push(calibration(config));
+    all.extend(standing_order(config));
+    all.push(devices::projector(config));
+    all.extend(page(config));
+    all.push(output(&config.output.dir));
+    all
+}
+
+/// The keys that change from projector to projector.
+fn set_up(config: &RigConfig) -> Finding {
+    let p = &config.projector;
+    let found = format!(
+        "projector.width = {}, height = {}, frame_rate = {}, planes = {}, for {}; another one may need other numbers",
+        p.width,
+        p.height,
+        p.frame_rate.hz(),
+        p.planes,
+        Identity::of(&p.backend)
+    );
+    Finding::new("rig", State::Info, found, "")
+}
+
+fn scene(rig: &Rig) -> Finding {
+    let scene = &rig.scene;
+    let found = format!(
+        "{} triangles of {} bodies, {} of which are tracked",
+        dpm_scene::SceneFeatures::of(scene).triangles,
+        scene.bodies.len(),
+        rig.bodies.len()
+    );
+    if scene.warnings.is_empty() {
+        return Finding::new("scene", State::Ok, found, "");
+    }
+    let told: Vec<&str> = scene.warnings.iter().take(MOST_WARNINGS).map(String::as_str).collect();
+    let more = scene.warnings.len() - told.len();
+    let more = if more > 0 { format!("; and {more} more") } else { String::new() };
+    let remedy = "`dpm plan` of this rig file lists every note, docs/SCENES.md says what is read";
+    Finding::new("scene", State::Warning, format!("{found}; {}{more}", told.join("; ")), remedy)
+}
+
+/// Whether the rig was measured, what of it, and how long ago.
+fn calibration(config: &RigConfig) -> Finding {
+    let name = "calibration";
+    let is_simulated = matches!(config.projector.backend, ProjectorBackend::Mock(_))
+        || matches!(config.tracker, TrackerConfig::Mock(_));
+    let Some(path) = &config.calibration.file else {
+        let known = match (is_simulated, &config.projector.calibration) {
+            (true, _) => return Finding::new(name, State::Info, "none; a mock needs none", ""),
+            (false, Some(file)) => format!("lens and pose of {}; nothing else was measured", file.display()),
+            (false, None) => "none: light falls where projector.position and projector.look_at say".into(),
+        };
+        return Finding::new(
+            name,
+            State::Warning,
+            known,
+            "measure with `dpm calibrate` (docs/CALIBRATION.md)",
+        );
+    };
+    let measured = match file::load(path) {
+        Ok(measured) => measured,
+        Err(e) => {
+            return Finding::new(name, State::Missing, e.to_string(), "measure again with `dpm calibrate`")
+        }
+    };
+    let mut parts = Vec::new();
+    if let Some(p) = &measured.projector {
+        let [width, height] = p.size;
+        let told = format!("projector, {width} x {height}, light within {:.2} px", p.predicted_p99_px);
+        parts.push((told, &p.provenance.date));
+    }
+    parts.extend(measured.bodies.iter().map(|(body, b)| (format!("body \"{body}\""), &b.provenance.date)));
+    parts.extend(measured.latency.as_ref().map(|l| ("latency".to_owned(), &l.provenance.date)));
+    parts.extend(measured.light.as_ref().map(|l| ("light".to_owned(), &l.provenance.date)));
+    let ages: Vec<Option<u64>> = parts.iter().map(|(_, date)| days_since(date, SystemTime::now())).collect();
+    let told: Vec<String> =
+        parts.iter().zip(&ages).map(|((part, _), age)| format!("{part} ({})", aged(*age))).collect();
+    let found =
+        format!("{}: {}", path.display(), if told.is_empty() { "empty".into() } else { told.join("; ") });
+    if measured.projector.is_none() {
+        return Finding::new(
+            name,
+            State::Warning,
+            found,
+            "the projector was not measured: `dpm calibrate projector`",
+        );
+    }
+    if ages.iter().any(|age| age.is_none_or(|days| days > OLD_DAYS)) {
+        return Finding::new(
+            name,
+            State::Warning,
+            found,
+            "see by `dpm calibrate check` whether it still holds",
+        );
+    }
+    Finding::new(name, State::Ok, found, "")
+}
+
+/// Whole days from a date of the form 2026-03-01T12:00:00Z until now; `None` for another text.
+fn days_since(date: &str, now: SystemTime) -> Option<u64> {
+    let now = now.duration_since(UNIX_EPOCH).ok()?.as_secs();
+    Some(now.saturating_sub(seconds_of_utc(date)?) / 86_400)
+}
+
+fn aged(days: Option<u64>) -> String {
+    match days {
+        None => "of unknown date".into(),
+        Some(0) => "of today".into(),
+        Some(1) => "1 day old".into(),
+        Some(days) => format!("{days} days old"),
+    }
+}
+
+/// An order that outlived the run in which it was given.
+fn standing_order(config: &RigConfig) -> Option<Finding> {
+    let identity = Identity::of(&config.projector.backend);
+    let stands = standing_in(&state_folder()?, &identity)?;
+    let found =
+        format!("the projector stays dark: {} stands {}", stands.order.word().to_uppercase(), stands.told);
+    Some(Finding::new("standing order", State::Warning, found, "run the rig and say `dpm arm`"))
+}
+
+/// Whether the page can listen.
+fn page(config: &RigConfig) -> Option<Finding> {
+    let text = config.page.listen.as_ref()?;
+    let address: SocketAddr = text.parse().ok()?;
+    Some(match TcpListener::bind(address) {
+        Ok(_) => Finding::new("page", State::Ok, format!("http://{address} is free"), ""),
+        Err(e) => {
+            let remedy =
+                "another program uses the port, or the machine has no such address: change page.listen";
+            Finding::new("page", State::Missing, format!("cannot listen on {address}: {e}"), remedy)
+        }
+    })
+}
+
+/// Whether reports and pictures can be written. A folder that is not there yet is judged by the one above it.
+fn output(dir: &Path) -> Finding {
+    let name = "output folder";
+    let there = dir
+        .ancestors()
+        .map(|d| if d.as_os_str().is_empty() { Path::new(".") } else { d })
+        .find(|d| d.exists());
+    let there = there.unwrap_or(Path::new("/"));
+    if !there.is_dir() || !os::may_read_and_write(there) {
+        let found =
+            format!("{} cannot be written: {} is no folder that may be", dir.display(), there.display());
+        return Finding::new(name, State::Missing, found, "set output.dir, or give --out");
+    }
+    match os::free_bytes(there) {
+        None => Finding::new(name, State::Ok, format!("{}", dir.display()), ""),
+        Some(free) => {
+            let found = format!("{}, {:.1} GB free", dir.display(), free as f64 / 1e9);
+            match free < LITTLE_SPACE {
+                true => Finding::new(name, State::Warning, found, "make room, or set output.dir elsewhere"),
+                false => Finding::new(name, State::Ok, found, ""),
+            }
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use dpm_rig::config::Overrides;
+    use dpm_rig::standing::utc;
+    use std::time::Duration;
+
+    fn demo(flags: &[String]) -> RigConfig {
+        RigConfig::demo(&Overrides { variables: vec![], flags: flags.to_vec() }).unwrap()
+    }
+
+    #[test]
+    fn an_age_is_counted_in_whole_days() {
+        let then = UNIX_EPOCH + Duration::from_secs(1_772_366_400);
+        let after = |days: f64| days_since(&utc(then), then + Duration::from_secs_f64(86_400.0 * days));
+        assert_eq!(
+            (after(0.0), after(0.99), after(1.0), after(400.5)),
+            (Some(0), Some(0), Some(1), Some(400))
+        );
+        assert_eq!(days_since("yesterday", then), None);
+        // A clock that was set back makes nothing negative.
+        assert_eq!(days_since(&utc(then + Duration::from_secs(9)), then), Some(0));
+    }
+
+    #[test]
+    fn a_port_that_is_taken_is_missing() {
+        let taken = TcpListener::bind("127.0.0.1:0").unwrap();
+        let address = taken.local_addr().unwrap();
+        let config = demo(&[format!("page.listen=\"{address}\"")]);
+        assert_eq!(page(&config).unwrap().state, State::Missing);
+        drop(taken);
+        assert_eq!(page(&config).unwrap().state, State::Ok);
+        assert!(page(&demo(&[])).is_none());
+    }
+
+    #[test]
+    fn a_folder_that_comes_later_is_judged_by_the_one_above_it() {
+        let below = std::env::temp_dir().join("dpm-doctor-none/of/these");
+        assert_ne!(output(&below).state, State::Missing);
+        let file = std::env::temp_dir().join(format!("dpm-doctor-file-{}", std::process::id()));
+        std::fs::write(&file, "").unwrap();
+        assert_eq!(output(&file.join("x")).state, State::Missing);
+        std::fs::remove_file(file).unwrap();
+        assert_ne!(output(Path::new("out")).state, State::Missing);
+    }
+}
