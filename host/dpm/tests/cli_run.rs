@@ -526,3 +526,35 @@ fn a_rig_with_a_networked_tracker_lights_what_the_tracker_sees() {
     assert!(latency > 0.0 && latency < 60_000.0, "{latency} ms");
     assert!(json["registration_error_px"].is_null(), "nobody knows the truth about a real tracker");
 }
+
+/// With the same number of samples everywhere all lanes work until the end; the allocation by variance leaves some idle.
+#[test]
+fn bench_counts_how_busy_lanes_are_and_marks_what_is_only_computed() {
+    let args = ["bench", "--json", "--count", "3", "--raster", "96x64", "--set", "render.spp=4"];
+    let output =
+        dpm(&[&args[..], &["--method", "full", "--method", "dpm"]].concat(), &[("DPM_VALIDATION", "1")]);
+    assert_eq!(code(&output), 0, "{}", err(&output));
+    let json: serde_json::Value = serde_json::from_str(&out(&output)).expect("one JSON object");
+    let lanes = |method: usize, width: usize| {
+        let of = &json["methods"][method]["lanes"][width];
+        (of["busy"].as_f64().expect("a share"), of["longest"].as_u64().expect("samples"))
+    };
+    for width in [0, 1] {
+        let (full, dpm) = (lanes(0, width), lanes(1, width));
+        assert!(full.0 > 0.9 && full.0 <= 1.0 && full.1 == 4, "{json:#}");
+        assert!(dpm.0 > 0.05 && dpm.0 < full.0 && dpm.1 > 4, "{json:#}");
+    }
+    let rows = json["modelled_not_measured"].as_array().expect("a list");
+    assert_eq!(rows.len(), 8, "four cards, two methods");
+    for row in rows {
+        let of = |name: &str| row[name].as_f64().expect("milliseconds");
+        let sum =
+            row["trace_ms"][0].as_f64().unwrap() + of("screen_ms") + of("barriers_ms") + of("readback_ms");
+        assert!((row["frame_ms"][0].as_f64().unwrap() - sum).abs() < 1e-9, "{row}");
+    }
+    let text = dpm(
+        &[&["bench", "--model", "--count", "3", "--raster", "48x32", "--method", "full"][..]].concat(),
+        &[],
+    );
+    assert!(out(&text).contains("computed, not measured"), "{}", out(&text));
+}

@@ -4,8 +4,10 @@ use super::median::{median, median_ms};
 use super::sequence::{draw, poses_at};
 use super::stamp::Stamp;
 use crate::error::plan::switched_method_of;
+use crate::gpu_model::{modelled, FrameWork, Modelled};
+use crate::lanes::{Lanes, WIDTHS};
 use dpm_render::gpu::Gpu;
-use dpm_render::{FrameCost, RenderError, Renderer, RendererSettings, PASSES};
+use dpm_render::{traffic, FrameCost, Keep, Output, RenderError, Renderer, RendererSettings, PASSES};
 use dpm_rig::config::RenderMethod;
 use dpm_rig::pipeline::{output, renderer_settings};
 use dpm_rig::rig::Rig;
@@ -51,6 +53,9 @@ pub struct MethodCost {
     pub samples_per_frame: f64,
     /// Pixels that the frame lights.
     pub lit_pixels: f64,
+    /// What a GPU would have to do, of which one frame after the others was counted.
+    #[serde(flatten)]
+    pub work: FrameWork,
     /// GPU time of a frame, all passes, ms; `None` without time stamps.
     pub gpu_ms: Option<f64>,
     /// From recording to the end of waiting, ms.
@@ -72,6 +77,8 @@ pub struct BenchReport {
     pub spp: u32,
     /// One a method.
     pub methods: Vec<MethodCost>,
+    /// What frames with these counts might take on GPUs that are not there; never measured.
+    pub modelled_not_measured: Vec<Modelled>,
 }
 
 /// Draws up to `frames` frames with every method of `only` (all when it is empty), with the switches of the rig file. `each` is told about
@@ -92,7 +99,10 @@ pub fn bench(
         each(&cost);
         methods.push(cost);
     }
-    Ok(BenchReport { stamp: Stamp::new(rig, gpu.summary()), spp: rig.config.render.spp, methods })
+    let counts = methods.iter().map(|m| (m.method, m.rays_per_frame, &m.work));
+    let modelled_not_measured = modelled(counts);
+    let (stamp, spp) = (Stamp::new(rig, gpu.summary()), rig.config.render.spp);
+    Ok(BenchReport { stamp, spp, methods, modelled_not_measured })
 }
 
 fn measure(rig: &Rig, gpu: &Arc<Gpu>, frames: u32, which: RenderMethod) -> Result<MethodCost, RenderError> {
@@ -115,6 +125,7 @@ fn measure(rig: &Rig, gpu: &Arc<Gpu>, frames: u32, which: RenderMethod) -> Resul
             }
         }
     }
+    let work = count_work(rig, &mut renderer, (costs.len() as u32 + WARM_UP, which))?;
     let n = costs.len() as f64;
     let mean = |of: &dyn Fn(&FrameCost) -> u64| costs.iter().map(of).sum::<u64>() as f64 / n;
     let rays_per_frame = mean(&|c| u64::from(c.counters().rays));
@@ -133,10 +144,37 @@ fn measure(rig: &Rig, gpu: &Arc<Gpu>, frames: u32, which: RenderMethod) -> Resul
         rays_per_frame,
         samples_per_frame,
         lit_pixels: mean(&|c| u64::from(c.counters().lit_pixels)),
+        work,
         gpu_ms,
         wall_ms,
         rays_per_s: rays_per_frame / seconds,
         samples_per_s: samples_per_frame / seconds,
         passes: if gpu_ms.is_some() { passes.collect() } else { Vec::new() },
     })
+}
+
+/// Draws one more frame and counts its work. Its time does not count.
+fn count_work(
+    rig: &Rig,
+    renderer: &mut Renderer,
+    (frame, which): (u32, RenderMethod),
+) -> Result<FrameWork, RenderError> {
+    let spp = rig.config.render.spp;
+    let mut slot = renderer.create_slot(true)?;
+    draw(rig, renderer, &mut slot, &poses_at(rig, u64::from(frame)), frame, spp, spp as f32)?;
+    let items = slot.work().unwrap_or(&[]);
+    let traffic = traffic(&settings_of_planes(rig, which), Keep::default());
+    Ok(FrameWork {
+        lanes: WIDTHS.iter().filter_map(|width| Lanes::of(items, *width)).collect(),
+        listed_pixels: slot.listed_pixels(),
+        bytes_per_pixel: traffic.iter().map(|t| t.read + t.written).sum(),
+        recorded_passes: traffic.len() as u32,
+        readback_bytes: (rig.camera.raster.plane_bytes() * rig.schedule.len()) as u64,
+    })
+}
+
+/// The settings by which a GPU would draw: it packs the planes itself, whatever this machine does.
+fn settings_of_planes(rig: &Rig, which: RenderMethod) -> RendererSettings {
+    let method = switched_method_of(&rig.config.render, which);
+    RendererSettings { method, output: Output::Planes(rig.schedule), ..renderer_settings(rig) }
 }

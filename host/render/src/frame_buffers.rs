@@ -64,6 +64,8 @@ pub(super) struct DebugBuffers {
     pub prior: Option<Buffer>,
     pub traced: Buffer,
     pub rates: Buffer,
+    pub schedule: Buffer,
+    pub work: Buffer,
     /// `None` unless planes follow.
     pub motion: Option<Buffer>,
 }
@@ -233,6 +235,8 @@ impl DebugBuffers {
             prior: kept("prior history", each.history)?,
             traced: size("radiance", pixels * each.radiance)?,
             rates: size("shading rates", tiles * 4)?,
+            schedule: size("schedule", size_of::<Schedule>())?,
+            work: size("work list", pixels * each.work)?,
             motion: kept("motion of surfaces", each.motion)?,
         })
     }

@@ -238,6 +238,8 @@ impl Renderer {
             }
             r.copy(&b.radiance, &d.traced, pixels * b.each.radiance);
             r.copy(&shared.rates, &d.rates, tiles * 4);
+            r.copy(&b.schedule, &d.schedule, size_of::<Schedule>());
+            r.copy(&b.work, &d.work, pixels * b.each.work);
             if let Some(to) = &d.motion {
                 r.copy(&b.motion, to, pixels * b.each.motion);
             }

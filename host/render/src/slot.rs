@@ -3,10 +3,10 @@
 use super::frame_buffers::FrameBuffers;
 use super::passes::PASSES;
 use super::resources::Resources;
-use super::tiles::TileList;
+use super::tiles::{TileList, TILE};
 use crate::gpu::{BindingSet, CommandList, FrameFence, GpuError, Place};
 use dpm_device::planes::Raster;
-use dpm_shaders::structs::{Counters, Guide, History, Moved, Surface};
+use dpm_shaders::structs::{Counters, Guide, History, Moved, Schedule, Surface, WorkItem};
 use std::sync::Arc;
 
 /// What a frame cost.
@@ -133,6 +133,19 @@ impl FrameSlot {
     /// Mean of the samples of each pixel in this frame, and their number as the fourth value. Only with `debug` at creation.
     pub fn traced(&self) -> Option<&[[f32; 4]]> {
         self.buffers.debug_host.as_ref().map(|d| d.traced.read(self.raster.pixel_count()))
+    }
+
+    /// The work items of the pass `trace`, in the order in which its threads took them. Only with `debug` at creation.
+    pub fn work(&self) -> Option<&[WorkItem]> {
+        let debug = self.buffers.debug_host.as_ref()?;
+        let items = debug.schedule.read::<Schedule>(1)[0].items as usize;
+        Some(debug.work.read(items.min(self.raster.pixel_count())))
+    }
+
+    /// Pixels of the tiles that the frame worked on.
+    pub fn listed_pixels(&self) -> u64 {
+        let tiles = self.tile_list.active().iter().filter(|is_active| **is_active).count();
+        tiles as u64 * u64::from(TILE * TILE)
     }
 
     /// How the surface of each pixel moves while the planes last, as [`crate::warp::gather`] reads it; of use only in tiles on which the light of

@@ -3,6 +3,7 @@
 use super::rig_args::RigArgs;
 use super::watch::{check_out, print, write_out};
 use dpm_lab::bench::{bench, MethodCost, METHODS};
+use dpm_lab::gpu_model;
 use dpm_rig::config::RenderMethod;
 use dpm_rig::failure::Failure;
 use dpm_rig::pipeline::PipelineError;
@@ -25,6 +26,10 @@ pub(crate) struct BenchArgs {
     /// Measure only this method; may be given several times
     #[arg(long, value_name = "NAME", value_parser = METHODS.map(RenderMethod::word))]
     method: Vec<String>,
+    /// Also print what frames with these counts might take on GPUs that are not there, computed from published and
+    /// estimated rates, term by term
+    #[arg(long)]
+    model: bool,
     /// Print one JSON object
     #[arg(long)]
     json: bool,
@@ -43,6 +48,11 @@ fn lines(c: &MethodCost) -> String {
     );
     let told: Vec<String> =
         c.passes.iter().filter(|p| p.ms > 0.0).map(|p| format!("{} {:.3}", p.pass, p.ms)).collect();
+    let lanes: Vec<String> =
+        c.work.lanes.iter().map(|l| format!("{:.0} % of {} lanes busy", 100.0 * l.busy, l.width)).collect();
+    if let Some(longest) = c.work.lanes.iter().map(|l| l.longest).max() {
+        text += &format!("          {}, at most {longest} samples a thread\n", lanes.join(", "));
+    }
     if !told.is_empty() {
         text += &format!("          ms by pass: {}\n", told.join(", "));
     }
@@ -80,6 +90,8 @@ pub(super) fn execute(args: &BenchArgs) -> Result<(), Failure> {
     .map_err(PipelineError::from)?;
     if args.json {
         print(&(to_json(&report) + "\n"));
+    } else if args.model {
+        print(&gpu_model::table(&report.modelled_not_measured));
     }
     write_out(args.flags.out.as_deref(), "bench.json", &report)
 }
