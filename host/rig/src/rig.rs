@@ -181,6 +181,18 @@ impl Rig {
         let (fitted, told) = environment(config, has_lights)?.unwrap_or(scene.environment).fitted();
         scene.environment = fitted;
         scene.warnings.extend(told.map(|t| format!("scene.environment: {t}")));
+        Self::around(scene, config, raster)
+    }
+
+    /// The same scene with everything else as another configuration says.
+    ///
+    /// # Errors
+    /// A part cannot be built. The error names its key.
+    pub fn with_config(self, config: &RigConfig) -> Result<Self, RigError> {
+        Self::around(self.scene, config, Some(self.camera.raster))
+    }
+
+    fn around(mut scene: Scene, config: &RigConfig, raster: Option<Raster>) -> Result<Self, RigError> {
         let raster = raster.unwrap_or_else(|| config.projector.raster());
         let measured = measured(config)?;
         let camera = match &measured.projector {

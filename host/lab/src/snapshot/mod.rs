@@ -2,28 +2,34 @@
 //!
 //! True poses, no tracker and no link: frame N is drawn after the N frames before it, so histories are what they are in a run.
 
+mod fit;
 pub(crate) mod glyphs;
 pub mod paint;
 pub mod views;
 
+pub use fit::{FittedView, SnapshotView};
+
 use super::sequence::{draw, poses_at};
 use dpm_common::files::{check_folder, write_atomically};
 use dpm_device::time::HostTime;
+use dpm_render::gpu::Gpu;
+use dpm_render::method::Method;
 use dpm_render::{FrameSlot, Keep, RenderError, Renderer, RendererSettings};
-use dpm_rig::config::RigConfig;
+use dpm_rig::config::{BodyConfig, MotionValue, RenderConfig, RigConfig};
 use dpm_rig::failure::{Failure, FailureKind};
 use dpm_rig::light::recorder::LightFrame;
 use dpm_rig::pictures::pictures;
 use dpm_rig::pipeline::{renderer_settings, PipelineError};
 use dpm_rig::rig::Rig;
 use dpm_rig::run_rig::{open_gpu, traced_raster};
-use glam::Vec3;
+use glam::{DAffine3, Vec3};
 use paint::Canvas;
 use serde::Serialize;
 use std::collections::VecDeque;
 use std::io::Write;
 use std::path::{Path, PathBuf};
-use views::{missing, srgb_canvas, tile_errors, Views};
+use std::sync::Arc;
+use views::{missing, scale_to_white, srgb_canvas, tile_errors, Views};
 
 /// A frame that comes later takes too long to reach; histories have settled long before.
 pub(crate) const MAX_FRAME: u32 = 100_000;
@@ -86,6 +92,19 @@ impl SnapshotImage {
     }
 }
 
+/// What to make pictures of.
+#[derive(Clone, Debug, Default)]
+pub struct SnapshotRequest {
+    /// Number of the frame; those before it are drawn, too.
+    pub frame: u32,
+    /// Pictures; empty: all that the method has.
+    pub what: Vec<SnapshotImage>,
+    /// From where.
+    pub view: SnapshotView,
+    /// Bodies stand still unless the rig file lists them: where nobody has said how an asset moves, it does not.
+    pub still: bool,
+}
+
 /// A picture that was not made.
 #[derive(Clone, Debug, Serialize)]
 pub struct NotMade {
@@ -108,6 +127,8 @@ pub struct SnapshotReport {
     pub files: Vec<PathBuf>,
     /// What this rig has no picture of.
     pub not_made: Vec<NotMade>,
+    /// The view, where it was fitted to the bodies instead of taken from the rig.
+    pub view: Option<FittedView>,
     /// What differs from a run on the rig.
     pub warnings: Vec<String>,
 }
@@ -116,80 +137,152 @@ fn gpu_failure(error: impl Into<RenderError>) -> Failure {
     PipelineError::Render(error.into()).into()
 }
 
-/// Plays frames 0 to `frame` and writes the pictures `what` of the last (all there are, when empty) into `dir`.
+/// Plays the frames up to that of `request` and writes the pictures of the last into `dir`.
 ///
 /// # Errors
-/// Bad scene or numbers or a picture asked for that the rig's method does not compute (exit code 2), no GPU (4).
+/// Bad scene or numbers, a picture asked for that the rig's method does not compute, no body to fit the view to (exit code 2), no
+/// GPU (4).
 pub fn snapshot(
     config: &RigConfig,
-    frame: u32,
-    what: &[SnapshotImage],
+    request: &SnapshotRequest,
     dir: &Path,
 ) -> Result<SnapshotReport, Failure> {
-    let bad = |text: String| Failure::new(FailureKind::BadInput, text);
-    if frame > MAX_FRAME {
-        return Err(bad(format!("--frame {frame}: at most {MAX_FRAME}")));
-    }
-    let method = config.render.to_method();
-    let name = config.render.method.word().to_owned();
-    for &image in what {
-        if let Some(why) = missing(image, &method) {
-            return Err(bad(format!("--what {}: method {name}: {why}", image.name())));
-        }
-    }
-    check_folder(dir).map_err(|e| bad(format!("{e}; choose another folder with --out")))?;
+    check(config, request, dir)?;
     let gpu = open_gpu(config)?;
     let mut warnings = Vec::new();
     let raster = traced_raster(config, &gpu, &mut warnings);
-    let rig = Rig::build(config, raster)?;
+    let (rig, view) = stage(Rig::build(config, raster)?, request, &gpu)?;
     warnings.extend(rig.scene.warnings.iter().cloned());
-    let raster = rig.camera.raster;
-    // What surfaces are like is of interest out of the light too.
-    let keep = Keep { every_pixel: true, ..Keep::default() };
-    // The views show code values, whatever the planes make of them.
-    let settings = RendererSettings { halftone: None, plane_groups: Vec::new(), ..renderer_settings(&rig) };
-    let mut renderer = Renderer::keeping(&gpu, &rig.scene, settings, keep).map_err(gpu_failure)?;
-    let mut slot = renderer.create_slot(true).map_err(gpu_failure)?;
+    let mut player = Player::new(&rig, &gpu)?;
+    let what = &request.what;
     let wanted: Vec<_> =
         SnapshotImage::ALL.into_iter().filter(|i| what.is_empty() || what.contains(i)).collect();
-    let window = (config.light_window_ms() * 1e-3 * rig.rate().hz()).round().max(1.0) as usize;
-    let window = if wanted.contains(&SnapshotImage::Viewer) { window } else { 0 };
-    let mut light = VecDeque::new();
-    let (mut poses, mut errors) = (Vec::new(), Vec::new());
-    for k in 0..=frame {
-        poses = poses_at(&rig, u64::from(k));
-        draw(&rig, &mut renderer, &mut slot, &poses, k, config.render.spp, config.render.spp as f32)
-            .map_err(gpu_failure)?;
-        // Rates are decided in every second frame.
-        if method.needs_rates() && k % 2 == 0 && k + 2 > frame {
-            errors = tile_errors(raster, &method, &slot);
-        }
-        if (frame - k) as usize >= window {
-            continue;
-        }
-        light.push_back(light_frame(&rig, k, &slot));
-    }
+    player.play(request.frame, wanted.contains(&SnapshotImage::Viewer))?;
+    let raster = rig.camera.raster;
     let mut report = SnapshotReport {
-        method: name,
-        frame,
+        method: rig.config.render.method.word().to_owned(),
+        frame: request.frame,
         raster: [raster.width(), raster.height()],
         files: Vec::new(),
         not_made: Vec::new(),
+        view,
         warnings,
     };
-    let views = Views {
-        raster,
-        method: &method,
-        slot: &slot,
-        renderer: &renderer,
-        poses: &poses,
-        tile_errors: &errors,
-    };
     for image in wanted {
-        let canvas = match missing(image, &method) {
+        player.save(image, dir, &mut report)?;
+    }
+    Ok(report)
+}
+
+/// Refuses what can be refused before the GPU is opened.
+fn check(config: &RigConfig, request: &SnapshotRequest, dir: &Path) -> Result<(), Failure> {
+    let bad = |text: String| Failure::new(FailureKind::BadInput, text);
+    if request.frame > MAX_FRAME {
+        return Err(bad(format!("--frame {}: at most {MAX_FRAME}", request.frame)));
+    }
+    let method = config.render.to_method();
+    for &image in &request.what {
+        if let Some(why) = missing(image, &method) {
+            let name = config.render.method.word();
+            return Err(bad(format!("--what {}: method {name}: {why}", image.name())));
+        }
+    }
+    check_folder(dir).map_err(|e| bad(format!("{e}; choose another folder with --out")))
+}
+
+/// The rig with its bodies standing still and its view fitted, where `request` asks for that.
+fn stage(
+    mut rig: Rig,
+    request: &SnapshotRequest,
+    gpu: &Arc<Gpu>,
+) -> Result<(Rig, Option<FittedView>), Failure> {
+    if request.still && rig.config.scene.bodies.is_empty() {
+        let body = |name: &str| BodyConfig {
+            name: name.to_owned(),
+            motion: MotionValue::still(),
+            ..BodyConfig::default()
+        };
+        let mut config = rig.config.clone();
+        config.scene.bodies = rig.bodies.iter().map(|b| body(&b.name)).collect();
+        rig = rig.with_config(&config)?;
+    }
+    if !request.view.is_fitted(&rig.config) {
+        return Ok((rig, None));
+    }
+    let poses = poses_at(&rig, u64::from(request.frame));
+    let Some(mut view) = FittedView::new(&rig.config, &rig.scene, &poses, rig.camera.raster) else {
+        let text = "the scene has no surface that light is projected on, so no view shows it (objects that emit light \
+                    everywhere are taken for lamps); name the object in scene.bodies of a rig file, or give --view rig";
+        return Err(Failure::new(FailureKind::BadInput, text));
+    };
+    let config = view.applied_to(&rig.config, request.view);
+    rig = rig.with_config(&config)?;
+    if config.render.exposure == RenderConfig::default().exposure {
+        view.exposure = fit::exposure(&rig, gpu, &poses).map_err(gpu_failure)?;
+        let config = view.applied_to(&config, request.view);
+        rig = rig.with_config(&config)?;
+    }
+    Ok((rig, Some(view)))
+}
+
+/// Draws the frames, and keeps what the pictures of the last are made from.
+struct Player<'a> {
+    rig: &'a Rig,
+    gpu: &'a Arc<Gpu>,
+    method: Method,
+    renderer: Renderer,
+    slot: FrameSlot,
+    /// world-from-body of the last frame.
+    poses: Vec<DAffine3>,
+    /// See [`tile_errors`].
+    errors: Vec<Option<f32>>,
+    /// Of the last frames, as many as an eye integrates.
+    light: VecDeque<LightFrame>,
+}
+
+impl<'a> Player<'a> {
+    fn new(rig: &'a Rig, gpu: &'a Arc<Gpu>) -> Result<Self, Failure> {
+        // What surfaces are like is of interest out of the light too.
+        let keep = Keep { every_pixel: true, ..Keep::default() };
+        // The views show code values, whatever the planes make of them.
+        let settings =
+            RendererSettings { halftone: None, plane_groups: Vec::new(), ..renderer_settings(rig) };
+        let renderer = Renderer::keeping(gpu, &rig.scene, settings, keep).map_err(gpu_failure)?;
+        let slot = renderer.create_slot(true).map_err(gpu_failure)?;
+        let method = rig.config.render.to_method();
+        let (poses, errors, light) = (Vec::new(), Vec::new(), VecDeque::new());
+        Ok(Self { rig, gpu, method, renderer, slot, poses, errors, light })
+    }
+
+    /// Draws frames 0 to `frame`. `keeps_light`: the light of the last ones will be asked for.
+    fn play(&mut self, frame: u32, keeps_light: bool) -> Result<(), Failure> {
+        let (rig, config) = (self.rig, &self.rig.config);
+        let window = (config.light_window_ms() * 1e-3 * rig.rate().hz()).round().max(1.0) as usize;
+        let spp = config.render.spp;
+        for k in 0..=frame {
+            self.poses = poses_at(rig, u64::from(k));
+            draw(rig, &mut self.renderer, &mut self.slot, &self.poses, k, spp, spp as f32)
+                .map_err(gpu_failure)?;
+            // Rates are decided in every second frame.
+            if self.method.needs_rates() && k % 2 == 0 && k + 2 > frame {
+                self.errors = tile_errors(rig.camera.raster, &self.method, &self.slot);
+            }
+            if keeps_light && ((frame - k) as usize) < window {
+                self.light.push_back(light_frame(rig, k, &self.slot));
+            }
+        }
+        Ok(())
+    }
+
+    /// Writes a picture, with what belongs to it, into `dir`.
+    fn save(&mut self, image: SnapshotImage, dir: &Path, report: &mut SnapshotReport) -> Result<(), Failure> {
+        let is_fitted = report.view.is_some();
+        let canvas = match missing(image, &self.method) {
             Some(why) => Err(why.to_owned()),
-            None if image == SnapshotImage::Viewer => viewer(&rig, &gpu, light.make_contiguous())?,
-            None => Ok(views.paint(image)),
+            None if image == SnapshotImage::Viewer => {
+                viewer(self.rig, self.gpu, self.light.make_contiguous(), is_fitted)?
+            }
+            None => Ok(self.views(is_fitted).paint(image)),
         };
         match canvas {
             Ok(canvas) => report.files.push(save_png(&dir.join(image.name() + ".png"), &canvas)?),
@@ -197,12 +290,25 @@ pub fn snapshot(
         }
         if image == SnapshotImage::Radiance {
             let path = dir.join("radiance.pfm");
-            let bytes = pfm(&views.radiance(), raster.width() as usize);
-            write_atomically(&path, |out| out.write_all(&bytes)).map_err(|e| bad(e.to_string()))?;
+            let bytes = pfm(&self.views(is_fitted).radiance(), self.rig.camera.raster.width() as usize);
+            write_atomically(&path, |out| out.write_all(&bytes))
+                .map_err(|e| Failure::new(FailureKind::BadInput, e.to_string()))?;
             report.files.push(path);
         }
+        Ok(())
     }
-    Ok(report)
+
+    fn views(&self, is_fitted: bool) -> Views<'_> {
+        Views {
+            raster: self.rig.camera.raster,
+            method: &self.method,
+            slot: &self.slot,
+            renderer: &self.renderer,
+            poses: &self.poses,
+            tile_errors: &self.errors,
+            exposure: is_fitted.then_some(self.rig.config.render.exposure as f32),
+        }
+    }
 }
 
 fn light_frame(rig: &Rig, frame: u32, slot: &FrameSlot) -> LightFrame {
@@ -214,17 +320,18 @@ fn light_frame(rig: &Rig, frame: u32, slot: &FrameSlot) -> LightFrame {
     LightFrame { frame, first_photon_at, codes: codes.collect() }
 }
 
-/// What the eye saw, or why nothing can be said about it.
+/// What the eye saw, or why nothing can be said about it. `is_exposed`: white is radiance 1, else the greatest where that is more.
 fn viewer(
     rig: &Rig,
-    gpu: &std::sync::Arc<dpm_render::gpu::Gpu>,
+    gpu: &Arc<Gpu>,
     light: &[LightFrame],
+    is_exposed: bool,
 ) -> Result<Result<Canvas, String>, Failure> {
     let made = pictures(rig, gpu, light, &[]).map_err(gpu_failure)?;
     Ok(match made.viewer {
         Ok(viewer) => {
-            let white = viewer.iter().fold(0.0f32, |m, v| m.max(v.max_element())).max(1e-9);
-            Ok(srgb_canvas(rig.camera.raster, &viewer, (1.0 / white).min(1.0)))
+            let scale = if is_exposed { 1.0 } else { scale_to_white(&viewer) };
+            Ok(srgb_canvas(rig.camera.raster, &viewer, scale))
         }
         Err(_) => {
             Err("only a mock tracker knows the true motion, which an eye follows; --simulate puts one in"

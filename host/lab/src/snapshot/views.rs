@@ -27,6 +27,8 @@ pub(crate) struct Views<'a> {
     pub poses: &'a [DAffine3],
     /// Error of every tile when rates were last decided, see [`tile_errors`].
     pub tile_errors: &'a [Option<f32>],
+    /// Factor from radiance to what is shown, of which 1 is white; `None`: 1, or less where that is too bright.
+    pub exposure: Option<f32>,
 }
 
 /// What [`SnapshotImage`] needs that `method` does not compute; `None`: nothing is missing.
@@ -82,8 +84,8 @@ impl Views<'_> {
         match image {
             I::Radiance | I::Viewer => {
                 let linear = self.radiance();
-                let white = linear.iter().fold(0.0f32, |m, v| m.max(v.max_element())).max(1e-9);
-                srgb_canvas(raster, &linear, (1.0 / white).min(1.0))
+                let scale = self.exposure.unwrap_or_else(|| scale_to_white(&linear));
+                srgb_canvas(raster, &linear, scale)
             }
             I::Rate => {
                 paint::kinds(raster, &self.rates(), &RATES, "rate of a tile\n(pixels x, y\nshare a ray)")
@@ -236,6 +238,12 @@ fn half_to_f32(bits: u16) -> f32 {
     } else {
         magnitude
     }
+}
+
+/// The factor, 1 at most, with which nothing is brighter than white.
+pub(crate) fn scale_to_white(linear: &[Vec3]) -> f32 {
+    let greatest = linear.iter().fold(0.0f32, |m, v| m.max(v.max_element())).max(1e-9);
+    (1.0 / greatest).min(1.0)
 }
 
 /// Linear colours as an sRGB picture.

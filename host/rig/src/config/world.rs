@@ -396,6 +396,13 @@ impl BodyConfig {
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct MotionValue(pub Option<toml::Table>);
 
+impl MotionValue {
+    /// The body does not move.
+    pub fn still() -> Self {
+        Self(Some(toml::Table::from_iter([("kind".to_owned(), "still".into())])))
+    }
+}
+
 impl ConfigValue for MotionValue {
     fn kind() -> String {
         "a table".into()
