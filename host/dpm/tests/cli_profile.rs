@@ -68,7 +68,15 @@ fn without_rendering_every_slot_is_accounted_for_and_no_frame_is_torn() {
         assert!(json["stages_ms"][stage]["p999"].is_f64(), "{stage} in {json}");
         assert_eq!(json["profile"]["intervals_ms"][stage]["count"], lit, "{stage}");
     }
-    for name in ["profile.json", "profile.hlog", "trace.json", "work.svg", "waits.svg", "latency.svg"] {
+    for name in [
+        "profile.json",
+        "profile.hlog",
+        "trace.json",
+        "work.svg",
+        "waits.svg",
+        "latency.svg",
+        "histogram.svg",
+    ] {
         assert!(std::fs::metadata(folder.path(name)).is_ok_and(|m| m.len() > 0), "{name}");
     }
     let trace = std::fs::read_to_string(folder.path("trace.json")).expect("trace.json");

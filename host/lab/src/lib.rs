@@ -26,6 +26,7 @@ pub mod offline;
 pub mod plan_savings;
 pub mod profile;
 pub mod reference;
+pub mod report;
 pub mod scene_plan;
 pub mod sequence;
 pub mod snapshot;

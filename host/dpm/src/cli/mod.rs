@@ -20,6 +20,7 @@ mod plan;
 mod profile;
 mod progress;
 mod record;
+mod report;
 mod rig_args;
 pub mod run;
 mod set;
@@ -97,6 +98,8 @@ enum Command {
     Doctor(doctor::DoctorArgs),
     /// Run stiff and extreme cases: measured error against bound, with the oracle of each
     Stability(stability::StabilityArgs),
+    /// Write what a run or a measurement left in a folder as one HTML file, and its tables as CSV
+    Report(report::ReportArgs),
     /// Write pictures of everything that one frame was made from: rates, errors, samples, history, motion, light
     Snapshot(snapshot::SnapshotArgs),
     /// Measure rays, samples and milliseconds per pass of every method on this device
@@ -184,6 +187,7 @@ fn dispatch(command: &Command) -> Result<(), Failure> {
         Command::Profile(args) => profile::execute(args),
         Command::Doctor(args) => doctor::execute(args),
         Command::Stability(args) => stability::execute(args),
+        Command::Report(args) => report::execute(args),
         Command::Snapshot(args) => snapshot::execute(args),
         Command::Bench(args) => bench::execute(args),
         Command::Error(args) => error::execute(args),

@@ -1,9 +1,11 @@
 //! `dpm profile`: a rig at its true rate into distributions, logs, trace and plots.
 
 pub mod compare;
+mod histogram;
 pub mod plots;
 mod v2log;
 
+use self::histogram::latency_histogram;
 use self::plots::percentiles;
 use self::v2log::write_v2_log;
 use dpm_common::files::write_atomically;
@@ -115,6 +117,9 @@ fn save(profile: &mut Profile, outcome: &RunOutcome, dir: &Path) -> Result<(), F
             percentiles(&outcome.profiler, kind, &made).map_err(|e| cannot_write(&dir.join(name), &e))?;
         put(name, &mut |out| out.write_all(svg.as_bytes()))?;
     }
+    let path = dir.join("histogram.svg");
+    let svg = latency_histogram(&outcome.profiler, &made).map_err(|e| cannot_write(&path, &e))?;
+    put("histogram.svg", &mut |out| out.write_all(svg.as_bytes()))?;
     let text = to_json(&profile.profile);
     put("profile.json", &mut |out| out.write_all(text.as_bytes()))
 }
@@ -137,7 +142,7 @@ fn made(report: &Report, now: SystemTime) -> String {
 }
 
 /// Days since 1970-01-01 as a date of the Gregorian calendar, UTC.
-fn civil(days: u64) -> (u64, u64, u64) {
+pub(crate) fn civil(days: u64) -> (u64, u64, u64) {
     // Counted from 0000-03-01, so that a leap day is the last of its year, in cycles of 400 years of 146,097 days [Hinnant].
     let z = days + 719_468;
     let (era, of_era) = (z / 146_097, z % 146_097);

@@ -51,7 +51,7 @@ const KEY_WIDTH: u32 = 190;
 /// Room for the titles above a chart, pixels.
 const TITLE_HEIGHT: u32 = 44;
 /// Colour of the line at the length of a slot.
-const SLOT_LINE: RGBColor = RGBColor(120, 120, 120);
+pub(super) const SLOT_LINE: RGBColor = RGBColor(120, 120, 120);
 
 /// Names of curves with a piece of each, below each other beside the chart, where they cover none of it. Returns what is left for the chart.
 ///
@@ -77,6 +77,21 @@ pub fn key<B: DrawingBackend>(
         beside.draw_text(name, &font, (36, y))?;
     }
     Ok(chart)
+}
+
+/// Writes two lines above a plot; returns what is left below them.
+///
+/// # Errors
+/// What the drawing library says.
+pub(super) fn titled<B: DrawingBackend>(
+    root: &DrawingArea<B, Shift>,
+    titles: &[String; 2],
+) -> Result<DrawingArea<B, Shift>, DrawingAreaErrorKind<B::ErrorType>> {
+    let (_, below) = root.split_vertically(TITLE_HEIGHT);
+    for (i, (title, size)) in titles.iter().zip([16, 12]).enumerate() {
+        root.draw_text(title, &("sans-serif", size).into_text_style(root), (24, 6 + 22 * i as i32))?;
+    }
+    Ok(below)
 }
 
 /// Latency against percentile for every interval of a kind, with the axis stretched towards the rare: one decade per nine. `made` says
@@ -123,10 +138,7 @@ fn draw(
     {
         let root = SVGBackend::with_string(&mut text, SIZE).into_drawing_area();
         root.fill(&WHITE)?;
-        let (_, below) = root.split_vertically(TITLE_HEIGHT);
-        for (i, (title, size)) in titles.iter().zip([16, 12]).enumerate() {
-            root.draw_text(title, &("sans-serif", size).into_text_style(&root), (24, 6 + 22 * i as i32))?;
-        }
+        let below = titled(&root, titles)?;
         let mut named: Vec<(&str, RGBColor, Stroke)> = curves
             .iter()
             .enumerate()
