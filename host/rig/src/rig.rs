@@ -177,7 +177,7 @@ impl Rig {
     pub fn build(config: &RigConfig, raster: Option<Raster>) -> Result<Self, RigError> {
         let mut scene = load_scene(config)?;
         let features = SceneFeatures::of(&scene);
-        let has_lights = features.emissive_triangles + features.punctual_lights > 0;
+        let has_lights = features.lamp_triangles + features.punctual_lights > 0;
         let (fitted, told) = environment(config, has_lights)?.unwrap_or(scene.environment).fitted();
         scene.environment = fitted;
         scene.warnings.extend(told.map(|t| format!("scene.environment: {t}")));

@@ -1,4 +1,6 @@
-//! Reads a latitude-longitude image file (PFM, Radiance RGBE, PNG, JPEG) as an [`Environment`].
+//! Reads a latitude-longitude image file (PFM, Radiance RGBE, OpenEXR, PNG, JPEG) as an [`Environment`].
+
+mod exr_picture;
 
 use std::path::Path;
 
@@ -10,6 +12,7 @@ use super::limits::Limits;
 use super::load::contained;
 use super::srgb::to_linear;
 use super::{Environment, SceneError};
+use exr_picture::read_exr;
 
 /// Maximum number of texels of an environment: 8192 x 4096.
 const MAX_TEXELS: u64 = 1 << 25;
@@ -17,8 +20,8 @@ const MAX_TEXELS: u64 = 1 << 25;
 /// Radiance beyond this counts as damage; the sun's disc is near 10^5 times the sky.
 const MAX_RADIANCE: f32 = 1.0e9;
 
-/// Reads an environment image: `.pfm` (linear, "PF" or "Pf"), Radiance `.hdr` (linear), PNG or JPEG (sRGB, decoded to
-/// linear); the first bytes identify the format. Row 0 is up; the middle column looks along -Z turned by `rotation_rad`
+/// Reads an environment image: `.pfm` (linear, "PF" or "Pf"), Radiance `.hdr` (linear), OpenEXR (linear), PNG or JPEG
+/// (sRGB, decoded to linear); the first bytes identify the format. Row 0 is up; the middle column looks along -Z turned by `rotation_rad`
 /// about +Y. Texels are multiplied by `scale`.
 ///
 /// # Errors
@@ -123,12 +126,13 @@ pub fn decode_environment(bytes: &[u8], rotation_rad: f32, scale: f32) -> Result
     let (width, height, mut texels) = match bytes {
         [b'P', b'F' | b'f', ..] => read_pfm(bytes)?,
         [b'#', b'?', ..] => read_rgbe(bytes)?,
+        [0x76, 0x2f, 0x31, 0x01, ..] => read_exr(bytes)?,
         [0x89, b'P', b'N', b'G', ..] => read_srgb(bytes, ImageFormat::Png)?,
         [0xff, 0xd8, ..] => read_srgb(bytes, ImageFormat::Jpeg)?,
         _ => {
             return Err(SceneError::unsupported(
                 "this image format",
-                "give a .pfm, a Radiance .hdr, a .png or a .jpg",
+                "give a .pfm, a Radiance .hdr, an .exr, a .png or a .jpg",
             ))
         }
     };
@@ -331,7 +335,12 @@ fn read_rgbe_row(rest: &mut &[u8], row: &mut [[u8; 4]]) -> Option<()> {
     Some(())
 }
 
-fn read_srgb(bytes: &[u8], format: ImageFormat) -> Result<Pixels, SceneError> {
+/// Decodes a picture with the sides that its header gives, which are checked first, in at most `texel_bytes` for each texel.
+fn decode_bounded(
+    bytes: &[u8],
+    format: ImageFormat,
+    texel_bytes: u64,
+) -> Result<image::DynamicImage, SceneError> {
     let reader = || ImageReader::with_format(std::io::Cursor::new(bytes), format);
     let failed = |e: image::ImageError| SceneError::broken("image", format!("cannot be decoded: {e}"));
     let (width, height) = reader().into_dimensions().map_err(failed)?;
@@ -340,15 +349,17 @@ fn read_srgb(bytes: &[u8], format: ImageFormat) -> Result<Pixels, SceneError> {
     let mut memory = image::Limits::default();
     memory.max_image_width = Some(width);
     memory.max_image_height = Some(height);
-    memory.max_alloc = Some(texels as u64 * 8 + (16 << 20));
+    memory.max_alloc = Some(texels as u64 * texel_bytes + (16 << 20));
     bounded.limits(memory);
-    let rgb = bounded.decode().map_err(failed)?.into_rgb16();
+    bounded.decode().map_err(failed)
+}
+
+fn read_srgb(bytes: &[u8], format: ImageFormat) -> Result<Pixels, SceneError> {
+    let rgb = decode_bounded(bytes, format, 8)?.into_rgb16();
     let linear = |x: u16| to_linear(f32::from(x) / 65535.0);
-    Ok((
-        width,
-        height,
-        rgb.as_raw().chunks_exact(3).map(|c| Vec3::new(linear(c[0]), linear(c[1]), linear(c[2]))).collect(),
-    ))
+    let texels = rgb.as_raw().chunks_exact(3);
+    let texels = texels.map(|c| Vec3::new(linear(c[0]), linear(c[1]), linear(c[2]))).collect();
+    Ok((rgb.width(), rgb.height(), texels))
 }
 
 #[cfg(test)]

@@ -154,6 +154,8 @@ pub struct Material {
     pub thin_walled: bool,
     /// Back faces are shaded (and emit) too.
     pub double_sided: bool,
+    /// What it emits is its base colour (KHR_materials_unlit): it is no lamp. It reflects nothing.
+    pub unlit: bool,
     /// Strength of the normal map.
     pub normal_scale: f32,
     /// sRGB base colour times alpha.
@@ -209,6 +211,7 @@ impl Default for Material {
             transmission: 0.0,
             thin_walled: true,
             double_sided: false,
+            unlit: false,
             normal_scale: 1.0,
             base_color_texture: None,
             metallic_roughness_texture: None,

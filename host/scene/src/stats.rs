@@ -11,6 +11,8 @@ pub struct SceneFeatures {
     pub triangles: usize,
     /// Triangles whose material emits.
     pub emissive_triangles: usize,
+    /// Those of them that are lamps: not those of unlit materials.
+    pub lamp_triangles: usize,
     /// Point, spot and directional lights.
     pub punctual_lights: usize,
     /// The surroundings.
@@ -74,7 +76,9 @@ impl SceneFeatures {
         };
         for (m, &triangles) in scene.materials.iter().zip(&used).filter(|(_, &n)| n > 0) {
             let transmits = m.transmission > 0.0 && m.metallic < 1.0;
-            out.emissive_triangles += if m.emissive.max_element() > 0.0 { triangles } else { 0 };
+            let emits = m.emissive.max_element() > 0.0;
+            out.emissive_triangles += if emits { triangles } else { 0 };
+            out.lamp_triangles += if emits && !m.unlit { triangles } else { 0 };
             out.normal_maps |= m.normal_texture.is_some();
             out.textures |= [
                 m.base_color_texture,

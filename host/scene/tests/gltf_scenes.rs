@@ -358,12 +358,46 @@ fn damaged_vertices_are_dropped_and_counted() {
 fn what_is_not_reproduced_is_said() {
     let glb = tetrahedra()
         .set("/materials/0/alphaMode", json!("BLEND"))
-        .set("/materials/0/extensions", json!({"KHR_materials_sheen": {}, "KHR_materials_unlit": {}}))
+        .set("/materials/0/extensions", json!({"KHR_materials_sheen": {}, "KHR_materials_clearcoat": {}}))
         .set("/animations", json!([{"channels": [], "samplers": []}]));
     let warnings = load(&glb).warnings.join("\n");
-    for words in ["alphaMode BLEND", "KHR_materials_sheen", "KHR_materials_unlit", "animations"] {
+    for words in ["alphaMode BLEND", "KHR_materials_sheen", "KHR_materials_clearcoat", "animations"] {
         assert!(warnings.contains(words), "{words} is missing in\n{warnings}");
     }
+}
+
+/// KHR_materials_unlit: the base colour is shown as it is, and nothing else of the material counts.
+#[test]
+fn unlit_materials_send_out_their_base_colour() {
+    let unlit = |glb: Glb| glb.set("/materials/0/extensions", json!({"KHR_materials_unlit": {}}));
+    let plain = unlit(tetrahedra())
+        .set("/materials/0/emissiveFactor", json!([1.0, 1.0, 1.0]))
+        .set("/materials/0/doubleSided", json!(true));
+    let scene = load(&plain);
+    let m = &scene.materials[0];
+    assert!(m.emissive.distance(Vec3::new(0.8, 0.4, 0.2)) < 1e-6, "{m:?}");
+    // Nothing is reflected: no colour, no metal, no coat.
+    assert_eq!((m.base_color, m.metallic, m.ior, m.transmission), (Vec3::ZERO, 0.0, 1.0, 0.0));
+    assert!(m.double_sided && scene.warnings.is_empty(), "{:?}", scene.warnings);
+    assert!(scene.bodies.iter().all(|b| b.projected), "a surface that is shown as it is is no lamp");
+    let features = dpm_scene::SceneFeatures::of(&scene);
+    assert_eq!((features.emissive_triangles, features.lamp_triangles), (8, 0));
+
+    let textured = load(&unlit(with_image(&png(4, 4, &[[200, 100, 50, 255]; 16]))));
+    let m = &textured.materials[0];
+    let sent = m.emissive_texture.map(|t| &textured.textures[t.texture as usize]);
+    assert!(sent.is_some_and(|t| t.srgb && t.texels[0] == [200, 100, 50, 255]), "{m:?}");
+    assert_eq!((m.base_color_texture, m.alpha_cutoff), (None, None));
+
+    let cut =
+        unlit(with_image(&png(4, 4, &[[200, 100, 50, 9]; 16]))).set("/materials/0/alphaMode", json!("MASK"));
+    let cut = load(&cut).materials[0].clone();
+    assert!(cut.base_color_texture.is_some() && cut.alpha_cutoff == Some(0.5), "{cut:?}");
+
+    let painted = load(&unlit(tetrahedra()).set("/meshes/0/primitives/0/attributes/COLOR_0", json!(0)));
+    let used = painted.bodies[0].mesh.materials[0] as usize;
+    let m = &painted.materials[used];
+    assert!(m.emissive_texture.is_some() && m.base_color_texture.is_none(), "{m:?}");
 }
 
 #[test]

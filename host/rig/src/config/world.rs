@@ -337,7 +337,7 @@ section! {
 section! {
     /// Light from a picture.
     pub struct ImageEnvironmentConfig {
-        /// PFM or Radiance .hdr (linear), PNG or JPEG (sRGB).
+        /// PFM, Radiance .hdr or OpenEXR (linear), PNG or JPEG (sRGB).
         file: PathBuf = PathBuf::new(), "", NotEmpty;
         /// Rotation about the world's Y axis, counter-clockwise from above.
         rotation_deg: f64 = 0.0, "deg", Within(-360.0, 360.0);

@@ -8,10 +8,11 @@ use super::json::{shorten, Item};
 const GREATEST_INTENSITY: f32 = 1.0e9;
 
 /// Extensions of materials that are reproduced.
-const REPRODUCED: [&str; 4] = [
+const REPRODUCED: [&str; 5] = [
     "KHR_materials_emissive_strength",
     "KHR_materials_ior",
     "KHR_materials_transmission",
+    "KHR_materials_unlit",
     "KHR_materials_volume",
 ];
 

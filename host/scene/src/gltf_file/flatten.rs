@@ -157,6 +157,7 @@ fn choose_automatically(
             .map(|p| {
                 Vec3::from(p.material().emissive_factor()).max_element() > 0.0
                     && p.material().emissive_texture().is_none()
+                    && !p.material().unlit()
             })
             .collect();
         let name = document

@@ -56,6 +56,28 @@ pub(crate) fn read_look(
     Ok(Look { materials, uv_sets, textures: reader.textures })
 }
 
+/// KHR_materials_unlit: the base colour is what the surface sends out, whatever falls on it. It reflects nothing, and nothing else
+/// of the material counts but what is cut out of it, and whether it has a back.
+fn unlit(material: Material) -> Material {
+    Material {
+        emissive: material.base_color,
+        emissive_texture: material.base_color_texture,
+        base_color: Vec3::ZERO,
+        // Its alpha cuts.
+        base_color_texture: material.base_color_texture.filter(|_| material.alpha_cutoff.is_some()),
+        metallic: 0.0,
+        roughness: 1.0,
+        // Without a coat.
+        ior: 1.0,
+        name: material.name,
+        alpha: material.alpha,
+        alpha_cutoff: material.alpha_cutoff,
+        double_sided: material.double_sided,
+        unlit: true,
+        ..Material::default()
+    }
+}
+
 struct Reader<'a> {
     document: &'a gltf::Document,
     image_items: Vec<Item<'a>>,
@@ -149,6 +171,9 @@ impl Reader<'_> {
             out.emissive_texture,
             out.transmission_texture,
         ] = references;
+        if m.unlit() {
+            out = unlit(out);
+        }
         Ok((out, uv_set))
     }
 

@@ -117,7 +117,11 @@ impl Paint {
         pairs.sort_unstable_by_key(|(_, painted)| *painted);
         for (plain, _) in pairs {
             let mut material = look.materials[plain as usize].clone();
-            material.base_color_texture = Some(made);
+            if material.unlit {
+                material.emissive_texture = Some(made);
+            } else {
+                material.base_color_texture = Some(made);
+            }
             look.materials.push(material);
         }
     }
