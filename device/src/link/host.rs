@@ -17,6 +17,7 @@ use super::message::{
 };
 use super::session::SessionNumbers;
 use super::slots::SlotClock;
+use super::tracks::Tracks;
 use crate::packet::Decoder;
 use crate::packet::{Codec, Header, Packet, MAX_CONTROL_BYTES, VERSION};
 use crate::time::{DeviceTicks, HostTime};
@@ -63,6 +64,10 @@ pub struct HostLink {
     flash: Option<FlashLimiter>,
     /// Counts the light against the limits.
     light: LightCount,
+    /// The caller wants to send tracks, if the device follows them.
+    wants_tracks: bool,
+    /// TRACKS sent in this session.
+    tracks_sent: u32,
     /// While the host keeps the projector dark because of a limit: the end of this rest, and its reason.
     rest: Option<(HostTime, DropReason)>,
     /// The last order of [`HostLink::command`] that [`HostLink::arm`] has not withdrawn.
@@ -111,6 +116,8 @@ impl HostLink {
             last_frame: None,
             flash,
             light: LightCount::new(rate, &limits),
+            wants_tracks: false,
+            tracks_sent: 0,
             rest: None,
             ordered: None,
             compactor,
@@ -132,6 +139,7 @@ impl HostLink {
         self.echo_sent_at = NEVER;
         self.echoes_sent = 0;
         self.frames_sent = 0;
+        self.tracks_sent = 0;
         self.last_frame = None;
         self.key_due = true;
         self.losses = 0;
@@ -438,8 +446,40 @@ impl HostLink {
             underrun: s.underrun,
             late_slots: s.late_slots,
             limits: s.limits,
+            tracks: self.greatest_shift().is_some(),
             epoch: self.slots.map_or(DeviceTicks(0), |c| c.epoch()),
         }
+    }
+
+    /// From the next session on, the device is asked to follow tracks if it can. Without this call no device is.
+    pub fn want_tracks(&mut self) {
+        self.wants_tracks = true;
+    }
+
+    /// By how many mirrors the device moves regions at most; `None` if it follows no tracks, or is not asked to.
+    pub fn greatest_shift(&self) -> Option<u8> {
+        self.inbox.hello?.greatest_shift.filter(|_| self.wants_tracks)
+    }
+
+    /// Sends `tracks` under the next number of this session. They are only sent while frames are, and never repeated:
+    /// newer ones follow soon.
+    ///
+    /// # Errors
+    /// The medium has no room, or has failed; nothing was sent.
+    pub fn send_tracks(
+        &mut self,
+        now: HostTime,
+        tracks: &Tracks,
+        transport: &mut dyn Transport,
+    ) -> Result<(), SendError> {
+        if self.state != LinkState::Streaming || self.verb.is_some() || self.greatest_shift().is_none() {
+            return Ok(());
+        }
+        let number = self.tracks_sent.wrapping_add(1);
+        self.control(now, &HostMessage::Tracks(tracks.numbered(number)), transport)?;
+        self.tracks_sent = number;
+        self.counters.tracks_sent += 1;
+        Ok(())
     }
 
     /// Frames that the device has room for.

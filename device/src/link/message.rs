@@ -1,18 +1,20 @@
 //! Encodes and decodes the payloads of the control messages. PLANE payloads are bits and have no structure of their
 //! own.
 //!
-//! Every payload has one fixed length (that of CONFIG grows with its planes). Another length is an error, so a wrong
+//! Every payload has one fixed length (that of CONFIG grows with its planes, that of TRACKS with its regions, and STATUS
+//! has a longer form for devices that follow tracks). Another length is an error, so a wrong
 //! build of one side is noticed at the first message. docs/PROTOCOL.md lists the bytes.
 
 mod types;
 
 use super::limits::LightLimits;
+use super::tracks::Tracks;
 use crate::packet::{u16_at, u32_at, u64_at, Header, MessageType, MAX_CONTROL_BYTES};
 use crate::planes::{PlaneSchedule, PlaneSpec, Raster, MAX_PLANES};
 use crate::time::{DeviceTicks, FrameRate};
 pub use types::{
     faults, Commit, Config, ConfigRefusal, DeviceHello, DeviceState, Echo, Fault, FaultCode, HostHello,
-    Status, Underrun, MAX_WATCHDOG_US,
+    Status, TrackCounts, Underrun, MAX_WATCHDOG_US,
 };
 
 /// Length of a CONFIG's payload before the LED codes of its planes.
@@ -68,6 +70,7 @@ pub enum HostMessage {
     /// Frames sent in this session.
     Sync(u32),
     Echo(Echo),
+    Tracks(Tracks),
     Stop,
     Black,
     Freeze,
@@ -138,6 +141,12 @@ fn write_echo(w: &mut Writer<'_>, e: &Echo) {
 
 /// Flag of CONFIG: an LED code may stand there several times.
 const CODES_REPEAT: u8 = 1;
+/// Flag of CONFIG: the host sends TRACKS, and the device follows them and says so in STATUS.
+const FOLLOWS: u8 = 2;
+/// Feature of a device in HELLO: it follows TRACKS.
+const FEATURE_TRACKS: u8 = 1;
+/// Length of a STATUS, and of one of a device that follows tracks.
+const STATUS_BYTES: [usize; 2] = [96, 120];
 
 impl Config {
     fn parse(p: &[u8]) -> Result<Self, PayloadError> {
@@ -184,6 +193,7 @@ impl Config {
             late_slots: p[18],
             epoch: DeviceTicks(u64_at(p, 24)),
             limits,
+            tracks: p[19] & FOLLOWS != 0,
         })
     }
 
@@ -191,12 +201,31 @@ impl Config {
         w.u16(self.raster.width() as u16).u16(self.raster.height() as u16);
         w.u32(self.rate.num()).u32(self.rate.den()).u32(self.watchdog_us);
         w.u8(self.schedule.len() as u8).u8(self.underrun as u8).u8(self.late_slots);
-        w.u8(if self.schedule.has_repeats() { CODES_REPEAT } else { 0 });
+        let repeats = if self.schedule.has_repeats() { CODES_REPEAT } else { 0 };
+        w.u8(repeats | if self.tracks { FOLLOWS } else { 0 });
         w.u16(self.limits.mean_permille).u16(0).u64(self.epoch.0);
         w.u32(self.limits.window_ms).u32(self.limits.full_white_ms);
         for plane in self.schedule.planes() {
             w.u8(plane.led_code());
         }
+    }
+}
+
+impl TrackCounts {
+    fn parse(p: &[u8]) -> Self {
+        Self {
+            taken: u32_at(p, 0),
+            refused: u32_at(p, 4),
+            planes_moved: u32_at(p, 8),
+            planes_clamped: u32_at(p, 12),
+            planes_stale: u32_at(p, 16),
+            greatest_age: u32_at(p, 20),
+        }
+    }
+
+    fn write(&self, w: &mut Writer<'_>) {
+        w.u32(self.taken).u32(self.refused).u32(self.planes_moved);
+        w.u32(self.planes_clamped).u32(self.planes_stale).u32(self.greatest_age);
     }
 }
 
@@ -237,6 +266,7 @@ impl HostMessage {
                 Self::Sync(u32_at(p, 0))
             }
             MessageType::Echo => Self::Echo(echo(p)?),
+            MessageType::Tracks => Self::Tracks(Tracks::parse(p)?),
             MessageType::Stop | MessageType::Black | MessageType::Freeze | MessageType::Safe => {
                 expect_len(kind, p, 0)?;
                 match kind {
@@ -280,6 +310,10 @@ impl HostMessage {
                 write_echo(&mut w, e);
                 MessageType::Echo
             }
+            Self::Tracks(tracks) => {
+                w.len = tracks.write(w.out);
+                MessageType::Tracks
+            }
             Self::Stop => MessageType::Stop,
             Self::Black => MessageType::Black,
             Self::Freeze => MessageType::Freeze,
@@ -303,6 +337,7 @@ impl DeviceMessage {
                     raster: raster(kind, p, 8)?,
                     max_planes: p[12],
                     frame_buffers: p[13],
+                    greatest_shift: (p[14] & FEATURE_TRACKS != 0).then_some(p[15]),
                     tick_hz: u32_at(p, 16),
                     min_plane_ns: u32_at(p, 20),
                     serial: u64_at(p, 24),
@@ -310,7 +345,9 @@ impl DeviceMessage {
                 })
             }
             MessageType::Status => {
-                expect_len(kind, p, 96)?;
+                let [short, long] = STATUS_BYTES;
+                let follows = p.len() == long;
+                expect_len(kind, p, if follows { long } else { short })?;
                 Self::Status(Status {
                     state: DeviceState::from_code(p[0]).ok_or(field("state"))?,
                     lit: p[1] & 1 != 0,
@@ -337,6 +374,7 @@ impl DeviceMessage {
                     payload_errors: u32_at(p, 84),
                     packets_ignored: u32_at(p, 88),
                     bytes_skipped: u32_at(p, 92),
+                    tracks: follows.then(|| TrackCounts::parse(&p[short..])),
                 })
             }
             MessageType::Echo => Self::Echo(echo(p)?),
@@ -366,7 +404,8 @@ impl DeviceMessage {
             Self::Hello(h) => {
                 w.u16(h.version).u16(h.firmware).u32(h.codecs);
                 w.u16(h.raster.width() as u16).u16(h.raster.height() as u16);
-                w.u8(h.max_planes).u8(h.frame_buffers).u16(0);
+                w.u8(h.max_planes).u8(h.frame_buffers);
+                w.u8(h.greatest_shift.map_or(0, |_| FEATURE_TRACKS)).u8(h.greatest_shift.unwrap_or(0));
                 w.u32(h.tick_hz).u32(h.min_plane_ns).u64(h.serial).u64(h.now.0);
                 MessageType::Hello
             }
@@ -391,6 +430,9 @@ impl DeviceMessage {
                     s.bytes_skipped,
                 ] {
                     w.u32(v);
+                }
+                if let Some(counts) = &s.tracks {
+                    counts.write(&mut w);
                 }
                 MessageType::Status
             }

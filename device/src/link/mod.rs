@@ -18,6 +18,7 @@ mod message;
 #[cfg(feature = "std")]
 mod session;
 mod slots;
+mod tracks;
 
 pub use crate::packet::{
     crc32c, crc32c_append, crc32c_append_table, frame_newer, packet_bytes, trailer_bytes, Codec, Decoder,
@@ -38,8 +39,10 @@ pub use limits::{
 pub use measure::{measure, LinkMeasurement};
 pub use message::{
     faults, Assembly, Commit, Config, ConfigRefusal, DeviceHello, DeviceMessage, DeviceState, Echo, Fault,
-    FaultCode, HostHello, HostMessage, PayloadError, Status, Underrun, COMMIT_BYTES, MAX_WATCHDOG_US,
+    FaultCode, HostHello, HostMessage, PayloadError, Status, TrackCounts, Underrun, COMMIT_BYTES,
+    MAX_WATCHDOG_US,
 };
 #[cfg(feature = "std")]
 pub use session::SessionNumbers;
 pub use slots::SlotClock;
+pub use tracks::{move_plane, Area, Move, Moves, Region, Tracks, MAX_REGIONS, MAX_SHIFT, MAX_TRACK_US};

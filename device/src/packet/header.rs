@@ -3,8 +3,8 @@
 use super::crc::crc32c;
 use crate::time::DeviceTicks;
 
-/// Longest payload of any message except PLANE.
-pub const MAX_CONTROL_BYTES: usize = 96;
+/// Longest payload of any message except PLANE: TRACKS of eight regions.
+pub const MAX_CONTROL_BYTES: usize = 248;
 
 /// First four bytes of every packet: `D P M L` in the order sent.
 pub const MAGIC: [u8; 4] = *b"DPML";
@@ -45,6 +45,8 @@ pub enum MessageType {
     Safe = 12,
     /// Repairs the credit count after lost packets.
     Sync = 13,
+    /// By how much regions of a frame are to be moved.
+    Tracks = 14,
 }
 
 impl MessageType {
@@ -64,6 +66,7 @@ impl MessageType {
             11 => Self::Freeze,
             12 => Self::Safe,
             13 => Self::Sync,
+            14 => Self::Tracks,
             _ => return None,
         })
     }

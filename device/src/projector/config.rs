@@ -40,6 +40,12 @@ pub struct FirmwareConfig {
     /// Lit slots that are kept with their planes for [`super::ProjectorFirmware::next_shown`]; when full, the oldest are
     /// dropped and counted. Each holds a frame.
     pub shown_kept: usize,
+    /// By how many mirrors it moves regions of planes at most as TRACKS say, at most [`crate::link::MAX_SHIFT`]; `None` if
+    /// it follows no tracks.
+    pub greatest_shift: Option<u8>,
+    /// Lit slots of which the shifts are kept for [`super::ProjectorFirmware::next_moves`]; when full, the oldest are
+    /// dropped and counted with the light events.
+    pub moves_kept: usize,
 }
 
 /// A lit slot that is over: what was on the mirrors, and when.
@@ -52,7 +58,8 @@ pub struct Shown {
     pub planes_end_at: HostTime,
     /// The order of the planes.
     pub schedule: PlaneSchedule,
-    /// The planes, one after the other.
+    /// The planes as they arrived, one after the other; [`super::ProjectorFirmware::next_moves`] says by how much tracks moved
+    /// them.
     pub planes: Arc<[u8]>,
 }
 
@@ -75,6 +82,8 @@ impl FirmwareConfig {
             limits: LightLimits::OFF,
             events_kept: 4096,
             shown_kept: 0,
+            greatest_shift: None,
+            moves_kept: 0,
         }
     }
 }

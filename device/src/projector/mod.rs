@@ -10,6 +10,7 @@
 mod ahead;
 mod clock;
 mod config;
+mod following;
 mod frames;
 mod guard;
 mod light;
@@ -31,6 +32,8 @@ pub use crate::light::{LightEvent, LightKind};
 pub use ahead::WaitingFrame;
 pub use clock::DeviceClock;
 pub use config::{FirmwareConfig, LightChange, Shown};
+use following::Following;
+pub use following::SlotMoves;
 use frames::FrameStore;
 use guard::LightGuard;
 pub use light::{gather_bits, light_of_planes, Exposure, Run};
@@ -102,6 +105,8 @@ struct Core {
     events_lost: u64,
     shown: VecDeque<Shown>,
     shown_lost: u64,
+    following: Following,
+    moves: VecDeque<SlotMoves>,
     /// The instant of the present event: `now`, or the exact instant of the device's own events.
     at: HostTime,
     changes: VecDeque<LightChange>,
@@ -148,6 +153,7 @@ const NO_STATUS: Status = Status {
     payload_errors: 0,
     packets_ignored: 0,
     bytes_skipped: 0,
+    tracks: None,
 };
 
 impl ProjectorFirmware {
@@ -193,6 +199,8 @@ impl ProjectorFirmware {
                 events_lost: 0,
                 shown: VecDeque::with_capacity(setup.shown_kept),
                 shown_lost: 0,
+                following: Following::default(),
+                moves: VecDeque::with_capacity(setup.moves_kept),
                 at: HostTime(i64::MIN),
                 changes: VecDeque::with_capacity(CHANGES_KEPT),
                 before: (false, DeviceState::Idle),
@@ -231,6 +239,14 @@ impl ProjectorFirmware {
     /// Lit slots that were dropped before they were taken.
     pub fn shown_lost(&self) -> u64 {
         self.core.shown_lost
+    }
+
+    /// What tracks made of the planes of the oldest lit slot that is over and was not yet taken. None is kept unless
+    /// [`FirmwareConfig::moves_kept`] says so, and only while CONFIG asks for tracks.
+    pub fn next_moves(&mut self) -> Option<SlotMoves> {
+        let core = &mut self.core;
+        core.moves.front().filter(|moves| moves.planes_end_at <= core.now)?;
+        core.moves.pop_front()
     }
 
     /// Number of light events that were replaced by newer ones before they were taken.
@@ -491,6 +507,7 @@ impl Core {
             raster: self.setup.raster,
             max_planes: self.setup.max_planes,
             frame_buffers: self.setup.frame_buffers,
+            greatest_shift: self.setup.greatest_shift,
             tick_hz: self.setup.clock.tick_hz,
             min_plane_ns: self.setup.min_plane_ns,
             serial: self.setup.serial,
@@ -527,6 +544,7 @@ impl Core {
                 .packets_ignored
                 .wrapping_add(all.foreign.wrapping_sub(before.foreign)),
             bytes_skipped: all.bytes_skipped.wrapping_sub(before.bytes_skipped),
+            tracks: self.track_counts(),
             ..self.status
         }
     }
@@ -578,6 +596,7 @@ impl Core {
     /// lit again.
     fn end_light(&mut self) {
         self.lit_now = false;
+        self.following.clear();
         self.store.lit = None;
         self.untaken = None;
         self.status_due = true;
@@ -595,6 +614,8 @@ impl Core {
             // them.
             let dark = self.dark_from().filter(|dark| *dark < start);
             let next = dark.unwrap_or(start);
+            // A plane that would begin when something else does is not lit any more.
+            self.light_planes(&config, DeviceTicks(next.min(bite).0.saturating_sub(1)).min(ticks));
             if next.min(bite) > ticks {
                 break;
             }
@@ -621,6 +642,7 @@ impl Core {
         }
         self.mode = Mode::Disarmed;
         self.lit_now = false;
+        self.following.clear();
         self.untaken = None;
         let thrown = self.store.clear();
         self.status.frames_refused = self.status.frames_refused.wrapping_add(thrown);
@@ -656,6 +678,7 @@ impl Core {
         self.config = None;
         self.last_seen_frame = None;
         self.status = NO_STATUS;
+        self.following.new_session();
         self.counters_due = true;
     }
 

@@ -12,6 +12,7 @@ use super::{Core, Mode, ECHOES_KEPT, MAX_LEAD_S};
 
 /// The packet that is arriving on a lane.
 #[derive(Debug, Default)]
+#[allow(clippy::large_enum_variant)] // There are two, and nothing may be allocated for a packet.
 pub(super) enum Incoming {
     #[default]
     Nothing,
@@ -92,8 +93,13 @@ impl Core {
     }
 
     fn ignore(&mut self) -> Incoming {
-        self.status.packets_ignored = self.status.packets_ignored.wrapping_add(1);
+        self.count_ignored();
         Incoming::Nothing
+    }
+
+    /// Counts a packet without effect.
+    pub(super) fn count_ignored(&mut self) {
+        self.status.packets_ignored = self.status.packets_ignored.wrapping_add(1);
     }
 
     /// True if an intact packet of `session` belongs to the open one, which feeds the watchdog; else as
@@ -308,6 +314,7 @@ impl Core {
             HostMessage::Echo(echo) if self.echoes.len() < ECHOES_KEPT => {
                 self.echoes.push_back(Echo { device_received: self.ticks(), ..echo });
             }
+            HostMessage::Tracks(tracks) => self.take_tracks(tracks),
             HostMessage::Sync(frames_sent) => {
                 self.give_up_frame();
                 self.account(frames_sent);

@@ -64,6 +64,7 @@ impl Core {
                 self.status.frames_lit = self.status.frames_lit.wrapping_add(1);
                 self.status.last_lit_frame = frame.frame;
                 self.status.last_lit_at = start;
+                self.following.lit(frame.slot);
                 self.store.lit =
                     Some(Held { frame: frame.frame, dark_from: frame.dark_from, buffer: frame.buffer });
                 self.generation += 1;
@@ -90,6 +91,7 @@ impl Core {
         let before = if self.lit_now { LightKind::Repeated } else { LightKind::Blank };
         self.untaken = (kind == LightKind::Lit).then_some(before);
         self.lit_now = kind != LightKind::Blank;
+        self.begin_planes(slots, slot);
         self.note_light(slots, slot, kind);
         let luminance = if self.lit_now { self.luminance } else { 0 };
         if self.flash.as_mut().is_some_and(|f| f.observe(luminance)) {
@@ -111,6 +113,7 @@ impl Core {
         if let Some(event) = self.events.back_mut() {
             (event.kind, event.frame) = (before, None);
         }
+        self.begin_planes(slots, slot);
         self.note_light(slots, slot, LightKind::Lit);
         // The light of the late frame counts once more than it falls: a limit is reached too early rather than too late.
         if let Some(rest_us) = self.guard.same_frame() {

@@ -3,6 +3,7 @@
 mod cable;
 mod codec;
 mod dark;
+mod following;
 mod limits;
 mod panel;
 mod protocol;
@@ -488,19 +489,23 @@ fn a_skewed_clock_lights_on_its_own_slots() {
     assert_eq!(echoes, 16);
 }
 
+/// The packets printed in docs/PROTOCOL.md, in their order.
+fn packets_of_the_document() -> Vec<Vec<u8>> {
+    let text = include_str!("../../../docs/PROTOCOL.md");
+    let bytes = |block: &str| {
+        let hex = block.split("```").next().unwrap();
+        hex.split_whitespace().map(|b| u8::from_str_radix(b, 16).unwrap()).collect()
+    };
+    text.split("```hex").skip(1).map(bytes).collect()
+}
+
 /// The packets printed in docs/PROTOCOL.md, byte for byte: the example makes the light that the document promises.
 #[test]
 fn the_documents_example_makes_light() {
-    let text = include_str!("../../../docs/PROTOCOL.md");
-    let packets: Vec<Vec<u8>> = text
-        .split("```hex")
-        .skip(1)
-        .map(|block| {
-            let hex = block.split("```").next().unwrap();
-            hex.split_whitespace().map(|b| u8::from_str_radix(b, 16).unwrap()).collect()
-        })
-        .collect();
-    let [hello, config, arm, plane, commit, stop] = &packets[..] else { panic!("{} packets", packets.len()) };
+    let packets = packets_of_the_document();
+    let [hello, config, arm, plane, commit, stop, _tracks] = &packets[..] else {
+        panic!("{} packets", packets.len())
+    };
     let mut mock = ProjectorFirmware::new(FirmwareConfig::new(Raster::new(16, 1).unwrap()));
     let mut states = Vec::new();
     for control in [hello, config, arm] {

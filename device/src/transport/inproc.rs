@@ -8,7 +8,7 @@ use dpm_handoff::ring::{exchange, ring, Consumer, Drainer, Filler, Producer};
 use dpm_handoff::wake::{WaitPolicy, Waiter, Waker};
 
 use super::{Lane, LinkDevice, SendError, Transport, TransportError};
-use crate::packet::Packet;
+use crate::packet::{packet_bytes, Packet, MAX_CONTROL_BYTES};
 use crate::time::HostTime;
 
 /// Calls the device as part of `send` and `receive`: nothing is copied or queued, and a run is a function of its
@@ -68,7 +68,7 @@ impl<D: LinkDevice> Transport for Direct<D> {
 }
 
 /// Maximum number of bytes in one control message slot.
-const SMALL_BYTES: usize = 160;
+const SMALL_BYTES: usize = packet_bytes(MAX_CONTROL_BYTES);
 /// Control messages and replies that may wait.
 const SMALL_DEPTH: usize = 64;
 
@@ -77,7 +77,7 @@ struct Small {
     lane: Lane,
     /// When the host put it in.
     at: HostTime,
-    len: u8,
+    len: u16,
     bytes: [u8; SMALL_BYTES],
 }
 
@@ -171,7 +171,7 @@ impl Transport for HostEnd {
                     bytes <= SMALL_BYTES,
                     "{bytes} bytes of control message, at most {SMALL_BYTES} travel"
                 );
-                let mut small = Small { lane, at: now, len: bytes as u8, bytes: [0; SMALL_BYTES] };
+                let mut small = Small { lane, at: now, len: bytes as u16, bytes: [0; SMALL_BYTES] };
                 gather(&mut small.bytes, packets);
                 self.control.push(small).map_err(|_| SendError::Busy)?;
             }
@@ -252,7 +252,7 @@ impl DeviceEnd {
         let replies = &mut self.replies;
         device.replies(clock(), &mut |lane, bytes| {
             if bytes.len() <= SMALL_BYTES {
-                let mut small = Small { lane, at: clock(), len: bytes.len() as u8, bytes: [0; SMALL_BYTES] };
+                let mut small = Small { lane, at: clock(), len: bytes.len() as u16, bytes: [0; SMALL_BYTES] };
                 small.bytes[..bytes.len()].copy_from_slice(bytes);
                 let _ = replies.push(small);
             }

@@ -76,6 +76,7 @@ fn hello() -> DeviceMessage {
         raster: raster(),
         max_planes: 8,
         frame_buffers: 2,
+        greatest_shift: None,
         tick_hz: 1_000_000,
         min_plane_ns: 1000,
         serial: 0,

@@ -185,6 +185,8 @@ pub struct LinkCounters {
     pub packets_ignored: u64,
     /// Damaged packets from the device.
     pub packets_damaged: u64,
+    /// TRACKS sent.
+    pub tracks_sent: u64,
     /// Sessions opened.
     pub sessions: u64,
 }

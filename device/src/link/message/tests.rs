@@ -1,6 +1,7 @@
 //! Golden payloads, written by hand from docs/PROTOCOL.md, encoded and decoded, and the refusal of malformed variants.
 
 use super::*;
+use crate::link::tracks::{Area, Region};
 use crate::planes::Channel;
 use proptest::prelude::*;
 
@@ -42,6 +43,7 @@ fn golden_messages_of_the_host() {
             late_slots: 2,
             epoch: DeviceTicks(0x0102_0304_0506_0708),
             limits: LightLimits { mean_permille: 300, window_ms: 10_000, full_white_ms: 70_000 },
+            tracks: false,
         }),
         MessageType::Config,
         "0004 0003 60ea0000 e9030000 50c30000 03 01 02 00 2c01 0000 0807060504030201 10270000 70110100 07 10 33",
@@ -68,10 +70,87 @@ fn golden_messages_of_the_host() {
         MessageType::Echo,
         "8877665544332211 0000000000000000 0000000000000000",
     );
+    golden_tracks();
     host(HostMessage::Stop, MessageType::Stop, "");
     host(HostMessage::Black, MessageType::Black, "");
     host(HostMessage::Freeze, MessageType::Freeze, "");
     host(HostMessage::Safe, MessageType::Safe, "");
+}
+
+/// Two regions of frame 0x01020304, 11 ms from the tick 0x1122334455667788 on.
+fn golden_tracks() {
+    let mut tracks = Tracks::new(0x0102_0304, 5, DeviceTicks(0x1122_3344_5566_7788), 11_000);
+    tracks.push(Region {
+        area: Area { left: 0x0102, top: 0x0304, width: 0x0506, height: 0x0708 },
+        clamp: 8,
+        gate: 192,
+        offset: [-1, 2],
+        velocity: [3, -4],
+        half_acceleration: [-5, 6],
+        drawn: [448, -448],
+    });
+    tracks.push(Region { area: Area { left: 0, top: 0, width: 1, height: 1 }, ..Region::default() });
+    host(
+        HostMessage::Tracks(tracks),
+        MessageType::Tracks,
+        "04030201 05000000 8877665544332211 f82a0000 02 000000
+         0201 0403 0605 0807 08 00 c000 ffff 0200 0300 fcff fbff 0600 c001 40fe
+         0000 0000 0100 0100 00 00 0000 0000 0000 0000 0000 0000 0000 0000 0000",
+    );
+    let nothing = "00000000 01000000 0000000000000000 01000000 00 000000";
+    host(HostMessage::Tracks(Tracks::new(0, 1, DeviceTicks(0), 1)), MessageType::Tracks, nothing);
+    let broken = |at: usize, value: u8| {
+        let mut p = hex(nothing);
+        p[at] = value;
+        HostMessage::parse(MessageType::Tracks, &p)
+    };
+    let kind = MessageType::Tracks;
+    assert_eq!(broken(16, 0), Err(PayloadError::Field { kind, field: "lasts" }));
+    assert_eq!(broken(17, 0x4f), Err(PayloadError::Field { kind, field: "lasts" }), "20.2 ms");
+    assert_eq!(broken(20, 9), Err(PayloadError::Field { kind, field: "regions" }));
+    assert_eq!(broken(20, 1), Err(PayloadError::Length { kind, expected: 52, got: 24 }));
+    assert_eq!(DeviceMessage::parse(kind, &hex(nothing)), Err(PayloadError::Direction(kind)));
+}
+
+/// A device that follows tracks says so where a device before tracks has zeros; CONFIG asks for it by a bit that a device
+/// before tracks does not look at, and only then STATUS is longer.
+#[test]
+fn tracks_are_offered_asked_for_and_counted_beside_what_older_ends_know() {
+    let offering =
+        hex("0200 0302 01000000 4001 f000 18 04 01 10 00ca9a3b e0ab0000 8877665544332211 0900000000000000");
+    let Ok(DeviceMessage::Hello(hello)) = DeviceMessage::parse(MessageType::Hello, &offering) else {
+        panic!()
+    };
+    assert_eq!(hello.greatest_shift, Some(16));
+    let mut out = [0; MAX_CONTROL_BYTES];
+    let (_, n) = DeviceMessage::Hello(hello).write(&mut out);
+    assert_eq!(&out[..n], &offering[..]);
+
+    let asks = hex(
+        "0004 0003 60ea0000 e9030000 50c30000 01 01 02 02 2c01 0000 0807060504030201 10270000 70110100 07",
+    );
+    let Ok(HostMessage::Config(config)) = HostMessage::parse(MessageType::Config, &asks) else { panic!() };
+    assert!(config.tracks && !config.schedule.has_repeats());
+    let (_, n) = HostMessage::Config(config).write(&mut out);
+    assert_eq!(&out[..n], &asks[..]);
+
+    let long = [&[0u8; 96][..], &hex("01000000 02000000 03000000 04000000 05000000 06000000")].concat();
+    let Ok(DeviceMessage::Status(status)) = DeviceMessage::parse(MessageType::Status, &long) else {
+        panic!()
+    };
+    let counts = TrackCounts {
+        taken: 1,
+        refused: 2,
+        planes_moved: 3,
+        planes_clamped: 4,
+        planes_stale: 5,
+        greatest_age: 6,
+    };
+    assert_eq!(status.tracks, Some(counts));
+    let (_, n) = DeviceMessage::Status(status).write(&mut out);
+    assert_eq!(&out[..n], &long[..]);
+    let refused = DeviceMessage::parse(MessageType::Status, &long[..119]);
+    assert_eq!(refused, Err(PayloadError::Length { kind: MessageType::Status, expected: 96, got: 119 }));
 }
 
 /// Planes of equal light: a flag permits what is refused without it, and no mirror may become brighter than white.
@@ -87,6 +166,7 @@ fn an_led_code_may_repeat_only_where_the_flag_says_so() {
         late_slots: 0,
         epoch: DeviceTicks(0),
         limits: LightLimits::OFF,
+        tracks: false,
     };
     let mut out = [0; MAX_CONTROL_BYTES];
     let (kind, n) = HostMessage::Config(config).write(&mut out);
@@ -111,6 +191,7 @@ fn golden_messages_of_the_device() {
             raster: Raster::new(320, 240).unwrap(),
             max_planes: 24,
             frame_buffers: 4,
+            greatest_shift: None,
             tick_hz: 1_000_000_000,
             min_plane_ns: 44_000,
             serial: 0x1122_3344_5566_7788,
@@ -146,6 +227,7 @@ fn golden_messages_of_the_device() {
             payload_errors: 12,
             packets_ignored: 13,
             bytes_skipped: 14,
+            tracks: None,
         }),
         MessageType::Status,
         "06 01 17 02 05000000 04000000 03000000 0d0c0b0a 0c0c0b0a 0101010101010101 0202020202020202
@@ -205,7 +287,7 @@ fn wrong_fields_are_named() {
 proptest! {
     /// Any bytes under any type: a value or an error, and a value written again gives the same bytes up to reserved fields.
     #[test]
-    fn any_payload_is_survived(code in 0u8..16, p in prop::collection::vec(any::<u8>(), 0..100)) {
+    fn any_payload_is_survived(code in 0u8..16, p in prop::collection::vec(any::<u8>(), 0..260)) {
         let Some(kind) = MessageType::from_code(code) else { return Ok(()) };
         let mut out = [0; MAX_CONTROL_BYTES];
         if let Ok(m) = HostMessage::parse(kind, &p) {

@@ -83,6 +83,8 @@ pub struct DeviceHello {
     pub max_planes: u8,
     /// Whole frames that can wait to be lit.
     pub frame_buffers: u8,
+    /// By how many mirrors it moves regions of planes at most as TRACKS say; `None` if it follows no TRACKS.
+    pub greatest_shift: Option<u8>,
     /// Nominal ticks a second of the device's clock.
     pub tick_hz: u32,
     /// Shortest time one plane can be shown, nanoseconds.
@@ -122,6 +124,8 @@ pub struct Config {
     pub epoch: DeviceTicks,
     /// Limits on light that the device must not exceed, whatever is sent.
     pub limits: LightLimits,
+    /// The host sends TRACKS. Only for a device that follows them.
+    pub tracks: bool,
 }
 
 /// FRAME_COMMIT: the end of a frame and how it is composed.
@@ -237,6 +241,25 @@ pub struct Status {
     pub packets_ignored: u32,
     /// Bytes that belonged to no packet.
     pub bytes_skipped: u32,
+    /// What became of TRACKS; `None` unless CONFIG asked for them.
+    pub tracks: Option<TrackCounts>,
+}
+
+/// Counters of a device that follows TRACKS, in STATUS.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct TrackCounts {
+    /// TRACKS taken.
+    pub taken: u32,
+    /// TRACKS without effect: not newer than one before, or of a region that is not on the raster.
+    pub refused: u32,
+    /// Planes lit of which a region was moved.
+    pub planes_moved: u32,
+    /// Planes lit for which a shift was clamped.
+    pub planes_clamped: u32,
+    /// Planes lit as drawn, because the TRACKS of their frame no longer held, or did not hold yet.
+    pub planes_stale: u32,
+    /// Greatest age of the TRACKS at the middle of a plane that followed them, in the newest slot that is over, ticks.
+    pub greatest_age: u32,
 }
 
 /// ECHO. The host writes `host_sent_ns` and zeros; the device fills the rest in.

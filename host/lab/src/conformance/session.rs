@@ -55,6 +55,7 @@ impl Bench<'_> {
             late_slots: 0,
             epoch: DeviceTicks(hello.now.0 + ahead),
             limits: LightLimits::OFF,
+            tracks: false,
         })
     }
 
