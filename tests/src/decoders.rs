@@ -8,7 +8,8 @@ use dpm_device::dlpc900::command::{CommandAssembler, ReplyAssembler, REPORT_BYTE
 use dpm_device::dlpc900::image;
 use dpm_device::link::crc32c;
 use dpm_device::link::{
-    rle_encode, Assembly, Decoder, DeviceMessage, Header, HostMessage, PacketSink, RleDecoder,
+    move_plane, rle_encode, Assembly, Decoder, DeviceMessage, Header, HostMessage, MessageType, PacketSink,
+    RleDecoder, MAX_CONTROL_BYTES, MAX_SHIFT,
 };
 use dpm_device::planes::Raster;
 use dpm_device::sensor::wire::{SensorMessage, MAX_FRAME, MAX_PACKET, MAX_SAMPLES};
@@ -39,9 +40,10 @@ use std::path::Path;
 pub type Entry = fn(&[u8]);
 
 /// Every entry with the name of its fuzz target, which is also the name of its folder of seeds.
-pub const ALL: [(&str, Entry); 35] = [
+pub const ALL: [(&str, Entry); 36] = [
     ("link_stream", link_stream),
     ("link_rle", link_rle),
+    ("link_tracks", link_tracks),
     ("cobs_stream", cobs_stream),
     ("dlpc900_reports", dlpc900_reports),
     ("dlpc900_image", dlpc900_image),
@@ -133,6 +135,37 @@ pub fn link_rle(bytes: &[u8]) {
         let (mut back, mut decoder) = ([0u8; 64], RleDecoder::new());
         decoder.push(&coded[..n], &mut back).expect("own code");
         assert!(decoder.finish(back.len()).is_ok() && back == plane);
+    }
+}
+
+/// Any instant, any lateness and any device of the tracks in `bytes`: no plane gets brighter, nothing changes outside of the
+/// regions, and no shift passes the device's greatest.
+pub fn link_tracks(bytes: &[u8]) {
+    let Some((&[late, most, seed, after], payload)) = bytes.split_first_chunk::<4>() else { return };
+    let Ok(HostMessage::Tracks(tracks)) = HostMessage::parse(MessageType::Tracks, payload) else { return };
+    let raster = Raster::new(40, 6).expect("a raster");
+    let mut again = [0; MAX_CONTROL_BYTES];
+    let (kind, n) = HostMessage::Tracks(tracks).write(&mut again);
+    assert_eq!(HostMessage::parse(kind, &again[..n]), Ok(HostMessage::Tracks(tracks)));
+    let instant = DeviceTicks(tracks.begin.0.saturating_add(u64::from(after) * 100));
+    let Some(moves) = tracks.moves_at(instant, 1_000_000, u32::from(late) << (late % 24), most) else {
+        assert!(!tracks.holds_at(instant, 1_000_000));
+        return;
+    };
+    let greatest = most.min(MAX_SHIFT);
+    assert!(moves.all().iter().flat_map(|one| one.shift).all(|shift| shift.unsigned_abs() <= greatest));
+    if !tracks.fits(raster) {
+        return;
+    }
+    let plane: Vec<u8> = (0..30u8).map(|i| seed.wrapping_mul(i | 1).rotate_left(3) ^ i).collect();
+    let mut light = vec![0; plane.len()];
+    move_plane(raster, &plane, &moves, &mut light);
+    let lit = |plane: &[u8]| plane.iter().map(|byte| byte.count_ones()).sum::<u32>();
+    assert!(lit(&light) <= lit(&plane));
+    for (x, y) in (0..40usize).flat_map(|x| (0..6usize).map(move |y| (x, y))) {
+        let (at, mask) = (y * 5 + x / 8, 0x80 >> (x % 8));
+        let is_outside = !moves.all().iter().any(|one| one.area.contains(x as i64, y as i64));
+        assert!(!is_outside || plane[at] & mask == light[at] & mask, "mirror {x}, {y}");
     }
 }
 

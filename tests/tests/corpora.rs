@@ -11,7 +11,9 @@ use common::{png, tetrahedra, with_image};
 use dpm_device::cobs::{encode, encoded_bytes};
 use dpm_device::dlpc900::command::{Command, Opcode};
 use dpm_device::dlpc900::image::{self, Compression, PlaneOrder};
-use dpm_device::link::{rle_encode, Commit, Header, HostMessage, MessageType, Packet, MAX_CONTROL_BYTES};
+use dpm_device::link::{
+    rle_encode, Area, Commit, Header, HostMessage, MessageType, Packet, Region, Tracks, MAX_CONTROL_BYTES,
+};
 use dpm_device::planes::Raster;
 use dpm_device::sensor::wire::{BlockHead, LevelBits, Levels, SensorMessage, MAX_FRAME};
 use dpm_device::time::DeviceTicks;
@@ -47,6 +49,21 @@ fn made() -> Vec<(&'static str, &'static str, Vec<u8>)> {
     (50..60).for_each(|i| bits[i] = i as u8);
     let n = rle_encode(&bits, &mut coded).expect("room");
     seeds.push(("link_rle", "runs", coded[..n].to_vec()));
+    let mut tracks = Tracks::new(3, 1, DeviceTicks(1_000_000), 11_000);
+    for (left, offset) in [(2, 300), (10, -700)] {
+        let area = Area { left, top: 1, width: 20, height: 4 };
+        let motion = [offset, -offset / 2];
+        tracks.push(Region {
+            area,
+            clamp: 8,
+            gate: 150,
+            offset: motion,
+            velocity: motion,
+            ..Region::default()
+        });
+    }
+    let (_, n) = HostMessage::Tracks(tracks).write(&mut payload);
+    seeds.push(("link_tracks", "regions", [&[1, 8, 0x5a, 9], &payload[..n]].concat()));
     let mut cobs = vec![0; encoded_bytes(stream.len())];
     let n = encode(&[&stream[..100]], &mut cobs).expect("room");
     seeds.push(("cobs_stream", "packets", cobs[..n].to_vec()));

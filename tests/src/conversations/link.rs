@@ -2,8 +2,8 @@
 //! from the middle of a stream. Session numbers and checksums are right.
 
 use dpm_device::link::{
-    Codec, Epoch, Header, HostLink, LightLimits, LinkSettings, LinkState, MessageType, Packet,
-    SessionNumbers, Underrun,
+    Area, Codec, Epoch, Header, HostLink, LightLimits, LinkSettings, LinkState, MessageType, Packet, Region,
+    SessionNumbers, Tracks, Underrun, MAX_TRACK_US,
 };
 use dpm_device::planes::{PlaneSchedule, Raster};
 use dpm_device::time::{DeviceTicks, FrameRate, HostTime};
@@ -64,6 +64,14 @@ fn raster() -> Raster {
     Raster::new(16, 2).expect("a raster")
 }
 
+/// By how many mirrors the mock moves light at most.
+const GREATEST_SHIFT: u8 = 3;
+
+fn mock_config() -> MockConfig {
+    let greatest_shift = Some(GREATEST_SHIFT);
+    MockConfig { events_kept: 0, moves_kept: 2, greatest_shift, ..MockConfig::new(raster()) }
+}
+
 /// A link that has not said a word, and its cable to a mock.
 fn silent() -> (HostLink, Cable) {
     let raster = raster();
@@ -81,8 +89,9 @@ fn silent() -> (HostLink, Cable) {
         limits: LightLimits::OFF,
     };
     // Always the same session, because a fuzzer's findings must be reproducible.
-    let link = HostLink::with_sessions(settings, SessionNumbers::from_source(|| 1));
-    let mock = MockProjector::new(MockConfig { events_kept: 0, ..MockConfig::new(raster) });
+    let mut link = HostLink::with_sessions(settings, SessionNumbers::from_source(|| 1));
+    link.want_tracks();
+    let mock = MockProjector::new(mock_config());
     (link, Cable { device: Direct::new(mock), session: 0, sent: Vec::new(), kept: None, inbound: None })
 }
 
@@ -105,6 +114,16 @@ fn streaming(keep: bool) -> (HostLink, Cable, HostTime) {
         let slots = link.slots().expect("slots");
         link.send_frame(now, id, slots.start(id + 4), slots.dark_from(id + 4, 0), &planes, &mut cable);
     }
+    let mut tracks = Tracks::new(1, 0, DeviceTicks(now.0 as u64), MAX_TRACK_US);
+    let area = Area { left: 1, top: 0, width: 12, height: 2 };
+    tracks.push(Region {
+        area,
+        clamp: GREATEST_SHIFT,
+        offset: [256, 0],
+        velocity: [64, 0],
+        ..Region::default()
+    });
+    link.send_tracks(now, &tracks, &mut cable).expect("room");
     (link, cable, now)
 }
 
@@ -142,8 +161,8 @@ fn packets(mut bytes: &[u8], mut each: impl FnMut(i64, Lane, &dyn Fn(u32) -> Vec
     }
 }
 
-/// What holds for a projector after any packet: its counters stay consistent, its answers are bounded, and its credit
-/// is kept.
+/// What holds for a projector after any packet: its counters stay consistent, its answers are bounded, its credit is kept,
+/// and no light is moved further than it can.
 fn answers(mock: &mut MockProjector, now: HostTime) {
     let mut answers = 0;
     mock.replies(now, &mut |_, _| answers += 1);
@@ -153,6 +172,10 @@ fn answers(mock: &mut MockProjector, now: HostTime) {
     let ended = s.frames_lit + s.frames_incomplete + s.frames_late + s.frames_superseded + s.frames_refused;
     assert!((ended..=ended + 8).contains(&s.frames_seen), "{s:?}");
     assert!(s.buffers_free <= 4, "{s:?}");
+    while let Some(slot) = mock.next_moves() {
+        let shifts = slot.planes().iter().flat_map(|plane| plane.all()).flat_map(|one| one.shift);
+        assert!(shifts.into_iter().all(|shift| shift.unsigned_abs() <= GREATEST_SHIFT), "{slot:?}");
+    }
 }
 
 /// Sends arbitrary packets to an armed projector.
@@ -169,7 +192,7 @@ pub fn projector(bytes: &[u8]) {
 
 /// Sends arbitrary packets to a projector that no host has greeted: it is dark until a host has armed it.
 pub fn projector_hello(bytes: &[u8]) {
-    let mut mock = MockProjector::new(MockConfig { events_kept: 0, ..MockConfig::new(raster()) });
+    let mut mock = MockProjector::new(mock_config());
     let (mut now, mut armed) = (HostTime(0), false);
     packets(bytes, |wait, lane, make| {
         now = now.plus_ns(wait);
