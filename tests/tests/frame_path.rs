@@ -43,6 +43,8 @@ fn the_steady_state_allocates_nothing() {
             &["real_time.pace=\"virtual\"", "render.spp=1"][..],
             &["real_time.pace=\"virtual\"", "render.method=\"paper\""],
             &["real_time.pace=\"real\"", "projector.frame_rate=\"200\""],
+            &["real_time.pace=\"virtual\"", "render.spp=1", "projector.tracks=\"auto\""],
+            &["real_time.pace=\"real\"", "projector.frame_rate=\"200\"", "projector.tracks=\"auto\""],
         ] {
             let rig = demo_rig(32, 16, settings);
             let (before, all) = (COUNTED.load(Ordering::Relaxed), ALL.load(Ordering::Relaxed));

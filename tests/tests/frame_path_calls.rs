@@ -25,10 +25,17 @@ fn a_hundred_thousand_frames_only_wait_and_wake() {
     frame_law::watch();
     let planned: u64 = std::thread::scope(|scope| {
         let runs: Vec<_> = (0..RIGS)
-            .map(|_| {
-                scope.spawn(|| {
-                    let settings =
-                        ["real_time.pace=\"real\"", "projector.frame_rate=\"2800\"", "projector.planes=8"];
+            .map(|k| {
+                scope.spawn(move || {
+                    // Every other rig also tells its projector of the bodies between frames.
+                    let tracks =
+                        if k % 2 == 0 { "projector.tracks=\"auto\"" } else { "projector.tracks=\"off\"" };
+                    let settings = [
+                        "real_time.pace=\"real\"",
+                        "projector.frame_rate=\"2800\"",
+                        "projector.planes=8",
+                        tracks,
+                    ];
                     let rig = demo_rig(32, 16, &settings);
                     let monitor = Arc::new(RunMonitor::default());
                     let options = RunOptions { frames: FRAMES, ..RunOptions::default() };
@@ -41,6 +48,8 @@ fn a_hundred_thousand_frames_only_wait_and_wake() {
                         (outcome, slider.join().expect("it only asks"))
                     });
                     assert!(changes > 100, "{changes} changes");
+                    let sent = outcome.report.projector.map_or(0, |projector| projector.tracks_sent);
+                    assert_eq!(sent > 100, k % 2 == 0, "{sent} TRACKS");
                     assert_eq!((outcome.frames_torn, outcome.frames_reordered), (0, 0));
                     assert!(outcome.report.frames_lit > FRAMES / 50, "{} lit", outcome.report.frames_lit);
                     monitor.counts().frames_planned

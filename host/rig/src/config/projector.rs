@@ -43,6 +43,10 @@ section! {
         /// light) are shown where the bodies are while these planes are lit, so that a moving picture is not smeared.
         /// "frame": all planes show the bodies at the centre of the frame's light, which saves two passes where bodies move.
         plane_poses: PlanePoses = PlanePoses::Own, "", Any;
+        /// Whether the projector is told between frames where the bodies are by now, so that it moves their light while the
+        /// planes are lit. "auto": if it offers that (the link's TRACKS), and not on a serial line. "off": never. Change it to
+        /// "auto" if bodies turn sharply and the projector can; it has not been tried on real hardware.
+        tracks: TracksUse = TracksUse::Off, "", Any;
         /// Position of the projector's lens in the world. Measure it, or give `calibration` instead.
         position: [f64; 3] = [0.0, 0.35, 1.1], "m", Within(-1e6, 1e6);
         /// The point in the world that the centre of the raster shows.
@@ -482,6 +486,16 @@ words! {
         Own = "own",
         /// The centre of the frame's light.
         Frame = "frame",
+    }
+}
+
+words! {
+    /// Whether the projector is told of bodies between frames.
+    pub enum TracksUse {
+        /// If it offers to follow tracks.
+        Auto = "auto",
+        /// Never.
+        Off = "off",
     }
 }
 

@@ -183,12 +183,16 @@ impl LinkKeeper {
     /// What the link has carried so far.
     fn carried(&self, link: &HostLink) -> Carried {
         let c = link.counters();
+        let by_tracks = link.status().and_then(|status| status.tracks).unwrap_or_default();
+        let by_tracks = [by_tracks.planes_moved, by_tracks.planes_clamped, by_tracks.planes_stale];
         Carried {
             sessions: c.sessions,
             rearmed: self.rearmed,
             bytes_sent: c.bytes_sent,
             planes: [c.planes_raw, c.planes_coded, c.planes_kept],
             not_sent: [c.not_streaming, c.no_credit, c.link_busy, c.link_lost, c.flash_limit, c.light_limit],
+            tracks_sent: c.tracks_sent,
+            planes_by_tracks: by_tracks.map(u64::from),
             device: self.reports.as_ref().map(StatusLight::counts),
             clock_bound_ns: self.clock_bound_ns,
             travel_ns: self.reports.as_ref().map(StatusLight::travel_ns),

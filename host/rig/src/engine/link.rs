@@ -1,16 +1,18 @@
 //! Decides when a packed frame is sent or left out, does what is due between frames, and ends the light.
 
 use super::facts::Facts;
+use super::follow::Follower;
 use super::keeper::{is_dark, LinkKeeper};
 use super::pace::Pace;
 use super::pack::is_overtaken;
 use crate::frame::job::{Fate, FrameNote};
 use crate::plan::lead::LeadEstimator;
 use crate::telemetry::projector::ProjectorReport;
+use crate::tracks::TrackSnapshot;
 use dpm_device::link::{HostLink, LinkState, SendOutcome};
 use dpm_device::time::HostTime;
 use dpm_device::transport::Transport;
-use dpm_handoff::latest::Publisher;
+use dpm_handoff::latest::{Publisher, Reader};
 use std::marker::PhantomData;
 use std::sync::atomic::Ordering;
 use std::sync::Arc;
@@ -58,6 +60,8 @@ pub(crate) struct LinkStage<P> {
     link: HostLink,
     keeper: LinkKeeper,
     lead: LeadEstimator,
+    /// `None` if no tracks are sent.
+    follower: Option<Follower>,
     slot_ns: i64,
     /// When the frame being offered was ready; `None` between frames.
     ready_at: Option<HostTime>,
@@ -81,6 +85,7 @@ impl<P: Pace> LinkStage<P> {
             link,
             keeper,
             lead,
+            follower: None,
             slot_ns,
             ready_at: None,
             credit_until: HostTime(i64::MIN / 2),
@@ -96,6 +101,16 @@ impl<P: Pace> LinkStage<P> {
         self.keeper.tell_times_to(times);
     }
 
+    /// From now on the projector is told of the bodies between frames, if it follows tracks, by what arrives at `newest`.
+    pub(crate) fn follow_by(&mut self, newest: Reader<TrackSnapshot>) {
+        self.follower = Some(Follower::new(&self.facts.rig, newest));
+    }
+
+    /// When the next tracks are due; `None` if none are sent.
+    pub(crate) fn tracks_due_at(&self) -> Option<HostTime> {
+        self.follower.as_ref().filter(|_| self.link.greatest_shift().is_some()).map(Follower::due_at)
+    }
+
     /// True while frames can be sent.
     pub(crate) fn is_streaming(&self) -> bool {
         self.link.state() == LinkState::Streaming
@@ -103,11 +118,8 @@ impl<P: Pace> LinkStage<P> {
 
     /// How long the caller may wait for a frame at `now` before the link must be polled, nanoseconds.
     pub(crate) fn rest_ns(&self, now: HostTime) -> i64 {
-        if self.link.awaits_echo(now) {
-            ECHO_STEP_NS
-        } else {
-            IDLE_NS
-        }
+        let step_ns = if self.link.awaits_echo(now) { ECHO_STEP_NS } else { IDLE_NS };
+        self.tracks_due_at().map_or(step_ns, |due| due.ns_since(now).clamp(0, step_ns))
     }
 
     /// How long one call may take: `step_ns`, or longer while a lost medium is being reopened.
@@ -120,12 +132,15 @@ impl<P: Pace> LinkStage<P> {
 
     /// Polls the link and does what is due between frames.
     pub(crate) fn poll(&mut self, now: HostTime, transport: &mut dyn Transport) {
-        let Self { facts, link, keeper, .. } = self;
+        let Self { facts, link, keeper, follower, .. } = self;
         let alive = now.ns_since(HostTime(facts.alive_at_ns.load(Ordering::Relaxed))) <= ALIVE_WITHIN_NS;
         let result = keeper.poll(now, link, transport, !P::FOLLOWS_CLOCK, alive, &facts.monitor);
         facts.travel_ns.store(keeper.travel_ns(), Ordering::Relaxed);
         if let Err(e) = result {
             facts.fail(e.into());
+        }
+        if let Some(follower) = follower {
+            follower.poll(now, keeper.time(), link, transport);
         }
     }
 
@@ -170,6 +185,9 @@ impl<P: Pace> LinkStage<P> {
         note.fate = Fate::Offered(outcome);
         if outcome == SendOutcome::Sent {
             self.keeper.sent(plan, now);
+            if let Some(follower) = &mut self.follower {
+                follower.sent(plan);
+            }
         } else {
             self.waited_ns = None;
         }

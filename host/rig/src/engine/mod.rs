@@ -4,6 +4,7 @@
 //!
 //! - [`plan`]: which slot the next frame is for, and when its poses are read;
 //! - [`pack`]: how long to wait for the GPU, and which frame to leave out;
+//! - [`follow`]: what a projector that can move parts of a frame is told of the bodies meanwhile;
 //! - [`link`]: when a frame is sent, the operator's orders, the projector's clock, and how the light ends;
 //! - [`supervision`]: which thread has fallen silent, and what is restarted.
 //!
@@ -14,6 +15,7 @@
 pub(crate) mod connect;
 pub(crate) mod error;
 pub(crate) mod facts;
+pub(crate) mod follow;
 pub(crate) mod keeper;
 pub(crate) mod link;
 pub(crate) mod options;

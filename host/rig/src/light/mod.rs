@@ -6,6 +6,7 @@ mod dark_bodies;
 mod live_view;
 mod measures;
 mod placement;
+pub mod planes;
 mod record;
 pub mod recorder;
 pub mod registration;

@@ -11,6 +11,7 @@ use crate::telemetry::monitor::RunMonitor;
 use dpm_common::clock::Stopwatch;
 use dpm_device::light::{LightEvent, LightKind};
 use dpm_device::planes::PlaneSchedule;
+use dpm_device::projector::SlotMoves;
 use dpm_device::time::HostTime;
 use dpm_handoff::channel::Sender;
 use std::collections::VecDeque;
@@ -53,6 +54,9 @@ pub(crate) struct LightRecorder {
     /// Lit planes carry marks, in this schedule.
     marks: Option<PlaneSchedule>,
     frames: VecDeque<LightFrame>,
+    /// What tracks made of the last lit slots, and how many are kept.
+    moves: VecDeque<SlotMoves>,
+    keep_moves: usize,
     /// Hash over all light in order.
     light_hash: u64,
     /// When the first photon of the frame on the mirrors left.
@@ -62,12 +66,13 @@ pub(crate) struct LightRecorder {
 }
 
 impl LightRecorder {
-    /// Sends notes to `notes` and keeps the last `keep` frames of light. `hash`: hashes every frame of light.
+    /// Sends notes to `notes` and keeps the last frames of light and the shifts of the last slots, as many of each as
+    /// `keep` says. `hash`: hashes every frame of light.
     /// `marks`: the planes, in this order, come from [`crate::pack::prepared`] and are checked for parts of other
     /// frames.
     pub(crate) fn new(
         notes: Sender<LightNote>,
-        keep: usize,
+        [keep, keep_moves]: [usize; 2],
         hash: bool,
         marks: Option<PlaneSchedule>,
     ) -> Self {
@@ -78,6 +83,8 @@ impl LightRecorder {
             hash,
             marks,
             frames: VecDeque::with_capacity(keep + 1),
+            moves: VecDeque::with_capacity(keep_moves),
+            keep_moves,
             light_hash: 0,
             lit_at: HostTime(0),
             observer: None,
@@ -106,6 +113,7 @@ impl LightRecorder {
     }
 
     fn drain(&mut self, mock: &mut MockProjector, watch: Stopwatch) {
+        self.take_moves(mock);
         while let Some(event) = mock.next_light() {
             let mut hash = 0;
             if event.kind == LightKind::Lit && (self.hash || self.keep > 0) {
@@ -129,6 +137,19 @@ impl LightRecorder {
         }
     }
 
+    /// Keeps what tracks made of the slots that are over.
+    fn take_moves(&mut self, mock: &mut MockProjector) {
+        while let Some(moves) = mock.next_moves() {
+            if self.keep_moves == 0 {
+                continue;
+            }
+            if self.moves.len() >= self.keep_moves {
+                self.moves.pop_front();
+            }
+            self.moves.push_back(moves);
+        }
+    }
+
     /// The hash of all light in order, in hexadecimal digits; `None` if not requested.
     pub(crate) fn hash(&self) -> Option<String> {
         self.hash.then(|| format!("{:016x}", self.light_hash))
@@ -146,9 +167,9 @@ impl LightRecorder {
         }
     }
 
-    /// The last frames of light, oldest first.
-    pub(crate) fn into_frames(self) -> Vec<LightFrame> {
-        self.frames.into()
+    /// The last frames of light and what tracks made of the last lit slots, oldest first.
+    pub(crate) fn into_frames(self) -> (Vec<LightFrame>, Vec<SlotMoves>) {
+        (self.frames.into(), self.moves.into())
     }
 }
 

@@ -58,10 +58,21 @@ impl RegistrationMeter {
         used: &'a DAffine3,
         truth: &'a DAffine3,
     ) -> impl Iterator<Item = f64> + 'a {
+        self.placed(body, used, truth).map(|(used, truth)| (used - truth).length())
+    }
+
+    /// For each point of the tracked body `body`: where the world-from-body poses `used` and `truth` place it in the
+    /// picture, pixels. Points that either pose places behind the projector are left out.
+    pub(super) fn placed<'a>(
+        &'a self,
+        body: usize,
+        used: &'a DAffine3,
+        truth: &'a DAffine3,
+    ) -> impl Iterator<Item = (DVec2, DVec2)> + 'a {
         let points = self.points.get(body).map_or(&[][..], Vec::as_slice);
         points.iter().filter_map(move |p| {
             let at = |m: &DAffine3| self.camera.project(m.transform_point3(*p));
-            Some((at(used)? - at(truth)?).length())
+            Some((at(used)?, at(truth)?))
         })
     }
 

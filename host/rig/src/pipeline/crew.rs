@@ -6,6 +6,7 @@
 //! cannot reach the light.
 
 use super::parts::CrewParts;
+use super::settings::wants_tracks;
 use super::threads::{
     pack_thread, plan_thread, policy, tracking_thread, PackInbox, PlanInbox, Shared, NOTES,
 };
@@ -20,7 +21,7 @@ use crate::tracks::TrackSnapshot;
 use dpm_common::realtime::os::standing_of;
 use dpm_device::time::HostTime;
 use dpm_handoff::channel::{channel, Receiver, Sender};
-use dpm_handoff::latest::{latest, Publisher};
+use dpm_handoff::latest::{latest, Publisher, Reader};
 use dpm_handoff::path::Lock;
 use dpm_handoff::wake::{WaitPolicy, Waiter};
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
@@ -40,6 +41,8 @@ pub(super) struct Port {
     pub(super) free: Sender<Box<FrameMemory>>,
     /// Publishes the projector's clock to the crew.
     pub(super) times: Publisher<LinkTime>,
+    /// The newest tracks; `None` if the projector is told of none.
+    pub(super) tracks: Option<Reader<TrackSnapshot>>,
 }
 
 /// The way by which the collector returns notes to the current crew. Not for the frame path: it may lock.
@@ -140,6 +143,8 @@ impl Crew {
             failure: Lock::new(None),
         });
         let (publisher, reader) = latest(TrackSnapshot::empty(rig.bodies.len()));
+        let (to_link, tracks) =
+            wants_tracks(rig).then(|| latest(TrackSnapshot::empty(rig.bodies.len()))).unzip();
         let (times, time) = latest(shared.time);
         let gpu_free = Waiter::new(policy);
         let gpu_waker = gpu_free.waker();
@@ -150,7 +155,7 @@ impl Crew {
             let (shared, state) = (shared.clone(), state.clone());
             named("tracking")
                 .spawn(move || {
-                    let unseen = tracking_thread(&shared, &state, tracking, publisher);
+                    let unseen = tracking_thread(&shared, &state, tracking, publisher, to_link);
                     state.returned[TRACKING].store(true, Ordering::Release);
                     unseen
                 })
@@ -178,7 +183,7 @@ impl Crew {
                 .map_err(refused("pack"))?
         };
         let crew = Self { state, tracking, others: [plan, pack], silences: Default::default() };
-        Ok((crew, Port { jobs: to_link_out, free: free_in, times }))
+        Ok((crew, Port { jobs: to_link_out, free: free_in, times, tracks }))
     }
 
     /// Checks the crew, `step_ns` after the last check.

@@ -120,6 +120,9 @@ impl Line {
                 // Frames of the former crew are dropped.
                 desk.crew = Some((port.jobs, port.free));
                 self.stage.tell_times_to(port.times);
+                if let Some(tracks) = port.tracks {
+                    self.stage.follow_by(tracks);
+                }
             }
             let job = desk.next(self.stage.rest_ns(shared.clock.now()));
             let now = shared.clock.now();

@@ -7,6 +7,7 @@ use crate::telemetry::report::Report;
 use crate::telemetry::slots::SlotCounts;
 use crate::telemetry::trace::TracedFrame;
 use dpm_common::realtime::standstill::Standstills;
+use dpm_device::projector::SlotMoves;
 
 /// The results of a run.
 pub struct RunOutcome {
@@ -16,6 +17,8 @@ pub struct RunOutcome {
     pub recent: Vec<FrameRecord>,
     /// The light of these frames, oldest first.
     pub light: Vec<LightFrame>,
+    /// What tracks made of the planes of the last lit slots of a mock in this process, oldest first; empty without tracks.
+    pub moves: Vec<SlotMoves>,
     /// Lit frames whose light was not what was rendered.
     pub light_mismatches: u64,
     /// Distributions of every interval.

@@ -1,7 +1,7 @@
 //! What a run needs: the tracker, the renderer, the memory of frames, and the projector at the other end of the
 //! cable.
 
-use super::settings::{budget_controller, output, renderer_settings};
+use super::settings::{budget_controller, output, renderer_settings, wants_tracks};
 use crate::config::{MockProjectorConfig, RenderMethod};
 use crate::engine::connect::{connect, ENDED_WITH_THE_LAST_RUN};
 use crate::engine::error::PipelineError;
@@ -31,6 +31,11 @@ use std::sync::Arc;
 /// How long the first frame may take, nanoseconds. Drivers translate shaders for it, which takes minutes on a slow,
 /// busy machine.
 pub(super) const FIRST_FRAME_TIMEOUT_NS: u64 = 180_000_000_000;
+
+/// By how many mirrors the mock moves light at most as tracks say.
+const GREATEST_SHIFT: u8 = 16;
+/// Slots whose shifts wait in the mock to be recorded.
+const MOVES_KEPT: usize = 64;
 
 /// Where the pictures of a run come from.
 #[derive(Clone)]
@@ -147,6 +152,9 @@ impl CrewParts {
                 self.budget = budget_controller(rig);
             }
         }
+        if wants_tracks(rig) {
+            self.tracking = self.tracking.with_lively(rig);
+        }
         Ok(self)
     }
 }
@@ -176,10 +184,12 @@ pub(super) fn mock_projector(
     setup.frame_buffers = mock.buffer_frames.min(64) as u8;
     setup.clock = DeviceClock { skew_ppb: (mock.clock_ppm * 1000.0) as i32, ..DeviceClock::IDEAL };
     setup.flash_limit = projector::flash_limit(config);
+    (setup.greatest_shift, setup.moves_kept) = (Some(GREATEST_SHIFT), MOVES_KEPT);
     let emulated = EmulatedProjector::new(setup, &mock.faults, config.render.seed, start)
         .map_err(|e| RigError::Unsupported(format!("projector.backend.faults: {e}")))?;
     let marks = marked.then_some(rig.schedule);
-    let recorder = LightRecorder::new(lights, options.keep_frames, options.verify, marks);
+    let kept = [options.keep_frames, options.keep_frames.max(options.keep_records)];
+    let recorder = LightRecorder::new(lights, kept, options.verify, marks);
     Ok((emulated, recorder))
 }
 
@@ -195,6 +205,9 @@ pub(super) fn bring_up(
 ) -> Result<(HostLink, LinkTime), PipelineError> {
     let settings = projector::link_settings(&rig.config, rig.camera.raster);
     let mut link = HostLink::new(LinkSettings { schedule: rig.schedule, ..settings });
+    if wants_tracks(rig) {
+        link.want_tracks();
+    }
     let acknowledged = if rig.config.safety.acknowledge_faults { u32::MAX } else { ENDED_WITH_THE_LAST_RUN };
     let time = connect(&mut link, medium, acknowledged, monitor, now, &|| monitor.stop_requested())?;
     Ok((link, time))

@@ -138,10 +138,12 @@ impl Ran {
         report.frames_per_wall_second = report.frames_lit as f64 / wall_s.max(1e-9);
         report.warnings.extend(warnings);
         report.warnings.extend(rig.scene.warnings.iter().cloned());
+        let (light, moves) = recorder.map_or_else(Default::default, LightRecorder::into_frames);
         RunOutcome {
             report,
             recent: std::mem::take(&mut collector.recent).into(),
-            light: recorder.map_or_else(Vec::new, LightRecorder::into_frames),
+            light,
+            moves,
             light_mismatches: collector.light_mismatches,
             traced: std::mem::take(&mut collector.traced).into(),
             slots,

@@ -100,12 +100,13 @@ pub(super) fn pop_within<T>(from: &mut Receiver<T>, limit_ns: i64) -> Option<T> 
     })
 }
 
-/// Reads the tracker until planning is over. Returns what is wrong with the tracker at the end.
+/// Reads the tracker until planning is over, for planning and, with `to_link`, for the link. Returns what is wrong with the tracker at the end.
 pub(super) fn tracking_thread(
     shared: &Shared,
     crew: &CrewState,
     mut stage: TrackingStage,
     mut latest: Publisher<TrackSnapshot>,
+    mut to_link: Option<Publisher<TrackSnapshot>>,
 ) -> Option<String> {
     let Shared { facts, clock, .. } = shared;
     shared.rights.enter(0);
@@ -125,6 +126,9 @@ pub(super) fn tracking_thread(
         steps = steps.saturating_add(1);
         enter_frame_path(steps >= WARM_UP_STEPS);
         read_tracker(facts, &mut stage, &mut latest, now);
+        if let Some(to_link) = &mut to_link {
+            stage.publish_lively(now, to_link);
+        }
         std::thread::sleep(POLL_REST);
     }
     enter_frame_path(false);

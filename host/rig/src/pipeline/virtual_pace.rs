@@ -3,7 +3,7 @@
 
 use super::parts::{bring_up, mock_projector, CrewParts, Origin, FIRST_FRAME_TIMEOUT_NS};
 use super::run::{Ran, LIGHTS};
-use super::settings::lead_estimator;
+use super::settings::{lead_estimator, wants_tracks};
 use super::supervisor::leave_behind;
 use super::threads::{enter_frame_path, may_stall, read_tracker, rendered, NOTES, WARM_UP_FRAMES};
 use crate::config::ProjectorBackend;
@@ -23,7 +23,7 @@ use crate::mock::EmulatedProjector;
 use crate::plan::link_time::LinkTime;
 use crate::rig::{Rig, RigError};
 use crate::telemetry::monitor::RunMonitor;
-use crate::tracks::TrackSnapshot;
+use crate::tracks::{open_for, TrackSnapshot, TrackingStage};
 use dpm_common::clock::Stopwatch;
 use dpm_common::realtime::standstill::Standstills;
 use dpm_device::time::HostTime;
@@ -72,10 +72,16 @@ pub(super) fn run_at_virtual_pace(
     let (done, finished) = channel(NOTES, WaitPolicy::Park);
     let free: Vec<_> = std::mem::take(&mut parts.memory).into_iter().map(Box::new).collect();
     let frames = free.len();
+    let mut late = LateTracks::of(rig, origin)?;
+    let mut stage = LinkStage::new(facts.clone(), link, keeper, lead);
+    if let Some(tracks) = late.as_mut().and_then(|late| late.reader.take()) {
+        stage.follow_by(tracks);
+    }
     let mut world = World {
         plan: PlanStage::new(facts.clone(), crew.clone(), &time, now),
         pack: PackStage::new(facts.clone(), crew, None),
-        link: LinkStage::new(facts.clone(), link, keeper, lead),
+        link: stage,
+        late,
         time,
         now,
         sent_at: now,
@@ -88,7 +94,7 @@ pub(super) fn run_at_virtual_pace(
         notes: RefCell::new((0..frames).map(|_| Box::new(FrameNote::new(rig))).collect()),
         under_way: VecDeque::with_capacity(frames),
         done: Some(done),
-        collector: Collector::new(rig.clone(), options.keep_frames, options.verify)
+        collector: Collector::new(rig.clone(), options.keep_frames.max(options.keep_records), options.verify)
             .about(origin.gpu().is_none(), None),
         inbox: Inbox { done: finished, lights },
         at_work: "plan",
@@ -112,12 +118,44 @@ pub(super) fn run_at_virtual_pace(
     })
 }
 
+/// The tracker once more, for the tracks that are sent between frames. Frames are planned ahead of the clock of the link
+/// here, so both cannot read one tracker in the order of time; the mock says the same to both.
+struct LateTracks {
+    tracking: TrackingStage,
+    frames: Publisher<TrackSnapshot>,
+    publisher: Publisher<TrackSnapshot>,
+    /// `None` once the link has it.
+    reader: Option<Reader<TrackSnapshot>>,
+}
+
+impl LateTracks {
+    /// `None` if no tracks are sent.
+    fn of(rig: &Rig, origin: &Origin) -> Result<Option<Self>, PipelineError> {
+        if !wants_tracks(rig) || matches!(origin, Origin::Pattern(..)) {
+            return Ok(None);
+        }
+        let tracker = open_for(rig, Arc::new(|| HostTime(0)), HostTime(0))?;
+        let empty = || latest(TrackSnapshot::empty(rig.bodies.len()));
+        let ((frames, _), (publisher, reader)) = (empty(), empty());
+        let tracking = TrackingStage::new(rig, tracker).with_lively(rig);
+        Ok(Some(Self { tracking, frames, publisher, reader: Some(reader) }))
+    }
+
+    /// Reads what has arrived by `now`. The failure of a tracker shows in the frames.
+    fn read(&mut self, now: HostTime) {
+        let _ = self.tracking.step(now, &mut self.frames);
+        self.tracking.publish_lively(now, &mut self.publisher);
+    }
+}
+
 /// All parts of a run, and its clock.
 struct World {
     facts: Arc<Facts>,
     plan: PlanStage<Virtual>,
     pack: PackStage,
     link: LinkStage<Virtual>,
+    /// `None` if the projector is told of no tracks.
+    late: Option<LateTracks>,
     /// The projector's clock as the handshake found it.
     time: LinkTime,
     /// When the last frame was latched.
@@ -249,6 +287,7 @@ impl World {
         enter_frame_path(frame >= WARM_UP_FRAMES && self.link.is_streaming());
         may_stall(&self.facts, StallIn::Link, frame);
         let mut now = note.timeline.packed_at.plus_ns(self.costs[3]);
+        self.follow(now);
         self.live(now);
         let watch = Stopwatch::start();
         let planes = memory.planes.bytes();
@@ -259,6 +298,17 @@ impl World {
         note.timeline.wall_ns[Stage::Link as usize] = watch.elapsed_ns();
         self.link.taken(note, now);
         self.sent_at = now;
+    }
+
+    /// Sends all tracks that are due before `until`, each by the samples that have arrived by then.
+    fn follow(&mut self, until: HostTime) {
+        while let Some(at) = self.link.tracks_due_at().filter(|at| *at < until) {
+            if let Some(late) = &mut self.late {
+                late.read(at.plus_ns(-self.track_ns));
+            }
+            self.live(at);
+            self.link.poll(at, &mut self.cable);
+        }
     }
 
     /// The link has finished with a frame: returns its memory, and passes its note to the collector.
@@ -283,6 +333,7 @@ impl World {
         let (last, mut now) = (self.sent_at, self.sent_at);
         while let Some(at) = self.link.end(now, last, &mut self.cable) {
             now = at;
+            self.follow(now);
             self.live(now);
         }
     }

@@ -53,6 +53,14 @@ pub(crate) struct FramePlan {
     /// Per tracked body: predicted world-from-mesh at the first photon and at the last; empty if all planes show the
     /// bodies at one instant.
     pub swept_poses: [Vec<DAffine3>; 2],
+    /// The instant of `tracked_poses` on the host's clock: the centre of the light.
+    pub centre_at: HostTime,
+    /// The instants of the first photon and of the last.
+    pub swept_at: [HostTime; 2],
+    /// Per tracked body: from the mesh's space to that of the body that the tracker reports.
+    pub mesh_to_body: Vec<DAffine3>,
+    /// Per tracked body: standard deviation of the predicted position along its worst axis, metres; 0 without a sample.
+    pub sigma_m: Vec<f64>,
     /// Per body of the scene: world-from-body.
     pub scene_poses: Vec<DAffine3>,
     /// The same for `swept_poses`.
@@ -120,6 +128,10 @@ impl FramePlan {
             dark: Vec::with_capacity(bodies),
             lost: Vec::with_capacity(bodies),
             swept_poses: [(); 2].map(|()| Vec::with_capacity(bodies)),
+            centre_at: HostTime(0),
+            swept_at: [HostTime(0); 2],
+            mesh_to_body: Vec::with_capacity(bodies),
+            sigma_m: Vec::with_capacity(bodies),
             scene_poses: Vec::with_capacity(rig.scene.bodies.len()),
             swept_scene: [(); 2].map(|()| Vec::with_capacity(rig.scene.bodies.len())),
             eye: DVec3::ZERO,
@@ -151,7 +163,8 @@ impl FramePlan {
         self.place_bodies(rig, snapshot, inputs, centre);
         rig.scene_poses(&self.tracked_poses, &mut self.scene_poses);
         let first = self.due_at.plus_ns(late_ns);
-        self.sweep_bodies(rig, snapshot, inputs.applied, [first, first.plus_ns(exposure_ns)]);
+        (self.centre_at, self.swept_at) = (centre, [first, first.plus_ns(exposure_ns)]);
+        self.sweep_bodies(rig, snapshot, inputs.applied);
         (self.eye, self.gaze) = rig.observer.eye_and_gaze(&self.tracked_poses);
         self.widen_deg = rig.observer.gaze_body().map_or(0.0, |body| {
             let track = snapshot.tracks.get(body).copied().flatten();
@@ -183,11 +196,14 @@ impl FramePlan {
         self.seen.clear();
         self.dark.clear();
         self.lost.clear();
+        self.mesh_to_body.clear();
+        self.sigma_m.clear();
         // The oldest among the lit bodies; the oldest among the dark ones is used only if none is lit.
         let mut oldest: [Option<(HostTime, HostTime)>; 2] = [None; 2];
         for (i, body) in rig.bodies.iter().enumerate() {
             let track = snapshot.tracks.get(i).copied().flatten();
-            let (pose, sampled, dark) = match track {
+            let mesh_to_body = inputs.applied.mesh_to_body[i];
+            let (pose, sampled, sigma_m, dark) = match track {
                 Some((state, received_at)) => {
                     let state = TrackState { lost_after_ns: inputs.predict_ns, ..state };
                     let sampled = state.predict(state.captured_at);
@@ -206,16 +222,19 @@ impl FramePlan {
                         *oldest = Some((state.captured_at, received_at));
                     }
                     let pose = if rig.config.prediction.on { used.pose } else { sampled.pose };
-                    let mesh_to_body = inputs.applied.mesh_to_body[i];
-                    (affine(&pose) * mesh_to_body, affine(&sampled.pose) * mesh_to_body, dark)
+                    let (pose, sampled) =
+                        (affine(&pose) * mesh_to_body, affine(&sampled.pose) * mesh_to_body);
+                    (pose, sampled, used.position_sigma_m, dark)
                 }
                 // The body was never seen, so nothing may be lit.
-                None => (affine(&body.rest), affine(&body.rest), Some(DarkCause::NeverSeen)),
+                None => (affine(&body.rest), affine(&body.rest), 0.0, Some(DarkCause::NeverSeen)),
             };
             self.tracked_poses.push(pose);
             self.sampled_poses.push(sampled);
             self.dark.push(dark);
             self.lost.push(dark.is_some());
+            self.mesh_to_body.push(mesh_to_body);
+            self.sigma_m.push(sigma_m);
             // A seen body has a known pose, whether or not its sample is new enough for light.
             self.seen.push(track.is_some());
         }
@@ -223,8 +242,8 @@ impl FramePlan {
         (self.captured_at, self.received_at) = oldest[0].or(oldest[1]).unwrap_or((self.due_at, self.due_at));
     }
 
-    /// For every body: where it will be at the instants `ends`. Bodies whose poses are not predicted stand still.
-    fn sweep_bodies(&mut self, rig: &Rig, snapshot: &TrackSnapshot, applied: &Applied, ends: [HostTime; 2]) {
+    /// For every body: where it will be at the instants `swept_at`. Bodies whose poses are not predicted stand still.
+    fn sweep_bodies(&mut self, rig: &Rig, snapshot: &TrackSnapshot, applied: &Applied) {
         for (swept, scene) in self.swept_poses.iter_mut().zip(&mut self.swept_scene) {
             swept.clear();
             scene.clear();
@@ -233,7 +252,7 @@ impl FramePlan {
             return;
         }
         for (end, (swept, scene)) in
-            ends.into_iter().zip(self.swept_poses.iter_mut().zip(&mut self.swept_scene))
+            self.swept_at.into_iter().zip(self.swept_poses.iter_mut().zip(&mut self.swept_scene))
         {
             for (i, body) in rig.bodies.iter().enumerate() {
                 let track = snapshot.tracks.get(i).copied().flatten();

@@ -45,6 +45,13 @@ impl LinkTime {
         self.anchor.1.plus_ns(i64::try_from(ns).unwrap_or(if ns > 0 { i64::MAX } else { i64::MIN }))
     }
 
+    /// Converts an instant of the host's clock to the device's, at the nominal rate; 0 before the device's clock began.
+    pub(crate) fn ticks_of(&self, at: HostTime) -> DeviceTicks {
+        let ns = i128::from(at.0) - i128::from(self.anchor.1 .0);
+        let ticks = ns * i128::from(self.clock.tick_hz()) / 1_000_000_000 + i128::from(self.anchor.0 .0);
+        DeviceTicks(u64::try_from(ticks.max(0)).unwrap_or(u64::MAX))
+    }
+
     /// The first slot that starts at or after `at`.
     pub(crate) fn slot_after(&self, at: HostTime) -> u64 {
         let since = at.ns_since(self.host_of_slot(self.first));

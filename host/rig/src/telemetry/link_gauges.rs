@@ -8,8 +8,8 @@ use std::sync::atomic::{AtomicI64, AtomicU64, Ordering};
 /// number is right, but they are not all of one instant.
 #[derive(Debug, Default)]
 pub(crate) struct LinkGauges {
-    /// Sessions, returns of the light, bytes, planes (3), frames not sent (6).
-    counts: [AtomicU64; 12],
+    /// Sessions, returns of the light, bytes, planes (3), TRACKS, planes that they moved (3), frames not sent (6).
+    counts: [AtomicU64; 16],
     /// What the projector counted.
     device: [AtomicU64; 9],
     /// Bound of the clock's error and the learned travel, nanoseconds; [`NONE`] while there is none.
@@ -45,6 +45,10 @@ pub(crate) struct Carried {
     pub planes: [u64; 3],
     /// Frames not sent, in the order of [`ProjectorReport::not_sent`].
     pub not_sent: [u64; 6],
+    /// TRACKS sent.
+    pub tracks_sent: u64,
+    /// Planes by what tracks did, in the order of [`ProjectorReport::planes_by_tracks`].
+    pub planes_by_tracks: [u64; 3],
     /// What the projector counted; `None` for the mock in this process.
     pub device: Option<DeviceCounts>,
     /// Bound of the clock's error, nanoseconds.
@@ -58,7 +62,8 @@ pub(crate) struct Carried {
 impl LinkGauges {
     /// Writes all figures.
     pub(crate) fn tell(&self, c: &Carried) {
-        let counts = [c.sessions, c.rearmed, c.bytes_sent].into_iter().chain(c.planes).chain(c.not_sent);
+        let counts = [c.sessions, c.rearmed, c.bytes_sent].into_iter().chain(c.planes);
+        let counts = counts.chain([c.tracks_sent]).chain(c.planes_by_tracks).chain(c.not_sent);
         self.counts.iter().zip(counts).for_each(|(to, n)| to.store(n, Ordering::Relaxed));
         if let Some(d) = c.device {
             let DeviceCounts { lit, lit_unseen, repeated, blank, incomplete, .. } = d;
@@ -85,7 +90,7 @@ impl LinkGauges {
 
     /// The figures as a report, with the name of the medium.
     pub(crate) fn report(&self, name: &str) -> ProjectorReport {
-        let [sessions, rearmed, bytes, raw, coded, kept, not_sent @ ..] =
+        let [sessions, rearmed, bytes, raw, coded, kept, tracks_sent, moved, clamped, stale, not_sent @ ..] =
             self.counts.each_ref().map(|n| n.load(Ordering::Relaxed));
         let [lit, lit_unseen, repeated, blank, incomplete, too_late, superseded, refused, damaged_packets] =
             self.device.each_ref().map(|n| n.load(Ordering::Relaxed));
@@ -111,6 +116,8 @@ impl LinkGauges {
             sent_mb: bytes as f64 / 1e6,
             planes: [raw, coded, kept],
             not_sent,
+            tracks_sent,
+            planes_by_tracks: [moved, clamped, stale],
             device: (self.has_device.load(Ordering::Relaxed) != 0).then_some(device),
             clock_bound_ns,
             travel_ms: travel_ns.map(|ns| ns as f64 / 1e6),
@@ -148,6 +155,8 @@ mod tests {
             bytes_sent: 3_000_000,
             planes: [4, 5, 6],
             not_sent: [7, 8, 9, 10, 11, 12],
+            tracks_sent: 15,
+            planes_by_tracks: [16, 17, 18],
             device: Some(device),
             clock_bound_ns: Some(-13),
             travel_ns: Some(14_000_000),
@@ -163,6 +172,8 @@ mod tests {
                 sent_mb: 3.0,
                 planes: [4, 5, 6],
                 not_sent: [7, 8, 9, 10, 11, 12],
+                tracks_sent: 15,
+                planes_by_tracks: [16, 17, 18],
                 device: Some(device),
                 clock_bound_ns: Some(-13),
                 travel_ms: Some(14.0),

@@ -16,6 +16,12 @@ pub struct ProjectorReport {
     /// Frames not sent: link not up, no buffer in the projector, no room on the medium, medium lost, limit on
     /// flashes, limits on light.
     pub not_sent: [u64; 6],
+    /// TRACKS messages sent, which tell a projector between frames where the bodies are; 0 unless `projector.tracks` is
+    /// "auto" and the projector follows them.
+    pub tracks_sent: u64,
+    /// Planes of which the projector has moved, clamped and not moved a part, the last because no track held any more, in the
+    /// newest session.
+    pub planes_by_tracks: [u64; 3],
     /// What the projector reported; null for the mock in this process, whose light is observed directly.
     pub device: Option<DeviceCounts>,
     /// Greatest error of the mapping from the projector's clock to the host's, as bounded by the newest exchange,

@@ -1,7 +1,7 @@
 //! The first stage of a frame: puts newly arrived samples into the tracks of all bodies.
 
 use super::tracker_frame::TrackerFrame;
-use crate::config::{TrackerConfig, MAX_TRACKED};
+use crate::config::{PredictionConfig, TrackerConfig, MAX_TRACKED};
 use crate::rig::Rig;
 use dpm_device::time::HostTime;
 use dpm_device::tracker::{BodyIndex, Tracker, TrackerError};
@@ -31,6 +31,8 @@ impl TrackSnapshot {
 pub struct TrackingStage {
     tracker: Box<dyn Tracker>,
     bank: PoseFilterBank,
+    /// Filters of the same bodies that follow faster; `None` if nobody asks for them.
+    lively: Option<PoseFilterBank>,
     received_at: Vec<HostTime>,
     bodies: usize,
     /// From the tracker's coordinates to the world's; `None` if they are the same.
@@ -67,17 +69,33 @@ const fn remedy(tracker: &TrackerConfig) -> &'static str {
     }
 }
 
+/// How much more acceleration the filters expect whose tracks correct the light between frames: a correction that comes at
+/// once is worth more noise, which [`crate::engine::follow`] keeps out by its gate.
+const LIVELIER: f64 = 1.5;
+
+/// Filters for the bodies of `rig` that expect `livelier` times the acceleration of the rig file.
+fn bank(rig: &Rig, livelier: f64) -> PoseFilterBank {
+    // Each frame decides how long a body is shown without samples, see [`crate::plan::frame::FramePlan::fill`]. The filter
+    // only needs to know how long a track is worth keeping.
+    let longest_ms = rig.config.safety.predict_ms.unwrap_or(MAX_PREDICT_MS);
+    let prediction = &rig.config.prediction;
+    let expected = PredictionConfig {
+        acceleration: livelier * prediction.acceleration,
+        angular_acceleration: livelier * prediction.angular_acceleration,
+        ..prediction.clone()
+    };
+    let bodies = rig.bodies.len().min(MAX_TRACKED);
+    PoseFilterBank::new(&vec![expected.to_filter(longest_ms); bodies])
+}
+
 impl TrackingStage {
     /// A stage for the rig's bodies.
     pub fn new(rig: &Rig, tracker: Box<dyn Tracker>) -> Self {
-        // Each frame decides how long a body is shown without samples, see [`crate::plan::frame::FramePlan::fill`]. The filter
-        // only needs to know how long a track is worth keeping.
-        let longest_ms = rig.config.safety.predict_ms.unwrap_or(MAX_PREDICT_MS);
-        let config = rig.config.prediction.to_filter(longest_ms);
         let bodies = rig.bodies.len().min(MAX_TRACKED);
         Self {
             tracker,
-            bank: PoseFilterBank::new(&vec![config; bodies]),
+            bank: bank(rig, 1.0),
+            lively: None,
             received_at: vec![HostTime(0); bodies],
             bodies,
             frame: TrackerFrame::of(&rig.config.tracker, rig.latency_ns),
@@ -87,13 +105,18 @@ impl TrackingStage {
         }
     }
 
+    /// The same with filters that follow faster, for [`TrackingStage::publish_lively`].
+    pub(crate) fn with_lively(self, rig: &Rig) -> Self {
+        Self { lively: Some(bank(rig, LIVELIER)), ..self }
+    }
+
     /// Reads what has arrived by `now` and publishes the tracks.
     ///
     /// # Errors
     /// The tracker is gone; the tracks that are known stay published.
     pub fn step(&mut self, now: HostTime, latest: &mut Publisher<TrackSnapshot>) -> Result<(), TrackerError> {
         self.began_at.get_or_insert(now);
-        let Self { tracker, bank, received_at, latency_ns, frame, .. } = self;
+        let Self { tracker, bank, lively, received_at, latency_ns, frame, .. } = self;
         let result = tracker.poll(now, &mut |sample| {
             let in_world;
             let sample = match frame {
@@ -103,6 +126,9 @@ impl TrackingStage {
                     &in_world
                 }
             };
+            if let Some(lively) = lively {
+                lively.update(sample);
+            }
             if let Some(verdict) = bank.update(sample) {
                 if verdict.is_accepted() {
                     if let Some(at) = received_at.get_mut(usize::from(sample.body.0)) {
@@ -113,7 +139,19 @@ impl TrackingStage {
                 }
             }
         });
-        let (bank, received_at, latency_ns) = (&self.bank, &self.received_at, self.latency_ns);
+        self.publish(&self.bank, now, latest);
+        result.map(|_| ())
+    }
+
+    /// Publishes the tracks of the filters that follow faster as they are at `now`, if there are such filters.
+    pub(crate) fn publish_lively(&self, now: HostTime, latest: &mut Publisher<TrackSnapshot>) {
+        if let Some(bank) = &self.lively {
+            self.publish(bank, now, latest);
+        }
+    }
+
+    fn publish(&self, bank: &PoseFilterBank, now: HostTime, latest: &mut Publisher<TrackSnapshot>) {
+        let (received_at, latency_ns) = (&self.received_at, self.latency_ns);
         latest.publish_with(|snapshot| {
             snapshot.through = now;
             snapshot.latency_ns = latency_ns;
@@ -121,7 +159,6 @@ impl TrackingStage {
                 *track = bank.state(BodyIndex(i as u16)).map(|s| (s, *at));
             }
         });
-        result.map(|_| ())
     }
 
     /// What the tracker says of itself.

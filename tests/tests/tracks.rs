@@ -1,0 +1,198 @@
+//! Tracks from end to end at virtual pace: a host that sends them, and a mock projector that follows them. What is judged
+//! is the light that the mock emitted: every plane with the shifts with which it was lit, at points of the bodies, each
+//! weighted with the light of its plane. It is in a file of its own so that nothing else runs at the same time.
+
+use dpm_device::projector::SlotMoves;
+use dpm_rig::light::planes::{PlaneMeter, PlanePoint};
+use dpm_rig::pipeline::{self, RunOptions, RunOutcome};
+use dpm_rig::rig::Rig;
+use dpm_rig::telemetry::monitor::RunMonitor;
+use dpm_tests::rigs::demo_rig;
+use std::sync::Arc;
+
+/// Frames of a run: a body turns twice in them, at places where it never turned before.
+const FRAMES: u64 = 800;
+/// Frames after which the filters know the motion.
+const BEGUN: u64 = 60;
+/// No shift of this host is greater, mirrors.
+const CLAMP: u8 = 8;
+
+/// A tracker, and the time from latch to light.
+#[derive(Clone, Copy)]
+struct Setting {
+    rate_hz: u32,
+    latency_us: u32,
+    lead_us: u32,
+}
+
+/// The settings for which limits are given: design/planes-that-follow, "order of work", 3.
+const SETTINGS: [(Setting, f64); 3] = [
+    (Setting { rate_hz: 500, latency_us: 2000, lead_us: 2200 }, 1.7),
+    (Setting { rate_hz: 500, latency_us: 2000, lead_us: 4500 }, 1.7),
+    (Setting { rate_hz: 1000, latency_us: 500, lead_us: 2200 }, 1.0),
+];
+
+const STEADY: &str = "{kind=\"translate\",speed_m_s=1.0,amplitude_m=2.0,acceleration_m_s2=50.0}";
+
+/// Reaching with a hand: swings of two paces along two lines, and a tremor of half a millimetre at 8 Hz.
+const HUMAN: &str = "{kind=\"together\",parts=[\
+    {kind=\"sinusoid\",peak_speed_m_s=0.8,peak_acceleration_m_s2=5.0},\
+    {kind=\"sinusoid\",direction=[0,1,0.3],peak_speed_m_s=0.3,peak_acceleration_m_s2=3.1},\
+    {kind=\"sinusoid\",direction=[0.3,1,0],peak_speed_m_s=0.025,peak_acceleration_m_s2=1.26}]}";
+
+/// Straight lines of 1 m/s with turns of 50 m/s2 between them, in run `k`.
+fn turning(k: usize) -> String {
+    let amplitude_m = [0.2, 0.14, 0.29, 0.17, 0.25, 0.31, 0.155, 0.22][k % 8];
+    let (sense, rise) = (if k & 1 == 0 { 1 } else { -1 }, 0.3 * (k % 3) as f64);
+    format!(
+        "{{kind=\"translate\",direction=[{sense},{rise},0.1],speed_m_s=1.0,amplitude_m={amplitude_m},acceleration_m_s2=50.0}}"
+    )
+}
+
+/// The demo at full size with both bodies in `motion`, and 0.1 mm of noise.
+fn rig(motion: &str, setting: Setting, tracks: &str) -> Arc<Rig> {
+    let Setting { rate_hz, latency_us, lead_us } = setting;
+    // 50 us of the lead are the pipeline's own margin.
+    let render_us = lead_us - 50 - 250;
+    let flags = [
+        format!("scene.bodies.0.motion={motion}"),
+        format!("scene.bodies.1.motion={motion}"),
+        format!("tracker.rate_hz={rate_hz}"),
+        format!("tracker.latency_us={latency_us}"),
+        "tracker.noise_m=0.0001".into(),
+        format!("real_time.stage_costs_us={{track=50,plan=50,render={render_us},pack=100,send=100}}"),
+        format!("projector.tracks=\"{tracks}\""),
+    ];
+    demo_rig(1024, 768, &flags.each_ref().map(String::as_str))
+}
+
+fn lit(rig: &Arc<Rig>, frames: u64) -> RunOutcome {
+    let options = RunOptions { frames, keep_records: frames as usize, ..RunOptions::default() };
+    let outcome = pipeline::run_prepared(rig.clone(), options, &Arc::new(RunMonitor::default()));
+    outcome.unwrap_or_else(|e| panic!("{e}"))
+}
+
+/// The light of runs: distances in pixels with the light that fell there, as drawn and as lit.
+#[derive(Default)]
+struct Light {
+    drawn: Vec<(f64, f64)>,
+    lit: Vec<(f64, f64)>,
+    /// Ages of the tracks in milliseconds, with the light of their planes.
+    ages_ms: Vec<(f64, f64)>,
+    planes_moved: usize,
+}
+
+impl Light {
+    /// Adds the light of a run.
+    fn add(&mut self, rig: &Arc<Rig>, outcome: &RunOutcome) {
+        let meter = PlaneMeter::new(rig.clone());
+        let planes = rig.schedule.planes();
+        for record in outcome.recent.iter().filter(|record| record.id.0 >= BEGUN) {
+            let of_frame = |m: &&SlotMoves| m.frame == record.id.0 as u32 && m.slot == record.slot;
+            // The light of the last frames ends with the run.
+            let Some(moves) = outcome.moves.iter().find(of_frame) else { continue };
+            meter.measure(record, Some(moves), &mut |p: PlanePoint| {
+                self.drawn.push((p.drawn_off_px, p.light));
+                self.lit.push((p.off_px, p.light));
+            });
+            for ((plane, age), spec) in moves.planes().iter().zip(moves.ages()).zip(planes) {
+                let age = age.expect("tracks hold for every plane");
+                self.ages_ms.push((f64::from(age) * 1e-6, f64::from(1u32 << spec.bit)));
+                self.planes_moved += usize::from(plane.is_any());
+                assert!(plane.all().len() <= rig.bodies.len(), "a region for each body that is seen");
+                assert!(plane.all().iter().flat_map(|one| one.shift).all(|s| s.unsigned_abs() <= CLAMP));
+            }
+        }
+    }
+
+    /// The 50th and the 99th percentile as drawn and as lit, pixels.
+    fn quantiles(&mut self) -> [[f64; 2]; 2] {
+        [&mut self.drawn, &mut self.lit].map(|all| [quantile(all, 0.5), quantile(all, 0.99)])
+    }
+}
+
+/// The value below which a share of the light lies.
+fn quantile(points: &mut [(f64, f64)], share: f64) -> f64 {
+    points.sort_by(|a, b| a.0.total_cmp(&b.0));
+    let all: f64 = points.iter().map(|p| p.1).sum();
+    let mut below = 0.0;
+    let reaches = |p: &&(f64, f64)| {
+        below += p.1;
+        below >= share * all
+    };
+    points.iter().find(reaches).map_or(f64::NAN, |p| p.0)
+}
+
+fn light_of(motions: &[String], setting: Setting) -> Light {
+    let mut light = Light::default();
+    for motion in motions {
+        let rig = rig(motion, setting, "auto");
+        light.add(&rig, &lit(&rig, FRAMES));
+    }
+    light
+}
+
+fn told(what: &str, setting: Setting, light: &mut Light) -> [[f64; 2]; 2] {
+    let [drawn, lit] = light.quantiles();
+    let age = quantile(&mut light.ages_ms, 0.99);
+    println!(
+        "| {} Hz, {} ms; {} ms | {what} | {:.2} / {:.2} | {:.2} / {:.2} | {age:.2} | {} |",
+        setting.rate_hz,
+        f64::from(setting.latency_us) / 1e3,
+        f64::from(setting.lead_us) / 1e3,
+        drawn[0],
+        drawn[1],
+        lit[0],
+        lit[1],
+        light.planes_moved
+    );
+    [drawn, lit]
+}
+
+/// Turns of 50 m/s2 that nothing foretells: with tracks the light lies within the limits, and without them it does not.
+/// The tracks in the light are young.
+#[test]
+fn tracks_keep_light_on_bodies_that_turn() {
+    let motions: Vec<String> = (0..4).map(turning).collect();
+    for (setting, limit_px) in SETTINGS {
+        let mut light = light_of(&motions, setting);
+        let [drawn, lit] = told("turns", setting, &mut light);
+        assert!(lit[1] <= limit_px, "p99 {} px, at most {limit_px}", lit[1]);
+        assert!(drawn[1] > 1.25 * lit[1], "p99 {} px as drawn, {} px as lit", drawn[1], lit[1]);
+        assert!(lit[0] <= 1.02 * drawn[0], "p50 {} px as drawn, {} px as lit", drawn[0], lit[0]);
+        assert!(quantile(&mut light.ages_ms, 0.99) <= 0.6);
+    }
+}
+
+/// Motion without surprises is at most 15 % worse.
+#[test]
+fn tracks_leave_quiet_motion_alone() {
+    for (setting, _) in SETTINGS {
+        for (what, motion) in [("steady", STEADY), ("human", HUMAN)] {
+            let [drawn, lit] = told(what, setting, &mut light_of(&[motion.into()], setting));
+            assert!(lit[1] <= 1.15 * drawn[1], "{what}: p99 {} px as drawn, {} px as lit", drawn[1], lit[1]);
+        }
+    }
+}
+
+/// A run repeats, shifts included. "off" sends none, and changes nothing else.
+#[test]
+fn tracks_repeat_and_can_be_switched_off() {
+    let run = |tracks: &str| {
+        let outcome = lit(&rig(&turning(1), SETTINGS[1].0, tracks), 300);
+        let moves: Vec<String> = outcome.moves.iter().map(|m| format!("{m:?}")).collect();
+        let poses: Vec<_> = outcome.recent.iter().map(|r| r.tracked_poses.clone()).collect();
+        let projector = outcome.report.projector.expect("the mock was used");
+        let [moved, clamped, stale] = projector.planes_by_tracks;
+        assert_eq!(moved > 0, tracks == "auto", "{moved} planes moved");
+        assert_eq!((clamped, stale), (0, 0));
+        // Four messages a millisecond, and those of the next frame beside them.
+        let sent = 300..3000;
+        assert_eq!(sent.contains(&projector.tracks_sent), tracks == "auto", "{}", projector.tracks_sent);
+        (moves, poses, outcome.report.frames_lit)
+    };
+    let (on, again, off) = (run("auto"), run("auto"), run("off"));
+    assert!(on.0.len() > 250 && on == again);
+    assert!(off.0.is_empty());
+    assert_eq!((on.1, on.2), (off.1, off.2));
+}
