@@ -25,7 +25,7 @@ struct Setting {
     lead_us: u32,
 }
 
-/// The settings for which limits are given: design/planes-that-follow, "order of work", 3.
+/// Trackers and delays, with the greatest 99th percentile that turns may have, pixels.
 const SETTINGS: [(Setting, f64); 3] = [
     (Setting { rate_hz: 500, latency_us: 2000, lead_us: 2200 }, 1.7),
     (Setting { rate_hz: 500, latency_us: 2000, lead_us: 4500 }, 1.7),
