@@ -170,8 +170,17 @@ mod tests {
         let mut child = std::process::Command::new("sleep").arg("30").spawn().expect("a program");
         drop(port);
         let mut theirs = never_wait(theirs).expect("set");
-        let hung_up = matches!(io::Read::read(&mut theirs, &mut [0; 1]), Ok(0))
-            || io::Read::read(&mut theirs, &mut [0; 1]).is_err_and(|e| e.kind() != io::ErrorKind::TimedOut);
+        // Another test may start a program between the opening of the pair and `never_wait`. That program holds the port
+        // for as long as it runs, which is much shorter than the child of this test runs.
+        let until = std::time::Instant::now() + std::time::Duration::from_secs(10);
+        let mut hung_up = false;
+        while !hung_up && std::time::Instant::now() < until {
+            hung_up = match io::Read::read(&mut theirs, &mut [0; 1]) {
+                Ok(read) => read == 0,
+                Err(e) => !matches!(e.kind(), io::ErrorKind::TimedOut | io::ErrorKind::WouldBlock),
+            };
+            std::thread::yield_now();
+        }
         let _ = child.kill();
         let _ = child.wait();
         assert!(hung_up);
