@@ -38,10 +38,14 @@ fn judged(outcome: &pipeline::RunOutcome, compared: &AgainstOffline) -> Result<(
         return Err(format!("p99 is {ratio:.3} times the predictor's"));
     }
     // The turns do not hide steady errors: a frame for another instant than its light's would always be off by the
-    // motion in between. This is not judged on a machine so busy that a frame takes a fifth of a second.
+    // motion in between. Points are compared one by one: the body that turns has half of them, so the median of all
+    // errors lies between its errors and the other body's, and one late frame moves it by a pixel. This is not judged on a machine so busy that a frame takes a fifth of a second.
     let is_starved = compared.horizon_ms.p50 > 200.0;
-    if !is_starved && compared.run.p50 > 1.2 * compared.offline.p50 + 0.02 {
-        return Err(format!("p50 {} px, offline {} px", compared.run.p50, compared.offline.p50));
+    if !is_starved && compared.apart.p50 > 0.02 {
+        return Err(format!(
+            "half of the points lie more than {} px from the predictor's",
+            compared.apart.p50
+        ));
     }
     Ok(())
 }
@@ -72,6 +76,7 @@ fn turns_are_lit_where_the_same_predictor_has_them_offline() {
             );
             row("as lit", &compared.run);
             row("the same predictor offline", &compared.offline);
+            row("from the light to where that predictor has it", &compared.apart);
             row("the same every 5 ms at the same horizons", &compared.evenly);
             row("all slots in which a frame stood, predicted to the first", &compared.held_by_first);
             row("the same, predicted to the middle of that time", &compared.held_by_middle);

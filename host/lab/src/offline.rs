@@ -81,6 +81,8 @@ pub struct AgainstOffline {
     pub run: Quantiles,
     /// As the predictor has them by all samples that had arrived when the frame was latched.
     pub offline: Quantiles,
+    /// How far the light lay from where the predictor has it, whatever the truth is: steady errors of the run alone.
+    pub apart: Quantiles,
     /// The same predictor every 5 ms while the run lasted, at those horizons in turn: turns whether or not a frame met them.
     pub evenly: Quantiles,
     /// Offline, in every slot in which a frame stood, its first and those in which it was repeated: predicted to the first, as the rig does.
@@ -107,7 +109,7 @@ impl AgainstOffline {
         let mut predictor = OfflinePredictor::new(rig)?;
         let slot_ns = rig.rate().slot_len_ns(0);
         let (mut run, mut offline, mut horizon_ms, mut behind_ms) = (vec![], vec![], vec![], vec![]);
-        let (mut by_first, mut by_middle, mut first_by_middle) = (vec![], vec![], vec![]);
+        let (mut by_first, mut by_middle, mut first_by_middle, mut apart) = (vec![], vec![], vec![], vec![]);
         let lit = |record: &FrameRecord| record.timeline.centre_at;
         let mut frames = 0;
         for (i, record) in records.iter().enumerate() {
@@ -137,6 +139,7 @@ impl AgainstOffline {
                     if k == 0 {
                         run.extend(meter.errors(body, &record.tracked_poses[body], &truth));
                         offline.extend(meter.errors(body, &to_first, &truth));
+                        apart.extend(meter.errors(body, &record.tracked_poses[body], &to_first));
                         first_by_middle.extend(meter.errors(body, &to_middle, &truth));
                     }
                 }
@@ -151,6 +154,7 @@ impl AgainstOffline {
             behind_ms: Quantiles::of(behind_ms),
             run: Quantiles::of(run),
             offline: Quantiles::of(offline),
+            apart: Quantiles::of(apart),
             held_by_first: Quantiles::of(by_first),
             held_by_middle: Quantiles::of(by_middle),
             first_by_middle: Quantiles::of(first_by_middle),
