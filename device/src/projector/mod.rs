@@ -15,14 +15,16 @@ mod frames;
 mod guard;
 mod light;
 mod receive;
+mod session;
 mod slots;
+mod status;
 mod thread;
 
 use std::collections::VecDeque;
 
 use crate::link::{
-    faults, Codec, Config, ConfigRefusal, Decoder, DecoderCounters, DeviceHello, DeviceMessage, DeviceState,
-    Echo, Fault, FaultCode, FlashLimiter, Header, Packet, SlotClock, Status, MAX_CONTROL_BYTES,
+    faults, Codec, Config, Decoder, DecoderCounters, DeviceMessage, DeviceState, Echo, Fault, FaultCode,
+    FlashLimiter, Header, Packet, SlotClock, Status, MAX_CONTROL_BYTES,
 };
 use crate::planes::{Raster, MAX_PLANES};
 use crate::time::{DeviceTicks, HostTime};
@@ -37,6 +39,7 @@ pub use following::SlotMoves;
 use frames::FrameStore;
 use guard::LightGuard;
 pub use light::{gather_bits, light_of_planes, Exposure, Run};
+use status::summed;
 pub use thread::{serve_cable, Served};
 
 /// Echo answers that may wait; later requests are dropped, as a busy device would.
@@ -481,80 +484,9 @@ impl LinkDevice for ProjectorFirmware {
     }
 }
 
-/// Counts of both lanes' decoders since power-on.
-fn summed(decoders: &[Decoder; 2]) -> DecoderCounters {
-    let [a, b] = decoders.each_ref().map(Decoder::counters);
-    DecoderCounters {
-        packets: a.packets.wrapping_add(b.packets),
-        header_errors: a.header_errors.wrapping_add(b.header_errors),
-        payload_errors: a.payload_errors.wrapping_add(b.payload_errors),
-        foreign: a.foreign.wrapping_add(b.foreign),
-        cut_short: a.cut_short.wrapping_add(b.cut_short),
-        bytes_skipped: a.bytes_skipped.wrapping_add(b.bytes_skipped),
-    }
-}
-
 impl Core {
     fn ticks(&self) -> DeviceTicks {
         self.setup.clock.ticks_at(self.now)
-    }
-
-    fn hello(&self, now: DeviceTicks) -> DeviceHello {
-        DeviceHello {
-            version: self.setup.version,
-            firmware: self.setup.firmware,
-            codecs: self.setup.codecs,
-            raster: self.setup.raster,
-            max_planes: self.setup.max_planes,
-            frame_buffers: self.setup.frame_buffers,
-            greatest_shift: self.setup.greatest_shift,
-            tick_hz: self.setup.clock.tick_hz,
-            min_plane_ns: self.setup.min_plane_ns,
-            serial: self.setup.serial,
-            now,
-        }
-    }
-
-    fn state(&self) -> DeviceState {
-        match (self.session, &self.config, self.mode) {
-            _ if self.latched != 0 => DeviceState::Faulted,
-            (0, ..) => DeviceState::Idle,
-            (_, None, _) => DeviceState::Greeted,
-            (_, _, Mode::Disarmed) => DeviceState::Configured,
-            (_, _, Mode::Normal) => DeviceState::Armed,
-            (_, _, Mode::Black) => DeviceState::Black,
-            (_, _, Mode::Frozen) => DeviceState::Frozen,
-        }
-    }
-
-    fn status_now(&self, decoders: &[Decoder; 2]) -> Status {
-        let (all, before) = (summed(decoders), self.counted_before);
-        Status {
-            state: self.state(),
-            lit: self.lit_now,
-            buffers_free: self.store.free() as u8,
-            faults: self.latched,
-            frame_limit: self.frame_limit(),
-            now: self.ticks(),
-            packets: all.packets.wrapping_sub(before.packets),
-            header_errors: all.header_errors.wrapping_sub(before.header_errors),
-            payload_errors: all.payload_errors.wrapping_sub(before.payload_errors),
-            packets_ignored: self
-                .status
-                .packets_ignored
-                .wrapping_add(all.foreign.wrapping_sub(before.foreign)),
-            bytes_skipped: all.bytes_skipped.wrapping_sub(before.bytes_skipped),
-            tracks: self.track_counts(),
-            ..self.status
-        }
-    }
-
-    fn frame_limit(&self) -> u32 {
-        if self.mode == Mode::Disarmed {
-            // No credit while the device would refuse frames.
-            return self.status.frames_accounted;
-        }
-        self.status.frames_accounted.wrapping_add(self.store.free() as u32)
     }
 
     /// When the watchdog expires if nothing more arrives.
@@ -633,107 +565,6 @@ impl Core {
         // External events happen now; the watchdog's effect was noted at its own instant.
         self.note_change();
         self.at = self.now;
-    }
-
-    /// Goes dark and drops every frame in flight.
-    fn disarm(&mut self) {
-        if self.mode != Mode::Disarmed {
-            self.counted_to = Some(self.now);
-        }
-        self.mode = Mode::Disarmed;
-        self.lit_now = false;
-        self.following.clear();
-        self.untaken = None;
-        let thrown = self.store.clear();
-        self.status.frames_refused = self.status.frames_refused.wrapping_add(thrown);
-        self.status_due = true;
-    }
-
-    /// Notes the number of damaged packets so far; if there are too many since a frame was whole, light ends.
-    fn damaged(&mut self, total: u32) {
-        if std::mem::take(&mut self.whole_since) || self.mode == Mode::Disarmed {
-            self.damaged_at_whole = total;
-        }
-        if total.wrapping_sub(self.damaged_at_whole) >= CHECKSUM_STORM {
-            self.damaged_at_whole = total;
-            self.latch(faults::CHECKSUM_STORM);
-        }
-    }
-
-    fn latch(&mut self, faults: u32) {
-        self.disarm();
-        self.latched |= faults;
-        self.report(FaultCode::Latched, 0);
-    }
-
-    fn report(&mut self, code: FaultCode, detail: u16) {
-        self.fault_due =
-            Some(Fault { latched: self.latched, code, detail, at: self.setup.clock.ticks_at(self.at) });
-        self.status_due = true;
-    }
-
-    fn open_session(&mut self, session: u32) {
-        self.disarm();
-        self.session = session;
-        self.config = None;
-        self.last_seen_frame = None;
-        self.status = NO_STATUS;
-        self.following.new_session();
-        self.counters_due = true;
-    }
-
-    fn configure(&mut self, config: Config) -> Result<(), ConfigRefusal> {
-        if config.raster != self.setup.raster {
-            return Err(ConfigRefusal::Raster);
-        }
-        if config.schedule.len() > self.setup.max_planes as usize {
-            return Err(ConfigRefusal::Planes);
-        }
-        let slots =
-            SlotClock::new(config.epoch, self.setup.clock.tick_hz, config.rate).ok_or(ConfigRefusal::Rate)?;
-        let plane_ns = 1_000_000_000 * u64::from(config.rate.den())
-            / (u64::from(config.rate.num()) * config.schedule.len() as u64);
-        if plane_ns < u64::from(self.setup.min_plane_ns) {
-            return Err(ConfigRefusal::Rate);
-        }
-        self.disarm();
-        self.config = Some((config, slots));
-        self.guard.configure(config.rate, config.limits, self.setup.limits);
-        self.flash = self.setup.flash_limit.map(|limit| FlashLimiter::backstop(config.rate, limit));
-        Ok(())
-    }
-
-    fn arm(&mut self, acknowledged: u32) {
-        let Some((_, slots)) = self.config else {
-            return self.report(FaultCode::Arm, 1);
-        };
-        if self.present != 0 || self.latched & !acknowledged != 0 {
-            return self.report(FaultCode::Arm, 2);
-        }
-        if self.ticks() < self.rest_until {
-            return self.report(FaultCode::Arm, 3);
-        }
-        if self.latched & faults::FLASH_LIMIT != 0 {
-            if let Some(flash) = &mut self.flash {
-                flash.reset();
-            }
-        }
-        self.latched = 0;
-        if self.mode == Mode::Disarmed {
-            let now = self.ticks();
-            self.next_slot = slots.slot_at(now).map_or(0, |k| k + 1);
-            let dark_ns = self.counted_to.map_or(0, |to| self.now.ns_since(to).max(0));
-            let rate = slots.rate();
-            let dark = dark_ns as u128 * u128::from(rate.num()) / (u128::from(rate.den()) * 1_000_000_000);
-            self.guard.was_dark(u64::try_from(dark).unwrap_or(u64::MAX).saturating_sub(1));
-        }
-        self.mode = Mode::Normal;
-        self.status_due = true;
-        // The light of the frozen frame may be over: then it ends now, not with the next slot.
-        let now = self.ticks();
-        if self.dark_from().is_some_and(|dark| dark <= now) {
-            self.end_light();
-        }
     }
 }
 
