@@ -1,6 +1,6 @@
 //! Latencies into a histogram: how many frames took how long, with the length of a slot.
 
-use super::plots::{color, key, titled, PlotError, Stroke, SIZE, SLOT_LINE};
+use super::plots::{color, framed, PlotError, SIZE, SLOT_LINE};
 use dpm_rig::telemetry::interval::Interval;
 use dpm_rig::telemetry::profile::Profiler;
 use plotters::element::DashedPathElement;
@@ -68,14 +68,7 @@ fn draw(
     {
         let root = SVGBackend::with_string(&mut text, SIZE).into_drawing_area();
         root.fill(&WHITE)?;
-        let below = titled(&root, titles)?;
-        let mut named: Vec<(&str, RGBColor, Stroke)> = curves
-            .iter()
-            .enumerate()
-            .map(|(i, (name, _))| (name.as_str(), color(i), Stroke::Plain(2)))
-            .collect();
-        named.push(("one slot", SLOT_LINE, Stroke::Dashed(1)));
-        let area = key(&below, &named)?;
+        let area = framed(&root, titles, curves.iter().map(|(name, _)| name.as_str()), true)?;
         // The axis begins at half a frame: a bin without a frame lies on it.
         let (bottom, top) = (0.5, 1.5 * most as f64);
         let mut chart = ChartBuilder::on(&area)

@@ -83,7 +83,7 @@ pub fn key<B: DrawingBackend>(
 ///
 /// # Errors
 /// What the drawing library says.
-pub(super) fn titled<B: DrawingBackend>(
+fn titled<B: DrawingBackend>(
     root: &DrawingArea<B, Shift>,
     titles: &[String; 2],
 ) -> Result<DrawingArea<B, Shift>, DrawingAreaErrorKind<B::ErrorType>> {
@@ -92,6 +92,25 @@ pub(super) fn titled<B: DrawingBackend>(
         root.draw_text(title, &("sans-serif", size).into_text_style(root), (24, 6 + 22 * i as i32))?;
     }
     Ok(below)
+}
+
+/// Titles above, and beside the chart the key of the curves `names` and of the line of a slot, if there is one. Returns what is left for the
+/// chart.
+///
+/// # Errors
+/// What the drawing library says.
+pub(super) fn framed<'a, B: DrawingBackend>(
+    root: &DrawingArea<B, Shift>,
+    titles: &[String; 2],
+    names: impl Iterator<Item = &'a str>,
+    has_slot: bool,
+) -> Result<DrawingArea<B, Shift>, DrawingAreaErrorKind<B::ErrorType>> {
+    let below = titled(root, titles)?;
+    let mut named: Vec<_> = names.enumerate().map(|(i, name)| (name, color(i), Stroke::Plain(2))).collect();
+    if has_slot {
+        named.push(("one slot", SLOT_LINE, Stroke::Dashed(1)));
+    }
+    key(&below, &named)
 }
 
 /// Latency against percentile for every interval of a kind, with the axis stretched towards the rare: one decade per nine. `made` says
@@ -138,17 +157,8 @@ fn draw(
     {
         let root = SVGBackend::with_string(&mut text, SIZE).into_drawing_area();
         root.fill(&WHITE)?;
-        let below = titled(&root, titles)?;
-        let mut named: Vec<(&str, RGBColor, Stroke)> = curves
-            .iter()
-            .enumerate()
-            .map(|(i, (name, _))| (name.as_str(), color(i), Stroke::Plain(2)))
-            .collect();
         let has_slot = (bottom..=top).contains(&slot_ms);
-        if has_slot {
-            named.push(("one slot", SLOT_LINE, Stroke::Dashed(1)));
-        }
-        let area = key(&below, &named)?;
+        let area = framed(&root, titles, curves.iter().map(|(name, _)| name.as_str()), has_slot)?;
         let mut chart = ChartBuilder::on(&area)
             .margin(24)
             .x_label_area_size(36)
