@@ -7,3 +7,4 @@ pub mod files;
 pub mod gpu;
 pub mod programs;
 pub mod rigs;
+pub mod sensor_wand;

@@ -2,11 +2,11 @@
 
 use dpm_calibration::file::{self, CalibrationFile};
 use dpm_tests::programs::{program, RunFolder, Talk};
+use dpm_tests::sensor_wand::SensorWandMock as Mock;
 use glam::{DAffine3, DQuat, DVec3};
 use hil_mock::sensor_wand::ProjectorOptics;
 use std::io::Write;
-use std::process::{Child, Command, Output, Stdio};
-use std::sync::{Mutex, MutexGuard, PoisonError};
+use std::process::{Child, Output, Stdio};
 use std::time::Duration;
 
 /// A folder for the commands of `dpm`.
@@ -78,62 +78,6 @@ fn text(output: &Output) -> String {
     String::from_utf8_lossy(&output.stdout).into_owned() + &String::from_utf8_lossy(&output.stderr)
 }
 
-/// Projector, host and sensor run at real pace. Two such chains at once are more than two cores carry in time, and a
-/// sweep with half of its frames is refused.
-static TURN: Mutex<()> = Mutex::new(());
-
-/// `hil-mock serve sensor-wand`, ended with this. There is one at a time.
-struct Mock {
-    talk: Talk,
-    _turn: MutexGuard<'static, ()>,
-    projector: String,
-    sensor: String,
-}
-
-impl Mock {
-    fn start(arguments: &[&str]) -> Self {
-        let turn = TURN.lock().unwrap_or_else(PoisonError::into_inner);
-        let child = Command::new(program("hil-mock"))
-            .args(["serve", "sensor-wand", "--port", "pty", "--orders"])
-            .args(arguments)
-            .stdin(Stdio::piped())
-            .stdout(Stdio::piped())
-            .spawn()
-            .unwrap();
-        let mut talk = Talk::with(child);
-        let mut after = |words: &str| {
-            talk.until(words);
-            talk.until("\n").trim().to_owned()
-        };
-        let sensor = after("light sensor on ");
-        let projector = after("bit-plane projector on ");
-        Self { talk, _turn: turn, projector, sensor }
-    }
-
-    /// Gives an order to the hand with the wand, again while it cannot be followed, and waits until the hand is there.
-    fn order(&mut self, order: &str) {
-        loop {
-            self.talk.say(order);
-            // A pattern is lit some frames after the question.
-            if self.talk.until_one(&["the tip is at", "the wand", "there is no light"]).0 < 2 {
-                return;
-            }
-            std::thread::sleep(Duration::from_millis(50));
-        }
-    }
-
-    fn rig(&self, width: u32, height: u32, rate: u32, command_port: u16) -> String {
-        format!(
-            "[projector]\nwidth = {width}\nheight = {height}\nframe_rate = \"{rate}\"\n\
-             backend = {{ kind = \"serial\", port = \"{}\" }}\n\
-             [tracker]\nkind = \"natnet\"\ncommand_port = {command_port}\ndata_port = {}\n\
-             [real_time]\npace = \"real\"\n",
-            self.projector,
-            command_port + 1
-        )
-    }
-}
-
 /// The mock's projector as its arguments say: an oracle that shares nothing with the solvers.
 fn truth(width: u32, height: u32, focal_px: f64) -> ProjectorOptics {
     let brown = [-0.06, 0.02, 0.0005, -0.0003, 0.0];
@@ -161,7 +105,7 @@ fn a_wand_with_a_sensor_finds_lens_pose_tip_and_latency() {
     let mock =
         Mock::start(&["--raster", "128x96", "--focal", "225", "--command-port", "15710", "--seed", "7"]);
     let folder = Folder::new("sensor");
-    folder.write("rig.toml", &mock.rig(128, 96, 48, 15710));
+    folder.write("rig.toml", &mock.rig([128, 96], 48, 15710));
     folder.done(&["calibrate", "wand", "rig.toml", "--tip", "11,-4,119"]);
     let told =
         folder.done(&["calibrate", "projector", "rig.toml", "--sensor", &mock.sensor, "--seconds", "20"]);
@@ -190,7 +134,7 @@ fn frames_and_their_inverse_do_the_same_on_a_projector_of_binary_planes() {
     let mut mock =
         Mock::start(&["--raster", "128x96", "--focal", "330", "--command-port", "15740", "--seed", "5"]);
     let folder = Folder::new("frames");
-    folder.write("rig.toml", &mock.rig(128, 96, 120, 15740));
+    folder.write("rig.toml", &mock.rig([128, 96], 120, 15740));
     folder.done(&["calibrate", "wand", "rig.toml", "--tip", "11,-4,119"]);
     mock.order("visit");
     let sensor = mock.sensor.clone();
@@ -355,7 +299,7 @@ fn with_bunny(name: &str, rate: u32, command_port: u16, more: &[&str]) -> (Folde
     let mock = Mock::start(&[&optics[..], more].concat());
     let folder = Folder::new(name);
     let tail = "[[scene.bodies]]\nname = \"bunny\"\n";
-    folder.write("rig.toml", &(mock.rig(256, 192, rate, command_port) + tail));
+    folder.write("rig.toml", &(mock.rig([256, 192], rate, command_port) + tail));
     (folder, mock)
 }
 

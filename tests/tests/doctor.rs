@@ -1,44 +1,18 @@
 //! `dpm doctor RIG.toml` on rigs whose parts are there, missing, wrong or in use. Nothing that it does makes light.
 
 use dpm_tests::programs::{program, RunFolder, Talk};
-use std::process::{Command, Stdio};
+use dpm_tests::sensor_wand::SensorWandMock;
+use std::process::Stdio;
 
-/// `hil-mock serve sensor-wand` with a body: a tracker and a projector of 128 x 96 mirrors in a process of their own.
-fn mock(command_port: &str) -> (Talk, String) {
-    let child = Command::new(program("hil-mock"))
-        .args([
-            "serve",
-            "sensor-wand",
-            "--port",
-            "pty",
-            "--raster",
-            "128x96",
-            "--body",
-            "bunny:0.03,0.02,0.05",
-        ])
-        .args(["--command-port", command_port, "--orders"])
-        .stdin(Stdio::piped())
-        .stdout(Stdio::piped())
-        .spawn()
-        .unwrap();
-    let mut talk = Talk::with(child);
-    talk.until("bit-plane projector on ");
-    let port = talk.until("\n").trim().to_owned();
-    (talk, port)
-}
-
-/// A folder with the rig file of that mock.
-fn folder(name: &str, projector: &str, command_port: u16) -> RunFolder {
+/// A tracker with a body and a projector of 128 x 96 mirrors, and a folder with their rig file.
+fn bench(name: &str, command_port: u16) -> (SensorWandMock, RunFolder) {
+    let port = command_port.to_string();
+    let mock = ["--raster", "128x96", "--body", "bunny:0.03,0.02,0.05", "--command-port", &port];
+    let mock = SensorWandMock::start(&mock);
     let folder = RunFolder::new(&format!("doctor-{name}"));
-    let rig = format!(
-        "[projector]\nwidth = 128\nheight = 96\nframe_rate = \"60\"\n\
-         backend = {{ kind = \"serial\", port = {projector:?} }}\n\
-         [tracker]\nkind = \"natnet\"\ncommand_port = {command_port}\ndata_port = {}\n\
-         [real_time]\npace = \"real\"\n[[scene.bodies]]\nname = \"bunny\"\n",
-        command_port + 1
-    );
+    let rig = mock.rig([128, 96], 60, command_port) + "[[scene.bodies]]\nname = \"bunny\"\n";
     std::fs::write(folder.path().join("rig.toml"), rig).unwrap();
-    folder
+    (mock, folder)
 }
 
 /// Exit code, what was found and what the last line says.
@@ -59,8 +33,7 @@ fn part<'a>(json: &'a serde_json::Value, name: &str) -> [&'a str; 3] {
 
 #[test]
 fn a_rig_that_can_run_is_told_from_one_that_cannot() {
-    let (mut mock, port) = mock("15760");
-    let folder = folder("whole", &port, 15760);
+    let (mut mock, folder) = bench("whole", 15760);
     let (code, json, told) = doctor(&folder, &[]);
     assert_eq!((code, &json["can_run"]), (Some(0), &true.into()), "{told}{json:#}");
     let [state, found, _] = part(&json, "tracker");
@@ -81,16 +54,14 @@ fn a_rig_that_can_run_is_told_from_one_that_cannot() {
     assert!(part(&json, "tracker")[2].contains("no server"), "{json:#}");
 
     // All of that was dark: no frame was lit, and the projector was never armed.
-    mock.say("tip 0 0 0");
-    let told = mock.until("the tip is at");
+    let told = mock.said();
     assert!(told.contains("Configured, dark: 0 frames lit"), "{told}");
     assert!(!told.contains("Armed"), "{told}");
 }
 
 #[test]
 fn a_projector_in_use_and_a_missing_one_are_named() {
-    let (_mock, port) = mock("15770");
-    let folder = folder("use", &port, 15770);
+    let (_mock, folder) = bench("use", 15770);
     let mut run = folder.command(program("dpm"));
     let run = run
         .args(["pattern", "grid", "rig.toml"])
@@ -108,14 +79,8 @@ fn a_projector_in_use_and_a_missing_one_are_named() {
     let (code, json, _) = doctor(&folder, &none);
     let [state, found, _] = part(&json, "projector");
     assert!(code == Some(1) && state == "missing" && found.contains("/dev/pts/none: not found"), "{found}");
-    let bad = folder
-        .command(program("dpm"))
-        .args(["doctor", "rig.toml", "--set", "scene.file=\"gone.glb\""])
-        .output();
-    let bad = bad.unwrap();
-    assert!(bad.status.code() != Some(0), "{}", String::from_utf8_lossy(&bad.stderr));
-    assert!(
-        String::from_utf8_lossy(&bad.stderr).contains("gone.glb")
-            || String::from_utf8_lossy(&bad.stdout).contains("gone.glb")
-    );
+    let scene = ["doctor", "rig.toml", "--set", "scene.file=\"gone.glb\""];
+    let bad = folder.command(program("dpm")).args(scene).output().unwrap();
+    let told = String::from_utf8_lossy(&bad.stderr);
+    assert!(bad.status.code() == Some(2) && told.contains("gone.glb"), "{told}");
 }
