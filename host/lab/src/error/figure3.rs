@@ -119,10 +119,10 @@ pub(crate) struct Findings {
     pub pairs: usize,
     /// Those in which the moving one is no worse, within 5 %.
     pub moving_no_worse: usize,
-    /// Mean ratio of moving to standing noise.
-    pub moving_to_still: f64,
-    /// At the fewest samples: mean noise of the materials with a diffuse part by that of those without.
-    pub diffuse_to_specular: f64,
+    /// Mean ratio of moving to standing noise; `None` without a pair.
+    pub moving_to_still: Option<f64>,
+    /// At the fewest samples: mean noise of the materials with a diffuse part by that of those without; `None` unless both were measured.
+    pub diffuse_to_specular: Option<f64>,
 }
 
 /// Reads the findings off the rows.
@@ -141,14 +141,21 @@ pub(crate) fn findings(groups: &[Figure3Group]) -> Findings {
             .filter(|r| r.spp == fewest && (["diffuse", "glossy"].contains(&r.material.as_str())) == diffuse)
             .map(|r| r.perceived)
             .collect();
-        of.iter().sum::<f64>() / of.len() as f64
+        mean(&of)
     };
     Findings {
         pairs: pairs.len(),
         moving_no_worse: pairs.iter().filter(|&&p| p <= 1.05).count(),
-        moving_to_still: pairs.iter().sum::<f64>() / pairs.len() as f64,
-        diffuse_to_specular: at_fewest(true) / at_fewest(false),
+        moving_to_still: mean(&pairs),
+        diffuse_to_specular: at_fewest(true)
+            .zip(at_fewest(false))
+            .map(|(diffuse, specular)| diffuse / specular),
     }
+}
+
+/// The mean of `values`; `None` without any.
+fn mean(values: &[f64]) -> Option<f64> {
+    (!values.is_empty()).then(|| values.iter().sum::<f64>() / values.len() as f64)
 }
 
 /// A table of all conditions, and the findings beside those of \[paper\].
@@ -170,12 +177,20 @@ pub fn markdown(groups: &[Figure3Group]) -> String {
         );
     }
     let f = findings(groups);
-    let _ = writeln!(
-        text,
-        "\nMoving is no worse than standing (within 5 %) in {} of {} conditions; on average it has {:.2} of the error. At the fewest samples the \
-         materials with a diffuse part have {:.2} times the error of those without.",
-        f.moving_no_worse, f.pairs, f.moving_to_still, f.diffuse_to_specular
-    );
+    // One group alone has no findings.
+    if let Some(ratio) = f.moving_to_still {
+        let _ = writeln!(
+            text,
+            "\nMoving is no worse than standing (within 5 %) in {} of {} conditions; on average it has {ratio:.2} of the error.",
+            f.moving_no_worse, f.pairs
+        );
+    }
+    if let Some(ratio) = f.diffuse_to_specular {
+        let _ = writeln!(
+            text,
+            "\nAt the fewest samples the materials with a diffuse part have {ratio:.2} times the error of those without."
+        );
+    }
     text
 }
 
@@ -243,9 +258,17 @@ mod tests {
         ];
         let f = findings(&groups);
         assert_eq!((f.pairs, f.moving_no_worse), (4, 3));
-        assert!((f.moving_to_still - (0.5 + 0.5 + 2.0 + 1.0) / 4.0).abs() < 1e-12);
-        assert!((f.diffuse_to_specular - 0.3 / 0.15).abs() < 1e-12);
+        assert!((f.moving_to_still.unwrap() - (0.5 + 0.5 + 2.0 + 1.0) / 4.0).abs() < 1e-12);
+        assert!((f.diffuse_to_specular.unwrap() - 0.3 / 0.15).abs() < 1e-12);
         assert!(markdown(&groups).contains("in 3 of 4 conditions"));
+        // `--index` shows one group, of which nothing can be found.
+        for one in &groups {
+            let told = markdown(std::slice::from_ref(one));
+            assert!(
+                told.lines().count() > 2 && !told.contains("NaN") && !told.contains("times the error"),
+                "{told}"
+            );
+        }
         assert_eq!(csv(&groups).lines().count(), 9);
         assert!(csv(&groups)
             .lines()
