@@ -99,6 +99,22 @@ pub(super) struct Data {
     pub accessors: Vec<Accessor>,
 }
 
+/// The range of a buffer view, or of an object with the same members: buffer, first byte, and number of bytes, which are there.
+pub(super) fn range_of(item: &Item, buffers: &[Vec<u8>]) -> Result<(usize, u64, u64), SceneError> {
+    let buffer =
+        item.index("buffer", buffers.len(), "buffer")?.ok_or_else(|| item.error("has no 'buffer'"))?;
+    let start = item.whole("byteOffset")?.unwrap_or(0);
+    let length = item.whole("byteLength")?.ok_or_else(|| item.error("has no 'byteLength'"))?;
+    let available = buffers[buffer].len() as u64;
+    let end = start.checked_add(length).filter(|&end| end <= available);
+    if end.is_none() {
+        return Err(
+            item.error(format!("covers {length} bytes from {start}, but buffer {buffer} has {available}"))
+        );
+    }
+    Ok((buffer, start, length))
+}
+
 impl Data {
     /// Checks all buffer views and accessors of `root` against the buffers.
     pub(super) fn new(root: &Item, buffers: Vec<Vec<u8>>, limits: &Limits) -> Result<Self, SceneError> {
@@ -121,17 +137,7 @@ impl Data {
     }
 
     fn check_view(&self, item: &Item) -> Result<View, SceneError> {
-        let buffer = item
-            .index("buffer", self.buffers.len(), "buffer")?
-            .ok_or_else(|| item.error("has no 'buffer'"))?;
-        let start = item.whole("byteOffset")?.unwrap_or(0);
-        let length = item.whole("byteLength")?.ok_or_else(|| item.error("has no 'byteLength'"))?;
-        let available = self.buffers[buffer].len() as u64;
-        let end = start.checked_add(length).filter(|&end| end <= available);
-        if end.is_none() {
-            return Err(item
-                .error(format!("covers {length} bytes from {start}, but buffer {buffer} has {available}")));
-        }
+        let (buffer, start, length) = range_of(item, &self.buffers)?;
         let stride = item.whole("byteStride")?;
         if let Some(stride) = stride.filter(|s| !(4..=252).contains(s) || s % 4 != 0) {
             return Err(
@@ -174,7 +180,7 @@ impl Data {
         };
         if base.is_none() && sparse.is_none() {
             return Err(item.error(
-                "has neither a 'bufferView' nor 'sparse' data; if the file was compressed with Draco or meshopt, re-export it without",
+                "has neither a 'bufferView' nor 'sparse' data, so that all its numbers are 0: re-export the mesh",
             ));
         }
         Ok(Accessor {

@@ -7,11 +7,15 @@
 use super::super::{Limits, SceneError};
 use super::accessor::{Component, Data};
 use super::check_look::check_look;
+use super::compressed;
 use super::instancing::{self, read_instances, Instances};
 use super::json::{shorten, Item};
 
 /// Extensions that this program understands, or may ignore without a wrong picture.
-const UNDERSTOOD: [&str; 12] = [
+const UNDERSTOOD: [&str; 15] = [
+    compressed::DRACO,
+    compressed::MESHOPT[0],
+    compressed::MESHOPT[1],
     instancing::NAME,
     "KHR_lights_punctual",
     "KHR_materials_emissive_strength",
@@ -95,8 +99,8 @@ pub(super) fn check(root: &Item, data: &Data, limits: &Limits) -> Result<Checked
     Ok(Checked { warnings, instances })
 }
 
-/// Checks the version and the required extensions. This comes first: a file that needs Draco has no plain vertices, and
-/// the operator should read that.
+/// Checks the version and the required extensions. This comes first: a file that needs something
+/// unknown may have no plain vertices, and the operator should read that.
 pub(crate) fn check_asset(root: &Item) -> Result<(), SceneError> {
     let asset = root.object("asset")?.ok_or_else(|| root.error("has no 'asset': this is not glTF"))?;
     let version = asset.text("version")?.ok_or_else(|| asset.error("has no 'version'"))?;
@@ -115,10 +119,6 @@ pub(crate) fn check_asset(root: &Item) -> Result<(), SceneError> {
             continue;
         }
         let remedy = match name {
-            "KHR_draco_mesh_compression" => "re-export without Draco compression",
-            "EXT_meshopt_compression" | "KHR_meshopt_compression" => {
-                "re-export without meshopt compression (gltfpack: leave out -c)"
-            }
             "KHR_texture_basisu" | "EXT_texture_webp" | "EXT_texture_avif" | "MSFT_texture_dds" => {
                 "re-export with PNG or JPEG textures"
             }
@@ -154,12 +154,6 @@ fn check_mesh(
     for mut primitive in primitives {
         primitive.name = format!("{}, {}", mesh.name, primitive.name);
         primitive.index("material", counts.materials, "material")?;
-        if primitive.extension("KHR_draco_mesh_compression")?.is_some() {
-            return Err(SceneError::unsupported(
-                format!("Draco compression ({})", primitive.name),
-                "re-export without Draco compression",
-            ));
-        }
         if primitive.get("targets").is_some() {
             warnings.push(format!("{}: morph targets are ignored, the rest shape is shown", primitive.name));
         }

@@ -7,6 +7,7 @@ use dpm_device::regular_file;
 use serde_json::Value;
 
 use super::super::{Limits, SceneError};
+use super::compressed::is_placeholder;
 use super::json::{parse, shorten, Item};
 
 const JSON_CHUNK: u32 = 0x4E4F_534A;
@@ -242,6 +243,10 @@ pub(crate) fn load_buffers(
     let mut total = 0u64;
     let mut out = vec![];
     for (i, buffer) in root.list("buffers", "buffer", limits.objects)?.iter().enumerate() {
+        if is_placeholder(buffer)? && buffer.get("uri").is_none() {
+            out.push(vec![]);
+            continue;
+        }
         let promised = buffer.whole("byteLength")?.ok_or_else(|| buffer.error("has no 'byteLength'"))?;
         total = total.saturating_add(promised);
         SceneError::check_limit(

@@ -125,6 +125,11 @@ impl<'a> Item<'a> {
         self.map.keys()
     }
 
+    /// The object as JSON text.
+    pub(super) fn to_json(&self) -> String {
+        serde_json::to_string(self.map).unwrap_or_default()
+    }
+
     /// A nested object.
     pub(super) fn object(&self, key: &str) -> Result<Option<Item<'a>>, SceneError> {
         self.get(key).map(|v| Item::new(v, format!("{}, {key}", self.name))).transpose()

@@ -1,9 +1,10 @@
-//! Reads a glTF file as a [`Scene`]: container, check, then the `gltf` crate's typed view of the checked document, look
+//! Reads a glTF file as a [`Scene`]: container, compressed meshes made plain, check, then the `gltf` crate's typed view of the checked document, look
 //! and geometry.
 
 mod accessor;
 mod check;
 mod check_look;
+mod compressed;
 mod container;
 mod flatten;
 mod instancing;
@@ -40,10 +41,12 @@ pub(super) fn read(
 ) -> Result<Scene, SceneError> {
     let limits = &options.limits;
     let folder = beside.map(Folder::of).transpose()?;
-    let container::Container { root: tree, binary } = container::split(bytes, limits)?;
+    let container::Container { root: mut tree, binary } = container::split(bytes, limits)?;
     let root = Item::new(&tree, "document".into())?;
     check::check_asset(&root)?;
-    let buffers = container::load_buffers(&root, binary, folder.as_ref(), limits)?;
+    let mut buffers = container::load_buffers(&root, binary, folder.as_ref(), limits)?;
+    compressed::decompress(&mut tree, &mut buffers, limits, cancel)?;
+    let root = Item::new(&tree, "document".into())?;
     let all_bytes = bytes.len() + buffers.iter().map(Vec::len).sum::<usize>();
     let limits = &limits.of_file(all_bytes as u64);
     let data = accessor::Data::new(&root, buffers, limits)?;
