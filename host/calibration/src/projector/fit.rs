@@ -51,7 +51,7 @@ fn brown(sigmas: [f64; BROWN]) -> [[f64; 2]; LENS] {
 impl Priors {
     /// For a dozen points: focal lengths, centre, k1 and k2 are free, the rest is expected to be small.
     pub fn few_points(raster: Raster) -> Self {
-        Self { aspect: [0.0, 0.02], lens: brown([0.5, 0.5, 1e-3, 1e-3, 0.02]), ..Self::many_points(raster) }
+        Self { aspect: [0.0, 0.02], ..Self::many_points(raster).with_usual_lens() }
     }
 
     /// For thousands of points: everything is free, within what lenses can be at all.
@@ -64,6 +64,14 @@ impl Priors {
             cy: [0.5 * h, 2.0 * h],
             lens: brown([1.0, 2.0, 0.02, 0.02, 5.0]),
         }
+    }
+
+    /// With a lens as most projectors have: k1 and k2 moderate, the rest small. What is known better stays.
+    pub(crate) fn with_usual_lens(mut self) -> Self {
+        let usual = brown([0.5, 0.5, 1e-3, 1e-3, 0.02]);
+        let expected = self.lens.iter_mut().zip(usual);
+        expected.filter(|(own, usual)| own[1] > usual[1]).for_each(|(own, usual)| *own = usual);
+        self
     }
 
     /// With more of the lens's numbers left to the data than Brown's five.

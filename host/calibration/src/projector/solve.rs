@@ -269,7 +269,7 @@ fn judge(
 ) -> Result<Solved, Refusal> {
     let model = &fitted.model;
     let depths: Vec<f64> = chosen(sights, &inliers).iter().map(|s| model.local(s.world).z).collect();
-    let (mean, range) = check_result(raster, model, &depths, &options.known)?;
+    let (mean, range) = check_result(model, &depths, &options.known)?;
     if fitted.offset_s.abs() > MOST_OFFSET_S {
         return Err(Refusal::TimeShifted { offset_ms: 1e3 * fitted.offset_s });
     }
@@ -292,7 +292,6 @@ fn judge(
 /// Judges a projector by the depths of its points, and by what is known of its place. Gives the mean of the depths and
 /// their range.
 pub(crate) fn check_result(
-    raster: Raster,
     model: &ProjectorModel,
     depths: &[f64],
     known: &Known,
@@ -304,9 +303,6 @@ pub(crate) fn check_result(
         return Err(Refusal::OneDepth { share: 100.0 * range / mean });
     }
     check_up(model.world_from_projector().matrix3.y_axis, known.up)?;
-    if model.camera(raster).is_err() {
-        return Err(Refusal::LensFolds);
-    }
     Ok((mean, range))
 }
 

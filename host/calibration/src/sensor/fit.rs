@@ -10,15 +10,14 @@
 
 use super::code::{Code, PLANES};
 use super::decode::Decoded;
+use super::lens::finish_told;
 use super::problem::{Fix, Limits, Measured, Planes, Problem, Seen, State, Tally, LATENCY, TIP, UNKNOWNS};
 use super::start::{prepare, start, thin, why_no_fit};
 use super::Timing;
 use crate::dense::inverse_spd;
 use crate::least_squares::{descend, Equations};
 use crate::model::{ProjectorModel, PARAMETERS};
-use crate::projector::{
-    check_result, check_terms, predict, Known, LensTerms, Predicted, Priors, Refusal, Volume,
-};
+use crate::projector::{check_result, predict, Known, Predicted, Priors, Refusal, Volume};
 use crate::trajectory::Trajectory;
 use dpm_device::planes::Raster;
 use glam::{DMat3, DVec2, DVec3};
@@ -67,6 +66,8 @@ pub struct Solution {
     pub covariance: Vec<Vec<f64>>,
     /// The error that the light may have over the volume, if the tracker has no bias.
     pub predicted: Predicted,
+    /// The data leave the lens open near the raster's border, where a usual lens was expected.
+    pub is_lens_open: bool,
     /// The tip in the wand's body frame, metres.
     pub tip: DVec3,
     /// Covariance of the tip, square metres.
@@ -164,33 +165,6 @@ pub fn solve(
     let start = start(&problem, &fixes)?;
     let fitted = refine(&problem, start, &seen, &FINEST)?;
     finish_told(&problem, &fitted, &seen, &FINEST)
-}
-
-/// As [`finish`], for a lens whose terms the data must tell.
-pub(super) fn finish_told<M: Measured>(
-    problem: &Problem,
-    fitted: &Fitted,
-    seen: &[M],
-    stages: &[(f64, bool)],
-) -> Result<Solution, SensorError> {
-    let solution = finish(problem, fitted, seen)?;
-    if problem.settings.priors.is_beyond_brown() {
-        let priors = problem.settings.priors.with_lens(LensTerms::Brown);
-        let settings = Settings { priors, ..*problem.settings };
-        let brown = Problem {
-            limits: problem.limits,
-            ..Problem::new(problem.raster, (problem.path, &settings), false)
-        };
-        let mut begun = fitted.state;
-        begun.model = ProjectorModel::from_camera(
-            &begun.model.pinhole(problem.raster).map_err(|_| Refusal::LensFolds)?,
-            [0.0; 5],
-            begun.model.origin,
-        );
-        let simple = refine(&brown, begun, seen, stages).ok().map(|f| f.state.model);
-        check_terms(problem.raster, &solution.model, simple, &solution.predicted, &settings.volume)?;
-    }
-    Ok(solution)
 }
 
 /// The planes of frames, and when their levels were.
@@ -303,7 +277,7 @@ pub(super) fn refine<M: Measured>(
     Ok(Fitted { state, equations, rms_level })
 }
 
-/// A fit into what is told of it.
+/// A fit into what is told of it. Whether its lens can be inverted over the raster is not asked here.
 pub(super) fn finish<M: Measured>(
     problem: &Problem,
     fitted: &Fitted,
@@ -334,7 +308,7 @@ pub(super) fn finish<M: Measured>(
         let fixes: Vec<Fix> = seen.iter().map(|s| *s.fix()).collect();
         return Err(why_no_fit(problem, &fixes, state, rms_px));
     }
-    check_result(problem.raster, &state.model, &depths, &settings.known)?;
+    check_result(&state.model, &depths, &settings.known)?;
     let mut expected = Equations::new(UNKNOWNS);
     problem.expect(state, &mut expected);
     let covariance =
@@ -358,6 +332,7 @@ pub(super) fn finish<M: Measured>(
         model: state.model,
         predicted: predict(&state.model, &model_covariance, &points),
         covariance: model_covariance,
+        is_lens_open: false,
         tip: state.tip,
         tip_covariance: DMat3::from_cols(of_tip(0), of_tip(1), of_tip(2)),
         latency_ns: (1e9 * state.latency_s).round() as i64,

@@ -11,6 +11,7 @@ mod decode;
 mod fit;
 mod inverse;
 mod latency;
+mod lens;
 mod lock;
 mod problem;
 mod start;

@@ -344,10 +344,14 @@ impl Sweeping<'_> {
 pub fn told_of(s: &Solution) -> String {
     let (p, [x, y, z]) = (&s.predicted, s.tip.to_array().map(|v| 1e3 * v));
     let at = p.worst;
+    let lens = match s.is_lens_open {
+        true => "no light was seen near the border of the picture, where a usual lens is taken: move there, too, if light is needed there;\n",
+        false => "",
+    };
     format!(
         "predicted error {:.3} px (99th percentile over the volume of the motion, for a tracker without bias);\n\
          it is least certain at ({:.2}, {:.2}, {:.2}) m: to make it better, run this again and move there, too;\n\
-         residual {:.3} px rms of {} frames; sensor at ({x:.2}, {y:.2}, {z:.2}) mm in the wand's body;\n\
+         {lens}residual {:.3} px rms of {} frames; sensor at ({x:.2}, {y:.2}, {z:.2}) mm in the wand's body;\n\
          latency {:.3} ms, known to {:.3} ms",
         p.p99_px,
         at.x,

@@ -3,8 +3,9 @@
 //! Where the wand was held still for a round of the code, its bits name a pixel: enough to start. Then the levels of all
 //! pairs are fitted, those in motion too, each frame at its own instant: the latency comes from them.
 
-use super::super::fit::{finish_told, refine, Scores, SensorError, Settings, Solution};
+use super::super::fit::{refine, Scores, SensorError, Settings, Solution};
 use super::super::latency::{self, Latency};
+use super::super::lens::finish_told;
 use super::super::problem::{Fix, Limits, Measured, Problem, State, Tally, RADIUS, UNKNOWNS};
 use super::super::start::{is_inside, start, thin};
 use super::code::{InverseCode, Stripe};
