@@ -48,9 +48,8 @@ pub(super) fn decompress(
         plain["byteLength"] = json!(bytes.len());
         buffers.push(bytes);
     }
-    let mut placed = vec![];
-    for mesh in draco_primitives(tree, buffers, limits, &mut room, cancel)? {
-        mesh.add_to(tree, buffers, &mut placed);
+    for primitive in draco_primitives(tree, buffers, limits, &mut room, cancel)? {
+        primitive.add_to(tree, buffers);
     }
     Ok(())
 }
@@ -94,26 +93,29 @@ fn meshopt_views(
 /// The plain bytes of a buffer view with the extension `item`.
 fn meshopt_bytes(item: &Item, buffers: &[Vec<u8>], room: &mut Room) -> Result<Vec<u8>, SceneError> {
     let needed = |key: &str| item.whole(key)?.ok_or_else(|| item.error(format!("has no '{key}'")));
-    let told =
-        |e: &dyn std::fmt::Display| item.error(format!("cannot be decoded: {}", shorten(&e.to_string())));
-    let (buffer, start, length) = range_of(item, buffers)?;
-    let source = &buffers[buffer][start as usize..(start + length) as usize];
+    let source = bytes_of(item, buffers)?;
     let (count, stride) = (needed("count")?, needed("byteStride")?);
     let mode = item.text("mode")?.ok_or_else(|| item.error("has no 'mode'"))?;
-    let mode = MeshoptMode::from_name(mode).map_err(|e| told(&e))?;
-    let filter = MeshoptFilter::from_name(item.text("filter")?.unwrap_or("NONE")).map_err(|e| told(&e))?;
-    let strides = if mode == MeshoptMode::Attributes { (4..=256).step_by(4) } else { (2..=4).step_by(2) };
-    if !strides.clone().any(|s| s == stride) {
+    let mode = MeshoptMode::from_name(mode).map_err(|e| undecodable(item, e))?;
+    let filter = item.text("filter")?.unwrap_or("NONE");
+    let filter = MeshoptFilter::from_name(filter).map_err(|e| undecodable(item, e))?;
+    let is_possible = match mode {
+        MeshoptMode::Attributes => (4..=256).contains(&stride) && stride % 4 == 0,
+        MeshoptMode::Triangles | MeshoptMode::Indices => stride == 2 || stride == 4,
+    };
+    if !is_possible {
         return Err(item.error(format!("'byteStride' is {stride}, which no stream of this mode can have")));
     }
     let size = count.saturating_mul(stride);
-    if count == 0 || size > length.saturating_mul(MOST_FROM_A_BYTE) {
-        return Err(item.error(format!("promises {count} elements, which its {length} bytes cannot hold")));
+    if count == 0 || size > source.len() as u64 * MOST_FROM_A_BYTE {
+        return Err(
+            item.error(format!("promises {count} elements, which its {} bytes cannot hold", source.len()))
+        );
     }
     room.take(size)?;
     let mut plain = vec![0; size as usize];
     meshopt::decode_buffer_view(&mut plain, source, mode, filter, count as usize, stride as usize)
-        .map_err(|e| told(&e))?;
+        .map_err(|e| undecodable(item, e))?;
     Ok(plain)
 }
 
@@ -132,7 +134,7 @@ struct Numbers {
 impl Numbers {
     /// Appends the bytes to `buffers`, and an accessor of them to the document, in the place of the file's own one where
     /// that is still empty. Returns the accessor's index.
-    fn add_to(self, tree: &mut Value, buffers: &mut Vec<Vec<u8>>, placed: &mut Vec<usize>) -> usize {
+    fn add_to(self, tree: &mut Value, buffers: &mut Vec<Vec<u8>>) -> usize {
         let views = list_mut(tree, "bufferViews");
         views.push(json!({"buffer": buffers.len(), "byteLength": self.bytes.len()}));
         let mut plain = json!({
@@ -144,9 +146,8 @@ impl Numbers {
         buffers.push(self.bytes);
         let accessors = list_mut(tree, "accessors");
         match self.accessor {
-            Some(own) if !placed.contains(&own) && accessors[own].get("bufferView").is_none() => {
+            Some(own) if accessors[own].get("bufferView").is_none() => {
                 accessors[own] = plain;
-                placed.push(own);
                 own
             }
             _ => {
@@ -168,10 +169,10 @@ struct Plain {
 
 impl Plain {
     /// Rewrites the primitive.
-    fn add_to(self, tree: &mut Value, buffers: &mut Vec<Vec<u8>>, placed: &mut Vec<usize>) {
+    fn add_to(self, tree: &mut Value, buffers: &mut Vec<Vec<u8>>) {
         let attributes: Vec<(String, usize)> =
-            self.attributes.into_iter().map(|(name, n)| (name, n.add_to(tree, buffers, placed))).collect();
-        let indices = self.indices.map(|n| n.add_to(tree, buffers, placed));
+            self.attributes.into_iter().map(|(name, n)| (name, n.add_to(tree, buffers))).collect();
+        let indices = self.indices.map(|n| n.add_to(tree, buffers));
         let primitive = &mut tree["meshes"][self.mesh]["primitives"][self.primitive];
         for (name, accessor) in attributes {
             primitive["attributes"][name] = json!(accessor);
@@ -241,54 +242,61 @@ impl Source<'_> {
 
     /// Decodes the primitive `item`.
     fn decode(&self, item: &Item, extension: &Item, room: &mut Room) -> Result<Decoded, SceneError> {
-        let told = |e: &dyn std::fmt::Display| {
-            extension.error(format!("cannot be decoded: {}", shorten(&e.to_string())))
-        };
         let attributes = item.object("attributes")?.ok_or_else(|| item.error("has no 'attributes'"))?;
         let own = |object: &Item, key: &str| object.index(key, self.accessors.len(), "accessor");
         // A file may hold the same numbers uncompressed, for programs without Draco.
         if own(&attributes, "POSITION")?.is_some_and(|i| self.accessors[i].get("bufferView").is_some()) {
             return Ok((vec![], None));
         }
-        let contract = self.contract(&attributes, room)?;
         let view = extension
             .index("bufferView", self.views.len(), "bufferView")?
             .ok_or_else(|| extension.error("has no 'bufferView'"))?;
-        let (buffer, start, length) = range_of(&self.views[view], self.buffers)?;
-        let payload = &self.buffers[buffer][start as usize..(start + length) as usize];
-        let text = extension.to_json();
-        let value = JsonValue::parse(text.as_bytes()).map_err(|e| told(&e))?;
-        let parsed = DracoPrimitiveExtension::from_json(&value).map_err(|e| told(&e))?;
-        let geometry = parsed.decode(payload, &contract).map_err(|e| told(&e))?;
-        let mut out = vec![];
+        let payload = bytes_of(&self.views[view], self.buffers)?;
+        let contract = self.contract(&attributes, room)?;
+        let geometry = JsonValue::parse(extension.to_json().as_bytes())
+            .map_err(|e| undecodable(extension, e))
+            .and_then(|v| DracoPrimitiveExtension::from_json(&v).map_err(|e| undecodable(extension, e)))?
+            .decode(payload, &contract)
+            .map_err(|e| undecodable(extension, e))?;
+        let mut plain = vec![];
         for a in geometry.attributes() {
             let kind = kind_of(usize::from(a.components())).ok_or_else(|| {
                 extension.error(format!("{} has {} components", shorten(a.semantic()), a.components()))
             })?;
             room.take(a.bytes().len() as u64)?;
-            out.push((
-                a.semantic().to_owned(),
-                Numbers {
-                    accessor: own(&attributes, a.semantic())?,
-                    kind,
-                    component: a.component_type() as u32,
-                    count: a.count(),
-                    normalized: a.normalized() && a.component_type() != ComponentType::F32,
-                    bytes: a.bytes().to_vec(),
-                },
-            ));
+            let numbers = Numbers {
+                accessor: own(&attributes, a.semantic())?,
+                kind,
+                component: a.component_type() as u32,
+                count: a.count(),
+                normalized: a.normalized() && a.component_type() != ComponentType::F32,
+                bytes: a.bytes().to_vec(),
+            };
+            plain.push((a.semantic().to_owned(), numbers));
         }
-        let indices = geometry.indices().map(|i| Numbers {
-            accessor: own(item, "indices").ok().flatten(),
+        let Some(indices) = geometry.indices() else { return Ok((plain, None)) };
+        room.take(indices.bytes().len() as u64)?;
+        let indices = Numbers {
+            accessor: own(item, "indices")?,
             kind: "SCALAR",
-            component: i.component_type() as u32,
-            count: i.count(),
+            component: indices.component_type() as u32,
+            count: indices.count(),
             normalized: false,
-            bytes: i.bytes().to_vec(),
-        });
-        room.take(indices.as_ref().map_or(0, |i| i.bytes.len() as u64))?;
-        Ok((out, indices))
+            bytes: indices.bytes().to_vec(),
+        };
+        Ok((plain, Some(indices)))
     }
+}
+
+/// The bytes of a buffer view, or of an object with the same members.
+fn bytes_of<'a>(item: &Item, buffers: &'a [Vec<u8>]) -> Result<&'a [u8], SceneError> {
+    let (buffer, start, length) = range_of(item, buffers)?;
+    Ok(&buffers[buffer][start as usize..(start + length) as usize])
+}
+
+/// What a decoder says of `item`.
+fn undecodable(item: &Item, why: impl std::fmt::Display) -> SceneError {
+    item.error(format!("cannot be decoded: {}", shorten(&why.to_string())))
 }
 
 /// The type of an accessor of so many components.

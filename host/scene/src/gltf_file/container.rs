@@ -243,7 +243,7 @@ pub(crate) fn load_buffers(
     let mut total = 0u64;
     let mut out = vec![];
     for (i, buffer) in root.list("buffers", "buffer", limits.objects)?.iter().enumerate() {
-        if is_placeholder(buffer)? && buffer.get("uri").is_none() {
+        if is_placeholder(buffer)? {
             out.push(vec![]);
             continue;
         }

@@ -1,5 +1,5 @@
-//! Reads a glTF file as a [`Scene`]: container, compressed meshes made plain, check, then the `gltf` crate's typed view of the checked document, look
-//! and geometry.
+//! Reads a glTF file as a [`Scene`]: container, compressed meshes made plain, check, then the `gltf` crate's typed view
+//! of the checked document, look and geometry.
 
 mod accessor;
 mod check;
