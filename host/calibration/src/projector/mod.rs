@@ -13,7 +13,7 @@ pub(crate) use fit::spread_of;
 use fit::{fit, Fit};
 pub use fit::{LensTerms, Priors};
 pub use refusal::Refusal;
-pub(crate) use solve::{check_result, check_terms, look_for_motion};
+pub(crate) use solve::{check_result, check_terms, look_for_motion, moved_px};
 pub use solve::{relocate, solve, Solved};
 pub(crate) use uncertainty::percentile;
 pub use uncertainty::{predict, Predicted, Volume};

@@ -99,13 +99,23 @@ pub(crate) fn check_terms(
     volume: &Volume,
 ) -> Result<(), Refusal> {
     let Some(simple) = simple else { return Ok(()) };
-    let points = volume.points(model, raster);
-    let moves = points.iter().filter_map(|p| Some((model.project(*p)? - simple.project(*p)?).length()));
-    let moved_px = percentile(moves.collect(), 0.99);
+    let moved_px = moved_px(raster, model, &simple, volume);
     if moved_px > predicted.p99_px {
         return Ok(());
     }
     Err(Refusal::LensUndetermined { moved_px, p99_px: predicted.p99_px })
+}
+
+/// How far apart two models light the points of a volume: the 99th percentile, pixels.
+pub(crate) fn moved_px(
+    raster: Raster,
+    model: &ProjectorModel,
+    other: &ProjectorModel,
+    volume: &Volume,
+) -> f64 {
+    let points = volume.points(model, raster);
+    let moves = points.iter().filter_map(|p| Some((model.project(*p)? - other.project(*p)?).length()));
+    percentile(moves.collect(), 0.99)
 }
 
 /// Finds the place of a projector whose lens is known, after a bump: from five points or more.

@@ -4,7 +4,7 @@
 use super::fit::{finish, refine, Fitted, SensorError, Settings, Solution};
 use super::problem::{Measured, Problem, State};
 use crate::model::ProjectorModel;
-use crate::projector::{check_terms, predict, LensTerms, Refusal};
+use crate::projector::{check_terms, moved_px, predict, LensTerms, Refusal};
 use glam::DVec2;
 
 /// A lens is open if the light in the raster's corners is uncertain by more than this share of the raster's width.
@@ -47,14 +47,10 @@ fn usual<M: Measured>(
     let settings = Settings { priors: problem.settings.priors.with_usual_lens(), ..*problem.settings };
     let expecting = with(problem, &settings);
     let fitted = refit(&expecting, begun, seen, stages).ok()?;
-    let told = check_terms(
-        problem.raster,
-        &solution.model,
-        Some(fitted.state.model),
-        &solution.predicted,
-        &settings.volume,
-    );
-    told.err()?;
+    let moved = moved_px(problem.raster, &solution.model, &fitted.state.model, &problem.settings.volume);
+    if moved > solution.predicted.p99_px {
+        return None;
+    }
     let usual = finish(&expecting, &fitted, seen).ok()?;
     Some(Solution { is_lens_open: true, ..usual })
 }
