@@ -1,5 +1,7 @@
 // Written by build-shaders from shaders/src/structs.rs and shaders/src/specialization.rs. Do not edit.
 
+#extension GL_EXT_shader_explicit_arithmetic_types_int64 : require
+
 #define NO_HIT 4294967295u
 #define NO_TEXTURE 4294967295u
 #define NO_INSTANCE 4294967295u
@@ -40,6 +42,10 @@
 #define RESPONSE_CODES 256u
 #define OWNER_NONE 0u
 #define OWNER_STILL 1u
+#define TRACE_LANES 64u
+#define TRACE_GROUP_SAMPLES 180u
+#define TRACE_PIXEL_SAMPLES 128u
+#define TRACE_SLOTS 320u
 #define SAMPLER_INDEPENDENT 0u
 #define SAMPLER_BLUE_NOISE 1u
 #define SAMPLER_CONTINUED 2u
@@ -144,6 +150,8 @@ layout(constant_id = 27) const uint PLANE_OF_BITS_16 = 4294967295u;
 layout(constant_id = 28) const uint PLANE_OF_BITS_20 = 4294967295u;
 // On GPUs: groups of nodes that may wait while a ray walks through a body, at most one for each level of the deepest tree.
 layout(constant_id = 29) const uint WALK_STACK = 24u;
+// On GPUs: a pixel may have more than `TRACE_PIXEL_SAMPLES` samples, so that those of a workgroup may take several rounds. The loop over the rounds costs registers even where there is one.
+layout(constant_id = 30) const bool MANY_SAMPLES = true;
 
 struct Frame {
     vec3 projector_position;
@@ -237,14 +245,15 @@ struct History {
 
 struct WorkItem {
     uint pixel;
-    uint spp;
+    uint first;
 };
 
 struct Schedule {
     uvec3 groups;
-    uint items;
     uint importance;
+    uint64_t listed;
     uint lit;
+    uint unused;
 };
 
 struct Filtered {

@@ -18,11 +18,12 @@ uint samples_of(uvec2 pixel, uint at) {
     float share = frame.budget_spp;
     if ((frame.flags & FRAME_ALLOCATE) != 0u) share *= float(importance_of(h)) / max(float(schedule.importance), 1.0) * float(schedule.lit);
     // No pixel waits longer than two or three frames.
-    share = clamp(share, min(0.5, 0.5 * frame.budget_spp), LARGEST_SHARE * max(frame.budget_spp, 1.0));
+    // Nor more samples than a workgroup of the pass `trace` has room for, unless the budget itself is larger.
+    float largest = min(LARGEST_SHARE * max(frame.budget_spp, 1.0), max(float(TRACE_PIXEL_SAMPLES), frame.budget_spp));
+    share = clamp(share, min(0.5, 0.5 * frame.budget_spp), largest);
     float one = min(1.0, 2.0 * frame.budget_spp);
-    // The light of a deterministic pixel takes one sample, and the tracer stops there. The others are for a pixel that has just stopped being
-    // deterministic. A new point is traced at once, because its own light is better than a guess.
-    if ((h.flags & HISTORY_EXACT) != 0u) share = max(one, 2.0 * frame.budget_spp);
+    // One sample has all light of a deterministic pixel. A new point is traced at once, because its own light is better than a guess.
+    if ((h.flags & HISTORY_EXACT) != 0u) share = one;
     else if (h.index == 0u) share = max(share, one);
     float whole = floor(share);
     return uint(whole) + (blue_noise(pixel, frame.drawn, 0u) < share - whole ? 1u : 0u);

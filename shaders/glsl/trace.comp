@@ -1,10 +1,10 @@
-// Work items into radiance toward the eye: `spp` paths from the surface point of each listed pixel.
+// Work items into radiance toward the eye: paths from the surface point of each listed pixel.
 #version 460
 #extension GL_GOOGLE_include_directive : require
 #include "path.glsl"
 #include "moments.glsl"
 
-layout(local_size_x = 64) in;
+layout(local_size_x = TRACE_LANES) in;
 
 layout(set = 0, binding = B_SCHEDULE, scalar) readonly buffer ScheduleBlock { Schedule schedule; };
 layout(set = 0, binding = B_WORK, scalar) readonly buffer Work { WorkItem work[]; };
@@ -13,19 +13,37 @@ layout(set = 0, binding = B_RADIANCE, scalar) writeonly buffer Radiance { vec4 r
 // Method dpm: `Moments` of the samples. The buffer holds the history's picture from the pass accumulate on.
 layout(set = 0, binding = B_FILTERED, scalar) writeonly buffer MomentsBlock { Filtered moments[]; };
 
-// The place in the random sequence from which the pixel's samples go on.
-Sampler begin_sampler(WorkItem item, uvec2 pixel) {
-    Sampler rng = Sampler(frame.seed, 0u, pixel);
+// The list of this frame: its items, and the samples of all of them.
+struct WorkList {
+    uint items;
+    uint samples;
+};
+
+// To be read while all lanes are active.
+WorkList work_list() {
+    uvec2 listed = unpackUint2x32(schedule.listed);
+    return WorkList(listed.x, listed.y);
+}
+
+uint first_sample_of(WorkList list, uint item) { return item < list.items ? work[item].first : list.samples; }
+
+uint group_index() { return gl_WorkGroupID.y * gl_NumWorkGroups.x + gl_WorkGroupID.x; }
+
+uvec2 pixel_of(uint at) { return uvec2(at % frame.width, at / frame.width); }
+
+// The place in the random sequence from which the samples of the pixel at index `at`, `spp` in this frame, go on.
+Sampler begin_sampler(uint at, uint spp) {
+    Sampler rng = Sampler(frame.seed, 0u, pixel_of(at));
     if (SAMPLER == SAMPLER_INDEPENDENT) {
-        rng.seed = hash_u32(item.pixel + hash_u32(frame.frame + hash_u32(frame.seed)));
+        rng.seed = hash_u32(at + hash_u32(frame.frame + hash_u32(frame.seed)));
     } else if (SAMPLER == SAMPLER_BLUE_NOISE) {
         rng.seed = hash_u32(frame.frame + hash_u32(frame.seed));
     } else if (SAMPLER == SAMPLER_PIXEL_SEQUENCE) {
         // The pixel's own sequence continues where the last frame left it. A number of samples by angle is the same in every frame.
-        rng.seed = hash_u32(item.pixel + hash_u32(frame.seed));
-        rng.index = (frame.flags & FRAME_SPP_BY_ANGLE) != 0u ? frame.drawn * item.spp : frame.first_sample;
+        rng.seed = hash_u32(at + hash_u32(frame.seed));
+        rng.index = (frame.flags & FRAME_SPP_BY_ANGLE) != 0u ? frame.drawn * spp : frame.first_sample;
     } else {
-        History h = history_at(item.pixel);
+        History h = history_at(at);
         rng.seed = h.seed;
         rng.index = h.index;
     }
@@ -41,58 +59,39 @@ Point first_point(Surface surface) {
     return shading_point(hit, normalize((camera_is_eye ? frame.projector_position : frame.eye_position) - p));
 }
 
-// Software Vulkan computes it once. On a GPU it would live across every walk, in two dozen registers, so it is computed again for each sample.
-#ifdef TEXEL_TABLES
-#define FIRST_POINT first
-#else
-#define FIRST_POINT first_point(surface_at(item.pixel))
-#endif
+// What only an ordinary camera traces: the background.
+vec3 background(uint at) { return environment_radiance(pixel_direction(pixel_of(at))); }
 
-void main() {
-    // This is read while all lanes are active. There is at least one item, because otherwise no workgroup is dispatched.
-    uint items = schedule.items;
-    WorkItem item = work[min(gl_GlobalInvocationID.x, items - 1u)];
-    if (gl_GlobalInvocationID.x >= items) return;
-    Surface surface = surface_at(item.pixel);
-    uvec2 pixel = uvec2(item.pixel % frame.width, item.pixel / frame.width);
-    if (surface.id == NO_HIT) {
-        // Only an ordinary camera traces the background.
-        radiance_out[item.pixel] = vec4(environment_radiance(pixel_direction(pixel)), 1.0);
-        return;
+// What the samples of a pixel add up to, in their order.
+struct Sums {
+    vec3 light;
+    float squares; // Of the luminances.
+    uint count;
+    bool exact;    // The last sample has all of the pixel's light, so that none follows.
+};
+
+const Sums NO_SAMPLES = Sums(vec3(0.0), 0.0, 0u, false);
+
+// A sample that is not finite is dropped. True: it was counted.
+bool add_sample(inout Sums sums, vec3 light, bool exact) {
+    bool valid = finite3(light);
+    if (valid) {
+        float y = luminance(light);
+        sums.light += light;
+        sums.squares += y * y;
+        sums.count++;
     }
-#ifdef TEXEL_TABLES
-    Point first = first_point(surface);
-#endif
-    Sampler rng = begin_sampler(item, pixel);
-    vec3 sum = vec3(0.0);
-    float sum_squares = 0.0;
-    uint count = 0u, invalid = 0u;
-    bool dpm = (frame.flags & FRAME_DPM) != 0u, exact = false;
-    uint rays = 0u;
-    // A lane whose path ends begins its next sample at once, while the paths of its neighbours continue.
-    Path path;
-    bool begins = true;
-    uint left = item.spp;
-    do {
-        if (begins) path = begin_path(FIRST_POINT);
-        begins = !advance_path(path, rng, rays);
-        if (begins) {
-            // A sample that is not finite is dropped.
-            bool valid = finite3(path.radiance);
-            vec3 l = valid ? path.radiance : vec3(0.0);
-            float y = luminance(l);
-            sum += l;
-            sum_squares += y * y;
-            count += valid ? 1u : 0u;
-            invalid += valid ? 0u : 1u;
-            rng.index++;
-            exact = dpm && path.exact;
-            left = exact ? 0u : left - 1u;
-        }
-    } while (left > 0u);
-    radiance_out[item.pixel] = vec4(count > 0u ? sum / float(count) : vec3(0.0), float(count));
-    if (dpm) moments[item.pixel] = pack_moments(Moments(sum_squares, exact));
-    COUNT(rays, rays)
-    COUNT(samples, count + invalid)
-    COUNT_RARE(invalid_samples, invalid)
+    sums.exact = exact;
+    return valid;
 }
+
+void write_sums(uint at, Sums sums) {
+    radiance_out[at] = vec4(sums.count > 0u ? sums.light / float(sums.count) : vec3(0.0), float(sums.count));
+    if ((frame.flags & FRAME_DPM) != 0u) moments[at] = pack_moments(Moments(sums.squares, sums.exact));
+}
+
+#ifdef TEXEL_TABLES
+#include "trace_software.glsl"
+#else
+#include "trace_gpu.glsl"
+#endif

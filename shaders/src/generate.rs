@@ -49,6 +49,15 @@ glsl_types! {
     [u32; 2] => "uvec2", 2 by "";
 }
 
+impl GlslType for u64 {
+    fn member(name: &str) -> String {
+        format!("    uint64_t {name};\n")
+    }
+    fn read(word: &mut usize) -> String {
+        format!("packUint2x32({})", <[u32; 2]>::read(word))
+    }
+}
+
 impl GlslType for structs::TextureUse {
     fn member(name: &str) -> String {
         format!("    TextureUse {name};\n")
@@ -74,7 +83,8 @@ pub const SOBOL_BITS: usize = 16;
 /// The text of `glsl/generated.glsl`.
 pub fn generated_glsl() -> String {
     let mut out = String::from(
-        "// Written by build-shaders from shaders/src/structs.rs and shaders/src/specialization.rs. Do not edit.\n\n",
+        "// Written by build-shaders from shaders/src/structs.rs and shaders/src/specialization.rs. Do not edit.\n\n\
+         #extension GL_EXT_shader_explicit_arithmetic_types_int64 : require\n\n",
     );
     for (name, value) in structs::CONSTANTS.iter().chain(structs::BINDINGS) {
         out.push_str(&format!("#define {name} {value}u\n"));

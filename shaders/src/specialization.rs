@@ -110,4 +110,7 @@ specialization_constants! {
     PLANE_OF_BITS_20: uint = 0xffff_ffff;
     /// On GPUs: groups of nodes that may wait while a ray walks through a body, at most one for each level of the deepest tree.
     WALK_STACK: uint = 24;
+    /// On GPUs: a pixel may have more than `TRACE_PIXEL_SAMPLES` samples, so that those of a workgroup may take several rounds. The loop over the
+    /// rounds costs registers even where there is one.
+    MANY_SAMPLES: bool = true;
 }

@@ -219,24 +219,26 @@ gpu_structs! {
         flags: u32,
     }
 
-    /// A pixel to be traced.
+    /// A pixel to be traced. Its samples end where those of the next item begin.
     struct WorkItem {
         /// Pixel index.
         pixel: u32,
-        /// Samples.
-        spp: u32,
+        /// Samples of all items before it.
+        first: u32,
     }
 
     /// Sizes that one pass leaves for the next.
     struct Schedule {
         /// Workgroups of the tracing pass.
         groups: [u32; 3],
-        /// Work items.
-        items: u32,
         /// Sum of all pixels' importance, in units of 1 / 256.
         importance: u32,
+        /// Work items in the lower 32 bits, their samples in the upper 32: one number, so that both grow in one step.
+        listed: u64,
         /// Lit pixels.
         lit: u32,
+        /// Nothing.
+        unused: u32,
     }
 
     /// A pixel's light before the spatial filter.
@@ -468,6 +470,10 @@ pub const CONSTANTS: &[(&str, u32)] = &[
     ("RESPONSE_CODES", RESPONSE_CODES),
     ("OWNER_NONE", OWNER_NONE),
     ("OWNER_STILL", OWNER_STILL),
+    ("TRACE_LANES", TRACE_LANES),
+    ("TRACE_GROUP_SAMPLES", TRACE_GROUP_SAMPLES),
+    ("TRACE_PIXEL_SAMPLES", TRACE_PIXEL_SAMPLES),
+    ("TRACE_SLOTS", TRACE_SLOTS),
     ("SAMPLER_INDEPENDENT", SAMPLER_INDEPENDENT),
     ("SAMPLER_BLUE_NOISE", SAMPLER_BLUE_NOISE),
     ("SAMPLER_CONTINUED", SAMPLER_CONTINUED),
@@ -554,6 +560,15 @@ pub const RESPONSE_CODES: u32 = 256;
 pub const OWNER_NONE: u32 = 0;
 /// What is at the pixel stays where it was drawn. The owners after it are the movers, in their order.
 pub const OWNER_STILL: u32 = 1;
+/// Lanes of a workgroup of the pass `trace`.
+pub const TRACE_LANES: u32 = 64;
+/// On a GPU a workgroup of the pass `trace` takes the pixels whose first sample lies in its own range of so many: a little below three a lane,
+/// because the samples of the last pixel may reach beyond the range.
+pub const TRACE_GROUP_SAMPLES: u32 = 180;
+/// Samples of a pixel, unless [`crate::specialization::MANY_SAMPLES`] is set.
+pub const TRACE_PIXEL_SAMPLES: u32 = 128;
+/// Samples for whose light such a workgroup has room: those of its range, and those of the last pixel beyond it.
+pub const TRACE_SLOTS: u32 = 320;
 /// Random numbers are independent for every path.
 pub const SAMPLER_INDEPENDENT: u32 = 0;
 /// One point set a frame, shifted at every pixel by blue noise.

@@ -162,10 +162,10 @@ fn count_work(
     let spp = rig.config.render.spp;
     let mut slot = renderer.create_slot(true)?;
     draw(rig, renderer, &mut slot, &poses_at(rig, u64::from(frame)), frame, spp, spp as f32)?;
-    let items = slot.work().unwrap_or(&[]);
+    let (items, samples) = slot.work().unwrap_or((&[], 0));
     let traffic = traffic(&settings_of_planes(rig, which), Keep::default());
     Ok(FrameWork {
-        lanes: WIDTHS.iter().filter_map(|width| Lanes::of(items, *width)).collect(),
+        lanes: WIDTHS.iter().filter_map(|width| Lanes::of(items, samples, *width)).collect(),
         listed_pixels: slot.listed_pixels(),
         bytes_per_pixel: traffic.iter().map(|t| t.read + t.written).sum(),
         recorded_passes: traffic.len() as u32,

@@ -1,9 +1,10 @@
 //! How evenly the work of the pass `trace` lies on the lanes of a GPU.
 //!
-//! A thread of that pass takes one item of the work list, a pixel with its number of samples, and the threads of a
-//! subgroup end together. Lanes whose pixels have fewer samples than the pixel with the most wait for it.
+//! A workgroup of that pass takes the work items whose first sample lies in its range, and its lanes take their samples one
+//! after the other (`shaders/glsl/trace_gpu.glsl`). The lanes of a subgroup end together, so those that have one sample
+//! less than another wait for it.
 
-use dpm_shaders::structs::WorkItem;
+use dpm_shaders::structs::{WorkItem, TRACE_GROUP_SAMPLES, TRACE_LANES, TRACE_SLOTS};
 use serde::Serialize;
 
 /// Widths of the subgroups of GPUs: NVIDIA's and AMD's narrow one, AMD's wide one.
@@ -22,32 +23,71 @@ pub struct Lanes {
 }
 
 impl Lanes {
-    /// Of `work`, whose items are taken in order by subgroups of `width` lanes; `None` without work.
-    pub fn of(work: &[WorkItem], width: usize) -> Option<Self> {
-        let most = |items: &[WorkItem]| items.iter().map(|item| item.spp).max().unwrap_or(0);
-        let samples: u64 = work.iter().map(|item| u64::from(item.spp)).sum();
-        let room: u64 = work.chunks(width).map(|group| width as u64 * u64::from(most(group))).sum();
-        (room > 0).then(|| Self { width, busy: samples as f64 / room as f64, longest: most(work) })
+    /// Of the list `work`, in the order of the samples, which are so many together, with subgroups of `width` lanes, at
+    /// most those of a workgroup; `None` without work.
+    pub fn of(work: &[WorkItem], samples: u32, width: usize) -> Option<Self> {
+        let (mut room, mut longest) = (0, 0);
+        for group in groups(work, samples) {
+            // The samples that each lane takes of a round: the first lanes may have one more than the last.
+            let rounds = (0..group).step_by(TRACE_SLOTS as usize).map(|done| (group - done).min(TRACE_SLOTS));
+            let taken = |n: u32, lane: u32| n.saturating_sub(lane).div_ceil(TRACE_LANES);
+            let first_lanes = (0..TRACE_LANES).step_by(width);
+            let of_round = |n| first_lanes.clone().map(|lane| u64::from(taken(n, lane))).sum::<u64>();
+            room += width as u64 * rounds.clone().map(of_round).sum::<u64>();
+            longest = longest.max(rounds.map(|n| taken(n, 0)).sum());
+        }
+        (room > 0).then(|| Self { width, busy: f64::from(samples) / room as f64, longest })
     }
+}
+
+/// The samples of each workgroup that has any.
+fn groups(work: &[WorkItem], samples: u32) -> Vec<u32> {
+    let group_of = |item: &WorkItem| item.first / TRACE_GROUP_SAMPLES;
+    let firsts: Vec<u32> =
+        work.chunk_by(|a, b| group_of(a) == group_of(b)).map(|group| group[0].first).collect();
+    let ends = firsts.iter().skip(1).chain(std::iter::once(&samples));
+    firsts.iter().zip(ends).map(|(first, end)| end - first).collect()
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
 
-    fn list(spp: impl IntoIterator<Item = u32>) -> Vec<WorkItem> {
-        spp.into_iter().enumerate().map(|(pixel, spp)| WorkItem { pixel: pixel as u32, spp }).collect()
+    fn lanes(spp: &[u32], width: usize) -> Option<Lanes> {
+        let mut samples = 0;
+        let list: Vec<_> = (0..)
+            .zip(spp)
+            .map(|(pixel, n)| {
+                samples += n;
+                WorkItem { pixel, first: samples - n }
+            })
+            .collect();
+        Lanes::of(&list, samples, width)
     }
 
     #[test]
-    fn equal_work_keeps_all_lanes_busy_and_one_long_thread_none_but_itself() {
-        let lanes = |spp: Vec<u32>| Lanes::of(&list(spp), 32).unwrap();
-        assert_eq!(lanes(vec![4; 64]), Lanes { width: 32, busy: 1.0, longest: 4 });
-        let mut one_long = vec![1; 32];
-        one_long[7] = 32;
-        assert!((lanes(one_long).busy - 63.0 / 1024.0).abs() < 1e-12);
-        // Half of the last subgroup has no pixel.
-        assert!((lanes(vec![2; 48]).busy - 0.75).abs() < 1e-12);
-        assert_eq!(Lanes::of(&[], 32), None);
+    fn samples_are_shared_out_whatever_pixels_they_belong_to() {
+        // 180 of 192 places are taken: 52 lanes have three samples and twelve have two.
+        for width in WIDTHS {
+            assert_eq!(lanes(&[1; 360], width), Some(Lanes { width, busy: 0.9375, longest: 3 }));
+        }
+        assert_eq!(lanes(&[2; 180], 32), lanes(&[1; 360], 32));
+        assert_eq!(lanes(&[], 32), None);
+    }
+
+    #[test]
+    fn few_samples_leave_lanes_idle_and_the_subgroup_without_any_costs_nothing() {
+        assert_eq!(lanes(&[1; 16], 32), Some(Lanes { width: 32, busy: 0.5, longest: 1 }));
+        assert_eq!(lanes(&[1; 16], 64), Some(Lanes { width: 64, busy: 0.25, longest: 1 }));
+    }
+
+    #[test]
+    fn a_pixel_with_many_samples_belongs_to_one_workgroup_and_takes_rounds() {
+        // 179 + 512 samples: rounds of 320, 320 and 51 samples, of which the busiest lane of each half takes 5 and 5, 5 and
+        // 5, 1 and 1.
+        let mut spp = vec![1; 179];
+        spp.push(512);
+        let room = 32.0 * f64::from((5 + 5) * 2 + 1 + 1);
+        assert_eq!(lanes(&spp, 32), Some(Lanes { width: 32, busy: 691.0 / room, longest: 11 }));
     }
 }

@@ -120,9 +120,17 @@ impl Method {
         self.dpm || self.spatial
     }
 
+    /// Most samples of a pixel that a frame may ask for: what the method was made for, and never fewer than a workgroup of the pass `trace` has
+    /// room for.
+    pub fn most_spp(&self) -> u32 {
+        let of_zones = if self.spp_by_angle { self.paper.zone_spp.into_iter().max().unwrap_or(0) } else { 0 };
+        (self.budget_spp.ceil() as u32).max(of_zones).max(gpu::TRACE_PIXEL_SAMPLES)
+    }
+
     /// Specialization constants that the method decides, each as id and value.
-    pub(crate) fn constants(&self) -> [(u32, u32); 4] {
+    pub(crate) fn constants(&self) -> [(u32, u32); 5] {
         [
+            (ids::MANY_SAMPLES, u32::from(self.most_spp() > gpu::TRACE_PIXEL_SAMPLES)),
             (ids::SAMPLER, self.sampler as u32),
             (ids::HAS_GUIDES, u32::from(self.needs_guides())),
             (ids::HAS_DEMODULATION, u32::from(self.dpm)),

@@ -66,9 +66,9 @@ impl Output {
 pub struct FrameInputs<'a> {
     /// Number of the frame.
     pub frame: u32,
-    /// Samples of a traced pixel, where neither the angle nor a budget decides them.
+    /// Samples of a traced pixel, where neither the angle nor a budget decides them; at most [`Method::most_spp`] are taken.
     pub spp: u32,
-    /// Average number of samples of a lit pixel (method dpm).
+    /// Average number of samples of a lit pixel (method dpm), with the same bound.
     pub budget_spp: f32,
     /// The projector.
     pub camera: &'a ProjectorCamera,

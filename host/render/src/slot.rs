@@ -135,11 +135,12 @@ impl FrameSlot {
         self.buffers.debug_host.as_ref().map(|d| d.traced.read(self.raster.pixel_count()))
     }
 
-    /// The work items of the pass `trace`, in the order in which its threads took them. Only with `debug` at creation.
-    pub fn work(&self) -> Option<&[WorkItem]> {
+    /// The work items of the pass `trace`, in the order of their samples, and how many samples they have together. Only with `debug` at creation.
+    pub fn work(&self) -> Option<(&[WorkItem], u32)> {
         let debug = self.buffers.debug_host.as_ref()?;
-        let items = debug.schedule.read::<Schedule>(1)[0].items as usize;
-        Some(debug.work.read(items.min(self.raster.pixel_count())))
+        let listed = debug.schedule.read::<Schedule>(1)[0].listed;
+        let items = (listed as u32) as usize;
+        Some((debug.work.read(items.min(self.raster.pixel_count())), (listed >> 32) as u32))
     }
 
     /// Pixels of the tiles that the frame worked on.

@@ -117,8 +117,14 @@ fn create(
     let priorities = [1.0];
     let queues =
         [vk::DeviceQueueCreateInfo::default().queue_family_index(queue_family).queue_priorities(&priorities)];
-    let mut vulkan12 = vk::PhysicalDeviceVulkan12Features::default().scalar_block_layout(true);
-    let mut info = vk::DeviceCreateInfo::default().queue_create_infos(&queues).push_next(&mut vulkan12);
+    let mut vulkan12 = vk::PhysicalDeviceVulkan12Features::default()
+        .scalar_block_layout(true)
+        .shader_buffer_int64_atomics(true);
+    let features = vk::PhysicalDeviceFeatures::default().shader_int64(true);
+    let mut info = vk::DeviceCreateInfo::default()
+        .queue_create_infos(&queues)
+        .enabled_features(&features)
+        .push_next(&mut vulkan12);
     let mut executable =
         vk::PhysicalDevicePipelineExecutablePropertiesFeaturesKHR::default().pipeline_executable_info(true);
     let extensions = [khr::pipeline_executable_properties::NAME.as_ptr()];
@@ -218,7 +224,7 @@ impl Gpu {
         let name =
             options.device.as_ref().map_or(String::new(), |d| format!(" and a name that contains \"{d}\""));
         let which = only.map_or(String::new(), |id| format!(", the very {} that was lost", id.name));
-        let needed = format!("Vulkan 1.2 with scalarBlockLayout{name}{which}");
+        let needed = format!("Vulkan 1.2 with scalarBlockLayout and shaderBufferInt64Atomics{name}{which}");
         Err(first_error.unwrap_or(GpuError::NoDevice { found, needed }))
     }
 

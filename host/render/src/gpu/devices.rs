@@ -54,6 +54,8 @@ pub(super) struct Candidate {
 struct Abilities {
     api_version: u32,
     scalar_block_layout: bool,
+    /// Atomic operations on numbers of 64 bits.
+    atomics_of_64_bits: bool,
     compute_queue: bool,
     /// Storage buffers that one shader can be given.
     storage_buffers: u32,
@@ -91,7 +93,9 @@ fn version_text(v: u32) -> String {
 impl Abilities {
     fn of(instance: &ash::Instance, physical: vk::PhysicalDevice) -> Self {
         let mut scalar = vk::PhysicalDeviceScalarBlockLayoutFeatures::default();
-        let mut features = vk::PhysicalDeviceFeatures2::default().push_next(&mut scalar);
+        let mut atomics = vk::PhysicalDeviceShaderAtomicInt64Features::default();
+        let mut features =
+            vk::PhysicalDeviceFeatures2::default().push_next(&mut scalar).push_next(&mut atomics);
         let mut subgroup = vk::PhysicalDeviceSubgroupProperties::default();
         let mut props = vk::PhysicalDeviceProperties2::default().push_next(&mut subgroup);
         // SAFETY: `features` and `props` chain valid structures.
@@ -100,10 +104,12 @@ impl Abilities {
             instance.get_physical_device_properties2(physical, &mut props);
         }
         let base = props.properties;
+        let has_64_bits = features.features.shader_int64 != 0;
         let in_compute = subgroup.supported_stages.contains(vk::ShaderStageFlags::COMPUTE);
         Self {
             api_version: base.api_version,
             scalar_block_layout: scalar.scalar_block_layout != 0,
+            atomics_of_64_bits: has_64_bits && atomics.shader_buffer_int64_atomics != 0,
             compute_queue: compute_family(instance, physical).is_some(),
             storage_buffers: (base.limits.max_per_stage_descriptor_storage_buffers)
                 .min(base.limits.max_descriptor_set_storage_buffers),
@@ -130,6 +136,9 @@ impl Abilities {
         }
         if !self.scalar_block_layout {
             missing.push("scalarBlockLayout".to_owned());
+        }
+        if !self.atomics_of_64_bits {
+            missing.push("shaderInt64 with shaderBufferInt64Atomics".to_owned());
         }
         if !self.compute_queue {
             missing.push("a compute queue".to_owned());
@@ -308,6 +317,7 @@ mod tests {
         Abilities {
             api_version: vk::make_api_version(0, 1, 2, 0),
             scalar_block_layout: true,
+            atomics_of_64_bits: true,
             compute_queue: true,
             storage_buffers: bound(BindingKind::Storage),
             storage_images: bound(BindingKind::Texel),
@@ -332,6 +342,7 @@ mod tests {
                     Abilities { api_version: vk::make_api_version(0, 1, 1, 0), ..able },
                 ),
                 ("scalarBlockLayout", Abilities { scalar_block_layout: false, ..able }),
+                ("shaderBufferInt64Atomics", Abilities { atomics_of_64_bits: false, ..able }),
                 ("a compute queue", Abilities { compute_queue: false, ..able }),
                 ("storage buffers", Abilities { storage_buffers: able.storage_buffers - 1, ..able }),
                 ("resources", Abilities { resources: able.resources - 1, ..able }),
@@ -377,6 +388,7 @@ mod tests {
     #[test]
     fn the_subgroup_operations_and_workgroups_are_those_of_the_shaders() {
         let (mut operations, mut largest) = (vk::SubgroupFeatureFlags::empty(), 0);
+        let mut features = std::collections::BTreeSet::new();
         for shader in dpm_shaders::ALL {
             let word = |c: &[u8]| u32::from_le_bytes([c[0], c[1], c[2], c[3]]);
             let words: Vec<u32> = shader.spirv.chunks_exact(4).map(word).collect();
@@ -393,6 +405,7 @@ mod tests {
                     (17, Some(66), _) => operations |= vk::SubgroupFeatureFlags::SHUFFLE_RELATIVE,
                     (17, Some(67), _) => operations |= vk::SubgroupFeatureFlags::CLUSTERED,
                     (17, Some(68), _) => operations |= vk::SubgroupFeatureFlags::QUAD,
+                    (17, Some(capability), _) => drop(features.insert(*capability)),
                     // OpExecutionMode LocalSize.
                     (16, _, Some(17)) => largest = largest.max(words[at + 3..at + 6].iter().product()),
                     _ => {}
@@ -401,6 +414,8 @@ mod tests {
             }
         }
         assert_eq!((operations, largest), (SUBGROUP_OPERATIONS, INVOCATIONS));
+        // Shader, Int64, Int64Atomics and ImageBuffer.
+        assert_eq!(features, [1, 11, 12, 47].into());
     }
 
     #[test]

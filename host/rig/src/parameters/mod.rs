@@ -249,7 +249,8 @@ fn axes(labels: [&'static str; 3], unit: &'static str, far: f64, step: f64) -> i
 
 /// Most samples per pixel that this rig may be asked for.
 fn most_samples(rig: &Rig) -> f64 {
-    f64::from(rig.config.render.spp.saturating_mul(SAMPLES_BEYOND).min(MOST_SAMPLES))
+    let wanted = rig.config.render.spp.saturating_mul(SAMPLES_BEYOND).min(MOST_SAMPLES);
+    f64::from(wanted.min(rig.config.render.to_method().most_spp()))
 }
 
 impl Nudge {

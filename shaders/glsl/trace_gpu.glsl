@@ -1,0 +1,148 @@
+// The work list on a GPU, where the lanes of a subgroup wait for the one that works longest. A workgroup takes the pixels of a range of samples, a
+// lane that is free takes the next sample, whichever pixel it belongs to, and the light of each lies in shared memory until all are done. Then each
+// pixel's samples are added in their order, so that no sum depends on which lane was free.
+#extension GL_KHR_shader_subgroup_ballot : require
+
+// For each sample first its pixel, its number among the pixel's samples, and how many those are; while it is traced its pixel, and the index and the
+// seed of its random numbers; then its light, as bits.
+shared uint slots[3u * TRACE_SLOTS];
+// A bit for each sample that has all of its pixel's light.
+shared uint exact_slots[TRACE_SLOTS / 32u];
+// The next sample that no lane has taken.
+shared uint next_slot;
+// The pixel whose samples end in a later round: what they add up to so far. Written in one round and read in the next.
+shared Sums carried[2];
+
+// The workgroup's part of the list: its items, and their samples. It lies in shared memory, because in registers it would live across every walk.
+struct Range {
+    uint first_item;
+    uint end_item;
+    uint first;
+    uint end;
+};
+shared Range range;
+
+// The first item between `first` and `end` whose samples begin at or behind `sample_index`, or `end`. Every lane looks at another item, so that few
+// looks are enough. To be called by every invocation.
+uint find_item(uint sample_index, uint first, uint end) {
+    while (first < end) {
+        uint step = (end - first + gl_SubgroupSize - 1u) / gl_SubgroupSize;
+        uint at = first + gl_SubgroupInvocationID * step;
+        bool before = at < end && work[at].first < sample_index;
+        uint lanes = subgroupBallotBitCount(subgroupBallot(before));
+        if (lanes == 0u) return first;
+        end = min(end, first + lanes * step);
+        first += (lanes - 1u) * step + 1u;
+    }
+    return first;
+}
+
+void find_range() {
+    WorkList list = work_list();
+    uint group = group_index();
+    uint first = find_item(group * TRACE_GROUP_SAMPLES, 0u, list.items);
+    // Every item has a sample at least.
+    uint end = find_item((group + 1u) * TRACE_GROUP_SAMPLES, first, min(list.items, first + TRACE_GROUP_SAMPLES));
+    if (gl_LocalInvocationIndex == 0u) range = Range(first, end, first_sample_of(list, first), first_sample_of(list, end));
+}
+
+// Where the samples of an item end.
+uint end_of(uint item) { return item + 1u < range.end_item ? work[item + 1u].first : range.end; }
+
+// The samples of the range from `base` on into the slots, as many as there is room for.
+void fill_slots(uint base) {
+    uint lane = gl_LocalInvocationIndex;
+    for (uint item = range.first_item + lane; item < range.end_item; item += TRACE_LANES) {
+        uint at = work[item].pixel, first = work[item].first, end = end_of(item);
+        for (uint i = max(first, base); i < min(end, base + TRACE_SLOTS); i++) {
+            uint slot = i - base;
+            slots[slot] = at;
+            slots[slot + TRACE_SLOTS] = i - first;
+            slots[slot + 2u * TRACE_SLOTS] = end - first;
+        }
+    }
+    if (lane < TRACE_SLOTS / 32u) exact_slots[lane] = 0u;
+    if (lane == 0u) next_slot = 0u;
+}
+
+void keep_light(uint slot, vec3 light, bool exact) {
+    uvec3 bits = floatBitsToUint(light);
+    slots[slot] = bits.x;
+    slots[slot + TRACE_SLOTS] = bits.y;
+    slots[slot + 2u * TRACE_SLOTS] = bits.z;
+    if (exact) atomicOr(exact_slots[slot / 32u], 1u << (slot % 32u));
+}
+
+// The path of a slot's sample, whose random numbers are then told by the slot. That of the background has ended already.
+void begin_slot(uint slot, inout Path path) {
+    uint at = slots[slot];
+    Sampler rng = begin_sampler(at, slots[slot + 2u * TRACE_SLOTS]);
+    slots[slot + 2u * TRACE_SLOTS] = rng.seed;
+    slots[slot + TRACE_SLOTS] += rng.index;
+    Surface surface = surface_at(at);
+    if (surface.id == NO_HIT) {
+        path.vertex = frame.depth;
+        path.radiance = background(at);
+    } else {
+        path = begin_path(first_point(surface));
+    }
+}
+
+Sampler sampler_of(uint slot) { return Sampler(slots[slot + 2u * TRACE_SLOTS], slots[slot + TRACE_SLOTS], pixel_of(slots[slot])); }
+
+// The light of every slot. A lane whose path ends takes the next slot at once, while the paths of its neighbours continue.
+void trace_slots(uint base) {
+    bool dpm = (frame.flags & FRAME_DPM) != 0u;
+    uint rays = 0u;
+    Path path;
+    bool begins = true;
+    uint slot = atomicAdd(next_slot, 1u);
+    while (slot < min(range.end - base, TRACE_SLOTS)) {
+        if (begins) begin_slot(slot, path);
+        begins = !advance_path(path, sampler_of(slot), rays);
+        if (begins) {
+            keep_light(slot, path.radiance, dpm && path.exact);
+            slot = atomicAdd(next_slot, 1u);
+        }
+    }
+    COUNT(rays, rays)
+}
+
+// Adds the light of the slots, pixel by pixel, and writes the pixels whose last sample is among them.
+void add_slots(uint base) {
+    uint round = (base - range.first) / TRACE_SLOTS, samples = 0u, invalid = 0u;
+    for (uint item = range.first_item + gl_LocalInvocationIndex; item < range.end_item; item += TRACE_LANES) {
+        uint at = work[item].pixel, first = work[item].first, end = end_of(item);
+        uint from = max(first, base), to = min(end, base + TRACE_SLOTS);
+        if (from >= to) continue;
+        Sums sums = NO_SAMPLES;
+        if (from > first) sums = carried[(round + 1u) & 1u];
+        for (uint slot = from - base; slot < to - base && !sums.exact; slot++) {
+            vec3 light = uintBitsToFloat(uvec3(slots[slot], slots[slot + TRACE_SLOTS], slots[slot + 2u * TRACE_SLOTS]));
+            bool exact = (exact_slots[slot / 32u] >> (slot % 32u) & 1u) != 0u;
+            if (!add_sample(sums, light, exact)) invalid++;
+        }
+        // The background has no path.
+        if (surface_at(at).id != NO_HIT) samples += to - from;
+        if (to < end) carried[round & 1u] = sums;
+        else write_sums(at, sums);
+    }
+    COUNT(samples, samples)
+    COUNT_RARE(invalid_samples, invalid)
+}
+
+void main() {
+    find_range();
+    barrier();
+    uint base = range.first;
+    do {
+        fill_slots(base);
+        barrier();
+        trace_slots(base);
+        barrier();
+        add_slots(base);
+        base += TRACE_SLOTS;
+        // The slots are filled anew only after all have been added.
+        if (MANY_SAMPLES) barrier();
+    } while (MANY_SAMPLES && base < range.end);
+}

@@ -1,0 +1,36 @@
+// The work list on software Vulkan: a lane takes a work item, and its first vertex is computed once for all of its samples.
+
+void main() {
+    WorkList list = work_list();
+    // This is read while all lanes are active. There is at least one item, because otherwise no workgroup is dispatched.
+    uint item = group_index() * TRACE_LANES + gl_LocalInvocationIndex;
+    uint at = work[min(item, list.items - 1u)].pixel;
+    uint spp = first_sample_of(list, item + 1u) - first_sample_of(list, item);
+    if (item >= list.items) return;
+    Surface surface = surface_at(at);
+    if (surface.id == NO_HIT) {
+        radiance_out[at] = vec4(background(at), 1.0);
+        return;
+    }
+    Point first = first_point(surface);
+    Sampler rng = begin_sampler(at, spp);
+    bool dpm = (frame.flags & FRAME_DPM) != 0u;
+    Sums sums = NO_SAMPLES;
+    uint traced = 0u, invalid = 0u, rays = 0u;
+    // A lane whose path ends begins its next sample at once, while the paths of its neighbours continue.
+    Path path;
+    bool begins = true;
+    do {
+        if (begins) path = begin_path(first);
+        begins = !advance_path(path, rng, rays);
+        if (begins) {
+            if (!add_sample(sums, path.radiance, dpm && path.exact)) invalid++;
+            rng.index++;
+            traced++;
+        }
+    } while (traced < spp && !sums.exact);
+    write_sums(at, sums);
+    COUNT(rays, rays)
+    COUNT(samples, traced)
+    COUNT_RARE(invalid_samples, invalid)
+}
