@@ -22,8 +22,9 @@ uint samples_of(uvec2 pixel, uint at) {
     float largest = min(LARGEST_SHARE * max(frame.budget_spp, 1.0), max(float(TRACE_PIXEL_SAMPLES), frame.budget_spp));
     share = clamp(share, min(0.5, 0.5 * frame.budget_spp), largest);
     float one = min(1.0, 2.0 * frame.budget_spp);
-    // One sample has all light of a deterministic pixel. A new point is traced at once, because its own light is better than a guess.
-    if ((h.flags & HISTORY_EXACT) != 0u) share = one;
+    // The light of a deterministic pixel takes one sample, and the tracer stops there. The others are for a pixel that has just stopped being
+    // deterministic. A new point is traced at once, because its own light is better than a guess.
+    if ((h.flags & HISTORY_EXACT) != 0u) share = max(one, 2.0 * frame.budget_spp);
     else if (h.index == 0u) share = max(share, one);
     float whole = floor(share);
     return uint(whole) + (blue_noise(pixel, frame.drawn, 0u) < share - whole ? 1u : 0u);

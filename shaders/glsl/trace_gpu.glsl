@@ -8,6 +8,9 @@
 shared uint slots[3u * TRACE_SLOTS];
 // A bit for each sample that has all of its pixel's light.
 shared uint exact_slots[TRACE_SLOTS / 32u];
+// A bit for each sample that waits for the one before it, because the pixel was deterministic in the last frame: if it still is, the first sample has
+// all of its light.
+shared uint waiting_slots[TRACE_SLOTS / 32u];
 // The next sample that no lane has taken.
 shared uint next_slot;
 // The pixel whose samples end in a later round: what they add up to so far. Written in one round and read in the next.
@@ -49,20 +52,31 @@ void find_range() {
 // Where the samples of an item end.
 uint end_of(uint item) { return item + 1u < range.end_item ? work[item + 1u].first : range.end; }
 
+bool is_exact(uint slot) { return (exact_slots[slot / 32u] >> (slot % 32u) & 1u) != 0u; }
+bool waits(uint slot) { return (waiting_slots[slot / 32u] >> (slot % 32u) & 1u) != 0u; }
+
 // The samples of the range from `base` on into the slots, as many as there is room for.
 void fill_slots(uint base) {
     uint lane = gl_LocalInvocationIndex;
+    if (lane < TRACE_SLOTS / 32u) {
+        exact_slots[lane] = 0u;
+        waiting_slots[lane] = 0u;
+    }
+    if (lane == 0u) next_slot = 0u;
+    barrier();
+    bool dpm = (frame.flags & FRAME_DPM) != 0u;
     for (uint item = range.first_item + lane; item < range.end_item; item += TRACE_LANES) {
         uint at = work[item].pixel, first = work[item].first, end = end_of(item);
+        bool was_exact = dpm && (history_at(at).flags & HISTORY_EXACT) != 0u;
         for (uint i = max(first, base); i < min(end, base + TRACE_SLOTS); i++) {
             uint slot = i - base;
+            // What comes first in a round waits for nothing.
+            if (was_exact && i > first && slot > 0u) atomicOr(waiting_slots[slot / 32u], 1u << (slot % 32u));
             slots[slot] = at;
             slots[slot + TRACE_SLOTS] = i - first;
             slots[slot + 2u * TRACE_SLOTS] = end - first;
         }
     }
-    if (lane < TRACE_SLOTS / 32u) exact_slots[lane] = 0u;
-    if (lane == 0u) next_slot = 0u;
 }
 
 void keep_light(uint slot, vec3 light, bool exact) {
@@ -73,19 +87,20 @@ void keep_light(uint slot, vec3 light, bool exact) {
     if (exact) atomicOr(exact_slots[slot / 32u], 1u << (slot % 32u));
 }
 
-// The path of a slot's sample, whose random numbers are then told by the slot. That of the background has ended already.
-void begin_slot(uint slot, inout Path path) {
+// The path of a slot's sample, whose random numbers are then told by the slot. That of the background has ended already, and so has that of a sample
+// that waits for another lane.
+void begin_slot(uint slot, bool is_left_out, inout Path path) {
     uint at = slots[slot];
+    Surface surface = surface_at(at);
+    if (is_left_out || surface.id == NO_HIT) {
+        path.vertex = frame.depth;
+        path.radiance = background(at);
+        return;
+    }
     Sampler rng = begin_sampler(at, slots[slot + 2u * TRACE_SLOTS]);
     slots[slot + 2u * TRACE_SLOTS] = rng.seed;
     slots[slot + TRACE_SLOTS] += rng.index;
-    Surface surface = surface_at(at);
-    if (surface.id == NO_HIT) {
-        path.vertex = frame.depth;
-        path.radiance = background(at);
-    } else {
-        path = begin_path(first_point(surface));
-    }
+    path = begin_path(first_point(surface));
 }
 
 Sampler sampler_of(uint slot) { return Sampler(slots[slot + 2u * TRACE_SLOTS], slots[slot + TRACE_SLOTS], pixel_of(slots[slot])); }
@@ -96,13 +111,18 @@ void trace_slots(uint base) {
     uint rays = 0u;
     Path path;
     bool begins = true;
+    // Whether this lane has traced the sample before the slot's.
+    bool follows = false;
+    uint count = min(range.end - base, TRACE_SLOTS);
     uint slot = atomicAdd(next_slot, 1u);
-    while (slot < min(range.end - base, TRACE_SLOTS)) {
-        if (begins) begin_slot(slot, path);
+    while (slot < count) {
+        if (begins) begin_slot(slot, waits(slot) && !follows, path);
         begins = !advance_path(path, sampler_of(slot), rays);
         if (begins) {
-            keep_light(slot, path.radiance, dpm && path.exact);
-            slot = atomicAdd(next_slot, 1u);
+            bool is_left_out = waits(slot) && !follows, exact = dpm && path.exact;
+            if (!is_left_out) keep_light(slot, path.radiance, exact);
+            follows = !is_left_out && !exact && slot + 1u < count && waits(slot + 1u);
+            slot = follows ? slot + 1u : atomicAdd(next_slot, 1u);
         }
     }
     COUNT(rays, rays)
@@ -117,13 +137,15 @@ void add_slots(uint base) {
         if (from >= to) continue;
         Sums sums = NO_SAMPLES;
         if (from > first) sums = carried[(round + 1u) & 1u];
-        for (uint slot = from - base; slot < to - base && !sums.exact; slot++) {
+        uint slot = from - base;
+        for (; slot < to - base && !sums.exact; slot++) {
             vec3 light = uintBitsToFloat(uvec3(slots[slot], slots[slot + TRACE_SLOTS], slots[slot + 2u * TRACE_SLOTS]));
-            bool exact = (exact_slots[slot / 32u] >> (slot % 32u) & 1u) != 0u;
-            if (!add_sample(sums, light, exact)) invalid++;
+            if (!add_sample(sums, light, is_exact(slot))) invalid++;
         }
-        // The background has no path.
-        if (surface_at(at).id != NO_HIT) samples += to - from;
+        // The background has no path, and a sample that still waits was not traced.
+        uint traced = slot - (from - base);
+        for (; slot < to - base; slot++) traced += waits(slot) ? 0u : 1u;
+        if (surface_at(at).id != NO_HIT) samples += traced;
         if (to < end) carried[round & 1u] = sums;
         else write_sums(at, sums);
     }

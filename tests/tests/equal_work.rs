@@ -61,7 +61,12 @@ fn every_sample_is_traced_once_and_lanes_are_busy() {
         assert!(pixels.len() == gpu.work.len() && pixels.len() > 300, "{what}: {} items", gpu.work.len());
         assert_eq!(gpu.work[0].first, 0, "{what}");
         assert!(gpu.work.is_sorted_by(|a, b| a.first < b.first), "{what}: samples in the order of items");
-        assert_eq!(gpu.cost.counters().samples, gpu.samples, "{what}: traced and listed");
+        // Where the first sample has all light, the others are not traced; on a GPU they are in the pixel's first frame.
+        let traced = [&software, &gpu].map(|drawn| drawn.cost.counters().samples);
+        assert!(traced[0] <= traced[1] && traced[1] <= gpu.samples, "{what}: {traced:?} of {}", gpu.samples);
+        if which != RenderMethod::Dpm {
+            assert_eq!(traced, [gpu.samples; 2], "{what}");
+        }
         for lanes in WIDTHS.map(|width| Lanes::of(&gpu.work, gpu.samples, width).expect("there is work")) {
             assert!(lanes.busy >= 0.8 && lanes.longest <= 8, "{what}: {lanes:?}");
         }
