@@ -3,14 +3,17 @@
 
 use dpm_device::planes::PlaneSpec;
 use dpm_device::time::HostTime;
+use dpm_lab::error::planes::{centre_of, middle_of};
 use dpm_lab::sequence::draw;
 use dpm_render::Renderer;
+use dpm_rig::light::recorder::LightFrame;
 use dpm_rig::pipeline::{self, renderer_settings, RunOptions};
 use dpm_rig::rig::Rig;
 use dpm_rig::telemetry::monitor::RunMonitor;
 use dpm_rig::telemetry::report::Report;
 use dpm_tests::gpu::with_gpu;
 use dpm_tests::rigs::{demo_rig, run};
+use glam::DVec3;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::Arc;
 use std::time::{Duration, Instant};
@@ -206,6 +209,70 @@ fn light_of_passing_bodies_is_centred_on_them_whatever_the_order_of_the_planes()
             "{planes} {weights} {order}: {smear} of {expected} px"
         );
     }
+}
+
+/// In a rendered run every plane shows each body where that body is at the plane's own instant. The picture of a frame is
+/// the same whether its planes follow or not, so each plane shows it elsewhere by what the body moves in between. What is
+/// compared is the light that the mock emitted with the true motion.
+#[test]
+fn planes_of_a_rendered_run_show_each_body_at_their_own_instants() {
+    with_gpu(|gpu| {
+        let moving = |i: usize, up: i32| {
+            format!(
+                "scene.bodies.{i}.motion={{kind=\"translate\",direction=[0,{up},0],speed_m_s=2.0,amplitude_m=0.15,acceleration_m_s2=50.0}}"
+            )
+        };
+        let lit = |poses: &str| {
+            let flags = [format!("projector.plane_poses=\"{poses}\""), moving(0, 1), moving(1, -1)];
+            let [poses, up, down] = flags.each_ref().map(String::as_str);
+            let rig = demo_rig(512, 384, &[poses, up, down, FULL, "render.exposure=1000.0"]);
+            let outcome = run(gpu, &rig, 24, 8).0;
+            assert_eq!((outcome.light_mismatches, outcome.light.len()), (0, 8));
+            (rig, outcome.light)
+        };
+        let ((rig, own), (_, one)) = (lit("own"), lit("frame"));
+        let slot_ns = rig.rate().slot_len_ns(0);
+        // The bodies stand side by side and move up and down.
+        let centres = [0, 1].map(|i| {
+            let body = rig.scene.bodies.iter().find(|b| b.tracked == Some(i)).expect("it has a mesh");
+            let all = &body.mesh.positions;
+            all.iter().map(|p| p.as_dvec3()).sum::<DVec3>() / all.len() as f64
+        });
+        let place = |body: usize, at: HostTime| {
+            let truth = rig.true_poses(at.0).expect("the mock tells");
+            rig.camera.project(truth[body].transform_point3(centres[body])).expect("in front")
+        };
+        let between = 0.5 * (place(0, HostTime(0)).x + place(1, HostTime(0)).x);
+        for body in 0..2 {
+            let is_left = place(body, HostTime(0)).x < between;
+            let row = |light: &LightFrame, bit: usize| {
+                let lit = light.codes.iter().enumerate().filter(|(i, code)| {
+                    let is_here = ((*i % 512) as f64) < between;
+                    is_here == is_left && code.iter().any(|c| c >> bit & 1 == 1)
+                });
+                let (count, sum) = lit.fold((0.0, 0.0), |(n, sum), (i, _)| (n + 1.0, sum + (i / 512) as f64));
+                (count, sum / count)
+            };
+            let (mut products, mut squares) = (0.0, 0.0);
+            for (own, one) in own.iter().zip(&one) {
+                assert_eq!(own.frame, one.frame);
+                let centre = own.first_photon_at.plus_ns((slot_ns as f64 * centre_of(&rig.schedule)) as i64);
+                for bit in 0..8 {
+                    // The middle plane of the three of a bit, which are lit from the highest bit on.
+                    let middle = slot_ns as f64 * middle_of(&rig.schedule, 3 * (7 - bit) + 1);
+                    let at = own.first_photon_at.plus_ns(middle as i64);
+                    let expected = place(body, at).y - place(body, centre).y;
+                    let ((count, own), (_, one)) = (row(own, bit), row(one, bit));
+                    assert!(count > 200.0, "body {body}, bit {bit}: {count} mirrors");
+                    products += count * expected * (own - one);
+                    squares += count * expected * expected;
+                }
+            }
+            let share = products / squares;
+            println!("body {body}: planes move by {share:.3} of the body's motion");
+            assert!((0.7..1.3).contains(&share), "body {body}: planes move by {share} of its motion");
+        }
+    });
 }
 
 /// Root mean square distance in time of a frame's light from its centre, seconds.

@@ -67,7 +67,12 @@ fn rig(motion: &str, setting: Setting, tracks: &str) -> Arc<Rig> {
 }
 
 fn lit(rig: &Arc<Rig>, frames: u64) -> RunOutcome {
-    let options = RunOptions { frames, keep_records: frames as usize, ..RunOptions::default() };
+    lit_keeping(rig, frames, 0)
+}
+
+/// The same with the last `keep_frames` frames of light.
+fn lit_keeping(rig: &Arc<Rig>, frames: u64, keep_frames: usize) -> RunOutcome {
+    let options = RunOptions { frames, keep_frames, keep_records: frames as usize, ..RunOptions::default() };
     let outcome = pipeline::run_prepared(rig.clone(), options, &Arc::new(RunMonitor::default()));
     outcome.unwrap_or_else(|e| panic!("{e}"))
 }
@@ -195,4 +200,63 @@ fn tracks_repeat_and_can_be_switched_off() {
     assert!(on.0.len() > 250 && on == again);
     assert!(off.0.is_empty());
     assert_eq!((on.1, on.2), (off.1, off.2));
+}
+
+/// What a run keeps of its light and what its report says of it have the shifts in them: every mirror of every plane shows
+/// what docs/PROTOCOL.md says, and an eye that follows the bodies sees less error than without tracks.
+#[test]
+fn the_light_and_the_report_of_a_run_have_tracks_in_them() {
+    let [on, off] = ["auto", "off"].map(|tracks| {
+        let rig = rig(&turning(1), SETTINGS[1].0, tracks);
+        let outcome = lit_keeping(&rig, 300, 30);
+        (rig, outcome)
+    });
+    let ((rig, on), (_, off)) = (on, off);
+    let seen = |outcome: &RunOutcome| {
+        let report = &outcome.report;
+        let [offset, smear] = [report.followed_offset_px, report.followed_smear_px];
+        (offset.expect("the mock tells the truth").max, smear.expect("the mock tells the truth").max)
+    };
+    println!("offset and smear with tracks {:?}, without {:?}", seen(&on), seen(&off));
+    assert!(seen(&on).0 < 0.5 * seen(&off).0, "{:?} {:?}", seen(&on), seen(&off));
+    assert_eq!((on.report.followed_light, off.report.followed_light), (Some("as lit"), Some("as lit")));
+    assert!(on.report.to_table().contains("px (with tracks)"));
+    assert!(!off.report.to_table().contains("tracks"));
+    let mut moved = 0;
+    for (seen, sent) in on.light.iter().zip(&off.light) {
+        assert_eq!(seen.frame, sent.frame);
+        let of_frame = |m: &&SlotMoves| m.frame == seen.frame && m.first_photon_at == seen.first_photon_at;
+        let Some(moves) = on.moves.iter().find(of_frame) else { continue };
+        assert_eq!(seen.is_moved, moves.is_any());
+        if moves.is_any() && moved < 3 {
+            moved += 1;
+            let expected = moved_light(&rig, &sent.codes, moves);
+            assert!(seen.codes == expected && seen.codes != sent.codes, "frame {}", seen.frame);
+        }
+    }
+    assert_eq!(moved, 3);
+}
+
+/// The light `sent`, each mirror of each plane by itself as `moves` say: a mirror of a region shows the mirror that lies the
+/// region's shift before it, if that is of the same region, and is dark otherwise.
+fn moved_light(rig: &Rig, sent: &[[u8; 3]], moves: &SlotMoves) -> Vec<[u8; 3]> {
+    let raster = rig.camera.raster;
+    let (width, height) = (i64::from(raster.width()), i64::from(raster.height()));
+    let mut light = vec![[0; 3]; sent.len()];
+    for (plane, moves) in rig.schedule.planes().iter().zip(moves.planes()) {
+        let region = |x: i64, y: i64| moves.all().iter().position(|one| one.area.contains(x, y));
+        for (y, x) in (0..height).flat_map(|y| (0..width).map(move |x| (y, x))) {
+            let [dx, dy] = moves.of_mirror(x, y).map(i64::from);
+            let (from_x, from_y) = (x - dx, y - dy);
+            let is_on = (0..width).contains(&from_x)
+                && (0..height).contains(&from_y)
+                && region(x, y) == region(from_x, from_y);
+            if is_on {
+                let channel = plane.channel as usize;
+                let code = sent[(from_y * width + from_x) as usize][channel];
+                light[(y * width + x) as usize][channel] |= code & (1 << plane.bit);
+            }
+        }
+    }
+    light
 }

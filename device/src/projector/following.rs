@@ -4,8 +4,8 @@
 //! planes can be settled whenever the projector advances: each by the tracks that had arrived when it began.
 
 use super::Core;
-use crate::link::{frame_newer, Config, Moves, SlotClock, TrackCounts, Tracks};
-use crate::planes::MAX_PLANES;
+use crate::link::{frame_newer, move_plane, Config, Moves, SlotClock, TrackCounts, Tracks};
+use crate::planes::{Raster, MAX_PLANES};
 use crate::time::{DeviceTicks, HostTime};
 
 /// What tracks made of the planes of a lit slot.
@@ -30,6 +30,24 @@ impl SlotMoves {
     /// The shifts of each plane that was lit, in the order shown.
     pub fn planes(&self) -> &[Moves] {
         &self.planes[..usize::from(self.lit)]
+    }
+
+    /// True if a mirror of a plane may show something else than what was sent.
+    pub fn is_any(&self) -> bool {
+        self.planes().iter().any(Moves::is_any)
+    }
+
+    /// Writes the light of the slot into `out`: `planes`, which are those of its frame as they were sent, one after the
+    /// other, each as tracks moved it. Planes that were cut off are left as they were sent.
+    ///
+    /// # Panics
+    /// When the lengths differ or are not those of whole planes of `raster`.
+    pub fn move_planes(&self, raster: Raster, planes: &[u8], out: &mut [u8]) {
+        assert_eq!(planes.len(), out.len(), "bytes of the planes");
+        let bytes = raster.plane_bytes();
+        for (k, (plane, out)) in planes.chunks(bytes).zip(out.chunks_mut(bytes)).enumerate() {
+            move_plane(raster, plane, self.planes().get(k).unwrap_or(&Moves::NONE), out);
+        }
     }
 
     /// Age of the tracks of each plane that was lit: ticks from their begin to the middle of the plane. `None` if none held.
@@ -101,7 +119,7 @@ impl Following {
 
 impl Core {
     /// True if CONFIG asked for tracks and this projector follows them.
-    fn follows(&self) -> bool {
+    pub(super) fn follows(&self) -> bool {
         self.setup.greatest_shift.is_some() && self.config.as_ref().is_some_and(|(config, _)| config.tracks)
     }
 

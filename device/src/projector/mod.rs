@@ -252,6 +252,12 @@ impl ProjectorFirmware {
         core.moves.pop_front()
     }
 
+    /// True while CONFIG asks for tracks that this projector follows. Then [`ProjectorFirmware::next_moves`] tells of every
+    /// lit slot, if [`FirmwareConfig::moves_kept`] says so.
+    pub fn follows_tracks(&self) -> bool {
+        self.core.follows()
+    }
+
     /// Number of light events that were replaced by newer ones before they were taken.
     pub fn light_events_lost(&self) -> u64 {
         self.core.events_lost

@@ -1,9 +1,13 @@
-//! Times of copying, packing and quantising one 1024 x 768 frame of 24 planes on one core, as text.
+//! Times of copying, packing and quantising one 1024 x 768 frame of 24 planes on one core, as text, and of what the CPU twin
+//! of the pass `warp` takes for such a frame whose every mirror moves.
 //!
 //! `cargo run --release -p dpm-render --example pack_bench`
 
 use dpm_device::planes::{PlaneSchedule, Raster};
 use dpm_render::pack::{pack, quantise, BitPlaneFrame, Kernel};
+use dpm_render::warp::gather::Drawn;
+use dpm_render::warp::plane_groups;
+use dpm_shaders::structs::{Moved, Mover, OWNER_STILL};
 use std::hint::black_box;
 use std::time::Instant;
 
@@ -31,6 +35,26 @@ fn main() {
         black_box(quantise(black_box(&drive), None, &mut codes));
     });
     println!("{:22} {ms:7.3} ms  {:5.2} x memcpy", "quantise", ms / copying);
+    let ms = warp_ms(raster, &mut codes);
+    println!("{:22} {ms:7.3} ms  {:5.2} x memcpy", "warp, scalar twin", ms / copying);
+}
+
+/// Time in which the twin of the warp makes the words of a frame that one body fills, which moves by 2 pixels to the right
+/// during the exposure.
+fn warp_ms(raster: Raster, codes: &mut [u32]) -> f64 {
+    let schedule = PlaneSchedule::rgb24();
+    let instant = |i: usize| (i as f64 + 0.5) / schedule.len() as f64 - 0.18;
+    let groups = plane_groups(&schedule, &(0..schedule.len()).map(instant).collect::<Vec<_>>());
+    let (width, height) = (raster.width() as i32, raster.height() as i32);
+    let mover = Mover { upper: [width, height], start: [128, 0], ..bytemuck::Zeroable::zeroed() };
+    let of = |&word: &u32| Moved { word, motion: 128, owner_and_depth: (OWNER_STILL + 1) << 24 };
+    let pixels: Vec<Moved> = codes.iter().map(of).collect();
+    median_ms(|| {
+        let drawn = Drawn { raster, pixels: black_box(&pixels), movers: &[mover], are_codes: true };
+        for (i, word) in codes.iter_mut().enumerate() {
+            *word = drawn.word([i as i32 % width, i as i32 / width], &groups);
+        }
+    })
 }
 
 /// Median of about 300 ms of runs.

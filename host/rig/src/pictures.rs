@@ -8,7 +8,7 @@
 use crate::light::recorder::LightFrame;
 use crate::light::FrameRecord;
 use crate::pipeline::renderer_settings;
-use crate::plan::light_centre::light_centre_ns;
+use crate::plan::light_centre::true_poses_at_centre;
 use crate::rig::Rig;
 use dpm_device::planes::Raster;
 use dpm_render::drive::Drive;
@@ -37,13 +37,11 @@ struct Window<'a> {
 /// The frames of `light` whose poses are known. With the mock tracker they are the true poses. With a real tracker
 /// they are the poses that each frame was drawn for: measured, then predicted.
 fn window<'a>(rig: &Rig, light: &'a [LightFrame], records: &[FrameRecord]) -> Window<'a> {
-    let to_centre = light_centre_ns(rig, rig.rate().slot_len_ns(0));
     let drawn_for = |f: &LightFrame| {
         let record = records.iter().find(|r| r.id.0 as u32 == f.frame)?;
         Some(record.tracked_poses.clone())
     };
-    let poses =
-        |f: &LightFrame| rig.true_poses(f.first_photon_at.plus_ns(to_centre).0).or_else(|| drawn_for(f));
+    let poses = |f: &LightFrame| true_poses_at_centre(rig, f.first_photon_at).or_else(|| drawn_for(f));
     Window { frames: light.iter().filter_map(|f| Some((f, poses(f)?))).collect() }
 }
 
@@ -70,8 +68,14 @@ pub fn pictures(
     records: &[FrameRecord],
 ) -> Result<Pictures, RenderError> {
     let window = window(rig, light, records);
-    if window.frames.is_empty() {
-        let why = "the poses of the bodies are not known";
+    // Tracks move light to where the bodies are by then. The poses that frames were drawn for are not that.
+    let is_apart = light.iter().any(|f| f.is_moved) && rig.true_poses(0).is_none();
+    if window.frames.is_empty() || is_apart {
+        let why = if is_apart {
+            "tracks moved the light, and where the bodies were then is known with a mock tracker only"
+        } else {
+            "the poses of the bodies are not known"
+        };
         return Ok(Pictures { light: mean(light), viewer: Err(why) });
     }
     let now = &window.frames[window.frames.len() - 1].1;

@@ -2,7 +2,8 @@
 
 use crate::calibrated::{calibrated_camera, measured, measured_camera, told_of_measured, CameraFileError};
 use crate::config::{
-    BodyConfig, BuiltinScene, EnvironmentConfig, FileAxis, GazeConfig, RigConfig, TrackerConfig,
+    BodyConfig, BuiltinScene, EnvironmentConfig, FileAxis, GazeConfig, ProjectorBackend, RigConfig,
+    TrackerConfig, TracksUse,
 };
 use crate::drive::{albedo_of, drive, DriveError};
 use crate::mock::{Motion, MotionError, MotionSpec};
@@ -252,6 +253,15 @@ impl Rig {
     /// The true world-from-mesh transform of every tracked body at an instant; `None` unless the tracker is the mock.
     pub fn true_poses(&self, t_ns: i64) -> Option<Vec<DAffine3>> {
         self.bodies.iter().map(|b| b.motion.as_ref().map(|m| affine(&m.pose_at(t_ns)))).collect()
+    }
+
+    /// True if a projector that follows tracks is sent some. Where poses are not predicted there is nothing to correct, and
+    /// on a serial line tracks would wait behind planes.
+    pub(crate) fn wants_tracks(&self) -> bool {
+        let config = &self.config;
+        let carries =
+            matches!(config.projector.backend, ProjectorBackend::Mock(_) | ProjectorBackend::Usb(_));
+        config.projector.tracks == TracksUse::Auto && config.prediction.on && carries
     }
 
     /// Writes the pose of every body of the scene to `out`, taking `tracked` for the tracked bodies and the rest pose

@@ -88,6 +88,17 @@ pub struct Remedies {
     pub own: f64,
 }
 
+/// How the planes of a frame are drawn.
+#[derive(Clone, Copy, PartialEq)]
+enum Drawing {
+    /// All for one instant.
+    Once,
+    /// Once, and each group of them is warped to its own instant.
+    Warped,
+    /// Each group of three planes of a bit by itself for its own instant: more than any warp can do.
+    Anew,
+}
+
 /// A card before a part of 320 x 240 mirrors of a projector of 1024 x 768: one mirror is 0.58 mm.
 pub struct Card {
     gpu: Arc<Gpu>,
@@ -141,11 +152,11 @@ impl Card {
         let schedule = PlaneSchedule::rgb24_in(order).expect("each bit once");
         let (mut follows, mut rests) = (Remedies::default(), Remedies::default());
         let centre = centre_of(&schedule);
-        for (aim, own) in [(0.5, false), (centre, false), (centre, true)] {
-            let frames = self.lit_frames(&schedule, motion, aim, own)?;
+        for (aim, drawing) in [(0.5, Drawing::Once), (centre, Drawing::Once), (centre, Drawing::Warped)] {
+            let frames = self.lit_frames(&schedule, motion, aim, drawing)?;
             for (remedies, eye_follows) in [(&mut follows, true), (&mut rests, false)] {
                 let error = self.error_of_light(&frames, &schedule, eye_follows);
-                match (own, aim == centre) {
+                match (drawing == Drawing::Warped, aim == centre) {
                     (true, _) => remedies.own = error,
                     (false, true) => remedies.centre = error,
                     (false, false) => remedies.middle = error,
@@ -153,6 +164,20 @@ impl Card {
             }
         }
         Ok(PlanesRow { motion: motion.name.into(), order, follows, rests })
+    }
+
+    /// The errors of an eye that follows and of one that rests if the planes of every bit were drawn by themselves for their
+    /// own instant, which costs eight times as much. What a warp has beyond that is its own error.
+    ///
+    /// # Errors
+    /// The renderer's.
+    ///
+    /// # Panics
+    /// When `order` does not name each bit once.
+    pub fn measure_drawn_anew(&self, motion: &CardMotion, order: [u8; 8]) -> Result<[f64; 2], RenderError> {
+        let schedule = PlaneSchedule::rgb24_in(order).expect("each bit once");
+        let frames = self.lit_frames(&schedule, motion, centre_of(&schedule), Drawing::Anew)?;
+        Ok([true, false].map(|eye_follows| self.error_of_light(&frames, &schedule, eye_follows)))
     }
 
     fn frames(&self, camera: &ProjectorCamera, groups: &[PlaneGroup]) -> Result<Frames, RenderError> {
@@ -175,17 +200,17 @@ impl Card {
         Ok(Frames { renderer, slot, camera: *camera })
     }
 
-    /// The frames of 33 ms, drawn for the instant `aim` of their exposures; `own`: planes follow.
+    /// The frames of 33 ms, drawn for the instant `aim` of their exposures.
     fn lit_frames(
         &self,
         schedule: &PlaneSchedule,
         motion: &CardMotion,
         aim: f64,
-        own: bool,
+        drawing: Drawing,
     ) -> Result<Vec<LitFrame>, RenderError> {
         let middles: Vec<f64> = (0..schedule.len()).map(|i| middle_of(schedule, i)).collect();
         let instants: Vec<f64> = middles.iter().map(|middle| middle - aim).collect();
-        let groups = if own { plane_groups(schedule, &instants) } else { Vec::new() };
+        let groups = if drawing == Drawing::Warped { plane_groups(schedule, &instants) } else { Vec::new() };
         let mut frames = self.frames(&self.camera, &groups)?;
         let at_rest = self.picture_of(&DAffine3::IDENTITY).inverse();
         (0..EYE_FRAMES as i32)
@@ -193,7 +218,15 @@ impl Card {
                 // The card is in the middle of the picture in the middle of the run, so that it stays on the raster.
                 let begin = f64::from(k - EYE_FRAMES as i32 / 2) * EXPOSURE_S;
                 let pose = |share: f64| motion.pose_at(begin + share * EXPOSURE_S);
-                let codes = frames.draw(pose(aim), Some([pose(0.0), pose(1.0)]))?;
+                let mut codes = frames.draw(pose(aim), Some([pose(0.0), pose(1.0)]))?;
+                if drawing == Drawing::Anew {
+                    for group in plane_groups(schedule, &middles) {
+                        let then = frames.draw(pose(f64::from(group.instant) / 65536.0), None)?;
+                        for (code, then) in codes.iter_mut().zip(then) {
+                            *code = *code & !group.mask | then & group.mask;
+                        }
+                    }
+                }
                 let moved = |middle: &f64| self.picture_of(&pose(*middle)) * at_rest;
                 Ok((codes, middles.iter().map(moved).collect()))
             })

@@ -317,7 +317,7 @@ fn light_frame(rig: &Rig, frame: u32, slot: &FrameSlot) -> LightFrame {
         [r, g, b]
     });
     let first_photon_at = HostTime(rig.rate().slot_start_ns(u64::from(frame)));
-    LightFrame { frame, first_photon_at, codes: codes.collect() }
+    LightFrame { frame, first_photon_at, codes: codes.collect(), is_moved: false }
 }
 
 /// What the eye saw, or why nothing can be said about it. `is_exposed`: white is radiance 1, else the greatest where that is more.

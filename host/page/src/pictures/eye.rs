@@ -5,7 +5,7 @@ use super::mesh::CoarseMesh;
 use dpm_device::planes::Raster;
 use dpm_device::projector::light_of_planes;
 use dpm_rig::rig::Rig;
-use dpm_rig::telemetry::live::{Drawn, SeenLight};
+use dpm_rig::telemetry::live::SeenLight;
 use dpm_scene::geometry::projector::ProjectorCamera;
 use glam::{DAffine3, DVec3, Vec3};
 use std::sync::Arc;
@@ -88,16 +88,17 @@ impl Eye {
         Some(Linear { raster: small, pixels })
     }
 
-    /// What the observer sees, radiance in scene units, in `light`. `None` while nothing can be seen.
-    pub(super) fn viewer(&mut self, light: &Linear, drawn: &Drawn) -> Option<Linear> {
-        if drawn.poses.len() != self.rig.bodies.len() {
+    /// What the observer sees, radiance in scene units, in `light`, which falls on tracked bodies at `poses`. `None` while
+    /// nothing can be seen.
+    pub(super) fn viewer(&mut self, light: &Linear, poses: &[DAffine3]) -> Option<Linear> {
+        if poses.len() != self.rig.bodies.len() {
             return None;
         }
         let projector = self.rig.camera.at_raster(self.raster);
         let intensity = Vec3::from_array(self.rig.config.projector.max_intensity.0.map(|v| v as f32));
         let ambient = Vec3::from_array(self.rig.config.scene.ambient.map(|v| v as f32));
-        let (eye, _) = self.rig.observer.eye_and_gaze(&drawn.poses);
-        self.rig.scene_poses(&drawn.poses, &mut self.poses);
+        let (eye, _) = self.rig.observer.eye_and_gaze(poses);
+        self.rig.scene_poses(poses, &mut self.poses);
         let camera = self.camera(eye)?;
         let bodies: Vec<(&CoarseMesh, DAffine3)> =
             self.meshes.iter().map(|(i, mesh)| (mesh, self.poses[*i])).collect();

@@ -12,7 +12,7 @@ use dpm_common::realtime::os::{give_way, thread_cpu_ns};
 use dpm_rig::config::ProjectorBackend;
 use dpm_rig::pictures::to_srgb;
 use dpm_rig::rig::Rig;
-use dpm_rig::telemetry::live::{Drawn, Live, SeenLight};
+use dpm_rig::telemetry::live::{Live, SeenLight};
 use dpm_rig::telemetry::monitor::{ProjectorHealth, RunMonitor};
 use eye::{Eye, Linear};
 use glam::Vec3;
@@ -208,9 +208,15 @@ impl Maker {
             let told = Some("The planes of the projector are not those of the rig.".into());
             return Newest { told, ..Newest::default() };
         };
-        let drawn = live.drawn(self.light.frame);
-        let viewer = drawn.and_then(|drawn: Drawn| self.eye.viewer(&light, &drawn));
-        let told = viewer.is_none().then(|| "The poses of the bodies are not known yet.".into());
+        let poses = live.poses_of(&self.light);
+        let viewer = poses.and_then(|poses| self.eye.viewer(&light, &poses));
+        let told = viewer.is_none().then(|| match self.light.is_moved {
+            true => {
+                "Tracks moved the light, and where the bodies were then is known with a mock tracker only."
+                    .into()
+            }
+            false => "The poses of the bodies are not known yet.".into(),
+        });
         let viewer = viewer.map(|viewer| {
             let white = viewer.pixels.iter().fold(1e-9f32, |m, v| m.max(v.max_element()));
             // The exposure follows slowly, so that a picture that becomes darker is seen to do so.

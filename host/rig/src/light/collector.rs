@@ -400,6 +400,9 @@ impl Collector {
         if note.wall_ns > 0 {
             self.stages[Stage::Light as usize].saturating_record(note.wall_ns);
         }
+        if let Some(moves) = &note.moves {
+            self.registration.moved(moves);
+        }
         let (slot, begin) = (note.event.slot, note.event.first_photon_at);
         self.slots.read_orders(monitor.dark());
         match note.event.kind {
@@ -589,7 +592,7 @@ mod tests {
                 first_photon_at: begin,
                 last_photon_at: begin.plus_ns(SLOT_NS),
             };
-            let note = LightNote { event, hash: 0, torn: false, wall_ns: 0, unseen: 0 };
+            let note = LightNote { event, hash: 0, torn: false, wall_ns: 0, unseen: 0, moves: None };
             assert!(lights_in.push(note).is_ok());
         }
         drop((done_in, lights_in));

@@ -1,17 +1,23 @@
 //! Registration of the light of a run: how far it fell from the points that it belongs to.
 
+use crate::config::ProjectorBackend;
 use crate::frame::FrameTimeline;
 use crate::light::record::FrameRecord;
 use crate::light::registration::{PlaneLight, RegistrationMeter};
 use crate::plan::light_centre::{instants_of_planes, lights_of_frame};
 use crate::rig::Rig;
 use crate::telemetry::report::{Report, Spread};
+use dpm_device::link::Moves;
+use dpm_device::projector::SlotMoves;
 use glam::DVec3;
 use hdrhistogram::Histogram;
+use std::collections::VecDeque;
 use std::sync::Arc;
 
 /// Every so many frames are followed plane by plane.
 const FOLLOWED_EVERY: u64 = 16;
+/// Followed frames that may wait for what tracks made of them. It comes with the light of the next slot.
+const MOST_WAITING: usize = 4;
 /// Registration is counted in millionths of a pixel.
 const PER_PIXEL: f64 = 1e6;
 
@@ -25,6 +31,8 @@ pub(crate) struct RegistrationMeasures {
     in_time: Histogram<u64>,
     /// What an eye sees that follows a point, of some frames: how far the light lies from it, and how far it is spread.
     followed: [Histogram<u64>; 2],
+    /// Tracks move the light of a projector in this process, which tells by how much. Then these frames wait for it.
+    tracks: Option<VecDeque<FrameRecord>>,
     /// Per tracked body: the light of each plane of a frame.
     planes: Vec<Vec<PlaneLight>>,
     /// Per tracked body: the planes of a frame follow it.
@@ -38,7 +46,9 @@ pub(crate) struct RegistrationMeasures {
 impl RegistrationMeasures {
     /// For a run of `rig` that has not begun.
     pub(crate) fn new(rig: Arc<Rig>) -> Self {
+        let is_mock = matches!(rig.config.projector.backend, ProjectorBackend::Mock(_));
         Self {
+            tracks: (is_mock && rig.wants_tracks()).then(VecDeque::new),
             meter: RegistrationMeter::new(&rig),
             at_centre: histogram(),
             in_time: histogram(),
@@ -60,9 +70,26 @@ impl RegistrationMeasures {
     /// whether or not the tracker sees them.
     pub(crate) fn lit(&mut self, record: &FrameRecord, late: bool, prepared: bool) {
         self.measure(record, late, prepared);
-        if record.id.0.is_multiple_of(FOLLOWED_EVERY) {
-            self.follow(record);
+        match &mut self.tracks {
+            _ if !is_followed(record.id.0) => {}
+            None => self.follow(record, None),
+            Some(waiting) => {
+                if waiting.len() >= MOST_WAITING {
+                    waiting.pop_front();
+                }
+                waiting.push_back(record.clone());
+            }
         }
+    }
+
+    /// Tracks moved the light of a slot. A frame that waits for that is measured.
+    pub(crate) fn moved(&mut self, moves: &SlotMoves) {
+        let Some(waiting) = &mut self.tracks else { return };
+        let of_slot = |record: &FrameRecord| {
+            record.id.0 as u32 == moves.frame && record.timeline.lit_at == Some(moves.first_photon_at)
+        };
+        let Some(record) = waiting.iter().position(of_slot).and_then(|at| waiting.remove(at)) else { return };
+        self.follow(&record, Some(moves));
     }
 
     /// Measures, on the lit bodies, where the light of each point fell and where the point was at the centre of
@@ -87,8 +114,9 @@ impl RegistrationMeasures {
         }
     }
 
-    /// Measures where the light of each plane fell on the lit bodies, as seen by an eye that follows them.
-    fn follow(&mut self, record: &FrameRecord) {
+    /// Measures where the light of each plane fell on the lit bodies, as seen by an eye that follows them. `moves`: what
+    /// tracks made of the frame.
+    fn follow(&mut self, record: &FrameRecord, moves: Option<&SlotMoves>) {
         let FrameTimeline { lit_at: Some(lit_at), last_photon_at: Some(last), .. } = record.timeline else {
             return;
         };
@@ -104,11 +132,12 @@ impl RegistrationMeasures {
         self.follows.clear();
         self.follows.extend((0..record.tracked_poses.len()).map(follows));
         let lights = lights_of_frame(&self.rig, last.ns_since(lit_at));
-        for ((middle_ns, light), instant) in lights.zip(&self.instants) {
+        for (k, ((middle_ns, light), instant)) in lights.zip(&self.instants).enumerate() {
+            let moves = *moves.and_then(|slot| slot.planes().get(k)).unwrap_or(&Moves::NONE);
             let Some(poses) = self.rig.true_poses(lit_at.plus_ns(middle_ns).0) else { return };
             for (i, (planes, truth)) in self.planes.iter_mut().zip(poses).enumerate() {
                 let instant = if self.follows[i] { *instant } else { 0.0 };
-                planes.push(PlaneLight { shown: record.pose_at(i, instant), truth, light });
+                planes.push(PlaneLight { shown: record.pose_at(i, instant), truth, light, moves });
             }
         }
         let counted = |px: f64| (px * PER_PIXEL).round() as u64;
@@ -131,7 +160,17 @@ impl RegistrationMeasures {
         [report.followed_offset_px, report.followed_smear_px] = self.followed.each_ref().map(spread);
         report.registration_error_unpredicted_px = spread(&self.unpredicted);
         report.registration_error_at = report.registration_error_px.map(|_| "light centre");
+        report.followed_light =
+            report.followed_offset_px.map(|_| match (&self.tracks, self.rig.wants_tracks()) {
+                (None, true) => "before tracks",
+                _ => "as lit",
+            });
     }
+}
+
+/// True if a frame is followed plane by plane. The low 32 bits of its number suffice.
+pub(crate) fn is_followed(frame: u64) -> bool {
+    frame.is_multiple_of(FOLLOWED_EVERY)
 }
 
 /// A distribution of what is never negative.

@@ -1,7 +1,7 @@
 //! Where the light of each plane fell, tracks included: the frames' records joined with what the mock projector made of
 //! their planes.
 
-use super::registration::RegistrationMeter;
+use super::registration::{shift_at, RegistrationMeter};
 use super::FrameRecord;
 use crate::plan::light_centre::{instants_of_planes, lights_of_frame};
 use crate::rig::Rig;
@@ -59,8 +59,7 @@ impl PlaneMeter {
                     if mirror.min_element() < 0.0 || mirror.x >= width.into() || mirror.y >= height.into() {
                         continue;
                     }
-                    let [dx, dy] = moved.of_mirror(mirror.x as i64, mirror.y as i64).map(f64::from);
-                    let fell = drawn + glam::DVec2::new(dx, dy);
+                    let fell = drawn + shift_at(moved, drawn);
                     let (off_px, drawn_off_px) = ((fell - right).length(), (drawn - right).length());
                     sink(PlanePoint { off_px, drawn_off_px, light, at });
                 }

@@ -4,21 +4,22 @@
 //! It runs where the mock runs: in the link thread at virtual pace, in the mock's own thread at real pace.
 
 use crate::frame::job::hash_codes;
+use crate::light::measures::is_followed;
 use crate::mock::{EmulatedProjector, MockProjector, Served};
 use crate::pack::prepared::is_whole;
 use crate::telemetry::live::SeenLight;
 use crate::telemetry::monitor::RunMonitor;
 use dpm_common::clock::Stopwatch;
 use dpm_device::light::{LightEvent, LightKind};
-use dpm_device::planes::PlaneSchedule;
-use dpm_device::projector::SlotMoves;
+use dpm_device::planes::{PlaneSchedule, Raster};
+use dpm_device::projector::{light_of_planes, SlotMoves};
 use dpm_device::time::HostTime;
 use dpm_handoff::channel::Sender;
 use std::collections::VecDeque;
 use std::sync::Arc;
 
 /// What the projector did in one slot.
-#[derive(Clone, Copy, Debug)]
+#[derive(Clone, Debug)]
 pub(crate) struct LightNote {
     /// The light event.
     pub event: LightEvent,
@@ -30,9 +31,12 @@ pub(crate) struct LightNote {
     pub wall_ns: u64,
     /// Frames lit since the previous note of which only the number is known.
     pub unseen: u32,
+    /// What tracks made of the slot before, if a frame was lit there that is followed plane by plane.
+    pub moves: Option<Box<SlotMoves>>,
 }
 
-/// One frame of light as it was emitted.
+/// One frame of light as it was emitted, moved by tracks where they moved it. Of the last frame of a run the moves may be
+/// unknown; it is as it was sent.
 #[derive(Clone, Debug)]
 pub struct LightFrame {
     /// Low 32 bits of the frame's number.
@@ -41,6 +45,20 @@ pub struct LightFrame {
     pub first_photon_at: HostTime,
     /// Red, green, blue code values, rows top to bottom.
     pub codes: Vec<[u8; 3]>,
+    /// Tracks moved a part of it.
+    pub is_moved: bool,
+}
+
+/// The planes on the mirrors as they were sent, kept until it is known what tracks made of them.
+#[derive(Default)]
+struct Sent {
+    /// The count of lit frames that they belong to.
+    generation: Option<u64>,
+    frame: Option<u32>,
+    planes: Vec<u8>,
+    /// The same as tracks moved them, and their light.
+    moved: Vec<u8>,
+    light: Vec<[u8; 3]>,
 }
 
 /// Records the light of a mock projector.
@@ -51,8 +69,10 @@ pub(crate) struct LightRecorder {
     pub notes_lost: u64,
     keep: usize,
     hash: bool,
-    /// Lit planes carry marks, in this schedule.
-    marks: Option<PlaneSchedule>,
+    schedule: PlaneSchedule,
+    /// Lit planes carry marks.
+    is_marked: bool,
+    sent: Sent,
     frames: VecDeque<LightFrame>,
     /// What tracks made of the last lit slots, and how many are kept.
     moves: VecDeque<SlotMoves>,
@@ -68,20 +88,23 @@ pub(crate) struct LightRecorder {
 impl LightRecorder {
     /// Sends notes to `notes` and keeps the last frames of light and the shifts of the last slots, as many of each as
     /// `keep` says. `hash`: hashes every frame of light.
-    /// `marks`: the planes, in this order, come from [`crate::pack::prepared`] and are checked for parts of other
-    /// frames.
+    /// `is_marked`: the planes, in the order of `schedule`, come from [`crate::pack::prepared`] and are checked for parts of
+    /// other frames.
     pub(crate) fn new(
         notes: Sender<LightNote>,
         [keep, keep_moves]: [usize; 2],
         hash: bool,
-        marks: Option<PlaneSchedule>,
+        schedule: PlaneSchedule,
+        is_marked: bool,
     ) -> Self {
         Self {
             notes: Some(notes),
             notes_lost: 0,
             keep,
             hash,
-            marks,
+            schedule,
+            is_marked,
+            sent: Sent::default(),
             frames: VecDeque::with_capacity(keep + 1),
             moves: VecDeque::with_capacity(keep_moves),
             keep_moves,
@@ -108,20 +131,23 @@ impl LightRecorder {
         mock.advance_to(now);
         self.drain(mock.projector(), watch);
         if let Some(monitor) = &self.observer {
-            monitor.live().show_light(|light| show(mock.projector(), self.lit_at, light));
+            let projector = mock.projector();
+            // Where the projector follows tracks, light is shown when its slot is over.
+            if !projector.follows_tracks() || projector.lit_generation().is_none() {
+                monitor.live().show_light(|light| show(projector, self.lit_at, light));
+            }
         }
     }
 
     fn drain(&mut self, mock: &mut MockProjector, watch: Stopwatch) {
-        self.take_moves(mock);
+        let mut moves = self.take_moves(mock);
         while let Some(event) = mock.next_light() {
             let mut hash = 0;
             if event.kind == LightKind::Lit && (self.hash || self.keep > 0) {
                 if let Some(light) = mock.light_of_frame() {
                     if self.hash {
-                        hash = hash_codes(light.iter().map(|c| u32::from_le_bytes([c[0], c[1], c[2], 0])));
-                        self.light_hash =
-                            (self.light_hash ^ hash).wrapping_mul(0x9e37_79b9_7f4a_7c15).rotate_left(23);
+                        hash = hash_of(light);
+                        self.light_hash = mixed(self.light_hash, hash);
                     }
                     keep(&mut self.frames, self.keep, &event, light);
                 }
@@ -130,16 +156,39 @@ impl LightRecorder {
                 self.lit_at = event.first_photon_at;
             }
             let torn = event.kind == LightKind::Lit && self.is_torn(mock, event.frame);
-            let note = LightNote { event, hash, torn, wall_ns: watch.elapsed_ns(), unseen: 0 };
+            let note =
+                LightNote { event, hash, torn, wall_ns: watch.elapsed_ns(), unseen: 0, moves: moves.take() };
             if self.notes.as_mut().is_none_or(|notes| notes.push(note).is_err()) {
                 self.notes_lost += 1;
             }
         }
+        self.remember(mock);
     }
 
-    /// Keeps what tracks made of the slots that are over.
-    fn take_moves(&mut self, mock: &mut MockProjector) {
+    /// Keeps the planes on the mirrors if somebody will want to know what tracks made of them.
+    fn remember(&mut self, mock: &MockProjector) {
+        let is_wanted = self.hash
+            || self.keep > 0
+            || self.observer.as_ref().is_some_and(|monitor| monitor.live().is_light_wanted());
+        let generation = mock.lit_generation();
+        if !is_wanted || !mock.follows_tracks() || generation == self.sent.generation {
+            return;
+        }
+        self.sent.generation = generation;
+        self.sent.frame = mock.lit_frame();
+        self.sent.planes.clear();
+        self.sent.planes.extend_from_slice(mock.lit_planes().unwrap_or(&[]));
+    }
+
+    /// Takes what tracks made of the slots that are over, and makes it a part of their light. Returns the last of them that
+    /// is followed plane by plane.
+    fn take_moves(&mut self, mock: &mut MockProjector) -> Option<Box<SlotMoves>> {
+        let mut followed = None;
         while let Some(moves) = mock.next_moves() {
+            if is_followed(u64::from(moves.frame)) {
+                followed = Some(Box::new(moves));
+            }
+            self.apply(mock.raster(), &moves);
             if self.keep_moves == 0 {
                 continue;
             }
@@ -147,6 +196,42 @@ impl LightRecorder {
                 self.moves.pop_front();
             }
             self.moves.push_back(moves);
+        }
+        followed
+    }
+
+    /// Makes the moves of a slot a part of its light.
+    fn apply(&mut self, raster: Raster, moves: &SlotMoves) {
+        let sent = &mut self.sent;
+        let live = self.observer.as_ref().map(|monitor| monitor.live()).filter(|live| live.is_light_wanted());
+        let is_known = sent.frame == Some(moves.frame) && !sent.planes.is_empty();
+        if !is_known || !(moves.is_any() || live.is_some()) {
+            return;
+        }
+        sent.moved.resize(sent.planes.len(), 0);
+        moves.move_planes(raster, &sent.planes, &mut sent.moved);
+        if let Some(live) = live {
+            live.show_light(|light| {
+                (light.frame, light.first_photon_at) = (Some(moves.frame), moves.first_photon_at);
+                light.is_moved = moves.is_any();
+                light.planes.clone_from(&sent.moved);
+            });
+        }
+        let of_slot = |light: &&mut LightFrame| {
+            light.frame == moves.frame && light.first_photon_at == moves.first_photon_at
+        };
+        let kept = self.frames.iter_mut().rev().find(of_slot);
+        if !moves.is_any() || (kept.is_none() && !self.hash) {
+            return;
+        }
+        sent.light.resize(raster.pixel_count(), [0; 3]);
+        light_of_planes(raster, &self.schedule, &sent.moved, &mut sent.light);
+        if self.hash {
+            self.light_hash = mixed(self.light_hash, hash_of(&sent.light));
+        }
+        if let Some(kept) = kept {
+            kept.is_moved = true;
+            kept.codes.copy_from_slice(&sent.light);
         }
     }
 
@@ -161,10 +246,8 @@ impl LightRecorder {
     }
 
     fn is_torn(&self, mock: &MockProjector, frame: Option<u32>) -> bool {
-        match (&self.marks, mock.lit_planes(), frame) {
-            (Some(schedule), Some(planes), Some(id)) => !is_whole(mock.raster(), schedule, planes, id),
-            _ => false,
-        }
+        let (true, Some(planes), Some(id)) = (self.is_marked, mock.lit_planes(), frame) else { return false };
+        !is_whole(mock.raster(), &self.schedule, planes, id)
     }
 
     /// The last frames of light and what tracks made of the last lit slots, oldest first.
@@ -178,6 +261,7 @@ fn show(mock: &MockProjector, lit_at: HostTime, light: &mut SeenLight) {
     let lit = mock.lit_generation().and(mock.lit_planes());
     light.frame = lit.and(mock.lit_frame());
     light.first_photon_at = lit_at;
+    light.is_moved = false;
     light.planes.clear();
     light.planes.extend_from_slice(lit.unwrap_or(&[]));
 }
@@ -195,5 +279,16 @@ fn keep(frames: &mut VecDeque<LightFrame>, limit: usize, event: &LightEvent, lig
         frame: event.frame.unwrap_or(0),
         first_photon_at: event.first_photon_at,
         codes,
+        is_moved: false,
     });
+}
+
+/// Hash of the light of a frame.
+fn hash_of(light: &[[u8; 3]]) -> u64 {
+    hash_codes(light.iter().map(|c| u32::from_le_bytes([c[0], c[1], c[2], 0])))
+}
+
+/// A hash over several frames, and one more.
+fn mixed(all: u64, one: u64) -> u64 {
+    (all ^ one).wrapping_mul(0x9e37_79b9_7f4a_7c15).rotate_left(23)
 }

@@ -2,6 +2,7 @@
 //! the projector.
 
 use crate::rig::Rig;
+use dpm_device::link::Moves;
 use dpm_render::warp::LEAST_MOTION_PX;
 use dpm_scene::geometry::projector::ProjectorCamera;
 use glam::{DAffine3, DVec2, DVec3};
@@ -30,6 +31,15 @@ pub(crate) struct PlaneLight {
     pub truth: DAffine3,
     /// Light of a mirror that is on, in any unit.
     pub light: f64,
+    /// How tracks moved the plane.
+    pub moves: Moves,
+}
+
+/// By how much light that was drawn at a place of the picture was moved, pixels.
+pub(super) fn shift_at(moves: &Moves, drawn: DVec2) -> DVec2 {
+    let mirror = drawn.floor();
+    let [dx, dy] = moves.of_mirror(mirror.x as i64, mirror.y as i64).map(f64::from);
+    DVec2::new(dx, dy)
 }
 
 /// Points spread over the tracked bodies of a rig.
@@ -97,7 +107,8 @@ impl RegistrationMeter {
             let at = |pose: &DAffine3| self.camera.project(pose.transform_point3(*p));
             let (mut weights, mut sum, mut squares) = (0.0, DVec2::ZERO, 0.0);
             for plane in planes {
-                let off = at(&plane.shown)? - at(&plane.truth)?;
+                let drawn = at(&plane.shown)?;
+                let off = drawn + shift_at(&plane.moves, drawn) - at(&plane.truth)?;
                 weights += plane.light;
                 sum += off * plane.light;
                 squares += off.length_squared() * plane.light;

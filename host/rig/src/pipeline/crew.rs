@@ -6,7 +6,6 @@
 //! cannot reach the light.
 
 use super::parts::CrewParts;
-use super::settings::wants_tracks;
 use super::threads::{
     pack_thread, plan_thread, policy, tracking_thread, PackInbox, PlanInbox, Shared, NOTES,
 };
@@ -144,7 +143,7 @@ impl Crew {
         });
         let (publisher, reader) = latest(TrackSnapshot::empty(rig.bodies.len()));
         let (to_link, tracks) =
-            wants_tracks(rig).then(|| latest(TrackSnapshot::empty(rig.bodies.len()))).unzip();
+            rig.wants_tracks().then(|| latest(TrackSnapshot::empty(rig.bodies.len()))).unzip();
         let (times, time) = latest(shared.time);
         let gpu_free = Waiter::new(policy);
         let gpu_waker = gpu_free.waker();

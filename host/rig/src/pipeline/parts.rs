@@ -1,7 +1,7 @@
 //! What a run needs: the tracker, the renderer, the memory of frames, and the projector at the other end of the
 //! cable.
 
-use super::settings::{budget_controller, output, renderer_settings, wants_tracks};
+use super::settings::{budget_controller, output, renderer_settings};
 use crate::config::{MockProjectorConfig, RenderMethod};
 use crate::engine::connect::{connect, ENDED_WITH_THE_LAST_RUN};
 use crate::engine::error::PipelineError;
@@ -152,7 +152,7 @@ impl CrewParts {
                 self.budget = budget_controller(rig);
             }
         }
-        if wants_tracks(rig) {
+        if rig.wants_tracks() {
             self.tracking = self.tracking.with_lively(rig);
         }
         Ok(self)
@@ -187,9 +187,8 @@ pub(super) fn mock_projector(
     (setup.greatest_shift, setup.moves_kept) = (Some(GREATEST_SHIFT), MOVES_KEPT);
     let emulated = EmulatedProjector::new(setup, &mock.faults, config.render.seed, start)
         .map_err(|e| RigError::Unsupported(format!("projector.backend.faults: {e}")))?;
-    let marks = marked.then_some(rig.schedule);
     let kept = [options.keep_frames, options.keep_frames.max(options.keep_records)];
-    let recorder = LightRecorder::new(lights, kept, options.verify, marks);
+    let recorder = LightRecorder::new(lights, kept, options.verify, rig.schedule, marked);
     Ok((emulated, recorder))
 }
 
@@ -205,7 +204,7 @@ pub(super) fn bring_up(
 ) -> Result<(HostLink, LinkTime), PipelineError> {
     let settings = projector::link_settings(&rig.config, rig.camera.raster);
     let mut link = HostLink::new(LinkSettings { schedule: rig.schedule, ..settings });
-    if wants_tracks(rig) {
+    if rig.wants_tracks() {
         link.want_tracks();
     }
     let acknowledged = if rig.config.safety.acknowledge_faults { u32::MAX } else { ENDED_WITH_THE_LAST_RUN };

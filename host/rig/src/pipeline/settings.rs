@@ -1,7 +1,7 @@
 //! Settings of a run, from the rig file: the renderer's settings, the first guess of the lead, the limits of the ray
 //! budget.
 
-use crate::config::{Packer, ProjectorBackend, TracksUse};
+use crate::config::Packer;
 use crate::engine::facts::RECEIPT_NS;
 use crate::plan::budget::{BudgetConfig, BudgetController, FEWEST_OF_MOST};
 use crate::plan::lead::LeadEstimator;
@@ -49,14 +49,6 @@ pub(super) fn budget_controller(rig: &Rig) -> Option<BudgetController> {
         initial_rays: full,
     };
     BudgetController::new(config).ok()
-}
-
-/// True if a projector that follows tracks is sent some. Where poses are not predicted there is nothing to correct, and on
-/// a serial line tracks would wait behind planes.
-pub(super) fn wants_tracks(rig: &Rig) -> bool {
-    let config = &rig.config;
-    let carries = matches!(config.projector.backend, ProjectorBackend::Mock(_) | ProjectorBackend::Usb(_));
-    config.projector.tracks == TracksUse::Auto && config.prediction.on && carries
 }
 
 /// The renderer's settings from the rig file.

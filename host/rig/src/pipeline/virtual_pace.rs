@@ -3,7 +3,7 @@
 
 use super::parts::{bring_up, mock_projector, CrewParts, Origin, FIRST_FRAME_TIMEOUT_NS};
 use super::run::{Ran, LIGHTS};
-use super::settings::{lead_estimator, wants_tracks};
+use super::settings::lead_estimator;
 use super::supervisor::leave_behind;
 use super::threads::{enter_frame_path, may_stall, read_tracker, rendered, NOTES, WARM_UP_FRAMES};
 use crate::config::ProjectorBackend;
@@ -131,7 +131,7 @@ struct LateTracks {
 impl LateTracks {
     /// `None` if no tracks are sent.
     fn of(rig: &Rig, origin: &Origin) -> Result<Option<Self>, PipelineError> {
-        if !wants_tracks(rig) || matches!(origin, Origin::Pattern(..)) {
+        if !rig.wants_tracks() || matches!(origin, Origin::Pattern(..)) {
             return Ok(None);
         }
         let tracker = open_for(rig, Arc::new(|| HostTime(0)), HostTime(0))?;

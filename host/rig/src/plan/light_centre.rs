@@ -7,9 +7,11 @@
 use crate::config::{PlanePoses, PlaneTiming};
 use crate::rig::Rig;
 use dpm_device::planes::{PlaneSchedule, PlaneSpec};
+use dpm_device::time::HostTime;
 use dpm_render::pack::source_bits;
 use dpm_render::warp::plane_groups;
 use dpm_shaders::structs::PlaneGroup;
+use glam::DAffine3;
 
 /// Time from the first photon to the centre of the light of a frame of `rig` that is lit for `exposure_ns` >= 0, in
 /// nanoseconds. Rounded down; 0 for a negative exposure.
@@ -18,6 +20,13 @@ use dpm_shaders::structs::PlaneGroup;
 /// pixel.
 pub(crate) fn light_centre_ns(rig: &Rig, exposure_ns: i64) -> i64 {
     Lights::of(rig).centre_ns(exposure_ns)
+}
+
+/// The true world-from-mesh transform of every tracked body at the centre of the light of a whole frame of `rig` whose first
+/// photon left at `first_photon_at`; `None` unless the tracker is the mock.
+pub(crate) fn true_poses_at_centre(rig: &Rig, first_photon_at: HostTime) -> Option<Vec<DAffine3>> {
+    let to_centre = light_centre_ns(rig, rig.rate().slot_len_ns(0));
+    rig.true_poses(first_photon_at.plus_ns(to_centre).0)
 }
 
 /// The light of each plane of a frame of `rig`: the time from the first photon to the middle of the plane in nanoseconds,

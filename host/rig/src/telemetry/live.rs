@@ -8,6 +8,7 @@ use super::histogram_steps::Steps;
 use super::miss_log::MissRun;
 use super::report::Report;
 use crate::plan::dark::DarkCause;
+use crate::plan::light_centre::true_poses_at_centre;
 use crate::rig::Rig;
 use dpm_common::unix::monotonic_ns;
 use dpm_device::time::HostTime;
@@ -109,8 +110,10 @@ pub struct SeenLight {
     pub frame: Option<u32>,
     /// When the first photon of that frame left.
     pub first_photon_at: HostTime,
-    /// Its bit planes, one after the other in the order of the rig's schedule; empty while it is dark.
+    /// Its bit planes, one after the other in the order of the rig's schedule, as tracks moved them; empty while it is dark.
     pub planes: Vec<u8>,
+    /// Tracks moved a part of it to where the bodies were by then.
+    pub is_moved: bool,
 }
 
 /// Shared between a run and its observers.
@@ -193,15 +196,29 @@ impl Live {
         drawn.iter().rev().find(|d| Some(d.frame) == frame).or_else(|| drawn.back()).cloned()
     }
 
+    /// Per tracked body: world-from-mesh where `light` fell. That is what its frame was drawn for; light that tracks moved
+    /// fell where the bodies were by then, which is `None` unless the tracker is the mock.
+    pub fn poses_of(&self, light: &SeenLight) -> Option<Vec<DAffine3>> {
+        if light.is_moved {
+            return true_poses_at_centre(self.rig()?, light.first_photon_at);
+        }
+        self.drawn(light.frame).map(|drawn| drawn.poses)
+    }
+
     /// Asks the mock projector for its light; [`Live::take_light`] has it a moment later.
     pub fn want_light(&self) {
         self.light_wanted.store(true, Ordering::Release);
     }
 
+    /// True while light that was asked for has not come.
+    pub(crate) fn is_light_wanted(&self) -> bool {
+        self.light_wanted.load(Ordering::Acquire)
+    }
+
     /// The light that was asked for, in exchange for the memory of an earlier one. False while it has not come, which
     /// it never does for a projector outside this process.
     pub fn take_light(&self, into: &mut SeenLight) -> bool {
-        if self.light_wanted.load(Ordering::Acquire) {
+        if self.is_light_wanted() {
             return false;
         }
         std::mem::swap(&mut *held(&self.light), into);
@@ -210,7 +227,7 @@ impl Live {
 
     /// Calls `see` with the place for the light, if it is asked for.
     pub(crate) fn show_light(&self, see: impl FnOnce(&mut SeenLight)) {
-        if self.light_wanted.load(Ordering::Acquire) {
+        if self.is_light_wanted() {
             see(&mut held(&self.light));
             self.light_wanted.store(false, Ordering::Release);
         }

@@ -199,8 +199,8 @@ pub struct Report {
     /// What was used of the calibration file, one sentence; absent without such a file.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub calibration: Option<String>,
-    /// Distance in projector pixels between where the light of a surface point fell and where that point was at that
-    /// instant; null without ground truth.
+    /// Distance in projector pixels between where the light of a surface point was drawn and where that point was at that
+    /// instant; null without ground truth. Tracks are not in it: see `followed_light`.
     pub registration_error_px: Option<Spread>,
     /// The same with the newest sample in place of the prediction.
     pub registration_error_unpredicted_px: Option<Spread>,
@@ -215,6 +215,9 @@ pub struct Report {
     /// Root mean square distance of that light from its mean: by how much the planes' motion smears it.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub followed_smear_px: Option<Spread>,
+    /// What that light is: "as lit", or "before tracks" if the projector moved it by tracks and only it knows by how much.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub followed_light: Option<&'static str>,
     /// True beginning of a slot minus the host's estimate, as observed by the mock in this process at real pace.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub clock_error_ms: Option<Latency>,
@@ -301,6 +304,7 @@ impl Default for Report {
             registration_error_in_time_px: None,
             followed_offset_px: None,
             followed_smear_px: None,
+            followed_light: None,
             clock_error_ms: None,
             registration_error_at: None,
             motion_to_first_photon_ms: None,

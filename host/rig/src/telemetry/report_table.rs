@@ -78,17 +78,28 @@ impl Report {
         if let Some(error) = self.registration_error_px {
             let how = if self.prediction { "predicted" } else { "prediction off" };
             let at = self.registration_error_at.map_or(String::new(), |at| format!(", at {at}"));
-            table.row("registration error", format!("{} px ({how}{at})", percentiles(error)));
+            let drawn = if self.tracks_sent() { ", before tracks" } else { "" };
+            table.row("registration error", format!("{} px ({how}{at}{drawn})", percentiles(error)));
         }
         if let Some(error) = self.registration_error_unpredicted_px {
             table.row("  without prediction", format!("{} px", percentiles(error)));
         }
         if let Some(offset) = self.followed_offset_px {
-            table.row("  seen by a following eye", format!("{} px", percentiles(offset)));
+            let light = match self.followed_light.filter(|_| self.tracks_sent()) {
+                None => "",
+                Some("as lit") => " (with tracks)",
+                Some(_) => " (before tracks; only the projector knows by how much they move light)",
+            };
+            table.row("  seen by a following eye", format!("{} px{light}", percentiles(offset)));
         }
         if let Some(smear) = self.followed_smear_px {
             table.row("    smeared by", format!("{} px (root mean square)", percentiles(smear)));
         }
+    }
+
+    /// True if the projector was told of tracks.
+    fn tracks_sent(&self) -> bool {
+        self.projector.as_ref().is_some_and(|projector| projector.tracks_sent > 0)
     }
 
     fn latency_rows(&self, table: &mut Table) {
@@ -150,6 +161,14 @@ fn projector_rows(p: &ProjectorReport, table: &mut Table) {
     }
     if coded + kept > 0 {
         table.row("  planes", format!("{raw} raw, {coded} coded, {kept} unchanged and not sent"));
+    }
+    if p.tracks_sent > 0 {
+        let [moved, clamped, stale] = p.planes_by_tracks;
+        let text = format!(
+            "{} sent; planes: {moved} moved, {clamped} not as far as they should, {stale} without a valid track",
+            p.tracks_sent
+        );
+        table.row("  tracks", text);
     }
     if let Some(d) = p.device {
         let text = format!(
