@@ -150,7 +150,7 @@ pub(crate) fn measured_response(light: &LightSection) -> [[f64; 256]; 3] {
 }
 
 #[cfg(test)]
-mod tests {
+pub(crate) mod tests {
     use super::CalibrationFile;
     use crate::config::{Overrides, RigConfig};
     use crate::rig::Rig;
@@ -295,7 +295,8 @@ mod tests {
         Rig::build(&config, None).map_err(|e| e.to_string())
     }
 
-    fn measured_file() -> CalibrationFile {
+    /// Everything but a wand and checks, of an unknown date.
+    pub(crate) fn measured_file() -> CalibrationFile {
         let raster = Raster::new(1024, 768).unwrap();
         let camera =
             ProjectorCamera::look_at(raster, DVec3::new(0.1, 0.6, 1.5), DVec3::ZERO, DVec3::Y, 0.6).unwrap();

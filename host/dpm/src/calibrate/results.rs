@@ -1,15 +1,13 @@
 //! The calibration file of a rig: where it lies, what is in it already, and how new parts get into it.
 
 use dpm_calibration::file::{self, CalibrationFile, Provenance};
+use dpm_rig::calibration_steps::calibration_file;
 use dpm_rig::config::RigConfig;
 use dpm_rig::failure::{Failure, FailureKind};
 use dpm_rig::rig::Rig;
 use dpm_rig::standing::{utc, Identity};
 use std::path::{Path, PathBuf};
 use std::time::SystemTime;
-
-/// Name of the file if neither a flag nor the rig file names one.
-const USUAL_NAME: &str = "calibration.toml";
 
 /// A calibration file that grows part by part.
 pub struct Results {
@@ -24,8 +22,7 @@ impl Results {
     /// # Errors
     /// There is one that cannot be read.
     pub fn open(named: Option<&Path>, rig: &Path, config: &RigConfig) -> Result<Self, Failure> {
-        let beside = rig.with_file_name(USUAL_NAME);
-        let path = named.map(Path::to_path_buf).or(config.calibration.file.clone()).unwrap_or(beside);
+        let path = named.map_or_else(|| calibration_file(rig, config), Path::to_path_buf);
         let file = if path.exists() {
             file::load(&path).map_err(|e| Failure::new(FailureKind::BadInput, e))?
         } else {
