@@ -1,5 +1,6 @@
 //! Opens the live page of a run, and tells the operator where it is.
 
+use super::guide::RigGuide;
 use super::tell::Teller;
 use dpm_page::token::Token;
 use dpm_page::{Page, Settings};
@@ -24,6 +25,7 @@ pub(super) fn open(
         address,
         hosts: rig.page.hosts.clone(),
         token: token.as_ref().ok().map(|(token, _)| token.clone()),
+        guide: Arc::new(RigGuide::of_run(rig)),
     };
     let page = match Page::serve(settings, monitor.clone(), orders.clone(), teller.kept()) {
         Ok(page) => page,

@@ -8,6 +8,7 @@ mod doctor;
 mod error;
 mod error_experiments;
 mod error_files;
+mod guide;
 mod keys;
 mod link_test;
 mod live_page;

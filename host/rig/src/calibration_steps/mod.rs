@@ -182,6 +182,11 @@ fn none(config: &RigConfig) -> Option<String> {
                     docs/CALIBRATION.md says how to try all steps without hardware.";
         return Some(told.into());
     }
+    if let ProjectorBackend::Dlpc900(_) = config.projector.backend {
+        let told = "A DLPC900 cannot show the pictures of a calibration. Measure lens and pose with another program, and \
+                    name its file in projector.calibration.";
+        return Some(told.into());
+    }
     if let TrackerConfig::Replay(_) = config.tracker {
         return Some("This rig plays a recording. Only a live tracker can be calibrated.".into());
     }
