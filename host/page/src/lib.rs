@@ -15,6 +15,7 @@ pub mod notes;
 mod orders;
 mod parameters;
 mod pictures;
+mod query;
 mod routes;
 mod server;
 mod shared;

@@ -138,6 +138,9 @@ async fn route(
     if let (Some(word), Some(run)) = (path.strip_prefix("/api/parameters/"), &site.run) {
         return change(request, word, (site, run)).await;
     }
+    if let Some(word) = path.strip_prefix("/api/calibration/") {
+        return calibrate(request, word, site).await;
+    }
     if request.method() != Method::GET {
         return plain(StatusCode::METHOD_NOT_ALLOWED, "only GET, and POST for orders and parameters");
     }
@@ -230,6 +233,21 @@ async fn change(
     match done {
         Ok(answered) => json(StatusCode::OK, &answered),
         Err(refused) => plain(StatusCode::BAD_REQUEST, format!("refused: {refused}")),
+    }
+}
+
+/// An act of a calibration, by whoever knows the token.
+async fn calibrate(request: &Request<Incoming>, word: &str, site: &Arc<Site>) -> Response<Answer> {
+    if let Err(refused) = site.door.guard.check_token(request.headers()) {
+        return refusal(refused);
+    }
+    if request.method() != Method::POST {
+        return plain(StatusCode::METHOD_NOT_ALLOWED, "an act of a calibration is a POST");
+    }
+    match calibration::act(word, request.uri().query().unwrap_or_default(), site).await {
+        Some(Ok(())) => plain(StatusCode::OK, "ok"),
+        Some(Err(why)) => plain(StatusCode::BAD_REQUEST, why),
+        None => plain(StatusCode::NOT_FOUND, "there is start, answer, stop, keep and discard"),
     }
 }
 

@@ -56,3 +56,30 @@ fn a_rig_that_is_only_calibrated_has_steps_and_no_orders() {
     let order = ask(page.address(), "POST", "/api/orders/arm", &[("Host", host.as_str())]);
     assert_eq!(order.status, 405);
 }
+
+#[test]
+fn nobody_does_a_step_without_the_token_under_another_name_or_from_another_site() {
+    let rig = Running::start("acts");
+    let path = "/api/calibration/start?step=wand&way=0";
+    let (host, token) = (rig.address.to_string(), rig.token.as_str());
+    let (host, token) = (("Host", host.as_str()), ("X-Dpm-Token", token));
+    let wrong = ("X-Dpm-Token", "0");
+    for (headers, status) in [
+        (vec![host], 401),
+        (vec![host, wrong], 403),
+        (vec![("Host", "evil.example"), token], 421),
+        (vec![host, token, ("Origin", "https://evil.example")], 403),
+        (vec![host, token, ("Sec-Fetch-Site", "cross-site")], 403),
+        // It is asked for, and what serves the page decides.
+        (vec![host, token], 400),
+    ] {
+        let answer = ask(rig.address, "POST", path, &headers);
+        assert_eq!(answer.status, status, "{headers:?}: {}", answer.body);
+    }
+    assert_eq!(ask(rig.address, "GET", path, &[host, token]).status, 405);
+    let told = ask(rig.address, "POST", "/api/calibration/stop", &[host, token]).body;
+    assert!(told.contains("nobody does Stop here"), "{told}");
+    assert_eq!(ask(rig.address, "POST", "/api/calibration/arm", &[host, token]).status, 404);
+    let told = ask(rig.address, "POST", &path.replace("way=0", "way=0&sensor=--set"), &[host, token]);
+    assert!(told.status == 400 && told.body.contains("path of a device file"), "{}", told.body);
+}

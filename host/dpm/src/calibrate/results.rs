@@ -9,6 +9,9 @@ use dpm_rig::standing::{utc, Identity};
 use std::path::{Path, PathBuf};
 use std::time::SystemTime;
 
+/// The end of the name of a calibration file on which the operator decides later.
+pub const TRIAL: &str = ".trial";
+
 /// A calibration file that grows part by part.
 pub struct Results {
     path: PathBuf,
@@ -60,6 +63,13 @@ impl Results {
     /// # Errors
     /// It cannot be written.
     pub fn save(&self, config: &RigConfig) -> Result<String, Failure> {
+        let name = self.path.file_name().unwrap_or_default().to_string_lossy();
+        if name.ends_with(TRIAL) {
+            // Nobody needs what a trial was before.
+            let _ = std::fs::remove_file(&self.path);
+            file::save(&self.file, &self.path).map_err(|e| Failure::new(FailureKind::BadInput, e))?;
+            return Ok("measured; it is not in the calibration file yet".into());
+        }
         let kept = file::save(&self.file, &self.path).map_err(|e| Failure::new(FailureKind::BadInput, e))?;
         let mut told = format!("written: {}", self.path.display());
         if let Some(old) = kept {

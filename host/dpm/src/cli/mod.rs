@@ -24,6 +24,7 @@ mod record;
 mod report;
 mod rig_args;
 pub mod run;
+mod session;
 mod set;
 mod snapshot;
 mod stability;

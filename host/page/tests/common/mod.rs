@@ -2,7 +2,7 @@
 #![allow(dead_code)] // Every test file uses a part of it.
 
 use dpm_device::planes::Raster;
-use dpm_page::calibration::Guide;
+use dpm_page::calibration::{Act, Guide, Session};
 use dpm_page::notes::Notes;
 use dpm_page::token::Token;
 use dpm_page::{Page, Settings};
@@ -33,7 +33,15 @@ pub(crate) struct Shown {
 impl Guide for Shown {
     fn steps(&self) -> Steps {
         let now = SystemTime::now();
-        Steps::of(&About { rig: &self.rig, config: &self.config, now, running_since: None })
+        Steps::of(&About { rig: &self.rig, config: &self.config, file: None, now, running_since: None })
+    }
+
+    fn session(&self) -> Option<Session> {
+        None
+    }
+
+    fn act(&self, act: Act) -> Result<(), String> {
+        Err(format!("nobody does {act:?} here"))
     }
 
     fn ports(&self) -> Vec<String> {

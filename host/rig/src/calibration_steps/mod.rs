@@ -136,6 +136,8 @@ pub struct About<'a> {
     pub rig: &'a Path,
     /// What it says.
     pub config: &'a RigConfig,
+    /// The calibration file to judge; `None`: that of the rig.
+    pub file: Option<&'a Path>,
     /// Now.
     pub now: SystemTime,
     /// When the run began that would not see what was measured since; `None` where nothing runs.
@@ -145,7 +147,7 @@ pub struct About<'a> {
 impl Steps {
     /// The steps of a rig by the calibration file as it is on the disk now.
     pub fn of(about: &About) -> Self {
-        let path = calibration_file(about.rig, about.config);
+        let path = about.file.map_or_else(|| calibration_file(about.rig, about.config), Path::to_path_buf);
         let (measured, fault) = match path.exists().then(|| file::load(&path)).transpose() {
             Ok(measured) => (measured.unwrap_or_else(CalibrationFile::new), None),
             Err(e) => (CalibrationFile::new(), Some(e.to_string())),

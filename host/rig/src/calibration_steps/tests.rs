@@ -43,7 +43,13 @@ impl Bench {
         let overrides = Overrides { variables: vec![], flags };
         let config = RigConfig::parse_for("rig.toml", text, &self.0, &overrides, purpose).unwrap();
         let now = UNIX_EPOCH + Duration::from_secs(86_400 * TODAY);
-        Steps::of(&About { rig: &self.0.join("my rig.toml"), config: &config, now, running_since: since })
+        Steps::of(&About {
+            rig: &self.0.join("my rig.toml"),
+            config: &config,
+            file: None,
+            now,
+            running_since: since,
+        })
     }
 }
 
