@@ -1,7 +1,6 @@
 //! The calibration of a rig as a guided page: its steps, and the commands that do them.
 
 use crate::query::part;
-use crate::site::Site;
 use dpm_rig::calibration_steps::{Steps, SENSOR};
 use std::fmt;
 use std::sync::Arc;
@@ -80,21 +79,21 @@ pub(crate) struct Told {
     session: Option<Session>,
 }
 
-/// What there is to tell; `None` if reading it failed in a way that nobody foresaw.
-pub(crate) async fn told(site: &Arc<Site>) -> Option<Told> {
-    let (guide, runs) = (site.guide.clone(), site.run.is_some());
+/// What there is to tell, where a rig `runs` or not; `None` if reading it failed in a way that nobody foresaw.
+pub(crate) async fn told(guide: &Arc<dyn Guide>, runs: bool) -> Option<Told> {
+    let guide = guide.clone();
     let tell = move || Told { runs, steps: guide.steps(), ports: guide.ports(), session: guide.session() };
     // The disk may be slow, and an order must not wait for it.
     tokio::task::spawn_blocking(tell).await.ok()
 }
 
 /// Does what a path below `/api/calibration/` and its query ask for; `None` if there is nothing at this path.
-pub(crate) async fn act(word: &str, query: &str, site: &Arc<Site>) -> Option<Result<(), String>> {
+pub(crate) async fn act(word: &str, query: &str, guide: &Arc<dyn Guide>) -> Option<Result<(), String>> {
     let act = match asked(word, query)? {
         Ok(act) => act,
         Err(why) => return Some(Err(why)),
     };
-    let guide = site.guide.clone();
+    let guide = guide.clone();
     let done = tokio::task::spawn_blocking(move || guide.act(act)).await;
     Some(done.unwrap_or_else(|_| Err("the program failed; look at its terminal".into())))
 }

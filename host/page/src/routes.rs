@@ -146,7 +146,7 @@ async fn route(
     }
     match (path, &site.run) {
         ("/calibration", _) | ("/", None) => page(CALIBRATION),
-        ("/api/calibration", _) => match calibration::told(site).await {
+        ("/api/calibration", _) => match calibration::told(&site.guide, site.run.is_some()).await {
             Some(told) => json(StatusCode::OK, &told),
             None => plain(StatusCode::INTERNAL_SERVER_ERROR, "the calibration file could not be read"),
         },
@@ -244,7 +244,7 @@ async fn calibrate(request: &Request<Incoming>, word: &str, site: &Arc<Site>) ->
     if request.method() != Method::POST {
         return plain(StatusCode::METHOD_NOT_ALLOWED, "an act of a calibration is a POST");
     }
-    match calibration::act(word, request.uri().query().unwrap_or_default(), site).await {
+    match calibration::act(word, request.uri().query().unwrap_or_default(), &site.guide).await {
         Some(Ok(())) => plain(StatusCode::OK, "ok"),
         Some(Err(why)) => plain(StatusCode::BAD_REQUEST, why),
         None => plain(StatusCode::NOT_FOUND, "there is start, answer, stop, keep and discard"),

@@ -209,4 +209,4 @@ fn next(steps: &[Step]) -> Option<usize> {
 }
 
 #[cfg(test)]
-mod tests;
+pub(crate) mod tests;
