@@ -6,36 +6,17 @@
 mod browser;
 mod cli_common;
 
-use browser::{installed, Browser, PATIENCE};
+use browser::{Browser, PATIENCE};
 use cli_common::{own_folder, start_with};
 use std::net::TcpListener;
 use std::path::{Path, PathBuf};
 use std::time::{Duration, Instant};
 
-const NAME: &str = "the_page_shows_the_rig_obeys_its_operator_and_comes_back";
-
 fn main() {
-    // The lines of the standard harness, which `./x test` counts.
-    let wanted =
-        std::env::args().skip(1).filter(|a| !a.starts_with('-')).all(|filter| NAME.contains(&filter));
-    if std::env::args().any(|a| a == "--list") {
-        println!("{NAME}: test");
-        return;
-    }
-    let program = installed();
-    let (ran, ignored) = match (&program, wanted) {
-        (Some(program), true) => {
-            the_page_shows_the_rig_obeys_its_operator_and_comes_back(program);
-            println!("test {NAME} ... ok");
-            (1, 0)
-        }
-        (None, true) => {
-            println!("test {NAME} ... ignored, no Chromium is installed (Debian: apt-get install chromium)");
-            (0, 1)
-        }
-        (_, false) => (0, 0),
-    };
-    println!("\ntest result: ok. {ran} passed; 0 failed; {ignored} ignored; 0 measured; 0 filtered out");
+    browser::test(
+        "the_page_shows_the_rig_obeys_its_operator_and_comes_back",
+        the_page_shows_the_rig_obeys_its_operator_and_comes_back,
+    );
 }
 
 /// A rig on software Vulkan, with its page at `address`.
@@ -143,6 +124,7 @@ fn the_page_shows_the_rig_obeys_its_operator_and_comes_back(program: &Path) {
     browser.wait("latency", "parseFloat(document.getElementById('p50').textContent) > 0");
     browser.wait("picture of the observer", "!document.getElementById('viewer').hidden");
     check_layout(&mut browser, 1280);
+    assert_eq!(browser.value("document.getElementById('guide').pathname"), "/calibration");
     browser.picture(&pictures.join("desktop.png"), false);
 
     // A click and a key, each answered after the light had obeyed.

@@ -6,6 +6,7 @@
 //! It runs on threads of its own. From the run it takes what [`dpm_rig::telemetry::monitor::RunMonitor`] shows to
 //! every observer, and it gives orders as the control socket does, through [`dpm_rig::control::orders::Orders`].
 
+pub mod calibration;
 mod connections;
 mod events;
 mod guard;
@@ -14,9 +15,11 @@ pub mod notes;
 mod orders;
 mod parameters;
 mod pictures;
+mod query;
 mod routes;
 mod server;
 mod shared;
+mod site;
 mod state;
 pub mod token;
 

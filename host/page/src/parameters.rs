@@ -1,6 +1,7 @@
 //! A change of the parameters that came over HTTP: given as the control socket gives it, and answered when planning
 //! uses it or the disk has it.
 
+use crate::query::part;
 use crate::shared::Shared;
 use dpm_rig::control::parameters;
 use dpm_rig::parameters::{Command, Refused};
@@ -8,8 +9,6 @@ use std::time::{Duration, Instant};
 
 /// How often to look whether a change is in use.
 const LOOK: Duration = Duration::from_millis(2);
-/// Longest query of a change, bytes.
-const MAX_QUERY: usize = 2048;
 
 /// What is answered to a change.
 #[derive(Debug, serde::Serialize)]
@@ -33,31 +32,8 @@ pub(crate) fn asked(word: &str, query: &str) -> Option<Result<Command, Refused>>
 /// `name=NAME&value=NUMBERS`, percent-encoded.
 fn change(query: &str) -> Result<Command, Refused> {
     let wrong = || Refused::Syntax("write ?name=exposure&value=1.5".into());
-    if query.len() > MAX_QUERY {
-        return Err(wrong());
-    }
-    let part = |key: &str| {
-        let found = query.split('&').find_map(|part| part.strip_prefix(key)?.strip_prefix('='));
-        found.and_then(decoded).ok_or_else(wrong)
-    };
+    let part = |key: &str| part(query, key).ok_or_else(wrong);
     Command::parse_change(&format!("{}={}", part("name")?, part("value")?))
-}
-
-/// Text without percent encoding; `None` if it is none.
-fn decoded(text: &str) -> Option<String> {
-    let mut bytes = Vec::with_capacity(text.len());
-    let mut rest = text.bytes();
-    while let Some(byte) = rest.next() {
-        bytes.push(match byte {
-            b'%' => {
-                let mut digit = || char::from(rest.next()?).to_digit(16);
-                (digit()? * 16 + digit()?) as u8
-            }
-            b'+' => b' ',
-            plain => plain,
-        });
-    }
-    String::from_utf8(bytes).ok()
 }
 
 /// Gives `command` and waits for its result, for two seconds at most.
@@ -78,6 +54,7 @@ pub(crate) async fn give(command: &Command, shared: &Shared) -> Result<Answered,
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::query::MAX_QUERY;
 
     #[test]
     fn a_query_names_a_parameter_whatever_its_letters() {

@@ -1,5 +1,6 @@
 //! From a request to its answer.
 
+use crate::calibration;
 use crate::connections::{Connection, Doing};
 use crate::events::Events;
 use crate::guard::Refused;
@@ -7,6 +8,7 @@ use crate::metrics;
 use crate::orders;
 use crate::parameters;
 use crate::shared::Shared;
+use crate::site::Site;
 use crate::state::State;
 use base64::prelude::{Engine, BASE64_STANDARD};
 use dpm_device::regular_file;
@@ -21,10 +23,13 @@ use std::sync::Arc;
 use std::task::{Context, Poll};
 use std::time::Duration;
 
-/// The page. Its script and style are marked with a number that is drawn for each answer.
+/// The live page, and that of a calibration. Scripts and styles are marked with a number that is drawn for each answer.
 const PAGE: &str = include_str!("page.html");
-/// What stands for that number in the page.
+const CALIBRATION: &str = include_str!("calibration.html");
+/// What stands for that number in a page, and for what both pages share.
 const NONCE: &str = "{{nonce}}";
+const SHARED: [(&str, &str); 2] =
+    [("{{style}}", include_str!("shared.css")), ("{{script}}", include_str!("shared.js"))];
 /// Longest page of a flight, bytes.
 const MAX_FLIGHT_BYTES: u64 = 1 << 20;
 /// How long the metrics wait for fresh figures.
@@ -90,15 +95,15 @@ fn refusal(refused: Refused) -> Response<Answer> {
 pub(crate) async fn answer(
     request: Request<Incoming>,
     connection: Arc<Connection>,
-    shared: Arc<Shared>,
+    site: Arc<Site>,
 ) -> Result<Response<Answer>, Infallible> {
     connection.now_does(Doing::Asks);
-    let mut response = match shared.guard.check(request.headers()) {
+    let mut response = match site.door.guard.check(request.headers()) {
         Err(refused) => {
-            tokio::time::sleep(shared.pace()).await;
+            tokio::time::sleep(site.door.pace()).await;
             refusal(refused)
         }
-        Ok(()) => route(&request, &connection, &shared).await,
+        Ok(()) => route(&request, &connection, &site).await,
     };
     if !matches!(response.body(), Answer::Events(_)) {
         connection.now_does(Doing::Nothing);
@@ -123,31 +128,48 @@ pub(crate) async fn answer(
 async fn route(
     request: &Request<Incoming>,
     connection: &Arc<Connection>,
-    shared: &Arc<Shared>,
+    site: &Arc<Site>,
 ) -> Response<Answer> {
     let path = request.uri().path();
-    if let Some(word) = path.strip_prefix("/api/orders/") {
-        return order(request, word, connection, shared).await;
+    if let (Some(word), Some(run)) = (path.strip_prefix("/api/orders/"), &site.run) {
+        return order(request, word, connection, (site, run)).await;
     }
-    if let Some(word) = path.strip_prefix("/api/parameters/") {
-        return change(request, word, shared).await;
+    tokio::time::sleep(site.door.pace()).await;
+    if let (Some(word), Some(run)) = (path.strip_prefix("/api/parameters/"), &site.run) {
+        return change(request, word, (site, run)).await;
     }
-    tokio::time::sleep(shared.pace()).await;
+    if let Some(word) = path.strip_prefix("/api/calibration/") {
+        return calibrate(request, word, site).await;
+    }
     if request.method() != Method::GET {
         return plain(StatusCode::METHOD_NOT_ALLOWED, "only GET, and POST for orders and parameters");
     }
+    match (path, &site.run) {
+        ("/calibration", _) | ("/", None) => page(CALIBRATION),
+        ("/api/calibration", _) => match calibration::told(&site.guide, site.run.is_some()).await {
+            Some(told) => json(StatusCode::OK, &told),
+            None => plain(StatusCode::INTERNAL_SERVER_ERROR, "the calibration file could not be read"),
+        },
+        ("/api/token", _) => match site.door.guard.check_token(request.headers()) {
+            Ok(()) => plain(StatusCode::OK, "ok"),
+            Err(refused) => refusal(refused),
+        },
+        ("/favicon.ico", _) => plain(StatusCode::NOT_FOUND, "none"),
+        (_, Some(run)) => of_run(path, connection, run).await,
+        _ => plain(StatusCode::NOT_FOUND, "there is / and /api/calibration"),
+    }
+}
+
+/// What there is to see of a run.
+async fn of_run(path: &str, connection: &Arc<Connection>, shared: &Arc<Shared>) -> Response<Answer> {
     match path {
-        "/" => page(),
+        "/" => page(PAGE),
         "/metrics" => {
             let text = metrics::text(&fresh(shared).await);
             whole(StatusCode::OK, "text/plain; version=0.0.4; charset=utf-8", text)
         }
         "/api/state" => json(StatusCode::OK, &fresh(shared).await.to_json()),
         "/api/parameters" => json(StatusCode::OK, &shared.monitor.parameters().shown()),
-        "/api/token" => match shared.guard.check_token(request.headers()) {
-            Ok(()) => plain(StatusCode::OK, "ok"),
-            Err(refused) => refusal(refused),
-        },
         "/api/events" => match shared.viewer() {
             Some(viewer) => {
                 connection.now_does(Doing::Views);
@@ -161,9 +183,9 @@ async fn route(
             }
         },
         _ if path.starts_with("/api/flights/") => flight(path, shared).await,
-        "/favicon.ico" => plain(StatusCode::NOT_FOUND, "none"),
         _ => {
-            plain(StatusCode::NOT_FOUND, "there is /, /metrics, /api/state, /api/parameters and /api/events")
+            let known = "there is /, /calibration, /metrics, /api/state, /api/parameters, /api/calibration and /api/events";
+            plain(StatusCode::NOT_FOUND, known)
         }
     }
 }
@@ -172,10 +194,10 @@ async fn order(
     request: &Request<Incoming>,
     word: &str,
     connection: &Arc<Connection>,
-    shared: &Arc<Shared>,
+    (site, shared): (&Site, &Arc<Shared>),
 ) -> Response<Answer> {
-    if let Err(refused) = shared.guard.check_token(request.headers()) {
-        tokio::time::sleep(shared.pace()).await;
+    if let Err(refused) = site.door.guard.check_token(request.headers()) {
+        tokio::time::sleep(site.door.pace()).await;
         return refusal(refused);
     }
     if request.method() != Method::POST {
@@ -189,10 +211,13 @@ async fn order(
     json(StatusCode::OK, &orders::give(order, shared).await)
 }
 
-/// A change of the parameters. It knows the token as an order does, but it waits its turn as every other request.
-async fn change(request: &Request<Incoming>, word: &str, shared: &Arc<Shared>) -> Response<Answer> {
-    tokio::time::sleep(shared.pace()).await;
-    if let Err(refused) = shared.guard.check_token(request.headers()) {
+/// A change of the parameters. It knows the token as an order does, but it has waited its turn as every other request.
+async fn change(
+    request: &Request<Incoming>,
+    word: &str,
+    (site, shared): (&Site, &Arc<Shared>),
+) -> Response<Answer> {
+    if let Err(refused) = site.door.guard.check_token(request.headers()) {
         return refusal(refused);
     }
     if request.method() != Method::POST {
@@ -208,6 +233,21 @@ async fn change(request: &Request<Incoming>, word: &str, shared: &Arc<Shared>) -
     match done {
         Ok(answered) => json(StatusCode::OK, &answered),
         Err(refused) => plain(StatusCode::BAD_REQUEST, format!("refused: {refused}")),
+    }
+}
+
+/// An act of a calibration, by whoever knows the token.
+async fn calibrate(request: &Request<Incoming>, word: &str, site: &Arc<Site>) -> Response<Answer> {
+    if let Err(refused) = site.door.guard.check_token(request.headers()) {
+        return refusal(refused);
+    }
+    if request.method() != Method::POST {
+        return plain(StatusCode::METHOD_NOT_ALLOWED, "an act of a calibration is a POST");
+    }
+    match calibration::act(word, request.uri().query().unwrap_or_default(), &site.guide).await {
+        Some(Ok(())) => plain(StatusCode::OK, "ok"),
+        Some(Err(why)) => plain(StatusCode::BAD_REQUEST, why),
+        None => plain(StatusCode::NOT_FOUND, "there is start, answer, stop, keep and discard"),
     }
 }
 
@@ -244,17 +284,20 @@ async fn fresh(shared: &Arc<Shared>) -> State {
     State::of(shared)
 }
 
-fn page() -> Response<Answer> {
+/// A page of this program, which loads nothing and runs nothing but what stands in it.
+fn page(text: &str) -> Response<Answer> {
     let mut bytes = [0u8; 16];
     if getrandom::fill(&mut bytes).is_err() {
         return plain(StatusCode::SERVICE_UNAVAILABLE, "the operating system gave no random bytes");
     }
     let nonce = BASE64_STANDARD.encode(bytes);
+    let text = SHARED.iter().fold(text.to_owned(), |text, (mark, part)| text.replacen(mark, part, 1));
+    let text = text.replace(NONCE, &nonce);
     let policy = format!(
         "default-src 'none'; script-src 'nonce-{nonce}'; style-src 'nonce-{nonce}'; img-src data:; connect-src 'self'; \
          base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
     );
-    let mut response = whole(StatusCode::OK, "text/html; charset=utf-8", PAGE.replace(NONCE, &nonce));
+    let mut response = whole(StatusCode::OK, "text/html; charset=utf-8", text);
     if let Ok(policy) = HeaderValue::from_str(&policy) {
         response.headers_mut().insert(header::CONTENT_SECURITY_POLICY, policy);
     }

@@ -1,11 +1,13 @@
 //! The server's thread: takes connections, and lets none of them cost more than it may.
 
+use crate::calibration::Guide;
 use crate::connections::{Connection, Connections};
 use crate::guard::Guard;
 use crate::notes::Notes;
 use crate::pictures::Pictures;
 use crate::routes;
 use crate::shared::Shared;
+use crate::site::{Door, Site};
 use crate::token::Token;
 use dpm_common::realtime::os::give_way;
 use dpm_rig::control::orders::Orders;
@@ -47,6 +49,8 @@ pub struct Settings {
     pub hosts: Vec<String>,
     /// What orders must know; `None`: there are no orders.
     pub token: Option<Token>,
+    /// The steps of the rig's calibration.
+    pub guide: Arc<dyn Guide>,
 }
 
 /// Why there is no page.
@@ -89,6 +93,24 @@ impl Page {
         orders: Arc<Orders>,
         notes: Arc<Notes>,
     ) -> Result<Self, PageError> {
+        Self::start(settings, || {
+            let pictures = Pictures::start(monitor.clone()).map_err(PageError::Thread)?;
+            Ok(Some(Arc::new(Shared::new(monitor, orders, notes, pictures))))
+        })
+    }
+
+    /// Serves the guided page of a calibration, without a run.
+    ///
+    /// # Errors
+    /// As [`Page::serve`].
+    pub fn serve_calibration(settings: Settings) -> Result<Self, PageError> {
+        Self::start(settings, || Ok(None))
+    }
+
+    fn start(
+        settings: Settings,
+        run: impl FnOnce() -> Result<Option<Arc<Shared>>, PageError>,
+    ) -> Result<Self, PageError> {
         let wanted = settings.address;
         if !wanted.ip().is_loopback() {
             return Err(PageError::NotLoopback(wanted));
@@ -105,9 +127,8 @@ impl Page {
             .enable_time()
             .build()
             .map_err(PageError::Thread)?;
-        let guard = Guard::new(address, &settings.hosts, settings.token);
-        let pictures = Pictures::start(monitor.clone()).map_err(PageError::Thread)?;
-        let shared = Arc::new(Shared::new(monitor, orders, notes, guard, pictures));
+        let door = Door::new(Guard::new(address, &settings.hosts, settings.token));
+        let site = Arc::new(Site { door, run: run()?, guide: settings.guide });
         let stop = Arc::new(Notify::new());
         let (ended, over) = mpsc::channel::<()>();
         let thread = std::thread::Builder::new()
@@ -120,7 +141,7 @@ impl Page {
                     // The stages of the rig come first where there are no real-time rights.
                     give_way(5);
                     runtime.block_on(async {
-                        tokio::spawn(take_connections(listener, shared));
+                        tokio::spawn(take_connections(listener, site));
                         stop.notified().await;
                     });
                     runtime.shutdown_background();
@@ -146,7 +167,7 @@ impl Drop for Page {
     }
 }
 
-async fn take_connections(listener: std::net::TcpListener, shared: Arc<Shared>) {
+async fn take_connections(listener: std::net::TcpListener, site: Arc<Site>) {
     let Ok(listener) = TcpListener::from_std(listener) else { return };
     let mut all = Connections::default();
     let mut taken = 0u32;
@@ -165,7 +186,7 @@ async fn take_connections(listener: std::net::TcpListener, shared: Arc<Shared>) 
         };
         if all.make_room() {
             let connection = Connection::new();
-            let task = tokio::spawn(serve(stream, connection.clone(), shared.clone()));
+            let task = tokio::spawn(serve(stream, connection.clone(), site.clone()));
             all.take(connection, task.abort_handle());
         }
         taken += 1;
@@ -175,10 +196,10 @@ async fn take_connections(listener: std::net::TcpListener, shared: Arc<Shared>) 
     }
 }
 
-async fn serve(stream: TcpStream, connection: Arc<Connection>, shared: Arc<Shared>) {
+async fn serve(stream: TcpStream, connection: Arc<Connection>, site: Arc<Site>) {
     let _ = stream.set_nodelay(true);
     let io = Stream { stream, connection: connection.clone() };
-    let service = service_fn(|request| routes::answer(request, connection.clone(), shared.clone()));
+    let service = service_fn(|request| routes::answer(request, connection.clone(), site.clone()));
     // An error is the client's: it went away, or sent no HTTP.
     let _ = http1::Builder::new()
         .timer(Clock)

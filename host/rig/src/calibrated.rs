@@ -152,15 +152,11 @@ pub(crate) fn measured_response(light: &LightSection) -> [[f64; 256]; 3] {
 #[cfg(test)]
 mod tests {
     use super::CalibrationFile;
+    use crate::calibration_steps::tests::measured_file;
     use crate::config::{Overrides, RigConfig};
     use crate::rig::Rig;
-    use dpm_calibration::file::{
-        BodySection, LatencySection, LightSection, Pose, ProjectorSection, Provenance,
-    };
-    use dpm_calibration::model::ProjectorModel;
     use dpm_device::planes::Raster;
-    use dpm_scene::geometry::projector::ProjectorCamera;
-    use glam::{DAffine3, DQuat};
+    use glam::DAffine3;
     use glam::{DVec2, DVec3};
     use std::path::{Path, PathBuf};
 
@@ -293,36 +289,6 @@ mod tests {
         let config =
             RigConfig::parse("rig.toml", &text, Path::new(""), &overrides).map_err(|e| e.to_string())?;
         Rig::build(&config, None).map_err(|e| e.to_string())
-    }
-
-    fn measured_file() -> CalibrationFile {
-        let raster = Raster::new(1024, 768).unwrap();
-        let camera =
-            ProjectorCamera::look_at(raster, DVec3::new(0.1, 0.6, 1.5), DVec3::ZERO, DVec3::Y, 0.6).unwrap();
-        let model = ProjectorModel::from_camera(&camera, [-0.1, 0.02, 0.0, 0.0, 0.0], DVec3::ZERO);
-        let mut file = CalibrationFile::new();
-        file.projector = Some(ProjectorSection::new(raster, &model, 0.2, 0.1, Provenance::default()));
-        let motion =
-            DAffine3::from_rotation_translation(DQuat::from_rotation_x(0.3), DVec3::new(0.01, 0.0, 0.02));
-        let body = BodySection {
-            mesh_to_body: Pose::new(&motion),
-            residual_m: 1e-4,
-            provenance: Provenance::default(),
-        };
-        file.bodies.insert("venus".into(), body);
-        file.latency =
-            Some(LatencySection { latency_us: 2500.0, sigma_us: 5.0, provenance: Provenance::default() });
-        file.light = Some(LightSection {
-            size: [1024, 768],
-            curves: vec![vec![0.0, 0.25, 1.0]; 3],
-            intensity: vec![0.25, 0.5, 0.25],
-            black: 0.01,
-            ambient: 0.0,
-            flat_field: [1.0, 0.0, 0.0, -0.2, 0.0, 0.0],
-            uncertainty: 0.01,
-            provenance: Provenance::default(),
-        });
-        file
     }
 
     #[test]

@@ -29,6 +29,7 @@
 //! ```
 
 pub mod calibrated;
+pub mod calibration_steps;
 pub mod config;
 pub mod control;
 pub mod drive;

@@ -8,7 +8,8 @@ mod sections;
 mod store;
 
 pub use sections::{
-    BodySection, LatencySection, LightSection, Pose, ProjectorSection, Provenance, WandSection, Wrong,
+    BodySection, CheckSection, LatencySection, LightSection, Pose, ProjectorSection, Provenance, WandSection,
+    Wrong,
 };
 pub use store::{load, parse, save, FileError, MAX_BYTES};
 
@@ -33,6 +34,9 @@ pub struct CalibrationFile {
     /// Bodies by their name in the rig file.
     #[serde(default, skip_serializing_if = "BTreeMap::is_empty")]
     pub bodies: BTreeMap<String, BodySection>,
+    /// What a check of the light found, by bodies.
+    #[serde(default, skip_serializing_if = "BTreeMap::is_empty")]
+    pub checks: BTreeMap<String, CheckSection>,
     /// Delays.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub latency: Option<LatencySection>,
@@ -58,6 +62,7 @@ impl CalibrationFile {
         self.projector.iter().try_for_each(|s| s.check())?;
         self.wand.iter().try_for_each(|s| s.check())?;
         self.bodies.iter().try_for_each(|(name, s)| s.check(name))?;
+        self.checks.iter().try_for_each(|(name, s)| s.check(name))?;
         self.latency.iter().try_for_each(|s| s.check())?;
         self.light.iter().try_for_each(|s| s.check())
     }

@@ -48,6 +48,16 @@ pub struct Provenance {
     pub method: String,
 }
 
+impl Provenance {
+    /// What [`Provenance::method`] says of a part that was moved by hand, until its outlines fitted.
+    pub const BY_EYE: &'static str = "nudged by eye";
+
+    /// True for a part that was moved by hand.
+    pub fn is_by_eye(&self) -> bool {
+        self.method == Self::BY_EYE
+    }
+}
+
 /// A rigid motion: `to = rotation * from + position`.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
@@ -203,6 +213,35 @@ impl BodySection {
     pub(super) fn check(&self, name: &str) -> Result<(), Wrong> {
         self.mesh_to_body.check(&format!("bodies.{name}.mesh_to_body"))?;
         within(&format!("bodies.{name}.residual_m"), &[self.residual_m], 0.0, 1.0)
+    }
+}
+
+/// What `dpm calibrate check` found on a body.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct CheckSection {
+    /// Points that were measured.
+    pub points: u32,
+    /// Median error of the light, pixels.
+    pub p50_px: f64,
+    /// Largest error of the light, pixels.
+    pub largest_px: f64,
+    /// The largest error that was accepted, pixels.
+    pub limit_px: f64,
+    /// Where this comes from.
+    pub provenance: Provenance,
+}
+
+impl CheckSection {
+    /// True if no error was larger than the limit.
+    pub fn is_within(&self) -> bool {
+        self.largest_px <= self.limit_px
+    }
+
+    pub(super) fn check(&self, name: &str) -> Result<(), Wrong> {
+        let errors = [self.p50_px, self.largest_px];
+        within(&format!("errors of checks.{name}"), &errors, 0.0, 1e9)?;
+        within(&format!("checks.{name}.limit_px"), &[self.limit_px], 0.0, 1e6)
     }
 }
 

@@ -38,6 +38,9 @@ fn full() -> CalibrationFile {
         Some(WandSection { tip: [0.01, -0.15, 1.0 / 3.0], tip_sigma_m: 2e-5, provenance: provenance() });
     let body = BodySection { mesh_to_body: Pose::new(&pose), residual_m: 1e-4, provenance: provenance() };
     file.bodies.insert("the head".into(), body);
+    let check =
+        CheckSection { points: 6, p50_px: 0.4, largest_px: 0.9, limit_px: 2.0, provenance: provenance() };
+    file.checks.insert("the head".into(), check);
     file.latency = Some(LatencySection { latency_us: 4321.0, sigma_us: 5.0, provenance: provenance() });
     file.light = Some(LightSection::new(&LightModel { channels, flat }, provenance()));
     file
@@ -106,6 +109,7 @@ fn numbers_that_cannot_be_are_refused_with_their_key() {
     refused(&|f| f.projector.as_mut().unwrap().lens = vec![0.1; 3], "projector is none");
     refused(&|f| f.wand.as_mut().unwrap().tip[2] = f64::INFINITY, "wand.tip");
     refused(&|f| f.bodies.get_mut("the head").unwrap().mesh_to_body.rotation = [0.0; 4], "bodies.the head");
+    refused(&|f| f.checks.get_mut("the head").unwrap().largest_px = f64::NAN, "checks.the head");
     refused(&|f| f.latency.as_mut().unwrap().latency_us = 1e9, "latency.latency_us");
     refused(&|f| f.light.as_mut().unwrap().curves[1] = vec![0.0, 0.6, 0.5, 1.0], "light.curves[1]");
     refused(&|f| f.light.as_mut().unwrap().intensity = vec![0.2; 3], "light.intensity");

@@ -4,10 +4,12 @@ use super::aim::Aim;
 use super::body::{carried, index_of, triangles_of};
 use super::dialogue::Dialogue;
 use super::poses::{held, still, Poses};
+use super::results::Results;
 use dpm_calibration::body::Surface;
 use dpm_calibration::check::{spread, Checked, Fault, Offset, Reading, Summary, SurfacePoint};
-use dpm_calibration::file::CalibrationFile;
+use dpm_calibration::file::{CalibrationFile, CheckSection};
 use dpm_calibration::trajectory::Stamped;
+use dpm_rig::config::RigConfig;
 use dpm_rig::failure::{Failure, FailureKind};
 use dpm_rig::rig::Rig;
 use dpm_scene::geometry::projector::ProjectorCamera;
@@ -319,6 +321,20 @@ pub fn judge(
         Some((fault, part)) => verdict(fault, &part, body, limit_px),
     };
     Ok((told, fault.is_none()))
+}
+
+/// Puts what a check of `body` found into the results; nothing if no point was measured.
+pub fn keep(results: &mut Results, config: &RigConfig, body: &str, offsets: &[Offset], limit_px: f64) {
+    let Some(light) = Checked::of(offsets).map(|checked| checked.light) else { return };
+    let data = format!("{} points of \"{body}\"", light.count);
+    let section = CheckSection {
+        points: light.count as u32,
+        p50_px: light.p50_px,
+        largest_px: light.largest_px,
+        limit_px,
+        provenance: results.provenance(config, "", data, "the wand's tip in the light and on the body"),
+    };
+    results.file.checks.insert(body.to_owned(), section);
 }
 
 /// The errors that the calibration file predicts.

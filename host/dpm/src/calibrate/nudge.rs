@@ -4,7 +4,7 @@ use super::body::{carried, index_of, triangles_of};
 use super::outline::{Outlines, MOST_POINTS};
 use super::poses::Poses;
 use super::results::Results;
-use dpm_calibration::file::{BodySection, Pose};
+use dpm_calibration::file::{BodySection, Pose, Provenance};
 use dpm_calibration::nudge::{Nudges, Order, TURN_DEG};
 use dpm_calibration::outline::Outline;
 use dpm_calibration::trajectory::Stamped;
@@ -220,7 +220,6 @@ pub fn check_known(results: &Results, moved: &Moved) -> Result<(), Failure> {
 
 /// Puts a motion into the results.
 pub fn keep(results: &mut Results, config: &RigConfig, moved: &Moved, motion: &DAffine3) {
-    const BY_EYE: &str = "nudged by eye";
     let place = Pose::new(motion);
     match moved {
         Moved::Body(name) => {
@@ -228,7 +227,7 @@ pub fn keep(results: &mut Results, config: &RigConfig, moved: &Moved, motion: &D
             let data = old.map_or(String::new(), |b| b.provenance.data.clone());
             // The residual is that of the measurement before: an eye gives none.
             let residual_m = old.map_or(0.0, |b| b.residual_m);
-            let provenance = results.provenance(config, name, data, BY_EYE);
+            let provenance = results.provenance(config, name, data, Provenance::BY_EYE);
             results
                 .file
                 .bodies
@@ -236,7 +235,7 @@ pub fn keep(results: &mut Results, config: &RigConfig, moved: &Moved, motion: &D
         }
         Moved::Projector => {
             let data = results.file.projector.as_ref().map_or(String::new(), |p| p.provenance.data.clone());
-            let provenance = results.provenance(config, "", data, BY_EYE);
+            let provenance = results.provenance(config, "", data, Provenance::BY_EYE);
             if let Some(section) = &mut results.file.projector {
                 (section.world_from_projector, section.provenance) = (place, provenance);
             }

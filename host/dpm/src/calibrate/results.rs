@@ -1,6 +1,7 @@
 //! The calibration file of a rig: where it lies, what is in it already, and how new parts get into it.
 
 use dpm_calibration::file::{self, CalibrationFile, Provenance};
+use dpm_rig::calibration_steps::calibration_file;
 use dpm_rig::config::RigConfig;
 use dpm_rig::failure::{Failure, FailureKind};
 use dpm_rig::rig::Rig;
@@ -8,8 +9,8 @@ use dpm_rig::standing::{utc, Identity};
 use std::path::{Path, PathBuf};
 use std::time::SystemTime;
 
-/// Name of the file if neither a flag nor the rig file names one.
-const USUAL_NAME: &str = "calibration.toml";
+/// The end of the name of a calibration file on which the operator decides later.
+pub const TRIAL: &str = ".trial";
 
 /// A calibration file that grows part by part.
 pub struct Results {
@@ -24,8 +25,7 @@ impl Results {
     /// # Errors
     /// There is one that cannot be read.
     pub fn open(named: Option<&Path>, rig: &Path, config: &RigConfig) -> Result<Self, Failure> {
-        let beside = rig.with_file_name(USUAL_NAME);
-        let path = named.map(Path::to_path_buf).or(config.calibration.file.clone()).unwrap_or(beside);
+        let path = named.map_or_else(|| calibration_file(rig, config), Path::to_path_buf);
         let file = if path.exists() {
             file::load(&path).map_err(|e| Failure::new(FailureKind::BadInput, e))?
         } else {
@@ -63,6 +63,13 @@ impl Results {
     /// # Errors
     /// It cannot be written.
     pub fn save(&self, config: &RigConfig) -> Result<String, Failure> {
+        let name = self.path.file_name().unwrap_or_default().to_string_lossy();
+        if name.ends_with(TRIAL) {
+            // Nobody needs what a trial was before.
+            let _ = std::fs::remove_file(&self.path);
+            file::save(&self.file, &self.path).map_err(|e| Failure::new(FailureKind::BadInput, e))?;
+            return Ok("measured; it is not in the calibration file yet".into());
+        }
         let kept = file::save(&self.file, &self.path).map_err(|e| Failure::new(FailureKind::BadInput, e))?;
         let mut told = format!("written: {}", self.path.display());
         if let Some(old) = kept {

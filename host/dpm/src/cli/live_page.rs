@@ -1,5 +1,6 @@
 //! Opens the live page of a run, and tells the operator where it is.
 
+use super::guide::RigGuide;
 use super::tell::Teller;
 use dpm_page::token::Token;
 use dpm_page::{Page, Settings};
@@ -8,6 +9,7 @@ use dpm_rig::control::orders::Orders;
 use dpm_rig::standing::state_folder;
 use dpm_rig::telemetry::monitor::RunMonitor;
 use std::io::IsTerminal;
+use std::net::SocketAddr;
 use std::path::PathBuf;
 use std::sync::Arc;
 
@@ -24,6 +26,7 @@ pub(super) fn open(
         address,
         hosts: rig.page.hosts.clone(),
         token: token.as_ref().ok().map(|(token, _)| token.clone()),
+        guide: Arc::new(RigGuide::of_run(rig)),
     };
     let page = match Page::serve(settings, monitor.clone(), orders.clone(), teller.kept()) {
         Ok(page) => page,
@@ -32,22 +35,35 @@ pub(super) fn open(
             return None;
         }
     };
-    let link = format!("http://{}/", page.address());
-    match token {
-        // A log is read by more people than a terminal.
-        Ok((token, _)) if std::io::stderr().is_terminal() => {
-            teller.whisper(&format!("page: {link}#token={}", token.as_str()));
-        }
-        Ok((_, path)) => {
-            teller.note(&format!("page: {link}; orders need the token in {}", path.display()));
-        }
-        Err(why) => teller.note(&format!("page: {link}, without orders: {why}")),
+    match link(page.address(), token) {
+        Link::Secret(told) => teller.whisper(&told),
+        Link::Open(told) => teller.note(&told),
     }
     Some(page)
 }
 
 /// The token that is kept in the state folder, and its file; or why there is none.
-fn token() -> Result<(Token, PathBuf), String> {
+pub(super) fn token() -> Result<(Token, PathBuf), String> {
     let folder = state_folder().ok_or("there is no state folder; name one by DPM_STATE_DIR")?;
     Token::kept_in(&folder).map_err(|e| e.to_string())
+}
+
+/// Where a page is, in words for the operator.
+pub(super) enum Link {
+    /// With the token: for a terminal.
+    Secret(String),
+    /// Without it.
+    Open(String),
+}
+
+/// Tells where the page at `address` is. A log is read by more people than a terminal, so only there the token is told.
+pub(super) fn link(address: SocketAddr, token: Result<(Token, PathBuf), String>) -> Link {
+    let link = format!("http://{address}/");
+    match token {
+        Ok((token, _)) if std::io::stderr().is_terminal() => {
+            Link::Secret(format!("page: {link}#token={}", token.as_str()))
+        }
+        Ok((_, path)) => Link::Open(format!("page: {link}; orders need the token in {}", path.display())),
+        Err(why) => Link::Open(format!("page: {link}, without orders: {why}")),
+    }
 }

@@ -4,7 +4,9 @@
 
 use std::ffi::CString;
 use std::os::unix::ffi::OsStrExt;
+use std::os::unix::process::CommandExt;
 use std::path::Path;
+use std::process::Command;
 
 /// True when the process may read and write `path`.
 pub(crate) fn may_read_and_write(path: &Path) -> bool {
@@ -22,6 +24,18 @@ pub(crate) fn free_bytes(path: &Path) -> Option<u64> {
     // SAFETY: all of it was zeroed, and the call succeeded.
     let stat = (told == 0).then(|| unsafe { stat.assume_init() })?;
     Some(stat.f_bavail.saturating_mul(stat.f_frsize))
+}
+
+/// Makes the system send SIGTERM to the process that `command` starts when the thread that starts it ends, however that
+/// ends.
+pub(super) fn end_with_this_thread(command: &mut Command) {
+    // SAFETY: between fork and exec it makes one system call with plain numbers.
+    unsafe {
+        command.pre_exec(|| match libc::prctl(libc::PR_SET_PDEATHSIG, libc::SIGTERM) {
+            0 => Ok(()),
+            _ => Err(std::io::Error::last_os_error()),
+        })
+    };
 }
 
 /// Ends the process at once, without destructors, whatever its other threads do.

@@ -14,8 +14,31 @@ const NAMES: [&str; 4] = ["chromium", "chromium-browser", "google-chrome", "goog
 /// How long anything in the browser may take on a busy machine.
 pub(crate) const PATIENCE: Duration = Duration::from_secs(60);
 
+/// Runs the one test of a program that is not made by the standard harness, but writes its lines, which `./x test` counts.
+pub(crate) fn test(name: &str, run: fn(&Path)) {
+    let wanted =
+        std::env::args().skip(1).filter(|a| !a.starts_with('-')).all(|filter| name.contains(&filter));
+    if std::env::args().any(|a| a == "--list") {
+        println!("{name}: test");
+        return;
+    }
+    let (ran, ignored) = match (installed(), wanted) {
+        (Some(program), true) => {
+            run(&program);
+            println!("test {name} ... ok");
+            (1, 0)
+        }
+        (None, true) => {
+            println!("test {name} ... ignored, no Chromium is installed (Debian: apt-get install chromium)");
+            (0, 1)
+        }
+        (_, false) => (0, 0),
+    };
+    println!("\ntest result: ok. {ran} passed; 0 failed; {ignored} ignored; 0 measured; 0 filtered out");
+}
+
 /// The path of a Chromium of this machine.
-pub(crate) fn installed() -> Option<PathBuf> {
+fn installed() -> Option<PathBuf> {
     let path = std::env::var_os("PATH")?;
     std::env::split_paths(&path).flat_map(|dir| NAMES.map(|name| dir.join(name))).find(|file| file.is_file())
 }
@@ -175,6 +198,9 @@ impl Browser {
         let down = match key {
             "Enter" => {
                 json!({ "type": "keyDown", "key": key, "code": key, "text": "\r", "windowsVirtualKeyCode": 13 })
+            }
+            "Escape" => {
+                json!({ "type": "keyDown", "key": key, "code": key, "windowsVirtualKeyCode": 27 })
             }
             "ArrowRight" => {
                 json!({ "type": "keyDown", "key": key, "code": key, "windowsVirtualKeyCode": 39 })

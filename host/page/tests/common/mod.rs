@@ -2,9 +2,11 @@
 #![allow(dead_code)] // Every test file uses a part of it.
 
 use dpm_device::planes::Raster;
+use dpm_page::calibration::{Act, Guide, Session};
 use dpm_page::notes::Notes;
 use dpm_page::token::Token;
 use dpm_page::{Page, Settings};
+use dpm_rig::calibration_steps::{About, Steps};
 use dpm_rig::config::{Overrides, RigConfig};
 use dpm_rig::control::orders::Orders;
 use dpm_rig::pipeline::{run_prepared, RunOptions, RunOutcome};
@@ -16,10 +18,36 @@ use std::net::{SocketAddr, TcpStream};
 use std::path::PathBuf;
 use std::sync::Arc;
 use std::thread::JoinHandle;
-use std::time::{Duration, Instant};
+use std::time::{Duration, Instant, SystemTime};
 
 /// How long anything may take on a busy machine.
 pub(crate) const PATIENCE: Duration = Duration::from_secs(30);
+
+/// The steps of a rig file that need not exist.
+#[derive(Debug)]
+pub(crate) struct Shown {
+    pub(crate) rig: PathBuf,
+    pub(crate) config: RigConfig,
+}
+
+impl Guide for Shown {
+    fn steps(&self) -> Steps {
+        let now = SystemTime::now();
+        Steps::of(&About { rig: &self.rig, config: &self.config, file: None, now, running_since: None })
+    }
+
+    fn session(&self) -> Option<Session> {
+        None
+    }
+
+    fn act(&self, act: Act) -> Result<(), String> {
+        Err(format!("nobody does {act:?} here"))
+    }
+
+    fn ports(&self) -> Vec<String> {
+        vec!["/dev/ttyACM9".into()]
+    }
+}
 
 pub(crate) struct Running {
     pub(crate) monitor: Arc<RunMonitor>,
@@ -53,6 +81,7 @@ impl Running {
             address: "127.0.0.1:0".parse().unwrap(),
             hosts: vec!["rig.example.org".into()],
             token: Some(token.clone()),
+            guide: Arc::new(Shown { rig: dir.join("rig.toml"), config: config.clone() }),
         };
         let notes = Arc::new(Notes::default());
         let page = Page::serve(settings, monitor.clone(), orders.clone(), notes.clone()).unwrap();

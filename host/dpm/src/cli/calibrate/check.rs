@@ -3,7 +3,7 @@
 use super::projector::while_showing;
 use super::{tip_of, Common};
 use crate::calibrate::aim::Aim;
-use crate::calibrate::check::{judge, measure, RealBench, Target};
+use crate::calibrate::check::{self, judge, measure, RealBench, Target};
 use crate::calibrate::nudge::{self, check_known, help, keep, Moved, Stage};
 use crate::calibrate::outline::Outlines;
 use crate::calibrate::poses::Poses;
@@ -55,7 +55,7 @@ fn above_0_to_1000(text: &str) -> Result<f64, String> {
 /// # Errors
 /// An error of the light is larger than the limit (exit code 1); nothing could be measured (2); a device failed (3).
 pub(super) fn check(args: &CheckArgs) -> Result<(), Failure> {
-    let (config, results) = args.common.open()?;
+    let (config, mut results) = args.common.open()?;
     let tip = tip_of(&results)?;
     let target = Target::of(&results.rig(&config)?, args.body.as_deref())?;
     let names = [args.common.wand.clone(), target.name.clone()];
@@ -67,7 +67,9 @@ pub(super) fn check(args: &CheckArgs) -> Result<(), Failure> {
             let bench = RealBench { poses: &poses, aim, dialogue };
             let offsets = measure(&bench, &target, tip, count)?;
             aim.hide();
-            judge(&offsets, &results.file, &target.name, limit)
+            let (told, is_within) = judge(&offsets, &results.file, &target.name, limit)?;
+            check::keep(&mut results, config, &target.name, &offsets, limit);
+            Ok((format!("{told}\n{}", results.save(config)?), is_within))
         })
     })?;
     print(&format!("{told}\n"));

@@ -2,6 +2,7 @@
 
 mod check;
 mod light;
+mod page;
 mod projector;
 
 use super::rig_args::RigArgs;
@@ -22,6 +23,7 @@ use dpm_rig::telemetry::report::to_json;
 use dpm_scene::camera_files::{export, Form};
 use glam::DVec3;
 use light::{LatencyArgs, LightArgs};
+use page::GuideArgs;
 use projector::ProjectorArgs;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
@@ -49,6 +51,8 @@ enum What {
     Light(LightArgs),
     /// Find the latency alone, with a light sensor and the projector of the calibration file
     Latency(LatencyArgs),
+    /// Serve a page in a browser that shows the steps for this rig, does them one by one, and asks what to keep
+    Page(GuideArgs),
     /// Write lens and pose of the rig's projector as a file of OpenCV (.xml, .yml or .json)
     Export(ExportArgs),
     /// Run the whole calibration in simulation, against truths that it does not know, and print its errors
@@ -327,6 +331,7 @@ pub(super) fn execute(args: &CalibrateArgs) -> Result<(), Failure> {
         What::Nudge(args) => nudge(args),
         What::Light(args) => args.execute(),
         What::Latency(args) => args.execute(),
+        What::Page(args) => args.execute(),
         What::Export(args) => write_opencv(args),
         What::Rehearse(args) => rehearse(args),
     }

@@ -84,7 +84,7 @@ pub(super) struct Findings {
 pub(super) fn execute(args: &DoctorArgs) -> Result<(), Failure> {
     args.flags.refuse("dpm doctor", &["--frames", "--seconds", "--no-prediction"])?;
     let config = args.rig.as_deref().map(|path| args.flags.rig_at_rest(Some(path))).transpose()?;
-    let system = System { root: PathBuf::from("/") };
+    let system = System::this();
     let mut findings = Vec::new();
     let can_render = vulkan(&mut findings);
     findings.push(cores(std::thread::available_parallelism().map_or(1, usize::from)));
@@ -253,6 +253,11 @@ struct System {
 }
 
 impl System {
+    /// The machine that this program runs on.
+    fn this() -> Self {
+        Self { root: PathBuf::from("/") }
+    }
+
     fn read(&self, path: &str) -> Option<String> {
         Some(fs::read_to_string(self.root.join(path)).ok()?.trim().to_string())
     }
@@ -364,12 +369,14 @@ impl System {
         out
     }
 
+    /// Names of serial ports in `dev`.
+    fn ports(&self) -> Vec<String> {
+        let is_port = |name: &String| ["ttyUSB", "ttyACM", "ttyAMA"].iter().any(|p| name.starts_with(p));
+        self.names("dev").into_iter().filter(is_port).collect()
+    }
+
     fn serial_ports(&self) -> Finding {
-        let ports: Vec<String> = self
-            .names("dev")
-            .into_iter()
-            .filter(|n| ["ttyUSB", "ttyACM", "ttyAMA"].iter().any(|p| n.starts_with(p)))
-            .collect();
+        let ports = self.ports();
         if ports.is_empty() {
             return Finding::new("serial ports", State::Info, "none", "");
         }
@@ -383,6 +390,11 @@ impl System {
             Finding::new("serial ports", State::Missing, found, remedy)
         }
     }
+}
+
+/// The device files of this machine's serial ports.
+pub(super) fn serial_ports() -> Vec<String> {
+    System::this().ports().iter().map(|name| format!("/dev/{name}")).collect()
 }
 
 /// The name of a USB device with these ids (four hexadecimal digits each), if it is a projector that this program

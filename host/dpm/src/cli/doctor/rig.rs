@@ -5,15 +5,15 @@ use super::super::os;
 use super::devices;
 use super::{Finding, State};
 use dpm_calibration::file;
-use dpm_rig::config::{ProjectorBackend, RigConfig, TrackerConfig};
+use dpm_rig::calibration_steps::age::{aged, days_since, OLD_DAYS};
+use dpm_rig::calibration_steps::is_simulated;
+use dpm_rig::config::RigConfig;
 use dpm_rig::rig::Rig;
-use dpm_rig::standing::{seconds_of_utc, standing_in, state_folder, Identity};
+use dpm_rig::standing::{standing_in, state_folder, Identity};
 use std::net::{SocketAddr, TcpListener};
 use std::path::Path;
-use std::time::{SystemTime, UNIX_EPOCH};
+use std::time::SystemTime;
 
-/// A calibration that is older than this, days, is worth a check.
-const OLD_DAYS: u64 = 30;
 /// Less free space than this, bytes, is soon used up by pictures and traces.
 const LITTLE_SPACE: u64 = 1 << 30;
 /// Most warnings of a scene that are told.
@@ -69,8 +69,7 @@ fn scene(rig: &Rig) -> Finding {
 /// Whether the rig was measured, what of it, and how long ago.
 fn calibration(config: &RigConfig) -> Finding {
     let name = "calibration";
-    let is_simulated = matches!(config.projector.backend, ProjectorBackend::Mock(_))
-        || matches!(config.tracker, TrackerConfig::Mock(_));
+    let is_simulated = is_simulated(config);
     let Some(path) = &config.calibration.file else {
         let known = match (is_simulated, &config.projector.calibration) {
             (true, _) => return Finding::new(name, State::Info, "none; a mock needs none", ""),
@@ -121,21 +120,6 @@ fn calibration(config: &RigConfig) -> Finding {
         );
     }
     Finding::new(name, State::Ok, found, "")
-}
-
-/// Whole days from a date of the form 2026-03-01T12:00:00Z until now; `None` for another text.
-fn days_since(date: &str, now: SystemTime) -> Option<u64> {
-    let now = now.duration_since(UNIX_EPOCH).ok()?.as_secs();
-    Some(now.saturating_sub(seconds_of_utc(date)?) / 86_400)
-}
-
-fn aged(days: Option<u64>) -> String {
-    match days {
-        None => "of unknown date".into(),
-        Some(0) => "of today".into(),
-        Some(1) => "1 day old".into(),
-        Some(days) => format!("{days} days old"),
-    }
 }
 
 /// An order that outlived the run in which it was given.
@@ -190,24 +174,9 @@ fn output(dir: &Path) -> Finding {
 mod tests {
     use super::*;
     use dpm_rig::config::Overrides;
-    use dpm_rig::standing::utc;
-    use std::time::Duration;
 
     fn demo(flags: &[String]) -> RigConfig {
         RigConfig::demo(&Overrides { variables: vec![], flags: flags.to_vec() }).unwrap()
-    }
-
-    #[test]
-    fn an_age_is_counted_in_whole_days() {
-        let then = UNIX_EPOCH + Duration::from_secs(1_772_366_400);
-        let after = |days: f64| days_since(&utc(then), then + Duration::from_secs_f64(86_400.0 * days));
-        assert_eq!(
-            (after(0.0), after(0.99), after(1.0), after(400.5)),
-            (Some(0), Some(0), Some(1), Some(400))
-        );
-        assert_eq!(days_since("yesterday", then), None);
-        // A clock that was set back makes nothing negative.
-        assert_eq!(days_since(&utc(then + Duration::from_secs(9)), then), Some(0));
     }
 
     #[test]
