@@ -527,7 +527,7 @@ fn a_rig_with_a_networked_tracker_lights_what_the_tracker_sees() {
     assert!(json["registration_error_px"].is_null(), "nobody knows the truth about a real tracker");
 }
 
-/// With the same number of samples everywhere all lanes work until the end; the allocation by variance leaves some idle.
+/// Lanes share the samples of their workgroup, so that they are busy whether all pixels have as many samples or not.
 #[test]
 fn bench_counts_how_busy_lanes_are_and_marks_what_is_only_computed() {
     let args = ["bench", "--json", "--count", "3", "--raster", "96x64", "--set", "render.spp=4"];
@@ -541,8 +541,11 @@ fn bench_counts_how_busy_lanes_are_and_marks_what_is_only_computed() {
     };
     for width in [0, 1] {
         let (full, dpm) = (lanes(0, width), lanes(1, width));
-        assert!(full.0 > 0.9 && full.0 <= 1.0 && full.1 == 4, "{json:#}");
-        assert!(dpm.0 > 0.05 && dpm.0 < full.0 && dpm.1 > 4, "{json:#}");
+        for (busy, longest) in [full, dpm] {
+            // A workgroup of this raster has few samples a lane, so that the last of them weigh.
+            assert!(busy > 0.85 && busy <= 1.0, "{json:#}");
+            assert!((2..=6).contains(&longest), "{json:#}");
+        }
     }
     let rows = json["modelled_not_measured"].as_array().expect("a list");
     assert_eq!(rows.len(), 8, "four cards, two methods");

@@ -10,7 +10,7 @@ use crate::light::live_view::bodies_of;
 use crate::light::measures::{histogram, RegistrationMeasures};
 use crate::light::placement::Placement;
 use crate::light::record::FrameRecord;
-use crate::light::recorder::LightNote;
+use crate::light::recorder::{LightNote, LightReceiver};
 use crate::plan::light_centre::light_centre_ns;
 use crate::rig::Rig;
 use crate::telemetry::flight::FlightRecorder;
@@ -42,7 +42,7 @@ pub(crate) struct Inbox {
     /// Frames that the link has finished with.
     pub done: Receiver<Box<FrameNote>>,
     /// What the projector did in each slot.
-    pub lights: Receiver<LightNote>,
+    pub lights: LightReceiver,
 }
 
 /// Counts and distributions of a run.
@@ -239,10 +239,10 @@ impl Collector {
         alive: &mut dyn FnMut(),
     ) -> bool {
         // Checked before reading: what arrived before the end must be read first.
-        let over = inbox.done.is_finished() && inbox.lights.is_finished();
+        let over = inbox.done.is_finished() && inbox.lights.notes.is_finished();
         self.slots.read_orders(monitor.dark());
         loop {
-            let light = self.held.take().or_else(|| inbox.lights.try_pop());
+            let light = self.held.take().or_else(|| inbox.lights.notes.try_pop());
             // Read after the light: all frames before that light have been reported by then.
             self.take_finished(&mut inbox.done, free, monitor, alive);
             // The frame was lit, but the link's thread has not reported it as sent yet.
@@ -252,6 +252,9 @@ impl Collector {
                 |slot: u64| !inbox.done.is_empty() && self.last_planned.is_none_or(|last| last < slot);
             match light {
                 Some(note) if !ahead(note.event.slot) && (over || !note.event.frame.is_some_and(unknown)) => {
+                    while let Some(moves) = inbox.lights.moves_before(note.event.slot) {
+                        self.registration.moved(&moves);
+                    }
                     self.light(&note, monitor);
                 }
                 light => {
@@ -399,9 +402,6 @@ impl Collector {
     fn light(&mut self, note: &LightNote, monitor: &RunMonitor) {
         if note.wall_ns > 0 {
             self.stages[Stage::Light as usize].saturating_record(note.wall_ns);
-        }
-        if let Some(moves) = &note.moves {
-            self.registration.moved(moves);
         }
         let (slot, begin) = (note.event.slot, note.event.first_photon_at);
         self.slots.read_orders(monitor.dark());
@@ -551,6 +551,7 @@ impl Collector {
 mod tests {
     use super::*;
     use crate::config::{Overrides, RigConfig};
+    use crate::light::recorder::light_channel;
     use crate::plan::frame::FrameId;
     use dpm_device::light::LightEvent;
     use dpm_device::link::SendOutcome;
@@ -572,7 +573,8 @@ mod tests {
         let config = RigConfig::demo(&Overrides::default()).unwrap_or_else(|e| panic!("{e}"));
         let rig = Arc::new(Rig::build(&config, Raster::new(16, 16)).unwrap_or_else(|e| panic!("{e}")));
         let (mut done_in, done) = channel(frames as usize, WaitPolicy::Park);
-        let (mut lights_in, lights) = channel(frames as usize, WaitPolicy::Park);
+        assert!(frames <= 8192, "more than there is room for");
+        let (mut lights_in, lights) = light_channel();
         for k in 0..frames {
             let begin = HostTime(k as i64 * SLOT_NS);
             let mut note = FrameNote::new(&rig);
@@ -592,8 +594,8 @@ mod tests {
                 first_photon_at: begin,
                 last_photon_at: begin.plus_ns(SLOT_NS),
             };
-            let note = LightNote { event, hash: 0, torn: false, wall_ns: 0, unseen: 0, moves: None };
-            assert!(lights_in.push(note).is_ok());
+            let note = LightNote { event, hash: 0, torn: false, wall_ns: 0, unseen: 0 };
+            assert!(lights_in.notes.push(note).is_ok());
         }
         drop((done_in, lights_in));
         let mut collector = Collector::new(rig, 0, false);

@@ -14,9 +14,15 @@ use dpm_device::light::{LightEvent, LightKind};
 use dpm_device::planes::{PlaneSchedule, Raster};
 use dpm_device::projector::{light_of_planes, SlotMoves};
 use dpm_device::time::HostTime;
-use dpm_handoff::channel::Sender;
+use dpm_handoff::channel::{channel, Receiver, Sender};
+use dpm_handoff::wake::WaitPolicy;
 use std::collections::VecDeque;
 use std::sync::Arc;
+
+/// Capacity for light events between the projector and the collector: eight seconds at 947 Hz.
+const LIGHTS: usize = 8192;
+/// The same for moves of slots that are followed: two seconds.
+const MOVES: usize = 128;
 
 /// What the projector did in one slot.
 #[derive(Clone, Debug)]
@@ -31,8 +37,41 @@ pub(crate) struct LightNote {
     pub wall_ns: u64,
     /// Frames lit since the previous note of which only the number is known.
     pub unseen: u32,
-    /// What tracks made of the slot before, if a frame was lit there that is followed plane by plane.
-    pub moves: Option<Box<SlotMoves>>,
+}
+
+/// Notes on light for the collector, and what tracks made of the slots that are followed plane by plane. Those are large
+/// and few, so that they have a channel of their own: no note has to carry them, and no memory is taken for one.
+pub(crate) struct LightSender {
+    /// What the projector did in each slot.
+    pub notes: Sender<LightNote>,
+    moves: Sender<SlotMoves>,
+}
+
+/// The other end of a [`LightSender`].
+pub(crate) struct LightReceiver {
+    /// What the projector did in each slot.
+    pub notes: Receiver<LightNote>,
+    moves: Receiver<SlotMoves>,
+    held: Option<SlotMoves>,
+}
+
+/// The way of light from the projector to the collector. Notes and moves for which there is no room are lost.
+pub(crate) fn light_channel() -> (LightSender, LightReceiver) {
+    let (notes_in, notes) = channel(LIGHTS, WaitPolicy::Park);
+    let (moves_in, moves) = channel(MOVES, WaitPolicy::Park);
+    (LightSender { notes: notes_in, moves: moves_in }, LightReceiver { notes, moves, held: None })
+}
+
+impl LightReceiver {
+    /// The next moves of a slot before `slot`. They are there as soon as a note of `slot` is.
+    pub(crate) fn moves_before(&mut self, slot: u64) -> Option<SlotMoves> {
+        let next = self.held.take().or_else(|| self.moves.try_pop())?;
+        if next.slot < slot {
+            return Some(next);
+        }
+        self.held = Some(next);
+        None
+    }
 }
 
 /// One frame of light as it was emitted, moved by tracks where they moved it. Of the last frame of a run the moves may be
@@ -64,7 +103,7 @@ struct Sent {
 /// Records the light of a mock projector.
 pub(crate) struct LightRecorder {
     /// `None` after [`LightRecorder::close`].
-    notes: Option<Sender<LightNote>>,
+    lights: Option<LightSender>,
     /// Notes for which there was no room.
     pub notes_lost: u64,
     keep: usize,
@@ -86,19 +125,19 @@ pub(crate) struct LightRecorder {
 }
 
 impl LightRecorder {
-    /// Sends notes to `notes` and keeps the last frames of light and the shifts of the last slots, as many of each as
+    /// Sends notes to `lights` and keeps the last frames of light and the shifts of the last slots, as many of each as
     /// `keep` says. `hash`: hashes every frame of light.
     /// `is_marked`: the planes, in the order of `schedule`, come from [`crate::pack::prepared`] and are checked for parts of
     /// other frames.
     pub(crate) fn new(
-        notes: Sender<LightNote>,
+        lights: LightSender,
         [keep, keep_moves]: [usize; 2],
         hash: bool,
         schedule: PlaneSchedule,
         is_marked: bool,
     ) -> Self {
         Self {
-            notes: Some(notes),
+            lights: Some(lights),
             notes_lost: 0,
             keep,
             hash,
@@ -140,7 +179,7 @@ impl LightRecorder {
     }
 
     fn drain(&mut self, mock: &mut MockProjector, watch: Stopwatch) {
-        let mut moves = self.take_moves(mock);
+        self.take_moves(mock);
         while let Some(event) = mock.next_light() {
             let mut hash = 0;
             if event.kind == LightKind::Lit && (self.hash || self.keep > 0) {
@@ -156,9 +195,8 @@ impl LightRecorder {
                 self.lit_at = event.first_photon_at;
             }
             let torn = event.kind == LightKind::Lit && self.is_torn(mock, event.frame);
-            let note =
-                LightNote { event, hash, torn, wall_ns: watch.elapsed_ns(), unseen: 0, moves: moves.take() };
-            if self.notes.as_mut().is_none_or(|notes| notes.push(note).is_err()) {
+            let note = LightNote { event, hash, torn, wall_ns: watch.elapsed_ns(), unseen: 0 };
+            if self.lights.as_mut().is_none_or(|lights| lights.notes.push(note).is_err()) {
                 self.notes_lost += 1;
             }
         }
@@ -180,13 +218,15 @@ impl LightRecorder {
         self.sent.planes.extend_from_slice(mock.lit_planes().unwrap_or(&[]));
     }
 
-    /// Takes what tracks made of the slots that are over, and makes it a part of their light. Returns the last of them that
-    /// is followed plane by plane.
-    fn take_moves(&mut self, mock: &mut MockProjector) -> Option<Box<SlotMoves>> {
-        let mut followed = None;
+    /// Takes what tracks made of the slots that are over, and makes it a part of their light. Sends those that are followed
+    /// plane by plane.
+    fn take_moves(&mut self, mock: &mut MockProjector) {
         while let Some(moves) = mock.next_moves() {
             if is_followed(u64::from(moves.frame)) {
-                followed = Some(Box::new(moves));
+                if let Some(lights) = &mut self.lights {
+                    // Without them the frame is not followed, and the report says of how many frames its figures are.
+                    let _ = lights.moves.push(moves);
+                }
             }
             self.apply(mock.raster(), &moves);
             if self.keep_moves == 0 {
@@ -197,7 +237,6 @@ impl LightRecorder {
             }
             self.moves.push_back(moves);
         }
-        followed
     }
 
     /// Makes the moves of a slot a part of its light.
@@ -242,7 +281,7 @@ impl LightRecorder {
 
     /// Ends the notes: their receiver comes to the end.
     pub(crate) fn close(&mut self) {
-        self.notes = None;
+        self.lights = None;
     }
 
     fn is_torn(&self, mock: &MockProjector, frame: Option<u32>) -> bool {

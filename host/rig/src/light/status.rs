@@ -155,14 +155,7 @@ impl StatusLight {
                 first_photon_at: time.host_of(start).plus_ns(self.light_delay_ns),
                 last_photon_at: time.host_of(time.start(slot + 1)).plus_ns(self.light_delay_ns),
             };
-            let _ = self.lights.push(LightNote {
-                event,
-                hash: 0,
-                torn: false,
-                wall_ns: 0,
-                unseen: told,
-                moves: None,
-            });
+            let _ = self.lights.push(LightNote { event, hash: 0, torn: false, wall_ns: 0, unseen: told });
         }
     }
 

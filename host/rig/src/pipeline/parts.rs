@@ -7,7 +7,7 @@ use crate::engine::connect::{connect, ENDED_WITH_THE_LAST_RUN};
 use crate::engine::error::PipelineError;
 use crate::engine::options::RunOptions;
 use crate::frame::job::FrameMemory;
-use crate::light::recorder::{LightNote, LightRecorder};
+use crate::light::recorder::{LightRecorder, LightSender};
 use crate::mock::{DeviceClock, EmulatedProjector, MockConfig};
 use crate::pack::prepared::PreparedFrames;
 use crate::pack::source::{PatternPainter, PatternSource, Pictures};
@@ -22,7 +22,6 @@ use dpm_device::link::{HostLink, LinkSettings};
 use dpm_device::time::{HostClock, HostTime};
 use dpm_device::tracker::Tracker;
 use dpm_device::transport::Transport;
-use dpm_handoff::channel::Sender;
 use dpm_render::gpu::Gpu;
 use dpm_render::pack::{BitPlaneFrame, Kernel};
 use dpm_render::{RenderError, Renderer, RendererSettings};
@@ -174,7 +173,7 @@ fn frame_memory(rig: &Rig, renderer: Option<&mut Renderer>) -> Result<FrameMemor
 pub(super) fn mock_projector(
     rig: &Rig,
     mock: &MockProjectorConfig,
-    lights: Sender<LightNote>,
+    lights: LightSender,
     options: RunOptions,
     marked: bool,
     start: HostTime,

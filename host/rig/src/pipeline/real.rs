@@ -6,7 +6,7 @@ use super::link::{device_thread, link_thread, Line};
 use super::parts::{bring_up, mock_projector, CrewParts, Origin};
 use super::projector;
 use super::rights::Rights;
-use super::run::{Ran, LIGHTS};
+use super::run::Ran;
 use super::settings::lead_estimator;
 use super::supervisor::{join_within, Maker, Supervisor};
 use super::threads::{policy, Shared, NOTES, STAGE_THREADS};
@@ -19,7 +19,7 @@ use crate::engine::options::RunOptions;
 use crate::engine::pulse::Pulse;
 use crate::engine::supervision::{Remake, Supervision};
 use crate::light::collector::{Collector, Inbox};
-use crate::light::recorder::{LightNote, LightRecorder};
+use crate::light::recorder::{light_channel, LightNote, LightReceiver, LightRecorder, LightSender};
 use crate::rig::{Rig, RigError};
 use crate::telemetry::monitor::RunMonitor;
 use crate::telemetry::projector::ProjectorReport;
@@ -64,7 +64,7 @@ pub(super) fn run_at_real_pace(
     let spin_ns = if usable_cores() > STAGE_THREADS { 50_000 } else { 0 };
     let clock = origin.clock().map_or_else(|| MonotonicClock::new(spin_ns), |clock| clock.spinning(spin_ns));
     let parts = crew_parts(rig, origin, options, clock)?;
-    let (lights_in, lights) = channel(LIGHTS, WaitPolicy::Park);
+    let (lights_in, lights) = light_channel();
     let rights = Arc::new(Rights::new(&rig.config.real_time));
     let standstill =
         StandstillMonitor::start(Arc::new(clock.sleeping()), STANDSTILL_NS, rights.highest_priority()).ok();
@@ -173,7 +173,7 @@ struct FarEnd {
 
 fn open_far_end(
     rig: &Rig,
-    lights: Sender<LightNote>,
+    lights: LightSender,
     options: RunOptions,
     marked: bool,
     clock: MonotonicClock,
@@ -210,7 +210,7 @@ fn open_far_end(
     let (mut transport, warnings) = (medium.transport, medium.warnings);
     // Replies are stamped when they arrive, not when they are read.
     transport.set_clock(Arc::new(move || clock.now()));
-    Ok(FarEnd { medium: transport, device: None, lights: Some(lights), warnings })
+    Ok(FarEnd { medium: transport, device: None, lights: Some(lights.notes), warnings })
 }
 
 /// Returns the recorder of the mock's thread, which ends when its cable is unplugged.
@@ -241,7 +241,7 @@ impl Threads {
         parts: CrewParts,
         line: Line,
         maker: Maker,
-        lights: dpm_handoff::channel::Receiver<LightNote>,
+        lights: LightReceiver,
     ) -> Result<(Self, Inbox, NotesBack), PipelineError> {
         let notes_back = NotesBack::default();
         let (crew, port) = Crew::start(shared, parts, &notes_back)?;

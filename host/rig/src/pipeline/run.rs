@@ -22,9 +22,6 @@ use dpm_render::gpu::Gpu;
 use std::sync::atomic::Ordering;
 use std::sync::Arc;
 
-/// Capacity for light events between the projector and the collector: eight seconds at 947 Hz.
-pub(super) const LIGHTS: usize = 8192;
-
 /// Runs the rig until `options.frames` are planned or `monitor` requests a stop. The projector ends dark.
 ///
 /// # Errors

@@ -2,7 +2,7 @@
 //! the modelled cost in the rig file, so a run is a function of its inputs, however fast or busy the machine is.
 
 use super::parts::{bring_up, mock_projector, CrewParts, Origin, FIRST_FRAME_TIMEOUT_NS};
-use super::run::{Ran, LIGHTS};
+use super::run::Ran;
 use super::settings::lead_estimator;
 use super::supervisor::leave_behind;
 use super::threads::{enter_frame_path, may_stall, read_tracker, rendered, NOTES, WARM_UP_FRAMES};
@@ -18,7 +18,7 @@ use crate::engine::plan::{PlanStage, LISTEN_NS};
 use crate::frame::job::{Fate, FrameJob, FrameMemory, FrameNote};
 use crate::frame::Stage;
 use crate::light::collector::{Collector, Inbox};
-use crate::light::recorder::LightRecorder;
+use crate::light::recorder::{light_channel, LightRecorder};
 use crate::mock::EmulatedProjector;
 use crate::plan::link_time::LinkTime;
 use crate::rig::{Rig, RigError};
@@ -53,7 +53,7 @@ pub(super) fn run_at_virtual_pace(
     let mut parts = CrewParts::new(rig, origin, options, Arc::new(|| HostTime(0)))?;
     // The link comes up just before the first frame. The filters need the time before that.
     let mut now = HostTime(LISTEN_NS);
-    let (lights_in, lights) = channel(LIGHTS, WaitPolicy::Park);
+    let (lights_in, lights) = light_channel();
     let ProjectorBackend::Mock(mock) = &rig.config.projector.backend else {
         let told = "real_time.pace = \"virtual\" works only with the mock projector";
         return Err(RigError::Unsupported(told.into()).into());

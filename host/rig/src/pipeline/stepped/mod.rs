@@ -22,7 +22,7 @@ use crate::engine::pulse::Pulse;
 use crate::engine::supervision::{Irreplaceable, Making, Remake, Supervision, Verdict};
 use crate::frame::job::FrameNote;
 use crate::light::collector::{Collector, Inbox};
-use crate::light::recorder::LightNote;
+use crate::light::recorder::light_channel;
 use crate::plan::dark::DarkCause;
 use crate::plan::link_time::LinkTime;
 use crate::rig::Rig;
@@ -55,8 +55,6 @@ const COLLECT_NS: i64 = 2_000_000;
 const COLLECT_WITHIN_NS: i64 = 5_000_000_000;
 /// Notes that circulate between planning and the collector.
 const NOTES: usize = 256;
-/// Light notes between the link and the collector.
-const LIGHTS: usize = 8192;
 
 /// The parts of a run that a [`Machine`] gives time to.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash)]
@@ -360,9 +358,10 @@ impl Running {
         let lead = lead_estimator(&rig, &link, frame_ns);
         let options = RunOptions { verify: false, ..RunOptions::default() };
         let facts = Arc::new(Facts::new(rig.clone(), monitor, options, &lead, now));
-        let (lights_in, lights) = channel::<LightNote>(LIGHTS, WaitPolicy::Park);
+        let (lights_in, lights) = light_channel();
         let (done_in, done) = channel(2 * NOTES, WaitPolicy::Park);
-        let keeper = LinkKeeper::new(time, &link, Some((lights_in, rig.config.projector.light_delay_ns())));
+        let keeper =
+            LinkKeeper::new(time, &link, Some((lights_in.notes, rig.config.projector.light_delay_ns())));
         let stage = LinkStage::new(facts.clone(), link, keeper, lead);
         let mut line = Line::new(stage, done_in, now);
         let tracker = run.machine.opens_tracker(now);
