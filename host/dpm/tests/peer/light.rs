@@ -253,6 +253,11 @@ impl Peer {
     /// Performs everything that happens by itself up to now, in order of time.
     pub(super) fn advance(&mut self) {
         let now = self.now();
+        self.advance_to(now);
+        self.light_planes(now);
+    }
+
+    fn advance_to(&mut self, now: u64) {
         while let Some(config) = self.config.clone() {
             let bites = match self.fault.as_str() {
                 "watchdog" => u64::MAX,
@@ -292,13 +297,16 @@ impl Peer {
 
     pub(super) fn end_light(&mut self, now: u64) {
         if self.dark_at().is_some_and(|d| d <= now) {
+            self.light_planes(now);
             self.light = false;
             self.shown = None;
+            self.following.forget();
             self.say_status = true;
         }
     }
 
     fn slot(&mut self, config: &Config, start: u64) {
+        self.light_planes(start);
         let slot = self.next_slot;
         self.next_slot += 1;
         self.say_status |= !self.breaks("status-slots");
@@ -368,6 +376,7 @@ impl Peer {
             self.n.blank += u32::from(!self.breaks("slots-counted"));
             self.light = false;
         }
+        self.begin_planes(config, slot);
         if self.flash.slot(start, luminance) && !self.breaks("flashes") {
             self.rest_until = start + 2 * HZ;
             self.latch(1 << 6);

@@ -3,6 +3,7 @@
 #![allow(dead_code)]
 
 mod light;
+mod tracks;
 mod wire;
 
 use light::{Flash, Level};
@@ -14,6 +15,7 @@ use std::os::unix::fs::OpenOptionsExt;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::Arc;
 use std::time::{Duration, Instant};
+use tracks::Following;
 use wire::{crc, packet, u16_at, u32_at, u64_at, unstuffed};
 
 /// A clock rate that no frame rate divides.
@@ -40,6 +42,7 @@ struct Config {
     watchdog: u64,
     blank: bool,
     late: u64,
+    tracks: bool,
     epoch: u64,
     leds: Vec<u8>,
 }
@@ -108,6 +111,7 @@ pub(crate) struct Peer {
     damaged: u32,
     flash: Flash,
     level: Level,
+    following: Following,
     line: Vec<u8>,
     half: Vec<u8>,
     out: Vec<u8>,
@@ -209,6 +213,7 @@ impl Peer {
             damaged: 0,
             flash: Flash::default(),
             level: Level::default(),
+            following: Following::default(),
             line: Vec::new(),
             half: Vec::new(),
             out: Vec::new(),
@@ -272,7 +277,7 @@ impl Peer {
             let pad = (4 - n % 4) % 4;
             let whole = 32 + if n == 0 { 0 } else { n + pad + 4 };
             let foreign = b[4] != 2 && !self.breaks("version-foreign")
-                || !(1..=13).contains(&b[5])
+                || !(1..=14).contains(&b[5])
                 || b[6] > 3 && !self.breaks("flags-unknown");
             if foreign && self.breaks("type-unknown") {
                 b = &b[1..];
@@ -367,6 +372,7 @@ impl Peer {
                 self.light |= self.breaks("freeze-dark");
                 self.say_status = true;
             }
+            14 => self.tracks(payload),
             13 => {
                 if self.arriving.take().is_some_and(|a| !a.refused) {
                     self.n.incomplete += 1;
@@ -397,7 +403,8 @@ impl Peer {
             }
             return false;
         }
-        if !self.breaks("watchdog-fed") || kind == 2 {
+        let is_deaf = self.breaks("watchdog-fed") || kind == 14 && self.breaks("tracks-watchdog");
+        if kind == 2 || !is_deaf {
             self.heard = self.now();
         }
         true
@@ -479,6 +486,7 @@ impl Peer {
         ] {
             p.extend(v.to_le_bytes());
         }
+        p.extend(self.track_counts());
         self.say(4, session, &p);
     }
 
@@ -511,13 +519,15 @@ impl Peer {
             if !self.breaks("hello-new") {
                 self.n = Counts::default();
             }
+            self.following = Following::default();
         }
         let mut a = 2u16.to_le_bytes().to_vec();
         a.extend(0x0305u16.to_le_bytes());
         a.extend(self.codecs.to_le_bytes());
         a.extend(WIDTH.to_le_bytes());
         a.extend(HEIGHT.to_le_bytes());
-        a.extend([MOST_PLANES, BUFFERS as u8, 0, 0]);
+        a.extend([MOST_PLANES, BUFFERS as u8]);
+        a.extend(self.offer());
         a.extend((HZ as u32).to_le_bytes());
         a.extend(SHORTEST_PLANE_NS.to_le_bytes());
         a.extend(77u64.to_le_bytes());
@@ -572,6 +582,7 @@ impl Peer {
             watchdog: watchdog * HZ / 1_000_000,
             blank: p[17] == 1,
             late,
+            tracks: p[19] & 2 != 0,
             epoch: u64_at(p, 24),
             leds,
         });
@@ -635,6 +646,9 @@ impl Peer {
             self.waiting.len() as u32 + u32::from(self.arriving.take().is_some_and(|a| !a.refused));
         self.waiting.clear();
         (self.shown, self.base) = (None, None);
+        if !self.breaks("tracks-forgotten") {
+            self.following.forget();
+        }
         self.say_status = true;
     }
 

@@ -16,6 +16,7 @@ mod safety;
 mod session;
 mod shot;
 mod time;
+mod tracks;
 mod watchdog;
 
 pub use driver::{Medium, MediumKind};
@@ -75,6 +76,7 @@ pub fn rules() -> impl Iterator<Item = &'static Rule> {
         codecs::RULES,
         packets::RULES,
         safety::RULES,
+        tracks::RULES,
         time::RULES,
     ]
     .into_iter()
