@@ -12,3 +12,6 @@ pub use dpm_device::projector::{
 };
 pub use emulated::EmulatedProjector;
 pub use faulty::FaultyProjector;
+
+/// By how many mirrors a mock in the same process moves light at most, as tracks say.
+pub const GREATEST_SHIFT: u8 = 16;

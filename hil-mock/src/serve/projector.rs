@@ -8,7 +8,7 @@ use std::sync::{Arc, Mutex, PoisonError};
 use std::time::Duration;
 
 use clap::{Args, ValueEnum};
-use dpm_device::link::faults;
+use dpm_device::link::{faults, MAX_SHIFT};
 use dpm_device::planes::Raster;
 use dpm_device::time::HostTime;
 use dpm_device::transport::LinkDevice;
@@ -32,6 +32,9 @@ pub(crate) struct ProjectorArguments {
     /// Whole frames that can wait
     #[arg(long, default_value_t = 4, value_parser = clap::value_parser!(u8).range(1..=64))]
     buffers: u8,
+    /// Offer to follow tracks, and move light by this many mirrors at most. Pictures and logs of the light show frames as they were sent
+    #[arg(long, value_name = "MIRRORS", value_parser = clap::value_parser!(u8).range(1..=MAX_SHIFT as i64))]
+    greatest_shift: Option<u8>,
     /// Serial number
     #[arg(long, default_value_t = 1)]
     serial_number: u64,
@@ -112,6 +115,7 @@ pub(super) fn run_beside(
     let projector = MockProjector::new(MockConfig {
         frame_buffers: arguments.buffers,
         serial: arguments.serial_number,
+        greatest_shift: arguments.greatest_shift,
         events_kept: 0,
         shown_kept,
         ..MockConfig::new(arguments.raster)

@@ -4,7 +4,7 @@
 mod cli_common;
 mod peer;
 
-use cli_common::{code, dpm, err, out};
+use cli_common::{code, dpm, err, out, own_folder};
 use dpm_device::link::packet_bytes;
 use dpm_device::planes::Raster;
 use dpm_device::time::HostTime;
@@ -77,6 +77,25 @@ fn a_device_that_breaks_a_rule_fails_it() {
         judges.into_iter().flat_map(|j| j.join().expect("no panic")).collect()
     });
     assert!(unnoticed.is_empty(), "faults that went unnoticed:\n{}", unnoticed.join("\n"));
+}
+
+/// Nothing ends a transfer to a device in this process, and it has no plug. It reads every codec, and nobody may be flashed at
+/// unasked.
+#[test]
+fn the_mock_projector_keeps_every_rule() {
+    let rig = concat!(env!("CARGO_MANIFEST_DIR"), "/../../rigs/demo.toml");
+    let folder = format!("output.dir={:?}", own_folder("mock-conformance"));
+    let output = dpm(&["link-test", rig, "--conformance", "--json", "--set", &folder], &[]);
+    assert_eq!(code(&output), 0, "{}{}", out(&output), err(&output));
+    let json: serde_json::Value = serde_json::from_str(&out(&output)).expect("one object");
+    let lines = json["lines"].as_array().expect("lines");
+    assert_eq!(lines.len(), rules().count());
+    let not_judged: Vec<&str> = lines
+        .iter()
+        .filter(|line| line["verdict"] == "not_judged")
+        .map(|line| line["rule"].as_str().unwrap_or(""))
+        .collect();
+    assert_eq!(not_judged, ["codec-unnamed", "cut-short", "flashes", "replug"], "{json:#}");
 }
 
 #[test]

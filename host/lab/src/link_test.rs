@@ -19,7 +19,7 @@ use dpm_rig::pipeline::projector::{self, Surroundings};
 use dpm_rig::pipeline::{connect, renderer_settings, PipelineError, ENDED_WITH_THE_LAST_RUN};
 use dpm_rig::rig::Rig;
 use dpm_rig::telemetry::monitor::RunMonitor;
-use hil_mock::projector::{serve_cable, EmulatedProjector, MockConfig};
+use hil_mock::projector::{serve_cable, EmulatedProjector, MockConfig, GREATEST_SHIFT};
 use std::sync::Arc;
 use std::time::Duration;
 
@@ -154,6 +154,7 @@ impl Far {
         let setup = MockConfig {
             frame_buffers: mock.buffer_frames.min(64) as u8,
             events_kept: 0,
+            greatest_shift: Some(GREATEST_SHIFT),
             ..MockConfig::new(raster)
         };
         let frame_buffers = usize::from(setup.frame_buffers);

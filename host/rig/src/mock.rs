@@ -8,7 +8,7 @@ use hil_mock::tracker::TRACKER_FAULTS;
 pub(crate) use hil_mock::faults::{FaultError, FaultPlan};
 pub(crate) use hil_mock::motion::{Motion, MotionError, MotionSpec};
 pub(crate) use hil_mock::projector::{
-    serve_cable, DeviceClock, EmulatedProjector, MockConfig, MockProjector, Served,
+    serve_cable, DeviceClock, EmulatedProjector, MockConfig, MockProjector, Served, GREATEST_SHIFT,
 };
 pub(crate) use hil_mock::tracker::{MockTracker, MockTrackerConfig, MockTrackerError};
 

@@ -8,7 +8,7 @@ use crate::engine::error::PipelineError;
 use crate::engine::options::RunOptions;
 use crate::frame::job::FrameMemory;
 use crate::light::recorder::{LightRecorder, LightSender};
-use crate::mock::{DeviceClock, EmulatedProjector, MockConfig};
+use crate::mock::{DeviceClock, EmulatedProjector, MockConfig, GREATEST_SHIFT};
 use crate::pack::prepared::PreparedFrames;
 use crate::pack::source::{PatternPainter, PatternSource, Pictures};
 use crate::pipeline::projector;
@@ -31,8 +31,6 @@ use std::sync::Arc;
 /// busy machine.
 pub(super) const FIRST_FRAME_TIMEOUT_NS: u64 = 180_000_000_000;
 
-/// By how many mirrors the mock moves light at most as tracks say.
-const GREATEST_SHIFT: u8 = 16;
 /// Slots whose shifts wait in the mock to be recorded.
 const MOVES_KEPT: usize = 64;
 
