@@ -138,7 +138,9 @@ fn frames_and_their_inverse_do_the_same_on_a_projector_of_binary_planes() {
     );
     // As above, half as much again covers a busy machine.
     assert!(predicted < 1.0 && errors[989] < 1.5 * predicted, "{}, predicted {predicted}", errors[989]);
-    assert!(latency.latency_us.abs() < 300.0 && latency.sigma_us < 200.0, "{latency:?}");
+    // On an idle machine it is a tenth of a millisecond; builds beside it made it 0.18 ms. The middle of the slot instead of the
+    // centre of its light would be 2.6 ms off.
+    assert!(latency.latency_us.abs() < 600.0 && latency.sigma_us < 300.0, "{latency:?}");
 }
 
 /// Points all over the picture of a wide lens, aimed at with an error of 0.05 pixels: `x y z column row`.
