@@ -127,7 +127,7 @@ fn frames_and_their_inverse_do_the_same_on_a_projector_of_binary_planes() {
     let too_bright = folder.dpm(&[&frames[..], &["--seconds", "6"]].concat());
     assert_eq!(too_bright.status.code(), Some(2), "{}", text(&too_bright));
     assert!(text(&too_bright).contains("choose a lower --gain"), "{}", text(&too_bright));
-    let told = folder.done(&[&frames[..], &["--gain", "6", "--seconds", "45"]].concat());
+    let told = folder.done(&[&frames[..], &["--gain", "6", "--seconds", "60"]].concat());
     let file = folder.calibration();
     let errors = errors_in_the_beam(&file, &truth(128, 96, 225.0));
     let predicted = file.projector.as_ref().unwrap().predicted_p99_px;

@@ -21,8 +21,9 @@ const FEWEST: usize = 300;
 pub const FEWEST_PLACES: usize = 8;
 /// The tip is held still if it moves by no more than this, metres.
 const STILL_M: f64 = 2e-3;
-/// Rounds of the code within which all stripes must be seen at a place.
-const MOST_ROUNDS: u64 = 3;
+/// Rounds of the code within which all stripes must be seen at a place. On a busy machine every other frame may be late;
+/// that the wand is still for as long is looked at apart.
+const MOST_ROUNDS: u64 = 8;
 /// Places that are nearer than this to each other are one, metres.
 const APART_M: f64 = 0.03;
 /// Latencies of a display and a tracker together, seconds.
