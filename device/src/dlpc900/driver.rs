@@ -9,7 +9,8 @@ use super::command::{
     Command, Malformed, Opcode, ReplyAssembler, TooLong, MAX_BMP_BYTES, MAX_REPLY_DATA, REPORT_BYTES,
 };
 use super::lut::{DisplayMode, Dmd};
-use super::sequence::{self, LedSetup, PatternSequence, SequenceError, Step, Version, VideoPatterns};
+use super::sequence::{self, LedSetup, PatternSequence, SequenceError, Step, Version};
+use super::video::VideoPatterns;
 
 /// Timeout for sending one report, and for receiving one reply. The controller answers within a few milliseconds; while
 /// it takes an image it may refuse data for some time.
@@ -18,6 +19,10 @@ const TIMEOUT: Duration = Duration::from_millis(1000);
 const MOST_STALE: usize = 8;
 /// Pause between two polls of the status while waiting, and the longest time until a stop is noticed during a wait.
 const POLL: Duration = Duration::from_millis(20);
+/// From the start of video patterns to the switch of the LEDs: by then an abort would have been reported.
+const ABORT_SHOWS: Duration = Duration::from_millis(500);
+/// How often a start of video patterns is tried.
+const MOST_STARTS: u32 = 4;
 /// Timeout for one report once a stop was requested: the process must end within two seconds, whatever the cable does.
 const HURRY: Duration = Duration::from_millis(250);
 /// How long a [`DarkLine`] waits for a pending command, so as not to disturb its reply.
@@ -257,6 +262,11 @@ impl Status {
     /// The video source is locked.
     pub const fn is_locked(&self) -> bool {
         self.main & 8 != 0
+    }
+
+    /// A sequence was aborted: the patterns of a video frame had not ended when the next frame began.
+    pub const fn is_aborted(&self) -> bool {
+        self.hardware & 0x40 != 0
     }
 
     /// The errors in the hardware bits, if any.
@@ -665,10 +675,34 @@ impl<P: HidPort> Dlpc900<P> {
         self.run(&sequence.upload(leds, self.firmware), progress)
     }
 
-    /// Sets up video patterns and starts them.
+    /// Sets up video patterns and starts them, with the LEDs last: what is wrong with the signal shows in the dark.
+    ///
+    /// # Errors
+    /// Those of the cable and of the controller; [`Dlpc900Error::Hardware`] if the sequence aborts every time.
     pub fn start_video_patterns(&mut self, video: &VideoPatterns) -> Result<(), Dlpc900Error> {
-        self.load_video_patterns(video)?;
-        self.start()
+        let steps = video.dark_steps(self.firmware).map_err(SequenceError::from)?;
+        self.run(&steps, &mut |_| ())?;
+        self.start_until_it_runs(video)
+    }
+
+    /// Starts loaded video patterns in the dark. A start in the middle of a change of the signal aborts the sequence, and
+    /// the controller stays in that state; so it is tried some times before the LEDs are switched on.
+    fn start_until_it_runs(&mut self, video: &VideoPatterns) -> Result<(), Dlpc900Error> {
+        let mut tries = 0;
+        loop {
+            self.run(&sequence::start(), &mut |_| ())?;
+            self.pause_for(ABORT_SHOWS)?;
+            let status = self.status()?;
+            tries += 1;
+            if !status.is_aborted() || tries == MOST_STARTS {
+                if let Some(what) = status.complaint() {
+                    return Err(Dlpc900Error::Hardware(what));
+                }
+                break;
+            }
+            self.run(&video.again(), &mut |_| ())?;
+        }
+        self.run(&video.light(), &mut |_| ())
     }
 
     /// Sets up video patterns; they are then loaded and stopped.

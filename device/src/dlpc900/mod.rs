@@ -1,8 +1,8 @@
 //! TI DLPC900 (LightCrafter 6500 / 9000 and relatives): shows patterns through the controller's HID commands.
 //!
 //! Reading order: [`command`] is the byte codec (`no_std`), [`lut`] the pattern table and its timing rules (`no_std`),
-//! `image` the 24-plane image format, `sequence` the order in which the controller expects things, `driver` the
-//! interface for programs, `usb` the cable. Facts: TI DLPU018 (programmer's guide), DLPS037 (data sheet), DLPT028
+//! `image` the 24-plane image format, `sequence` the order in which the controller expects things, `video` the
+//! patterns of a video signal, `driver` the interface for programs, `usb` the cable. Facts: TI DLPU018 (programmer's guide), DLPS037 (data sheet), DLPT028
 //! (errata).
 
 pub mod command;
@@ -15,3 +15,5 @@ pub mod lut;
 pub mod sequence;
 #[cfg(feature = "usb")]
 pub mod usb;
+#[cfg(feature = "std")]
+pub mod video;

@@ -16,9 +16,9 @@ pub const IDLE_LEAST: Duration = Duration::from_secs(3);
 /// Time from "standby" to parked mirrors: two minutes of exercise and three seconds.
 pub const STANDBY_TIME: Duration = Duration::from_secs(123);
 /// LED enable (0x1A07): all off, by hand.
-const LEDS_OFF: u8 = 0;
+pub(super) const LEDS_OFF: u8 = 0;
 /// LED enable (0x1A07): the sequencer lights them.
-const LEDS_BY_SEQUENCER: u8 = 0x08;
+pub(super) const LEDS_BY_SEQUENCER: u8 = 0x08;
 
 /// A firmware version.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash)]
@@ -242,7 +242,7 @@ impl<'a> SequenceBuilder<'a> {
     }
 }
 
-fn write(opcode: Opcode, data: &[u8]) -> Step<'static> {
+pub(super) fn write(opcode: Opcode, data: &[u8]) -> Step<'static> {
     Step::Write(opcode, data.to_vec())
 }
 
@@ -277,7 +277,7 @@ pub struct LedSetup {
 
 impl LedSetup {
     /// Current, polarity, then enable by the sequencer: no LED is lit before its current is right.
-    fn steps(&self) -> Vec<Step<'static>> {
+    pub(super) fn steps(&self) -> Vec<Step<'static>> {
         let mut steps = Vec::new();
         steps.extend(self.current.map(|c| write(Opcode::LED_CURRENT, &c)));
         steps.extend(self.polarity.map(|p| write(Opcode::LED_POLARITY, &[p])));
@@ -287,7 +287,7 @@ impl LedSetup {
 }
 
 /// A mode switch in the dark, with the park cycle that firmware with the block lock needs after it.
-fn switch_mode(mode: DisplayMode, firmware: Version) -> Vec<Step<'static>> {
+pub(super) fn switch_mode(mode: DisplayMode, firmware: Version) -> Vec<Step<'static>> {
     let mut steps = vec![write(Opcode::DISPLAY_MODE, &[mode as u8])];
     steps.extend(unlock_blocks(firmware));
     steps
@@ -302,7 +302,7 @@ pub fn unlock_blocks(firmware: Version) -> Vec<Step<'static>> {
     }
 }
 
-fn table(entries: &[LutEntry], repeat: u32) -> Vec<Step<'static>> {
+pub(super) fn table(entries: &[LutEntry], repeat: u32) -> Vec<Step<'static>> {
     let mut steps: Vec<_> = entries.iter().map(|e| write(Opcode::LUT_DEFINITION, &e.encode())).collect();
     let n = (entries.len() as u16).to_le_bytes();
     let r = repeat.to_le_bytes();
@@ -365,54 +365,6 @@ impl PatternSequence {
         let mut steps = stop();
         steps.extend(table(&self.entries, self.repeat.number(self.entries.len(), firmware)));
         steps
-    }
-}
-
-/// The video input for video-pattern mode.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
-#[repr(u8)]
-pub enum Receiver {
-    /// No receiver: the parallel port is fed directly.
-    #[default]
-    None = 0,
-    /// HDMI.
-    Hdmi = 1,
-    /// DisplayPort.
-    DisplayPort = 2,
-}
-
-/// Patterns cut out of a 24-bit video signal.
-#[derive(Clone, Debug, PartialEq, Eq)]
-pub struct VideoPatterns {
-    /// The DMD.
-    pub dmd: Dmd,
-    /// The video input.
-    pub receiver: Receiver,
-    /// Frames per second of the video, at most 120.
-    pub frame_hz: u32,
-    /// The table; every entry's image is 0, its planes are those of the video frame.
-    pub entries: Vec<LutEntry>,
-    /// LEDs.
-    pub leds: LedSetup,
-}
-
-impl VideoPatterns {
-    /// Steps from any state to the running sequence. The source is set before the mode, in video mode, and must be locked (about
-    /// 300 ms) before the switch to video patterns: in any other order the controller never locks.
-    pub fn steps(&self, firmware: Version) -> Result<Vec<Step<'static>>, LutError> {
-        let frame_us = Some(1_000_000 / u64::from(self.frame_hz.clamp(1, 120)));
-        validate(&self.entries, &Limits { dmd: self.dmd, images: 1, frame_us })?;
-        let mut steps = stop();
-        steps.push(write(Opcode::LED_ENABLE, &[LEDS_OFF]));
-        steps.push(write(Opcode::RECEIVER, &[self.receiver as u8]));
-        // Parallel port, 24 bits.
-        steps.push(write(Opcode::INPUT_SOURCE, &[0x08]));
-        steps.extend(switch_mode(DisplayMode::Video, firmware));
-        steps.push(Step::WaitLocked(Duration::from_secs(3)));
-        steps.extend(switch_mode(DisplayMode::VideoPattern, firmware));
-        steps.extend(table(&self.entries, 0));
-        steps.extend(self.leds.steps());
-        Ok(steps)
     }
 }
 
@@ -545,24 +497,6 @@ mod tests {
         let before = s.clone();
         assert_eq!(s.retime(|e| (if e.index == 1 { 104 } else { 105 }, 0)).unwrap_err().entry, 1);
         assert_eq!(s, before);
-    }
-
-    #[test]
-    fn video_patterns_wait_for_the_lock_between_source_and_mode() {
-        let entries: Vec<_> = (0..24).map(|i| LutEntry::one_bit(i, 0, i as u8, 300)).collect();
-        let leds = LedSetup::default();
-        let mut v =
-            VideoPatterns { dmd: Dmd::Dlp6500, receiver: Receiver::Hdmi, frame_hz: 120, entries, leds };
-        let steps = v.steps(NEW).unwrap();
-        assert_eq!(opcodes(&steps[..7]), [0x1a24, 0x1a07, 0x1a01, 0x1a00, 0x1a1b, 2, 0x1a1b]);
-        assert_eq!(steps[4], Step::Write(Opcode::DISPLAY_MODE, vec![0]));
-        assert_eq!(steps[6], Step::Write(Opcode::DISPLAY_MODE, vec![2]));
-        // The LEDs come last; the caller starts the sequence.
-        assert_eq!(steps.last(), Some(&Step::Write(Opcode::LED_ENABLE, vec![LEDS_BY_SEQUENCER])));
-        assert!(!steps.contains(&Step::Write(Opcode::START_STOP, vec![2])));
-        v.entries[23].exposure_us = 1500;
-        assert_eq!(v.steps(NEW).unwrap_err().to_string(),
-            "LUT entry 23: patterns up to here take 8400 us, a video frame has 8333 us: expose shorter or lower the frame rate");
     }
 
     #[test]

@@ -9,6 +9,7 @@ use dpm_device::time::HostTime;
 
 use super::patterns::{Patterns, Refusal};
 use super::registers::{is_loose, setting};
+use super::video::VideoInput;
 use super::{Dlpc900Fault, Options};
 
 /// Time from setting the source until it is locked.
@@ -38,6 +39,8 @@ pub(super) struct Controller {
     pub blocks_locked: bool,
     /// Set by a fault: bits that are added to the hardware status.
     pub hardware_fault: u8,
+    /// What arrives at the video input.
+    pub video: VideoInput,
     pub source_present: bool,
     source_set_at: HostTime,
     park_requested: bool,
@@ -63,6 +66,7 @@ impl Controller {
             parked: false,
             blocks_locked: options.firmware.locks_blocks(),
             hardware_fault: 0,
+            video: VideoInput::default(),
             source_present: options.source_present,
             source_set_at: HostTime(0),
             park_requested: false,
@@ -161,7 +165,13 @@ impl Controller {
         if self.dark_because().is_some() || self.mode == DisplayMode::Video {
             return None;
         }
-        let place = self.patterns.showing(self.elapsed_us(now)?, self.counts_patterns()).0?;
+        let place = if self.has_video() {
+            // Each frame's patterns are shown once, from its synchronisation on.
+            let elapsed = self.video_elapsed_us(now).filter(|us| *us < self.patterns.table_us())?;
+            self.patterns.showing(elapsed, self.counts_patterns()).0?
+        } else {
+            self.patterns.showing(self.elapsed_us(now)?, self.counts_patterns()).0?
+        };
         self.patterns.table().get(place).map(|e| (place, *e)).filter(|(_, e)| e.leds & led::WHITE != 0)
     }
 
@@ -169,7 +179,7 @@ impl Controller {
         self.source_present && now.ns_since(self.source_set_at) >= LOCK_NS
     }
 
-    fn setting(&self, opcode: Opcode) -> Vec<u8> {
+    pub(super) fn setting(&self, opcode: Opcode) -> Vec<u8> {
         let reset = || setting(opcode, self.options.firmware).unwrap_or_default();
         self.settings.get(&opcode.0).cloned().unwrap_or_else(reset)
     }
@@ -342,8 +352,14 @@ impl Controller {
             2 => {
                 let (warnings, faults) =
                     (std::mem::take(&mut self.warnings), std::mem::take(&mut self.faults));
-                let present = self.source_present;
-                *self = Self { warnings, faults, source_present: present, ..Self::new(self.options.clone()) };
+                let (present, video) = (self.source_present, std::mem::take(&mut self.video));
+                *self = Self {
+                    warnings,
+                    faults,
+                    source_present: present,
+                    video,
+                    ..Self::new(self.options.clone())
+                };
             }
             other => return refuse(6, format!("power mode {other} of 0 to 2")),
         }
@@ -391,6 +407,8 @@ impl Controller {
             self.parked = false;
             if std::mem::take(&mut self.park_requested) {
                 self.blocks_locked = false;
+                // The one way out of an abort, seen in the field: stopped, parked, unparked, and the table again.
+                self.hardware_fault &= !0x40;
             }
         }
         Ok(())

@@ -10,6 +10,7 @@ mod descriptors;
 mod patterns;
 mod port;
 mod registers;
+mod video;
 
 use std::collections::VecDeque;
 use std::fmt::Write as _;
@@ -227,7 +228,12 @@ impl Dlpc900Model {
 
     /// Bit `bit` of the `place`-th pattern.
     pub fn projected_bit(&self, place: usize, bit: u8) -> Option<Vec<u8>> {
-        let mut plane = self.controller.patterns.plane(place, bit)?;
+        let mut plane = if self.controller.has_video() {
+            let entry = *self.table().get(place)?;
+            self.controller.video_plane(&entry, bit)?
+        } else {
+            self.controller.patterns.plane(place, bit)?
+        };
         let raster = self.options().dmd.raster();
         let on = |o| self.controller.setting_byte(o) & 1 != 0;
         let (mirror, upside_down, invert) =
@@ -274,6 +280,38 @@ impl Dlpc900Model {
         let mut out = format!("P5\n{} {}\n255\n", raster.width(), raster.height()).into_bytes();
         out.extend(self.projected_grey(place)?);
         Some(out)
+    }
+
+    /// A frame of `size` (columns, rows) has arrived at the video input: its last row is there, and the next frame begins at
+    /// `now`. `pixels` are XRGB8888, row by row; empty for black.
+    pub fn video_frame(&mut self, now: HostTime, size: [u32; 2], pixels: &[u8]) {
+        self.controller.settle(now);
+        self.controller.video_frame(now, size, pixels);
+    }
+
+    /// Light of each mirror in one pass of the table: red, green and blue, in microseconds of a full LED, times 255. It does
+    /// not ask whether anything is lit.
+    pub fn light_of_table(&self) -> Vec<[u64; 3]> {
+        let raster = self.options().dmd.raster();
+        let mut light = vec![[0; 3]; raster.pixel_count()];
+        for (place, entry) in self.table().iter().enumerate() {
+            let full = (1u64 << entry.depth) - 1;
+            for bit in 0..entry.depth {
+                let Some(plane) = self.projected_bit(place, bit) else { continue };
+                let weight = u64::from(entry.exposure_us) * 255 * (1 << bit) / full;
+                let rows = plane.chunks(raster.row_bytes()).zip(light.chunks_mut(raster.width() as usize));
+                for (x, mirror, row) in
+                    rows.flat_map(|(row, out)| out.iter_mut().enumerate().map(move |(x, m)| (x, m, row)))
+                {
+                    if row[x / 8] >> (7 - x % 8) & 1 != 0 {
+                        for (led, light) in mirror.iter_mut().enumerate() {
+                            *light += if entry.leds >> led & 1 != 0 { weight } else { 0 };
+                        }
+                    }
+                }
+            }
+        }
+        light
     }
 
     /// The pattern lit at `now` and its place in the table; `None` while no light leaves the projector.

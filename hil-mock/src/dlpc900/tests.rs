@@ -4,9 +4,8 @@ use super::*;
 use dpm_device::dlpc900::command::Command;
 use dpm_device::dlpc900::driver::{Dlpc900, Dlpc900Error, HidPort, PortError};
 use dpm_device::dlpc900::image::{encode, Compression};
-use dpm_device::dlpc900::sequence::{
-    LedSetup, Pattern, PatternSequence, Receiver, Repeat, SequenceBuilder, VideoPatterns,
-};
+use dpm_device::dlpc900::sequence::{LedSetup, Pattern, PatternSequence, Repeat, SequenceBuilder};
+use dpm_device::dlpc900::video::{Receiver, VideoPatterns};
 use proptest::prelude::*;
 use std::sync::{Arc, Mutex};
 use std::time::Duration;
@@ -303,7 +302,14 @@ fn every_bits_place_in_the_pixel_is_an_option_on_both_sides() {
 fn video_patterns_lock_or_say_that_they_do_not() {
     let entries: Vec<_> = (0..24).map(|i| LutEntry::one_bit(i, 0, i as u8, 300)).collect();
     let leds = LedSetup::default();
-    let video = VideoPatterns { dmd: Dmd::Dlp6500, receiver: Receiver::Hdmi, frame_hz: 60, entries, leds };
+    let video = VideoPatterns {
+        dmd: Dmd::Dlp6500,
+        receiver: Receiver::Hdmi,
+        ports: None,
+        frame_hz: 60,
+        entries,
+        leds,
+    };
     let (model, mut d) = driver(Options { strict: true, ..Options::default() });
     d.start_video_patterns(&video).unwrap();
     assert_eq!(model.lock().unwrap().mode(), DisplayMode::VideoPattern);

@@ -5,11 +5,13 @@
 //! blank. [`mode`] says what a mode is, [`set_up`] chooses connector, mode and properties or says why not, [`encoding`] puts
 //! planes into pixels, [`pacer`] follows the blanks, [`panel`] is the state machine, and [`transport`] its thread at the end
 //! of an in-process cable. [`scan_out`] is what a panel asks of what shows its pictures, [`kms`] what is asked of the kernel
-//! besides, [`card`] the kernel, [`fake`] the one of tests, and [`window`] a window for a desk without a projector.
+//! besides, [`card`] the kernel, [`fake`] the one of tests, [`dlpc900`] a controller that the display feeds, and [`window`] a
+//! window for a desk without a projector.
 //!
 //! **Nothing of this has run on real hardware yet.**
 
 pub mod card;
+pub mod dlpc900;
 pub mod encoding;
 pub mod fake;
 pub mod kms;

@@ -41,7 +41,7 @@ pub(crate) fn run_pattern_dlpc900(
     let pictures = show.pictures().len();
     let mut report = present(&mut open, &Show::Preloaded(sequence), seconds, monitor)?;
     report.frames_loaded = Some(pictures);
-    report.warnings = vec![crate::run_dlpc900::NO_WATCHDOG.to_owned()];
+    report.warnings = vec![dpm_rig::pipeline::projector::NO_WATCHDOG.to_owned()];
     Ok(report)
 }
 

@@ -42,7 +42,8 @@ mod tests {
     use super::*;
     use dpm_device::dlpc900::driver::PortError;
     use dpm_device::dlpc900::lut::{led, Dmd, LutEntry};
-    use dpm_device::dlpc900::sequence::{LedSetup, Receiver, VideoPatterns};
+    use dpm_device::dlpc900::sequence::LedSetup;
+    use dpm_device::dlpc900::video::{Receiver, VideoPatterns};
     use hil_mock::dlpc900::{Dlpc900Model, Options, VirtualHid};
     use std::cell::Cell;
     use std::rc::Rc;
@@ -83,6 +84,7 @@ mod tests {
         VideoPatterns {
             dmd: Dmd::Dlp5500,
             receiver: Receiver::Hdmi,
+            ports: None,
             frame_hz: 60,
             entries: (0..8).map(entry).collect(),
             leds: LedSetup::default(),

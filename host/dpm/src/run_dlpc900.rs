@@ -12,9 +12,10 @@ use dpm_device::dlpc900::driver::{DarkLine, Dlpc900, Dlpc900Error, HidPort, Port
 use dpm_device::dlpc900::image::PlaneOrder;
 use dpm_device::dlpc900::lut::{led, Dmd, LutEntry, IMAGE_PLANES, MAX_IMAGES};
 use dpm_device::dlpc900::sequence::{
-    LedSetup, Pattern, PatternSequence, Receiver, Repeat, SequenceBuilder, SequenceError, VideoPatterns,
+    LedSetup, Pattern, PatternSequence, Repeat, SequenceBuilder, SequenceError,
 };
 use dpm_device::dlpc900::usb::{describe, UsbHid, UsbPlace};
+use dpm_device::dlpc900::video::{share_us, Receiver, VideoPatterns};
 use dpm_device::link::faults;
 use dpm_device::planes::{Channel, PlaneSchedule};
 use dpm_lab::sequence::{draw, poses_at};
@@ -23,6 +24,7 @@ use dpm_render::{RenderError, Renderer};
 use dpm_rig::config::{Dlpc900Config, Dlpc900Mode, ProjectorBackend, RigConfig, TrackerConfig, VideoInput};
 use dpm_rig::failure::{Failure, FailureKind};
 use dpm_rig::order::Order;
+use dpm_rig::pipeline::projector::NO_WATCHDOG;
 use dpm_rig::pipeline::{renderer_settings, PipelineError};
 use dpm_rig::rig::Rig;
 use dpm_rig::run_rig::open_gpu;
@@ -43,11 +45,6 @@ const AGAIN_NS: u64 = 10_000_000;
 const BUSY_PATIENCE_NS: u64 = 5_000_000_000;
 /// How often to query the controller's state, and to search for a lost controller.
 const LOOK_NS: u64 = 200_000_000;
-
-/// What every report on a DLPC900 says.
-pub(crate) const NO_WATCHDOG: &str =
-    "a DLPC900 has no watchdog: if this machine fails, or this program and its guard process are both killed, it continues \
-     to show its patterns; `dpm dlpc900 idle` ends that";
 
 /// Report of a run on a DLPC900.
 #[derive(Clone, Debug, serde::Serialize)]
@@ -308,7 +305,7 @@ fn video(config: &RigConfig, backend: &Dlpc900Config, dmd: Dmd) -> VideoPatterns
     let rate = config.projector.frame_rate;
     let frame_hz = rate.hz().round() as u32;
     let patterns = config.projector.planes as u8;
-    let share = 1_000_000 / frame_hz.max(1) / u32::from(patterns);
+    let share = share_us(frame_hz, patterns);
     let exposure_us = backend.exposure_us.unwrap_or(share).min(share);
     let entry = |i: u8| LutEntry { leds: led::WHITE, ..LutEntry::one_bit(i.into(), 0, i, exposure_us) };
     VideoPatterns {
@@ -318,6 +315,7 @@ fn video(config: &RigConfig, backend: &Dlpc900Config, dmd: Dmd) -> VideoPatterns
             VideoInput::Hdmi => Receiver::Hdmi,
             VideoInput::DisplayPort => Receiver::DisplayPort,
         },
+        ports: None,
         frame_hz,
         entries: (0..patterns).map(entry).collect(),
         leds: LedSetup::default(),

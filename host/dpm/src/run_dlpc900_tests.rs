@@ -237,6 +237,7 @@ fn shows() -> [Show; 2] {
     let video = VideoPatterns {
         dmd: DMD,
         receiver: Receiver::Hdmi,
+        ports: None,
         frame_hz: 60,
         entries: (0..8).map(entry).collect(),
         leds: LedSetup::default(),

@@ -151,6 +151,12 @@ fn sweep(
     monitor: &Arc<RunMonitor>,
 ) -> Result<Paced<Sweep>, Failure> {
     let raster = config.projector.raster();
+    if !config.projector.is_lit_without_gap() {
+        return Err(refused(
+            "the codes of a light sensor need light without gaps, and a DLPC900 behind a display is dark at the end of \
+             every frame; calibrate by hand: leave --sensor out",
+        ));
+    }
     let settings = |timing: Timing, poses: &[Stamped]| {
         let tips = poses.iter().map(|p| p.place(tip));
         let volume = Volume::around(tips).ok_or_else(|| refused("the wand was not tracked"))?;

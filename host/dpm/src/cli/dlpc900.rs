@@ -9,8 +9,9 @@ use dpm_common::guardian::{self, Guardian};
 use dpm_device::dlpc900::driver::{Dlpc900, Dlpc900Error, UploadProgress};
 use dpm_device::dlpc900::image::{Compression, PlaneOrder};
 use dpm_device::dlpc900::lut::{led, LutEntry};
-use dpm_device::dlpc900::sequence::{LedSetup, Receiver, Repeat, VideoPatterns};
+use dpm_device::dlpc900::sequence::{LedSetup, Repeat};
 use dpm_device::dlpc900::usb::{describe, list, UsbHid, UsbPlace};
+use dpm_device::dlpc900::video::{share_us, Receiver, VideoPatterns};
 use dpm_rig::config::{Dlpc900Config, ProjectorBackend};
 use dpm_rig::failure::{Failure, FailureKind};
 use dpm_rig::standing::Identity;
@@ -107,7 +108,7 @@ struct VideoArgs {
     /// Patterns per frame, 1 bit each
     #[arg(long, default_value_t = 24, value_parser = clap::value_parser!(u8).range(1..=24))]
     patterns: u8,
-    /// Exposure, microseconds; default: an equal share of the frame
+    /// Exposure, microseconds; default: an equal share of the frame, of which 250 us are left
     #[arg(long)]
     exposure_us: Option<u32>,
     /// LEDs lit
@@ -270,8 +271,18 @@ fn guard(place: Option<UsbPlace>) -> Result<(), Failure> {
 pub(super) struct Guard(Option<Guardian>);
 
 impl Guard {
+    /// The guard of a run on `backend`; `None` if no DLPC900 is part of it.
+    pub(super) fn of(backend: &ProjectorBackend) -> Option<Self> {
+        let device = match backend {
+            ProjectorBackend::Dlpc900(controller) => &controller.device,
+            ProjectorBackend::Display(display) => &display.dlpc900.as_ref()?.device,
+            _ => return None,
+        };
+        Some(Self::start(device.as_deref()))
+    }
+
     /// Starts it. If that fails, the run continues without this precaution.
-    pub(super) fn start(device: Option<&str>) -> Self {
+    fn start(device: Option<&str>) -> Self {
         let start = || {
             let mut command = std::process::Command::new(std::env::current_exe()?);
             command.args(["dlpc900", "guard"]).stdout(Stdio::null());
@@ -338,7 +349,7 @@ fn execute_upload(d: &mut Dlpc900<UsbHid>, u: &UploadArgs) -> Result<(), Failure
 }
 
 fn execute_video(d: &mut Dlpc900<UsbHid>, v: &VideoArgs) -> Result<(), Failure> {
-    let exposure_us = v.exposure_us.unwrap_or(1_000_000 / v.frame_hz / u32::from(v.patterns));
+    let exposure_us = v.exposure_us.unwrap_or_else(|| share_us(v.frame_hz, v.patterns));
     let entry = |i: u8| LutEntry { leds: v.leds.bits(), ..LutEntry::one_bit(i.into(), 0, i, exposure_us) };
     make_ready(d)?;
     d.start_video_patterns(&VideoPatterns {
@@ -348,6 +359,7 @@ fn execute_video(d: &mut Dlpc900<UsbHid>, v: &VideoArgs) -> Result<(), Failure> 
             Input::Hdmi => Receiver::Hdmi,
             Input::DisplayPort => Receiver::DisplayPort,
         },
+        ports: None,
         frame_hz: v.frame_hz,
         entries: (0..v.patterns).map(entry).collect(),
         leds: LedSetup::default(),

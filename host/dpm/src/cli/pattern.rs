@@ -1,6 +1,5 @@
 //! `dpm pattern KIND RIG.toml`: shows a pattern on the rig's projector, or writes it as pictures.
 
-use super::dlpc900::Guard;
 use super::rig_args::RigArgs;
 use super::watch::{print, run_and_report, watch};
 use crate::pattern_dlpc900::run_pattern_dlpc900;
@@ -202,14 +201,8 @@ pub(super) fn execute(args: &PatternArgs) -> Result<(), Failure> {
         return write_pictures(&show, file, args.json);
     }
     refuse_flashes(&rig, &show)?;
-    if let ProjectorBackend::Dlpc900(backend) = &rig.projector.backend {
-        let device = backend.device.clone();
-        let report = watch(rig, move |rig, monitor| {
-            let guard = Guard::start(device.as_deref());
-            let result = run_pattern_dlpc900(rig, &show, monitor);
-            guard.dismiss();
-            result
-        })?;
+    if let ProjectorBackend::Dlpc900(_) = &rig.projector.backend {
+        let report = watch(rig, move |rig, monitor| run_pattern_dlpc900(rig, &show, monitor))?;
         print(&if args.json { to_json(&report) + "\n" } else { report.to_table() });
         return Ok(());
     }

@@ -1,6 +1,5 @@
 //! `dpm run RIG.toml` and `dpm demo`: run a rig from its file to light.
 
-use super::dlpc900::Guard;
 use super::rig_args::RigArgs;
 use super::watch::{check_out, print, run_and_report, watch, write_out};
 use crate::keep_parameters;
@@ -74,17 +73,9 @@ pub(crate) fn execute_demo(args: &DemoArgs) -> Result<(), Failure> {
 
 fn start(path: Option<&Path>, flags: &RigArgs, json: bool) -> Result<(), Failure> {
     let rig = flags.rig(path)?;
-    if let ProjectorBackend::Dlpc900(backend) = &rig.projector.backend {
+    if let ProjectorBackend::Dlpc900(_) = &rig.projector.backend {
         check_out(flags.out.as_deref())?;
-        let device = backend.device.clone();
-        let report = watch(rig, move |rig, monitor| {
-            // Started only when this instance has the controller's lock. A panic ends without a message to the
-            // guard, like a SIGKILL.
-            let guard = Guard::start(device.as_deref());
-            let result = run_dlpc900(rig, monitor);
-            guard.dismiss();
-            result
-        })?;
+        let report = watch(rig, |rig, monitor| run_dlpc900(rig, monitor))?;
         print(&if json { to_json(&report) + "\n" } else { report.to_table() });
         return write_out(flags.out.as_deref(), "report.json", &report);
     }

@@ -5,6 +5,7 @@
 //! The watching thread itself writes nothing. A pipe without a reader or a stopped terminal blocks only the thread
 //! that writes.
 
+use super::dlpc900::Guard;
 use super::keys::Keys;
 use super::live_page;
 use super::osc;
@@ -125,7 +126,13 @@ fn watch_with<T: Send + 'static>(
         std::thread::Builder::new()
             .name("dpm-run".into())
             .spawn(move || {
+                // Only the instance that has the projector's lock starts it. A panic ends without a message to the guard,
+                // like a SIGKILL.
+                let guard = Guard::of(&rig.projector.backend);
                 let result = run(&rig, &monitor);
+                if let Some(guard) = guard {
+                    guard.dismiss();
+                }
                 // The watcher is gone only if it panicked; then the result is not needed.
                 let _ = done.send(result);
             })

@@ -132,16 +132,18 @@ fn projector(judged: &Judged) -> Step {
     );
     let how = match config.plane_timing() {
         PlaneTiming::Equal => "With the wand's light sensor: move it through the whole volume for 30 s.",
-        PlaneTiming::ByWeight | PlaneTiming::Held => {
+        PlaneTiming::ByWeight | PlaneTiming::ByChannel | PlaneTiming::Held => {
             "With the wand's light sensor: hold it still at 8 to 20 places, near and far, for 75 s in all."
         }
     };
     step.needs = vec![need_wand(judged), "its light sensor, or 12 crosses to aim at by hand".into()];
-    step.ways = vec![
-        calibrate(judged, how, "projector", &["--sensor", SENSOR]),
+    let by_sensor = calibrate(judged, how, "projector", &["--sensor", SENSOR]);
+    // The sensor's codes need light without gaps.
+    step.ways = config.is_lit_without_gap().then_some(by_sensor).into_iter().collect();
+    step.ways.push(
         calibrate(judged, "By hand: hold the tip into one cross after another.", "projector", &[])
             .answered(&[("u", "take the last point back"), ("d", "done")]),
-    ];
+    );
     if let Some(section) = &judged.file.projector {
         let checks: Vec<&CheckSection> = judged.file.checks.values().collect();
         let quality = format!(

@@ -2,8 +2,8 @@
 
 use super::world::{EnvironmentConfig, GazeConfig, TrackerConfig};
 use super::{
-    AlpConfig, AlpWeights, DisplayEncoding, Pace, PlaneWeights, ProjectorBackend, ProjectorConfig, Purpose,
-    ResponseConfig, RigConfig,
+    AlpConfig, AlpWeights, DisplayConfig, DisplayEncoding, Dlpc900Panel, Pace, PlaneWeights,
+    ProjectorBackend, ProjectorConfig, Purpose, ResponseConfig, RigConfig,
 };
 use crate::mock::{self, FaultError};
 use dpm_common::keys::read::{ConfigValue, Reader};
@@ -170,59 +170,10 @@ fn projector(rig: &RigConfig, reader: &mut Reader) {
         }
     }
     if let ProjectorBackend::Dlpc900(dlpc900) = &p.backend {
-        let panel = dlpc900.panel.dmd().raster();
-        if (p.width, p.height) != (panel.width(), panel.height()) {
-            contradict(
-                reader,
-                &[
-                    ("projector.width", shown(p.width)),
-                    ("projector.height", shown(p.height)),
-                    ("projector.backend.panel", shown(dlpc900.panel)),
-                    ("projector.backend.kind", format!("{:?}", p.backend.word())),
-                ],
-                &format!(
-                    "a {} has {} x {} mirrors",
-                    dlpc900.panel.dmd().name(),
-                    panel.width(),
-                    panel.height()
-                ),
-                format!("set projector.width = {} and projector.height = {}", panel.width(), panel.height()),
-            );
-        }
+        check_panel(p, "projector.backend.panel", dlpc900.panel, reader);
     }
     if let ProjectorBackend::Display(display) = &p.backend {
-        if let Err(e) = display.mode.parse::<ModeWish>() {
-            refuse(
-                reader,
-                &["projector.backend.mode"],
-                e.to_string(),
-                "`dpm display` lists the modes".into(),
-            );
-        }
-        if display.encoding == DisplayEncoding::Planes24 && p.planes != 24 {
-            contradict(
-                reader,
-                &[
-                    ("projector.planes", shown(p.planes)),
-                    ("projector.backend.encoding", shown(display.encoding)),
-                    ("projector.backend.kind", format!("{:?}", p.backend.word())),
-                ],
-                "a pixel carries 24 planes",
-                "set projector.planes = 24".into(),
-            );
-        }
-        if display.encoding == DisplayEncoding::Rgb8 && p.weights == PlaneWeights::Equal {
-            contradict(
-                reader,
-                &[
-                    ("projector.weights", format!("{:?}", p.weights.word())),
-                    ("projector.backend.encoding", shown(display.encoding)),
-                    ("projector.backend.kind", format!("{:?}", p.backend.word())),
-                ],
-                "the bits of a code value have binary weights",
-                "leave `projector.weights` out, or use encoding = \"planes24\"".into(),
-            );
-        }
+        check_display(p, display, reader);
     }
     if matches!(p.backend, ProjectorBackend::Window(_)) && p.weights == PlaneWeights::Equal {
         contradict(
@@ -258,6 +209,96 @@ fn projector(rig: &RigConfig, reader: &mut Reader) {
             ],
             "a DLPC900 shows at most 120 frames/s of 24 planes",
             "lower `projector.frame_rate` to 120 or choose another backend".into(),
+        );
+    }
+}
+
+/// A display, and the controller behind it.
+fn check_display(p: &ProjectorConfig, display: &DisplayConfig, reader: &mut Reader) {
+    if let Err(e) = display.mode.parse::<ModeWish>() {
+        refuse(reader, &["projector.backend.mode"], e.to_string(), "`dpm display` lists the modes".into());
+    }
+    if display.encoding == DisplayEncoding::Planes24 && p.planes != 24 {
+        contradict(
+            reader,
+            &[
+                ("projector.planes", shown(p.planes)),
+                ("projector.backend.encoding", shown(display.encoding)),
+                ("projector.backend.kind", format!("{:?}", p.backend.word())),
+            ],
+            "a pixel carries 24 planes",
+            "set projector.planes = 24".into(),
+        );
+    }
+    if display.encoding == DisplayEncoding::Rgb8 && p.weights == PlaneWeights::Equal {
+        contradict(
+            reader,
+            &[
+                ("projector.weights", format!("{:?}", p.weights.word())),
+                ("projector.backend.encoding", shown(display.encoding)),
+                ("projector.backend.kind", format!("{:?}", p.backend.word())),
+            ],
+            "the bits of a code value have binary weights",
+            "leave `projector.weights` out, or use encoding = \"planes24\"".into(),
+        );
+    }
+    if let Some(behind) = &display.dlpc900 {
+        check_panel(p, "projector.backend.dlpc900.panel", behind.panel, reader);
+        check_behind(p, display, reader);
+    }
+}
+
+/// A controller behind a display: its patterns must fit a frame, and equal planes be said to be equal.
+fn check_behind(p: &ProjectorConfig, display: &DisplayConfig, reader: &mut Reader) {
+    let encoding = ("projector.backend.encoding", shown(display.encoding));
+    if display.encoding == DisplayEncoding::Planes24 && p.weights == PlaneWeights::Binary {
+        contradict(
+            reader,
+            &[("projector.weights", shown(p.weights)), encoding.clone()],
+            "a DLPC900 lights all planes of a pixel equally long",
+            "set projector.weights = \"equal\"".into(),
+        );
+    }
+    if display.encoding == DisplayEncoding::Rgb8 && p.planes != 24 {
+        contradict(
+            reader,
+            &[("projector.planes", shown(p.planes)), encoding],
+            "a DLPC900 lights each colour of a pixel with an LED of its own",
+            "set projector.planes = 24".into(),
+        );
+    }
+    if let Some(Err(why)) = display.exposure_us(p.frame_rate) {
+        refuse(
+            reader,
+            &["projector.backend.dlpc900.exposure_us", "projector.frame_rate"],
+            why.to_string(),
+            "leave `projector.backend.dlpc900.exposure_us` out, or lower `projector.frame_rate`".into(),
+        );
+    }
+    if p.frame_rate.num() > 120 * p.frame_rate.den() {
+        contradict(
+            reader,
+            &[("projector.frame_rate", shown(p.frame_rate))],
+            "a DLPC900 receives at most 120 video frames/s",
+            "choose a mode with a lower rate".into(),
+        );
+    }
+}
+
+/// A controller's panel has as many mirrors as the projector.
+fn check_panel(p: &ProjectorConfig, key: &str, panel: Dlpc900Panel, reader: &mut Reader) {
+    let raster = panel.dmd().raster();
+    if (p.width, p.height) != (raster.width(), raster.height()) {
+        contradict(
+            reader,
+            &[
+                ("projector.width", shown(p.width)),
+                ("projector.height", shown(p.height)),
+                (key, shown(panel)),
+                ("projector.backend.kind", format!("{:?}", p.backend.word())),
+            ],
+            &format!("a {} has {} x {} mirrors", panel.dmd().name(), raster.width(), raster.height()),
+            format!("set projector.width = {} and projector.height = {}", raster.width(), raster.height()),
         );
     }
 }

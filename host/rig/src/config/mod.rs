@@ -4,6 +4,7 @@
 //! reported at once, each with file, line and column. `docs/CONFIG.md` lists the keys; it is generated from their
 //! declarations here.
 
+mod backend;
 mod calibration;
 mod check;
 mod method;
@@ -19,6 +20,7 @@ mod world;
 #[cfg(test)]
 mod tests;
 
+pub use backend::*;
 pub use calibration::CalibrationConfig;
 pub(crate) use check::MAX_TRACKED;
 pub(crate) use dpm_common::keys::read::KeyDoc;
@@ -366,11 +368,12 @@ fn motions() -> String {
     out
 }
 
-/// Formats `projector.backend(usb)` as `[projector.backend]` with `kind = "usb"`, and `scene.bodies[]` as
-/// `[[scene.bodies]]`.
+/// Formats `projector.backend(usb)` as `[projector.backend]` with `kind = "usb"`, a table within it likewise, and
+/// `scene.bodies[]` as `[[scene.bodies]]`.
 fn heading(table: &str) -> String {
-    match (table.strip_suffix(')').and_then(|t| t.split_once('(')), table.strip_suffix("[]")) {
-        (Some((table, kind)), _) => format!("`[{table}]` with `kind = \"{kind}\"`"),
+    let of_kind = table.split_once('(').and_then(|(before, rest)| Some((before, rest.split_once(')')?)));
+    match (of_kind, table.strip_suffix("[]")) {
+        (Some((table, (kind, within))), _) => format!("`[{table}{within}]` with `kind = \"{kind}\"`"),
         (_, Some(list)) => format!("`[[{list}]]`"),
         _ => format!("`[{table}]`"),
     }

@@ -719,3 +719,41 @@ fn the_light_of_a_display_is_later_than_its_slots() {
         assert!(told.contains(names), "{told}");
     }
 }
+
+/// A controller behind a display shows a frame once it has all of it, and each of its planes for the same time; what does not
+/// fit it is refused.
+#[test]
+fn a_controller_behind_a_display_shows_frames_that_have_arrived() {
+    const RIG: &str = include_str!("../../../../rigs/dlpc900-live.toml");
+    let parsed = |keys: &[&str]| {
+        let flags = keys.iter().map(|k| (*k).to_owned()).collect();
+        RigConfig::parse(
+            "rigs/dlpc900-live.toml",
+            RIG,
+            Path::new(""),
+            &Overrides { variables: vec![], flags },
+        )
+    };
+    let projector = parsed(&[]).unwrap_or_else(|e| panic!("{e}")).projector;
+    assert_eq!(projector.light_delay_ns(), 8_000_000 + 2 * (16_666_667 / 2));
+    assert_eq!(projector.plane_timing(), PlaneTiming::Equal);
+    assert_eq!(projector.lit_of_frame_ns(), [24 * 620_000, 16_666_666]);
+    assert!(!projector.is_lit_without_gap());
+    let colours = parsed(&["projector.backend.encoding=\"rgb8\"", "projector.weights=\"binary\""]);
+    let colours = colours.unwrap_or_else(|e| panic!("{e}")).projector;
+    assert_eq!(colours.plane_timing(), PlaneTiming::ByChannel);
+    assert_eq!(colours.lit_of_frame_ns(), [3 * 4_960_000, 16_666_666]);
+    let rgb8 = "projector.backend.encoding=\"rgb8\"";
+    for (keys, names) in [
+        (&["projector.weights=\"binary\""][..], "set projector.weights = \"equal\""),
+        (&["projector.width=1024"], "a DLP6500 has 1920 x 1080 mirrors"),
+        (&["projector.backend.dlpc900.panel=\"dlp9000\""], "a DLP9000 has 2560 x 1600 mirrors"),
+        (&["projector.backend.dlpc900.exposure_us=685"], "not within 105 to 684 us"),
+        (&["projector.frame_rate=144"], "at most 120 video frames/s"),
+        (&[rgb8, "projector.weights=\"binary\"", "projector.frame_rate=90"], "lower the frame rate"),
+        (&[rgb8, "projector.weights=\"binary\"", "projector.planes=8"], "an LED of its own"),
+    ] {
+        let told = parsed(keys).expect_err("refused").to_string();
+        assert!(told.contains(names), "{keys:?}: {told}");
+    }
+}

@@ -1,11 +1,13 @@
 //! Opens the medium of `[projector.backend]`, and derives the link's settings from the rig file.
 
 use crate::config::{
-    AlpConfig, AlpWeights, Compaction, DisplayConfig, DisplayEncoding, Pace, ProjectorBackend,
-    ResponseConfig, RigConfig, WindowConfig,
+    AlpConfig, AlpWeights, Compaction, DisplayConfig, DisplayEncoding, Dlpc900BehindConfig, Pace,
+    ProjectorBackend, ResponseConfig, RigConfig, WindowConfig,
 };
 use crate::engine::connect::ConnectError;
 use dpm_device::alp::{AlpSettings, AlpTransport, Showing};
+use dpm_device::dlpc900::driver::{Dlpc900, Dlpc900Error};
+use dpm_device::dlpc900::usb::{describe, UsbHid, UsbPlace};
 use dpm_device::link::{packet_bytes, Codec, Epoch, LinkError, LinkSettings, Underrun, COMMIT_BYTES};
 use dpm_device::planes::Raster;
 use dpm_device::time::{DeviceTicks, HostClock};
@@ -21,6 +23,11 @@ use dpm_display::window::{interrupt_program, WindowSettings};
 use dpm_handoff::wake::WaitPolicy;
 use dpm_render::pack::Halftone;
 use std::sync::Arc;
+
+/// What an operator of a DLPC900 must know.
+pub const NO_WATCHDOG: &str =
+    "a DLPC900 has no watchdog: if this machine fails, or this program and its guard process are both killed, it continues \
+     to show its patterns; `dpm dlpc900 idle` ends that";
 
 /// Time from the handshake to slot 0.
 const EPOCH_NS: u64 = 5_000_000;
@@ -126,15 +133,45 @@ fn open_display(
 ) -> Result<Medium, TransportError> {
     let settings = display_settings(config, display, raster)?;
     let (card, connector) = (display.card.clone(), display.connector.clone());
-    let opener = on_card(move || open_for(card.as_deref(), connector.as_deref()), settings);
+    let mut opener = on_card(move || open_for(card.as_deref(), connector.as_deref()), settings);
+    if let Some(behind) = &display.dlpc900 {
+        opener = feeding(opener, config, display, behind)?;
+    }
     let mut medium = open_panel(config, opener)?;
     medium
         .warnings
         .push("a display as projector has not been tried on real hardware yet (docs/DISPLAY.md)".into());
-    if display.encoding == DisplayEncoding::Rgb8 {
+    if display.dlpc900.is_some() {
+        medium.warnings.push(NO_WATCHDOG.into());
+    } else if display.encoding == DisplayEncoding::Rgb8 {
         medium.warnings.extend(linear_code_values(config));
     }
     Ok(medium)
+}
+
+/// The opener of a display with the DLPC900 that it feeds.
+fn feeding(
+    opener: Opener,
+    config: &RigConfig,
+    display: &DisplayConfig,
+    behind: &Dlpc900BehindConfig,
+) -> Result<Opener, TransportError> {
+    let refused = |key: &str, why: String| TransportError::Unsuitable {
+        device: format!("projector.backend.dlpc900.{key}"),
+        why,
+    };
+    let place = behind.device.as_deref().map(str::parse::<UsbPlace>).transpose();
+    let place = place.map_err(|e| refused("device", e.to_string()))?;
+    let schedule = config.projector.schedule();
+    let Some(video) = display.video_patterns(config.projector.frame_rate, &schedule) else {
+        return Ok(opener);
+    };
+    let video = video.map_err(|e| refused("exposure_us", e.to_string()))?;
+    let open = move || {
+        let port = UsbHid::open(place);
+        Dlpc900::new(port.map_err(|source| Dlpc900Error::Port { doing: describe(place), source })?)
+    };
+    Ok(dpm_display::dlpc900::behind(opener, Arc::new(open), video))
 }
 
 fn open_window(config: &RigConfig, window: &WindowConfig, raster: Raster) -> Result<Medium, TransportError> {

@@ -6,7 +6,8 @@
 
 use crate::config::{PlanePoses, PlaneTiming};
 use crate::rig::Rig;
-use dpm_device::planes::{PlaneSchedule, PlaneSpec};
+use dpm_device::dlpc900::video::COLOUR_ORDER;
+use dpm_device::planes::{Channel, PlaneSchedule, PlaneSpec};
 use dpm_device::time::HostTime;
 use dpm_render::pack::source_bits;
 use dpm_render::warp::plane_groups;
@@ -34,8 +35,7 @@ pub(crate) fn true_poses_at_centre(rig: &Rig, first_photon_at: HostTime) -> Opti
 /// whole frame, it is shared out over as many equal parts.
 pub(crate) fn lights_of_frame(rig: &Rig, exposure_ns: i64) -> impl Iterator<Item = (i64, f64)> + '_ {
     let lights = Lights::of(rig);
-    let whole = lights.whole();
-    let middle = move |(_, halves)| (i128::from(exposure_ns.max(0)) * halves / (2 * whole)) as i64;
+    let middle = move |(_, halves)| lights.instant_ns(halves, 1, exposure_ns);
     lights.planes().map(move |plane| (middle(plane), f64::from(lights.light_of(plane.0))))
 }
 
@@ -60,11 +60,7 @@ pub(crate) fn groups_that_follow(rig: &Rig) -> Vec<PlaneGroup> {
         return Vec::new();
     }
     let lights = Lights::of(rig);
-    let [moments, light] = lights.moments();
-    let centre = moments as f64 / light as f64;
-    let instants: Vec<f64> =
-        lights.planes().map(|(_, halves)| (halves as f64 - centre) / (2 * lights.whole()) as f64).collect();
-    plane_groups(lights.schedule, &instants)
+    plane_groups(lights.schedule, &lights.shares())
 }
 
 /// When the planes of a frame are lit, and how much light they give.
@@ -72,31 +68,37 @@ pub(crate) fn groups_that_follow(rig: &Rig) -> Vec<PlaneGroup> {
 struct Lights<'a> {
     schedule: &'a PlaneSchedule,
     timing: PlaneTiming,
+    /// How long the planes are lit together, and how long the frame lasts; in the same unit.
+    lit: [i64; 2],
 }
 
 impl<'a> Lights<'a> {
     fn of(rig: &'a Rig) -> Self {
-        Self { schedule: &rig.schedule, timing: rig.config.projector.plane_timing() }
+        let projector = &rig.config.projector;
+        Self { schedule: &rig.schedule, timing: projector.plane_timing(), lit: projector.lit_of_frame_ns() }
     }
 
     /// How long a plane lasts, in units that all planes share.
     fn length_of(self, plane: PlaneSpec) -> i128 {
         match self.timing {
             PlaneTiming::ByWeight => 1 << plane.bit,
-            PlaneTiming::Equal | PlaneTiming::Held => 1,
+            PlaneTiming::Equal | PlaneTiming::Held | PlaneTiming::ByChannel => 1,
         }
     }
 
     /// The light of a plane.
     fn light_of(self, plane: PlaneSpec) -> u32 {
         match self.timing {
-            PlaneTiming::ByWeight | PlaneTiming::Equal => 1 << plane.bit,
+            PlaneTiming::ByWeight | PlaneTiming::Equal | PlaneTiming::ByChannel => 1 << plane.bit,
             PlaneTiming::Held => 1,
         }
     }
 
-    /// How long the frame lasts, in the units of [`Self::length_of`].
+    /// How long the planes are lit together, in the units of [`Self::length_of`].
     fn whole(self) -> i128 {
+        if self.timing == PlaneTiming::ByChannel {
+            return COLOUR_ORDER.len() as i128;
+        }
         self.schedule.planes().iter().map(|plane| self.length_of(*plane)).sum()
     }
 
@@ -104,9 +106,12 @@ impl<'a> Lights<'a> {
     fn planes(self) -> impl Iterator<Item = (PlaneSpec, i128)> + 'a {
         self.schedule.planes().iter().scan(0, move |begin, plane| {
             let length = self.length_of(*plane);
-            let halves = 2 * *begin + length;
+            let before = match self.timing {
+                PlaneTiming::ByChannel => third_of(plane.channel),
+                _ => *begin,
+            };
             *begin += length;
-            Some((*plane, halves))
+            Some((*plane, 2 * before + length))
         })
     }
 
@@ -118,23 +123,42 @@ impl<'a> Lights<'a> {
         })
     }
 
+    /// For each plane the time from the centre of the light to its middle, as a share of the frame.
+    fn shares(self) -> Vec<f64> {
+        let [moments, light] = self.moments();
+        let centre = moments as f64 / light as f64;
+        let [lit, frame] = self.lit.map(|ns| ns as f64);
+        let share = lit / frame / (2 * self.whole()) as f64;
+        self.planes().map(|(_, halves)| (halves as f64 - centre) * share).collect()
+    }
+
     /// As [`light_centre_ns`].
     fn centre_ns(self, exposure_ns: i64) -> i64 {
         // A schedule has 1 to 32 planes of bits below 8, so nothing here overflows, and the light is positive.
         let [moments, light] = self.moments();
-        (i128::from(exposure_ns.max(0)) * moments / (2 * self.whole() * light)) as i64
+        self.instant_ns(moments, light, exposure_ns)
     }
+
+    /// Time from the first photon to `halves / over`, in units as [`Self::planes`] gives them, for a frame of `exposure_ns`.
+    fn instant_ns(self, halves: i128, over: i128, exposure_ns: i64) -> i64 {
+        let [lit, frame] = self.lit.map(i128::from);
+        (i128::from(exposure_ns.max(0)) * lit * halves / (2 * self.whole() * over * frame)) as i64
+    }
+}
+
+/// How many colours a DLPC900 shows before `channel`. White planes have the bits of green.
+fn third_of(channel: Channel) -> i128 {
+    COLOUR_ORDER.iter().position(|colour| *colour == channel).unwrap_or(0) as i128
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
-    use dpm_device::planes::Channel;
 
     const SLOT: i64 = 1_055_966;
 
     fn centre_ns(schedule: &PlaneSchedule, timing: PlaneTiming, exposure_ns: i64) -> i64 {
-        Lights { schedule, timing }.centre_ns(exposure_ns)
+        Lights { schedule, timing, lit: [1, 1] }.centre_ns(exposure_ns)
     }
 
     #[test]
@@ -155,7 +179,7 @@ mod tests {
     /// The middles of planes that last as long as they weigh: the first of `7 6 5 ...` takes half of the exposure.
     #[test]
     fn planes_follow_one_another_without_gaps() {
-        let lights = Lights { schedule: &PlaneSchedule::mono8(), timing: PlaneTiming::ByWeight };
+        let lights = Lights { schedule: &PlaneSchedule::mono8(), timing: PlaneTiming::ByWeight, lit: [1, 1] };
         let mut end = 0;
         for (plane, halves) in lights.planes() {
             assert_eq!(halves - end, 1 << plane.bit);
@@ -184,5 +208,36 @@ mod tests {
             [Channel::Red, Channel::Green, Channel::Blue].map(|channel| PlaneSpec { channel, bit: 3 });
         assert_eq!(centre_ns(&PlaneSchedule::new(&equal).unwrap(), timing, 600), 300);
         assert_eq!(centre_ns(&PlaneSchedule::mono8(), timing, -5), 0);
+    }
+
+    /// 24 patterns of 620 us in a sixtieth of a second, or three of 4960 us: the instants are those at which a DLPC900 shows
+    /// them, whatever is left of the frame.
+    #[test]
+    fn planes_of_a_controller_behind_a_display_have_its_instants() {
+        let frame_ns = 16_666_667;
+        let middles = |schedule: &PlaneSchedule, timing, lit_ns| -> Vec<i64> {
+            let lights = Lights { schedule, timing, lit: [lit_ns, frame_ns] };
+            let centre = lights.centre_ns(frame_ns);
+            let from_shares = lights.shares().into_iter().map(|s| centre + (s * frame_ns as f64) as i64);
+            let all = lights.planes().map(|(_, halves)| lights.instant_ns(halves, 1, frame_ns));
+            assert!(all.zip(from_shares).all(|(a, b)| (a - b).abs() <= 2));
+            lights.planes().map(|(_, halves)| lights.instant_ns(halves, 1, frame_ns)).collect()
+        };
+        let planes = middles(&PlaneSchedule::equal_rgb24(), PlaneTiming::Equal, 24 * 620_000);
+        assert!(
+            planes.iter().zip(0..).all(|(at, k)| (at - (620_000 * k + 310_000)).abs() <= 1),
+            "{planes:?}"
+        );
+        let schedule = PlaneSchedule::rgb24();
+        let colours = middles(&schedule, PlaneTiming::ByChannel, 3 * 4_960_000);
+        for (plane, at) in schedule.planes().iter().zip(colours) {
+            let third =
+                [Channel::Green, Channel::Red, Channel::Blue].iter().position(|c| *c == plane.channel);
+            let wanted = 4_960_000 * third.unwrap() as i64 + 2_480_000;
+            assert!((at - wanted).abs() <= 1, "{plane:?}: {at}");
+        }
+        let all =
+            Lights { schedule: &schedule, timing: PlaneTiming::ByChannel, lit: [3 * 4_960_000, frame_ns] };
+        assert!((all.centre_ns(frame_ns) - 7_440_000).abs() <= 1, "the middle of red");
     }
 }

@@ -1,0 +1,184 @@
+//! A DLPC900 behind the display: it cuts each frame that the display sends into patterns, and shows them while the next
+//! frame arrives.
+//!
+//! The display shows black before the controller is set up, and the controller rests before the display is given back.
+//! In between, a thread of its own asks the controller for its state: the frame path never speaks to it.
+
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::{Arc, OnceLock};
+use std::thread::JoinHandle;
+use std::time::{Duration, Instant};
+
+use dpm_device::dlpc900::driver::{Dlpc900, Dlpc900Error, HidPort, PortError};
+use dpm_device::dlpc900::video::VideoPatterns;
+use dpm_device::transport::TransportError;
+
+use crate::scan_out::{DisplayError, Flip, Picture, Pixels, ScanOut};
+use crate::transport::Opener;
+
+/// How often the controller is asked for its state.
+const LOOK: Duration = Duration::from_millis(200);
+/// How often its thread looks for the end.
+const STEP: Duration = Duration::from_millis(5);
+/// How long the end waits for the controller to rest.
+const REST_WITHIN: Duration = Duration::from_millis(400);
+/// Answers in a row that may be missing or make no sense: another program may ask the controller too.
+const MOST_SILENT: u32 = 4;
+
+/// Whoever opens the controller.
+pub type OpenController<P> = Arc<dyn Fn() -> Result<Dlpc900<P>, Dlpc900Error> + Send + Sync>;
+
+/// The opener of a display by `display` with the controller that `controller` opens behind it, set up to show `video`.
+pub fn behind<P: HidPort + Send + 'static>(
+    display: Opener,
+    controller: OpenController<P>,
+    video: VideoPatterns,
+) -> Opener {
+    Arc::new(move || {
+        // Black is on the wire before the controller looks at it.
+        let mut shown = display()?;
+        let failed = |e: Dlpc900Error| match is_gone(&e) {
+            true => TransportError::Unplugged { device: "DLPC900".into() },
+            false => TransportError::Unsuitable { device: "DLPC900".into(), why: e.to_string() },
+        };
+        let mut controller = controller().map_err(failed)?;
+        let found = controller.dmd();
+        if found != video.dmd {
+            let why = format!(
+                "projector.backend.dlpc900.panel is a {}, the controller drives a {}",
+                video.dmd.name(),
+                found.name()
+            );
+            return Err(TransportError::Unsuitable { device: "DLPC900".into(), why });
+        }
+        if let Err(e) = controller.make_ready().and_then(|_| controller.start_video_patterns(&video)) {
+            rest(&mut controller);
+            return Err(failed(e));
+        }
+        shown.name = format!("{} behind {}", found.name(), shown.name);
+        shown.out = Box::new(Fed { out: shown.out, watch: Watch::start(controller).map_err(no_thread)? });
+        Ok(shown)
+    })
+}
+
+fn no_thread(e: std::io::Error) -> TransportError {
+    let why = format!("cannot start the thread that watches the controller: {e}");
+    TransportError::Unsuitable { device: "DLPC900".into(), why }
+}
+
+fn is_gone(e: &Dlpc900Error) -> bool {
+    matches!(e, Dlpc900Error::Port { source: PortError::Gone | PortError::NotFound, .. })
+}
+
+/// Stops the sequence, switches the LEDs off and exercises the mirrors, as quickly as the cable allows. True if the
+/// controller rests then.
+fn rest<P: HidPort>(controller: &mut Dlpc900<P>) -> bool {
+    controller.hurry();
+    // Half a command may have been sent before; the next one may be lost with it.
+    let stopped = controller.stop().or_else(|e| if is_gone(&e) { Err(e) } else { controller.stop() });
+    stopped.and_then(|()| controller.idle()).is_ok()
+}
+
+/// The thread that asks the controller for its state, and puts it to rest at the end.
+struct Watch {
+    is_over: Arc<AtomicBool>,
+    /// Why the controller shows nothing any more; `None` inside for a controller that is gone.
+    lost: Arc<OnceLock<Option<String>>>,
+    thread: Option<JoinHandle<()>>,
+}
+
+impl Watch {
+    fn start<P: HidPort + Send + 'static>(mut controller: Dlpc900<P>) -> std::io::Result<Self> {
+        let (is_over, lost) = (Arc::new(AtomicBool::new(false)), Arc::new(OnceLock::new()));
+        let (over, why) = (is_over.clone(), lost.clone());
+        let thread = std::thread::Builder::new().name("dpm-dlpc900".into()).spawn(move || {
+            if let Some(loss) = look_until(&mut controller, &over) {
+                let _ = why.set(loss);
+            }
+            rest(&mut controller);
+        })?;
+        Ok(Self { is_over, lost, thread: Some(thread) })
+    }
+
+    /// Why the controller shows nothing any more.
+    fn lost(&self) -> Option<DisplayError> {
+        self.lost.get().map(|why| match why {
+            None => DisplayError::Gone,
+            Some(what) => DisplayError::Unsuitable { card: "DLPC900".into(), what: what.clone() },
+        })
+    }
+}
+
+impl Drop for Watch {
+    fn drop(&mut self) {
+        self.is_over.store(true, Ordering::Release);
+        let Some(thread) = self.thread.take() else { return };
+        let limit = Instant::now() + REST_WITHIN;
+        while !thread.is_finished() && Instant::now() < limit {
+            std::thread::sleep(Duration::from_millis(1));
+        }
+        // A thread that hangs in a call is left behind; the guardian of the run puts the controller to rest then.
+        if thread.is_finished() {
+            let _ = thread.join();
+        }
+    }
+}
+
+/// Asks the controller for its state until `over`, or until it shows nothing any more: why.
+fn look_until<P: HidPort>(controller: &mut Dlpc900<P>, over: &AtomicBool) -> Option<Option<String>> {
+    let (mut looked, mut silent) = (Instant::now(), 0);
+    while !over.load(Ordering::Acquire) {
+        std::thread::sleep(STEP);
+        if looked.elapsed() < LOOK {
+            continue;
+        }
+        looked = Instant::now();
+        silent = match controller.status() {
+            Ok(status) => match status.complaint() {
+                Some(what) => return Some(Some(format!("the controller reports {what}"))),
+                None if !status.is_locked() => {
+                    return Some(Some("the controller receives no video signal".into()))
+                }
+                None if !status.is_running() => {
+                    return Some(Some("its patterns were stopped, perhaps by another program".into()))
+                }
+                None => 0,
+            },
+            Err(e) if is_gone(&e) => return Some(None),
+            Err(e) if silent == MOST_SILENT => return Some(Some(e.to_string())),
+            Err(_) => silent + 1,
+        };
+    }
+    None
+}
+
+/// A display in front of a controller.
+struct Fed {
+    // Dropped first: the controller rests while the display still shows black.
+    watch: Watch,
+    out: Box<dyn ScanOut>,
+}
+
+impl ScanOut for Fed {
+    fn pixels(&mut self, frame: usize) -> Pixels<'_> {
+        self.out.pixels(frame)
+    }
+    fn flip(&mut self, picture: Picture) -> Result<(), DisplayError> {
+        self.out.flip(picture)
+    }
+    fn flips(&mut self, sink: &mut dyn FnMut(Flip)) {
+        self.out.flips(sink);
+    }
+    fn lost(&mut self) -> Option<DisplayError> {
+        self.out.lost().or_else(|| self.watch.lost())
+    }
+    fn now_ns(&self) -> i64 {
+        self.out.now_ns()
+    }
+    fn blacken(&mut self) {
+        self.out.blacken();
+    }
+    fn guarded(&self) -> Option<(std::os::fd::OwnedFd, Vec<std::ffi::OsString>)> {
+        self.out.guarded()
+    }
+}
