@@ -473,7 +473,9 @@ impl Controller {
                     }
                     DisplayMode::VideoPattern => {
                         // The sequencer aborts and recovers with the next frame that fits.
-                        if self.patterns.table_us() > self.options.video_frame_us {
+                        let planned = self.faults.iter().position(|f| *f == Dlpc900Fault::AbortStart);
+                        let is_planned = planned.map(|i| self.faults.swap_remove(i)).is_some();
+                        if is_planned || self.patterns.table_us() > self.options.video_frame_us {
                             self.hardware_fault |= 0x40;
                         }
                     }

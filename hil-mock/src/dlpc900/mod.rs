@@ -73,6 +73,8 @@ pub enum Dlpc900Fault {
     StrayReply,
     /// These bits are added to the hardware status until a mode switch or reset.
     Hardware(u8),
+    /// The next start of video patterns is aborted: the signal was changing.
+    AbortStart,
     /// The video signal disappears (false) or returns.
     Source(bool),
 }

@@ -180,7 +180,7 @@ mod tests {
         assert!(d.status().unwrap().is_aborted());
         d.start_video_patterns(&video).unwrap();
         assert!(!d.status().unwrap().is_aborted());
-        lock(&model).inject(Dlpc900Fault::Hardware(ABORTED));
+        lock(&model).inject(Dlpc900Fault::AbortStart);
         d.start_video_patterns(&video).unwrap();
         let m = lock(&model);
         let parked = m.executed().iter().filter(|c| c.opcode == Opcode::DMD_PARK).count();
