@@ -2,289 +2,32 @@
 //! remedy.
 
 use std::sync::atomic::{AtomicBool, Ordering};
-use std::sync::{Arc, Mutex, OnceLock, PoisonError, TryLockError};
-use std::time::{Duration, Instant};
+use std::sync::{Arc, Mutex, PoisonError};
+use std::time::Duration;
 
 use super::command::{
     Command, Malformed, Opcode, ReplyAssembler, TooLong, MAX_BMP_BYTES, MAX_REPLY_DATA, REPORT_BYTES,
 };
 use super::lut::{DisplayMode, Dmd};
+use super::port::POLL;
 use super::sequence::{self, LedSetup, PatternSequence, SequenceError, Step, Version};
 use super::video::VideoPatterns;
+
+pub use super::error::{error_meaning, remedy, Dlpc900Error, PortError};
+pub use super::port::{DarkLine, HidPort, SecondLine};
+pub use super::status::Status;
 
 /// Timeout for sending one report, and for receiving one reply. The controller answers within a few milliseconds; while
 /// it takes an image it may refuse data for some time.
 const TIMEOUT: Duration = Duration::from_millis(1000);
 /// Replies to other commands that are dropped before a reply counts as missing (another program's, or one never read).
 const MOST_STALE: usize = 8;
-/// Pause between two polls of the status while waiting, and the longest time until a stop is noticed during a wait.
-const POLL: Duration = Duration::from_millis(20);
 /// From the start of video patterns to the switch of the LEDs: by then an abort would have been reported.
 const ABORT_SHOWS: Duration = Duration::from_millis(500);
 /// How often a start of video patterns is tried.
 const MOST_STARTS: u32 = 4;
 /// Timeout for one report once a stop was requested: the process must end within two seconds, whatever the cable does.
 const HURRY: Duration = Duration::from_millis(250);
-/// How long a [`DarkLine`] waits for a pending command, so as not to disturb its reply.
-const MANNERS: Duration = Duration::from_millis(25);
-
-/// The cable: sends and receives reports of 64 bytes. Every wait MUST end within the time given.
-pub trait HidPort {
-    /// Sends one report.
-    fn write_report(&mut self, report: &[u8; REPORT_BYTES], timeout: Duration) -> Result<(), PortError>;
-
-    /// Receives one report.
-    fn read_report(&mut self, report: &mut [u8; REPORT_BYTES], timeout: Duration) -> Result<(), PortError>;
-
-    /// Name of the controller in messages.
-    fn name(&self) -> &str {
-        "DLPC900"
-    }
-
-    /// Waits. Simulated ports advance their own time.
-    fn pause(&mut self, time: Duration) {
-        std::thread::sleep(time);
-    }
-
-    /// The time since a fixed instant, by the clock that pauses and timeouts go by. Simulated ports have their own.
-    fn now(&self) -> Duration {
-        static BEGIN: OnceLock<Instant> = OnceLock::new();
-        BEGIN.get_or_init(Instant::now).elapsed()
-    }
-
-    /// A second way to send reports over the same cable from another thread. It works even while this thread hangs
-    /// inside a call. `None` if there is none.
-    fn second_line(&self) -> Option<Box<dyn SecondLine>> {
-        None
-    }
-}
-
-/// Sends reports beside the [`HidPort`] that it belongs to.
-pub trait SecondLine: Send {
-    /// Sends one report. MUST end within `timeout`.
-    fn write_report(&mut self, report: &[u8; REPORT_BYTES], timeout: Duration) -> Result<(), PortError>;
-}
-
-/// Makes a controller dark from another thread than the one that uses it. Its commands request no reply, so it need not
-/// wait for one. It waits briefly for a pending command, and no longer.
-pub struct DarkLine {
-    line: Box<dyn SecondLine>,
-    turn: Arc<Mutex<()>>,
-}
-
-impl DarkLine {
-    /// Stops the sequence, so that no light leaves the projector. With `leds_off`, for the end of a run, it also
-    /// switches the LEDs off. The first report is sent within some 25 ms.
-    ///
-    /// # Errors
-    /// Those of the cable. The controller did not receive the orders then.
-    pub fn dark(&mut self, leds_off: bool) -> Result<(), PortError> {
-        let mut waited = Duration::ZERO;
-        let step = Duration::from_millis(1);
-        let turn = loop {
-            match self.turn.try_lock() {
-                Ok(turn) => break Some(turn),
-                Err(TryLockError::Poisoned(turn)) => break Some(turn.into_inner()),
-                // The other thread hangs inside a command; its reply is no longer of use.
-                Err(TryLockError::WouldBlock) if waited >= MANNERS => break None,
-                Err(TryLockError::WouldBlock) => {
-                    std::thread::sleep(step);
-                    waited += step;
-                }
-            }
-        };
-        let mut steps = sequence::stop();
-        if leds_off {
-            steps.push(sequence::leds_off());
-        }
-        for step in &steps {
-            let Step::Write(opcode, data) = step else { continue };
-            // Fits one report, so it cannot end up between the reports of another command.
-            for report in Command::write(0, *opcode, data, false).reports().into_iter().flatten() {
-                self.line.write_report(&report, POLL)?;
-            }
-        }
-        drop(turn);
-        Ok(())
-    }
-}
-
-/// Errors of the cable.
-#[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
-pub enum PortError {
-    /// Nothing within the time given.
-    #[error("no answer in time: is it switched on, and past its start (10 s)? Else switch it off and on")]
-    Timeout,
-    /// The device has gone.
-    #[error("the device was unplugged or has lost power: check cable and supply")]
-    Gone,
-    /// No such device.
-    #[error("none is plugged in and switched on there: check cable and supply; `lsusb -d 0451:c900` lists those that are")]
-    NotFound,
-    /// The operating system denies access; the text is the remedy.
-    #[error("no permission to open the device: {0}")]
-    Denied(String),
-    /// Another program uses the device.
-    #[error("another program holds the device: close it (TI's own, or a second dpm; `fuser -v` on the device file names it)")]
-    Busy,
-    /// Anything else.
-    #[error("{0}")]
-    Other(String),
-}
-
-/// Why a call failed.
-#[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
-pub enum Dlpc900Error {
-    /// The cable failed.
-    #[error("{doing}: {source}")]
-    Port {
-        /// The device and the command.
-        doing: String,
-        /// The error.
-        source: PortError,
-    },
-    /// The controller refused a command.
-    #[error("{doing}: the controller refuses (error {code}, \"{text}\"): {remedy}")]
-    Refused {
-        /// The command, with the entry or image that it concerned.
-        doing: String,
-        /// The controller's error code.
-        code: u8,
-        /// The controller's error text.
-        text: String,
-        /// The remedy in the present state of the controller.
-        remedy: &'static str,
-    },
-    /// The controller's answer makes no sense.
-    #[error("{doing}: the answer makes no sense ({what})")]
-    Protocol {
-        /// Which command.
-        doing: String,
-        /// What is wrong with it.
-        what: String,
-    },
-    /// A sequence that the controller cannot show.
-    #[error(transparent)]
-    Sequence(#[from] SequenceError),
-    /// The controller reports a hardware error.
-    #[error("the controller reports {0}: check DMD, cable and power, then reset")]
-    Hardware(String),
-    /// No video signal.
-    #[error("the video source did not lock within {0:?}: check cable, resolution and that the graphics card sends a picture")]
-    NotLocked(Duration),
-    /// A stop was requested during the call; see [`Dlpc900::stop_when`].
-    #[error("stopped before the controller was set up")]
-    Stopped,
-    /// An unknown DMD.
-    #[error("the controller drives a DMD with unknown number {0}: update this program or the controller's firmware")]
-    UnknownDmd(u8),
-}
-
-/// What the controller's error code means.
-pub const fn error_meaning(code: u8) -> &'static str {
-    match code {
-        0 => "no error",
-        1 => "batch file checksum error",
-        2 => "device failure",
-        3 => "invalid command number",
-        4 => "incompatible controller and DMD",
-        5 => "command not allowed in current mode",
-        6 => "invalid command parameter",
-        7 => "item referred by the parameter is not present",
-        8 => "out of resource (RAM or flash)",
-        9 => "invalid BMP compression type",
-        10 => "pattern bit number out of range",
-        11 => "pattern BMP not present in flash",
-        12 => "pattern dark time is out of range",
-        13 => "signal delay parameter is out of range",
-        14 => "pattern exposure time is out of range",
-        15 => "pattern number is out of range",
-        16 => "invalid pattern definition",
-        17 => "pattern image memory address is out of range",
-        255 => "internal error",
-        _ => "unknown error",
-    }
-}
-
-/// The remedy for an error code.
-pub const fn remedy(code: u8) -> &'static str {
-    match code {
-        1 | 7 | 11 => {
-            "what the command names is not in the controller's flash; load it there or upload it over USB"
-        }
-        2 | 4 | 255 => {
-            "power the projector off and on; if it stays, DMD and controller do not fit or are damaged"
-        }
-        3 => "the firmware does not know this command; update it",
-        5 => "stop the sequence and select the right display mode first",
-        6 => "a number in the command is outside its range",
-        8 => "fewer or smaller images",
-        9 => "the image stream is damaged; upload again, without other programs on the cable",
-        10 => "bit position plus depth must stay within 24 planes",
-        12 => "a shorter dark time",
-        13 => "trigger delays lie between -20 and 20000 us",
-        14 => "a longer exposure or fewer bits; the least exposure grows with the depth",
-        15 => "fewer patterns in the table",
-        16 => "number the entries 0, 1, 2, ... without gaps and define each before the configuration",
-        17 => "image numbers must be below the number of images uploaded",
-        _ => "look the code up in the programmer's guide (DLPU018, command 0x0100)",
-    }
-}
-
-/// Everything that one poll of the controller yields.
-#[derive(Clone, Debug, PartialEq, Eq)]
-pub struct Status {
-    /// Firmware.
-    pub firmware: Version,
-    /// DMD.
-    pub dmd: Dmd,
-    /// The firmware's tag, such as `DLPR900PROM-6500`.
-    pub tag: String,
-    /// Display mode; `None` for a byte without a meaning.
-    pub mode: Option<DisplayMode>,
-    /// Hardware status byte (0x1A0A).
-    pub hardware: u8,
-    /// System status byte (0x1A0B).
-    pub system: u8,
-    /// Main status byte (0x1A0C).
-    pub main: u8,
-}
-
-impl Status {
-    /// Mirrors parked.
-    pub const fn is_parked(&self) -> bool {
-        self.main & 1 != 0
-    }
-    /// A sequence runs.
-    pub const fn is_running(&self) -> bool {
-        self.main & 2 != 0
-    }
-    /// The video source is locked.
-    pub const fn is_locked(&self) -> bool {
-        self.main & 8 != 0
-    }
-
-    /// A sequence was aborted: the patterns of a video frame had not ended when the next frame began.
-    pub const fn is_aborted(&self) -> bool {
-        self.hardware & 0x40 != 0
-    }
-
-    /// The errors in the hardware bits, if any.
-    pub fn complaint(&self) -> Option<String> {
-        let bits = [
-            (self.hardware & 0x01 == 0, "initialisation failed"),
-            (self.hardware & 0x02 != 0, "an incompatible DMD"),
-            (self.hardware & 0x04 != 0, "a DMD reset controller error"),
-            (self.hardware & 0x08 != 0, "a forced buffer swap"),
-            (self.hardware & 0x40 != 0, "a sequencer abort"),
-            (self.hardware & 0x80 != 0, "a sequencer error"),
-            (self.system & 0x01 == 0, "a failed memory test"),
-        ];
-        let found: Vec<_> = bits.iter().filter(|b| b.0).map(|b| b.1).collect();
-        (!found.is_empty()).then(|| found.join(", "))
-    }
-}
-
 /// How far an upload has come.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct UploadProgress {
@@ -756,6 +499,13 @@ impl<P: HidPort> Dlpc900<P> {
     /// Stops the sequence.
     pub fn stop(&mut self) -> Result<(), Dlpc900Error> {
         self.run(&sequence::stop(), &mut |_| ())
+    }
+
+    /// Stops the sequence at the end of a run, whatever the cable did before: half a command may have been sent, and the next
+    /// one may be lost with it. Everything after it is in a hurry too; see [`Dlpc900::hurry`].
+    pub fn stop_at_the_end(&mut self) -> Result<(), Dlpc900Error> {
+        self.hurry();
+        self.stop().or_else(|e| if e.is_gone() { Err(e) } else { self.stop() })
     }
 
     /// Pauses the sequence.

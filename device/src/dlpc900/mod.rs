@@ -9,10 +9,16 @@ pub mod command;
 #[cfg(feature = "std")]
 pub mod driver;
 #[cfg(feature = "std")]
+mod error;
+#[cfg(feature = "std")]
 pub mod image;
 pub mod lut;
 #[cfg(feature = "std")]
+mod port;
+#[cfg(feature = "std")]
 pub mod sequence;
+#[cfg(feature = "std")]
+mod status;
 #[cfg(feature = "usb")]
 pub mod usb;
 #[cfg(feature = "std")]

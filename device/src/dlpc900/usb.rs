@@ -6,7 +6,7 @@ use std::time::{Duration, Instant};
 use rusb::{Context, Device, DeviceHandle, Direction, TransferType, UsbContext};
 
 use super::command::REPORT_BYTES;
-use super::driver::{HidPort, PortError, SecondLine};
+use super::driver::{Dlpc900, Dlpc900Error, HidPort, PortError, SecondLine};
 use crate::usb_help::{node, node_of, remedy};
 
 /// USB vendor, Texas Instruments.
@@ -39,6 +39,15 @@ impl std::fmt::Display for UsbPlace {
 pub fn describe(place: Option<UsbPlace>) -> String {
     let at = place.map_or(String::new(), |p| format!(" at {p}"));
     format!("DLPC900 ({VENDOR:04x}:{PRODUCT:04x}){at}")
+}
+
+/// Opens the controller at `place`, the only one if `None`, and greets it.
+///
+/// # Errors
+/// Those of the cable and of the controller.
+pub fn open(place: Option<UsbPlace>) -> Result<Dlpc900<UsbHid>, Dlpc900Error> {
+    let port = UsbHid::open(place);
+    Dlpc900::new(port.map_err(|source| Dlpc900Error::Port { doing: describe(place), source })?)
 }
 
 impl std::str::FromStr for UsbPlace {

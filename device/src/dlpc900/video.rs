@@ -80,8 +80,8 @@ pub const COLOUR_ORDER: [Channel; 3] = [Channel::Green, Channel::Red, Channel::B
 /// An exposure that does not fit a video frame, or that the DMD cannot keep.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct BadExposure {
-    /// What was asked for, microseconds; `None` for no wish.
-    pub wish_us: Option<u32>,
+    /// What was asked for, microseconds.
+    pub exposure_us: u32,
     /// The least for the depth, microseconds.
     pub least_us: u32,
     /// The most for the frame, microseconds.
@@ -90,24 +90,20 @@ pub struct BadExposure {
 
 impl fmt::Display for BadExposure {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        let Self { wish_us, least_us, most_us } = *self;
-        match wish_us {
-            _ if least_us > most_us => write!(
-                f,
-                "a pattern needs {least_us} us, and a video frame has {most_us} us for each: lower the frame rate"
-            ),
-            Some(wish_us) => write!(f, "an exposure of {wish_us} us is not within {least_us} to {most_us} us"),
-            None => write!(f, "{least_us} to {most_us} us are possible"),
+        let Self { exposure_us, least_us, most_us } = *self;
+        if least_us > most_us {
+            write!(f, "a pattern needs {least_us} us, and a video frame has {most_us} us for each: lower the frame rate")
+        } else {
+            write!(f, "an exposure of {exposure_us} us is not within {least_us} to {most_us} us")
         }
     }
 }
 
 impl std::error::Error for BadExposure {}
 
-/// What each of `patterns` patterns of a frame has for itself if all have the same, microseconds.
-pub const fn share_us(frame_hz: u32, patterns: u8) -> u32 {
-    let frame_us = 1_000_000 / if frame_hz == 0 { 1 } else { frame_hz };
-    frame_us.saturating_sub(FRAME_REST_US) / if patterns == 0 { 1 } else { patterns as u32 }
+/// What each of `patterns` patterns (not 0) of a frame of `frame_us` has for itself if all have the same, microseconds.
+pub const fn share_us(frame_us: u32, patterns: u32) -> u32 {
+    frame_us.saturating_sub(FRAME_REST_US) / patterns
 }
 
 /// How long each pattern of a frame is lit, microseconds: `wish_us`, or 155 / 171 of what the frame has for it, which is
@@ -122,13 +118,13 @@ pub fn exposure_us(
     wish_us: Option<u32>,
 ) -> Result<u32, BadExposure> {
     let frame_us = u32::try_from(rate.slot_len_ns(0) / 1000).unwrap_or(u32::MAX);
-    let most_us = frame_us.saturating_sub(FRAME_REST_US) / bits.patterns();
+    let most_us = share_us(frame_us, bits.patterns());
     let least_us = dmd.min_exposure_us(bits.depth()).unwrap_or(1);
     let exposure_us = wish_us.unwrap_or_else(|| ((u64::from(most_us) * 155 / 171) as u32).max(least_us));
     if (least_us..=most_us).contains(&exposure_us) {
         Ok(exposure_us)
     } else {
-        Err(BadExposure { wish_us, least_us, most_us })
+        Err(BadExposure { exposure_us, least_us, most_us })
     }
 }
 
@@ -191,7 +187,7 @@ impl VideoPatterns {
     /// An entry that breaks a rule of the table.
     pub fn steps(&self, firmware: Version) -> Result<Vec<Step<'static>>, LutError> {
         let mut steps = self.dark_steps(firmware)?;
-        steps.extend(self.leds.steps());
+        steps.extend(self.light());
         Ok(steps)
     }
 

@@ -9,7 +9,7 @@ use dpm_device::time::HostTime;
 
 use super::patterns::{Patterns, Refusal};
 use super::registers::{is_loose, setting};
-use super::video::VideoInput;
+use super::video::{VideoInput, ABORTED};
 use super::{Dlpc900Fault, Options};
 
 /// Time from setting the source until it is locked.
@@ -408,7 +408,7 @@ impl Controller {
             if std::mem::take(&mut self.park_requested) {
                 self.blocks_locked = false;
                 // The one way out of an abort, seen in the field: stopped, parked, unparked, and the table again.
-                self.hardware_fault &= !0x40;
+                self.hardware_fault &= !ABORTED;
             }
         }
         Ok(())
@@ -476,7 +476,7 @@ impl Controller {
                         let planned = self.faults.iter().position(|f| *f == Dlpc900Fault::AbortStart);
                         let is_planned = planned.map(|i| self.faults.swap_remove(i)).is_some();
                         if is_planned || self.patterns.table_us() > self.options.video_frame_us {
-                            self.hardware_fault |= 0x40;
+                            self.hardware_fault |= ABORTED;
                         }
                     }
                 }

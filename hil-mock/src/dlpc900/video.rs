@@ -8,7 +8,7 @@ use dpm_device::time::HostTime;
 use super::controller::{Controller, Sequencer};
 
 /// Hardware status: the sequence was aborted.
-const ABORTED: u8 = 0x40;
+pub(super) const ABORTED: u8 = 0x40;
 
 /// What the video input has received.
 #[derive(Debug, Default)]

@@ -9,7 +9,7 @@ use std::sync::{Arc, OnceLock};
 use std::thread::JoinHandle;
 use std::time::{Duration, Instant};
 
-use dpm_device::dlpc900::driver::{Dlpc900, Dlpc900Error, HidPort, PortError};
+use dpm_device::dlpc900::driver::{Dlpc900, Dlpc900Error, HidPort};
 use dpm_device::dlpc900::video::VideoPatterns;
 use dpm_device::transport::TransportError;
 
@@ -37,7 +37,7 @@ pub fn behind<P: HidPort + Send + 'static>(
     Arc::new(move || {
         // Black is on the wire before the controller looks at it.
         let mut shown = display()?;
-        let failed = |e: Dlpc900Error| match is_gone(&e) {
+        let failed = |e: Dlpc900Error| match e.is_gone() {
             true => TransportError::Unplugged { device: "DLPC900".into() },
             false => TransportError::Unsuitable { device: "DLPC900".into(), why: e.to_string() },
         };
@@ -66,17 +66,10 @@ fn no_thread(e: std::io::Error) -> TransportError {
     TransportError::Unsuitable { device: "DLPC900".into(), why }
 }
 
-fn is_gone(e: &Dlpc900Error) -> bool {
-    matches!(e, Dlpc900Error::Port { source: PortError::Gone | PortError::NotFound, .. })
-}
-
-/// Stops the sequence, switches the LEDs off and exercises the mirrors, as quickly as the cable allows. True if the
-/// controller rests then.
-fn rest<P: HidPort>(controller: &mut Dlpc900<P>) -> bool {
-    controller.hurry();
-    // Half a command may have been sent before; the next one may be lost with it.
-    let stopped = controller.stop().or_else(|e| if is_gone(&e) { Err(e) } else { controller.stop() });
-    stopped.and_then(|()| controller.idle()).is_ok()
+/// Stops the sequence, switches the LEDs off and exercises the mirrors. A controller that cannot be told is the guard
+/// process's.
+fn rest<P: HidPort>(controller: &mut Dlpc900<P>) {
+    let _ = controller.stop_at_the_end().and_then(|()| controller.idle());
 }
 
 /// The thread that asks the controller for its state, and puts it to rest at the end.
@@ -144,7 +137,7 @@ fn look_until<P: HidPort>(controller: &mut Dlpc900<P>, over: &AtomicBool) -> Opt
                 }
                 None => 0,
             },
-            Err(e) if is_gone(&e) => return Some(None),
+            Err(e) if e.is_gone() => return Some(None),
             Err(e) if silent == MOST_SILENT => return Some(Some(e.to_string())),
             Err(_) => silent + 1,
         };

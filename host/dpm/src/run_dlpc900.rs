@@ -14,7 +14,7 @@ use dpm_device::dlpc900::lut::{led, Dmd, LutEntry, IMAGE_PLANES, MAX_IMAGES};
 use dpm_device::dlpc900::sequence::{
     LedSetup, Pattern, PatternSequence, Repeat, SequenceBuilder, SequenceError,
 };
-use dpm_device::dlpc900::usb::{describe, UsbHid, UsbPlace};
+use dpm_device::dlpc900::usb::{self, UsbHid, UsbPlace};
 use dpm_device::dlpc900::video::{share_us, Receiver, VideoPatterns};
 use dpm_device::link::faults;
 use dpm_device::planes::{Channel, PlaneSchedule};
@@ -216,12 +216,13 @@ pub(crate) fn opener(
 ) -> impl FnMut() -> Result<Dlpc900<UsbHid>, Dlpc900Error> + '_ {
     let waited = Stopwatch::start();
     move || loop {
-        match UsbHid::open(place) {
-            Ok(port) => break Dlpc900::new(port),
-            Err(PortError::Busy) if waited.elapsed_ns() < BUSY_PATIENCE_NS && !monitor.stop_requested() => {
+        match usb::open(place) {
+            Err(Dlpc900Error::Port { source: PortError::Busy, .. })
+                if waited.elapsed_ns() < BUSY_PATIENCE_NS && !monitor.stop_requested() =>
+            {
                 std::thread::sleep(STEP);
             }
-            Err(source) => break Err(Dlpc900Error::Port { doing: describe(place), source }),
+            opened => break opened,
         }
     }
 }
@@ -305,7 +306,7 @@ fn video(config: &RigConfig, backend: &Dlpc900Config, dmd: Dmd) -> VideoPatterns
     let rate = config.projector.frame_rate;
     let frame_hz = rate.hz().round() as u32;
     let patterns = config.projector.planes as u8;
-    let share = share_us(frame_hz, patterns);
+    let share = share_us(1_000_000 / frame_hz.max(1), patterns.into());
     let exposure_us = backend.exposure_us.unwrap_or(share).min(share);
     let entry = |i: u8| LutEntry { leds: led::WHITE, ..LutEntry::one_bit(i.into(), 0, i, exposure_us) };
     VideoPatterns {
@@ -385,9 +386,7 @@ pub(crate) fn present<P: HidPort>(
         });
         // Whatever happened: stopped, LEDs off, mirrors exercised. A controller that is gone cannot be told, and one that does not
         // answer is not asked again: the process must end.
-        d.hurry();
-        // Half a command may have been sent before the stop. The next command may be lost with it.
-        let stopped = d.stop().or_else(|e| if is_gone(&e) { Err(e) } else { d.stop() });
+        let stopped = d.stop_at_the_end();
         word.is_dark.store(stopped.is_ok(), Ordering::SeqCst);
         let rested = if matches!(stopped, Err(Dlpc900Error::Port { .. })) { stopped } else { d.idle() };
         (result, rested)
@@ -395,13 +394,9 @@ pub(crate) fn present<P: HidPort>(
     monitor.set_projector(ProjectorHealth::Stopped);
     result?;
     match rested {
-        Err(e) if !is_gone(&e) => Err(e.into()),
+        Err(e) if !e.is_gone() => Err(e.into()),
         _ => Ok(report),
     }
-}
-
-fn is_gone(e: &Dlpc900Error) -> bool {
-    matches!(e, Dlpc900Error::Port { source: PortError::Gone | PortError::NotFound, .. })
 }
 
 /// What the run's thread and the dark thread share. The dark thread exists because the run's thread may spend a
@@ -700,7 +695,7 @@ impl<P: HidPort> Watch<'_, P> {
                 self.is_torn = true;
             }
             // Right after it was plugged in it may still be without rights, in other hands, or silent.
-            Err(e) if is_gone(&e) || self.lost && matches!(e, Dlpc900Error::Port { .. }) => {
+            Err(e) if e.is_gone() || self.lost && matches!(e, Dlpc900Error::Port { .. }) => {
                 self.lost = true;
                 self.monitor.set_projector(ProjectorHealth::Lost);
             }

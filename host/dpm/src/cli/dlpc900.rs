@@ -6,11 +6,11 @@ use crate::rest_dlpc900::put_to_rest;
 use crate::signals;
 use clap::ValueEnum;
 use dpm_common::guardian::{self, Guardian};
-use dpm_device::dlpc900::driver::{Dlpc900, Dlpc900Error, UploadProgress};
+use dpm_device::dlpc900::driver::{Dlpc900, UploadProgress};
 use dpm_device::dlpc900::image::{Compression, PlaneOrder};
 use dpm_device::dlpc900::lut::{led, LutEntry};
 use dpm_device::dlpc900::sequence::{LedSetup, Repeat};
-use dpm_device::dlpc900::usb::{describe, list, UsbHid, UsbPlace};
+use dpm_device::dlpc900::usb::{self, describe, list, UsbHid, UsbPlace};
 use dpm_device::dlpc900::video::{share_us, Receiver, VideoPatterns};
 use dpm_rig::config::{Dlpc900Config, ProjectorBackend};
 use dpm_rig::failure::{Failure, FailureKind};
@@ -255,11 +255,7 @@ fn guard(place: Option<UsbPlace>) -> Result<(), Failure> {
     if !guardian::outlived() {
         return Ok(());
     }
-    let mut open = || {
-        let port = UsbHid::open(place);
-        Dlpc900::new(port.map_err(|source| Dlpc900Error::Port { doing: describe(place), source })?)
-    };
-    put_to_rest(&mut open)
+    put_to_rest(&mut || usb::open(place))
         .map_err(|e| device(format!("{e}; it could not be stopped and continues to show its patterns")))?;
     let _ =
         writeln!(std::io::stderr(), "the run was killed: its DLPC900 is stopped and exercises its mirrors");
@@ -349,7 +345,7 @@ fn execute_upload(d: &mut Dlpc900<UsbHid>, u: &UploadArgs) -> Result<(), Failure
 }
 
 fn execute_video(d: &mut Dlpc900<UsbHid>, v: &VideoArgs) -> Result<(), Failure> {
-    let exposure_us = v.exposure_us.unwrap_or_else(|| share_us(v.frame_hz, v.patterns));
+    let exposure_us = v.exposure_us.unwrap_or_else(|| share_us(1_000_000 / v.frame_hz, v.patterns.into()));
     let entry = |i: u8| LutEntry { leds: v.leds.bits(), ..LutEntry::one_bit(i.into(), 0, i, exposure_us) };
     make_ready(d)?;
     d.start_video_patterns(&VideoPatterns {

@@ -7,6 +7,7 @@
 mod backend;
 mod calibration;
 mod check;
+mod check_projector;
 mod method;
 mod osc;
 mod page;

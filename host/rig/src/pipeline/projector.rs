@@ -6,8 +6,7 @@ use crate::config::{
 };
 use crate::engine::connect::ConnectError;
 use dpm_device::alp::{AlpSettings, AlpTransport, Showing};
-use dpm_device::dlpc900::driver::{Dlpc900, Dlpc900Error};
-use dpm_device::dlpc900::usb::{describe, UsbHid, UsbPlace};
+use dpm_device::dlpc900::usb::{self, UsbPlace};
 use dpm_device::link::{packet_bytes, Codec, Epoch, LinkError, LinkSettings, Underrun, COMMIT_BYTES};
 use dpm_device::planes::Raster;
 use dpm_device::time::{DeviceTicks, HostClock};
@@ -167,11 +166,7 @@ fn feeding(
         return Ok(opener);
     };
     let video = video.map_err(|e| refused("exposure_us", e.to_string()))?;
-    let open = move || {
-        let port = UsbHid::open(place);
-        Dlpc900::new(port.map_err(|source| Dlpc900Error::Port { doing: describe(place), source })?)
-    };
-    Ok(dpm_display::dlpc900::behind(opener, Arc::new(open), video))
+    Ok(dpm_display::dlpc900::behind(opener, Arc::new(move || usb::open(place)), video))
 }
 
 fn open_window(config: &RigConfig, window: &WindowConfig, raster: Raster) -> Result<Medium, TransportError> {
