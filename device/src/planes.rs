@@ -63,7 +63,8 @@ pub enum Channel {
     White = 3,
 }
 
-/// One plane of a frame: which bit of which channel it shows. Its LED intensity is `2^bit / 255` of full.
+/// One plane of a frame: which bit of which channel it shows. Its LED intensity is `2^bit / 255` of full, or its share of the
+/// full light where the planes of a schedule share it ([`PlaneSchedule::filling`]).
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct PlaneSpec {
     /// LED lit.
@@ -99,12 +100,32 @@ impl PlaneSpec {
 /// Most planes a frame may have.
 pub const MAX_PLANES: usize = 32;
 
-/// The planes of a frame in the order they are shown. All planes share one slot length; grey comes from LED intensity.
+/// The planes of a frame in the order they are shown. The light of a plane goes by its bit.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct PlaneSchedule {
     planes: [PlaneSpec; MAX_PLANES],
     len: u8,
     repeats: bool,
+    fills: bool,
+}
+
+/// How a code value is shared out over a frame whose planes do not weigh as its bits do: each channel shows several parts, one
+/// after the other, and every part is a number of a few bits. The light of a frame is the sum of the parts.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Parts {
+    /// Parts of a channel, at least 2.
+    pub count: u8,
+    /// Bits of a part, 1 to 8. A part of one bit is a plane, and all planes give equal light then.
+    pub depth: u8,
+    /// All planes are white, and show the green code value; else red, green and blue have as many parts each.
+    pub white: bool,
+}
+
+impl Parts {
+    /// The greatest sum of the parts of a channel: what a mirror adds up to that is on in all its planes.
+    pub const fn most(self) -> u32 {
+        self.count as u32 * ((1 << self.depth) - 1)
+    }
 }
 
 impl PlaneSchedule {
@@ -121,27 +142,70 @@ impl PlaneSchedule {
         }
         let mut all = [PlaneSpec { channel: Channel::White, bit: 0 }; MAX_PLANES];
         all[..planes.len()].copy_from_slice(planes);
-        Some(Self { planes: all, len: planes.len() as u8, repeats: false })
+        Some(Self { planes: all, len: planes.len() as u8, repeats: false, fills: false })
     }
 
     /// Planes in the order given, of which several may have the same channel and bit: for codes that need planes of equal
     /// light. `None` as for [`PlaneSchedule::new`], or if a mirror that is on in every plane would send out more light
     /// than full white in one of the channels.
     pub fn with_repeats(planes: &[PlaneSpec]) -> Option<Self> {
+        Self::repeating(planes).filter(|schedule| schedule.greatest_sum() <= 255)
+    }
+
+    /// Planes in the order given that share the full light of a frame among them: a mirror that is on in all of them is as
+    /// bright as the projector can make it, whatever the sum of their bits. Displays and panels whose light source is not
+    /// dimmed from plane to plane are of this kind. `None` as for [`PlaneSchedule::new`], or if the channels that are lit do not
+    /// reach the same sum; white and coloured planes do not mix.
+    pub fn filling(planes: &[PlaneSpec]) -> Option<Self> {
+        let schedule = Self::repeating(planes)?;
+        let sums = [Channel::Red, Channel::Green, Channel::Blue].map(|channel| schedule.sum_of(channel));
+        let whites = planes.iter().filter(|p| p.channel == Channel::White).count();
+        let is_one_kind = whites == 0 || whites == planes.len();
+        let is_even = sums.iter().all(|&sum| sum == 0 || sum == schedule.greatest_sum());
+        (is_one_kind && is_even).then_some(Self { fills: true, ..schedule })
+    }
+
+    /// This schedule as one whose planes share the full light; itself if that is not possible. See [`PlaneSchedule::filling`].
+    pub fn filled(self) -> Self {
+        Self::filling(self.planes()).unwrap_or(self)
+    }
+
+    fn repeating(planes: &[PlaneSpec]) -> Option<Self> {
         if planes.is_empty() || planes.len() > MAX_PLANES || planes.iter().any(|p| p.bit > 7) {
-            return None;
-        }
-        let light = |channel| {
-            let lights = |p: &&PlaneSpec| p.channel == channel || p.channel == Channel::White;
-            planes.iter().filter(lights).map(|p| 1u32 << p.bit).sum::<u32>()
-        };
-        if [Channel::Red, Channel::Green, Channel::Blue].into_iter().any(|channel| light(channel) > 255) {
             return None;
         }
         let mut all = [PlaneSpec { channel: Channel::White, bit: 0 }; MAX_PLANES];
         all[..planes.len()].copy_from_slice(planes);
         let repeats = planes.iter().enumerate().any(|(i, p)| planes[..i].contains(p));
-        Some(Self { planes: all, len: planes.len() as u8, repeats })
+        Some(Self { planes: all, len: planes.len() as u8, repeats, fills: false })
+    }
+
+    /// Sum of `2^bit` over the planes that light `channel`.
+    fn sum_of(&self, channel: Channel) -> u32 {
+        let lights = |p: &&PlaneSpec| p.channel == channel || p.channel == Channel::White;
+        self.planes().iter().filter(lights).map(|p| 1u32 << p.bit).sum()
+    }
+
+    fn greatest_sum(&self) -> u32 {
+        [Channel::Red, Channel::Green, Channel::Blue].map(|c| self.sum_of(c)).into_iter().fold(0, u32::max)
+    }
+
+    /// `parts.count` parts of `parts.depth` bits for each channel, in the order in which a DLPC900 shows the bits of a pixel:
+    /// part by part, in each green, red and blue, and of each number the lowest bit first. They share the full light of a
+    /// frame. `None` if these are more planes than a frame may have, or a part has no bits or more than 8.
+    pub fn of_parts(parts: Parts) -> Option<Self> {
+        let channels: &[Channel] =
+            if parts.white { &[Channel::White] } else { &[Channel::Green, Channel::Red, Channel::Blue] };
+        let planes = usize::from(parts.count) * usize::from(parts.depth) * channels.len();
+        if planes > MAX_PLANES || parts.depth > 8 {
+            return None;
+        }
+        let mut all = [PlaneSpec { channel: Channel::White, bit: 0 }; MAX_PLANES];
+        for (i, plane) in all[..planes].iter_mut().enumerate() {
+            let (pattern, bit) = (i / usize::from(parts.depth), i % usize::from(parts.depth));
+            *plane = PlaneSpec { channel: channels[pattern % channels.len()], bit: bit as u8 };
+        }
+        Self::filling(&all[..planes])
     }
 
     /// 24 planes of equal white light, each at 8 / 255 of full: three quarters of full white if all are on.
@@ -162,28 +226,60 @@ impl PlaneSchedule {
         Self::with_repeats(&[PlaneSpec { channel: Channel::White, bit: 4 }; 8]).expect("128 of 255")
     }
 
-    /// Number of planes of each channel, if they all give the same light and grey can come only from how many of them a
-    /// mirror is on in: one white channel, or red, green and blue with at most 8 planes each. `None` for other schedules.
-    pub fn equal_planes(&self) -> Option<u8> {
-        let count = |channel| self.planes().iter().filter(|p| p.channel == channel).count();
-        let (first, white) = (self.planes()[0], count(Channel::White));
-        let each = if white > 0 { white } else { count(Channel::Red) };
-        let is_even = if white > 0 {
-            white == self.len() && white <= 24
+    /// How code values are shared out over the planes, if these do not weigh as the bits of a code value do: every channel
+    /// (one white, or red, green and blue alike) shows the same few bits several times, lowest first. A white channel has at
+    /// most 24 planes, a coloured one at most 8. `None` for other schedules.
+    pub fn parts(&self) -> Option<Parts> {
+        let white = self.planes().iter().all(|p| p.channel == Channel::White);
+        let of =
+            |channel| if white { Some(self.numbers_of(Channel::White)?) } else { self.numbers_of(channel) };
+        let [red, green, blue] = [Channel::Red, Channel::Green, Channel::Blue].map(of);
+        let first = red?;
+        let planes = usize::from(first.0) * usize::from(first.1);
+        let all = if white { planes } else { 3 * planes };
+        let is_alike = green == red && blue == red && all == self.len();
+        let fits = planes <= if white { 24 } else { 8 };
+        (is_alike && fits && first.0 > 1).then_some(Parts { count: first.0, depth: first.1, white })
+    }
+
+    /// How often a channel shows how many bits, and the lowest of them; `None` if it does not show the same ones again and
+    /// again.
+    fn numbers_of(&self, channel: Channel) -> Option<(u8, u8, u8)> {
+        let bits = || self.planes().iter().filter(|p| p.channel == channel).map(|p| p.bit);
+        let lowest = bits().next()?;
+        let depth = bits().zip(lowest..).take_while(|(bit, rising)| bit == rising).count();
+        let is_again = |(i, bit): (usize, u8)| usize::from(bit - lowest) == i % depth;
+        let count = bits().count();
+        let is_even =
+            count % depth == 0 && bits().all(|bit| bit >= lowest) && bits().enumerate().all(is_again);
+        is_even.then_some(((count / depth) as u8, depth as u8, lowest))
+    }
+
+    /// The sum of `2^bit` over the planes of a channel that is full white: 255, unless the planes share the full light among
+    /// them.
+    pub fn white_weight(&self) -> u32 {
+        if self.fills {
+            self.greatest_sum()
         } else {
-            each <= 8 && count(Channel::Green) == each && count(Channel::Blue) == each
-        };
-        let is_equal = self.planes().iter().all(|p| p.bit == first.bit);
-        (each > 1 && is_even && is_equal).then_some(each as u8)
+            255
+        }
+    }
+
+    /// Light of a channel as a code value, rounded, at most 255, where `sum` is the sum of `2^bit` over the planes in which a
+    /// mirror is on.
+    pub fn light_of(&self, sum: u32) -> u8 {
+        let white = self.white_weight();
+        ((sum.min(white) * 255 + white / 2) / white) as u8
     }
 
     /// Light of a channel when all planes are on, as a code value: 255 for binary planes of eight bits.
     pub fn full_light(&self) -> u32 {
-        let light = |channel| {
-            let lights = |p: &&PlaneSpec| p.channel == channel || p.channel == Channel::White;
-            self.planes().iter().filter(lights).map(|p| 1u32 << p.bit).sum::<u32>().min(255)
-        };
-        [Channel::Red, Channel::Green, Channel::Blue].into_iter().map(light).max().unwrap_or(0)
+        self.light_of(self.greatest_sum()).into()
+    }
+
+    /// The planes share the full light of a frame among them; see [`PlaneSchedule::filling`].
+    pub const fn fills(&self) -> bool {
+        self.fills
     }
 
     /// Two planes have the same channel and bit.
@@ -231,5 +327,76 @@ impl PlaneSchedule {
     /// Never true: a schedule has at least one plane.
     pub const fn is_empty(&self) -> bool {
         self.len == 0
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn parts(count: u8, depth: u8, white: bool) -> Parts {
+        Parts { count, depth, white }
+    }
+
+    /// What a schedule was made of is found in it again, and schedules whose bits weigh as those of a code value have none.
+    #[test]
+    fn parts_are_found_again() {
+        for (count, depth, white) in [
+            (3, 8, true),
+            (4, 6, true),
+            (6, 4, true),
+            (8, 3, true),
+            (12, 2, true),
+            (24, 1, true),
+            (2, 4, false),
+            (4, 2, false),
+            (8, 1, false),
+        ] {
+            let made = parts(count, depth, white);
+            let schedule = PlaneSchedule::of_parts(made).unwrap();
+            assert_eq!(schedule.len(), 24);
+            assert_eq!(schedule.parts(), Some(made));
+            assert!(schedule.fills() && schedule.has_repeats());
+            assert_eq!((schedule.white_weight(), schedule.full_light()), (made.most(), 255));
+            // The light of a mirror that is on in the planes of a single part.
+            let single = schedule.light_of((1 << depth) - 1);
+            assert!((f64::from(single) - 255.0 / f64::from(count)).abs() <= 0.5, "{made:?}: {single}");
+        }
+        for (schedule, each, white) in [
+            (PlaneSchedule::equal_rgb24(), 8, false),
+            (PlaneSchedule::equal_mono8(), 8, true),
+            (PlaneSchedule::equal24(), 24, true),
+        ] {
+            assert_eq!(schedule.parts(), Some(parts(each, 1, white)));
+            assert_eq!(schedule.filled().parts(), schedule.parts());
+            assert!(schedule.full_light() < 255 && schedule.filled().full_light() == 255);
+        }
+        for schedule in [PlaneSchedule::rgb24(), PlaneSchedule::mono8(), PlaneSchedule::mono8().filled()] {
+            assert_eq!((schedule.parts(), schedule.white_weight()), (None, 255));
+            assert!((0..256).all(|sum| u32::from(schedule.light_of(sum)) == sum));
+        }
+        let ascending = PlaneSchedule::of_parts(parts(1, 8, false)).unwrap();
+        assert_eq!(
+            (ascending.parts(), ascending.has_repeats(), ascending.white_weight()),
+            (None, false, 255)
+        );
+    }
+
+    #[test]
+    fn a_schedule_that_cannot_share_the_light_is_refused() {
+        assert_eq!(PlaneSchedule::of_parts(parts(4, 8, false)), None);
+        assert_eq!(PlaneSchedule::of_parts(parts(2, 9, true)), None);
+        assert_eq!(PlaneSchedule::of_parts(parts(0, 8, true)), None);
+        assert_eq!(PlaneSchedule::of_parts(parts(2, 0, true)), None);
+        let plane = |channel, bit| PlaneSpec { channel, bit };
+        let uneven = [plane(Channel::Red, 0), plane(Channel::Green, 1)];
+        let mixed = [plane(Channel::White, 0), plane(Channel::Green, 0)];
+        assert_eq!([&uneven, &mixed].map(|planes| PlaneSchedule::filling(planes)), [None, None]);
+        // More than full white of a dimmed light source, and full light shared out.
+        let thrice = [plane(Channel::White, 7); 3];
+        assert_eq!(PlaneSchedule::with_repeats(&thrice), None);
+        assert_eq!(PlaneSchedule::filling(&thrice).unwrap().light_of(128), 85);
+        // A single colour may fill alone.
+        assert!(PlaneSchedule::filling(&[plane(Channel::Blue, 3); 4]).is_some());
     }
 }

@@ -126,32 +126,34 @@ layout(constant_id = 15) const bool HAS_RESPONSE = false;
 layout(constant_id = 16) const bool HAS_FLAT_FIELD = false;
 // The albedo of some body's real surface is a picture over its texture coordinates.
 layout(constant_id = 17) const bool HAS_ALBEDO_MAPS = false;
-// Planes of equal light of each channel.
-layout(constant_id = 18) const uint HALFTONE_PLANES = 8u;
-// They are white, and show the green code value.
-layout(constant_id = 19) const bool HALFTONE_WHITE = false;
-// Planes that follow are taken from whole words, which are halftones and no code values.
-layout(constant_id = 20) const bool WARP_WHOLE_WORDS = false;
+// Parts of a frame in which each channel shows its code value.
+layout(constant_id = 18) const uint HALFTONE_PARTS = 8u;
+// Bits of a part.
+layout(constant_id = 19) const uint HALFTONE_DEPTH = 1u;
+// The planes are white, and show the green code value.
+layout(constant_id = 20) const bool HALFTONE_WHITE = false;
+// Planes that follow are taken from whole words, which are halftones and hold no code values.
+layout(constant_id = 21) const bool WARP_WHOLE_WORDS = false;
 // Width of the bit planes, pixels.
-layout(constant_id = 21) const uint PLANE_WIDTH = 1u;
+layout(constant_id = 22) const uint PLANE_WIDTH = 1u;
 // Height of the bit planes, pixels.
-layout(constant_id = 22) const uint PLANE_HEIGHT = 1u;
+layout(constant_id = 23) const uint PLANE_HEIGHT = 1u;
 // Which planes show bits 0 to 3 of a code value, a byte each from the lowest on; 255: none does.
-layout(constant_id = 23) const uint PLANE_OF_BITS_0 = 4294967295u;
+layout(constant_id = 24) const uint PLANE_OF_BITS_0 = 4294967295u;
 // The same for bits 4 to 7.
-layout(constant_id = 24) const uint PLANE_OF_BITS_4 = 4294967295u;
+layout(constant_id = 25) const uint PLANE_OF_BITS_4 = 4294967295u;
 // The same for bits 8 to 11.
-layout(constant_id = 25) const uint PLANE_OF_BITS_8 = 4294967295u;
+layout(constant_id = 26) const uint PLANE_OF_BITS_8 = 4294967295u;
 // The same for bits 12 to 15.
-layout(constant_id = 26) const uint PLANE_OF_BITS_12 = 4294967295u;
+layout(constant_id = 27) const uint PLANE_OF_BITS_12 = 4294967295u;
 // The same for bits 16 to 19.
-layout(constant_id = 27) const uint PLANE_OF_BITS_16 = 4294967295u;
+layout(constant_id = 28) const uint PLANE_OF_BITS_16 = 4294967295u;
 // The same for bits 20 to 23.
-layout(constant_id = 28) const uint PLANE_OF_BITS_20 = 4294967295u;
+layout(constant_id = 29) const uint PLANE_OF_BITS_20 = 4294967295u;
 // On GPUs: groups of nodes that may wait while a ray walks through a body, at most one for each level of the deepest tree.
-layout(constant_id = 29) const uint WALK_STACK = 24u;
+layout(constant_id = 30) const uint WALK_STACK = 24u;
 // On GPUs: a pixel may have more than `TRACE_PIXEL_SAMPLES` samples, so that those of a workgroup may take several rounds. The loop over the rounds costs registers even where there is one.
-layout(constant_id = 30) const bool MANY_SAMPLES = true;
+layout(constant_id = 31) const bool MANY_SAMPLES = true;
 
 struct Frame {
     vec3 projector_position;

@@ -1,4 +1,4 @@
-// Code values into halftones, for planes of equal light: words in which each plane of a channel has a bit. Equals the CPU's `halftone` bit for
+// Code values into halftones, for frames that show them in parts of a few bits: words in which each plane of a channel has a bit. Equals the CPU's `halftone` bit for
 // bit, which says how and why.
 //
 // One workgroup is a block of 8 x 8 pixels.
@@ -16,7 +16,10 @@ layout(set = 0, binding = B_TILES, scalar) readonly buffer Tiles { uint tiles[];
 shared uint keys[64];
 shared uint rests;
 
-// A pixel's value of the blue noise for a channel's remainders, and for the plane at which it begins.
+// What the parts of a channel add up to at full light.
+const uint MOST = HALFTONE_PARTS * ((1u << HALFTONE_DEPTH) - 1u);
+
+// A pixel's value of the blue noise for a channel's remainders, and for the part at which it begins.
 uvec2 noise_of(uvec2 pixel, uint channel) {
     // The mask has two channels; the third of a frame is the first, half a mask aside.
     uint x = (pixel.x + (channel >> 1u) * (NOISE_SIZE / 2u)) % NOISE_SIZE;
@@ -26,18 +29,20 @@ uvec2 noise_of(uvec2 pixel, uint channel) {
     return (channel & 1u) == 0u ? values : values.yx;
 }
 
-// The bits of `ones` of the planes, spread evenly, from plane `phase` on.
-uint spread(uint ones, uint phase) {
+// Parts that add up to `sum`: all the same number, or one more in some that are spread evenly, from part `phase` on.
+uint spread(uint sum, uint phase) {
+    uint each = sum / HALFTONE_PARTS;
+    uint more = sum % HALFTONE_PARTS;
     uint word = 0u;
-    for (uint p = 0u; p < HALFTONE_PLANES; p++)
-        if ((p * ones + phase) % HALFTONE_PLANES < ones) word |= 1u << p;
+    for (uint p = 0u; p < HALFTONE_PARTS; p++)
+        word |= (each + ((p * more + phase) % HALFTONE_PARTS < more ? 1u : 0u)) << (p * HALFTONE_DEPTH);
     return word;
 }
 
 // The bits of a channel with the code value `code`. All invocations of the workgroup call it; outside the raster `code` is 0.
 uint share_out(uint code, uvec2 pixel, uint channel) {
     uint i = gl_LocalInvocationIndex;
-    uint rest = code * HALFTONE_PLANES % 255u;
+    uint rest = code * MOST % 255u;
     uvec2 noise = noise_of(pixel, channel);
     // Unique, and above 0: the number of the mirror decides between equals.
     uint key = rest > 0u ? ((rest + noise.x) << 6u) | i : 0u;
@@ -49,10 +54,10 @@ uint share_out(uint code, uvec2 pixel, uint channel) {
     uint extra = (rests + ((frame.drawn & 1u) == 0u ? 63u : 191u)) / 255u;
     uint before = 0u;
     for (uint k = 0u; k < 64u; k++) before += keys[k] > key ? 1u : 0u;
-    uint ones = code * HALFTONE_PLANES / 255u + (key > 0u && before < extra ? 1u : 0u);
+    uint sum = code * MOST / 255u + (key > 0u && before < extra ? 1u : 0u);
     // The next channel writes the same memory.
     barrier();
-    return spread(ones, noise.y % HALFTONE_PLANES);
+    return spread(sum, noise.y % HALFTONE_PARTS);
 }
 
 void main() {

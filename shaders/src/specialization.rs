@@ -86,11 +86,13 @@ specialization_constants! {
     HAS_FLAT_FIELD: bool = false;
     /// The albedo of some body's real surface is a picture over its texture coordinates.
     HAS_ALBEDO_MAPS: bool = false;
-    /// Planes of equal light of each channel.
-    HALFTONE_PLANES: uint = 8;
-    /// They are white, and show the green code value.
+    /// Parts of a frame in which each channel shows its code value.
+    HALFTONE_PARTS: uint = 8;
+    /// Bits of a part.
+    HALFTONE_DEPTH: uint = 1;
+    /// The planes are white, and show the green code value.
     HALFTONE_WHITE: bool = false;
-    /// Planes that follow are taken from whole words, which are halftones and no code values.
+    /// Planes that follow are taken from whole words, which are halftones and hold no code values.
     WARP_WHOLE_WORDS: bool = false;
     /// Width of the bit planes, pixels.
     PLANE_WIDTH: uint = 1;

@@ -2,7 +2,7 @@
 //! light against that of one whose planes are binary.
 
 use bytemuck::Zeroable;
-use dpm_device::planes::{PlaneSchedule, Raster};
+use dpm_device::planes::{Parts, PlaneSchedule, Raster};
 use dpm_lab::reference::Sampler;
 use dpm_render::blue_noise;
 use dpm_render::gpu::{Buffer, Gpu};
@@ -30,7 +30,11 @@ fn on_gpu(gpu: &Arc<Gpu>, how: Halftone, raster: Raster, number: u32, codes: &[u
     let tiles = uploaded(gpu, "tiles", bytemuck::cast_slice(&tiles));
     let noise = uploaded(gpu, "noise", blue_noise::MASK);
     let words = Buffer::from_slice(gpu, "codes", codes).unwrap();
-    let constants = [(ids::HALFTONE_PLANES, how.planes), (ids::HALFTONE_WHITE, how.white.into())];
+    let constants = [
+        (ids::HALFTONE_PARTS, how.parts),
+        (ids::HALFTONE_DEPTH, how.depth),
+        (ids::HALFTONE_WHITE, how.white.into()),
+    ];
     let buffers = [("B_FRAME", &frame), ("B_TILES", &tiles), ("B_NOISE", &noise), ("B_CODES", &words)];
     let through = |texel| {
         let shader = dpm_shaders::HALFTONE.reading(texel);
@@ -38,6 +42,16 @@ fn on_gpu(gpu: &Arc<Gpu>, how: Halftone, raster: Raster, number: u32, codes: &[u
         run_shader(gpu, (shader, &constants), [4 * tiles_x * tiles_y, 1, 1], &buffers, ("B_CODES", len))
     };
     bytemuck::pod_collect_to_vec(&through(false))
+}
+
+/// Planes of equal light, and parts of more bits.
+fn schedules() -> Vec<PlaneSchedule> {
+    let parts =
+        [(3, 8, true), (4, 6, true), (6, 4, true), (8, 3, true), (12, 2, true), (2, 4, false), (4, 2, false)];
+    let of_parts =
+        parts.map(|(count, depth, white)| PlaneSchedule::of_parts(Parts { count, depth, white }).unwrap());
+    let equal = [PlaneSchedule::equal_rgb24(), PlaneSchedule::equal_mono8(), PlaneSchedule::equal24()];
+    [&equal[..], &of_parts].concat()
 }
 
 #[test]
@@ -52,10 +66,8 @@ fn halftones_of_gpu_and_cpu_are_the_same_bits() {
             // Even fields, in which every mirror of a block has the same remainder.
             let even = vec![0x80_7f01; raster.pixel_count()];
             for (codes, number) in [(&noise, i as u32), (&even, 1_000_003)] {
-                for schedule in
-                    [PlaneSchedule::equal_rgb24(), PlaneSchedule::equal_mono8(), PlaneSchedule::equal24()]
-                {
-                    let how = Halftone::of(&schedule).expect("planes of equal light");
+                for schedule in schedules() {
+                    let how = Halftone::of(&schedule).expect("parts");
                     let mut expected = vec![0; codes.len()];
                     halftone(how, raster, number, codes, &mut expected);
                     let got = on_gpu(gpu, how, raster, number, codes);

@@ -1,7 +1,7 @@
 //! Compares the packing shader with the CPU's packer, byte for byte, at rasters of every alignment; and runs a rig
 //! that packs on the GPU.
 
-use dpm_device::planes::{Channel, PlaneSchedule, PlaneSpec, Raster};
+use dpm_device::planes::{Channel, Parts, PlaneSchedule, PlaneSpec, Raster};
 use dpm_lab::reference::Sampler;
 use dpm_render::gpu::{Buffer, Gpu};
 use dpm_render::pack::{self, BitPlaneFrame, Kernel};
@@ -33,6 +33,8 @@ fn planes_of_gpu_and_cpu_are_the_same_bytes() {
         PlaneSchedule::new(&odd).unwrap(),
         PlaneSchedule::equal_rgb24(),
         PlaneSchedule::equal24(),
+        PlaneSchedule::of_parts(Parts { count: 3, depth: 8, white: true }).unwrap(),
+        PlaneSchedule::of_parts(Parts { count: 2, depth: 4, white: false }).unwrap(),
     ];
     let sizes = [
         (1, 1),

@@ -1,5 +1,5 @@
-//! Patterns cut out of a video signal: each frame of 24-bit pixels is 24 one-bit patterns, or one 8-bit pattern for each
-//! colour, shown while the next frame arrives.
+//! Patterns cut out of a video signal: each frame of 24-bit pixels is 24 one-bit patterns, three 8-bit ones, or something in
+//! between, shown one after the other while the next frame arrives.
 //!
 //! The order of the steps is the guide's, with what programs in the field have learned: black on the wire before
 //! anything else, the whole input shown, some seconds between the lock and the switch to video patterns, LEDs last.
@@ -11,7 +11,7 @@ use std::time::Duration;
 use super::command::Opcode;
 use super::lut::{led, validate, DisplayMode, Dmd, Limits, LutEntry, LutError};
 use super::sequence::{stop, switch_mode, table, write, LedSetup, Step, Version, LEDS_OFF};
-use crate::planes::{Channel, PlaneSchedule};
+use crate::planes::{Channel, PlaneSchedule, PlaneSpec};
 use crate::time::FrameRate;
 
 /// What the patterns of a frame leave of it, microseconds. A sequence that has not ended when the next frame begins is
@@ -50,32 +50,38 @@ pub enum PixelPorts {
     Both = 2,
 }
 
-/// What the 24 bits of a video pixel are to the controller.
+/// Bits of a video pixel.
+pub const PIXEL_BITS: u32 = 24;
+
+/// How the 24 bits of a video pixel are cut into patterns of equally many bits, which are shown one after the other: bit 0 to 7
+/// of green, of red, of blue.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum VideoBits {
-    /// 24 one-bit patterns: green 0 to 7, red 0 to 7, blue 0 to 7.
-    Planes,
-    /// Three 8-bit patterns: green, red, blue.
-    Colours,
-}
+pub struct VideoBits(u8);
 
 impl VideoBits {
+    /// 24 patterns of one bit: the k-th is the k-th plane of a frame.
+    pub const PLANES: Self = Self(1);
+    /// Three patterns of eight bits.
+    pub const BYTES: Self = Self(8);
+
+    /// Patterns of `depth` bits, which must divide 24 and be at most 8.
+    pub const fn new(depth: u8) -> Option<Self> {
+        match depth {
+            1..=4 | 6 | 8 => Some(Self(depth)),
+            _ => None,
+        }
+    }
+
     /// Patterns of a frame.
     pub const fn patterns(self) -> u32 {
-        match self {
-            Self::Planes => 24,
-            Self::Colours => 3,
-        }
+        PIXEL_BITS / self.0 as u32
     }
 
     /// Bits of a pattern.
     pub const fn depth(self) -> u8 {
-        24 / self.patterns() as u8
+        self.0
     }
 }
-
-/// The order in which the colours of an 8-bit pixel are shown.
-pub const COLOUR_ORDER: [Channel; 3] = [Channel::Green, Channel::Red, Channel::Blue];
 
 /// An exposure that does not fit a video frame, or that the DMD cannot keep.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -128,6 +134,16 @@ pub fn exposure_us(
     }
 }
 
+/// The LEDs of planes of a channel.
+const fn led_of(channel: Channel) -> u8 {
+    match channel {
+        Channel::Red => led::RED,
+        Channel::Green => led::GREEN,
+        Channel::Blue => led::BLUE,
+        Channel::White => led::WHITE,
+    }
+}
+
 /// Patterns cut out of a 24-bit video signal.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct VideoPatterns {
@@ -146,9 +162,8 @@ pub struct VideoPatterns {
 }
 
 impl VideoPatterns {
-    /// The patterns of frames that a rig sends: with [`VideoBits::Planes`] the k-th pattern is the k-th plane of `schedule`,
-    /// lit by that plane's LED; with [`VideoBits::Colours`] each colour is a pattern of its own. Each is lit for
-    /// `exposure_us`, one right after the other.
+    /// The patterns of frames that a rig sends, whose 24 planes are those of `schedule`: each pattern shows as many planes as
+    /// `bits` says, lowest bit first, and is lit by the LED of their channel for `exposure_us`, one right after the other.
     pub fn of_rig(
         dmd: Dmd,
         receiver: Receiver,
@@ -157,25 +172,13 @@ impl VideoPatterns {
         bits: VideoBits,
         exposure_us: u32,
     ) -> Self {
-        let led_of = |channel| match channel {
-            Channel::Red => led::RED,
-            Channel::Green => led::GREEN,
-            Channel::Blue => led::BLUE,
-            Channel::White => led::WHITE,
+        let depth = bits.depth();
+        let entry = |(i, planes): (usize, &[PlaneSpec])| LutEntry {
+            leds: led_of(planes[0].channel),
+            depth,
+            ..LutEntry::one_bit(i as u16, 0, i as u8 * depth, exposure_us)
         };
-        let entry = |i: usize, channel| LutEntry {
-            leds: led_of(channel),
-            depth: bits.depth(),
-            ..LutEntry::one_bit(i as u16, 0, i as u8 * bits.depth(), exposure_us)
-        };
-        let entries = match bits {
-            VideoBits::Planes => {
-                schedule.planes().iter().enumerate().map(|(i, plane)| entry(i, plane.channel)).collect()
-            }
-            VideoBits::Colours => {
-                COLOUR_ORDER.into_iter().enumerate().map(|(i, channel)| entry(i, channel)).collect()
-            }
-        };
+        let entries = schedule.planes().chunks(depth.into()).enumerate().map(entry).collect();
         // The table is checked against whole frames a second: rounded up, so that nothing is longer than the frame.
         let frame_hz = rate.num().div_ceil(rate.den());
         Self { dmd, receiver, ports: Some(PixelPorts::Both), frame_hz, entries, leds: LedSetup::default() }
@@ -244,6 +247,7 @@ impl VideoPatterns {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::planes::Parts;
 
     const NEW: Version = Version { major: 6, minor: 0, patch: 1 };
 
@@ -290,18 +294,18 @@ mod tests {
     fn exposures_leave_a_rest_of_every_frame() {
         let rate = |n| FrameRate::new(n, 1).unwrap();
         let of = |bits, n, wish| exposure_us(bits, Dmd::Dlp6500, rate(n), wish);
-        assert_eq!(of(VideoBits::Planes, 60, None), Ok(620));
-        assert_eq!(of(VideoBits::Planes, 60, Some(684)), Ok(684));
-        let refused = of(VideoBits::Planes, 60, Some(685)).unwrap_err();
+        assert_eq!(of(VideoBits::PLANES, 60, None), Ok(620));
+        assert_eq!(of(VideoBits::PLANES, 60, Some(684)), Ok(684));
+        let refused = of(VideoBits::PLANES, 60, Some(685)).unwrap_err();
         assert_eq!(refused.to_string(), "an exposure of 685 us is not within 105 to 684 us");
-        assert!(of(VideoBits::Planes, 60, Some(104)).is_err());
-        assert_eq!(of(VideoBits::Colours, 60, None), Ok(4960));
+        assert!(of(VideoBits::PLANES, 60, Some(104)).is_err());
+        assert_eq!(of(VideoBits::BYTES, 60, None), Ok(4960));
         // At 80 frames/s the default would be too short for eight bits, and the least is taken.
-        assert_eq!(of(VideoBits::Colours, 80, None), Ok(4046));
-        let refused = of(VideoBits::Colours, 90, None).unwrap_err();
+        assert_eq!(of(VideoBits::BYTES, 80, None), Ok(4046));
+        let refused = of(VideoBits::BYTES, 90, None).unwrap_err();
         assert!(refused.to_string().contains("lower the frame rate"), "{refused}");
         for n in 24..=120 {
-            for bits in [VideoBits::Planes, VideoBits::Colours] {
+            for bits in (1..=8).filter_map(VideoBits::new) {
                 let Ok(us) = of(bits, n, None) else { continue };
                 let lit = i64::from(us * bits.patterns());
                 assert!((lit + i64::from(FRAME_REST_US)) * 1000 <= rate(n).slot_len_ns(0));
@@ -313,17 +317,26 @@ mod tests {
     }
 
     #[test]
-    fn each_pattern_is_lit_by_the_led_of_its_plane() {
-        let schedule = PlaneSchedule::equal_rgb24();
+    fn each_pattern_is_lit_by_the_led_of_its_planes() {
         let rate = FrameRate::new(60, 1).unwrap();
-        let of =
-            |bits, us| VideoPatterns::of_rig(Dmd::Dlp6500, Receiver::Hdmi, rate, &schedule, bits, us).entries;
-        let planes = of(VideoBits::Planes, 620);
+        let of = |schedule: PlaneSchedule, bits, us| {
+            VideoPatterns::of_rig(Dmd::Dlp6500, Receiver::Hdmi, rate, &schedule, bits, us).entries
+        };
+        let parts = |count, depth, white| PlaneSchedule::of_parts(Parts { count, depth, white }).unwrap();
+        let planes = of(PlaneSchedule::equal_rgb24(), VideoBits::PLANES, 620);
         let leds: Vec<u8> = planes[..4].iter().map(|e| e.leds).collect();
         assert_eq!(leds, [led::RED, led::GREEN, led::BLUE, led::RED]);
         assert!(planes.iter().enumerate().all(|(i, e)| (usize::from(e.bit), e.depth) == (i, 1)));
-        let colours = of(VideoBits::Colours, 4960);
+        let colours = of(parts(1, 8, false), VideoBits::BYTES, 4960);
         let places: Vec<_> = colours.iter().map(|e| (e.leds, e.bit, e.depth)).collect();
         assert_eq!(places, [(led::GREEN, 0, 8), (led::RED, 8, 8), (led::BLUE, 16, 8)]);
+        let white = of(parts(4, 6, true), VideoBits::new(6).unwrap(), 3000);
+        let places: Vec<_> = white.iter().map(|e| (e.leds, e.bit, e.depth)).collect();
+        assert_eq!(places, [0, 6, 12, 18].map(|bit| (led::WHITE, bit, 6)));
+        let two_poses = of(parts(2, 4, false), VideoBits::new(4).unwrap(), 2000);
+        let leds: Vec<_> = two_poses.iter().map(|e| e.leds).collect();
+        assert_eq!(leds, [led::GREEN, led::RED, led::BLUE, led::GREEN, led::RED, led::BLUE]);
+        assert!(two_poses.iter().enumerate().all(|(i, e)| usize::from(e.bit) == 4 * i));
+        assert_eq!([0, 5, 7, 9].map(VideoBits::new), [None; 4]);
     }
 }

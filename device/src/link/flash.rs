@@ -50,7 +50,7 @@ pub fn mean_luminance(raster: Raster, schedule: &PlaneSchedule, planes: &[u8]) -
         };
         light += lit * (weight << spec.bit);
     }
-    let full = u64::from(rows) * u64::from(raster.width()) * 255 * 10_000;
+    let full = u64::from(rows) * u64::from(raster.width()) * u64::from(schedule.white_weight()) * 10_000;
     (light * u64::from(FULL_LUMINANCE) / full).min(u64::from(FULL_LUMINANCE)) as u32
 }
 

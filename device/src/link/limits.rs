@@ -92,7 +92,7 @@ pub fn light_level(raster: Raster, schedule: &PlaneSchedule, planes: &[u8]) -> u
     }
     let white = drive[Channel::White as usize];
     let greatest = drive[..3].iter().map(|d| d + white).fold(0, u64::max);
-    let full = raster.pixel_count() as u64 * 255;
+    let full = raster.pixel_count() as u64 * u64::from(schedule.white_weight());
     // Rounded up, so that rounding never hides an excess.
     (greatest * u64::from(FULL_LUMINANCE)).div_ceil(full) as u32
 }

@@ -143,10 +143,22 @@ fn write_echo(w: &mut Writer<'_>, e: &Echo) {
 const CODES_REPEAT: u8 = 1;
 /// Flag of CONFIG: the host sends TRACKS, and the device follows them and says so in STATUS.
 const FOLLOWS: u8 = 2;
+/// Flag of CONFIG: the planes share the full light of a frame among them.
+const FILLS: u8 = 4;
 /// Feature of a device in HELLO: it follows TRACKS.
 const FEATURE_TRACKS: u8 = 1;
 /// Length of a STATUS, and of one of a device that follows tracks.
 const STATUS_BYTES: [usize; 2] = [96, 120];
+
+/// The planes of a CONFIG with `flags`; `None` if codes stand there that the flags do not allow.
+fn schedule(planes: &[PlaneSpec], flags: u8) -> Option<PlaneSchedule> {
+    match (flags & FILLS != 0, flags & CODES_REPEAT != 0) {
+        (false, false) => PlaneSchedule::new(planes),
+        (false, true) => PlaneSchedule::with_repeats(planes),
+        (true, false) => PlaneSchedule::filling(planes).filter(|schedule| !schedule.has_repeats()),
+        (true, true) => PlaneSchedule::filling(planes),
+    }
+}
 
 impl Config {
     fn parse(p: &[u8]) -> Result<Self, PayloadError> {
@@ -164,6 +176,9 @@ impl Config {
         for (spec, &code) in specs.iter_mut().zip(&p[CONFIG_BYTES..]) {
             *spec = PlaneSpec::from_led_code(code).ok_or(field("led codes"))?;
         }
+        if p[19] & !(CODES_REPEAT | FOLLOWS | FILLS) != 0 {
+            return Err(field("flags"));
+        }
         let watchdog_us = u32_at(p, 12);
         if watchdog_us == 0 || watchdog_us > MAX_WATCHDOG_US {
             return Err(field("watchdog"));
@@ -178,11 +193,7 @@ impl Config {
         }
         Ok(Self {
             raster: raster(kind, p, 0)?,
-            schedule: match p[19] & CODES_REPEAT {
-                0 => PlaneSchedule::new(&specs[..count]),
-                _ => PlaneSchedule::with_repeats(&specs[..count]),
-            }
-            .ok_or(field("led codes"))?,
+            schedule: schedule(&specs[..count], p[19]).ok_or(field("led codes"))?,
             rate: FrameRate::new(u32_at(p, 4), u32_at(p, 8)).ok_or(field("frame rate"))?,
             watchdog_us,
             underrun: match p[17] {
@@ -201,8 +212,10 @@ impl Config {
         w.u16(self.raster.width() as u16).u16(self.raster.height() as u16);
         w.u32(self.rate.num()).u32(self.rate.den()).u32(self.watchdog_us);
         w.u8(self.schedule.len() as u8).u8(self.underrun as u8).u8(self.late_slots);
-        let repeats = if self.schedule.has_repeats() { CODES_REPEAT } else { 0 };
-        w.u8(repeats | if self.tracks { FOLLOWS } else { 0 });
+        let flag = |is_set: bool, flag: u8| if is_set { flag } else { 0 };
+        w.u8(flag(self.schedule.has_repeats(), CODES_REPEAT)
+            | flag(self.tracks, FOLLOWS)
+            | flag(self.schedule.fills(), FILLS));
         w.u16(self.limits.mean_permille).u16(0).u64(self.epoch.0);
         w.u32(self.limits.window_ms).u32(self.limits.full_white_ms);
         for plane in self.schedule.planes() {

@@ -2,7 +2,8 @@
 //!
 //! A plane of bit `b` is lit for one plane slot with an LED at `2^b / 255` of full. Summed over a channel's planes, a
 //! pixel receives `code / 255` of the light of a full slot, where `code` is the number that its bits form: light **is**
-//! the code value.
+//! the code value. Where planes share the full light among them ([`PlaneSchedule::filling`]), it is their sum as a share of
+//! the sum of all, out of 255.
 
 use crate::planes::{Channel, PlaneSchedule, Raster, MAX_PLANES};
 
@@ -38,7 +39,7 @@ fn transpose_bytes(rows: &mut [u64; 8]) {
 pub fn light_of_planes(raster: Raster, schedule: &PlaneSchedule, planes: &[u8], out: &mut [[u8; 3]]) {
     assert_eq!(planes.len(), raster.plane_bytes() * schedule.len(), "bytes of planes");
     assert_eq!(out.len(), raster.pixel_count(), "pixels of light");
-    if schedule.has_repeats() {
+    if schedule.has_repeats() || schedule.white_weight() != 255 {
         return light_of_repeats(raster, schedule, planes, out);
     }
     let width = raster.width() as usize;
@@ -122,19 +123,26 @@ pub fn gather_bits(
     }
 }
 
-/// The same for a schedule in which a bit of a channel may have several planes: plane by plane.
+/// The same for a schedule in which a bit of a channel may have several planes, or whose planes share the full light: eight
+/// mirrors at a time, plane by plane.
 fn light_of_repeats(raster: Raster, schedule: &PlaneSchedule, planes: &[u8], out: &mut [[u8; 3]]) {
-    out.fill([0; 3]);
-    for (spec, plane) in schedule.planes().iter().zip(planes.chunks_exact(raster.plane_bytes())) {
-        let rows = plane.chunks_exact(raster.row_bytes()).zip(out.chunks_exact_mut(raster.width() as usize));
-        for (row, pixels) in rows {
-            let is_lit = |x: &usize| row[x / 8] << (x % 8) & 0x80 != 0;
-            for (_, pixel) in pixels.iter_mut().enumerate().filter(|(x, _)| is_lit(x)) {
-                let add = |c: &mut u8| *c = c.saturating_add(1 << spec.bit);
-                match spec.channel {
-                    Channel::White => pixel.iter_mut().for_each(add),
-                    channel => add(&mut pixel[channel as usize]),
+    let (plane_bytes, row_bytes) = (raster.plane_bytes(), raster.row_bytes());
+    for (y, row) in out.chunks_exact_mut(raster.width() as usize).enumerate() {
+        for (i, eight) in row.chunks_mut(8).enumerate() {
+            // Sums of `2^bit` of red, green and blue: at most 32 planes of 128.
+            let mut sums = [[0u16; 3]; 8];
+            for (spec, plane) in schedule.planes().iter().zip(planes.chunks_exact(plane_bytes)) {
+                let byte = plane[y * row_bytes + i];
+                let lights = match spec.channel {
+                    Channel::White => [true; 3],
+                    channel => [0, 1, 2].map(|c| c == channel as usize),
+                };
+                for (_, sum) in sums.iter_mut().enumerate().filter(|(x, _)| byte << x & 0x80 != 0) {
+                    sum.iter_mut().zip(lights).for_each(|(s, lit)| *s += u16::from(lit) << spec.bit);
                 }
+            }
+            for (pixel, sum) in eight.iter_mut().zip(sums) {
+                *pixel = sum.map(|s| schedule.light_of(s.into()));
             }
         }
     }
@@ -194,38 +202,44 @@ impl Exposure {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::planes::PlaneSpec;
+    use crate::planes::{Parts, PlaneSpec};
     use proptest::prelude::*;
 
     /// One bit at a time, as the definition says: the oracle.
     fn bit_by_bit(raster: Raster, schedule: &PlaneSchedule, planes: &[u8]) -> Vec<[u8; 3]> {
-        let mut out = vec![[0u8; 3]; raster.pixel_count()];
+        let mut sums = vec![[0u32; 3]; raster.pixel_count()];
         for (k, spec) in schedule.planes().iter().enumerate() {
             for y in 0..raster.height() as usize {
                 for x in 0..raster.width() as usize {
                     let byte = planes[k * raster.plane_bytes() + y * raster.row_bytes() + x / 8];
-                    let weight = (byte >> (7 - x % 8) & 1) << spec.bit;
-                    let pixel = &mut out[y * raster.width() as usize + x];
+                    let weight = u32::from(byte >> (7 - x % 8) & 1) << spec.bit;
+                    let pixel = &mut sums[y * raster.width() as usize + x];
                     match spec.channel {
-                        Channel::White => pixel.iter_mut().for_each(|c| *c = c.saturating_add(weight)),
-                        c => pixel[c as usize] = pixel[c as usize].saturating_add(weight),
+                        Channel::White => pixel.iter_mut().for_each(|c| *c += weight),
+                        c => pixel[c as usize] += weight,
                     }
                 }
             }
         }
-        out
+        let full = f64::from(schedule.white_weight());
+        let light = |sum: u32| (f64::from(sum) * 255.0 / full).min(255.0).round() as u8;
+        sums.into_iter().map(|sum| sum.map(light)).collect()
     }
 
     proptest! {
         #![proptest_config(ProptestConfig::with_cases(48))]
         #[test]
-        fn words_equal_single_bits(w in 1u32..150, h in 1u32..6, seed in any::<u64>(), kind in 0u8..3) {
+        fn words_equal_single_bits(w in 1u32..150, h in 1u32..6, seed in any::<u64>(), kind in 0u8..7) {
             let raster = Raster::new(w, h).unwrap();
             let mixed: Vec<PlaneSpec> =
                 [0x07, 0x37, 0x36, 0x10, 0x22].iter().map(|&c| PlaneSpec::from_led_code(c).unwrap()).collect();
             let schedule = match kind {
                 0 => PlaneSchedule::mono8(),
                 1 => PlaneSchedule::rgb24(),
+                2 => PlaneSchedule::equal_rgb24(),
+                3 => PlaneSchedule::equal_rgb24().filled(),
+                4 => PlaneSchedule::of_parts(Parts { count: 3, depth: 8, white: true }).unwrap(),
+                5 => PlaneSchedule::of_parts(Parts { count: 2, depth: 4, white: false }).unwrap(),
                 _ => PlaneSchedule::new(&mixed).unwrap(),
             };
             let mut state = seed | 1;

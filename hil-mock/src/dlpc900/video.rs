@@ -136,7 +136,7 @@ mod tests {
         let rate = FrameRate::new(60, 1).unwrap();
         let schedule = PlaneSchedule::equal_rgb24();
         let video =
-            VideoPatterns::of_rig(Dmd::Dlp6500, Receiver::Hdmi, rate, &schedule, VideoBits::Planes, 620);
+            VideoPatterns::of_rig(Dmd::Dlp6500, Receiver::Hdmi, rate, &schedule, VideoBits::PLANES, 620);
         let mut d = Dlpc900::new(VirtualHid::new(model.clone())).unwrap();
         d.start_video_patterns(&video).unwrap();
         let now = d.into_port().now();

@@ -48,7 +48,16 @@ impl Timing {
 
     /// From the first pixel of a frame to the end of its last row, nanoseconds: how long the picture rolls.
     pub fn scan_ns(&self) -> i64 {
-        i64::from(self.frame[0]) * i64::from(self.row[3]) * 1_000_000 / i64::from(self.clock_khz).max(1)
+        self.rows_ns(self.frame[0])
+    }
+
+    /// From the first pixel of a frame to the vertical pulse after its last row, nanoseconds.
+    pub fn pulse_ns(&self) -> i64 {
+        self.rows_ns(self.frame[1])
+    }
+
+    fn rows_ns(&self, rows: u16) -> i64 {
+        i64::from(rows) * i64::from(self.row[3]) * 1_000_000 / i64::from(self.clock_khz).max(1)
     }
 }
 

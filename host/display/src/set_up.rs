@@ -20,8 +20,11 @@ pub struct DisplaySettings {
     /// Properties that a physical connector may lack although the encoding needs them.
     pub without: Vec<String>,
     /// From the choice of a frame to the vertical blank from which on it is scanned out, nanoseconds; half of the blank is
-    /// added to it.
+    /// added to it, or with `shows_at_pulse` the time from the pulse in it to the first row.
     pub commit_ns: i64,
+    /// What the display feeds shows a frame from the vertical pulse on that follows its last row, instead of row by row: a
+    /// controller that cuts frames into patterns.
+    pub shows_at_pulse: bool,
     /// The rig's raster.
     pub raster: Raster,
     /// The rig's planes.
@@ -107,9 +110,14 @@ pub fn plan(connectors: &[Connector], settings: &DisplaySettings) -> Result<Plan
         ));
     };
     let period_ns = settings.rate.slot_len_ns(0);
-    let lead_ns = settings.commit_ns + (period_ns - timing.scan_ns()).max(0) / 2;
+    let before_ns = if settings.shows_at_pulse {
+        (period_ns - timing.pulse_ns()).max(0)
+    } else {
+        (period_ns - timing.scan_ns()).max(0) / 2
+    };
+    let lead_ns = settings.commit_ns + before_ns;
     if lead_ns * 10 > period_ns * 9 {
-        let most_us = (period_ns * 9 / 10 - (period_ns - timing.scan_ns()).max(0) / 2).max(0) / 1000;
+        let most_us = (period_ns * 9 / 10 - before_ns).max(0) / 1000;
         return refuse(format!(
             "projector.backend.commit_us = {} leaves no time at {timing}; write {most_us} at most",
             settings.commit_ns / 1000

@@ -73,7 +73,7 @@ impl Chain {
 
     fn open(&self) -> Result<DisplayTransport, TransportError> {
         let settings = settings(Encoding::Planes24);
-        let bits = VideoBits::Planes;
+        let bits = VideoBits::PLANES;
         let us = exposure_us(bits, DMD, settings.rate, None).unwrap();
         let video = VideoPatterns::of_rig(DMD, Receiver::Hdmi, settings.rate, &settings.schedule, bits, us);
         let (card, clock) = (self.card.clone(), self.clock.clone());

@@ -74,6 +74,7 @@ fn settings(encoding: Encoding) -> DisplaySettings {
         encoding,
         without: Vec::new(),
         commit_ns: 5_000_000,
+        shows_at_pulse: false,
         raster: Raster::new(width, height).unwrap(),
         schedule: PlaneSchedule::rgb24(),
         rate: timing().rate().unwrap(),

@@ -1,6 +1,7 @@
 //! `dpm plan`: a rig into what its scene and method need of the renderer, what is left out of it and how, and what that saves.
 
 use super::plan_savings::{changed, compare, flipped, keeping, Saving, Side};
+use dpm_device::planes::Channel;
 use dpm_render::method::{Method, SamplerKind};
 use dpm_render::scene_data::{SceneData, SceneNeeds};
 use dpm_render::warp::LEAST_MOTION_PX;
@@ -186,8 +187,8 @@ pub(crate) fn method_entries(method: &Method, full: &Method, word: &str) -> Vec<
 fn rig_entries(rig: &Rig) -> Vec<PlanEntry> {
     let config = &rig.config;
     let resting = rig.scene.bodies.iter().filter(|b| b.tracked.is_none()).count();
-    let planes = config.projector.planes;
-    let mono = planes == 8;
+    let planes = rig.schedule.len();
+    let mono = rig.schedule.planes().iter().all(|plane| plane.channel == Channel::White);
     let depth = config.render.depth;
     vec![
         PlanEntry {
@@ -219,8 +220,8 @@ fn rig_entries(rig: &Rig) -> Vec<PlanEntry> {
         ),
         entry(
             "planes of three colours",
-            (!mono).then(|| format!("projector.planes = {planes}")),
-            "projector.planes = 8, one colour",
+            (!mono).then(|| format!("{planes} planes of red, green and blue")),
+            &format!("{planes} planes of one colour"),
             "plane not sent; radiance still has three channels",
         ),
         planes_that_follow(rig),

@@ -260,7 +260,8 @@ impl Pass {
             (Grid::Planes, Some(schedule)) => pack::gpu::constants(settings.raster, schedule).to_vec(),
             _ => {
                 let halftone = settings.halftone.into_iter().flat_map(pack::Halftone::constants);
-                let whole_words = (ids::WARP_WHOLE_WORDS, u32::from(settings.halftone.is_some()));
+                let whole_words =
+                    (ids::WARP_WHOLE_WORDS, u32::from(settings.halftone.is_some_and(|h| !h.is_exact())));
                 shared.iter().copied().chain(halftone).chain([whole_words]).collect()
             }
         }

@@ -32,7 +32,7 @@ pub struct RendererSettings {
     pub leave_nothing_out: bool,
     /// How a frame spends its rays.
     pub method: Method,
-    /// The planes give equal light: code values are made into halftones. `None`: grey comes from the planes' light.
+    /// Code values are shown in parts of a few bits: they are made into halftones. `None`: the planes weigh as the bits do.
     pub halftone: Option<Halftone>,
     /// Groups of bit planes that are shown where the bodies are at their own instants; empty: all planes show what was drawn for the frame's instant.
     pub plane_groups: Vec<PlaneGroup>,

@@ -10,7 +10,7 @@ use crate::telemetry::report::Report;
 use crate::telemetry::trace::write_trace;
 use crate::tracks::SourceError;
 use dpm_common::files::{check_folder, write_atomically};
-use dpm_device::planes::Raster;
+use dpm_device::planes::{Channel, Raster};
 use dpm_render::gpu::{validation_messages, Gpu, GpuError, GpuOptions};
 use dpm_render::{least_memory_bytes, RenderError};
 use glam::Vec3;
@@ -38,9 +38,9 @@ pub fn run_rig(config: &RigConfig, monitor: &Arc<RunMonitor>) -> Result<Ended<Re
             "output.images: no pictures are written, because the light of a real projector cannot be observed".into(),
         );
     }
-    if config.projector.planes == 8 {
+    if rig.schedule.planes().iter().all(|plane| plane.channel == Channel::White) {
         notes.push(
-            "projector.planes = 8: the one white channel shows the green of the picture; red and blue alone stay dark".into(),
+            "the projector has one white channel, which shows the green of the picture; red and blue alone stay dark".into(),
         );
     }
     let window = (config.light_window_ms() * 1e-3 * rig.rate().hz()).round().max(1.0) as usize;

@@ -44,7 +44,7 @@ fn with_everything(settings: RendererSettings, camera: ProjectorCamera) -> Resul
         lens: Some(ProjectorCamera { lens, ..camera }),
         leave_nothing_out: true,
         clamp_indirect: Some(10.0),
-        halftone: Some(Halftone { planes: 8, white: false }),
+        halftone: Some(Halftone { parts: 8, depth: 1, white: false }),
         ..settings
     })
 }

@@ -176,6 +176,17 @@ fn an_led_code_may_repeat_only_where_the_flag_says_so() {
     assert!(HostMessage::parse(kind, &out[..n]).is_err(), "a code twice without the flag");
     (out[19], out[40]) = (1, 0x37);
     assert!(HostMessage::parse(kind, &out[..n]).is_err(), "128 + 64 + 64 of 255");
+    // Planes that share the full light: the flag permits any sum, and is a part of the schedule.
+    out[19] = 5;
+    let Ok(HostMessage::Config(shared)) = HostMessage::parse(kind, &out[..n]) else { panic!() };
+    assert!(shared.schedule.fills() && shared.schedule.white_weight() == 256);
+    let mut again = [0; MAX_CONTROL_BYTES];
+    assert_eq!(HostMessage::Config(shared).write(&mut again), (kind, n));
+    assert_eq!(again[..n], out[..n]);
+    out[19] = 4;
+    assert!(HostMessage::parse(kind, &out[..n]).is_err(), "a code twice without its flag");
+    out[19] = 9;
+    assert!(HostMessage::parse(kind, &out[..n]).is_err(), "a flag without a meaning");
     assert!(PlaneSchedule::with_repeats(&[equal[0]; 4]).is_none());
     assert!(PlaneSchedule::equal24().has_repeats() && !PlaneSchedule::rgb24().has_repeats());
     assert_eq!(PlaneSchedule::with_repeats(PlaneSchedule::rgb24().planes()), Some(PlaneSchedule::rgb24()));

@@ -35,6 +35,7 @@ pub fn settings(encoding: Encoding) -> DisplaySettings {
         encoding,
         without: Vec::new(),
         commit_ns: 3_000_000,
+        shows_at_pulse: false,
         raster: raster(),
         schedule: PlaneSchedule::rgb24(),
         rate: FrameRate::new(60, 1).unwrap(),

@@ -1,22 +1,23 @@
-//! Code values into halftones, for planes of equal light.
+//! Code values into halftones, for frames that show each code value in several parts of a few bits.
 //!
 //! Displays that carry one bit a plane, and sequences with one exposure time for all planes, give no plane more light
-//! than another. Grey is then the number of planes in which a mirror is on. `k` planes give a mirror `k + 1` levels;
-//! what is lost by that is shared out over each block of 8 x 8 mirrors and over time:
+//! than another: every plane is a part of one bit. A controller that shows several pictures of a few bits in a frame has
+//! parts of as many bits. Grey is then the sum of the parts. `k` parts of `b` bits add up to `s = k (2^b - 1)`, so a mirror
+//! has `s + 1` levels; what is lost by that is shared out over each block of 8 x 8 mirrors and over time:
 //!
-//! - A mirror of code value `c` is on in `floor(c k / 255)` planes of its channel, or in one more. The number of mirrors
-//!   with one more is that which gives the block its mean; two frames, an even and an odd one, round it by different
-//!   amounts. So the mean level of a block differs by at most `0.75 * 255 / (64 k)` in a frame and by at most
-//!   `0.25 * 255 / (64 k)` over two frames: with 8 planes by 0.38 and 0.13 levels of 255.
+//! - The parts of a mirror of code value `c` add up to `floor(c s / 255)`, or to one more. The number of mirrors with one
+//!   more is that which gives the block its mean; two frames, an even and an odd one, round it by different amounts. So the
+//!   mean level of a block differs by at most `0.75 * 255 / (64 s)` in a frame and by at most `0.25 * 255 / (64 s)` over two
+//!   frames: with 8 planes by 0.38 and 0.13 levels of 255. Three parts of eight bits are exact: each is the code value.
 //! - Which mirrors have one more is decided by the remainder plus blue noise in space and time (\[Wolfe22\]), so what
 //!   remains of the pattern has no low frequencies.
-//! - The planes in which a mirror is on are spread evenly over the frame, and begin at a plane that blue noise chooses.
-//!   So all planes of an even field give equal light.
+//! - All parts of a mirror are the same number or one more. Those with one more are spread evenly over the frame, and begin
+//!   at a part that blue noise chooses. So all parts of an even field give equal light.
 //!
 //! Everything is integer arithmetic, so `shaders/glsl/halftone.comp` gives the same words.
 
 use crate::blue_noise;
-use dpm_device::planes::{Channel, PlaneSchedule, Raster};
+use dpm_device::planes::{Parts, PlaneSchedule, Raster};
 use dpm_shaders::specialization as ids;
 
 /// Mirrors in a row of a block.
@@ -25,25 +26,41 @@ const SIDE: usize = 8;
 /// and three quarters.
 const ROUNDING: [u32; 2] = [63, 191];
 
-/// How planes of equal light show grey.
+/// How the parts of a frame show grey.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Halftone {
-    /// Planes of each channel: 2 to 8, or to 24 if there is only white.
-    pub planes: u32,
+    /// Parts of each channel, at least 2.
+    pub parts: u32,
+    /// Bits of a part. A channel has at most 8 in all its parts, or 24 if there is only white.
+    pub depth: u32,
     /// All planes are white. They show the green code value.
     pub white: bool,
 }
 
 impl Halftone {
-    /// That of `schedule`; `None` if its planes do not give equal light.
+    /// That of `schedule`; `None` if its planes weigh as the bits of a code value do.
     pub fn of(schedule: &PlaneSchedule) -> Option<Self> {
-        let white = schedule.planes()[0].channel == Channel::White;
-        schedule.equal_planes().map(|planes| Self { planes: planes.into(), white })
+        let Parts { count, depth, white } = schedule.parts()?;
+        Some(Self { parts: count.into(), depth: depth.into(), white })
+    }
+
+    /// What the parts of a channel add up to at full light.
+    pub const fn most(self) -> u32 {
+        self.parts * ((1 << self.depth) - 1)
+    }
+
+    /// Each part holds a whole code value, so that its bits may be interpolated between pixels.
+    pub(crate) const fn is_exact(self) -> bool {
+        self.depth == 8
     }
 
     /// Specialization constants of the pass.
-    pub(crate) fn constants(self) -> [(u32, u32); 2] {
-        [(ids::HALFTONE_PLANES, self.planes), (ids::HALFTONE_WHITE, self.white.into())]
+    pub(crate) fn constants(self) -> [(u32, u32); 3] {
+        [
+            (ids::HALFTONE_PARTS, self.parts),
+            (ids::HALFTONE_DEPTH, self.depth),
+            (ids::HALFTONE_WHITE, self.white.into()),
+        ]
     }
 
     /// Where each channel's bits begin in a word, and where its code value begins.
@@ -55,12 +72,13 @@ impl Halftone {
         }
     }
 
-    /// Number of planes of red, green and blue that light a mirror with the word `word`.
-    pub(super) fn ones(self, word: u32) -> [u32; 3] {
-        let all = (1u32 << self.planes) - 1;
+    /// What the parts of red, green and blue of the word `word` add up to.
+    pub(super) fn sums(self, word: u32) -> [u32; 3] {
+        let sum =
+            |at: u32| (0..self.parts).map(|p| word >> (at + p * self.depth) & ((1 << self.depth) - 1)).sum();
         match self.white {
-            true => [(word & all).count_ones(); 3],
-            false => [0, 8, 16].map(|at| (word >> at & all).count_ones()),
+            true => [sum(0); 3],
+            false => [0, 8, 16].map(sum),
         }
     }
 }
@@ -74,14 +92,16 @@ fn noise(x: usize, y: usize, frame: u32, channel: usize) -> [u32; 2] {
     [channel & 1, channel & 1 ^ 1].map(|c| u32::from(blue_noise::MASK[2 * at + c]))
 }
 
-/// The bits of `ones` of `planes` planes, spread evenly, from plane `phase` on.
-fn spread(ones: u32, planes: u32, phase: u32) -> u32 {
-    // `p -> p * ones` runs through the residues evenly, so exactly `ones` of them are below `ones`, whatever the phase.
-    (0..planes).fold(0, |word, p| word | u32::from((p * ones + phase) % planes < ones) << p)
+/// The parts of a mirror, of `depth` bits each, that add up to `sum`: all the same number, or one more in some of `parts` that are
+/// spread evenly, from part `phase` on.
+fn spread(sum: u32, parts: u32, depth: u32, phase: u32) -> u32 {
+    let (each, more) = (sum / parts, sum % parts);
+    // `p -> p * more` runs through the residues evenly, so exactly `more` of them are below `more`, whatever the phase.
+    (0..parts).fold(0, |word, p| word | (each + u32::from((p * more + phase) % parts < more)) << (p * depth))
 }
 
 /// Code values `0x00BBGGRR` of frame number `frame`, row after row, into words in which each plane of a channel has a
-/// bit; see the module. `words` are overwritten.
+/// bit, the lowest bit of the first part first; see the module. `words` are overwritten.
 ///
 /// # Panics
 /// When `codes` or `words` do not hold exactly one value per pixel of `raster`.
@@ -125,7 +145,7 @@ impl Block {
         };
         let code = |x: usize, y: usize| codes[y * width + x] >> code_at & 0xff;
         for (i, x, y) in pixels() {
-            let rest = code(x, y) * self.halftone.planes % 255;
+            let rest = code(x, y) * self.halftone.most() % 255;
             sum += rest;
             if rest > 0 {
                 let [threshold, _] = noise(x, y, self.frame, self.channel);
@@ -136,10 +156,10 @@ impl Block {
         let extra = (sum + ROUNDING[self.frame as usize & 1]) / 255;
         for (i, x, y) in pixels() {
             let before = keys.iter().filter(|&&key| key > keys[i]).count() as u32;
-            let ones = code(x, y) * self.halftone.planes / 255 + u32::from(keys[i] > 0 && before < extra);
+            let sum = code(x, y) * self.halftone.most() / 255 + u32::from(keys[i] > 0 && before < extra);
             let [_, begin] = noise(x, y, self.frame, self.channel);
-            words[y * width + x] |=
-                spread(ones, self.halftone.planes, begin % self.halftone.planes) << bits_at;
+            let Halftone { parts, depth, .. } = self.halftone;
+            words[y * width + x] |= spread(sum, parts, depth, begin % parts) << bits_at;
         }
     }
 }
@@ -148,6 +168,7 @@ impl Block {
 mod tests {
     use super::super::{pack, BitPlaneFrame, Kernel, Shown};
     use super::*;
+    use dpm_device::planes::Channel;
     use proptest::prelude::*;
 
     /// The words of an even field.
@@ -163,21 +184,48 @@ mod tests {
         words
     }
 
-    fn schedules() -> [PlaneSchedule; 3] {
-        [PlaneSchedule::equal_rgb24(), PlaneSchedule::equal_mono8(), PlaneSchedule::equal24()]
+    fn of_parts(count: u8, depth: u8, white: bool) -> PlaneSchedule {
+        PlaneSchedule::of_parts(Parts { count, depth, white }).unwrap()
+    }
+
+    fn schedules() -> [PlaneSchedule; 10] {
+        [
+            PlaneSchedule::equal_rgb24(),
+            PlaneSchedule::equal_mono8(),
+            PlaneSchedule::equal24(),
+            of_parts(3, 8, true),
+            of_parts(4, 6, true),
+            of_parts(6, 4, true),
+            of_parts(8, 3, true),
+            of_parts(12, 2, true),
+            of_parts(2, 4, false),
+            of_parts(4, 2, false),
+        ]
     }
 
     #[test]
-    fn only_planes_of_equal_light_are_halftoned() {
+    fn only_planes_that_do_not_weigh_as_bits_are_halftoned() {
         assert_eq!([PlaneSchedule::rgb24(), PlaneSchedule::mono8()].map(|s| Halftone::of(&s)), [None, None]);
-        let planes = schedules().map(|s| Halftone::of(&s).map(|h| (h.planes, h.white)));
-        assert_eq!(planes, [Some((8, false)), Some((8, true)), Some((24, true))]);
+        let halftones = schedules().map(|s| Halftone::of(&s).map(|h| (h.parts, h.depth, h.white)));
+        assert_eq!(halftones[..3], [Some((8, 1, false)), Some((8, 1, true)), Some((24, 1, true))]);
+        assert_eq!(halftones[3..6], [Some((3, 8, true)), Some((4, 6, true)), Some((6, 4, true))]);
+        assert_eq!(halftones.map(|h| h.unwrap().0 * h.unwrap().1 <= 24), [true; 10]);
     }
 
-    /// Dark stays dark and full stays full, whatever the noise; and between them every plane has its share: an even
+    /// Three parts of eight bits are the code value three times, whatever the noise.
+    #[test]
+    fn parts_of_eight_bits_are_the_code_value() {
+        let schedule = of_parts(3, 8, true);
+        for code in 0..256u32 {
+            let words = even(&schedule, Raster::new(9, 5).unwrap(), code, code << 8);
+            assert!(words.iter().all(|&word| word == code * 0x01_0101), "{code}");
+        }
+    }
+
+    /// Dark stays dark and full stays full, whatever the noise; and between them every part has its share: an even
     /// field is equally bright in all of them, to a tenth of its light.
     #[test]
-    fn every_plane_of_an_even_field_gives_the_same_light() {
+    fn every_part_of_an_even_field_gives_the_same_light() {
         let raster = Raster::new(64, 64).unwrap();
         for schedule in schedules() {
             for (code, share) in
@@ -186,12 +234,18 @@ mod tests {
                 let words = even(&schedule, raster, 7, code);
                 let mut frame = BitPlaneFrame::new(raster, schedule);
                 pack(Kernel::best(), &words, &mut frame);
-                for plane in 0..schedule.len() {
-                    let on: u32 = frame.plane(plane).iter().map(|byte| byte.count_ones()).sum();
-                    let is = f64::from(on) / raster.pixel_count() as f64;
+                let depth = usize::from(schedule.parts().unwrap().depth);
+                for part in 0..schedule.len() / depth {
+                    let on = |bit: usize| {
+                        let ones = frame.plane(part * depth + bit).iter().map(|byte| byte.count_ones());
+                        ones.sum::<u32>() << bit
+                    };
+                    let sum: u32 = (0..depth).map(on).sum();
+                    let is = f64::from(sum) / (raster.pixel_count() * ((1 << depth) - 1)) as f64;
                     assert!(
                         (is - share).abs() <= 0.1 * share.min(1.0 - share),
-                        "plane {plane}: {is} of {share}"
+                        "part {part} of {:?}: {is} of {share}",
+                        schedule.parts()
                     );
                 }
             }
@@ -218,7 +272,7 @@ mod tests {
         #![proptest_config(ProptestConfig::with_cases(64))]
         /// The law of the module, for any picture: each mirror has one of its two nearest levels, each block its mean.
         #[test]
-        fn every_block_keeps_its_mean(width in 1u32..40, height in 1u32..20, seed in any::<u64>(), number in 0u32..1_000_000, kind in 0usize..3) {
+        fn every_block_keeps_its_mean(width in 1u32..40, height in 1u32..20, seed in any::<u64>(), number in 0u32..1_000_000, kind in 0usize..10) {
             let raster = Raster::new(width, height).unwrap();
             let schedule = schedules()[kind];
             let how = Halftone::of(&schedule).unwrap();
@@ -232,9 +286,9 @@ mod tests {
                 halftone(how, raster, number, &codes, &mut words);
                 words
             });
-            let level = |word: u32, channel: usize| how.ones(word)[channel];
+            let level = |word: u32, channel: usize| how.sums(word)[channel];
             for (channel, &(_, code_at)) in how.channels().iter().enumerate() {
-                let wanted = |i: usize| (codes[i] >> code_at & 0xff) * how.planes;
+                let wanted = |i: usize| (codes[i] >> code_at & 0xff) * how.most();
                 for words in &frames {
                     for (i, word) in words.iter().enumerate() {
                         let (is, low) = (level(*word, channel), wanted(i) / 255);
@@ -257,7 +311,7 @@ mod tests {
 
         /// What the recorder takes for the light of a word is what the planes give.
         #[test]
-        fn light_of_a_word_is_that_of_its_planes(word in any::<u32>(), kind in 0usize..3) {
+        fn light_of_a_word_is_that_of_its_planes(word in any::<u32>(), kind in 0usize..10) {
             let schedule = schedules()[kind];
             let raster = Raster::new(1, 1).unwrap();
             let mut frame = BitPlaneFrame::new(raster, schedule);
@@ -271,7 +325,7 @@ mod tests {
                 }
             }
             let told = Shown::by(&schedule).light(word);
-            prop_assert_eq!([0, 8, 16].map(|at| told >> at & 0xff), light);
+            prop_assert_eq!([0, 8, 16].map(|at| told >> at & 0xff), light.map(|sum| u32::from(schedule.light_of(sum))));
         }
     }
 }

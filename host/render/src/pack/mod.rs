@@ -95,14 +95,14 @@ pub(crate) const fn source_bit(plane: PlaneSpec) -> u32 {
     channel + plane.bit as u32
 }
 
-/// For each plane of `schedule` the bit of a pixel's word that it shows. The words are code values; for planes of equal
-/// light they are what [`halftone()`] makes of code values, in which each plane of a channel has a bit of its own.
+/// For each plane of `schedule` the bit of a pixel's word that it shows. The words are code values; for frames that show them
+/// in parts they are what [`halftone()`] makes of code values, in which each plane of a channel has a bit of its own.
 pub fn source_bits(schedule: &PlaneSchedule) -> [u8; MAX_PLANES] {
     let mut bits = [0; MAX_PLANES];
     let mut before = [0u8; 4];
     for (bit, &plane) in bits.iter_mut().zip(schedule.planes()) {
         let number = &mut before[plane.channel as usize];
-        *bit = match (schedule.equal_planes(), plane.channel) {
+        *bit = match (schedule.parts(), plane.channel) {
             (None, _) => source_bit(plane) as u8,
             (Some(_), Channel::White) => *number,
             (Some(_), channel) => 8 * channel as u8 + *number,
@@ -119,17 +119,15 @@ pub struct Shown {
     coloured: u32,
     /// Bits of the green code value that white planes show.
     white: u32,
-    /// Planes of equal light: the word is a halftone's.
-    halftone: Option<Halftone>,
-    /// The bit that each of them has.
-    bit: u8,
+    /// The word is a halftone's, of planes of this schedule.
+    halftone: Option<(Halftone, PlaneSchedule)>,
 }
 
 impl Shown {
     /// That of `schedule`.
     pub fn by(schedule: &PlaneSchedule) -> Self {
-        let (halftone, bit) = (Halftone::of(schedule), schedule.planes()[0].bit);
-        let mut shown = Self { coloured: 0, white: 0, halftone, bit };
+        let halftone = Halftone::of(schedule).map(|halftone| (halftone, *schedule));
+        let mut shown = Self { coloured: 0, white: 0, halftone };
         for &plane in schedule.planes() {
             match plane.channel {
                 Channel::White => shown.white |= 1 << plane.bit,
@@ -142,8 +140,10 @@ impl Shown {
     /// The light of a mirror with the word `code`, `0x00BBGGRR`, as code values of red, green and blue: white planes light all three, and a sum
     /// above full light stays full.
     pub fn light(self, code: u32) -> u32 {
-        if let Some(halftone) = self.halftone {
-            let [r, g, b] = halftone.ones(code).map(|ones| (ones << self.bit).min(0xff));
+        if let Some((halftone, schedule)) = self.halftone {
+            // The lowest bit of a part weighs what the first plane does.
+            let lowest = schedule.planes()[0].bit;
+            let [r, g, b] = halftone.sums(code).map(|sum| u32::from(schedule.light_of(sum << lowest)));
             return r | g << 8 | b << 16;
         }
         let own = code & self.coloured;
@@ -156,7 +156,7 @@ impl Shown {
     }
 }
 
-/// Code values `0x00BBGGRR` (for planes of equal light the words that [`halftone()`] makes of them), row after row, into the planes of `frame`; bits 24 to 31 are ignored, padding bits become 0.
+/// Code values `0x00BBGGRR` (for frames that show them in parts the words that [`halftone()`] makes of them), row after row, into the planes of `frame`; bits 24 to 31 are ignored, padding bits become 0.
 /// A `kernel` that this CPU cannot run is replaced by [`Kernel::best`].
 ///
 /// # Panics

@@ -32,15 +32,20 @@ pub struct Sweep<'a> {
 }
 
 /// The groups of planes that are warped together. `instants` gives for each plane of `schedule` the time from the
-/// frame's instant to the middle of the plane, as a share of the exposure, -1 to 1. Neighbours that show the same bit of
-/// different channels are one group at their mean instant; planes of equal light are a group each.
+/// frame's instant to the middle of the plane, as a share of the exposure, -1 to 1. Neighbours that are lit together are one
+/// group, and so are neighbours that show the same bit of different channels, at their mean instant. Of code values that are
+/// shown in parts, every part is a group of its own.
 pub fn plane_groups(schedule: &PlaneSchedule, instants: &[f64]) -> Vec<PlaneGroup> {
     let planes = schedule.planes();
     let bits = source_bits(schedule);
     let mut groups = Vec::new();
     let mut from = 0;
     for i in 1..=planes.len() {
-        let is_one = |i: usize| schedule.equal_planes().is_none() && planes[i].bit == planes[from].bit;
+        let is_same_bit = |i: usize| schedule.parts().is_none() && planes[i].bit == planes[i - 1].bit;
+        let is_together = |i: usize| {
+            planes[i].channel == planes[from].channel && (instants[i] - instants[from]).abs() < LEAST_SHARE
+        };
+        let is_one = |i: usize| is_same_bit(i) || is_together(i);
         if i < planes.len() && is_one(i) {
             continue;
         }
@@ -51,6 +56,9 @@ pub fn plane_groups(schedule: &PlaneSchedule, instants: &[f64]) -> Vec<PlaneGrou
     }
     groups
 }
+
+/// Planes whose instants differ by less than this share of the exposure are lit together: half a unit of their groups' instants.
+const LEAST_SHARE: f64 = 0.5 / 65536.0;
 
 /// A share of the exposure in units of 2^-16, rounded, and smaller than one exposure.
 fn share_of_exposure(share: f64) -> i32 {

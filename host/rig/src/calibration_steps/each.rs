@@ -132,7 +132,7 @@ fn projector(judged: &Judged) -> Step {
     );
     let how = match config.plane_timing() {
         PlaneTiming::Equal => "With the wand's light sensor: move it through the whole volume for 30 s.",
-        PlaneTiming::ByWeight | PlaneTiming::ByChannel | PlaneTiming::Held => {
+        PlaneTiming::ByWeight | PlaneTiming::Together { .. } | PlaneTiming::Held => {
             "With the wand's light sensor: hold it still at 8 to 20 places, near and far, for 75 s in all."
         }
     };

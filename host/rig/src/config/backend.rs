@@ -7,9 +7,11 @@ use dpm_device::alp::Weights;
 use dpm_device::dlpc900::lut::Dmd;
 use dpm_device::dlpc900::video::{exposure_us, BadExposure, Receiver, VideoBits, VideoPatterns};
 use dpm_device::link::Codec;
-use dpm_device::planes::PlaneSchedule;
+use dpm_device::planes::{Parts, PlaneSchedule};
 use dpm_device::time::FrameRate;
 use std::path::PathBuf;
+
+use super::projector::PlaneWeights;
 
 kinds! {
     /// The connections to a projector.
@@ -161,9 +163,9 @@ section! {
 }
 
 section! {
-    /// A TI DLPC900 whose video input the display feeds: every frame is cut into patterns, which are shown while the next
-    /// frame arrives. With `encoding` = "planes24" these are the 24 planes of a frame, each lit by its own LED; write
-    /// `projector.weights` = "equal" then. With "rgb8" they are the green, red and blue code values, one after the other.
+    /// A TI DLPC900 whose video input the display feeds: every frame is cut into patterns, which are shown one after the other
+    /// while the next frame arrives. `encoding` says into which; the planes and their weights follow from it, so leave
+    /// `projector.weights` out.
     pub struct Dlpc900BehindConfig {
         /// The panel at the controller; it must have the projector's width and height.
         panel: Dlpc900Panel = Dlpc900Panel::Dlp6500, "", Any;
@@ -172,18 +174,48 @@ section! {
         /// The controller, as BUS:ADDRESS in `lsusb`; needed if several are plugged in.
         device: Option<String> = None, "", NotEmpty;
         /// Exposure of each pattern. If left out, nine tenths of what a frame has for it: 620 of at most 684 for 24
-        /// planes at 60 frames/s.
+        /// patterns at 60 frames/s.
         exposure_us: Option<u32> = None, "us", Within(24, 40_000);
     }
 }
 
 impl DisplayEncoding {
-    /// What the bits of a pixel are to a DLPC900.
+    /// How each channel shows its code value in a frame of a DLPC900.
+    pub const fn parts(self) -> Parts {
+        let (count, depth, white) = match self {
+            Self::Rgb8 => (1, 8, false),
+            Self::Rgb4x2 => (2, 4, false),
+            Self::Rgb2x4 => (4, 2, false),
+            Self::Planes24 | Self::Binary24 => (8, 1, false),
+            Self::Mono8x3 => (3, 8, true),
+            Self::Mono6x4 => (4, 6, true),
+            Self::Mono4x6 => (6, 4, true),
+            Self::Mono3x8 => (8, 3, true),
+            Self::Mono2x12 => (12, 2, true),
+            Self::Mono1x24 => (24, 1, true),
+        };
+        Parts { count, depth, white }
+    }
+
+    /// How a DLPC900 cuts a pixel into patterns.
     pub const fn video_bits(self) -> VideoBits {
-        match self {
-            Self::Rgb8 => VideoBits::Colours,
-            Self::Planes24 => VideoBits::Planes,
+        match VideoBits::new(self.parts().depth) {
+            Some(bits) => bits,
+            None => VideoBits::PLANES,
         }
+    }
+
+    /// How much light the planes of a channel give behind a DLPC900: the bits of a pattern weigh as those of a number do.
+    pub const fn weights(self) -> PlaneWeights {
+        match self.parts().depth {
+            1 => PlaneWeights::Equal,
+            _ => PlaneWeights::Binary,
+        }
+    }
+
+    /// It says how a DLPC900 cuts pixels, and nothing to a display by itself.
+    pub const fn needs_dlpc900(self) -> bool {
+        !matches!(self, Self::Rgb8 | Self::Planes24)
     }
 }
 
@@ -192,6 +224,16 @@ impl DisplayConfig {
     /// `frame_ns`: time of a frame.
     pub fn commit_ns(&self, frame_ns: i64) -> i64 {
         self.commit_us.map_or((frame_ns / 2).min(8_000_000), |us| i64::from(us) * 1000)
+    }
+
+    /// The planes of a frame behind a DLPC900, in the order in which it shows them; `None` without one.
+    pub(super) fn schedule(&self) -> Option<PlaneSchedule> {
+        self.dlpc900.as_ref()?;
+        match self.encoding.parts() {
+            // Colours in turn: a moving edge of grey is less coloured than with eight planes of green, of red, of blue.
+            Parts { depth: 1, white: false, .. } => Some(PlaneSchedule::equal_rgb24().filled()),
+            parts => PlaneSchedule::of_parts(parts),
+        }
     }
 
     /// How long each pattern of the DLPC900 behind this display is lit, microseconds; `None` without one.
@@ -247,10 +289,29 @@ words! {
     /// What the bits of a display's pixel mean.
     pub enum DisplayEncoding {
         /// Code values: the display shows grey by itself. `projector.response` says how much light a code value gives.
+        /// Behind them, a DLPC900 shows three patterns of eight bits: green, red, blue.
         Rgb8 = "rgb8",
         /// The 24 planes of a frame, in the order in which a DLPC900 shows the bits of a pixel: green 0 to 7, red 0 to 7,
-        /// blue 0 to 7.
+        /// blue 0 to 7. In front of a DLPC900 the same as "binary24".
         Planes24 = "planes24",
+        /// For a DLPC900: 24 halftones of one bit, red, green and blue in turn.
+        Binary24 = "binary24",
+        /// For a DLPC900: three white patterns of eight bits.
+        Mono8x3 = "mono8x3",
+        /// For a DLPC900: four white patterns of six bits, halftoned.
+        Mono6x4 = "mono6x4",
+        /// For a DLPC900: six white patterns of four bits, halftoned.
+        Mono4x6 = "mono4x6",
+        /// For a DLPC900: eight white patterns of three bits, halftoned.
+        Mono3x8 = "mono3x8",
+        /// For a DLPC900: twelve white patterns of two bits, halftoned.
+        Mono2x12 = "mono2x12",
+        /// For a DLPC900: 24 white halftones of one bit.
+        Mono1x24 = "mono1x24",
+        /// For a DLPC900: two patterns of four bits for each colour, halftoned.
+        Rgb4x2 = "rgb4x2",
+        /// For a DLPC900: four patterns of two bits for each colour, halftoned.
+        Rgb2x4 = "rgb2x4",
     }
 }
 

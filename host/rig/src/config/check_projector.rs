@@ -112,24 +112,34 @@ fn check_display(p: &ProjectorConfig, display: &DisplayConfig, reader: &mut Read
     if let Err(e) = display.mode.parse::<ModeWish>() {
         refuse(reader, &["projector.backend.mode"], e.to_string(), "`dpm display` lists the modes".into());
     }
-    if display.encoding == DisplayEncoding::Planes24 && p.planes != 24 {
+    let encoding = ("projector.backend.encoding", shown(display.encoding));
+    let is_behind = display.dlpc900.is_some();
+    if p.planes != 24 && (display.encoding != DisplayEncoding::Rgb8 || is_behind) {
         contradict(
             reader,
             &[
                 ("projector.planes", shown(p.planes)),
-                ("projector.backend.encoding", shown(display.encoding)),
+                encoding.clone(),
                 ("projector.backend.kind", format!("{:?}", p.backend.word())),
             ],
             "a pixel carries 24 planes",
             "set projector.planes = 24".into(),
         );
     }
-    if display.encoding == DisplayEncoding::Rgb8 && p.weights == PlaneWeights::Equal {
+    if display.encoding.needs_dlpc900() && !is_behind {
+        contradict(
+            reader,
+            &[encoding.clone(), ("projector.backend.dlpc900", "not there".into())],
+            "only a DLPC900 cuts pixels into such patterns",
+            "add the table [projector.backend.dlpc900], or use encoding = \"rgb8\"".into(),
+        );
+    }
+    if display.encoding == DisplayEncoding::Rgb8 && p.weights == PlaneWeights::Equal && !is_behind {
         contradict(
             reader,
             &[
                 ("projector.weights", format!("{:?}", p.weights.word())),
-                ("projector.backend.encoding", shown(display.encoding)),
+                encoding,
                 ("projector.backend.kind", format!("{:?}", p.backend.word())),
             ],
             "the bits of a code value have binary weights",
@@ -142,23 +152,21 @@ fn check_display(p: &ProjectorConfig, display: &DisplayConfig, reader: &mut Read
     }
 }
 
-/// A controller behind a display: its patterns must fit a frame, and equal planes be said to be equal.
+/// A controller behind a display: its patterns must fit a frame, and weights be those of its patterns if they are told at all.
 fn check_behind(p: &ProjectorConfig, display: &DisplayConfig, reader: &mut Reader) {
-    let encoding = ("projector.backend.encoding", shown(display.encoding));
-    if display.encoding == DisplayEncoding::Planes24 && p.weights == PlaneWeights::Binary {
+    if reader.is_written("projector.weights") && p.weights != display.encoding.weights() {
+        let why = match display.encoding.weights() {
+            PlaneWeights::Equal => "a DLPC900 lights all planes of a pixel equally long",
+            PlaneWeights::Binary => "a DLPC900 weights the bits of a pattern itself",
+        };
         contradict(
             reader,
-            &[("projector.weights", shown(p.weights)), encoding.clone()],
-            "a DLPC900 lights all planes of a pixel equally long",
-            "set projector.weights = \"equal\"".into(),
-        );
-    }
-    if display.encoding == DisplayEncoding::Rgb8 && p.planes != 24 {
-        contradict(
-            reader,
-            &[("projector.planes", shown(p.planes)), encoding],
-            "a DLPC900 lights each colour of a pixel with an LED of its own",
-            "set projector.planes = 24".into(),
+            &[
+                ("projector.weights", format!("{:?}", p.weights.word())),
+                ("projector.backend.encoding", shown(display.encoding)),
+            ],
+            why,
+            "leave `projector.weights` out: the encoding decides it".into(),
         );
     }
     if let Some(Err(why)) = display.exposure_us(p.frame_rate) {

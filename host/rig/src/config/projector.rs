@@ -108,12 +108,14 @@ impl ProjectorConfig {
     /// How the light of a frame is shared out over its exposure.
     pub fn plane_timing(&self) -> PlaneTiming {
         match &self.backend {
-            ProjectorBackend::Display(display) if display.encoding == DisplayEncoding::Rgb8 => {
-                if display.dlpc900.is_some() {
-                    PlaneTiming::ByChannel
-                } else {
-                    PlaneTiming::Held
+            ProjectorBackend::Display(display) if display.dlpc900.is_some() => {
+                match display.encoding.video_bits().depth() {
+                    1 => PlaneTiming::Equal,
+                    planes => PlaneTiming::Together { planes },
                 }
+            }
+            ProjectorBackend::Display(display) if display.encoding == DisplayEncoding::Rgb8 => {
+                PlaneTiming::Held
             }
             ProjectorBackend::Window(_) => PlaneTiming::Held,
             ProjectorBackend::Alp(alp) if alp.weights == AlpWeights::Binary => PlaneTiming::ByWeight,
@@ -141,19 +143,27 @@ impl ProjectorConfig {
     /// Light of a mirror that is on in all planes, as a code value of which 255 is full light. It is less where planes of
     /// equal light are lit by LEDs that are dimmed for the bits of a code value.
     pub fn full_light(&self) -> u32 {
+        self.schedule().full_light()
+    }
+
+    /// `schedule` as this projector lights it: a light source that is not dimmed from plane to plane gives full white where
+    /// all planes are on, whatever their bits.
+    pub fn lit_by(&self, schedule: PlaneSchedule) -> PlaneSchedule {
         match &self.backend {
-            ProjectorBackend::Display(_) | ProjectorBackend::Window(_) | ProjectorBackend::Alp(_) => 255,
-            _ => self.schedule().full_light(),
+            ProjectorBackend::Display(_) | ProjectorBackend::Window(_) | ProjectorBackend::Alp(_) => {
+                schedule.filled()
+            }
+            _ => schedule,
         }
     }
 
     /// From the start of a slot on the projector's clock to the light of its frame, nanoseconds: `latency_us`, and for a
     /// display or a window the time until the vertical blank and until the middle row. A DLPC900 behind a display shows a
-    /// frame once it has all of it.
+    /// frame from the vertical pulse on that follows it.
     pub fn light_delay_ns(&self) -> i64 {
         let frame_ns = self.frame_rate.slot_len_ns(0);
         let commit_ns = match &self.backend {
-            // Half of the time without rows before the first row, the rows, and the other half of it.
+            // From the vertical pulse before the first row to the one after the last row is a whole frame.
             ProjectorBackend::Display(display) if display.dlpc900.is_some() => {
                 display.commit_ns(frame_ns) + frame_ns / 2
             }
@@ -168,6 +178,15 @@ impl ProjectorConfig {
 
     /// The planes of a frame in the order in which they are shown.
     pub fn schedule(&self) -> PlaneSchedule {
+        let of_encoding = match &self.backend {
+            ProjectorBackend::Display(display) => display.schedule(),
+            _ => None,
+        };
+        of_encoding.unwrap_or_else(|| self.lit_by(self.schedule_of_keys()))
+    }
+
+    /// The planes that `planes`, `weights` and `plane_order` describe.
+    fn schedule_of_keys(&self) -> PlaneSchedule {
         let BitOrder(bits) = self.plane_order;
         let binary = match self.planes {
             8 => PlaneSchedule::mono8_in(bits),
@@ -256,8 +275,11 @@ pub enum PlaneTiming {
     Equal,
     /// Every plane is lit for as long as its bit weighs, always with the same light: an ALP with `weights = "binary"`.
     ByWeight,
-    /// Each channel has a third of the time, in the order of a DLPC900's pixels, and its planes are lit together in it.
-    ByChannel,
+    /// So many planes are lit together, as a number of as many bits, and the next ones after them: the patterns of a DLPC900.
+    Together {
+        /// Planes of a pattern.
+        planes: u8,
+    },
     /// There are no planes: code values are shown for the whole frame, by a display that is given them.
     Held,
 }

@@ -1,6 +1,8 @@
 //! Rig files that are accepted and refused.
 
 use super::*;
+use dpm_device::dlpc900::lut::led;
+use dpm_device::planes::{Channel, PlaneSchedule};
 
 fn parse(text: &str) -> Result<RigConfig, ConfigErrors> {
     RigConfig::parse("rig.toml", text, Path::new("/nonexistent"), &Overrides::default())
@@ -739,19 +741,47 @@ fn a_controller_behind_a_display_shows_frames_that_have_arrived() {
     assert_eq!(projector.plane_timing(), PlaneTiming::Equal);
     assert_eq!(projector.lit_of_frame_ns(), [24 * 620_000, 16_666_666]);
     assert!(!projector.is_lit_without_gap());
-    let colours = parsed(&["projector.backend.encoding=\"rgb8\"", "projector.weights=\"binary\""]);
-    let colours = colours.unwrap_or_else(|e| panic!("{e}")).projector;
-    assert_eq!(colours.plane_timing(), PlaneTiming::ByChannel);
-    assert_eq!(colours.lit_of_frame_ns(), [3 * 4_960_000, 16_666_666]);
+    assert_eq!(projector.schedule(), PlaneSchedule::equal_rgb24().filled());
+    // The encoding says everything of the planes: their number of bits, their LEDs, their instants, their weights.
     let rgb8 = "projector.backend.encoding=\"rgb8\"";
+    for (encoding, patterns, white, exposure_us) in [
+        ("rgb8", 3, false, 4960),
+        ("rgb4x2", 6, false, 2480),
+        ("rgb2x4", 12, false, 1240),
+        ("planes24", 24, false, 620),
+        ("binary24", 24, false, 620),
+        ("mono8x3", 3, true, 4960),
+        ("mono6x4", 4, true, 3720),
+        ("mono4x6", 6, true, 2480),
+        ("mono3x8", 8, true, 1860),
+        ("mono2x12", 12, true, 1240),
+        ("mono1x24", 24, true, 620),
+    ] {
+        let key = format!("projector.backend.encoding={encoding:?}");
+        let p = parsed(&[&key]).unwrap_or_else(|e| panic!("{encoding}: {e}")).projector;
+        let (timing, schedule) = (p.plane_timing(), p.schedule());
+        match patterns {
+            24 => assert_eq!(timing, PlaneTiming::Equal),
+            _ => assert_eq!(timing, PlaneTiming::Together { planes: 24 / patterns as u8 }),
+        }
+        assert_eq!(p.lit_of_frame_ns(), [patterns * exposure_us * 1000, 16_666_666], "{encoding}");
+        assert_eq!(schedule.planes().iter().all(|p| p.channel == Channel::White), white, "{encoding}");
+        assert_eq!((schedule.len(), schedule.fills(), p.full_light()), (24, true, 255), "{encoding}");
+        let ProjectorBackend::Display(display) = &p.backend else { panic!() };
+        let video = display.video_patterns(p.frame_rate, &schedule).unwrap().unwrap();
+        assert_eq!(video.entries.len() as i64, patterns, "{encoding}");
+        let lit_us: u32 = video.entries.iter().map(|e| e.exposure_us).sum();
+        assert!(video.entries.iter().all(|e| e.leds == led::WHITE) == white && lit_us < 16_417, "{encoding}");
+    }
     for (keys, names) in [
-        (&["projector.weights=\"binary\""][..], "set projector.weights = \"equal\""),
+        (&["projector.weights=\"binary\""][..], "lights all planes of a pixel equally long"),
+        (&[rgb8, "projector.weights=\"equal\""], "weights the bits of a pattern itself"),
         (&["projector.width=1024"], "a DLP6500 has 1920 x 1080 mirrors"),
         (&["projector.backend.dlpc900.panel=\"dlp9000\""], "a DLP9000 has 2560 x 1600 mirrors"),
         (&["projector.backend.dlpc900.exposure_us=685"], "not within 105 to 684 us"),
         (&["projector.frame_rate=144"], "at most 120 video frames/s"),
-        (&[rgb8, "projector.weights=\"binary\"", "projector.frame_rate=90"], "lower the frame rate"),
-        (&[rgb8, "projector.weights=\"binary\"", "projector.planes=8"], "an LED of its own"),
+        (&[rgb8, "projector.frame_rate=90"], "lower the frame rate"),
+        (&[rgb8, "projector.planes=8"], "set projector.planes = 24"),
     ] {
         let told = parsed(keys).expect_err("refused").to_string();
         assert!(told.contains(names), "{keys:?}: {told}");

@@ -111,24 +111,21 @@ impl PatternPainter {
     /// anew.
     pub(crate) fn light_of(&mut self, planes: &BitPlaneFrame) -> &[u32] {
         self.drawn = None;
-        self.codes.fill(0);
         let (width, row_bytes) = (self.raster.width() as usize, self.raster.row_bytes());
-        for (k, spec) in planes.schedule().planes().iter().enumerate() {
-            let shifts: &[u32] = match spec.channel {
-                Channel::Red => &[0],
-                Channel::Green => &[8],
-                Channel::Blue => &[16],
-                Channel::White => &[0, 8, 16],
-            };
-            let rows = planes.plane(k).chunks_exact(row_bytes).zip(self.codes.chunks_exact_mut(width));
-            for (row, codes) in rows {
-                for (x, code) in codes.iter_mut().enumerate() {
-                    let light = u32::from(row[x / 8] >> (7 - x % 8) & 1) << spec.bit;
-                    for shift in shifts {
-                        let sum = ((*code >> shift & 0xff) + light).min(0xff);
-                        *code = *code & !(0xff << shift) | sum << shift;
+        let schedule = *planes.schedule();
+        for (y, row) in self.codes.chunks_exact_mut(width).enumerate() {
+            for (x, code) in row.iter_mut().enumerate() {
+                let mut sums = [0u32; 3];
+                for (k, spec) in schedule.planes().iter().enumerate() {
+                    let lit = planes.plane(k)[y * row_bytes + x / 8] >> (7 - x % 8) & 1;
+                    let light = u32::from(lit) << spec.bit;
+                    match spec.channel {
+                        Channel::White => sums.iter_mut().for_each(|sum| *sum += light),
+                        channel => sums[channel as usize] += light,
                     }
                 }
+                let [red, green, blue] = sums.map(|sum| u32::from(schedule.light_of(sum)));
+                *code = red | green << 8 | blue << 16;
             }
         }
         &self.codes

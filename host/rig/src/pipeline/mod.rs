@@ -33,7 +33,7 @@ pub use crate::engine::connect::{connect, ENDED_WITH_THE_LAST_RUN};
 pub use crate::engine::error::PipelineError;
 pub use crate::engine::options::{RunOptions, Stall, StallIn};
 pub use outcome::RunOutcome;
-pub use run::{run, run_pattern, run_prepared};
+pub use run::{run, run_over, run_pattern, run_prepared};
 pub use settings::{output, renderer_settings};
 pub use supervisor::has_left_threads_behind;
 pub use threads::on_frame_path;

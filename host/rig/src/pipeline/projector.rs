@@ -62,6 +62,10 @@ impl Surroundings {
     }
 }
 
+/// Whatever opens the medium of a rig's projector: [`open`], or a test that puts a made-up device in its place.
+pub type OpenMedium =
+    dyn Fn(&RigConfig, Raster, &Surroundings) -> Result<Option<Medium>, ConnectError> + Sync;
+
 /// Opens the medium of a bit-plane projector on USB or a serial port. `None` for the other backends, which have none.
 ///
 /// # Errors
@@ -115,10 +119,11 @@ pub fn display_settings(
         mode: display.mode.parse::<ModeWish>().map_err(|e| no_mode(e.to_string()))?,
         encoding: match display.encoding {
             DisplayEncoding::Rgb8 => Encoding::Rgb8,
-            DisplayEncoding::Planes24 => Encoding::Planes24,
+            _ => Encoding::Planes24,
         },
         without: display.without.clone(),
         commit_ns: display.commit_ns(projector.frame_rate.slot_len_ns(0)),
+        shows_at_pulse: display.dlpc900.is_some(),
         raster,
         schedule: projector.schedule(),
         rate: projector.frame_rate,

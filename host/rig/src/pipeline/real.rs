@@ -4,7 +4,7 @@
 use super::crew::{Crew, NotesBack, OnExit, Port};
 use super::link::{device_thread, link_thread, Line};
 use super::parts::{bring_up, mock_projector, CrewParts, Origin};
-use super::projector;
+use super::projector::{self, OpenMedium};
 use super::rights::Rights;
 use super::run::Ran;
 use super::settings::lead_estimator;
@@ -57,6 +57,7 @@ const END_WITHIN: Duration = Duration::from_secs(1);
 pub(super) fn run_at_real_pace(
     rig: &Arc<Rig>,
     origin: &Origin,
+    open: &OpenMedium,
     options: RunOptions,
     monitor: &Arc<RunMonitor>,
 ) -> Result<Ran, PipelineError> {
@@ -69,7 +70,7 @@ pub(super) fn run_at_real_pace(
     let standstill =
         StandstillMonitor::start(Arc::new(clock.sleeping()), STANDSTILL_NS, rights.highest_priority()).ok();
     let watch = Stopwatch::start();
-    let mut far = open_far_end(rig, lights_in, options, origin.is_marked(), clock, &rights, monitor)?;
+    let mut far = open_far_end(rig, open, lights_in, options, origin.is_marked(), clock, &rights, monitor)?;
     let (link, time) = bring_up(rig, far.medium.as_mut(), monitor, &mut || {
         clock.wait_until(clock.now().plus_ns(CONNECT_STEP_NS))
     })?;
@@ -173,6 +174,7 @@ struct FarEnd {
 
 fn open_far_end(
     rig: &Rig,
+    open: &OpenMedium,
     lights: LightSender,
     options: RunOptions,
     marked: bool,
@@ -203,7 +205,7 @@ fn open_far_end(
         enter: Arc::new(move || its_rights.enter_projector()),
         wait: policy(rig),
     };
-    let medium = projector::open(config, raster, &surroundings)?.ok_or_else(|| {
+    let medium = open(config, raster, &surroundings)?.ok_or_else(|| {
         let word = backend.word();
         RigError::Unsupported(format!("projector.backend.kind = {word:?} takes no frames over a link"))
     })?;

@@ -2,6 +2,7 @@
 
 use super::outcome::RunOutcome;
 use super::parts::Origin;
+use super::projector::{self, OpenMedium};
 use super::real::run_at_real_pace;
 use super::virtual_pace::run_at_virtual_pace;
 use crate::config::Pace;
@@ -32,7 +33,21 @@ pub fn run(
     options: RunOptions,
     monitor: &Arc<RunMonitor>,
 ) -> Result<RunOutcome, PipelineError> {
-    run_from(rig, &Origin::Gpu(gpu.clone()), options, monitor)
+    run_from(rig, &Origin::Gpu(gpu.clone()), &projector::open, options, monitor)
+}
+
+/// Like [`run`] at real pace, over the medium that `open` opens instead of the rig's own.
+///
+/// # Errors
+/// As for [`run`].
+pub fn run_over(
+    rig: Arc<Rig>,
+    gpu: &Arc<Gpu>,
+    open: &OpenMedium,
+    options: RunOptions,
+    monitor: &Arc<RunMonitor>,
+) -> Result<RunOutcome, PipelineError> {
+    run_from(rig, &Origin::Gpu(gpu.clone()), open, options, monitor)
 }
 
 /// Like [`run`] with prepared frames instead of rendered ones, without a GPU. Every lit frame is checked for parts of
@@ -45,7 +60,7 @@ pub fn run_prepared(
     options: RunOptions,
     monitor: &Arc<RunMonitor>,
 ) -> Result<RunOutcome, PipelineError> {
-    run_from(rig, &Origin::Prepared, RunOptions { verify: false, ..options }, monitor)
+    run_from(rig, &Origin::Prepared, &projector::open, RunOptions { verify: false, ..options }, monitor)
 }
 
 /// Shows the pictures of `source`, without a GPU and without a tracker, whatever the rig's tracker is.
@@ -59,7 +74,7 @@ pub fn run_pattern(
     options: RunOptions,
     monitor: &Arc<RunMonitor>,
 ) -> Result<RunOutcome, PipelineError> {
-    let rig = match source.schedule() {
+    let rig = match source.schedule().map(|schedule| rig.config.projector.lit_by(schedule)) {
         Some(schedule) if schedule != rig.schedule => {
             Arc::new(Rig { schedule, ..Rig::of_projector(&rig.config)? })
         }
@@ -67,12 +82,13 @@ pub fn run_pattern(
     };
     // Nothing renders: a slow link tells of itself by what it carries.
     let options = RunOptions { tells_slow: false, ..options };
-    run_from(rig, &Origin::Pattern(source, clock), options, monitor)
+    run_from(rig, &Origin::Pattern(source, clock), &projector::open, options, monitor)
 }
 
 fn run_from(
     rig: Arc<Rig>,
     origin: &Origin,
+    open: &OpenMedium,
     options: RunOptions,
     monitor: &Arc<RunMonitor>,
 ) -> Result<RunOutcome, PipelineError> {
@@ -85,7 +101,7 @@ fn run_from(
     }
     let ran = match rig.config.real_time.pace {
         // Hashing every frame costs a millisecond at full size, which only virtual pace can afford.
-        Pace::Real => run_at_real_pace(&rig, origin, RunOptions { verify: false, ..options }, monitor),
+        Pace::Real => run_at_real_pace(&rig, origin, open, RunOptions { verify: false, ..options }, monitor),
         Pace::Virtual => run_at_virtual_pace(&rig, origin, options, monitor),
     }?;
     Ok(ran.into_outcome(&rig, origin))

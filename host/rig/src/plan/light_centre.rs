@@ -6,8 +6,7 @@
 
 use crate::config::{PlanePoses, PlaneTiming};
 use crate::rig::Rig;
-use dpm_device::dlpc900::video::COLOUR_ORDER;
-use dpm_device::planes::{Channel, PlaneSchedule, PlaneSpec};
+use dpm_device::planes::{PlaneSchedule, PlaneSpec};
 use dpm_device::time::HostTime;
 use dpm_render::pack::source_bits;
 use dpm_render::warp::plane_groups;
@@ -82,23 +81,20 @@ impl<'a> Lights<'a> {
     fn length_of(self, plane: PlaneSpec) -> i128 {
         match self.timing {
             PlaneTiming::ByWeight => 1 << plane.bit,
-            PlaneTiming::Equal | PlaneTiming::Held | PlaneTiming::ByChannel => 1,
+            PlaneTiming::Equal | PlaneTiming::Held | PlaneTiming::Together { .. } => 1,
         }
     }
 
     /// The light of a plane.
     fn light_of(self, plane: PlaneSpec) -> u32 {
         match self.timing {
-            PlaneTiming::ByWeight | PlaneTiming::Equal | PlaneTiming::ByChannel => 1 << plane.bit,
+            PlaneTiming::ByWeight | PlaneTiming::Equal | PlaneTiming::Together { .. } => 1 << plane.bit,
             PlaneTiming::Held => 1,
         }
     }
 
     /// How long the planes are lit together, in the units of [`Self::length_of`].
     fn whole(self) -> i128 {
-        if self.timing == PlaneTiming::ByChannel {
-            return COLOUR_ORDER.len() as i128;
-        }
         self.schedule.planes().iter().map(|plane| self.length_of(*plane)).sum()
     }
 
@@ -106,12 +102,15 @@ impl<'a> Lights<'a> {
     fn planes(self) -> impl Iterator<Item = (PlaneSpec, i128)> + 'a {
         self.schedule.planes().iter().scan(0, move |begin, plane| {
             let length = self.length_of(*plane);
-            let before = match self.timing {
-                PlaneTiming::ByChannel => third_of(plane.channel),
-                _ => *begin,
+            let halves = match self.timing {
+                // The middle of the planes that are lit together, whose lengths are 1.
+                PlaneTiming::Together { planes } => {
+                    2 * (*begin - *begin % i128::from(planes)) + i128::from(planes)
+                }
+                _ => 2 * *begin + length,
             };
             *begin += length;
-            Some((*plane, 2 * before + length))
+            Some((*plane, halves))
         })
     }
 
@@ -146,14 +145,10 @@ impl<'a> Lights<'a> {
     }
 }
 
-/// How many colours a DLPC900 shows before `channel`. White planes have the bits of green.
-fn third_of(channel: Channel) -> i128 {
-    COLOUR_ORDER.iter().position(|colour| *colour == channel).unwrap_or(0) as i128
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
+    use dpm_device::planes::{Channel, Parts};
 
     const SLOT: i64 = 1_055_966;
 
@@ -228,16 +223,27 @@ mod tests {
             planes.iter().zip(0..).all(|(at, k)| (at - (620_000 * k + 310_000)).abs() <= 1),
             "{planes:?}"
         );
-        let schedule = PlaneSchedule::rgb24();
-        let colours = middles(&schedule, PlaneTiming::ByChannel, 3 * 4_960_000);
-        for (plane, at) in schedule.planes().iter().zip(colours) {
-            let third =
-                [Channel::Green, Channel::Red, Channel::Blue].iter().position(|c| *c == plane.channel);
-            let wanted = 4_960_000 * third.unwrap() as i64 + 2_480_000;
-            assert!((at - wanted).abs() <= 1, "{plane:?}: {at}");
+        for (count, depth, white) in [(1, 8, false), (3, 8, true), (4, 6, true), (2, 4, false), (12, 2, true)]
+        {
+            let schedule = PlaneSchedule::of_parts(Parts { count, depth, white }).unwrap();
+            let timing = PlaneTiming::Together { planes: depth };
+            let pattern_ns = 24 / i64::from(depth) * 100_000;
+            let lit_ns = pattern_ns * 24 / i64::from(depth);
+            let middles = middles(&schedule, timing, lit_ns);
+            for (i, at) in middles.iter().enumerate() {
+                let wanted = pattern_ns * (i as i64 / i64::from(depth)) + pattern_ns / 2;
+                assert!((at - wanted).abs() <= 1, "{count} x {depth}, plane {i}: {at}");
+            }
+            let all = Lights { schedule: &schedule, timing, lit: [lit_ns, frame_ns] };
+            assert!((all.centre_ns(frame_ns) - lit_ns / 2).abs() <= 1, "the middle of all");
+            // Planes that are lit together follow together: a pattern is a group, at its own instant.
+            let groups = plane_groups(&schedule, &all.shares());
+            assert_eq!(groups.len(), 24 / usize::from(depth));
+            assert!(groups.windows(2).all(|pair| pair[0].instant < pair[1].instant));
+            assert!(
+                groups.iter().all(|group| group.mask.count_ones() == u32::from(depth)),
+                "{count} x {depth}: {groups:?}"
+            );
         }
-        let all =
-            Lights { schedule: &schedule, timing: PlaneTiming::ByChannel, lit: [3 * 4_960_000, frame_ns] };
-        assert!((all.centre_ns(frame_ns) - 7_440_000).abs() <= 1, "the middle of red");
     }
 }
