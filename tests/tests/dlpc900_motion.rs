@@ -30,12 +30,13 @@ const HEIGHT: u32 = 384;
 /// The same at 60 Hz.
 const MODE: Timing =
     Timing { clock_khz: 15_360, row: [512, 540, 580, 640], frame: [384, 388, 392, 400], flags: 5 };
-const FRAMES: u64 = 200;
+const FRAMES: u64 = 240;
 /// Frames in time that are enough for a judgement, and the most runs in which they must be found.
-const ENOUGH: usize = 40;
-const MOST_RUNS: usize = 5;
-/// A body whose speed has not changed for so long moves steadily, nanoseconds: the filter has learned its speed.
-const STEADY_NS: i64 = 150_000_000;
+const ENOUGH: usize = 30;
+const MOST_RUNS: usize = 10;
+/// A body whose speed has not changed for so long moves steadily, nanoseconds: the filter had learned its speed when the frame was
+/// planned, which on a busy machine is 140 ms before its light.
+const STEADY_NS: i64 = 230_000_000;
 /// The corners of a card that no row or column of mirrors is parallel to, metres.
 const CORNERS: [[f32; 3]; 4] =
     [[-0.05, -0.03, 0.0], [0.03, -0.05, 0.0], [0.05, 0.03, 0.0], [-0.03, 0.05, 0.0]];
@@ -58,11 +59,11 @@ spp = 1
 depth = 1
 exposure = 100.0
 [run]
-frames = 200
+frames = 240
 [[scene.bodies]]
 name = "card"
 node = "card"
-motion = { kind = "translate", speed_m_s = 1.0, amplitude_m = 0.2, acceleration_m_s2 = 50.0 }
+motion = { kind = "translate", speed_m_s = 1.0, amplitude_m = 0.22, acceleration_m_s2 = 50.0 }
 "#;
 
 /// A white card as a GLB.
@@ -114,7 +115,8 @@ fn sent(rig: &Arc<Rig>, gpu: &Arc<dpm_render::gpu::Gpu>) -> (Vec<Scanned>, u64) 
         let kms = move || Ok(Box::new(FakeKms::new(card.clone(), clock.clone())) as Box<dyn Kms>);
         let model = Arc::new(Mutex::new(Dlpc900Model::default()));
         let controller = move || Dlpc900::new(VirtualHid::new(model.clone()));
-        let opener = behind(on_card(kms, settings), Arc::new(controller), video.clone());
+        let opener =
+            behind(on_card(kms, settings), Arc::new(controller), video.clone(), surroundings.stop.clone());
         let transport = DisplayTransport::open(opener, surroundings.wait, 0).unwrap();
         Ok(Some(Medium { transport: Box::new(transport), warnings: Vec::new() }))
     });
@@ -235,7 +237,8 @@ fn every_pattern_of_a_moving_body_is_where_the_body_is() {
             ];
             let rig = rig(&folder, &settings.each_ref().map(String::as_str));
             let (mut in_time, mut late) = (Vec::new(), [0, 0]);
-            // A busy machine is late with many frames, so several runs may be needed for enough of the others.
+            // On a busy machine many frames are late, and the others are planned long before their light, as far as the turns of the
+            // card: such a run judges the machine, and is repeated.
             for _ in 0..MOST_RUNS {
                 // A device that was kept from finishing at the end of a run is opened anew.
                 let (scanned, told) = sent(&rig, &gpu.reopen().unwrap());
@@ -243,6 +246,10 @@ fn every_pattern_of_a_moving_body_is_where_the_body_is() {
                 // A frame that comes a blank late is off by the 15 px that the card moves in a frame; the report has told of it.
                 let (right, wrong): (Vec<_>, Vec<_>) = all.into_iter().partition(|s| s.offset_px < 7.0);
                 assert!(wrong.len() as u64 <= told, "{} of {told} that were told: {wrong:?}", wrong.len());
+                if told > FRAMES / 8 {
+                    println!("{encoding}, poses {poses}: {told} of {FRAMES} frames were late, which is too busy a machine");
+                    continue;
+                }
                 late = [late[0] + wrong.len() as u64, late[1] + told];
                 in_time.extend(right);
                 if in_time.len() >= ENOUGH {

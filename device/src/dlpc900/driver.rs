@@ -1,7 +1,6 @@
 //! The driver: turns calls into commands to a DLPC900, and its answers into values, or into errors that name the
 //! remedy.
 
-use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Arc, Mutex, PoisonError};
 use std::time::Duration;
 
@@ -48,14 +47,16 @@ pub struct Counters {
     pub stale: u64,
 }
 
+/// True once whoever waits for the controller should wait no more.
+pub type StopAsked = Arc<dyn Fn() -> bool + Send + Sync>;
+
 /// A DLPC900 behind a cable.
-#[derive(Debug)]
 pub struct Dlpc900<P> {
     port: P,
     /// Locked from a command to its reply.
     turn: Arc<Mutex<()>>,
     /// When set, every long operation ends with [`Dlpc900Error::Stopped`].
-    stop: Option<Arc<AtomicBool>>,
+    stop: Option<StopAsked>,
     timeout: Duration,
     sequence: u8,
     firmware: Version,
@@ -110,7 +111,7 @@ impl<P: HidPort> Dlpc900<P> {
     /// Once `stop` is true, every long operation (uploads, the mirrors' three seconds, waiting for a video signal) ends
     /// with [`Dlpc900Error::Stopped`] within 20 ms. Calls that make the controller dark are exempt once
     /// [`Dlpc900::hurry`] was called.
-    pub fn stop_when(&mut self, stop: Arc<AtomicBool>) {
+    pub fn stop_when(&mut self, stop: StopAsked) {
         self.stop = Some(stop);
     }
 
@@ -121,7 +122,7 @@ impl<P: HidPort> Dlpc900<P> {
 
     fn go_on(&self) -> Result<(), Dlpc900Error> {
         match &self.stop {
-            Some(stop) if stop.load(Ordering::Relaxed) => Err(Dlpc900Error::Stopped),
+            Some(stop) if stop() => Err(Dlpc900Error::Stopped),
             _ => Ok(()),
         }
     }

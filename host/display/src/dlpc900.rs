@@ -9,7 +9,7 @@ use std::sync::{Arc, OnceLock};
 use std::thread::JoinHandle;
 use std::time::{Duration, Instant};
 
-use dpm_device::dlpc900::driver::{Dlpc900, Dlpc900Error, HidPort};
+use dpm_device::dlpc900::driver::{Dlpc900, Dlpc900Error, HidPort, StopAsked};
 use dpm_device::dlpc900::video::VideoPatterns;
 use dpm_device::transport::TransportError;
 
@@ -28,11 +28,13 @@ const MOST_SILENT: u32 = 4;
 /// Whoever opens the controller.
 pub type OpenController<P> = Arc<dyn Fn() -> Result<Dlpc900<P>, Dlpc900Error> + Send + Sync>;
 
-/// The opener of a display by `display` with the controller that `controller` opens behind it, set up to show `video`.
+/// The opener of a display by `display` with the controller that `controller` opens behind it, set up to show `video`. A set-up
+/// takes seconds; it ends in the dark within 20 ms once `stop` is true.
 pub fn behind<P: HidPort + Send + 'static>(
     display: Opener,
     controller: OpenController<P>,
     video: VideoPatterns,
+    stop: StopAsked,
 ) -> Opener {
     Arc::new(move || {
         // Black is on the wire before the controller looks at it.
@@ -51,6 +53,7 @@ pub fn behind<P: HidPort + Send + 'static>(
             );
             return Err(TransportError::Unsuitable { device: "DLPC900".into(), why });
         }
+        controller.stop_when(stop.clone());
         if let Err(e) = controller.make_ready().and_then(|_| controller.start_video_patterns(&video)) {
             rest(&mut controller);
             return Err(failed(e));
@@ -137,6 +140,8 @@ fn look_until<P: HidPort>(controller: &mut Dlpc900<P>, over: &AtomicBool) -> Opt
                 }
                 None => 0,
             },
+            // The run ends.
+            Err(Dlpc900Error::Stopped) => return None,
             Err(e) if e.is_gone() => return Some(None),
             Err(e) if silent == MOST_SILENT => return Some(Some(e.to_string())),
             Err(_) => silent + 1,

@@ -8,7 +8,7 @@ use std::sync::{Arc, Mutex, MutexGuard};
 use std::time::{Duration, Instant};
 
 use common::{link_settings, lit, planes, raster, run, settings, shared, with, PATIENCE};
-use dpm_device::dlpc900::command::REPORT_BYTES;
+use dpm_device::dlpc900::command::{Opcode, REPORT_BYTES};
 use dpm_device::dlpc900::driver::{Dlpc900, HidPort, PortError};
 use dpm_device::dlpc900::lut::Dmd;
 use dpm_device::dlpc900::video::{exposure_us, Receiver, VideoBits, VideoPatterns};
@@ -57,6 +57,8 @@ struct Chain {
     model: Arc<Mutex<Dlpc900Model>>,
     clock: Arc<dyn HostClock>,
     is_plugged: Arc<AtomicBool>,
+    /// The run should end.
+    stop: Arc<AtomicBool>,
 }
 
 impl Chain {
@@ -68,6 +70,7 @@ impl Chain {
             model: Arc::new(Mutex::new(Dlpc900Model::default())),
             clock,
             is_plugged: Arc::new(AtomicBool::new(true)),
+            stop: Arc::default(),
         }
     }
 
@@ -82,7 +85,9 @@ impl Chain {
         let controller = move || {
             Dlpc900::new(Cable { model: model.clone(), clock: clock.clone(), is_plugged: is_plugged.clone() })
         };
-        let opener = behind(on_card(kms, settings), Arc::new(controller), video);
+        let stop = self.stop.clone();
+        let stop = Arc::new(move || stop.load(Ordering::Relaxed));
+        let opener = behind(on_card(kms, settings), Arc::new(controller), video, stop);
         let mut transport = DisplayTransport::open(opener, WaitPolicy::Park, 0)?;
         transport.set_clock(self.clock.clone());
         Ok(transport)
@@ -190,4 +195,23 @@ fn a_controller_that_cannot_be_fed_is_told_and_rests() {
     let chain = Chain::new();
     chain.is_plugged.store(false, Ordering::Relaxed);
     assert!(matches!(chain.open().err(), Some(TransportError::Unplugged { .. })));
+}
+
+/// A stop during the seconds of a set-up is not waited for: the controller rests at once, and nothing was lit.
+#[test]
+fn a_stop_ends_a_set_up_at_once() {
+    let chain = Chain::new();
+    let stop = chain.stop.clone();
+    let asked = std::thread::spawn(move || {
+        std::thread::sleep(Duration::from_secs(1));
+        stop.store(true, Ordering::Relaxed);
+        Instant::now()
+    });
+    assert!(chain.open().is_err());
+    let ended = asked.join().unwrap().elapsed();
+    assert!(ended < Duration::from_millis(500), "{ended:?}");
+    assert_eq!(chain.dark_because(), Some("mirrors exercised"));
+    let led_on =
+        |m: &Dlpc900Model| m.executed().iter().any(|c| c.opcode == Opcode::LED_ENABLE && c.data != [0]);
+    assert!(!led_on(&lock(&chain.model)), "the LEDs were never switched on");
 }

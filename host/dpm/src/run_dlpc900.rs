@@ -598,7 +598,8 @@ impl<P: HidPort> Watch<'_, P> {
         let watch = Stopwatch::start();
         let word = self.word;
         *word.line.lock().unwrap_or_else(PoisonError::into_inner) = self.d.dark_line();
-        self.d.stop_when(Arc::clone(&word.stop));
+        let stop = Arc::clone(&word.stop);
+        self.d.stop_when(Arc::new(move || stop.load(Ordering::Relaxed)));
         // Before seconds go into an upload: out of the exercise that every run ends in, and of a sequence that a killed run left.
         self.d.make_ready()?;
         self.d.stop()?;

@@ -5,6 +5,7 @@ use crate::config::{
     ProjectorBackend, ResponseConfig, RigConfig, WindowConfig,
 };
 use crate::engine::connect::ConnectError;
+use dpm_common::stopping;
 use dpm_device::alp::{AlpSettings, AlpTransport, Showing};
 use dpm_device::dlpc900::usb::{self, UsbPlace};
 use dpm_device::link::{packet_bytes, Codec, Epoch, LinkError, LinkSettings, Underrun, COMMIT_BYTES};
@@ -53,12 +54,14 @@ pub struct Surroundings {
     pub enter: Arc<dyn Fn() + Send + Sync>,
     /// How that thread waits.
     pub wait: WaitPolicy,
+    /// True once the run should end, also while a projector is still being set up.
+    pub stop: Arc<dyn Fn() -> bool + Send + Sync>,
 }
 
 impl Surroundings {
-    /// A thread without special rights that parks.
+    /// A thread without special rights that parks. A signal stops it.
     pub fn plain(clock: Arc<dyn HostClock>) -> Self {
-        Self { clock, enter: Arc::new(|| ()), wait: WaitPolicy::Park }
+        Self { clock, enter: Arc::new(|| ()), wait: WaitPolicy::Park, stop: Arc::new(stopping::is_stopping) }
     }
 }
 
@@ -77,7 +80,10 @@ pub fn open(
     surroundings: &Surroundings,
 ) -> Result<Option<Medium>, ConnectError> {
     let frame_bytes = frame_bytes(raster, config.projector.schedule().len());
-    let failed = |e| ConnectError::from(LinkError::Transport(e));
+    let failed = |e| match (surroundings.stop)() {
+        true => ConnectError::Stopped,
+        false => ConnectError::from(LinkError::Transport(e)),
+    };
     Ok(match &config.projector.backend {
         ProjectorBackend::Usb(usb) => {
             let settings = UsbSettings {
@@ -96,7 +102,9 @@ pub fn open(
             let transport = Box::new(SerialTransport::open(settings).map_err(failed)?);
             Some(Medium { transport, warnings: Vec::new() })
         }
-        ProjectorBackend::Display(display) => Some(open_display(config, display, raster).map_err(failed)?),
+        ProjectorBackend::Display(display) => {
+            Some(open_display(config, display, raster, surroundings).map_err(failed)?)
+        }
         ProjectorBackend::Window(window) => Some(open_window(config, window, raster).map_err(failed)?),
         ProjectorBackend::Alp(alp) => Some(open_alp(config, alp, frame_bytes, surroundings)?),
         ProjectorBackend::Mock(_) | ProjectorBackend::Dlpc900(_) => None,
@@ -134,12 +142,13 @@ fn open_display(
     config: &RigConfig,
     display: &DisplayConfig,
     raster: Raster,
+    surroundings: &Surroundings,
 ) -> Result<Medium, TransportError> {
     let settings = display_settings(config, display, raster)?;
     let (card, connector) = (display.card.clone(), display.connector.clone());
     let mut opener = on_card(move || open_for(card.as_deref(), connector.as_deref()), settings);
     if let Some(behind) = &display.dlpc900 {
-        opener = feeding(opener, config, display, behind)?;
+        opener = feeding(opener, config, display, behind, surroundings)?;
     }
     let mut medium = open_panel(config, opener)?;
     medium
@@ -159,6 +168,7 @@ fn feeding(
     config: &RigConfig,
     display: &DisplayConfig,
     behind: &Dlpc900BehindConfig,
+    surroundings: &Surroundings,
 ) -> Result<Opener, TransportError> {
     let refused = |key: &str, why: String| TransportError::Unsuitable {
         device: format!("projector.backend.dlpc900.{key}"),
@@ -171,7 +181,12 @@ fn feeding(
         return Ok(opener);
     };
     let video = video.map_err(|e| refused("exposure_us", e.to_string()))?;
-    Ok(dpm_display::dlpc900::behind(opener, Arc::new(move || usb::open(place)), video))
+    Ok(dpm_display::dlpc900::behind(
+        opener,
+        Arc::new(move || usb::open(place)),
+        video,
+        surroundings.stop.clone(),
+    ))
 }
 
 fn open_window(config: &RigConfig, window: &WindowConfig, raster: Raster) -> Result<Medium, TransportError> {

@@ -199,11 +199,12 @@ fn open_far_end(
             warnings: Vec::new(),
         });
     }
-    let its_rights = rights.clone();
+    let (its_rights, its_monitor) = (rights.clone(), monitor.clone());
     let surroundings = projector::Surroundings {
         clock: Arc::new(move || clock.now()),
         enter: Arc::new(move || its_rights.enter_projector()),
         wait: policy(rig),
+        stop: Arc::new(move || its_monitor.stop_requested()),
     };
     let medium = open(config, raster, &surroundings)?.ok_or_else(|| {
         let word = backend.word();
