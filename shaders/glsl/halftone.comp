@@ -12,6 +12,7 @@ layout(local_size_x = 8, local_size_y = 8) in;
 layout(set = 0, binding = B_CODES, scalar) buffer Codes { uint codes[]; };
 layout(set = 0, binding = B_NOISE, scalar) readonly buffer Noise { uint noise_bytes[]; };
 layout(set = 0, binding = B_TILES, scalar) readonly buffer Tiles { uint tiles[]; };
+layout(set = 0, binding = B_MOVERS, scalar) readonly buffer Movers { Mover movers[]; };
 
 shared uint keys[64];
 shared uint rests;
@@ -19,11 +20,21 @@ shared uint rests;
 // What the parts of a channel add up to at full light.
 const uint MOST = HALFTONE_PARTS * ((1u << HALFTONE_DEPTH) - 1u);
 
-// A pixel's value of the blue noise for a channel's remainders, and for the part at which it begins.
-uvec2 noise_of(uvec2 pixel, uint channel) {
+// A pixel's place on the blue noise. It is fixed to the body that the pixel shows, where that moves: so the values of a surface point are those
+// that follow one another in time.
+uvec2 place_of(uvec2 pixel, uint index) {
+    if (frame.mover_count == 0u) return pixel;
+    uint id = surface_at(index).id;
+    uint mover = id == NO_HIT ? 0u : instance_at(id >> 24u).mover;
+    // The size of the noise is a power of two, so that places left of it and above it wrap around, too.
+    return mover == 0u ? pixel : uvec2(ivec2(pixel) - movers[mover - 1u].centre);
+}
+
+// The blue noise of a place for a channel's remainders, and for the part at which it begins.
+uvec2 noise_of(uvec2 place, uint channel) {
     // The mask has two channels; the third of a frame is the first, half a mask aside.
-    uint x = (pixel.x + (channel >> 1u) * (NOISE_SIZE / 2u)) % NOISE_SIZE;
-    uint texel = ((frame.drawn % NOISE_FRAMES) * NOISE_SIZE + pixel.y % NOISE_SIZE) * NOISE_SIZE + x;
+    uint x = (place.x + (channel >> 1u) * (NOISE_SIZE / 2u)) % NOISE_SIZE;
+    uint texel = ((frame.drawn % NOISE_FRAMES) * NOISE_SIZE + place.y % NOISE_SIZE) * NOISE_SIZE + x;
     uint pair = (noise_bytes[texel >> 1u] >> ((texel & 1u) * 16u)) & 0xffffu;
     uvec2 values = uvec2(pair & 255u, pair >> 8u);
     return (channel & 1u) == 0u ? values : values.yx;
@@ -40,10 +51,10 @@ uint spread(uint sum, uint phase) {
 }
 
 // The bits of a channel with the code value `code`. All invocations of the workgroup call it; outside the raster `code` is 0.
-uint share_out(uint code, uvec2 pixel, uint channel) {
+uint share_out(uint code, uvec2 place, uint channel) {
     uint i = gl_LocalInvocationIndex;
     uint rest = code * MOST % 255u;
-    uvec2 noise = noise_of(pixel, channel);
+    uvec2 noise = noise_of(place, channel);
     // Unique, and above 0: the number of the mirror decides between equals.
     uint key = rest > 0u ? ((rest + noise.x) << 6u) | i : 0u;
     if (i == 0u) rests = 0u;
@@ -65,11 +76,12 @@ void main() {
     bool inside = tile_pixel(tiles[gl_WorkGroupID.x >> 2u], pixel);
     uint index = pixel.y * frame.width + pixel.x;
     uint code = inside ? codes[index] : 0u;
+    uvec2 place = inside ? place_of(pixel, index) : pixel;
     uint word;
     if (HALFTONE_WHITE) {
-        word = share_out((code >> 8u) & 255u, pixel, 0u);
+        word = share_out((code >> 8u) & 255u, place, 0u);
     } else {
-        word = share_out(code & 255u, pixel, 0u) | (share_out((code >> 8u) & 255u, pixel, 1u) << 8u) | (share_out((code >> 16u) & 255u, pixel, 2u) << 16u);
+        word = share_out(code & 255u, place, 0u) | (share_out((code >> 8u) & 255u, place, 1u) << 8u) | (share_out((code >> 16u) & 255u, place, 2u) << 16u);
     }
     if (inside) codes[index] = word;
 }

@@ -6,16 +6,44 @@ use dpm_device::planes::{Parts, PlaneSchedule, Raster};
 use dpm_lab::reference::Sampler;
 use dpm_render::blue_noise;
 use dpm_render::gpu::{Buffer, Gpu};
-use dpm_render::pack::{halftone, Halftone};
+use dpm_render::pack::{halftone, halftone_of_bodies, Halftone};
 use dpm_rig::light::recorder::LightFrame;
 use dpm_shaders::specialization as ids;
-use dpm_shaders::structs::Frame;
+use dpm_shaders::structs::{Frame, Instance, Mover, Surface, NO_HIT};
 use dpm_tests::gpu::{run_shader, uploaded, with_gpu};
 use dpm_tests::rigs::{demo_rig, run};
 use std::sync::Arc;
 
+/// What the pixels show: bodies by the numbers of their instances, and the centres of those that move.
+#[derive(Default)]
+struct Shows {
+    ids: Vec<u32>,
+    movers_of_instances: Vec<u32>,
+    centres: Vec<[i32; 2]>,
+}
+
+impl Shows {
+    /// To which point a pixel's noise is fixed.
+    fn anchor(&self, pixel: usize) -> [i32; 2] {
+        let id = self.ids.get(pixel).copied().unwrap_or(NO_HIT);
+        let mover = if id == NO_HIT { 0 } else { self.movers_of_instances[(id >> 24) as usize] };
+        if mover == 0 {
+            [0, 0]
+        } else {
+            self.centres[mover as usize - 1]
+        }
+    }
+}
+
 /// Runs the shader alone over all tiles of the raster.
-fn on_gpu(gpu: &Arc<Gpu>, how: Halftone, raster: Raster, number: u32, codes: &[u32]) -> Vec<u32> {
+fn on_gpu(
+    gpu: &Arc<Gpu>,
+    how: Halftone,
+    raster: Raster,
+    number: u32,
+    codes: &[u32],
+    shows: &Shows,
+) -> Vec<u32> {
     let (tiles_x, tiles_y) = (raster.width().div_ceil(16), raster.height().div_ceil(16));
     let frame = Frame {
         drawn: number,
@@ -23,6 +51,7 @@ fn on_gpu(gpu: &Arc<Gpu>, how: Halftone, raster: Raster, number: u32, codes: &[u
         height: raster.height(),
         tiles_x,
         tile_count: tiles_x * tiles_y,
+        mover_count: shows.centres.len() as u32,
         ..Frame::zeroed()
     };
     let tiles: Vec<u32> = (0..tiles_x * tiles_y).collect();
@@ -35,7 +64,25 @@ fn on_gpu(gpu: &Arc<Gpu>, how: Halftone, raster: Raster, number: u32, codes: &[u
         (ids::HALFTONE_DEPTH, how.depth),
         (ids::HALFTONE_WHITE, how.white.into()),
     ];
-    let buffers = [("B_FRAME", &frame), ("B_TILES", &tiles), ("B_NOISE", &noise), ("B_CODES", &words)];
+    let surfaces: Vec<Surface> = shows.ids.iter().map(|&id| Surface { id, ..Surface::zeroed() }).collect();
+    let instances: Vec<Instance> =
+        shows.movers_of_instances.iter().map(|&mover| Instance { mover, ..Instance::zeroed() }).collect();
+    let movers: Vec<Mover> =
+        shows.centres.iter().map(|&centre| Mover { centre, ..Mover::zeroed() }).collect();
+    // Buffers are never empty.
+    let table = |name, bytes: &[u8]| uploaded(gpu, name, if bytes.is_empty() { &[0; 16] } else { bytes });
+    let surfaces = table("surfaces", bytemuck::cast_slice(&surfaces));
+    let instances = table("instances", bytemuck::cast_slice(&instances));
+    let movers = table("movers", bytemuck::cast_slice(&movers));
+    let buffers = [
+        ("B_FRAME", &frame),
+        ("B_TILES", &tiles),
+        ("B_NOISE", &noise),
+        ("B_CODES", &words),
+        ("B_SURFACES", &surfaces),
+        ("B_INSTANCES", &instances),
+        ("B_MOVERS", &movers),
+    ];
     let through = |texel| {
         let shader = dpm_shaders::HALFTONE.reading(texel);
         let len = codes.len() * 4;
@@ -70,10 +117,38 @@ fn halftones_of_gpu_and_cpu_are_the_same_bits() {
                     let how = Halftone::of(&schedule).expect("parts");
                     let mut expected = vec![0; codes.len()];
                     halftone(how, raster, number, codes, &mut expected);
-                    let got = on_gpu(gpu, how, raster, number, codes);
+                    let got = on_gpu(gpu, how, raster, number, codes, &Shows::default());
                     assert!(got == expected, "{width} x {height}, {how:?}");
                 }
             }
+        }
+    });
+}
+
+/// The noise is fixed to bodies that move, wherever their centres are; to the raster for those that rest and where nothing is.
+#[test]
+fn noise_goes_with_bodies_on_gpu_and_cpu_alike() {
+    with_gpu(|gpu| {
+        let mut random = Sampler::new(79, 0);
+        let schedule = PlaneSchedule::equal_rgb24();
+        let how = Halftone::of(&schedule).unwrap();
+        for (width, height) in [(9, 5), (64, 48), (100, 37)] {
+            let raster = Raster::new(width, height).unwrap();
+            let codes: Vec<u32> =
+                (0..raster.pixel_count()).map(|_| random.next_u64() as u32 & 0xff_ffff).collect();
+            let id = |of: u64| [NO_HIT, 0, 1 << 24 | 7, 2 << 24, 3 << 24][(of % 5) as usize];
+            let shows = Shows {
+                ids: (0..raster.pixel_count()).map(|_| id(random.next_u64())).collect(),
+                movers_of_instances: vec![2, 0, 1, 3],
+                centres: vec![[5, -3], [-1000, 70], [31, 2047]],
+            };
+            let mut expected = vec![0; codes.len()];
+            halftone_of_bodies(how, raster, 11, &codes, &|pixel| shows.anchor(pixel), &mut expected);
+            let got = on_gpu(gpu, how, raster, 11, &codes, &shows);
+            assert!(got == expected, "{width} x {height}");
+            let mut fixed = vec![0; codes.len()];
+            halftone(how, raster, 11, &codes, &mut fixed);
+            assert!(fixed != expected, "the noise has moved");
         }
     });
 }

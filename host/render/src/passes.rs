@@ -183,7 +183,7 @@ pub(super) const TABLE: [Pass; 12] = [
         name: "halftone",
         code: Code::OfAll(Kernel {
             shader: |texel| shaders::HALFTONE.reading(texel),
-            reads: &["B_CODES"],
+            reads: &["B_SURFACES", "B_CODES"],
             writes: &["B_CODES"],
         }),
         when: |s, _| s.halftone.is_some(),

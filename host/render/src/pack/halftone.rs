@@ -11,6 +11,7 @@
 //!   frames: with 8 planes by 0.38 and 0.13 levels of 255. Three parts of eight bits are exact: each is the code value.
 //! - Which mirrors have one more is decided by the remainder plus blue noise in space and time (\[Wolfe22\]), so what
 //!   remains of the pattern has no low frequencies.
+//! - The noise is fixed to a body that moves, so the values that a point of its surface meets follow one another in time.
 //! - All parts of a mirror are the same number or one more. Those with one more are spread evenly over the frame, and begin
 //!   at a part that blue noise chooses. So all parts of an even field give equal light.
 //!
@@ -83,12 +84,13 @@ impl Halftone {
     }
 }
 
-/// A pixel's value of the blue noise for a channel's remainders, and for the plane at which it begins.
-fn noise(x: usize, y: usize, frame: u32, channel: usize) -> [u32; 2] {
+/// The blue noise of a place for a channel's remainders, and for the part at which it begins.
+fn noise([x, y]: [i32; 2], frame: u32, channel: usize) -> [u32; 2] {
+    let within = |place: i32| place.rem_euclid(blue_noise::SIZE as i32) as usize;
     // The mask has two channels; the third of a frame is the first, half a mask aside.
-    let x = (x + (channel >> 1) * (blue_noise::SIZE / 2)) % blue_noise::SIZE;
+    let x = (within(x) + (channel >> 1) * (blue_noise::SIZE / 2)) % blue_noise::SIZE;
     let slice = frame as usize % blue_noise::FRAMES;
-    let at = (slice * blue_noise::SIZE + y % blue_noise::SIZE) * blue_noise::SIZE + x;
+    let at = (slice * blue_noise::SIZE + within(y)) * blue_noise::SIZE + x;
     [channel & 1, channel & 1 ^ 1].map(|c| u32::from(blue_noise::MASK[2 * at + c]))
 }
 
@@ -106,6 +108,22 @@ fn spread(sum: u32, parts: u32, depth: u32, phase: u32) -> u32 {
 /// # Panics
 /// When `codes` or `words` do not hold exactly one value per pixel of `raster`.
 pub fn halftone(halftone: Halftone, raster: Raster, frame: u32, codes: &[u32], words: &mut [u32]) {
+    halftone_of_bodies(halftone, raster, frame, codes, &|_| [0, 0], words);
+}
+
+/// The same with bodies that move. `anchor` gives for the number of a pixel the column and row of the point to which its noise
+/// is fixed: the centre of the body that it shows, and `[0, 0]` where nothing moves.
+///
+/// # Panics
+/// As [`halftone()`].
+pub fn halftone_of_bodies(
+    halftone: Halftone,
+    raster: Raster,
+    frame: u32,
+    codes: &[u32],
+    anchor: &dyn Fn(usize) -> [i32; 2],
+    words: &mut [u32],
+) {
     assert_eq!(
         (codes.len(), words.len()),
         (raster.pixel_count(), raster.pixel_count()),
@@ -116,7 +134,7 @@ pub fn halftone(halftone: Halftone, raster: Raster, frame: u32, codes: &[u32], w
     for (channel, &(bits_at, code_at)) in halftone.channels().iter().enumerate() {
         for y in (0..height).step_by(SIDE) {
             for x in (0..width).step_by(SIDE) {
-                let block = Block { halftone, channel, at: [x, y], raster, frame };
+                let block = Block { halftone, channel, at: [x, y], raster, frame, anchor };
                 block.share_out(codes, code_at, words, bits_at);
             }
         }
@@ -124,15 +142,16 @@ pub fn halftone(halftone: Halftone, raster: Raster, frame: u32, codes: &[u32], w
 }
 
 /// A channel of 8 x 8 mirrors; fewer at the right and lower edge.
-struct Block {
+struct Block<'a> {
     halftone: Halftone,
     channel: usize,
     at: [usize; 2],
     raster: Raster,
     frame: u32,
+    anchor: &'a dyn Fn(usize) -> [i32; 2],
 }
 
-impl Block {
+impl Block<'_> {
     fn share_out(&self, codes: &[u32], code_at: u32, words: &mut [u32], bits_at: u32) {
         let width = self.raster.width() as usize;
         let [right, lower] = [width, self.raster.height() as usize];
@@ -144,11 +163,15 @@ impl Block {
                 .filter(|&(_, x, y)| x < right && y < lower)
         };
         let code = |x: usize, y: usize| codes[y * width + x] >> code_at & 0xff;
+        let noise_at = |x: usize, y: usize| {
+            let [column, row] = (self.anchor)(y * width + x);
+            noise([x as i32 - column, y as i32 - row], self.frame, self.channel)
+        };
         for (i, x, y) in pixels() {
             let rest = code(x, y) * self.halftone.most() % 255;
             sum += rest;
             if rest > 0 {
-                let [threshold, _] = noise(x, y, self.frame, self.channel);
+                let [threshold, _] = noise_at(x, y);
                 // Unique, and above 0: the number of the mirror decides between equals.
                 keys[i] = ((rest + threshold) << 6 | i as u32) as u16;
             }
@@ -157,7 +180,7 @@ impl Block {
         for (i, x, y) in pixels() {
             let before = keys.iter().filter(|&&key| key > keys[i]).count() as u32;
             let sum = code(x, y) * self.halftone.most() / 255 + u32::from(keys[i] > 0 && before < extra);
-            let [_, begin] = noise(x, y, self.frame, self.channel);
+            let [_, begin] = noise_at(x, y);
             let Halftone { parts, depth, .. } = self.halftone;
             words[y * width + x] |= spread(sum, parts, depth, begin % parts) << bits_at;
         }
@@ -265,6 +288,74 @@ mod tests {
             };
             let sums: Vec<u32> = (0..16).map(|i| sum(i % 4 * 16, i / 4 * 16)).collect();
             assert!(sums.iter().max().unwrap() - sums.iter().min().unwrap() <= 4, "{code}: {sums:?}");
+        }
+    }
+
+    /// Words of frame `number` of an even field that shows a body which has moved `by` pixels, with its noise fixed to it.
+    fn moved(schedule: &PlaneSchedule, raster: Raster, number: u32, code: u32, by: [i32; 2]) -> Vec<u32> {
+        let mut words = vec![0; raster.pixel_count()];
+        let how = Halftone::of(schedule).unwrap();
+        let codes = vec![code; raster.pixel_count()];
+        halftone_of_bodies(how, raster, number, &codes, &|_| by, &mut words);
+        words
+    }
+
+    /// The pattern goes with the body: bit for bit where the body moves by whole blocks, to any side.
+    #[test]
+    fn noise_goes_with_the_body() {
+        let raster = Raster::new(64, 48).unwrap();
+        let schedule = PlaneSchedule::equal_rgb24();
+        let still = even(&schedule, raster, 5, 0x33_6690);
+        for by in [[8, 0], [-16, 8], [24, -40]] {
+            let words = moved(&schedule, raster, 5, 0x33_6690, by);
+            for (y, x) in (0..48).flat_map(|y| (0..64).map(move |x| (y, x))) {
+                // The noise repeats every 64 places.
+                let from = [x - by[0], y - by[1]];
+                if (0..64).contains(&from[0]) && (0..48).contains(&from[1]) {
+                    assert_eq!(words[(y * 64 + x) as usize], still[(from[1] * 64 + from[0]) as usize]);
+                }
+            }
+        }
+    }
+
+    /// An eye that follows a body sees less of the pattern if its noise goes with the body: over four frames the levels of a
+    /// surface point are spread by two fifths less, and as much as at rest.
+    #[test]
+    fn an_eye_that_follows_sees_less_of_the_pattern() {
+        let raster = Raster::new(64, 64).unwrap();
+        let schedule = PlaneSchedule::equal_mono8();
+        let how = Halftone::of(&schedule).unwrap();
+        // Root mean square of what the mean of four frames differs by from the code value, in levels of the halftone.
+        let residue = |goes: bool, speed: [i32; 2]| {
+            let (mut squares, mut points) = (0.0, 0);
+            for (code, first) in (3..255u32).step_by(28).zip((0..).step_by(4)) {
+                let frames: Vec<Vec<u32>> = (0..4)
+                    .map(|i| {
+                        let by = speed.map(|v| v * i);
+                        moved(&schedule, raster, first + i as u32, code << 8, if goes { by } else { [0, 0] })
+                    })
+                    .collect();
+                let wanted = f64::from(code * how.most()) / 255.0;
+                for (y, x) in (0..64).flat_map(|y| (0..64).map(move |x| (y, x))) {
+                    // A point that stays in the picture, at its place in each frame.
+                    let places = [0, 1, 2, 3].map(|i| [x + speed[0] * i, y + speed[1] * i]);
+                    if places.iter().all(|p| p.iter().all(|c| (0..64).contains(c))) {
+                        let of = |(p, words): (&[i32; 2], &Vec<u32>)| {
+                            how.sums(words[(p[1] * 64 + p[0]) as usize])[0]
+                        };
+                        let mean = f64::from(places.iter().zip(&frames).map(of).sum::<u32>()) / 4.0;
+                        squares += (mean - wanted) * (mean - wanted);
+                        points += 1;
+                    }
+                }
+            }
+            (squares / f64::from(points)).sqrt()
+        };
+        let still = residue(true, [0, 0]);
+        for speed in [[5, 0], [11, 3], [-7, 6]] {
+            let [fixed, going] = [false, true].map(|goes| residue(goes, speed));
+            println!("{speed:?} px a frame: {fixed:.3} levels with noise on the raster, {going:.3} with the body, {still:.3} at rest");
+            assert!(going < 0.7 * fixed && going < 1.1 * still, "{speed:?}: {fixed}, {going}, {still}");
         }
     }
 

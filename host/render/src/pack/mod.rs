@@ -11,7 +11,7 @@ mod scalar;
 mod simd;
 
 pub use frame::BitPlaneFrame;
-pub use halftone::{halftone, Halftone};
+pub use halftone::{halftone, halftone_of_bodies, Halftone};
 pub use quantise::{quantise, QuantiseCounts};
 
 use dpm_device::planes::{Channel, PlaneSchedule, PlaneSpec, MAX_PLANES};
