@@ -7,7 +7,7 @@ use std::ffi::OsString;
 use std::fs::{File, OpenOptions};
 use std::io;
 use std::os::fd::{AsFd, BorrowedFd, OwnedFd};
-use std::os::unix::fs::{FileExt, OpenOptionsExt};
+use std::os::unix::fs::{FileExt, MetadataExt, OpenOptionsExt};
 use std::path::{Path, PathBuf};
 use std::time::{Duration, Instant};
 
@@ -25,6 +25,10 @@ use drm::{ClientCapability, Device, DriverCapability};
 use crate::kms::{Connector, Domain, Kms, Owner, Property, Setup};
 use crate::mode::Timing;
 use crate::scan_out::{DisplayError, Flip, Picture, Pixels, ScanOut};
+
+mod guard;
+
+pub use guard::{let_go, show_black};
 
 /// How long another program may need to let go of the displays.
 const MASTER_PATIENCE: Duration = Duration::from_millis(1500);
@@ -44,6 +48,21 @@ impl AsFd for Node {
 
 impl Device for Node {}
 impl ControlDevice for Node {}
+
+impl Node {
+    /// The numbers and names of the connectors that this descriptor sees.
+    fn connector_names(&self) -> Vec<(u32, String)> {
+        let Ok(resources) = self.resource_handles() else { return Vec::new() };
+        let known = |handle: &connector::Handle| self.get_connector(*handle, false).ok();
+        let infos = resources.connectors().iter().filter_map(known);
+        infos.map(|info| (info.handle().into(), info.to_string())).collect()
+    }
+
+    /// True while this descriptor, which is a lease, is one: the lender has not taken it back, and drives the card.
+    fn is_lent(&self) -> bool {
+        drm_ffi::mode::get_lease(self.as_fd(), None).is_ok_and(|lease| lease.count_objects > 0)
+    }
+}
 
 /// The objects that drive a connector.
 #[derive(Clone, Copy)]
@@ -70,11 +89,13 @@ struct Output {
     status: Option<File>,
 }
 
-/// A graphics card.
+/// A graphics card, or the part of it that its owner has lent.
 pub struct Card {
     node: Node,
     path: PathBuf,
     output: Option<Output>,
+    /// Who lent it.
+    lender: Option<String>,
 }
 
 fn call(doing: &'static str) -> impl Fn(io::Error) -> DisplayError {
@@ -98,6 +119,29 @@ pub fn cards() -> Vec<PathBuf> {
         path.to_string_lossy().trim_start_matches("/dev/dri/card").parse::<u32>().unwrap_or(u32::MAX)
     });
     all
+}
+
+/// The numbers and names of all connectors of the cards that this user may open.
+pub fn connector_names() -> Vec<(u32, String)> {
+    let open = |path: PathBuf| {
+        let options = OpenOptions::new().read(true).write(true).custom_flags(libc::O_CLOEXEC).open(path);
+        options.ok().map(|file| Node(file.into()))
+    };
+    cards().into_iter().filter_map(open).flat_map(|node| node.connector_names()).collect()
+}
+
+/// The same of the card behind `descriptor` alone; empty if it is none.
+pub fn connector_names_of(descriptor: OwnedFd) -> Vec<(u32, String)> {
+    Node(descriptor).connector_names()
+}
+
+/// The device file of a card's descriptor.
+fn path_of(descriptor: &OwnedFd) -> PathBuf {
+    let device =
+        descriptor.try_clone().and_then(|fd| File::from(fd).metadata()).map_or(0, |about| about.rdev());
+    let (major, minor) = (rustix::fs::major(device), rustix::fs::minor(device));
+    let link = std::fs::read_link(format!("/sys/dev/char/{major}:{minor}")).ok();
+    Path::new("/dev/dri").join(link.as_deref().and_then(Path::file_name).unwrap_or("card".as_ref()))
 }
 
 /// Opens the card at `card`, or, without one, the first that has the connector `connector`, or a display at any.
@@ -164,7 +208,40 @@ impl Card {
                 io::ErrorKind::PermissionDenied => DisplayError::Denied(name.clone()),
                 _ => DisplayError::Call { doing: "open the graphics card", source: e },
             })?;
-        let node = Node(file.into());
+        Self::of(Node(file.into()), path.into(), None)
+    }
+
+    /// Takes the lease `descriptor`, which `lender` has given: a card with one connector and what drives it. It is given
+    /// back with the last duplicate of the descriptor.
+    ///
+    /// # Errors
+    /// The descriptor is none of a graphics card, or as [`Card::open`].
+    pub fn lent(descriptor: OwnedFd, lender: String) -> Result<Self, DisplayError> {
+        let prepare = || {
+            // These are the lender's choice at first. Reading events must never wait, and no program that this one starts may
+            // keep the lease but the guardian, which gets its own.
+            let flags = rustix::fs::fcntl_getfl(&descriptor)?;
+            rustix::fs::fcntl_setfl(&descriptor, flags | rustix::fs::OFlags::NONBLOCK)?;
+            rustix::io::fcntl_setfd(&descriptor, rustix::io::FdFlags::CLOEXEC)
+        };
+        prepare().map_err(|e| call("use the lease")(e.into()))?;
+        let path = path_of(&descriptor);
+        Self::of(Node(descriptor), path, Some(lender))
+    }
+
+    /// False if this card is a lease that its owner has taken back.
+    pub fn is_still_lent(&self) -> bool {
+        self.lender.is_none() || self.node.is_lent()
+    }
+
+    /// The names of the connectors that this card has, or that were lent.
+    pub fn connector_names(&self) -> Vec<String> {
+        self.node.connector_names().into_iter().map(|(_, name)| name).collect()
+    }
+
+    /// A card by its descriptor, which sees everything that atomic mode setting needs from now on.
+    fn of(node: Node, path: PathBuf, lender: Option<String>) -> Result<Self, DisplayError> {
+        let name = path.display().to_string();
         let unsuitable = |what: &str| DisplayError::Unsuitable { card: name.clone(), what: what.into() };
         let atomic = node.set_client_capability(ClientCapability::UniversalPlanes, true);
         if atomic.and_then(|()| node.set_client_capability(ClientCapability::Atomic, true)).is_err() {
@@ -178,7 +255,7 @@ impl Card {
         if node.get_driver_capability(DriverCapability::DumbBuffer).unwrap_or(0) == 0 {
             return Err(unsuitable("its driver has no plain buffers to scan out; use another card"));
         }
-        Ok(Self { node, path: path.into(), output: None })
+        Ok(Self { node, path, output: None, lender })
     }
 
     /// True if a program drives this card's displays, this one included.
@@ -348,6 +425,8 @@ impl Card {
     ) -> Result<(), DisplayError> {
         self.node.page_flip(crtc, picture, flags, None).map_err(|e| match e.raw_os_error() {
             Some(libc::EBUSY) => DisplayError::Busy,
+            // The objects of a lease are not there for those from whom it was taken. Its owner may have lost the card, too.
+            Some(libc::ENOENT | libc::EACCES | libc::EPERM) if self.lender.is_some() => DisplayError::Revoked,
             // What is gone is refused in several ways.
             Some(libc::ENODEV | libc::ENXIO | libc::EINVAL | libc::EACCES | libc::EPERM) => {
                 DisplayError::Gone
@@ -445,7 +524,14 @@ impl Kms for Card {
         self.node
             .atomic_commit(test, request.clone())
             .map_err(call("set the mode with these properties (the driver refuses them together)"))?;
-        self.node.atomic_commit(AtomicCommitFlags::ALLOW_MODESET, request).map_err(call("set the mode"))
+        let set = self.node.atomic_commit(AtomicCommitFlags::ALLOW_MODESET, request);
+        // A lease that is used again may still hold events of the pictures before.
+        let _ = self.node.receive_events().map(Iterator::count);
+        set.map_err(call("set the mode"))
+    }
+
+    fn lender(&self) -> Option<&str> {
+        self.lender.as_deref()
     }
 }
 
@@ -481,11 +567,17 @@ impl ScanOut for Card {
     }
 
     fn lost(&mut self) -> Option<DisplayError> {
-        let status = self.output.as_ref().and_then(|output| output.status.as_ref())?;
         let mut word = [0; 16];
-        let is_connected =
-            matches!(status.read_at(&mut word, 0), Ok(n) if !word[..n].starts_with(b"disconnected"));
-        (!is_connected).then_some(DisplayError::Gone)
+        let is_connected = match self.output.as_ref().and_then(|output| output.status.as_ref()) {
+            Some(status) => {
+                matches!(status.read_at(&mut word, 0), Ok(n) if !word[..n].starts_with(b"disconnected"))
+            }
+            None => true,
+        };
+        if !is_connected {
+            return Some(DisplayError::Gone);
+        }
+        (!self.is_still_lent()).then_some(DisplayError::Revoked)
     }
 
     fn now_ns(&self) -> i64 {
@@ -525,36 +617,4 @@ impl Drop for Card {
         self.blacken();
         self.release();
     }
-}
-
-/// The guardian's side of [`ScanOut::guarded`]: shows the picture `black` on `crtc` with the descriptor that it was started
-/// with, and keeps it there until another program drives the displays, for `hold` at most. The end of the last program that
-/// holds a card gives its displays back to the console.
-///
-/// # Errors
-/// The kernel does not take the picture.
-pub fn show_black(descriptor: OwnedFd, crtc: u32, black: u32, hold: Duration) -> Result<(), DisplayError> {
-    let node = Node(descriptor);
-    let handle = |n: u32| std::num::NonZeroU32::new(n).ok_or(DisplayError::Gone);
-    let (crtc, black) = (crtc::Handle::from(handle(crtc)?), framebuffer::Handle::from(handle(black)?));
-    let limit = Instant::now() + BLACK_PATIENCE.saturating_mul(10);
-    loop {
-        match node.page_flip(crtc, black, PageFlipFlags::empty(), None) {
-            Ok(()) => break,
-            Err(e) if e.raw_os_error() == Some(libc::EBUSY) && Instant::now() < limit => {
-                std::thread::sleep(STEP)
-            }
-            Err(e) => return Err(call("show black")(e)),
-        }
-    }
-    let end = Instant::now() + hold;
-    let _ = node.release_master_lock();
-    while Instant::now() < end {
-        std::thread::sleep(STEP.saturating_mul(250));
-        match node.acquire_master_lock() {
-            Ok(()) => drop(node.release_master_lock()),
-            Err(_) => break,
-        }
-    }
-    Ok(())
 }

@@ -135,8 +135,8 @@ impl AlpWeights {
 }
 
 section! {
-    /// A display on a graphics card of this machine, which shows nothing else meanwhile. docs/DISPLAY.md says how to set
-    /// it up. Nothing of it has been tried on real hardware yet.
+    /// A display on a graphics card of this machine, which shows nothing else meanwhile, or lends this display alone.
+    /// docs/DISPLAY.md says how to set it up. Nothing of it has been tried on real hardware yet.
     pub struct DisplayConfig {
         /// The connector, as `dpm display` lists them, for example "HDMI-A-1"; the only one with a display if left out.
         connector: Option<String> = None, "", NotEmpty;
@@ -148,6 +148,10 @@ section! {
         encoding: DisplayEncoding = DisplayEncoding::Rgb8, "", Any;
         /// The graphics card's device file; the first with such a connector if left out.
         card: Option<PathBuf> = None, "", NotEmpty;
+        /// Whether a desktop is asked to lend the connector. "auto" takes the card where no other program drives it, and
+        /// else asks the desktop that the environment names: by WAYLAND_DISPLAY, or else by DISPLAY. "off" asks none. "x11"
+        /// and "wayland" ask at once. docs/DISPLAY.md says what a desktop lends.
+        lease: DisplayLease = DisplayLease::Auto, "", Any;
         /// How long before its vertical blank a frame is chosen and written. Half a frame and at most 8000 if left out.
         /// Raise it if the report counts repeated frames although frames were there in time; each microsecond is one
         /// of latency.
@@ -251,6 +255,20 @@ words! {
         /// The 24 planes of a frame, in the order in which a DLPC900 shows the bits of a pixel: green 0 to 7, red 0 to 7,
         /// blue 0 to 7.
         Planes24 = "planes24",
+    }
+}
+
+words! {
+    /// Whether a desktop is asked for a display.
+    pub enum DisplayLease {
+        /// If another program drives the card.
+        Auto = "auto",
+        /// Never.
+        Off = "off",
+        /// The X server of the variable DISPLAY, by RandR 1.6.
+        X11 = "x11",
+        /// The compositor of the variable WAYLAND_DISPLAY, by wp_drm_lease_device_v1.
+        Wayland = "wayland",
     }
 }
 
