@@ -20,6 +20,9 @@ use crate::card::{let_go, open_for, Card};
 use crate::kms::Kms;
 use crate::scan_out::DisplayError;
 
+#[cfg(test)]
+#[path = "../tests/common/compositor.rs"]
+mod compositor;
 pub mod names;
 pub mod wayland;
 pub mod x11;
@@ -196,23 +199,8 @@ fn left(until: Instant) -> Option<rustix::event::Timespec> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use rustix::net::{sendmsg, SendAncillaryBuffer, SendAncillaryMessage, SendFlags};
     use std::fs::File;
-    use std::io::{IoSlice, Read};
-    use std::mem::MaybeUninit;
-    use std::os::fd::{AsFd, BorrowedFd};
-
-    /// Sends bytes, a descriptor beside them, as the fake servers do.
-    pub(super) fn send(stream: &UnixStream, bytes: &[u8], descriptor: Option<BorrowedFd<'_>>) {
-        let mut space = [MaybeUninit::uninit(); 64];
-        let mut beside = SendAncillaryBuffer::new(&mut space);
-        let descriptors: Vec<BorrowedFd<'_>> = descriptor.into_iter().collect();
-        if !descriptors.is_empty() {
-            assert!(beside.push(SendAncillaryMessage::ScmRights(&descriptors)));
-        }
-        // A client that has gone has judged already.
-        let _ = sendmsg(stream.as_fd(), &[IoSlice::new(bytes)], &mut beside, SendFlags::NOSIGNAL);
-    }
+    use std::io::Read;
 
     /// A descriptor that a fake server hands out, and what tells whether another one is the same.
     pub(super) struct Handed {

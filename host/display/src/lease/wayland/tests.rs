@@ -1,216 +1,13 @@
-//! The client against a small compositor that is written from the protocol: it offers, lends, refuses, vanishes, says nothing
-//! or says nonsense.
+//! The client against a small compositor that offers, lends, refuses, vanishes, says nothing or says nonsense.
 
-use std::io::Read;
-use std::os::fd::{AsFd, OwnedFd};
+use std::os::fd::OwnedFd;
 use std::os::unix::net::UnixStream;
 use std::thread::JoinHandle;
 use std::time::{Duration, Instant};
 
-use super::super::tests::{send, Handed};
+use super::super::compositor::{Compositor, Manner, Request, Seen, FIRST};
+use super::super::tests::Handed;
 use super::{lease_over, socket_of, Lease, Refusal};
-
-/// How the compositor behaves.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-enum Manner {
-    Lends,
-    Refuses,
-    /// It goes away instead of an answer to this request.
-    VanishesAt(Request),
-    /// It answers everything but this request.
-    SilentAt(Request),
-    /// It answers the request for a list with bytes of no protocol.
-    Nonsense,
-    /// It withdraws what it has offered before it has listed everything.
-    Withdraws,
-    /// It has no such protocol.
-    Plain,
-}
-
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-enum Request {
-    List,
-    Bind,
-    Submit,
-}
-
-/// The objects of a client, by their numbers.
-#[derive(Default)]
-struct Objects {
-    registry: u32,
-    device: u32,
-    request: u32,
-    lease: u32,
-}
-
-/// What the client did after its lease.
-#[derive(Debug, Default, PartialEq, Eq)]
-struct Seen {
-    /// The connector that it asked for.
-    asked: Option<u32>,
-    has_released_device: bool,
-    has_destroyed_lease: bool,
-}
-
-struct Compositor {
-    stream: UnixStream,
-    manner: Manner,
-    offers: Vec<(&'static str, u32)>,
-    given: Option<OwnedFd>,
-    seen: Seen,
-}
-
-/// The compositor's own numbers begin here.
-const FIRST: u32 = 0xff00_0000;
-/// Its number of the global.
-const GLOBAL: u32 = 7;
-
-fn string(text: &str) -> Vec<u8> {
-    let mut bytes = u32::try_from(text.len() + 1).unwrap().to_ne_bytes().to_vec();
-    bytes.extend(text.as_bytes());
-    bytes.push(0);
-    bytes.resize(bytes.len().next_multiple_of(4), 0);
-    bytes
-}
-
-fn number(n: u32) -> Vec<u8> {
-    n.to_ne_bytes().to_vec()
-}
-
-impl Compositor {
-    fn event(&self, object: u32, opcode: u32, arguments: &[u8]) {
-        self.event_with(object, opcode, arguments, None);
-    }
-
-    fn event_with(&self, object: u32, opcode: u32, arguments: &[u8], descriptor: Option<&OwnedFd>) {
-        let size = u32::try_from(8 + arguments.len()).unwrap();
-        let mut bytes = number(object);
-        bytes.extend(number(size << 16 | opcode));
-        bytes.extend(arguments);
-        send(&self.stream, &bytes, descriptor.map(AsFd::as_fd));
-    }
-
-    /// Reads one request: object, opcode and arguments. `None` when the client has gone.
-    fn read(&mut self) -> Option<(u32, u32, Vec<u32>)> {
-        let mut head = [0; 8];
-        self.stream.read_exact(&mut head).ok()?;
-        let word = |bytes: &[u8]| u32::from_ne_bytes(bytes.try_into().unwrap());
-        let (object, word_2) = (word(&head[..4]), word(&head[4..]));
-        let mut rest = vec![0; (word_2 >> 16) as usize - 8];
-        self.stream.read_exact(&mut rest).ok()?;
-        Some((object, word_2 & 0xffff, rest.chunks_exact(4).map(word).collect()))
-    }
-
-    fn serve(mut self) -> Seen {
-        let mut objects = Objects::default();
-        while let Some((object, opcode, arguments)) = self.read() {
-            let last = arguments.last().copied().unwrap_or(0);
-            let is_gone = match (object, opcode) {
-                (1, 1) => {
-                    objects.registry = last;
-                    false
-                }
-                (1, 0) => self.list(objects.registry, last),
-                (o, 0) if o == objects.registry => {
-                    objects.device = last;
-                    self.offer(last)
-                }
-                (o, 0) if o == objects.device => {
-                    objects.request = last;
-                    false
-                }
-                (o, 1) if o == objects.device => {
-                    self.seen.has_released_device = true;
-                    false
-                }
-                (o, 0) if o == objects.request => {
-                    self.seen.asked = Some(last);
-                    false
-                }
-                (o, 1) if o == objects.request => {
-                    objects.lease = last;
-                    self.answer(last)
-                }
-                (o, 0) if o == objects.lease => {
-                    self.seen.has_destroyed_lease = true;
-                    false
-                }
-                _ => false,
-            };
-            if is_gone {
-                break;
-            }
-        }
-        self.seen
-    }
-
-    /// True if the compositor goes away now; `None` if it says nothing.
-    fn mood(&self, request: Request) -> Option<bool> {
-        match self.manner {
-            Manner::VanishesAt(at) if at == request => Some(true),
-            Manner::SilentAt(at) if at == request => None,
-            _ => Some(false),
-        }
-    }
-
-    fn list(&self, registry: u32, callback: u32) -> bool {
-        match self.mood(Request::List) {
-            Some(false) => {}
-            other => return other.unwrap_or(false),
-        }
-        if self.manner == Manner::Nonsense {
-            send(&self.stream, &[0xff; 64], None);
-            return false;
-        }
-        let mut globals = vec![("wl_output", 3)];
-        if self.manner != Manner::Plain {
-            globals.push(("wp_drm_lease_device_v1", GLOBAL));
-        }
-        for (interface, name) in globals {
-            let mut arguments = number(name);
-            arguments.extend(string(interface));
-            arguments.extend(number(1));
-            self.event(registry, 0, &arguments);
-        }
-        self.event(callback, 0, &number(0));
-        false
-    }
-
-    fn offer(&self, device: u32) -> bool {
-        // A descriptor that is no card: what connectors are called, only the compositor can say then.
-        let card: OwnedFd = std::fs::File::open("/dev/null").unwrap().into();
-        self.event_with(device, 0, &[], Some(&card));
-        for (place, (name, id)) in (0..).zip(&self.offers) {
-            let connector = FIRST + place;
-            self.event(device, 1, &number(connector));
-            self.event(connector, 0, &string(name));
-            self.event(connector, 1, &string("a display"));
-            self.event(connector, 2, &number(*id));
-            self.event(connector, 3, &[]);
-        }
-        match self.mood(Request::Bind) {
-            Some(false) => {}
-            other => return other.unwrap_or(false),
-        }
-        if self.manner == Manner::Withdraws {
-            (0..).zip(&self.offers).for_each(|(place, _)| self.event(FIRST + place, 4, &[]));
-        }
-        self.event(device, 2, &[]);
-        false
-    }
-
-    fn answer(&mut self, lease: u32) -> bool {
-        match self.mood(Request::Submit) {
-            Some(false) => {}
-            other => return other.unwrap_or(false),
-        }
-        match (self.manner, self.given.take()) {
-            (Manner::Lends, Some(given)) => self.event_with(lease, 0, &[], Some(&given)),
-            _ => self.event(lease, 1, &[]),
-        }
-        false
-    }
-}
 
 const OFFERS: [(&str, u32); 2] = [("DP-1", 33), ("HDMI-A-1", 44)];
 
@@ -220,9 +17,11 @@ fn compositor(
     offers: &[(&'static str, u32)],
     given: Option<OwnedFd>,
 ) -> (UnixStream, JoinHandle<Seen>) {
-    let (client, server) = UnixStream::pair().unwrap();
-    let compositor =
-        Compositor { stream: server, manner, offers: offers.to_vec(), given, seen: Seen::default() };
+    let (client, stream) = UnixStream::pair().unwrap();
+    // The card is none: what connectors are called, only the compositor can say then.
+    let card = std::fs::File::open("/dev/null").unwrap().into();
+    let (mut given, offers, seen) = (given, offers.to_vec(), Seen::default());
+    let compositor = Compositor { stream, manner, offers, card, lend: Box::new(move || given.take()), seen };
     (client, std::thread::spawn(move || compositor.serve()))
 }
 

@@ -12,7 +12,8 @@ use x11rb::protocol::xproto;
 use x11rb::rust_connection::{DefaultStream, RustConnection};
 use x11rb::x11_utils::Serialize;
 
-use super::super::tests::{send, Handed};
+use super::super::compositor::send;
+use super::super::tests::Handed;
 use super::{lease_of, Bounded, Lease, Refusal};
 
 /// Its number of the extension's requests.
