@@ -125,7 +125,10 @@ pub fn cards() -> Vec<PathBuf> {
 pub fn connector_names() -> Vec<(u32, String)> {
     let open = |path: PathBuf| {
         let options = OpenOptions::new().read(true).write(true).custom_flags(libc::O_CLOEXEC).open(path);
-        options.ok().map(|file| Node(file.into()))
+        let node = Node(options.ok()?.into());
+        // Whoever opens a card that nobody drives drives it, and its owner may be about to return.
+        let _ = node.release_master_lock();
+        Some(node)
     };
     cards().into_iter().filter_map(open).flat_map(|node| node.connector_names()).collect()
 }

@@ -91,6 +91,14 @@ pub struct Lease {
     pub lender: String,
 }
 
+/// What an opener has on lease, and from whom.
+#[derive(Default)]
+struct Held {
+    lease: Option<Lease>,
+    /// Who has lent it once.
+    lender: Option<Lender>,
+}
+
 /// Opens the display at `connector` of `card` as `access` says. What is lent is kept between calls, and given back when the
 /// function is dropped.
 pub fn opener(
@@ -98,34 +106,40 @@ pub fn opener(
     connector: Option<String>,
     access: Access,
 ) -> impl Fn() -> Result<Box<dyn Kms>, DisplayError> + Send + Sync {
-    let held = Lock::new(None);
+    let held = Lock::new(Held::default());
     move || {
-        let lend = |lender| lent(&held, lender, card.as_deref(), connector.as_deref());
-        match access {
-            Access::Alone => open_for(card.as_deref(), connector.as_deref()),
-            Access::Lent(lender) => lend(lender),
-            Access::Auto => match open_for(card.as_deref(), connector.as_deref()) {
-                Err(alone @ (DisplayError::InUse(_) | DisplayError::Denied(_))) => {
-                    Lender::of_environment().map_or(Err(alone), lend)
-                }
-                other => other,
-            },
+        // Nothing is left half-done by a call that panicked.
+        let mut held = held.lock().unwrap_or_else(std::sync::PoisonError::into_inner);
+        let (card, connector) = (card.as_deref(), connector.as_deref());
+        // A desktop that shows another console drives no card for that time, and must find its own free when it returns.
+        let lender = match access {
+            Access::Auto => held.lender,
+            Access::Alone => None,
+            Access::Lent(lender) => Some(lender),
+        };
+        match lender
+            .map_or_else(|| open_for(card, connector), |lender| lent(&mut held, lender, card, connector))
+        {
+            Err(alone @ (DisplayError::InUse(_) | DisplayError::Denied(_))) if access == Access::Auto => {
+                let lender = Lender::of_environment().ok_or(alone)?;
+                lent(&mut held, lender, card, connector)
+            }
+            other => other,
         }
     }
 }
 
+/// The card that `held` has on lease, or a new lease.
 fn lent(
-    held: &Lock<Option<Lease>>,
+    held: &mut Held,
     lender: Lender,
     card: Option<&Path>,
     connector: Option<&str>,
 ) -> Result<Box<dyn Kms>, DisplayError> {
-    // Nothing is left half-done by an opener that panicked.
-    let mut held = held.lock().unwrap_or_else(std::sync::PoisonError::into_inner);
-    if let Some(lease) = held.take() {
+    if let Some(lease) = held.lease.take() {
         match taken(&lease, card) {
             Ok(card) if card.is_still_lent() => {
-                *held = Some(lease);
+                held.lease = Some(lease);
                 return Ok(Box::new(card));
             }
             _ => drop(lease),
@@ -133,7 +147,7 @@ fn lent(
     }
     let lease = ask(lender, connector)?;
     let card = taken(&lease, card)?;
-    *held = Some(lease);
+    *held = Held { lease: Some(lease), lender: Some(lender) };
     Ok(Box::new(card))
 }
 

@@ -207,6 +207,14 @@ fn shown_taken_back_and_taken_up_again(desktop: &Arc<Desktop>) {
     println!("  {lost}");
     assert!(lost.contains("taken the display back"), "{lost}");
     until("dark without the lease", || !desktop.is_shown());
+    // The desktop shows another console. The card must be free when it returns, although nobody drives it now.
+    desktop.node.release_master_lock().unwrap();
+    let away = Instant::now();
+    while away.elapsed() < Duration::from_secs(4) {
+        assert!(display.reopen().is_err(), "there is nobody to ask");
+        std::thread::sleep(Duration::from_millis(100));
+    }
+    desktop.node.acquire_master_lock().expect("the card is the desktop's");
     // As the link does, until the display is back.
     let reopen = |display: &mut DisplayTransport| {
         let limit = Instant::now() + PATIENCE;
