@@ -23,7 +23,7 @@ use drm::control::{connector, crtc, plane, Device as ControlDevice, LeaseId, Raw
 use drm::{ClientCapability, Device};
 
 use super::compositor::{Compositor, Manner, Seen};
-use super::{checksum, checksums, pixels, settings, stream, this_program, wait_for, PATIENCE};
+use super::{checksum, checksums, pixels, settings, stream, this_program, wait_for, HOLD, PATIENCE};
 
 const CONNECTOR: &str = "Virtual-1";
 
@@ -269,7 +269,9 @@ fn kept_by_the_guardian(desktop: &Arc<Desktop>) {
     assert!(desktop.lend().is_none(), "the kernel lends nothing twice");
     drop(told);
     until("the guardian lets go when it is asked", || let_go(Some(CONNECTOR)));
+    let asked = Instant::now();
     until("the lease ends with the guardian", || desktop.lessees() == 0);
+    assert!(asked.elapsed() < HOLD / 2, "{:?}", asked.elapsed());
     let leases = desktop.leases();
     let (display, _clock) = open(Access::Lent(Lender::Wayland));
     assert_eq!(desktop.leases(), leases + 1);
