@@ -26,6 +26,14 @@ use crate::kms::{Connector, Domain, Kms, Owner, Property, Setup};
 use crate::mode::Timing;
 use crate::scan_out::{DisplayError, Flip, Picture, Pixels, ScanOut};
 
+mod find;
+mod guard;
+
+pub use find::{cards, connector_names, connector_names_of, open_for};
+pub use guard::{let_go, show_black};
+
+use find::path_of;
+
 /// How long another program may need to let go of the displays.
 const MASTER_PATIENCE: Duration = Duration::from_millis(1500);
 /// How long a way out waits for the kernel to take the black picture.
@@ -44,6 +52,21 @@ impl AsFd for Node {
 
 impl Device for Node {}
 impl ControlDevice for Node {}
+
+impl Node {
+    /// The numbers and names of the connectors that this descriptor sees.
+    fn connector_names(&self) -> Vec<(u32, String)> {
+        let Ok(resources) = self.resource_handles() else { return Vec::new() };
+        let known = |handle: &connector::Handle| self.get_connector(*handle, false).ok();
+        let infos = resources.connectors().iter().filter_map(known);
+        infos.map(|info| (info.handle().into(), info.to_string())).collect()
+    }
+
+    /// True while this descriptor, which is a lease, is one: the lender has not taken it back, and drives the card.
+    fn is_lent(&self) -> bool {
+        drm_ffi::mode::get_lease(self.as_fd(), None).is_ok_and(|lease| lease.count_objects > 0)
+    }
+}
 
 /// The objects that drive a connector.
 #[derive(Clone, Copy)]
@@ -70,11 +93,13 @@ struct Output {
     status: Option<File>,
 }
 
-/// A graphics card.
+/// A graphics card, or the part of it that its owner has lent.
 pub struct Card {
     node: Node,
     path: PathBuf,
     output: Option<Output>,
+    /// Who lent it.
+    lender: Option<String>,
 }
 
 fn call(doing: &'static str) -> impl Fn(io::Error) -> DisplayError {
@@ -82,48 +107,6 @@ fn call(doing: &'static str) -> impl Fn(io::Error) -> DisplayError {
         Some(libc::ENODEV | libc::ENXIO) => DisplayError::Gone,
         _ => DisplayError::Call { doing, source },
     }
-}
-
-/// The cards of this machine, in the order of their numbers.
-pub fn cards() -> Vec<PathBuf> {
-    let listed = std::fs::read_dir("/dev/dri").into_iter().flatten().flatten().map(|entry| entry.path());
-    let is_card = |path: &PathBuf| {
-        path.file_name()
-            .and_then(|n| n.to_str())
-            .and_then(|n| n.strip_prefix("card"))
-            .is_some_and(|n| n.parse::<u32>().is_ok())
-    };
-    let mut all: Vec<PathBuf> = listed.filter(is_card).collect();
-    all.sort_by_key(|path| {
-        path.to_string_lossy().trim_start_matches("/dev/dri/card").parse::<u32>().unwrap_or(u32::MAX)
-    });
-    all
-}
-
-/// Opens the card at `card`, or, without one, the first that has the connector `connector`, or a display at any.
-///
-/// # Errors
-/// No such card; or as [`Card::open`].
-pub fn open_for(card: Option<&Path>, connector: Option<&str>) -> Result<Box<dyn Kms>, DisplayError> {
-    if let Some(path) = card {
-        return Ok(Box::new(Card::open(path)?));
-    }
-    let all = cards();
-    let mut first_error = None;
-    for path in &all {
-        let fits = |c: &Connector| match connector {
-            Some(name) => c.name == name,
-            None => c.is_connected,
-        };
-        match Card::look(path).and_then(|mut card| card.connectors()) {
-            Ok(connectors) if all.len() == 1 || connectors.iter().any(fits) => {
-                return Ok(Box::new(Card::open(path)?));
-            }
-            Ok(_) => {}
-            Err(e) => first_error = first_error.or(Some(e)),
-        }
-    }
-    Err(first_error.unwrap_or_else(|| DisplayError::NoCard("/dev/dri/card*".into())))
 }
 
 impl Card {
@@ -164,7 +147,40 @@ impl Card {
                 io::ErrorKind::PermissionDenied => DisplayError::Denied(name.clone()),
                 _ => DisplayError::Call { doing: "open the graphics card", source: e },
             })?;
-        let node = Node(file.into());
+        Self::of(Node(file.into()), path.into(), None)
+    }
+
+    /// Takes the lease `descriptor`, which `lender` has given: a card with one connector and what drives it. It is given
+    /// back with the last duplicate of the descriptor.
+    ///
+    /// # Errors
+    /// The descriptor is none of a graphics card, or as [`Card::open`].
+    pub fn lent(descriptor: OwnedFd, lender: String) -> Result<Self, DisplayError> {
+        let prepare = || {
+            // These are the lender's choice at first. Reading events must never wait, and no program that this one starts may
+            // keep the lease but the guardian, which gets its own.
+            let flags = rustix::fs::fcntl_getfl(&descriptor)?;
+            rustix::fs::fcntl_setfl(&descriptor, flags | rustix::fs::OFlags::NONBLOCK)?;
+            rustix::io::fcntl_setfd(&descriptor, rustix::io::FdFlags::CLOEXEC)
+        };
+        prepare().map_err(|e| call("use the lease")(e.into()))?;
+        let path = path_of(&descriptor);
+        Self::of(Node(descriptor), path, Some(lender))
+    }
+
+    /// False if this card is a lease that its owner has taken back.
+    pub fn is_still_lent(&self) -> bool {
+        self.lender.is_none() || self.node.is_lent()
+    }
+
+    /// The names of the connectors that this card has, or that were lent.
+    pub fn connector_names(&self) -> Vec<String> {
+        self.node.connector_names().into_iter().map(|(_, name)| name).collect()
+    }
+
+    /// A card by its descriptor, which sees everything that atomic mode setting needs from now on.
+    fn of(node: Node, path: PathBuf, lender: Option<String>) -> Result<Self, DisplayError> {
+        let name = path.display().to_string();
         let unsuitable = |what: &str| DisplayError::Unsuitable { card: name.clone(), what: what.into() };
         let atomic = node.set_client_capability(ClientCapability::UniversalPlanes, true);
         if atomic.and_then(|()| node.set_client_capability(ClientCapability::Atomic, true)).is_err() {
@@ -178,7 +194,7 @@ impl Card {
         if node.get_driver_capability(DriverCapability::DumbBuffer).unwrap_or(0) == 0 {
             return Err(unsuitable("its driver has no plain buffers to scan out; use another card"));
         }
-        Ok(Self { node, path: path.into(), output: None })
+        Ok(Self { node, path, output: None, lender })
     }
 
     /// True if a program drives this card's displays, this one included.
@@ -348,6 +364,8 @@ impl Card {
     ) -> Result<(), DisplayError> {
         self.node.page_flip(crtc, picture, flags, None).map_err(|e| match e.raw_os_error() {
             Some(libc::EBUSY) => DisplayError::Busy,
+            // The objects of a lease are not there for those from whom it was taken. Its owner may have lost the card, too.
+            Some(libc::ENOENT | libc::EACCES | libc::EPERM) if self.lender.is_some() => DisplayError::Revoked,
             // What is gone is refused in several ways.
             Some(libc::ENODEV | libc::ENXIO | libc::EINVAL | libc::EACCES | libc::EPERM) => {
                 DisplayError::Gone
@@ -445,7 +463,14 @@ impl Kms for Card {
         self.node
             .atomic_commit(test, request.clone())
             .map_err(call("set the mode with these properties (the driver refuses them together)"))?;
-        self.node.atomic_commit(AtomicCommitFlags::ALLOW_MODESET, request).map_err(call("set the mode"))
+        let set = self.node.atomic_commit(AtomicCommitFlags::ALLOW_MODESET, request);
+        // A lease that is used again may still hold events of the pictures before.
+        let _ = self.node.receive_events().map(Iterator::count);
+        set.map_err(call("set the mode"))
+    }
+
+    fn lender(&self) -> Option<&str> {
+        self.lender.as_deref()
     }
 }
 
@@ -481,11 +506,17 @@ impl ScanOut for Card {
     }
 
     fn lost(&mut self) -> Option<DisplayError> {
-        let status = self.output.as_ref().and_then(|output| output.status.as_ref())?;
         let mut word = [0; 16];
-        let is_connected =
-            matches!(status.read_at(&mut word, 0), Ok(n) if !word[..n].starts_with(b"disconnected"));
-        (!is_connected).then_some(DisplayError::Gone)
+        let is_connected = match self.output.as_ref().and_then(|output| output.status.as_ref()) {
+            Some(status) => {
+                matches!(status.read_at(&mut word, 0), Ok(n) if !word[..n].starts_with(b"disconnected"))
+            }
+            None => true,
+        };
+        if !is_connected {
+            return Some(DisplayError::Gone);
+        }
+        (!self.is_still_lent()).then_some(DisplayError::Revoked)
     }
 
     fn now_ns(&self) -> i64 {
@@ -525,36 +556,4 @@ impl Drop for Card {
         self.blacken();
         self.release();
     }
-}
-
-/// The guardian's side of [`ScanOut::guarded`]: shows the picture `black` on `crtc` with the descriptor that it was started
-/// with, and keeps it there until another program drives the displays, for `hold` at most. The end of the last program that
-/// holds a card gives its displays back to the console.
-///
-/// # Errors
-/// The kernel does not take the picture.
-pub fn show_black(descriptor: OwnedFd, crtc: u32, black: u32, hold: Duration) -> Result<(), DisplayError> {
-    let node = Node(descriptor);
-    let handle = |n: u32| std::num::NonZeroU32::new(n).ok_or(DisplayError::Gone);
-    let (crtc, black) = (crtc::Handle::from(handle(crtc)?), framebuffer::Handle::from(handle(black)?));
-    let limit = Instant::now() + BLACK_PATIENCE.saturating_mul(10);
-    loop {
-        match node.page_flip(crtc, black, PageFlipFlags::empty(), None) {
-            Ok(()) => break,
-            Err(e) if e.raw_os_error() == Some(libc::EBUSY) && Instant::now() < limit => {
-                std::thread::sleep(STEP)
-            }
-            Err(e) => return Err(call("show black")(e)),
-        }
-    }
-    let end = Instant::now() + hold;
-    let _ = node.release_master_lock();
-    while Instant::now() < end {
-        std::thread::sleep(STEP.saturating_mul(250));
-        match node.acquire_master_lock() {
-            Ok(()) => drop(node.release_master_lock()),
-            Err(_) => break,
-        }
-    }
-    Ok(())
 }

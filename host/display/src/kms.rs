@@ -86,4 +86,9 @@ pub trait Kms: ScanOut {
     /// # Errors
     /// The kernel refuses; then nothing has changed.
     fn start(&mut self, setup: &Setup) -> Result<(), DisplayError>;
+
+    /// Who has lent the display, if it is lent.
+    fn lender(&self) -> Option<&str> {
+        None
+    }
 }

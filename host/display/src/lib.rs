@@ -5,7 +5,7 @@
 //! blank. [`mode`] says what a mode is, [`set_up`] chooses connector, mode and properties or says why not, [`encoding`] puts
 //! planes into pixels, [`pacer`] follows the blanks, [`panel`] is the state machine, and [`transport`] its thread at the end
 //! of an in-process cable. [`scan_out`] is what a panel asks of what shows its pictures, [`kms`] what is asked of the kernel
-//! besides, [`card`] the kernel, [`fake`] the one of tests, [`dlpc900`] a controller that the display feeds, and [`window`] a
+//! besides, [`card`] the kernel, [`lease`] asks a desktop for a part of a card, [`fake`] the one of tests, [`dlpc900`] a controller that the display feeds, and [`window`] a
 //! window for a desk without a projector.
 //!
 //! **Nothing of this has run on real hardware yet.**
@@ -15,6 +15,7 @@ pub mod dlpc900;
 pub mod encoding;
 pub mod fake;
 pub mod kms;
+pub mod lease;
 pub mod mode;
 pub mod pacer;
 pub mod panel;

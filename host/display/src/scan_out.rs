@@ -39,6 +39,12 @@ pub enum DisplayError {
     /// The display or its card is gone.
     #[error("the display is unplugged or switched off")]
     Gone,
+    /// What was lent is lent no longer.
+    #[error(
+        "the desktop has taken the display back, or has let go of the graphics card itself (another console, the end of the \
+         session)"
+    )]
+    Revoked,
     /// Somebody closed the window.
     #[error("its window was closed")]
     Closed,
@@ -54,9 +60,18 @@ pub enum DisplayError {
     /// Another program shows its picture there.
     #[error(
         "{0}: another program drives its displays (a desktop, a display manager, another run); switch to a bare console \
-         (Ctrl+Alt+F3), or stop it: `systemctl isolate multi-user.target`"
+         (Ctrl+Alt+F3), or stop it: `systemctl isolate multi-user.target`; or start from within the desktop, which may lend \
+         the display (projector.backend.lease)"
     )]
     InUse(String),
+    /// The desktop does not lend the display.
+    #[error("{lender} lends no display: {what}")]
+    Unlent {
+        /// Which desktop was asked.
+        lender: String,
+        /// Why, and what to do.
+        what: String,
+    },
     /// The driver cannot do it.
     #[error("{card}: {what}")]
     Unsuitable {

@@ -59,7 +59,8 @@ pub fn on_card(
         let refused = |why: String| TransportError::Unsuitable { device: device(), why };
         let plan = plan(&connectors, &settings).map_err(|e| refused(e.0))?;
         kms.start(&plan.setup).map_err(failed)?;
-        let name = format!("display {} ({})", plan.setup.connector, plan.setup.timing);
+        let lent = kms.lender().map(|lender| format!(", lent by {lender}")).unwrap_or_default();
+        let name = format!("display {} ({}){lent}", plan.setup.connector, plan.setup.timing);
         Ok(Shown { out: kms, panel: plan.panel, name, warnings: plan.warnings })
     })
 }

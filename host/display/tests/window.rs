@@ -18,10 +18,12 @@ use dpm_device::planes::{PlaneSchedule, Raster};
 use dpm_device::time::{FrameRate, HostClock, HostTime};
 use dpm_device::transport::{Transport, TransportError};
 use dpm_display::encoding::Encoding;
+use dpm_display::lease::{self, Access, Lender};
 use dpm_display::transport::DisplayTransport;
 use dpm_display::window::{opener, WindowSettings};
 use dpm_handoff::wake::WaitPolicy;
 use x11rb::connection::Connection as _;
+use x11rb::protocol::randr::{ConnectionExt as _, Rotation};
 use x11rb::protocol::xproto::{ClientMessageEvent, ConnectionExt as _, EventMask, ImageFormat, Window};
 use x11rb::rust_connection::RustConnection;
 
@@ -30,12 +32,13 @@ const SCREEN: (u32, u32) = (320, 240);
 const MONITOR: &str = "screen";
 
 fn main() {
-    let tests: [(&str, fn()); 5] = [
+    let tests: [(&str, fn()); 6] = [
         ("every_picture_of_a_window_is_a_frame_that_was_sent", pictures),
         ("light_is_told_when_the_server_shows_it", stamps),
         ("a_window_that_is_closed_stays_closed", closed),
         ("a_server_that_ends_is_told_as_unplugged", ended),
         ("what_does_not_fit_the_desk_is_refused_by_name", refused),
+        ("a_server_without_leases_lends_nothing_and_says_so", lends_nothing),
     ];
     // The lines of the standard harness, which `./x test` counts.
     let arguments: Vec<String> = std::env::args().skip(1).collect();
@@ -279,4 +282,31 @@ fn refused() {
         std::thread::sleep(Duration::from_millis(1));
     };
     assert!(error.to_string().contains("says 50.000"), "{error}");
+}
+
+/// Xvfb speaks RandR 1.6, and has one output, which its desktop uses, and no leases.
+fn lends_nothing() {
+    let server = Server::start();
+    let why = |display: &str, connector: &str| {
+        std::env::set_var("DISPLAY", display);
+        let open = lease::opener(None, Some(connector.into()), Access::Lent(Lender::X11));
+        let told = open().err().expect("refused").to_string();
+        println!("  {told}");
+        told
+    };
+    let told = why(&server.name, MONITOR);
+    assert!(told.contains(&format!("{:?}", server.name)), "{told}");
+    assert!(told.contains("xrandr --output screen --off"), "{told}");
+    assert!(why(&server.name, "HDMI-A-1").contains("outputs (screen)"));
+    assert!(why(&format!("{}.7", server.name), MONITOR).contains("no screen 7"));
+    assert!(why(":4711", MONITOR).contains("does not answer"));
+    assert!(why("somewhere:0", MONITOR).contains("another machine"));
+    assert!(why("nonsense", MONITOR).contains("DISPLAY"));
+    let desk = server.look();
+    let resources = desk.server.randr_get_screen_resources_current(desk.root).unwrap().reply().unwrap();
+    let off = desk.server.randr_set_crtc_config(resources.crtcs[0], 0, 0, 0, 0, 0, Rotation::ROTATE0, &[]);
+    off.unwrap().reply().expect("the desktop leaves its output");
+    let told = why(&server.name, MONITOR);
+    assert!(told.contains("has no leases") && told.contains("Match"), "{told}");
+    std::env::remove_var("DISPLAY");
 }

@@ -101,7 +101,11 @@ fn listed(all: &[Seen]) -> String {
     }
     let mut text = String::new();
     for Seen { path, is_in_use, connectors } in all {
-        let used = if *is_in_use { ", driven by another program (a desktop?)" } else { "" };
+        let used = if *is_in_use {
+            ", driven by another program (a desktop may lend one of them: docs/DISPLAY.md)"
+        } else {
+            ""
+        };
         text += &format!("{}{used}\n", path.display());
         let connectors = match connectors {
             Ok(connectors) => connectors,

@@ -137,8 +137,8 @@ impl AlpWeights {
 }
 
 section! {
-    /// A display on a graphics card of this machine, which shows nothing else meanwhile. docs/DISPLAY.md says how to set
-    /// it up. Nothing of it has been tried on real hardware yet.
+    /// A display on a graphics card of this machine, which shows nothing else meanwhile, or lends this display alone.
+    /// docs/DISPLAY.md says how to set it up. Nothing of it has been tried on real hardware yet.
     pub struct DisplayConfig {
         /// The connector, as `dpm display` lists them, for example "HDMI-A-1"; the only one with a display if left out.
         connector: Option<String> = None, "", NotEmpty;
@@ -150,6 +150,10 @@ section! {
         encoding: DisplayEncoding = DisplayEncoding::Rgb8, "", Any;
         /// The graphics card's device file; the first with such a connector if left out.
         card: Option<PathBuf> = None, "", NotEmpty;
+        /// Whether a desktop is asked to lend the connector. "auto" takes the card where no other program drives it, and
+        /// else asks the desktop that the environment names: by WAYLAND_DISPLAY, or else by DISPLAY. "off" asks none. "x11"
+        /// and "wayland" ask at once. docs/DISPLAY.md says what a desktop lends.
+        lease: DisplayLease = DisplayLease::Auto, "", Any;
         /// How long before its vertical blank a frame is chosen and written. Half a frame and at most 8000 if left out.
         /// Raise it if the report counts repeated frames although frames were there in time; each microsecond is one
         /// of latency.
@@ -312,6 +316,20 @@ words! {
         Rgb4x2 = "rgb4x2",
         /// For a DLPC900: four patterns of two bits for each colour, halftoned.
         Rgb2x4 = "rgb2x4",
+    }
+}
+
+words! {
+    /// Whether a desktop is asked for a display.
+    pub enum DisplayLease {
+        /// If another program drives the card.
+        Auto = "auto",
+        /// Never.
+        Off = "off",
+        /// The X server of the variable DISPLAY, by RandR 1.6.
+        X11 = "x11",
+        /// The compositor of the variable WAYLAND_DISPLAY, by wp_drm_lease_device_v1.
+        Wayland = "wayland",
     }
 }
 

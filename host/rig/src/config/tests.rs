@@ -683,6 +683,16 @@ fn the_light_of_a_display_is_later_than_its_slots() {
     let rig = parsed(&[]).unwrap_or_else(|e| panic!("{e}"));
     let ProjectorBackend::Display(display) = &rig.projector.backend else { panic!("a display") };
     assert_eq!((display.encoding, display.commit_us), (DisplayEncoding::Rgb8, None));
+    assert_eq!(display.lease, DisplayLease::Auto);
+    for (word, lease) in
+        [("off", DisplayLease::Off), ("x11", DisplayLease::X11), ("wayland", DisplayLease::Wayland)]
+    {
+        let rig = parsed(&[&format!("projector.backend.lease={word}")]).unwrap_or_else(|e| panic!("{e}"));
+        let ProjectorBackend::Display(display) = &rig.projector.backend else { panic!("a display") };
+        assert_eq!(display.lease, lease);
+    }
+    let told = parsed(&["projector.backend.lease=mir"]).unwrap_err().to_string();
+    assert!(told.contains("projector.backend.lease") && told.contains("wayland"), "{told}");
     // 16 ms, 8 ms, and half of a sixtieth of a second.
     assert_eq!(rig.projector.light_delay_ns(), 24_000_000 + 8_333_333);
     assert!(rig.projector.plane_timing() == PlaneTiming::Held);

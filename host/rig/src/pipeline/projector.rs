@@ -1,8 +1,8 @@
 //! Opens the medium of `[projector.backend]`, and derives the link's settings from the rig file.
 
 use crate::config::{
-    AlpConfig, AlpWeights, Compaction, DisplayConfig, DisplayEncoding, Dlpc900BehindConfig, Pace,
-    ProjectorBackend, ResponseConfig, RigConfig, WindowConfig,
+    AlpConfig, AlpWeights, Compaction, DisplayConfig, DisplayEncoding, DisplayLease, Dlpc900BehindConfig,
+    Pace, ProjectorBackend, ResponseConfig, RigConfig, WindowConfig,
 };
 use crate::engine::connect::ConnectError;
 use dpm_common::stopping;
@@ -14,8 +14,8 @@ use dpm_device::time::{DeviceTicks, HostClock};
 use dpm_device::transport::serial::{SerialSettings, SerialTransport};
 use dpm_device::transport::usb::{UsbSettings, UsbTransport};
 use dpm_device::transport::{Transport, TransportError};
-use dpm_display::card::open_for;
 use dpm_display::encoding::Encoding;
+use dpm_display::lease::{self, Access, Lender};
 use dpm_display::mode::ModeWish;
 use dpm_display::set_up::DisplaySettings;
 use dpm_display::transport::{on_card, DisplayTransport, Opener};
@@ -145,8 +145,14 @@ fn open_display(
     surroundings: &Surroundings,
 ) -> Result<Medium, TransportError> {
     let settings = display_settings(config, display, raster)?;
-    let (card, connector) = (display.card.clone(), display.connector.clone());
-    let mut opener = on_card(move || open_for(card.as_deref(), connector.as_deref()), settings);
+    let access = match display.lease {
+        DisplayLease::Auto => Access::Auto,
+        DisplayLease::Off => Access::Alone,
+        DisplayLease::X11 => Access::Lent(Lender::X11),
+        DisplayLease::Wayland => Access::Lent(Lender::Wayland),
+    };
+    let card = lease::opener(display.card.clone(), display.connector.clone(), access);
+    let mut opener = on_card(card, settings);
     if let Some(behind) = &display.dlpc900 {
         opener = feeding(opener, config, display, behind, surroundings)?;
     }

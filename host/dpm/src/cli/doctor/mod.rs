@@ -206,7 +206,8 @@ fn displays(all: &[Seen]) -> Vec<Finding> {
             .collect();
         let found = if told.is_empty() { "none answers".into() } else { told.join(", ") };
         let remedy = if *is_in_use {
-            "another program drives them: a rig needs a bare console (Ctrl+Alt+F3)"
+            "another program drives them: a rig needs a bare console (Ctrl+Alt+F3), or a lease of one of them from the desktop \
+             (docs/DISPLAY.md)"
         } else if told.is_empty() {
             "plug one in and switch it on; `dpm display` lists connectors"
         } else {
