@@ -8,7 +8,7 @@ use dpm_common::files::check_folder;
 use dpm_device::planes::Raster;
 use dpm_lab::error::figure3::Figure3Group;
 use dpm_lab::error::plan::Setting;
-use dpm_lab::error::planes::{markdown, Card, MOTIONS};
+use dpm_lab::error::planes::{markdown, Card, Panel, MOTIONS};
 use dpm_lab::error::runs::{ErrorOptions, Extent, GroupResult};
 use dpm_lab::error::table::TableGroup;
 use dpm_render::gpu::Gpu;
@@ -133,8 +133,9 @@ fn planes(json: bool) -> Result<(), Failure> {
     let config = RigConfig::demo(&Overrides::default())?;
     let failed = |e| Failure::from(PipelineError::from(e));
     let card = Card::new(&open_gpu(&config)?).map_err(failed)?;
-    let of = |order: &[u8; 8]| MOTIONS.iter().map(|motion| card.measure(motion, *order)).collect::<Vec<_>>();
-    let rows = ORDERS.iter().flat_map(of).collect::<Result<Vec<_>, _>>().map_err(failed)?;
+    let panels = ORDERS.into_iter().map(Panel::of_bits).chain([Panel::of_binary24()]);
+    let of = |panel: Panel| MOTIONS.iter().map(|motion| card.measure(motion, &panel)).collect::<Vec<_>>();
+    let rows = panels.flat_map(of).collect::<Result<Vec<_>, _>>().map_err(failed)?;
     print(&if json { to_json(&serde_json::json!({ "planes": rows })) + "\n" } else { markdown(&rows) });
     Ok(())
 }

@@ -10,7 +10,7 @@ use dpm_device::planes::{PlaneSchedule, Raster};
 use dpm_render::drive::Drive;
 use dpm_render::gpu::{Gpu, GpuError};
 use dpm_render::method::Method;
-use dpm_render::pack::source_bits;
+use dpm_render::pack::{source_bits, Halftone};
 use dpm_render::warp::{plane_groups, Sweep};
 use dpm_render::{FrameInputs, FrameSlot, Output, RenderError, Renderer, RendererSettings};
 use dpm_scene::geometry::projector::ProjectorCamera;
@@ -64,13 +64,58 @@ pub const MOTIONS: [CardMotion; 7] = [
     CardMotion::of("1 m/s, turning at 4 rad/s", 1.0, DVec3::new(0.0, 0.0, 4.0)),
 ];
 
-/// Errors of one motion and one order of the planes: root of the mean square over the pixels, full light is 1.
+/// What shows the card: the planes of its frames, and when they are lit.
+#[derive(Clone, Debug)]
+pub struct Panel {
+    /// What it is called in the table.
+    pub name: String,
+    schedule: PlaneSchedule,
+    /// Length of a frame, seconds, and how many of them an eye collects.
+    frame_s: f64,
+    frames: i32,
+    /// From the beginning of a frame to the middle of each plane, in frames.
+    middles: Vec<f64>,
+}
+
+impl Panel {
+    /// A bit-plane projector at 947 frames/s that shows the bits in `order`, red, green and blue of each in turn.
+    ///
+    /// # Panics
+    /// When `order` does not name each bit once.
+    pub fn of_bits(order: [u8; 8]) -> Self {
+        let schedule = PlaneSchedule::rgb24_in(order).expect("each bit once");
+        let middles = (0..schedule.len()).map(|i| middle_of(&schedule, i)).collect();
+        let name = order.map(|bit| bit.to_string()).join(" ");
+        Self { name, schedule, frame_s: EXPOSURE_S, frames: EYE_FRAMES as i32, middles }
+    }
+
+    /// A DLPC900 behind a display of 60 frames/s that shows 24 halftones of one bit, red, green and blue in turn, 620 us each.
+    pub fn of_binary24() -> Self {
+        let (schedule, frame_s) = (PlaneSchedule::equal_rgb24().filled(), 1.0 / 60.0);
+        let middles = (0..schedule.len()).map(|i| (i as f64 + 0.5) * 620e-6 / frame_s).collect();
+        Self { name: "binary24, 60 Hz".into(), schedule, frame_s, frames: 2, middles }
+    }
+
+    /// The centre of the light of a frame, in frames from its beginning on.
+    fn centre(&self) -> f64 {
+        let light = |i: usize| f64::from(1u32 << self.schedule.planes()[i].bit);
+        let all: f64 = (0..self.schedule.len()).map(light).sum();
+        self.middles.iter().enumerate().map(|(i, middle)| middle * light(i)).sum::<f64>() / all
+    }
+
+    /// The middle of the time in which a frame is lit.
+    fn middle(&self) -> f64 {
+        (self.middles[0] + self.middles[self.middles.len() - 1]) / 2.0
+    }
+}
+
+/// Errors of one motion and one kind of planes: root of the mean square over the pixels, full light is 1.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct PlanesRow {
     /// How the card moves.
     pub motion: String,
-    /// The bits in the order in which they are lit.
-    pub order: [u8; 8],
+    /// The bits in the order in which they are lit, or what shows them.
+    pub planes: String,
     /// An eye that follows the card.
     pub follows: Remedies,
     /// An eye that rests.
@@ -136,34 +181,27 @@ impl Card {
         let mut card = Self { gpu: gpu.clone(), scene, camera, texture: Vec::new() };
         let finer = Raster::new(WIDTH * FINER as u32, HEIGHT * FINER as u32).expect("a small raster");
         let fine = card.camera.at_raster(finer);
-        let mut frames = card.frames(&fine, &[])?;
+        let mut frames = card.frames(&fine, &[], None)?;
         card.texture = frames.draw(DAffine3::IDENTITY, None)?;
         Ok(card)
     }
 
-    /// Measures one motion with one order of the bits.
+    /// Measures one motion with one kind of planes.
     ///
     /// # Errors
     /// The renderer's.
-    ///
-    /// # Panics
-    /// When `order` does not name each bit once.
-    pub fn measure(&self, motion: &CardMotion, order: [u8; 8]) -> Result<PlanesRow, RenderError> {
-        let schedule = PlaneSchedule::rgb24_in(order).expect("each bit once");
+    pub fn measure(&self, motion: &CardMotion, panel: &Panel) -> Result<PlanesRow, RenderError> {
         let (mut follows, mut rests) = (Remedies::default(), Remedies::default());
-        let centre = centre_of(&schedule);
-        for (aim, drawing) in [(0.5, Drawing::Once), (centre, Drawing::Once), (centre, Drawing::Warped)] {
-            let frames = self.lit_frames(&schedule, motion, aim, drawing)?;
+        let (middle, centre) = (panel.middle(), panel.centre());
+        let ways = [(middle, Drawing::Once), (centre, Drawing::Once), (centre, Drawing::Warped)];
+        for (way, (aim, drawing)) in ways.into_iter().enumerate() {
+            let frames = self.lit_frames(panel, motion, aim, drawing)?;
             for (remedies, eye_follows) in [(&mut follows, true), (&mut rests, false)] {
-                let error = self.error_of_light(&frames, &schedule, eye_follows);
-                match (drawing == Drawing::Warped, aim == centre) {
-                    (true, _) => remedies.own = error,
-                    (false, true) => remedies.centre = error,
-                    (false, false) => remedies.middle = error,
-                }
+                let error = self.error_of_light(&frames, panel, eye_follows);
+                *[&mut remedies.middle, &mut remedies.centre, &mut remedies.own][way] = error;
             }
         }
-        Ok(PlanesRow { motion: motion.name.into(), order, follows, rests })
+        Ok(PlanesRow { motion: motion.name.into(), planes: panel.name.clone(), follows, rests })
     }
 
     /// The errors of an eye that follows and of one that rests if the planes of every bit were drawn by themselves for their
@@ -171,16 +209,17 @@ impl Card {
     ///
     /// # Errors
     /// The renderer's.
-    ///
-    /// # Panics
-    /// When `order` does not name each bit once.
-    pub fn measure_drawn_anew(&self, motion: &CardMotion, order: [u8; 8]) -> Result<[f64; 2], RenderError> {
-        let schedule = PlaneSchedule::rgb24_in(order).expect("each bit once");
-        let frames = self.lit_frames(&schedule, motion, centre_of(&schedule), Drawing::Anew)?;
-        Ok([true, false].map(|eye_follows| self.error_of_light(&frames, &schedule, eye_follows)))
+    pub fn measure_drawn_anew(&self, motion: &CardMotion, panel: &Panel) -> Result<[f64; 2], RenderError> {
+        let frames = self.lit_frames(panel, motion, panel.centre(), Drawing::Anew)?;
+        Ok([true, false].map(|eye_follows| self.error_of_light(&frames, panel, eye_follows)))
     }
 
-    fn frames(&self, camera: &ProjectorCamera, groups: &[PlaneGroup]) -> Result<Frames, RenderError> {
+    fn frames(
+        &self,
+        camera: &ProjectorCamera,
+        groups: &[PlaneGroup],
+        halftone: Option<Halftone>,
+    ) -> Result<Frames, RenderError> {
         let settings = RendererSettings {
             raster: camera.raster,
             depth: 2,
@@ -191,36 +230,36 @@ impl Card {
             camera_is_eye: false,
             leave_nothing_out: false,
             method: Method::full(1),
-            halftone: None,
+            halftone,
             plane_groups: groups.to_vec(),
             output: Output::Codes,
         };
         let renderer = Renderer::new(&self.gpu, &self.scene, settings)?;
         let slot = renderer.create_slot(false)?;
-        Ok(Frames { renderer, slot, camera: *camera })
+        Ok(Frames { renderer, slot, camera: *camera, drawn: 0 })
     }
 
-    /// The frames of 33 ms, drawn for the instant `aim` of their exposures.
+    /// The frames of 33 ms, drawn for the instant `aim`, in frames from their beginning.
     fn lit_frames(
         &self,
-        schedule: &PlaneSchedule,
+        panel: &Panel,
         motion: &CardMotion,
         aim: f64,
         drawing: Drawing,
     ) -> Result<Vec<LitFrame>, RenderError> {
-        let middles: Vec<f64> = (0..schedule.len()).map(|i| middle_of(schedule, i)).collect();
+        let Panel { schedule, middles, .. } = panel;
         let instants: Vec<f64> = middles.iter().map(|middle| middle - aim).collect();
         let groups = if drawing == Drawing::Warped { plane_groups(schedule, &instants) } else { Vec::new() };
-        let mut frames = self.frames(&self.camera, &groups)?;
+        let mut frames = self.frames(&self.camera, &groups, Halftone::of(schedule))?;
         let at_rest = self.picture_of(&DAffine3::IDENTITY).inverse();
-        (0..EYE_FRAMES as i32)
+        (0..panel.frames)
             .map(|k| {
                 // The card is in the middle of the picture in the middle of the run, so that it stays on the raster.
-                let begin = f64::from(k - EYE_FRAMES as i32 / 2) * EXPOSURE_S;
-                let pose = |share: f64| motion.pose_at(begin + share * EXPOSURE_S);
+                let begin = f64::from(k - panel.frames / 2) * panel.frame_s;
+                let pose = |share: f64| motion.pose_at(begin + share * panel.frame_s);
                 let mut codes = frames.draw(pose(aim), Some([pose(0.0), pose(1.0)]))?;
                 if drawing == Drawing::Anew {
-                    for group in plane_groups(schedule, &middles) {
+                    for group in plane_groups(schedule, middles) {
                         let then = frames.draw(pose(f64::from(group.instant) / 65536.0), None)?;
                         for (code, then) in codes.iter_mut().zip(then) {
                             *code = *code & !group.mask | then & group.mask;
@@ -246,13 +285,15 @@ impl Card {
 
     /// By how much the red light that an eye sees differs from that of the texture. In every plane a mirror shows the bit
     /// of some code value; the texture is that of the place on the card that is at the middle of this mirror.
-    fn error_of_light(&self, frames: &[LitFrame], schedule: &PlaneSchedule, follows: bool) -> f64 {
+    fn error_of_light(&self, frames: &[LitFrame], panel: &Panel, follows: bool) -> f64 {
+        let schedule = &panel.schedule;
         let bits = source_bits(schedule);
+        let full = 255.0 / f64::from(schedule.white_weight());
         let mut off = vec![0.0; LOOK * LOOK];
         for (words, moved) in frames {
             for i in (0..schedule.len()).filter(|i| bits[*i] < 8) {
                 let back = moved[i].inverse();
-                let light = f64::from(1u32 << schedule.planes()[i].bit);
+                let light = full * f64::from(1u32 << schedule.planes()[i].bit);
                 for fine in 0..LOOK * FINER * LOOK * FINER {
                     let (x, y) = (fine % (LOOK * FINER), fine / (LOOK * FINER));
                     let place = DVec2::new(x as f64 + 0.5, y as f64 + 0.5) / FINER as f64 + LOOK_FROM;
@@ -285,6 +326,8 @@ struct Frames {
     renderer: Renderer,
     slot: FrameSlot,
     camera: ProjectorCamera,
+    /// Frames drawn before: halftones differ from one to the next.
+    drawn: u32,
 }
 
 impl Frames {
@@ -292,7 +335,10 @@ impl Frames {
     fn draw(&mut self, pose: DAffine3, sweep: Option<[DAffine3; 2]>) -> Result<Vec<u32>, GpuError> {
         let ends = sweep.map(|ends| ends.map(|end| [end]));
         let poses = [pose];
+        let frame = self.drawn;
+        self.drawn = self.drawn.wrapping_add(1);
         let inputs = FrameInputs {
+            frame,
             sweep: ends.as_ref().map(|[first, last]| Sweep { first, last }),
             ..FrameInputs::new(&self.camera, (self.camera.position(), DVec3::ZERO), &poses)
         };
@@ -323,14 +369,14 @@ pub fn centre_of(schedule: &PlaneSchedule) -> f64 {
 /// The rows as a Markdown table.
 pub fn markdown(rows: &[PlanesRow]) -> String {
     let mut out = String::from(
-        "| motion | order of the bits | eye | all for mid-exposure | all for the light's centre | each for its own instant |\n\
+        "| motion | planes | eye | all for mid-exposure | all for the light's centre | each for its own instant |\n\
          |---|---|---|---:|---:|---:|\n",
     );
     for row in rows {
-        let order = row.order.map(|bit| bit.to_string()).join(" ");
         for (eye, errors) in [("follows", row.follows), ("rests", row.rests)] {
             let Remedies { middle, centre, own } = errors;
-            out += &format!("| {} | {order} | {eye} | {middle:.4} | {centre:.4} | {own:.4} |\n", row.motion);
+            let (motion, planes) = (&row.motion, &row.planes);
+            out += &format!("| {motion} | {planes} | {eye} | {middle:.4} | {centre:.4} | {own:.4} |\n");
         }
     }
     out
