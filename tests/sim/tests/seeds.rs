@@ -5,7 +5,7 @@ use std::collections::BTreeSet;
 
 fn order(seed: u64, rate_hz: Option<u32>, seconds: i64) -> Order {
     let length_ns = seconds * 1_000_000_000;
-    Order { seed, length_ns, rate_hz, without: BTreeSet::new(), until: None, is_loud: false }
+    Order { seed, length_ns, rate_hz, follows: None, without: BTreeSet::new(), until: None, is_loud: false }
 }
 
 fn lived(order: &Order) -> Lived {

@@ -265,7 +265,8 @@ impl Scene<'_> {
         let centre = camera.to_projector_space(made[0].transform_point3(shape.points[0]));
         let depth = -centre.z;
         // Both filters know the same samples, so their distance has less noise than two independent ones would have.
-        let noise = drawn.sigma_m[body].hypot(late[0].position_sigma_m) * camera.fx / depth;
+        let (before, now) = (drawn.sigma_m[body], late[0].position_sigma_m);
+        let noise = (before * before + now * now).sqrt() * camera.fx / depth;
         let fixed = |v: DVec2| Some([fixed(v.x)?, fixed(v.y)?]);
         Some((
             depth,

@@ -165,9 +165,13 @@ impl Line {
                 frame: plan.id.0 as u32,
                 sent_at: now,
                 due_at: plan.due_at,
+                target_at: plan.target_at,
                 captured_at: plan.oldest_captured_at(),
                 predict_ns: plan.predict_ns,
                 poses: &plan.tracked_poses,
+                centre_at: plan.centre_at,
+                swept: plan.swept_poses.each_ref().map(Vec::as_slice),
+                swept_at: plan.swept_at,
                 lit: &self.lit,
                 planes,
             });
