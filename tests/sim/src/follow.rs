@@ -136,7 +136,8 @@ struct Packets {
 
 impl PacketSink for Packets {
     fn begin(&mut self, header: &Header) -> bool {
-        let is_frame = matches!(header.kind, MessageType::Plane | MessageType::FrameCommit | MessageType::Sync);
+        let is_frame =
+            matches!(header.kind, MessageType::Plane | MessageType::FrameCommit | MessageType::Sync);
         self.open = if is_frame { None } else { Assembly::new(header) };
         self.open.is_some()
     }

@@ -49,7 +49,7 @@ pub struct Lived {
     pub worst_age_milli: i64,
     /// The longest time from calm to light, nanoseconds.
     pub slowest_return_ns: i64,
-    /// Planes of which tracks moved light, and how far in peace it was from the body.
+    /// Planes of which tracks moved light, and how far it was from the body.
     pub planes_moved: u64,
     /// See `planes_moved`.
     pub placed: Placed,

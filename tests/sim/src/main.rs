@@ -218,7 +218,7 @@ fn run() -> Result<bool, String> {
     );
     let rms = |sum_px2: f64| (sum_px2 / sum.placed.moved.max(1) as f64).sqrt();
     println!(
-        "{} of the lives with tracks: {} planes moved; of {} in peace the light was {:.2} mirrors off the body (rms), and \
+        "{} of the lives with tracks: {} planes moved; the light of {} was judged: {:.2} mirrors off the body (rms), and \
          without tracks it would have been {:.2}",
         sum.following,
         sum.planes_moved,

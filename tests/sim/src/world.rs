@@ -486,7 +486,8 @@ impl World {
         let Some(mut tracks) = self.tracks.take() else { return };
         while let Some(moves) = self.projector.next_moves() {
             let sum = moves.planes().iter().flat_map(|plane| plane.all().iter().flat_map(|one| one.shift));
-            let sum = sum.fold(moves.slot, |sum, shift| sum.wrapping_mul(31).wrapping_add_signed(shift.into()));
+            let sum =
+                sum.fold(moves.slot, |sum, shift| sum.wrapping_mul(31).wrapping_add_signed(shift.into()));
             self.fold(7, sum);
             let moment = self.laws.moment(self.t, self.lag.load(Ordering::Relaxed));
             let told = tracks.slot(&moves, &self.projector, self.laws.sent(moves.frame), &moment);
