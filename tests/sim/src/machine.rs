@@ -89,6 +89,8 @@ pub struct Sent {
     pub position: [f64; 3],
     /// Begin of its slot on the projector's clock.
     pub target_at: DeviceTicks,
+    /// From then on there is no light of it, on the projector's clock.
+    pub dark_from: DeviceTicks,
     /// Pose of the body for which it was drawn, as a whole, and its instant on the host's clock.
     pub pose: DAffine3,
     /// See `pose`.
@@ -278,6 +280,7 @@ impl Machine for SimMachine {
             predict_ns: frame.predict_ns,
             position,
             target_at: frame.target_at,
+            dark_from: frame.dark_from,
             pose,
             centre_at: frame.centre_at,
             swept,

@@ -116,15 +116,23 @@ pub struct Episodes {
     dice: Dice,
     cells: Vec<(State, Kind)>,
     kinds: Vec<Kind>,
+    /// Now and then a long rest comes before an episode, in which the laws of peace are judged.
+    rests: bool,
     next: u32,
 }
+
+/// The long rest, and its share of episodes.
+const REST_NS: i64 = 6_000_000_000;
+/// See [`REST_NS`].
+const RESTING: f64 = 0.03;
 
 impl Episodes {
     /// The episodes of a life.
     pub fn new(setup: &Setup) -> Self {
         let all = Kind::ALL.iter().copied();
         let kinds = all.filter(|kind| setup.follows || !kind.needs_tracks()).collect();
-        Self { dice: Dice::new(setup.seed, 0xe915), cells: Vec::new(), kinds, next: 0 }
+        let dice = Dice::new(setup.seed, 0xe915);
+        Self { dice, cells: Vec::new(), kinds, rests: setup.follows, next: 0 }
     }
 
     /// The next pair of state and kind: each comes once before any comes again.
@@ -166,12 +174,16 @@ impl Episodes {
             faults.push(Planned { number: self.next, kind, after_ns, seed: self.dice.bits() });
             self.next += 1;
         }
-        Episode {
+        let mut episode = Episode {
             state,
             way: self.dice.bits(),
             faults,
             rest_ns: self.dice.between(20, 250) * 1_000_000,
             person_ns: self.dice.between(5, 200) * 1_000_000,
+        };
+        if self.rests && self.dice.happens(RESTING) {
+            episode.rest_ns = REST_NS;
         }
+        episode
     }
 }

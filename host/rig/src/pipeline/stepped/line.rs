@@ -166,6 +166,7 @@ impl Line {
                 sent_at: now,
                 due_at: plan.due_at,
                 target_at: plan.target_at,
+                dark_from: plan.dark_from,
                 captured_at: plan.oldest_captured_at(),
                 predict_ns: plan.predict_ns,
                 poses: &plan.tracked_poses,

@@ -104,6 +104,8 @@ pub struct SentFrame<'a> {
     pub due_at: HostTime,
     /// The same on the projector's clock.
     pub target_at: DeviceTicks,
+    /// From then on there is no light of it, on the projector's clock.
+    pub dark_from: DeviceTicks,
     /// Mid-exposure of the newest sample of the lit body that was seen longest ago; `None` if all bodies are dark.
     pub captured_at: Option<HostTime>,
     /// The longest time for which prediction may extend a track, nanoseconds.
