@@ -117,7 +117,7 @@ pub struct Episodes {
     cells: Vec<(State, Kind)>,
     kinds: Vec<Kind>,
     /// Now and then a long rest comes before an episode, in which the laws of peace are judged.
-    rests: bool,
+    rests: Option<Dice>,
     next: u32,
 }
 
@@ -132,7 +132,8 @@ impl Episodes {
         let all = Kind::ALL.iter().copied();
         let kinds = all.filter(|kind| setup.follows || !kind.needs_tracks()).collect();
         let dice = Dice::new(setup.seed, 0xe915);
-        Self { dice, cells: Vec::new(), kinds, rests: setup.follows, next: 0 }
+        let rests = setup.follows.then(|| Dice::new(setup.seed, 0x4e57));
+        Self { dice, cells: Vec::new(), kinds, rests, next: 0 }
     }
 
     /// The next pair of state and kind: each comes once before any comes again.
@@ -181,7 +182,7 @@ impl Episodes {
             rest_ns: self.dice.between(20, 250) * 1_000_000,
             person_ns: self.dice.between(5, 200) * 1_000_000,
         };
-        if self.rests && self.dice.happens(RESTING) {
+        if self.rests.as_mut().is_some_and(|dice| dice.happens(RESTING)) {
             episode.rest_ns = REST_NS;
         }
         episode

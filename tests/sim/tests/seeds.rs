@@ -57,6 +57,24 @@ fn what_once_broke_a_law_keeps_them_all() {
     }
 }
 
+/// The same for lives in which the projector follows tracks.
+#[test]
+fn what_once_broke_a_law_of_tracks_keeps_them_all() {
+    let found = [
+        // The field flashed, and the host kept it dark without a word: the projector was called up.
+        (9_000_048, 5),
+        // A frame that was meant for a slot before the first one of a new session: the simulator's own mistake.
+        (149_400_595_585_016, 5),
+        // A tracker that did not see the body, and light that followed what had been foretold: a bound that was too narrow.
+        (20_000_012, 40),
+    ];
+    for (seed, seconds) in found {
+        let lived = lived(&Order { follows: Some(true), ..order(seed, None, seconds) });
+        assert_eq!(lived.broken, None, "seed {seed}");
+        assert!(lived.table.total() > 0 && lived.setup.follows, "seed {seed} has no faults");
+    }
+}
+
 #[test]
 fn the_same_seed_is_the_same_life_and_another_is_not() {
     let (a, b) = (lived(&order(77, Some(120), 20)), lived(&order(77, Some(120), 20)));
