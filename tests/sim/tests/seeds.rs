@@ -63,6 +63,8 @@ fn what_once_broke_a_law_of_tracks_keeps_them_all() {
     let found = [
         // The field flashed, and the host kept it dark without a word: the projector was called up.
         (9_000_048, 5),
+        // ARM after SAFE: TRACKS named a frame whose light was over.
+        (23_162_617_315_999, 4),
         // A frame that was meant for a slot before the first one of a new session: the simulator's own mistake.
         (149_400_595_585_016, 5),
         // A tracker that did not see the body, and light that followed what had been foretold: a bound that was too narrow.
