@@ -325,15 +325,15 @@ impl Memory {
         let is_of = |kept: &Option<Tracks>, frame: u32| kept.is_some_and(|kept| kept.frame == frame);
         let is_lit = |kept: &Option<Tracks>| kept.is_some_and(|kept| Some(kept.frame) == lit);
         let age = |kept: &Option<Tracks>| kept.map_or(0, |kept| tracks.number.wrapping_sub(kept.number));
-        if is_of(a, tracks.frame) || a.is_none() {
-            *a = Some(tracks);
+        let is_first = if is_of(a, tracks.frame) || a.is_none() {
+            true
         } else if is_of(b, tracks.frame) || b.is_none() {
-            *b = Some(tracks);
-        } else if is_lit(a) || !is_lit(b) && age(b) > age(a) {
-            *b = Some(tracks);
+            false
         } else {
-            *a = Some(tracks);
-        }
+            // The place of the frame that is lit stays; of two others that of the older tracks is taken.
+            !is_lit(a) && (is_lit(b) || age(b) <= age(a))
+        };
+        *(if is_first { a } else { b }) = Some(tracks);
         self.note(present.ticks);
     }
 
