@@ -168,6 +168,11 @@ impl HostLink {
         self.rest.is_some_and(|(end, _)| now < end)
     }
 
+    /// True while light rests because the field flashed too often.
+    pub fn rests_after_flashes(&self) -> bool {
+        matches!(self.rest, Some((_, DropReason::FlashLimit)))
+    }
+
     /// The limit on light that caused the present rest.
     pub fn resting_for(&self) -> Option<LimitReached> {
         match self.rest {

@@ -33,6 +33,8 @@ pub struct CableFaults {
     pub stale: f64,
     /// The port cannot be opened.
     pub denied: bool,
+    /// Packets on the control lane to the device arrive so much later.
+    pub control_late_ns: i64,
 }
 
 /// Bytes on their way.
@@ -71,6 +73,12 @@ pub struct Cable {
     back: VecDeque<(i64, Vec<u8>)>,
     old_reply: Vec<u8>,
     free_at: i64,
+    /// The control lane keeps the order of its packets. Without tracks they are so few that it does not matter.
+    pub keeps_order: bool,
+    /// Then: when its last packet arrives.
+    control_at: i64,
+    /// Packets to the device may have been lost, doubled or damaged since this was looked at.
+    pub disturbed: bool,
     dice: Dice,
     spare: Vec<Vec<u8>>,
     /// The most transfers that ever waited in either direction.
@@ -92,6 +100,9 @@ impl Cable {
             back: VecDeque::new(),
             old_reply: Vec::new(),
             free_at: 0,
+            keeps_order: false,
+            control_at: 0,
+            disturbed: false,
             dice: Dice::new(seed, 0xcab1e),
             spare: Vec::new(),
             longest: 0,
@@ -154,6 +165,7 @@ impl Cable {
     /// The plug is pulled: everything on its way is lost.
     pub fn pull(&mut self) {
         self.plugged = false;
+        self.disturbed = true;
         self.out.clear();
         self.back.clear();
     }
@@ -174,6 +186,7 @@ impl Cable {
         let mut bytes = self.memory();
         let faults = self.faults;
         let is_bad = faults.corrupt > 0.0 || faults.loss > 0.0 || faults.twice > 0.0;
+        self.disturbed |= is_bad || faults.short > 0.0;
         for packet in packets {
             let from = bytes.len();
             packet.parts().into_iter().for_each(|part| bytes.extend_from_slice(part));
@@ -204,9 +217,13 @@ impl Cable {
             ns = ns * faults.slow_milli / 1000;
         }
         let begin = self.now.max(if lane == Lane::Data { self.free_at } else { 0 });
-        let at = begin + ns + self.travel_ns;
+        let mut at = begin + ns + self.travel_ns;
         if lane == Lane::Data {
             self.free_at = begin + ns;
+        } else if self.keeps_order {
+            // What was late holds up what follows it.
+            at = (at + faults.control_late_ns).max(self.control_at);
+            self.control_at = at;
         }
         let place = self.out.partition_point(|t| t.at <= at);
         self.out.insert(place, Transfer { at, lane, bytes, cut });
@@ -264,6 +281,7 @@ impl Transport for HostEnd {
     fn flush_output(&mut self) {
         let mut cable = lock(&self.cable);
         let (now, free_at) = (cable.now, cable.free_at);
+        cable.disturbed = true;
         // The transfer that is being carried ends here, cut off; what waits behind it is discarded.
         cable.out.retain(|t| t.at <= now);
         cable.free_at = free_at.min(now);

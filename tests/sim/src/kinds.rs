@@ -213,11 +213,18 @@ kinds! {
     X6,
     /// The tracker falls silent while the GPU hangs.
     X7,
+    /// The control lane is late: tracks arrive when they are old.
+    X8,
 }
 
 const FILES: &str = "scenes are read only when the program starts, before any light";
 
 impl Kind {
+    /// It strikes only where the projector follows tracks.
+    pub fn needs_tracks(self) -> bool {
+        self == Self::X8
+    }
+
     /// Why this kind cannot strike in `state`; `None` if it can.
     pub fn impossible(self, state: State) -> Option<&'static str> {
         use Kind as K;

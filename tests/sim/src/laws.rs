@@ -3,9 +3,9 @@
 
 use crate::cable::lock;
 use crate::machine::{hash, Beneath, Sent};
-use crate::net::motion;
 use crate::plan::Setup;
 use crate::process::{Exit, Process};
+use crate::tracks::Moment;
 use dpm_device::light::{LightEvent, LightKind};
 use dpm_device::link::{frame_newer, DeviceState};
 use dpm_rig::control::orders::Ticket;
@@ -27,9 +27,8 @@ const DARK_WITHIN_NS: i64 = 50 * MS;
 const DARK_AT_LAST_NS: i64 = 300 * MS;
 /// Light returns within this time after all causes are gone.
 const LIT_WITHIN_NS: i64 = S;
-/// The body's greatest speed and acceleration, in metres and seconds.
+/// The body's greatest speed, metres a second.
 const SPEED: f64 = 0.3;
-const ACCELERATION: f64 = 1.0;
 
 /// A broken law.
 #[derive(Clone, Debug, PartialEq, Eq)]
@@ -62,6 +61,8 @@ pub struct Laws {
     rate_hz: u32,
     is_quick: bool,
     motion: Option<Motion>,
+    /// The body's greatest acceleration, m/s2.
+    acceleration: f64,
     sent: Vec<Sent>,
     /// The greatest distance between slots of frames sent lately.
     stride_ns: i64,
@@ -120,7 +121,8 @@ impl Laws {
             predict_ns: setup.predict_ms.map(|ms| i64::from(ms) * MS),
             rate_hz: setup.rate_hz,
             is_quick: setup.render_milli < 800,
-            motion: motion(1.0).ok(),
+            motion: setup.motion.of(1.0).ok(),
+            acceleration: setup.motion.acceleration(),
             sent: vec![Sent::default(); REMEMBERED],
             stride_ns: slot_ns,
             last_due: 0,
@@ -289,7 +291,30 @@ impl Laws {
         self.standing.is_some_and(|s| s.order == Order::Freeze && !s.is_orphan)
     }
 
-    fn remember(&mut self, beneath: &Arc<Mutex<Beneath>>) {
+    /// The frame `frame` that this process has sent lately.
+    pub(crate) fn sent(&self, frame: u32) -> Option<&Sent> {
+        let sent = &self.sent[frame as usize % REMEMBERED];
+        (sent.frame == frame && sent.process == self.process).then_some(sent)
+    }
+
+    /// What may be expected of light at `t`, if the host's clock lags by `lag`.
+    pub(crate) fn moment(&self, t: i64, lag: i64) -> Moment {
+        Moment {
+            t,
+            lag,
+            is_peaceful: t - self.disturbed_at > 2 * S,
+            is_true: t >= self.lies_until + S && t - self.started_at >= S,
+            is_steady: t - self.clock_moved_at > 4 * S,
+        }
+    }
+
+    /// True if a second of peace is over in which nearly every slot has its own frame. `crew_ready`: when the last crew was.
+    pub(crate) fn is_in_peace(&self, t: i64, calm_for: i64, crew_ready: i64) -> bool {
+        let is_calm = calm_for > 2 * S && t - self.good_at < S && t - self.disturbed_at > 3 * S;
+        is_calm && self.is_quick && t - crew_ready > 3 * S && t - self.started_at > 4 * S
+    }
+
+    pub(crate) fn remember(&mut self, beneath: &Arc<Mutex<Beneath>>) {
         let mut beneath = lock(beneath);
         while let Some(sent) = beneath.sent.pop_front() {
             let stride = (sent.due_at - self.last_due).clamp(self.slot_ns, S);
@@ -396,8 +421,9 @@ impl Laws {
             }
         }
         self.last_lit = Some((self.process, frame));
-        // While a clock jumps, several slots begin at one instant, and the mirrors show the last of them.
-        if planes.map(hash) != Some(sent.hash) && at - self.clock_moved_at > S {
+        // While a clock jumps, several slots begin at one instant, and the mirrors show the last of them. Where the projector
+        // finds in this slot that the field flashes too often, it is dark before a photon has left.
+        if planes.is_some_and(|planes| hash(planes) != sent.hash) && at - self.clock_moved_at > S {
             return self.fail(at, format!("frame {frame} is lit with other planes than were sent"));
         }
         self.judge_pose(&sent, at, event.last_photon_at.0, lag);
@@ -480,7 +506,7 @@ impl Laws {
         let slack = if peace { 0.002 } else { 0.004 + 2.0 * SPEED * age_s };
         // At its worst the filter takes noise for an acceleration of 40 m/s^2, for the 12 ms that it carries one on.
         let slack = slack + 40.0 * 0.012 * (age_s + 0.5 * (last - at) as f64 * 1e-9);
-        let allowed = slack + 0.5 * ACCELERATION * age_s * age_s + SPEED * (late_s + 0.001);
+        let allowed = slack + 0.5 * self.acceleration * age_s * age_s + SPEED * (late_s + 0.001);
         if off > allowed {
             let frame = sent.frame;
             self.fail(
@@ -525,8 +551,7 @@ impl Laws {
         self.crews += crew.1 - std::mem::replace(&mut self.crews_seen, crew.1);
         self.tick = (self.tick + 1) % self.ticks.len();
         let before = std::mem::replace(&mut self.ticks[self.tick], self.good_frames);
-        let is_in_peace = calm_for > 2 * S && t - self.good_at < S && t - self.disturbed_at > 3 * S;
-        if is_in_peace && self.is_quick && t - crew.0 > 3 * S && t - self.started_at > 4 * S {
+        if self.is_in_peace(t, calm_for, crew.0) {
             let frames = self.good_frames - before;
             // Ten ticks are a second, and the window is eleven; a tenth may be missing.
             if frames * 10 < u64::from(self.rate_hz) * 9 {
@@ -537,7 +562,7 @@ impl Laws {
             }
         }
         let health = process.as_ref().map(|p| p.health());
-        if matches!(health, Some(ProjectorHealth::Resting(_))) {
+        if matches!(health, Some(ProjectorHealth::Resting(_) | ProjectorHealth::RestingAfterFlashes)) {
             self.rested_until = t;
         }
         self.words(t, process, is_frozen);

@@ -8,6 +8,7 @@
 pub mod cable;
 pub mod dice;
 pub mod disk;
+pub mod follow;
 pub mod kinds;
 pub mod laws;
 pub mod life;
@@ -17,4 +18,5 @@ pub mod plan;
 pub mod process;
 pub mod strike;
 pub mod table;
+pub mod tracks;
 pub mod world;

@@ -3,6 +3,7 @@
 use crate::laws::Broken;
 use crate::plan::{Episodes, Setup};
 use crate::table::Table;
+use crate::tracks::Placed;
 use crate::world::{World, S};
 use std::collections::BTreeSet;
 
@@ -15,6 +16,8 @@ pub struct Order {
     pub length_ns: i64,
     /// Frames per second, if not the seed's own.
     pub rate_hz: Option<u32>,
+    /// Whether the projector follows tracks, if not as the seed says.
+    pub follows: Option<bool>,
     /// Faults that do not strike, by number.
     pub without: BTreeSet<u32>,
     /// Stop at this event.
@@ -46,6 +49,10 @@ pub struct Lived {
     pub worst_age_milli: i64,
     /// The longest time from calm to light, nanoseconds.
     pub slowest_return_ns: i64,
+    /// Planes of which tracks moved light, and how far it was from the body.
+    pub planes_moved: u64,
+    /// See `planes_moved`.
+    pub placed: Placed,
 }
 
 /// Runs a life.
@@ -53,11 +60,14 @@ pub struct Lived {
 /// # Errors
 /// The world cannot be made, which is a mistake in this program.
 pub fn live(order: &Order) -> Result<Lived, String> {
-    let setup = Setup::of(order.seed, order.rate_hz);
+    let setup = Setup::of(order.seed, order.rate_hz, order.follows);
     let mut world = World::new(setup.clone())?;
     world.is_loud = order.is_loud;
     world.laws.is_loud = order.is_loud;
-    let mut episodes = Episodes::new(order.seed);
+    if let Some(tracks) = &mut world.tracks {
+        tracks.is_loud = order.is_loud;
+    }
+    let mut episodes = Episodes::new(&world.setup);
     let mut faults = Vec::new();
     let mut next = episodes.next_episode();
     let mut ready_since = None;
@@ -91,6 +101,8 @@ pub fn live(order: &Order) -> Result<Lived, String> {
         story: world.story.into(),
         worst_age_milli: world.laws.worst_age_milli,
         slowest_return_ns: world.laws.slowest_return_ns,
+        planes_moved: world.tracks.as_ref().map_or(0, |tracks| tracks.planes_moved),
+        placed: world.tracks.as_ref().map_or(Placed::default(), |tracks| tracks.placed),
     })
 }
 

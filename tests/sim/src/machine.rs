@@ -3,11 +3,12 @@
 use crate::cable::lock;
 use crate::dice::Dice;
 use crate::net::{Net, SimSocket};
-use dpm_device::time::{HostClock, HostTime};
+use dpm_device::time::{DeviceTicks, HostClock, HostTime};
 use dpm_device::tracker::natnet::client::{NatNetClient, NatNetConfig};
 use dpm_device::tracker::{BodyKey, Tracker};
 use dpm_render::gpu::{GpuError, MemoryPool};
 use dpm_rig::pipeline::stepped::{Machine, Part, Rendered, SentFrame, Takes};
+use glam::DAffine3;
 use std::collections::VecDeque;
 use std::net::Ipv4Addr;
 use std::sync::atomic::{AtomicI64, Ordering};
@@ -86,8 +87,33 @@ pub struct Sent {
     pub predict_ns: i64,
     /// Position of the body for which it was drawn.
     pub position: [f64; 3],
+    /// Begin of its slot on the projector's clock.
+    pub target_at: DeviceTicks,
+    /// From then on there is no light of it, on the projector's clock.
+    pub dark_from: DeviceTicks,
+    /// Pose of the body for which it was drawn, as a whole, and its instant on the host's clock.
+    pub pose: DAffine3,
+    /// See `pose`.
+    pub centre_at: HostTime,
+    /// Poses for which its first and last planes were drawn, and their instants.
+    pub swept: [DAffine3; 2],
+    /// See `swept`.
+    pub ends: [HostTime; 2],
     /// A hash of its planes.
     pub hash: u64,
+}
+
+impl Sent {
+    /// Pose of the body for which planes are drawn that are lit at `at` of the host's clock.
+    pub fn pose_at(&self, at: HostTime) -> DAffine3 {
+        let exposure_ns = self.ends[1].ns_since(self.ends[0]).max(1);
+        let share = at.ns_since(self.centre_at) as f64 / exposure_ns as f64;
+        let [first, last] = self.swept;
+        DAffine3 {
+            matrix3: self.pose.matrix3 + (last.matrix3 - first.matrix3) * share,
+            translation: self.pose.translation + (last.translation - first.translation) * share,
+        }
+    }
 }
 
 /// A hash of planes that is cheap enough for every frame.
@@ -242,7 +268,9 @@ impl Machine for SimMachine {
     fn sent(&mut self, frame: &SentFrame<'_>) {
         let mut beneath = lock(&self.beneath);
         let process = beneath.process;
-        let position = frame.poses.first().map_or([0.0; 3], |pose| pose.translation.to_array());
+        let pose = frame.poses.first().copied().unwrap_or(DAffine3::IDENTITY);
+        let swept = frame.swept.map(|poses| poses.first().copied().unwrap_or(pose));
+        let position = pose.translation.to_array();
         beneath.sent.push_back(Sent {
             frame: frame.frame,
             process,
@@ -251,6 +279,12 @@ impl Machine for SimMachine {
             captured_at: frame.captured_at.map(|at| at.0),
             predict_ns: frame.predict_ns,
             position,
+            target_at: frame.target_at,
+            dark_from: frame.dark_from,
+            pose,
+            centre_at: frame.centre_at,
+            swept,
+            ends: frame.swept_at,
             hash: hash(frame.planes),
         });
     }

@@ -2,6 +2,7 @@
 
 use dpm_sim::life::{live, shrink, Lived, Order};
 use dpm_sim::table::Table;
+use dpm_sim::tracks::Placed;
 use std::collections::{BTreeMap, BTreeSet};
 use std::process::ExitCode;
 use std::time::Instant;
@@ -13,6 +14,7 @@ dpm-sim: a simulated world around the rig, with every fault in every state
   --seed N        first seed; default: a fresh one, which is printed
   --rate HZ       frames per second of every life; default: each seed's own
   --life S        simulated seconds of each seed; default 120
+  --tracks WHO    all or none: whose projector follows tracks; default: a third of the seeds'
   --until EVENT   stop the (single) seed at this event and print what happened
   --without LIST  numbers of faults that do not strike, as a shrunk seed names them
   --minutes M     end after so many minutes of real time
@@ -28,6 +30,7 @@ struct Wish {
     seed: Option<u64>,
     rate: Option<u32>,
     life_s: f64,
+    follows: Option<bool>,
     until: Option<u64>,
     without: BTreeSet<u32>,
     minutes: Option<f64>,
@@ -44,6 +47,7 @@ fn wish() -> Result<Wish, String> {
         seed: None,
         rate: None,
         life_s: 120.0,
+        follows: None,
         until: None,
         without: BTreeSet::new(),
         minutes: None,
@@ -64,6 +68,11 @@ fn wish() -> Result<Wish, String> {
             "--seed" => wish.seed = Some(number(&value()?)?),
             "--rate" => wish.rate = Some(number(&value()?)?),
             "--life" => wish.life_s = number(&value()?)?,
+            "--tracks" => match value()?.as_str() {
+                "all" => wish.follows = Some(true),
+                "none" => wish.follows = Some(false),
+                other => return Err(format!("--tracks {other:?}: give \"all\" or \"none\"")),
+            },
             "--until" => wish.until = Some(number(&value()?)?),
             "--without" => {
                 for word in value()?.split(',').filter(|word| !word.is_empty()) {
@@ -103,6 +112,9 @@ struct Sum {
     worst_age_milli: i64,
     slowest_return_ns: i64,
     lives: u64,
+    following: u64,
+    planes_moved: u64,
+    placed: Placed,
 }
 
 fn report(lived: &Lived, order: &Order, shrinks: bool) -> Result<String, String> {
@@ -115,9 +127,14 @@ fn report(lived: &Lived, order: &Order, shrinks: bool) -> Result<String, String>
     least.story.iter().rev().take(40).rev().for_each(|line| println!("  {line}"));
     let without: Vec<String> = small.without.iter().map(u32::to_string).collect();
     let rate = order.rate_hz.map_or(String::new(), |hz| format!(" --rate {hz}"));
+    let tracks = match order.follows {
+        None => "",
+        Some(true) => " --tracks all",
+        Some(false) => " --tracks none",
+    };
     println!("  LAW: {told}");
     println!(
-        "  again: --seed {}{rate} --life {:.0} --hours 0.0001 --loud --without {}",
+        "  again: --seed {}{rate}{tracks} --life {:.0} --hours 0.0001 --loud --without {}",
         order.seed,
         (least.length_ns as f64 * 1e-9).ceil() + 1.0,
         if without.is_empty() { "\"\"".into() } else { without.join(",") }
@@ -139,6 +156,7 @@ fn run() -> Result<bool, String> {
             seed,
             length_ns: (wish.life_s * 1e9) as i64,
             rate_hz: wish.rate,
+            follows: wish.follows,
             without: wish.without.clone(),
             until: wish.until,
             is_loud: wish.is_loud,
@@ -153,6 +171,9 @@ fn run() -> Result<bool, String> {
         sum.worst_age_milli = sum.worst_age_milli.max(lived.worst_age_milli);
         sum.slowest_return_ns = sum.slowest_return_ns.max(lived.slowest_return_ns);
         sum.lives += 1;
+        sum.following += u64::from(lived.setup.follows);
+        sum.planes_moved += lived.planes_moved;
+        sum.placed.add(&lived.placed);
         if lived.broken.is_some() {
             let told = report(&lived, &order, wish.shrinks && wish.until.is_none())?;
             sum.failures.push(format!("{seed}: {told}"));
@@ -194,6 +215,16 @@ fn run() -> Result<bool, String> {
         sum.worst_age_milli as f64 / 10.0,
         sum.slowest_return_ns as f64 * 1e-9,
         begin.elapsed().as_secs_f64()
+    );
+    let rms = |sum_px2: f64| (sum_px2 / sum.placed.moved.max(1) as f64).sqrt();
+    println!(
+        "{} of the lives with tracks: {} planes moved; the light of {} was judged: {:.2} mirrors off the body (rms), and \
+         without tracks it would have been {:.2}",
+        sum.following,
+        sum.planes_moved,
+        sum.placed.moved,
+        rms(sum.placed.with),
+        rms(sum.placed.without)
     );
     if let Some(path) = &wish.table {
         std::fs::write(path, sum.table.to_markdown()).map_err(|e| format!("{path}: {e}"))?;

@@ -34,6 +34,8 @@ pub struct ServerKind {
     pub is_old: bool,
     /// Positions in millimetres.
     pub millimetres: bool,
+    /// How the body moves.
+    pub motion: BodyMotion,
 }
 
 /// How the network behaves at present.
@@ -88,18 +90,46 @@ pub struct Net {
     pub overrun: u64,
 }
 
-/// The true motion of the body, at time 0 of the world and `scale` times as large: to and fro by 0.3 m/s at most.
-///
-/// # Errors
-/// The motion is none, which is a mistake in this program.
-pub fn motion(scale: f64) -> Result<Motion, String> {
-    let spec = MotionSpec::Sinusoid {
-        direction: [1.0, 0.0, 0.0],
-        peak_speed_m_s: 0.3 * scale,
-        peak_acceleration_m_s2: 1.0 * scale,
-    };
-    let rest = Pose { position_m: [0.0, 0.1 * scale, 0.0], ..Pose::IDENTITY };
-    Motion::new(&spec, rest).map_err(|e| e.to_string())
+/// How the body moves: to and fro by 0.3 m/s at most.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum BodyMotion {
+    /// As a pendulum.
+    Swings,
+    /// On a straight line with turns of so many m/s2 at its ends.
+    Turns(u32),
+}
+
+impl BodyMotion {
+    /// Its greatest acceleration, m/s2.
+    pub fn acceleration(self) -> f64 {
+        match self {
+            Self::Swings => 1.0,
+            Self::Turns(acceleration) => f64::from(acceleration),
+        }
+    }
+
+    /// The true motion of the body from time 0 of the world on, `scale` times as large.
+    ///
+    /// # Errors
+    /// The motion is none, which is a mistake in this program.
+    pub fn of(self, scale: f64) -> Result<Motion, String> {
+        let spec = match self {
+            Self::Swings => MotionSpec::Sinusoid {
+                direction: [1.0, 0.0, 0.0],
+                peak_speed_m_s: 0.3 * scale,
+                peak_acceleration_m_s2: 1.0 * scale,
+            },
+            Self::Turns(acceleration) => MotionSpec::Translate {
+                direction: [1.0, 0.4, 0.0],
+                speed_m_s: 0.3 * scale,
+                amplitude_m: 0.06 * scale,
+                acceleration_m_s2: f64::from(acceleration) * scale,
+                rest_s: 0.0,
+            },
+        };
+        let rest = Pose { position_m: [0.0, 0.1 * scale, 0.0], ..Pose::IDENTITY };
+        Motion::new(&spec, rest).map_err(|e| e.to_string())
+    }
 }
 
 fn server(kind: &ServerKind, seed: u64) -> Result<NatNetServer, String> {
@@ -112,7 +142,7 @@ fn server(kind: &ServerKind, seed: u64) -> Result<NatNetServer, String> {
         latency_jitter_ns: 300_000,
         ..Default::default()
     };
-    let motion = motion(if kind.millimetres { 1000.0 } else { 1.0 })?;
+    let motion = kind.motion.of(if kind.millimetres { 1000.0 } else { 1.0 })?;
     let source = SampleSource::new(config, vec![motion]).map_err(|e| e.to_string())?;
     let config = NatNetServerConfig {
         bodies: vec![(kind.name.clone(), kind.number)],

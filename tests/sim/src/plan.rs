@@ -2,6 +2,7 @@
 
 use crate::dice::Dice;
 use crate::kinds::{Kind, State};
+use crate::net::BodyMotion;
 
 /// The rates at which rigs run, frames per second.
 pub const RATES: [u32; 6] = [24, 60, 120, 240, 947, 2000];
@@ -27,11 +28,20 @@ pub struct Setup {
     pub ns_per_byte: i64,
     /// Travel time of the cable.
     pub travel_ns: i64,
+    /// The projector follows tracks, and the host sends some.
+    pub follows: bool,
+    /// Mirrors in a row, and rows.
+    pub raster: (u32, u32),
+    /// How the body moves.
+    pub motion: BodyMotion,
 }
 
+/// The share of lives whose projector follows tracks.
+const FOLLOWING: f64 = 1.0 / 3.0;
+
 impl Setup {
-    /// The rig that `seed` describes; `rate_hz` overrides its rate.
-    pub fn of(seed: u64, rate_hz: Option<u32>) -> Self {
+    /// The rig that `seed` describes; `rate_hz` overrides its rate, and `follows` whether its projector follows tracks.
+    pub fn of(seed: u64, rate_hz: Option<u32>, follows: Option<bool>) -> Self {
         let mut dice = Dice::new(seed, 0x5e7);
         let drawn = dice.one_of(&RATES);
         let rate_hz = rate_hz.unwrap_or(drawn);
@@ -45,7 +55,21 @@ impl Setup {
         let needed_ms = (2 * (3 + 2_000 / i64::from(tracker_hz)) + 8 * slot_us / 1000 + 20)
             + slot_us * render_milli / 1_000_000 * 4;
         let predict_ms = dice.happens(0.3).then(|| dice.between(needed_ms, 2 * needed_ms).min(1_000) as u32);
+        // These have a row of their own, so that a life without tracks is what it was before there were any.
+        let mut late = Dice::new(seed, 0x7ac);
+        let drawn = late.happens(FOLLOWING);
+        let turns = late.one_of(&[None, Some(10), Some(40)]);
+        let follows = follows.unwrap_or(drawn);
+        // Mirrors are small enough that a body can be elsewhere by some of them.
+        let (raster, motion) = match turns {
+            Some(acceleration) if follows => ((64, 48), BodyMotion::Turns(acceleration)),
+            None if follows => ((64, 48), BodyMotion::Swings),
+            _ => ((16, 12), BodyMotion::Swings),
+        };
         Self {
+            follows,
+            raster,
+            motion,
             seed,
             rate_hz,
             planes,
@@ -91,20 +115,32 @@ pub struct Episode {
 pub struct Episodes {
     dice: Dice,
     cells: Vec<(State, Kind)>,
+    kinds: Vec<Kind>,
+    /// Now and then a long rest comes before an episode, in which the laws of peace are judged.
+    rests: Option<Dice>,
     next: u32,
 }
 
+/// The long rest, and its share of episodes.
+const REST_NS: i64 = 6_000_000_000;
+/// See [`REST_NS`].
+const RESTING: f64 = 0.03;
+
 impl Episodes {
-    /// The episodes of `seed`.
-    pub fn new(seed: u64) -> Self {
-        Self { dice: Dice::new(seed, 0xe915), cells: Vec::new(), next: 0 }
+    /// The episodes of a life.
+    pub fn new(setup: &Setup) -> Self {
+        let all = Kind::ALL.iter().copied();
+        let kinds = all.filter(|kind| setup.follows || !kind.needs_tracks()).collect();
+        let dice = Dice::new(setup.seed, 0xe915);
+        let rests = setup.follows.then(|| Dice::new(setup.seed, 0x4e57));
+        Self { dice, cells: Vec::new(), kinds, rests, next: 0 }
     }
 
     /// The next pair of state and kind: each comes once before any comes again.
     fn cell(&mut self) -> (State, Kind) {
         if self.cells.is_empty() {
             for state in State::ALL {
-                let possible = Kind::ALL.iter().filter(|kind| kind.impossible(state).is_none());
+                let possible = self.kinds.iter().filter(|kind| kind.impossible(state).is_none());
                 self.cells.extend(possible.map(|kind| (state, *kind)));
             }
             for i in (1..self.cells.len()).rev() {
@@ -130,7 +166,7 @@ impl Episodes {
         for i in 0..count {
             let mut kind = first;
             if i > 0 {
-                kind = self.dice.one_of(Kind::ALL);
+                kind = self.dice.one_of(&self.kinds);
                 if kind.impossible(state).is_some() {
                     continue;
                 }
@@ -139,12 +175,16 @@ impl Episodes {
             faults.push(Planned { number: self.next, kind, after_ns, seed: self.dice.bits() });
             self.next += 1;
         }
-        Episode {
+        let mut episode = Episode {
             state,
             way: self.dice.bits(),
             faults,
             rest_ns: self.dice.between(20, 250) * 1_000_000,
             person_ns: self.dice.between(5, 200) * 1_000_000,
+        };
+        if self.rests.as_mut().is_some_and(|dice| dice.happens(RESTING)) {
+            episode.rest_ns = REST_NS;
         }
+        episode
     }
 }

@@ -82,6 +82,10 @@ impl World {
                 self.bad_file = true;
                 self.lasts(kind, dice.between(100, 1_500) * MS, Undo::File);
             }
+            K::X8 => {
+                lock(&self.cable).faults.control_late_ns = dice.decades(200_000, 30_000_000);
+                self.lasts(kind, dice.decades(2, 1_500) * MS, Undo::Cable);
+            }
             K::T18 | K::G3 | K::G9 => self.lasts(kind, MS, Undo::Nothing),
         }
     }
@@ -201,6 +205,7 @@ impl World {
                 self.pull();
                 let own = std::mem::replace(&mut self.projector, other);
                 self.aside = Some(own);
+                self.new_projector();
                 self.laws.acknowledged();
                 lock(&self.cable).push_in();
                 return self.lasts(kind, lasts_ns, Undo::Projector);
@@ -214,6 +219,16 @@ impl World {
         lock(&self.cable).pull();
         self.projector.bus_reset(HostTime(self.t));
         self.see_light();
+        if let Some(tracks) = &mut self.tracks {
+            tracks.no_session(&self.projector);
+        }
+    }
+
+    /// Another projector is at the end of the cable, or this one has lost its memory.
+    fn new_projector(&mut self) {
+        if let Some(tracks) = &mut self.tracks {
+            tracks.new_device();
+        }
     }
 
     fn strike_cable(&mut self, kind: Kind, dice: &mut Dice) {
@@ -245,6 +260,7 @@ impl World {
             K::U8 => {
                 self.projector.power_cycle(now);
                 self.see_light();
+                self.new_projector();
                 if self.projector.status().faults == 0 {
                     self.laws.acknowledged();
                 }
@@ -254,6 +270,9 @@ impl World {
                 self.laws.clock_moved(self.t);
                 self.projector.shift_clock(now, dice.decades(10_000, 3_000_000_000) as u64);
                 self.see_light();
+                if let Some(tracks) = &mut self.tracks {
+                    tracks.clock_moved();
+                }
                 self.lasts(kind, MS, Undo::Nothing);
             }
             K::U12 => {
@@ -434,6 +453,7 @@ impl World {
         link.connect();
         let _ = link.poll(HostTime(self.t), &mut words);
         if lock(&self.cable).plugged {
+            self.hear(&words.0, false);
             self.projector.receive(HostTime(self.t), Lane::Control, &words.0);
             self.see_light();
         }
@@ -460,6 +480,7 @@ impl World {
                 if let Some(own) = self.aside.take() {
                     self.pull();
                     self.projector = own;
+                    self.new_projector();
                     self.laws.acknowledged();
                     self.projector.advance_to(HostTime(self.t));
                     self.see_light();

@@ -9,15 +9,16 @@ use crate::net::{Net, ServerKind};
 use crate::plan::{Episode, Setup};
 use crate::process::{Exit, Process};
 use crate::table::Table;
+use crate::tracks::TrackLaws;
 use dpm_device::link::faults;
 use dpm_device::planes::Raster;
 use dpm_device::time::HostTime;
-use dpm_device::transport::LinkDevice;
+use dpm_device::transport::{Lane, LinkDevice};
 use dpm_rig::config::{Overrides, RigConfig};
 use dpm_rig::order::Order;
 use dpm_rig::rig::Rig;
 use dpm_rig::telemetry::monitor::ProjectorHealth;
-use hil_mock::projector::{DeviceClock, MockConfig, MockProjector};
+use hil_mock::projector::{DeviceClock, MockConfig, MockProjector, GREATEST_SHIFT};
 use std::cmp::Reverse;
 use std::collections::{BinaryHeap, VecDeque};
 use std::path::Path;
@@ -38,8 +39,8 @@ const STARTS: usize = 5;
 const STARTS_WITHIN_NS: i64 = 60 * S;
 /// How often a person who clears up looks again.
 const PERSON_NS: i64 = 300 * MS;
-/// Mirrors of the simulated projector.
-pub const RASTER: (u32, u32) = (16, 12);
+/// Slots of which the shifts wait to be judged.
+const MOVES_KEPT: usize = 64;
 
 /// What happens at a planned instant.
 #[derive(Clone, Debug)]
@@ -148,6 +149,8 @@ pub struct World {
     tick_at: i64,
     /// The laws.
     pub laws: Laws,
+    /// Those of tracks, if the projector follows any.
+    pub tracks: Option<TrackLaws>,
     /// Kinds by state.
     pub table: Table,
     /// Events so far.
@@ -164,12 +167,13 @@ pub struct World {
 const ASSETS: &str = concat!(env!("CARGO_MANIFEST_DIR"), "/assets");
 
 fn rig_of(setup: &Setup, acknowledges: bool) -> Result<Rig, String> {
+    let tracks = if setup.follows { "tracks = \"auto\"\nhorizontal_fov_deg = 20\n" } else { "" };
     let predict = setup.predict_ms.map_or(String::new(), |ms| format!("predict_ms = {ms}\n"));
     let text = format!(
         "[tracker]\nkind = \"natnet\"\nserver = \"10.0.0.2\"\nlocal = \"10.0.0.1\"\nrate_hz = {}\n\
-         [projector]\nwidth = {}\nheight = {}\nplanes = {}\nframe_rate = {}\nbackend = {{ kind = \"usb\" }}\n\
+         [projector]\nwidth = {}\nheight = {}\nplanes = {}\nframe_rate = {}\nbackend = {{ kind = \"usb\" }}\n{tracks}\
          [scene]\nfile = \"triangle.gltf\"\n[[scene.bodies]]\nname = \"a\"\n[safety]\nacknowledge_faults = {acknowledges}\n{predict}",
-        setup.tracker_hz, RASTER.0, RASTER.1, setup.planes, setup.rate_hz
+        setup.tracker_hz, setup.raster.0, setup.raster.1, setup.planes, setup.rate_hz
     );
     let config = RigConfig::parse("simulated.toml", &text, Path::new(ASSETS), &Overrides::default())
         .map_err(|e| e.to_string())?;
@@ -178,9 +182,12 @@ fn rig_of(setup: &Setup, acknowledges: bool) -> Result<Rig, String> {
 
 /// A projector as it left the factory.
 pub(crate) fn projector_of(setup: &Setup, raster: Option<Raster>, now: i64) -> Result<MockProjector, String> {
-    let own = Raster::new(RASTER.0, RASTER.1).ok_or("no raster")?;
+    let own = Raster::new(setup.raster.0, setup.raster.1).ok_or("no raster")?;
     let mut config = MockConfig::new(raster.unwrap_or(own));
     config.events_kept = 64;
+    if setup.follows {
+        (config.greatest_shift, config.moves_kept) = (Some(GREATEST_SHIFT), MOVES_KEPT);
+    }
     config.clock = DeviceClock {
         skew_ppb: setup.clock_ppb,
         power_on_at: HostTime(now),
@@ -201,8 +208,10 @@ impl World {
         let kind = server_kind(&setup);
         let slot_ns = S / i64::from(setup.rate_hz);
         let seed = setup.seed;
-        let cable = Cable::new(seed, setup.ns_per_byte, setup.travel_ns);
+        let mut cable = Cable::new(seed, setup.ns_per_byte, setup.travel_ns);
+        cable.keeps_order = setup.follows;
         let laws = Laws::new(&rig, &setup);
+        let tracks = setup.follows.then(|| TrackLaws::new(&rig, &setup)).transpose()?;
         Ok(Self {
             t: 0,
             cable: Arc::new(Mutex::new(cable)),
@@ -232,6 +241,7 @@ impl World {
             arming_since: None,
             tick_at: TICK_NS,
             laws,
+            tracks,
             table: Table::default(),
             events: 0,
             trace: seed,
@@ -271,7 +281,9 @@ impl World {
             ProjectorHealth::Black | ProjectorHealth::Frozen | ProjectorHealth::InterlockOpen => {
                 State::FrozenOrBlack
             }
-            ProjectorHealth::Faulted(_) | ProjectorHealth::Resting(_) => State::Faulted,
+            ProjectorHealth::Faulted(_)
+            | ProjectorHealth::Resting(_)
+            | ProjectorHealth::RestingAfterFlashes => State::Faulted,
             ProjectorHealth::Connecting | ProjectorHealth::Stopped => State::Arming,
         }
     }
@@ -414,6 +426,9 @@ impl World {
         loop {
             let arrived = lock(&self.cable).arrived();
             let Some(transfer) = arrived else { break };
+            if transfer.lane == Lane::Control {
+                self.hear(&transfer.bytes, transfer.cut);
+            }
             self.projector.receive(HostTime(self.t), transfer.lane, &transfer.bytes);
             if transfer.cut {
                 self.projector.end_of_transfer(HostTime(self.t), transfer.lane);
@@ -428,11 +443,34 @@ impl World {
         }
     }
 
+    /// The laws of tracks read what is about to reach the projector on the control lane.
+    pub(crate) fn hear(&mut self, bytes: &[u8], cut: bool) {
+        if self.tracks.is_none() {
+            return;
+        }
+        self.projector.advance_to(HostTime(self.t));
+        self.see_light();
+        self.laws.remember(&self.beneath);
+        let moment = self.laws.moment(self.t, self.lag.load(Ordering::Relaxed));
+        let Self { tracks, laws, projector, cable, .. } = self;
+        let Some(tracks) = tracks else { return };
+        if std::mem::take(&mut lock(cable).disturbed) {
+            tracks.cable_disturbed();
+        }
+        let told = tracks.hear(bytes, cut, projector, &moment, &|frame| laws.sent(frame));
+        if let Err(told) = told {
+            self.laws.fail(self.t, told);
+        }
+    }
+
     /// Judges the light that the projector has made.
     pub(crate) fn see_light(&mut self) {
         while let Some(change) = self.projector.next_change() {
             self.fold(2, change.at.0 as u64 ^ u64::from(change.frame.unwrap_or(u32::MAX)) << 32);
             self.laws.change(&change, self.t);
+            if let Some(tracks) = &mut self.tracks {
+                tracks.change(&change, &self.projector);
+            }
         }
         while let Some(event) = self.projector.next_light() {
             let lag = self.lag.load(Ordering::Relaxed);
@@ -440,6 +478,24 @@ impl World {
             let planes = self.projector.lit_planes();
             self.laws.light(&event, planes, lag, &self.beneath, self.events);
         }
+        self.see_moves();
+    }
+
+    /// Judges what tracks made of the light of slots that are over.
+    fn see_moves(&mut self) {
+        let Some(mut tracks) = self.tracks.take() else { return };
+        while let Some(moves) = self.projector.next_moves() {
+            let sum = moves.planes().iter().flat_map(|plane| plane.all().iter().flat_map(|one| one.shift));
+            let sum =
+                sum.fold(moves.slot, |sum, shift| sum.wrapping_mul(31).wrapping_add_signed(shift.into()));
+            self.fold(7, sum);
+            let moment = self.laws.moment(self.t, self.lag.load(Ordering::Relaxed));
+            let told = tracks.slot(&moves, &self.projector, self.laws.sent(moves.frame), &moment);
+            if let Err(told) = told {
+                self.laws.fail(self.t, told);
+            }
+        }
+        self.tracks = Some(tracks);
     }
 
     fn move_process(&mut self) {
@@ -637,6 +693,12 @@ impl World {
         let lag = self.lag.load(Ordering::Relaxed);
         let longest = lock(&self.cable).longest;
         let is_frozen = self.t < self.frozen_until;
+        if let Some(tracks) = &mut self.tracks {
+            let is_in_peace = self.laws.is_in_peace(self.t, calm_for, crew_ready + lag);
+            if let Err(told) = tracks.tick(&self.projector, is_in_peace) {
+                self.laws.fail(self.t, told);
+            }
+        }
         self.laws.tick(
             self.t,
             calm_for,
@@ -744,5 +806,12 @@ impl World {
 
 /// The server that belongs to the rig.
 pub(crate) fn server_kind(setup: &Setup) -> ServerKind {
-    ServerKind { rate_hz: setup.tracker_hz, name: "a".into(), number: 1, is_old: false, millimetres: false }
+    ServerKind {
+        rate_hz: setup.tracker_hz,
+        name: "a".into(),
+        number: 1,
+        is_old: false,
+        millimetres: false,
+        motion: setup.motion,
+    }
 }

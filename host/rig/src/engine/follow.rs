@@ -10,7 +10,7 @@ use crate::rig::{affine, Rig};
 use crate::tracks::TrackSnapshot;
 use dpm_device::link::{Area, HostLink, Region, Tracks, MAX_REGIONS};
 use dpm_device::planes::Raster;
-use dpm_device::time::HostTime;
+use dpm_device::time::{DeviceTicks, HostTime};
 use dpm_device::transport::Transport;
 use dpm_handoff::latest::Reader;
 use dpm_scene::geometry::projector::ProjectorCamera;
@@ -67,6 +67,8 @@ impl Shape {
 struct Drawn {
     frame: u32,
     due_at: HostTime,
+    /// From then on there is no light of it.
+    dark_from: DeviceTicks,
     /// The instant of `poses`, and those of `swept`.
     centre_at: HostTime,
     ends: [HostTime; 2],
@@ -85,6 +87,7 @@ impl Drawn {
         Self {
             frame: 0,
             due_at: HostTime(i64::MIN),
+            dark_from: DeviceTicks(0),
             centre_at: HostTime(0),
             ends: [HostTime(0); 2],
             predict_ns: 0,
@@ -98,7 +101,7 @@ impl Drawn {
     }
 
     fn take(&mut self, plan: &FramePlan) {
-        (self.frame, self.due_at) = (plan.id.0 as u32, plan.due_at);
+        (self.frame, self.due_at, self.dark_from) = (plan.id.0 as u32, plan.due_at, plan.dark_from);
         (self.centre_at, self.ends) = (plan.centre_at, plan.swept_at);
         (self.predict_ns, self.camera) = (plan.predict_ns, plan.camera);
         self.poses.clone_from(&plan.tracked_poses);
@@ -183,7 +186,12 @@ impl Follower {
         let next = self.drawn.iter().filter(is_next).min_by_key(|drawn| drawn.due_at);
         let frames = [lit, next].map(|drawn| drawn.filter(|d| d.due_at.0 != i64::MIN));
         let snapshot = self.newest.latest().0;
+        let ticks = time.ticks_of(now);
         for drawn in frames.into_iter().flatten() {
+            if drawn.dark_from <= ticks {
+                // After an order to go dark the last frame that was sent is an old one.
+                continue;
+            }
             let scene =
                 Scene { raster: self.raster, shapes: &self.shapes, light_delay_ns: self.light_delay_ns };
             let tracks = scene.tracks(drawn, snapshot, now, time, most.min(CLAMP), &mut self.regions);
@@ -265,7 +273,8 @@ impl Scene<'_> {
         let centre = camera.to_projector_space(made[0].transform_point3(shape.points[0]));
         let depth = -centre.z;
         // Both filters know the same samples, so their distance has less noise than two independent ones would have.
-        let noise = drawn.sigma_m[body].hypot(late[0].position_sigma_m) * camera.fx / depth;
+        let (before, now) = (drawn.sigma_m[body], late[0].position_sigma_m);
+        let noise = (before * before + now * now).sqrt() * camera.fx / depth;
         let fixed = |v: DVec2| Some([fixed(v.x)?, fixed(v.y)?]);
         Some((
             depth,

@@ -362,6 +362,9 @@ fn health(link: &HostLink, standing: Option<Verb>) -> ProjectorHealth {
     if let (Some(limit), LinkState::Streaming) = (link.resting_for(), link.state()) {
         return ProjectorHealth::Resting(limit);
     }
+    if link.rests_after_flashes() && link.state() == LinkState::Streaming {
+        return ProjectorHealth::RestingAfterFlashes;
+    }
     match (link.state(), standing) {
         (LinkState::Lost | LinkState::Closed, _) => ProjectorHealth::Lost,
         (LinkState::Faulted, _) => ProjectorHealth::Faulted(link.status().map_or(0, |s| s.faults)),

@@ -41,6 +41,8 @@ pub enum ProjectorHealth {
     InterlockOpen,
     /// Dark for a while because a limit on light was reached.
     Resting(LimitReached),
+    /// Dark for two seconds because the field flashed too often.
+    RestingAfterFlashes,
 }
 
 impl ProjectorHealth {
@@ -57,6 +59,7 @@ impl ProjectorHealth {
             Self::InterlockOpen => 7,
             Self::Resting(LimitReached::Mean) => 8,
             Self::Resting(LimitReached::FullWhite) => 9,
+            Self::RestingAfterFlashes => 10,
         }
     }
 
@@ -72,6 +75,7 @@ impl ProjectorHealth {
             7 => Self::InterlockOpen,
             8 => Self::Resting(LimitReached::Mean),
             9 => Self::Resting(LimitReached::FullWhite),
+            10 => Self::RestingAfterFlashes,
             _ => Self::Connecting,
         }
     }
@@ -103,7 +107,7 @@ impl ProjectorHealth {
             Self::Frozen => "FROZEN",
             Self::Stopped => "dark",
             Self::InterlockOpen => "INTERLOCK",
-            Self::Resting(_) => "RESTING",
+            Self::Resting(_) | Self::RestingAfterFlashes => "RESTING",
         }
     }
 }
@@ -130,6 +134,10 @@ impl fmt::Display for ProjectorHealth {
             Self::Resting(LimitReached::FullWhite) => write!(
                 f,
                 "dark, full white lasted for safety.limits.full_white_s; light comes back after as long"
+            ),
+            Self::RestingAfterFlashes => write!(
+                f,
+                "dark, the field flashed more often than safety.flashes_per_second; light comes back after 2 s"
             ),
         }
     }
@@ -500,6 +508,7 @@ mod tests {
             H::InterlockOpen,
             H::Resting(LimitReached::Mean),
             H::Resting(LimitReached::FullWhite),
+            H::RestingAfterFlashes,
             H::Faulted(0),
             H::Faulted(u32::MAX),
         ];

@@ -39,7 +39,7 @@ impl CrewParts {
             picture: None,
         };
         Self {
-            tracking: TrackingStage::new(rig, tracker),
+            tracking: tracking(rig, tracker),
             renderer: None,
             pictures: None,
             kernel: Kernel::best(),
@@ -47,6 +47,16 @@ impl CrewParts {
             memory: (0..in_flight.max(2)).map(|_| memory()).collect(),
             frame_ns,
         }
+    }
+}
+
+/// Tracking, with the filters that tracks between frames need if the rig sends any.
+fn tracking(rig: &Rig, tracker: Box<dyn Tracker>) -> TrackingStage {
+    let stage = TrackingStage::new(rig, tracker);
+    if rig.wants_tracks() {
+        stage.with_lively(rig)
+    } else {
+        stage
     }
 }
 
@@ -91,6 +101,8 @@ pub(super) struct Crew {
     tracking_at: HostTime,
     publisher: Publisher<TrackSnapshot>,
     reader: Reader<TrackSnapshot>,
+    /// The newest tracks for the link; `None` if the projector is told of none.
+    to_link: Option<Publisher<TrackSnapshot>>,
     times: Reader<LinkTime>,
     plan: PlanStage<Real>,
     planning: Planning,
@@ -123,6 +135,11 @@ impl Crew {
     ) -> Self {
         let crew = Arc::new(CrewFacts::new(parts.frame_ns));
         let (publisher, reader) = latest(TrackSnapshot::empty(facts.rig.bodies.len()));
+        let to_link = facts.rig.wants_tracks().then(|| {
+            let (to_link, newest) = latest(TrackSnapshot::empty(facts.rig.bodies.len()));
+            line.stage.follow_by(newest);
+            to_link
+        });
         let (times_in, mut times) = latest(time);
         line.stage.tell_times_to(times_in);
         let time = *times.latest().0;
@@ -135,6 +152,7 @@ impl Crew {
             tracking_at: now,
             publisher,
             reader,
+            to_link,
             times,
             planning: Planning::Free { at: now },
             waited: false,
@@ -264,6 +282,9 @@ impl Crew {
             Takes::Ns(ns) => {
                 let read_at = now.plus_ns(ns);
                 crate::pipeline::threads::read_tracker(facts, &mut self.tracking, &mut self.publisher, now);
+                if let Some(to_link) = &mut self.to_link {
+                    self.tracking.publish_lively(now, to_link);
+                }
                 let next = machine.next_sample_at(now).min(now.plus_ns(POLL_AT_LEAST_NS));
                 self.tracking_at = next.max(read_at.plus_ns(POLL_REST_NS));
             }

@@ -31,7 +31,7 @@ use crate::telemetry::projector::ProjectorReport;
 use crate::telemetry::report::Report;
 use crew::Crew;
 use dpm_device::link::HostLink;
-use dpm_device::time::HostTime;
+use dpm_device::time::{DeviceTicks, HostTime};
 use dpm_device::tracker::Tracker;
 use dpm_device::transport::Transport;
 use dpm_handoff::channel::channel;
@@ -102,12 +102,22 @@ pub struct SentFrame<'a> {
     pub sent_at: HostTime,
     /// Begin of its slot, as the host sees it.
     pub due_at: HostTime,
+    /// The same on the projector's clock.
+    pub target_at: DeviceTicks,
+    /// From then on there is no light of it, on the projector's clock.
+    pub dark_from: DeviceTicks,
     /// Mid-exposure of the newest sample of the lit body that was seen longest ago; `None` if all bodies are dark.
     pub captured_at: Option<HostTime>,
     /// The longest time for which prediction may extend a track, nanoseconds.
     pub predict_ns: i64,
     /// Per tracked body: the pose for which it was drawn.
     pub poses: &'a [DAffine3],
+    /// The instant of `poses`.
+    pub centre_at: HostTime,
+    /// Per tracked body: the poses for which its first and its last planes were drawn; empty if they are all `poses`.
+    pub swept: [&'a [DAffine3]; 2],
+    /// The instants of `swept`.
+    pub swept_at: [HostTime; 2],
     /// Per tracked body: light falls on it.
     pub lit: &'a [bool],
     /// Its planes.
@@ -324,6 +334,9 @@ impl<M: Machine> SteppedRun<M> {
             Err(e) => return Self::failed(PipelineError::Render(e.into())),
         };
         let mut link = Box::new(HostLink::new(link_settings(&self.rig.config, self.rig.camera.raster)));
+        if self.rig.wants_tracks() {
+            link.want_tracks();
+        }
         let acknowledged =
             if self.rig.config.safety.acknowledge_faults { u32::MAX } else { ENDED_WITH_THE_LAST_RUN };
         let connecting = Connecting::begin(&mut link, acknowledged, now);
