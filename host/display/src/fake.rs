@@ -38,6 +38,8 @@ pub struct FakeState {
     pub ppm: i64,
     /// By how much stamps are late at most, nanoseconds: an X server on a busy machine.
     pub jitter_ns: i64,
+    /// So long after a picture was taken it is told, nanoseconds: a machine that is slow with interrupts.
+    pub told_late_ns: i64,
     /// Blanks are not counted.
     pub counts_none: bool,
     /// Blanks stop.
@@ -112,6 +114,7 @@ pub fn display(modes: &[Timing]) -> FakeState {
         missed: BTreeSet::new(),
         ppm: 0,
         jitter_ns: 0,
+        told_late_ns: 0,
         counts_none: false,
         is_stuck: false,
         refuses: false,
@@ -253,7 +256,9 @@ impl ScanOut for FakeKms {
 
     fn flips(&mut self, sink: &mut dyn FnMut(Flip)) {
         self.scan();
-        self.taken.drain(..).for_each(sink);
+        let told_until = self.now_ns() - self.with(|s| s.told_late_ns);
+        let told = self.taken.iter().take_while(|flip| flip.at_ns <= told_until).count();
+        self.taken.drain(..told).for_each(sink);
     }
 
     fn lost(&mut self) -> Option<DisplayError> {

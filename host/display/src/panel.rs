@@ -257,7 +257,9 @@ impl<S: ScanOut> Panel<S> {
                 self.firmware.advance_to(pacer.slot_at(self.next));
                 self.next += 1;
             }
-            self.counts.missed.fetch_add(blank.saturating_sub(expected), Ordering::Relaxed);
+            // A stamp that is told late comes after slots for whose blanks nothing could be handed over.
+            let newest = blank.max(self.next - 1);
+            self.counts.missed.fetch_add(newest.saturating_sub(expected), Ordering::Relaxed);
         } else {
             self.learned.push((flip.sequence, HostTime(flip.at_ns + self.offset_ns)));
         }

@@ -113,6 +113,28 @@ fn a_thread_that_is_late_counts_every_slot_that_it_missed() {
     assert_eq!(shown.len() as u32, status.frames_lit, "every frame that is told was shown");
 }
 
+/// A picture that is told to be taken only after the next slot has begun leaves that slot without a picture: it is counted.
+#[test]
+fn a_slot_that_begins_before_the_picture_on_its_way_is_told_is_counted() {
+    let mut rig = Rig::new(Encoding::Rgb8, |_| {});
+    rig.stream();
+    rig.send(10);
+    let counts = rig.cable.device().counts();
+    let [taken, missed] = [&counts.taken, &counts.missed].map(|n| n.load(Ordering::Relaxed));
+    // A slot begins 10.7 ms after the blank of the one before.
+    let slot = rig.slot();
+    with(&rig.shared, |s| s.told_late_ns = 12_000_000);
+    rig.pass(400_000_000);
+    with(&rig.shared, |s| s.told_late_ns = 0);
+    rig.pass(40_000_000);
+    let slots = rig.slot() - slot;
+    let [taken, missed] = [(&counts.taken, taken), (&counts.missed, missed)]
+        .map(|(n, before)| n.load(Ordering::Relaxed) - before);
+    assert!(missed >= 8, "{missed} missed of {slots}");
+    // A picture may be on its way at either end.
+    assert!((taken + missed).abs_diff(slots) <= 1, "{slots} slots, {taken} pictures taken, {missed} missed");
+}
+
 /// Every way in which the light must end is black at the next blank but one.
 #[test]
 fn light_ends_black() {

@@ -22,10 +22,10 @@ use dpm_handoff::wake::WaitPolicy;
 use drm::control::{connector, crtc, plane, Device as ControlDevice, LeaseId, RawResourceHandle};
 use drm::{ClientCapability, Device};
 
-use super::compositor::{Compositor, Manner, Seen};
-use super::{checksum, checksums, pixels, settings, stream, this_program, wait_for, HOLD, PATIENCE};
-
-const CONNECTOR: &str = "Virtual-1";
+use crate::checksum::{checksum, checksums, wait_for};
+use crate::compositor::{Compositor, Manner, Seen};
+use crate::rig::{pixels, settings, stream, CONNECTOR, PATIENCE};
+use crate::ways_out::{this_program, HOLD};
 
 /// The card, as the desktop drives it.
 struct Node(File);
@@ -165,7 +165,7 @@ fn open(access: Access) -> (DisplayTransport, Arc<dyn HostClock>) {
 pub(super) fn run_for_ever() {
     set_guardian(vec![this_program(), "guard".into()]);
     let (mut display, clock) = open(Access::Lent(Lender::Wayland));
-    stream(&mut display, clock.as_ref(), Encoding::Rgb8, |_| false);
+    stream(&mut display, clock.as_ref(), Encoding::Rgb8, |_, _| false);
 }
 
 /// Every test, with one desktop.
@@ -183,7 +183,7 @@ fn shown_taken_back_and_taken_up_again(desktop: &Arc<Desktop>) {
     println!("  {}", display.name());
     assert!(display.name().contains("lent by the Wayland compositor"), "{}", display.name());
     let told = checksums();
-    let sent = stream(&mut display, clock.as_ref(), Encoding::Rgb8, |sent| sent >= 60);
+    let sent = stream(&mut display, clock.as_ref(), Encoding::Rgb8, |sent, _| sent >= 60);
     let known: BTreeMap<u32, u64> =
         sent.iter().map(|(id, _)| (checksum(&pixels(Encoding::Rgb8, *id)), *id)).collect();
     let black = checksum(&vec![0; pixels(Encoding::Rgb8, 0).len()]);
@@ -225,12 +225,12 @@ fn shown_taken_back_and_taken_up_again(desktop: &Arc<Desktop>) {
     };
     reopen(&mut display);
     assert_eq!(desktop.leases(), 2, "it was asked again");
-    stream(&mut display, clock.as_ref(), Encoding::Rgb8, |sent| sent >= 20);
+    stream(&mut display, clock.as_ref(), Encoding::Rgb8, |sent, _| sent >= 20);
     assert!(desktop.is_shown());
     // As after unplugging: what is still lent is not asked for again.
     reopen(&mut display);
     assert_eq!(desktop.leases(), 2, "it was kept");
-    stream(&mut display, clock.as_ref(), Encoding::Rgb8, |sent| sent >= 20);
+    stream(&mut display, clock.as_ref(), Encoding::Rgb8, |sent, _| sent >= 20);
     drop(display);
     until("given back at the end", || desktop.lessees() == 0);
     assert!(!desktop.is_shown());
