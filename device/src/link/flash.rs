@@ -103,11 +103,29 @@ impl FlashLimiter {
     /// Observes the light of the next slot (0 when dark). Returns `true` if this slot makes more flashes in the last
     /// second than allowed: the light must go off and stay off for [`REST_US`].
     pub fn observe(&mut self, luminance: u32) -> bool {
-        self.sum += u64::from(luminance.min(FULL_LUMINANCE));
-        self.in_window += 1;
-        if self.in_window < self.slots_per_window {
-            return false;
+        self.repeated(luminance, 1)
+    }
+
+    /// Observes `slots` slots of the same light. Returns `true` as [`FlashLimiter::observe`] does, if any of them is one too
+    /// many.
+    pub fn repeated(&mut self, luminance: u32, slots: u64) -> bool {
+        let of_window = u64::from(self.slots_per_window);
+        // Light that has not changed for a second changes nothing more: whole windows only pass.
+        let idle = (slots / of_window).saturating_sub(2 * u64::from(self.windows_per_s));
+        let mut left = slots - idle * of_window;
+        let mut is_struck = false;
+        while left > 0 {
+            let taken = left.min(of_window - u64::from(self.in_window));
+            left -= taken;
+            self.sum += taken * u64::from(luminance.min(FULL_LUMINANCE));
+            self.in_window += taken as u32;
+            is_struck |= self.in_window == self.slots_per_window && self.window_ends();
         }
+        self.window = self.window.wrapping_add(idle as u32);
+        is_struck
+    }
+
+    fn window_ends(&mut self) -> bool {
         let mean = (self.sum / u64::from(self.in_window)) as u32;
         (self.sum, self.in_window) = (0, 0);
         self.window = self.window.wrapping_add(1);

@@ -10,7 +10,6 @@ mod light;
 mod types;
 
 use super::compact::Compactor;
-use super::flash::FlashLimiter;
 use super::limits::LimitReached;
 use super::message::{
     Config, ConfigRefusal, DeviceHello, DeviceState, Echo, Fault, FaultCode, HostHello, HostMessage, Status,
@@ -23,7 +22,7 @@ use crate::packet::{Codec, Header, Packet, MAX_CONTROL_BYTES, VERSION};
 use crate::time::{DeviceTicks, HostTime};
 use crate::transport::{Lane, SendError, Transport, TransportError};
 use inbox::{Inbox, ECHOES_KEPT};
-use light::LightCount;
+use light::{FlashCount, LightCount};
 pub use types::{
     DropReason, EchoSample, Epoch, LinkCounters, LinkError, LinkSettings, LinkState, SendOutcome, Verb,
 };
@@ -61,7 +60,8 @@ pub struct HostLink {
     echoes_sent: u32,
     frames_sent: u32,
     last_frame: Option<u32>,
-    flash: Option<FlashLimiter>,
+    /// Counts flashes.
+    flash: Option<FlashCount>,
     /// Counts the light against the limits.
     light: LightCount,
     /// The caller wants to send tracks, if the device follows them.
@@ -97,7 +97,7 @@ impl HostLink {
             Compactor::new(settings.raster, settings.schedule.len(), frame_ns, settings.codecs)
         });
         let (rate, limits) = (settings.rate, settings.limits);
-        let flash = settings.flash_limit.map(|limit| FlashLimiter::new(settings.rate, limit));
+        let flash = settings.flash_limit.map(|limit| FlashCount::new(settings.rate, limit));
         Self {
             settings,
             sessions,
@@ -145,6 +145,9 @@ impl HostLink {
         self.losses = 0;
         self.rest = None;
         self.light.new_session();
+        if let Some(flash) = &mut self.flash {
+            flash.new_session();
+        }
     }
 
     /// Permits light once the device is configured, shows the picture again after BLACK or FREEZE, or acknowledges latched

@@ -179,9 +179,9 @@ impl HostLink {
         // flash.
         let is_shown = self.ordered.is_none();
         let mut struck = None;
-        if let Some(limiter) = &mut self.flash {
-            if is_shown && limiter.observe(mean_luminance(raster, schedule, planes)) {
-                limiter.reset();
+        if let (Some(slots), Some(flash)) = (&self.slots, &mut self.flash) {
+            let luminance = is_shown.then(|| mean_luminance(raster, schedule, planes));
+            if flash.slot(slots, [target_at, dark_from], luminance) {
                 struck = Some((u64::from(REST_US), DropReason::FlashLimit));
             }
         }

@@ -1,5 +1,6 @@
-//! Computes what frames and their slots add to the light of the field, for the host's limiter.
+//! Computes what frames and their slots add to the light of the field and to its flashes, for the host's limiters.
 
+use crate::link::flash::FlashLimiter;
 use crate::link::limits::{LightLimiter, LightLimits, LimitReached};
 use crate::link::slots::SlotClock;
 use crate::time::{DeviceTicks, FrameRate};
@@ -18,20 +19,45 @@ pub(super) enum Shown {
     Nothing,
 }
 
+/// Which slots have been counted.
+#[derive(Debug, Default)]
+struct Counted {
+    /// Last slot counted in this session.
+    slot: Option<u64>,
+    /// The first slot in which the frame in it no longer repeats by itself.
+    over: u64,
+}
+
+impl Counted {
+    /// Counts on to the slot that `target_at` lies in, whose frame is lit until `dark_from`. Returns how many slots before it
+    /// repeat the frame before, and how many after these are dark: a slot without a frame of its own repeats the previous
+    /// one, until the light of that frame is over.
+    fn on_to(&mut self, clock: &SlotClock, [target_at, dark_from]: [DeviceTicks; 2]) -> [u64; 2] {
+        let slot = clock.slot_at(target_at).unwrap_or(0);
+        let passed = self.slot.map_or([0, 0], |last| {
+            let between = slot.saturating_sub(last + 1);
+            let repeats = between.min(self.over.saturating_sub(last + 1));
+            [repeats, between - repeats]
+        });
+        self.slot = Some(self.slot.map_or(slot, |last| last.max(slot)));
+        self.over = clock.slot_at(dark_from).map_or(slot, |k| k + 1);
+        passed
+    }
+}
+
 /// Counts the light of frames in the slots that they are sent for.
 #[derive(Debug)]
 pub(super) struct LightCount {
     limiter: Option<LightLimiter>,
-    /// Last slot counted in this session.
-    slot: Option<u64>,
-    /// Level of the frame in it, and the first slot in which that frame no longer repeats by itself.
+    counted: Counted,
+    /// Level of the frame in the last slot counted.
     level: u32,
-    over: u64,
 }
 
 impl LightCount {
     pub(super) fn new(rate: FrameRate, limits: &LightLimits) -> Self {
-        Self { limiter: LightLimiter::ahead(rate, limits, OBEYED_WITHIN_MS), slot: None, level: 0, over: 0 }
+        let limiter = LightLimiter::ahead(rate, limits, OBEYED_WITHIN_MS);
+        Self { limiter, counted: Counted::default(), level: 0 }
     }
 
     pub(super) fn is_off(&self) -> bool {
@@ -45,32 +71,135 @@ impl LightCount {
 
     /// Slots are counted anew, from the dark. Earlier light still counts, as if no time had passed.
     pub(super) fn new_session(&mut self) {
-        (self.slot, self.level) = (None, 0);
+        (self.counted.slot, self.level) = (None, 0);
     }
 
-    /// Counts a frame for the slot that `target_at` lies in; returns the limit that its light would exceed.
+    /// Counts a frame for the slot that `times`, its target and the end of its light, lie in; returns the limit that its light
+    /// would exceed.
     pub(super) fn slot(
         &mut self,
         clock: &SlotClock,
-        [target_at, dark_from]: [DeviceTicks; 2],
+        times: [DeviceTicks; 2],
         shown: Shown,
     ) -> Option<LimitReached> {
         let limiter = self.limiter.as_mut()?;
-        let slot = clock.slot_at(target_at).unwrap_or(0);
-        if let Some(last) = self.slot {
-            // A slot without a frame of its own repeats the previous one, until the light of that frame is over.
-            let between = slot.saturating_sub(last + 1);
-            let repeats = between.min(self.over.saturating_sub(last + 1));
-            limiter.repeated(self.level, repeats);
-            limiter.repeated(0, between - repeats);
-        }
-        self.slot = Some(self.slot.map_or(slot, |last| last.max(slot)));
-        self.over = clock.slot_at(dark_from).map_or(slot, |k| k + 1);
+        let [repeats, dark] = self.counted.on_to(clock, times);
+        limiter.repeated(self.level, repeats);
+        limiter.repeated(0, dark);
         match shown {
             Shown::New(level) => self.level = level,
-            Shown::Same => self.over = u64::MAX,
+            Shown::Same => self.counted.over = u64::MAX,
             Shown::Nothing => self.level = 0,
         }
         limiter.observe(self.level)
+    }
+}
+
+/// Counts the flashes of frames in the slots that they are sent for, as the device does that shows them.
+#[derive(Debug)]
+pub(super) struct FlashCount {
+    limiter: FlashLimiter,
+    counted: Counted,
+    /// Luminance of the frame in the last slot counted.
+    luminance: u32,
+}
+
+impl FlashCount {
+    pub(super) fn new(rate: FrameRate, limit: u8) -> Self {
+        Self { limiter: FlashLimiter::new(rate, limit), counted: Counted::default(), luminance: 0 }
+    }
+
+    /// Slots are counted anew, from the dark. Earlier flashes still count, as if no time had passed.
+    pub(super) fn new_session(&mut self) {
+        (self.counted.slot, self.luminance) = (None, 0);
+    }
+
+    /// Counts a frame of mean `luminance` for the slot that `times`, its target and the end of its light, lie in; `None` for a
+    /// frame that an order keeps dark, which counts neither as light nor as a flash. True if the field flashes too often: it
+    /// counts from the dark then.
+    pub(super) fn slot(
+        &mut self,
+        clock: &SlotClock,
+        times: [DeviceTicks; 2],
+        luminance: Option<u32>,
+    ) -> bool {
+        let [repeats, dark] = self.counted.on_to(clock, times);
+        let Some(luminance) = luminance else {
+            self.luminance = 0;
+            return false;
+        };
+        let in_repeats = self.limiter.repeated(self.luminance, repeats);
+        let in_dark = self.limiter.repeated(0, dark);
+        self.luminance = luminance;
+        let is_struck = self.limiter.observe(luminance) || in_repeats || in_dark;
+        if is_struck {
+            self.limiter.reset();
+            self.luminance = 0;
+        }
+        is_struck
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::link::flash::FULL_LUMINANCE;
+    use crate::rng::Draws;
+
+    /// A device that has no frame of its own for a slot shows the one before, and its limiter counts the slot: so does the
+    /// host's, and strikes first, however many slots its frames are held for.
+    #[test]
+    fn the_host_counts_flashes_as_often_as_the_device_and_strikes_first() {
+        for (rate, limit) in [(60, 3), (240, 3), (947, 3), (2000, 1)] {
+            let rate = FrameRate::new(rate, 1).unwrap();
+            let clock = SlotClock::new(DeviceTicks(0), 1_000_000_000, rate).unwrap();
+            let mut strikes = 0;
+            for seed in 0..40 {
+                let draws = Draws::new(seed);
+                let mut host = FlashCount::new(rate, limit);
+                let mut device = FlashLimiter::backstop(rate, limit);
+                let (mut slot, mut on, mut left) = (0, false, 0);
+                for i in 0..4000 {
+                    // Light that flashes up to 27 times a second, in frames that are held for one to four slots: counted by
+                    // frames, the fastest flashes would be averaged out.
+                    if left <= 0 {
+                        on = !on;
+                        let slots = u64::from(rate.num());
+                        left = (slots / 54 + draws.bits(2 * i) % (slots / 20 + 1)) as i64;
+                    }
+                    let held = 1 + draws.bits(2 * i + 1) % 4;
+                    left -= held as i64;
+                    let luminance = if on { FULL_LUMINANCE } else { 0 };
+                    let times = [slot, slot + 100].map(|slot| clock.start(slot));
+                    if host.slot(&clock, times, Some(luminance)) {
+                        strikes += 1;
+                        break;
+                    }
+                    assert!(
+                        !device.repeated(luminance, held),
+                        "the device strikes first: {rate:?}, seed {seed}, frame {i}"
+                    );
+                    slot += held;
+                }
+            }
+            assert!(strikes >= 30, "{rate:?}: {strikes} of 40 flashed too often");
+        }
+    }
+
+    /// Slots of the same light are as many single ones, whatever their number.
+    #[test]
+    fn repeated_light_is_counted_slot_by_slot() {
+        for rate in [24, 60, 947] {
+            let rate = FrameRate::new(rate, 1).unwrap();
+            let [mut at_once, mut one_by_one] = [FlashLimiter::new(rate, 3), FlashLimiter::new(rate, 3)];
+            let draws = Draws::new(rate.num().into());
+            for i in 0..400 {
+                let luminance = (draws.bits(2 * i) % 2) as u32 * FULL_LUMINANCE;
+                let slots = draws.bits(2 * i + 1) % (3 * u64::from(rate.num()));
+                let slots = if i % 3 == 0 { slots } else { slots % 40 };
+                let single = (0..slots).fold(false, |struck, _| one_by_one.observe(luminance) || struck);
+                assert_eq!(at_once.repeated(luminance, slots), single, "{rate:?}, {i}: {slots} slots");
+            }
+        }
     }
 }
