@@ -197,6 +197,9 @@ impl HostLink {
         }
         let Some((rest_us, reason)) = struck else { return Ok(()) };
         self.light.is_dark();
+        if let Some(flash) = &mut self.flash {
+            flash.is_dark();
+        }
         // If it does not get through now, `poll` repeats it until the device confirms it.
         let _ = self.give(now, Verb::Black, transport);
         self.rest = Some((now.plus_ns((rest_us * 1000) as i64), reason));

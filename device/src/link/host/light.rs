@@ -19,29 +19,36 @@ pub(super) enum Shown {
     Nothing,
 }
 
-/// Which slots have been counted.
+/// The frame on the mirrors, as far as the host knows, and up to which slot it has been counted.
 #[derive(Debug, Default)]
-struct Counted {
+struct Held {
     /// Last slot counted in this session.
     slot: Option<u64>,
-    /// The first slot in which the frame in it no longer repeats by itself.
+    /// The first slot in which the frame no longer repeats by itself.
     over: u64,
+    /// Its level or luminance; 0 for none.
+    value: u32,
 }
 
-impl Counted {
-    /// Counts on to the slot that `target_at` lies in, whose frame is lit until `dark_from`. Returns how many slots before it
-    /// repeat the frame before, and how many after these are dark: a slot without a frame of its own repeats the previous
-    /// one, until the light of that frame is over.
-    fn on_to(&mut self, clock: &SlotClock, [target_at, dark_from]: [DeviceTicks; 2]) -> [u64; 2] {
+impl Held {
+    /// Slots are counted anew, from the dark. Earlier light still counts, as if no time had passed.
+    fn new_session(&mut self) {
+        (self.slot, self.value) = (None, 0);
+    }
+
+    /// Counts on to the slot that `target_at` lies in, whose frame is lit until `dark_from`. Returns the light of the slots
+    /// before it, and how many they are: a slot without a frame of its own repeats the previous one, until the light of that
+    /// frame is over.
+    fn on_to(&mut self, clock: &SlotClock, [target_at, dark_from]: [DeviceTicks; 2]) -> [(u32, u64); 2] {
         let slot = clock.slot_at(target_at).unwrap_or(0);
-        let passed = self.slot.map_or([0, 0], |last| {
+        let [repeats, dark] = self.slot.map_or([0, 0], |last| {
             let between = slot.saturating_sub(last + 1);
             let repeats = between.min(self.over.saturating_sub(last + 1));
             [repeats, between - repeats]
         });
         self.slot = Some(self.slot.map_or(slot, |last| last.max(slot)));
         self.over = clock.slot_at(dark_from).map_or(slot, |k| k + 1);
-        passed
+        [(self.value, repeats), (0, dark)]
     }
 }
 
@@ -49,15 +56,12 @@ impl Counted {
 #[derive(Debug)]
 pub(super) struct LightCount {
     limiter: Option<LightLimiter>,
-    counted: Counted,
-    /// Level of the frame in the last slot counted.
-    level: u32,
+    held: Held,
 }
 
 impl LightCount {
     pub(super) fn new(rate: FrameRate, limits: &LightLimits) -> Self {
-        let limiter = LightLimiter::ahead(rate, limits, OBEYED_WITHIN_MS);
-        Self { limiter, counted: Counted::default(), level: 0 }
+        Self { limiter: LightLimiter::ahead(rate, limits, OBEYED_WITHIN_MS), held: Held::default() }
     }
 
     pub(super) fn is_off(&self) -> bool {
@@ -66,12 +70,12 @@ impl LightCount {
 
     /// The device is dark until a frame is sent.
     pub(super) fn is_dark(&mut self) {
-        self.level = 0;
+        self.held.value = 0;
     }
 
-    /// Slots are counted anew, from the dark. Earlier light still counts, as if no time had passed.
+    /// As [`Held::new_session`].
     pub(super) fn new_session(&mut self) {
-        (self.counted.slot, self.level) = (None, 0);
+        self.held.new_session();
     }
 
     /// Counts a frame for the slot that `times`, its target and the end of its light, lie in; returns the limit that its light
@@ -83,15 +87,15 @@ impl LightCount {
         shown: Shown,
     ) -> Option<LimitReached> {
         let limiter = self.limiter.as_mut()?;
-        let [repeats, dark] = self.counted.on_to(clock, times);
-        limiter.repeated(self.level, repeats);
-        limiter.repeated(0, dark);
-        match shown {
-            Shown::New(level) => self.level = level,
-            Shown::Same => self.counted.over = u64::MAX,
-            Shown::Nothing => self.level = 0,
+        for (level, slots) in self.held.on_to(clock, times) {
+            limiter.repeated(level, slots);
         }
-        limiter.observe(self.level)
+        match shown {
+            Shown::New(level) => self.held.value = level,
+            Shown::Same => self.held.over = u64::MAX,
+            Shown::Nothing => self.held.value = 0,
+        }
+        limiter.observe(self.held.value)
     }
 }
 
@@ -99,42 +103,42 @@ impl LightCount {
 #[derive(Debug)]
 pub(super) struct FlashCount {
     limiter: FlashLimiter,
-    counted: Counted,
-    /// Luminance of the frame in the last slot counted.
-    luminance: u32,
+    held: Held,
 }
 
 impl FlashCount {
     pub(super) fn new(rate: FrameRate, limit: u8) -> Self {
-        Self { limiter: FlashLimiter::new(rate, limit), counted: Counted::default(), luminance: 0 }
+        Self { limiter: FlashLimiter::new(rate, limit), held: Held::default() }
     }
 
-    /// Slots are counted anew, from the dark. Earlier flashes still count, as if no time had passed.
+    /// The device is dark until a frame is sent.
+    pub(super) fn is_dark(&mut self) {
+        self.held.value = 0;
+    }
+
+    /// As [`Held::new_session`].
     pub(super) fn new_session(&mut self) {
-        (self.counted.slot, self.luminance) = (None, 0);
+        self.held.new_session();
     }
 
     /// Counts a frame of mean `luminance` for the slot that `times`, its target and the end of its light, lie in; `None` for a
     /// frame that an order keeps dark, which counts neither as light nor as a flash. True if the field flashes too often: it
-    /// counts from the dark then.
+    /// is counted from the dark then.
     pub(super) fn slot(
         &mut self,
         clock: &SlotClock,
         times: [DeviceTicks; 2],
         luminance: Option<u32>,
     ) -> bool {
-        let [repeats, dark] = self.counted.on_to(clock, times);
-        let Some(luminance) = luminance else {
-            self.luminance = 0;
-            return false;
-        };
-        let in_repeats = self.limiter.repeated(self.luminance, repeats);
-        let in_dark = self.limiter.repeated(0, dark);
-        self.luminance = luminance;
-        let is_struck = self.limiter.observe(luminance) || in_repeats || in_dark;
+        let before = self.held.on_to(clock, times);
+        self.held.value = luminance.unwrap_or(0);
+        let Some(luminance) = luminance else { return false };
+        let mut is_struck = false;
+        for (luminance, slots) in before.into_iter().chain([(luminance, 1)]) {
+            is_struck |= self.limiter.repeated(luminance, slots);
+        }
         if is_struck {
             self.limiter.reset();
-            self.luminance = 0;
         }
         is_struck
     }

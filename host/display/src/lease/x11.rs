@@ -10,7 +10,8 @@ use std::time::{Duration, Instant};
 use rustix::event::{poll, PollFd, PollFlags};
 use rustix::net::SocketAddrUnix;
 use x11rb::connection::{Connection as _, RequestConnection as _};
-use x11rb::errors::{ReplyError, ReplyOrIdError};
+use x11rb::cookie::Cookie;
+use x11rb::errors::{ConnectionError, ReplyError, ReplyOrIdError};
 use x11rb::protocol::randr::{self, ConnectionExt as _};
 use x11rb::protocol::xproto::{AtomEnum, ConnectionExt as _};
 use x11rb::protocol::ErrorKind;
@@ -18,6 +19,7 @@ use x11rb::reexports::x11rb_protocol::parse_display::{parse_display, ConnectAddr
 use x11rb::reexports::x11rb_protocol::xauth::get_auth;
 use x11rb::rust_connection::{DefaultStream, PollMode, RustConnection, Stream};
 use x11rb::utils::RawFdContainer;
+use x11rb::x11_utils::TryParse;
 
 use super::names::{find, Output};
 use super::{connect_to, left, Lease, Refusal};
@@ -138,9 +140,9 @@ fn broken(error: impl Into<ReplyOrIdError>) -> Refusal {
     })
 }
 
-/// Broken or refused.
-fn of_reply(error: ReplyError) -> Refusal {
-    broken(ReplyOrIdError::from(error))
+/// What the server answers to a request.
+fn answer<R: TryParse>(asked: Result<Cookie<'_, Server, R>, ConnectionError>) -> Result<R, Refusal> {
+    asked.map_err(broken)?.reply().map_err(broken)
 }
 
 /// Asks the server that `server` is connected to. `kernel`: numbers and names of the kernel's connectors.
@@ -157,24 +159,19 @@ pub(super) fn lease_of(
     if server.extension_information(randr::X11_EXTENSION_NAME).map_err(broken)?.is_none() {
         return Err(Refusal::new("it has no extension RandR; use a bare console, or another server"));
     }
-    let version = server.randr_query_version(1, 6).map_err(broken)?.reply().map_err(of_reply)?;
+    let version = answer(server.randr_query_version(1, 6))?;
     let (major, minor) = (version.major_version, version.minor_version);
     if (major, minor) < (1, 6) {
         return Err(Refusal::new(format!(
             "it speaks RandR {major}.{minor}, and leases came with 1.6; use a newer server, or a bare console"
         )));
     }
-    let resources =
-        server.randr_get_screen_resources_current(root).map_err(broken)?.reply().map_err(of_reply)?;
+    let resources = answer(server.randr_get_screen_resources_current(root))?;
     let outputs = outputs(&server, &resources)?;
     let output = choose(&outputs, connector, kernel).map_err(|(what, is_lent)| Refusal { what, is_lent })?;
     let mut crtcs = Vec::new();
     for crtc in &output.crtcs {
-        let info = server
-            .randr_get_crtc_info(*crtc, resources.config_timestamp)
-            .map_err(broken)?
-            .reply()
-            .map_err(of_reply)?;
+        let info = answer(server.randr_get_crtc_info(*crtc, resources.config_timestamp))?;
         if info.mode == 0 && info.outputs.is_empty() {
             crtcs.push(*crtc);
         }
@@ -189,20 +186,16 @@ fn outputs(
     server: &Server,
     resources: &randr::GetScreenResourcesCurrentReply,
 ) -> Result<Vec<Output>, Refusal> {
-    let property = server.intern_atom(true, b"CONNECTOR_ID").map_err(broken)?.reply().map_err(of_reply)?.atom;
+    let property = answer(server.intern_atom(true, b"CONNECTOR_ID"))?.atom;
     let mut all = Vec::new();
     for id in &resources.outputs {
-        let info = server
-            .randr_get_output_info(*id, resources.config_timestamp)
-            .map_err(broken)?
-            .reply()
-            .map_err(of_reply)?;
+        let info = answer(server.randr_get_output_info(*id, resources.config_timestamp))?;
         // An atom that no driver has named is 0.
         let connector_id = if property == 0 {
             None
         } else {
             let asked = server.randr_get_output_property(*id, property, AtomEnum::ANY, 0, 1, false, false);
-            let told = asked.map_err(broken)?.reply().map_err(of_reply)?;
+            let told = answer(asked)?;
             if told.format == 32 {
                 told.data.first_chunk().map(|bytes| u32::from_ne_bytes(*bytes))
             } else {
@@ -309,7 +302,7 @@ fn create(
                     e.error_kind
                 )));
             }
-            Err(e) => return Err(of_reply(e)),
+            Err(e) => return Err(broken(e)),
         }
     }
     Err(refused.unwrap_or_else(|| {

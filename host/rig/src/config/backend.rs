@@ -203,10 +203,7 @@ impl DisplayEncoding {
 
     /// How a DLPC900 cuts a pixel into patterns.
     pub const fn video_bits(self) -> VideoBits {
-        match VideoBits::new(self.parts().depth) {
-            Some(bits) => bits,
-            None => VideoBits::PLANES,
-        }
+        VideoBits::new(self.parts().depth).expect("each word's bits fill a pixel")
     }
 
     /// How much light the planes of a channel give behind a DLPC900: the bits of a pattern weigh as those of a number do.

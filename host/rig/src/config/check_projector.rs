@@ -69,30 +69,17 @@ pub(super) fn projector(rig: &RigConfig, reader: &mut Reader) {
     if let ProjectorBackend::Display(display) = &p.backend {
         check_display(p, display, reader);
     }
-    if matches!(p.backend, ProjectorBackend::Window(_)) && p.weights == PlaneWeights::Equal {
-        contradict(
-            reader,
-            &[
-                ("projector.weights", format!("{:?}", p.weights.word())),
-                ("projector.backend.kind", format!("{:?}", p.backend.word())),
-            ],
-            "a window shows code values, whose bits have binary weights",
-            "leave `projector.weights` out".into(),
-        );
-    }
     if let ProjectorBackend::Alp(alp) = &p.backend {
         check_alp(p, alp, reader);
     }
-    if matches!(p.backend, ProjectorBackend::Dlpc900(_)) && p.weights == PlaneWeights::Equal {
-        contradict(
-            reader,
-            &[
-                ("projector.weights", format!("{:?}", p.weights.word())),
-                ("projector.backend.kind", format!("{:?}", p.backend.word())),
-            ],
-            "a DLPC900 weights the bits of loaded frames itself",
-            "leave `projector.weights` out".into(),
-        );
+    let no_equal_planes = match &p.backend {
+        ProjectorBackend::Window(_) => Some("a window shows code values, whose bits have binary weights"),
+        ProjectorBackend::Dlpc900(_) => Some("a DLPC900 weights the bits of loaded frames itself"),
+        _ => None,
+    };
+    if let (Some(why), PlaneWeights::Equal) = (no_equal_planes, p.weights) {
+        let backend = ("projector.backend.kind", format!("{:?}", p.backend.word()));
+        contradict(reader, &[weights_of(p), backend], why, "leave `projector.weights` out".into());
     }
     if matches!(p.backend, ProjectorBackend::Dlpc900(_)) && num > 120 * den {
         contradict(
@@ -105,6 +92,11 @@ pub(super) fn projector(rig: &RigConfig, reader: &mut Reader) {
             "lower `projector.frame_rate` to 120 or choose another backend".into(),
         );
     }
+}
+
+/// The weights, as a contradiction names them.
+fn weights_of(p: &ProjectorConfig) -> (&'static str, String) {
+    ("projector.weights", format!("{:?}", p.weights.word()))
 }
 
 /// A display, and the controller behind it.
@@ -137,11 +129,7 @@ fn check_display(p: &ProjectorConfig, display: &DisplayConfig, reader: &mut Read
     if display.encoding == DisplayEncoding::Rgb8 && p.weights == PlaneWeights::Equal && !is_behind {
         contradict(
             reader,
-            &[
-                ("projector.weights", format!("{:?}", p.weights.word())),
-                encoding,
-                ("projector.backend.kind", format!("{:?}", p.backend.word())),
-            ],
+            &[weights_of(p), encoding, ("projector.backend.kind", format!("{:?}", p.backend.word()))],
             "the bits of a code value have binary weights",
             "leave `projector.weights` out, or use encoding = \"planes24\"".into(),
         );
@@ -161,10 +149,7 @@ fn check_behind(p: &ProjectorConfig, display: &DisplayConfig, reader: &mut Reade
         };
         contradict(
             reader,
-            &[
-                ("projector.weights", format!("{:?}", p.weights.word())),
-                ("projector.backend.encoding", shown(display.encoding)),
-            ],
+            &[weights_of(p), ("projector.backend.encoding", shown(display.encoding))],
             why,
             "leave `projector.weights` out: the encoding decides it".into(),
         );
