@@ -254,3 +254,6 @@ fn calibration(p: &ProjectorConfig, reader: &mut Reader) {
         refuse(reader, &[key], problem, "remove one of the two".into());
     }
 }
+
+#[cfg(test)]
+mod tests;

@@ -1,0 +1,133 @@
+//! What a rig file says of its projector: instants and planes of displays and of controllers behind them, and refusals.
+
+use crate::config::*;
+use dpm_device::dlpc900::lut::led;
+use dpm_device::planes::{Channel, PlaneSchedule};
+use std::path::Path;
+
+/// The template of a display is a rig, and its light is later than its slots: by the time until the blank and until the
+/// middle row, and by the projector's own latency.
+#[test]
+fn the_light_of_a_display_is_later_than_its_slots() {
+    const RIG: &str = include_str!("../../../../../rigs/display.toml");
+    let parsed = |keys: &[&str]| {
+        let flags = keys.iter().map(|k| (*k).to_owned()).collect();
+        RigConfig::parse("rigs/display.toml", RIG, Path::new(""), &Overrides { variables: vec![], flags })
+    };
+    let rig = parsed(&[]).unwrap_or_else(|e| panic!("{e}"));
+    let ProjectorBackend::Display(display) = &rig.projector.backend else { panic!("a display") };
+    assert_eq!((display.encoding, display.commit_us), (DisplayEncoding::Rgb8, None));
+    assert_eq!(display.lease, DisplayLease::Auto);
+    for (word, lease) in
+        [("off", DisplayLease::Off), ("x11", DisplayLease::X11), ("wayland", DisplayLease::Wayland)]
+    {
+        let rig = parsed(&[&format!("projector.backend.lease={word}")]).unwrap_or_else(|e| panic!("{e}"));
+        let ProjectorBackend::Display(display) = &rig.projector.backend else { panic!("a display") };
+        assert_eq!(display.lease, lease);
+    }
+    let told = parsed(&["projector.backend.lease=mir"]).unwrap_err().to_string();
+    assert!(told.contains("projector.backend.lease") && told.contains("wayland"), "{told}");
+    // 16 ms, 8 ms, and half of a sixtieth of a second.
+    assert_eq!(rig.projector.light_delay_ns(), 24_000_000 + 8_333_333);
+    assert!(rig.projector.plane_timing() == PlaneTiming::Held);
+    let alp = RigConfig::parse(
+        "rigs/alp.toml",
+        include_str!("../../../../../rigs/alp.toml"),
+        Path::new(""),
+        &Overrides { variables: vec![], flags: vec![] },
+    )
+    .unwrap_or_else(|e| panic!("{e}"));
+    assert_eq!(alp.projector.plane_timing(), PlaneTiming::ByWeight);
+    let window = RigConfig::parse(
+        "rigs/window.toml",
+        include_str!("../../../../../rigs/window.toml"),
+        Path::new(""),
+        &Overrides { variables: vec![], flags: vec![] },
+    )
+    .unwrap_or_else(|e| panic!("{e}"));
+    // Three quarters of a sixtieth of a second, and half of it.
+    assert_eq!(window.projector.light_delay_ns(), 16_666_667 / 4 * 3 + 8_333_333);
+    assert!(window.projector.plane_timing() == PlaneTiming::Held);
+    let usb = parsed(&["projector.backend={kind=\"usb\"}"]).unwrap_or_else(|e| panic!("{e}"));
+    assert_eq!(
+        (usb.projector.light_delay_ns(), usb.projector.plane_timing()),
+        (16_000_000, PlaneTiming::Equal)
+    );
+    for (key, names) in [
+        ("projector.backend.mode=\"1920\"", "projector.backend.mode"),
+        ("projector.backend={kind=\"display\",encoding=\"planes24\"}", "projector.planes = 24"),
+        ("projector.weights=\"equal\"", "projector.weights"),
+        ("projector={backend={kind=\"window\"},weights=\"equal\"}", "a window shows code values"),
+        ("projector.backend.commit_us=1", "projector.backend.commit_us"),
+        ("real_time.pace=\"virtual\"", "runs on its own clock"),
+    ] {
+        let told = parsed(&[key, "projector.planes=8"]).expect_err("refused").to_string();
+        assert!(told.contains(names), "{told}");
+    }
+}
+
+/// A controller behind a display shows a frame once it has all of it, and each of its planes for the same time; what does not
+/// fit it is refused.
+#[test]
+fn a_controller_behind_a_display_shows_frames_that_have_arrived() {
+    const RIG: &str = include_str!("../../../../../rigs/dlpc900-live.toml");
+    let parsed = |keys: &[&str]| {
+        let flags = keys.iter().map(|k| (*k).to_owned()).collect();
+        RigConfig::parse(
+            "rigs/dlpc900-live.toml",
+            RIG,
+            Path::new(""),
+            &Overrides { variables: vec![], flags },
+        )
+    };
+    let projector = parsed(&[]).unwrap_or_else(|e| panic!("{e}")).projector;
+    assert_eq!(projector.light_delay_ns(), 8_000_000 + 2 * (16_666_667 / 2));
+    assert_eq!(projector.plane_timing(), PlaneTiming::Equal);
+    assert_eq!(projector.lit_of_frame_ns(), [24 * 620_000, 16_666_666]);
+    assert!(!projector.is_lit_without_gap());
+    assert_eq!(projector.schedule(), PlaneSchedule::equal_rgb24().filled());
+    // The encoding says everything of the planes: their number of bits, their LEDs, their instants, their weights.
+    let rgb8 = "projector.backend.encoding=\"rgb8\"";
+    for (encoding, patterns, white, exposure_us) in [
+        ("rgb8", 3, false, 4960),
+        ("rgb4x2", 6, false, 2480),
+        ("rgb2x4", 12, false, 1240),
+        ("planes24", 24, false, 620),
+        ("binary24", 24, false, 620),
+        ("mono8x3", 3, true, 4960),
+        ("mono6x4", 4, true, 3720),
+        ("mono4x6", 6, true, 2480),
+        ("mono3x8", 8, true, 1860),
+        ("mono2x12", 12, true, 1240),
+        ("mono1x24", 24, true, 620),
+    ] {
+        let key = format!("projector.backend.encoding={encoding:?}");
+        let p = parsed(&[&key]).unwrap_or_else(|e| panic!("{encoding}: {e}")).projector;
+        let (timing, schedule) = (p.plane_timing(), p.schedule());
+        match patterns {
+            24 => assert_eq!(timing, PlaneTiming::Equal),
+            _ => assert_eq!(timing, PlaneTiming::Together { planes: 24 / patterns as u8 }),
+        }
+        assert_eq!(p.lit_of_frame_ns(), [patterns * exposure_us * 1000, 16_666_666], "{encoding}");
+        assert_eq!(schedule.planes().iter().all(|p| p.channel == Channel::White), white, "{encoding}");
+        assert_eq!((schedule.len(), schedule.fills(), p.full_light()), (24, true, 255), "{encoding}");
+        let ProjectorBackend::Display(display) = &p.backend else { panic!() };
+        let video = display.video_patterns(p.frame_rate, &schedule).unwrap().unwrap();
+        assert_eq!(video.entries.len() as i64, patterns, "{encoding}");
+        let lit_us: u32 = video.entries.iter().map(|e| e.exposure_us).sum();
+        assert!(video.entries.iter().all(|e| e.leds == led::WHITE) == white && lit_us < 16_417, "{encoding}");
+    }
+    for (keys, names) in [
+        (&["projector.weights=\"binary\""][..], "lights all planes of a pixel equally long"),
+        (&[rgb8, "projector.weights=\"equal\""], "weights the bits of a pattern itself"),
+        (&["projector.width=1024"], "a DLP6500 has 1920 x 1080 mirrors"),
+        (&["projector.backend.dlpc900.panel=\"dlp9000\""], "a DLP9000 has 2560 x 1600 mirrors"),
+        (&["projector.backend.dlpc900.exposure_us=685"], "not within 105 to 684 us"),
+        (&["projector.frame_rate=144"], "at most 120 video frames/s"),
+        (&[rgb8, "projector.frame_rate=90"], "lower the frame rate"),
+        (&[rgb8, "projector.planes=8"], "set projector.planes = 24"),
+    ] {
+        let told = parsed(keys).expect_err("refused").to_string();
+        assert!(told.contains(names), "{keys:?}: {told}");
+    }
+}
