@@ -22,7 +22,7 @@ use crate::packet::{Codec, Header, Packet, MAX_CONTROL_BYTES, VERSION};
 use crate::time::{DeviceTicks, HostTime};
 use crate::transport::{Lane, SendError, Transport, TransportError};
 use inbox::{Inbox, ECHOES_KEPT};
-use light::{FlashCount, LightCount};
+use light::FieldCount;
 pub use types::{
     DropReason, EchoSample, Epoch, LinkCounters, LinkError, LinkSettings, LinkState, SendOutcome, Verb,
 };
@@ -60,10 +60,8 @@ pub struct HostLink {
     echoes_sent: u32,
     frames_sent: u32,
     last_frame: Option<u32>,
-    /// Counts flashes.
-    flash: Option<FlashCount>,
-    /// Counts the light against the limits.
-    light: LightCount,
+    /// Counts light and flashes against the limits.
+    field: FieldCount,
     /// The caller wants to send tracks, if the device follows them.
     wants_tracks: bool,
     /// TRACKS sent in this session.
@@ -96,8 +94,7 @@ impl HostLink {
             let frame_ns = settings.rate.slot_len_ns(0);
             Compactor::new(settings.raster, settings.schedule.len(), frame_ns, settings.codecs)
         });
-        let (rate, limits) = (settings.rate, settings.limits);
-        let flash = settings.flash_limit.map(|limit| FlashCount::new(settings.rate, limit));
+        let field = FieldCount::new(&settings);
         Self {
             settings,
             sessions,
@@ -114,8 +111,7 @@ impl HostLink {
             echoes_sent: 0,
             frames_sent: 0,
             last_frame: None,
-            flash,
-            light: LightCount::new(rate, &limits),
+            field,
             wants_tracks: false,
             tracks_sent: 0,
             rest: None,
@@ -144,10 +140,7 @@ impl HostLink {
         self.key_due = true;
         self.losses = 0;
         self.rest = None;
-        self.light.new_session();
-        if let Some(flash) = &mut self.flash {
-            flash.new_session();
-        }
+        self.field.new_session();
     }
 
     /// Permits light once the device is configured, shows the picture again after BLACK or FREEZE, or acknowledges latched

@@ -1,10 +1,9 @@
 //! Sends one frame's planes as packets: whole or not at all.
 
-use super::light::Shown;
+use super::light::{Reached, Shown};
 use super::{DropReason, HostLink, LinkState, SendOutcome, Verb};
 use crate::link::compact::PlaneForm;
-use crate::link::flash::{mean_luminance, REST_US};
-use crate::link::limits::light_level;
+use crate::link::flash::REST_US;
 use crate::link::message::{Commit, HostMessage};
 use crate::packet::MAX_CONTROL_BYTES;
 use crate::packet::{frame_newer, Codec, Header, MessageType, Packet};
@@ -174,32 +173,20 @@ impl HostLink {
         if let Some((_, reason)) = self.rest {
             return Err(reason);
         }
-        let (raster, schedule) = (self.settings.raster, &self.settings.schedule);
-        // Frames are sent even while an order keeps them dark. A frame that is not lit counts neither as light nor as a
-        // flash.
-        let is_shown = self.ordered.is_none();
-        let mut struck = None;
-        if let (Some(slots), Some(flash)) = (&self.slots, &mut self.flash) {
-            let luminance = is_shown.then(|| mean_luminance(raster, schedule, planes));
-            if flash.slot(slots, [target_at, dark_from], luminance) {
-                struck = Some((u64::from(REST_US), DropReason::FlashLimit));
+        let Some(slots) = self.slots else { return Ok(()) };
+        // Frames are sent even while an order keeps them dark.
+        let shown = match self.ordered {
+            None => Shown::New(planes),
+            Some(Verb::Freeze) => Shown::Same,
+            Some(_) => Shown::Nothing,
+        };
+        let (rest_us, reason) = match self.field.slot(&slots, [target_at, dark_from], shown) {
+            None => return Ok(()),
+            Some(Reached::Flashes) => (u64::from(REST_US), DropReason::FlashLimit),
+            Some(Reached::Light(limit)) => {
+                (self.settings.limits.rest_us(limit), DropReason::LightLimit(limit))
             }
-        }
-        if let (Some(slots), false) = (self.slots, self.light.is_off()) {
-            let shown = match self.ordered {
-                None => Shown::New(light_level(raster, schedule, planes)),
-                Some(Verb::Freeze) => Shown::Same,
-                Some(_) => Shown::Nothing,
-            };
-            if let Some(limit) = self.light.slot(&slots, [target_at, dark_from], shown) {
-                struck = Some((self.settings.limits.rest_us(limit), DropReason::LightLimit(limit)));
-            }
-        }
-        let Some((rest_us, reason)) = struck else { return Ok(()) };
-        self.light.is_dark();
-        if let Some(flash) = &mut self.flash {
-            flash.is_dark();
-        }
+        };
         // If it does not get through now, `poll` repeats it until the device confirms it.
         let _ = self.give(now, Verb::Black, transport);
         self.rest = Some((now.plus_ns((rest_us * 1000) as i64), reason));

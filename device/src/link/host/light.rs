@@ -1,45 +1,123 @@
 //! Computes what frames and their slots add to the light of the field and to its flashes, for the host's limiters.
 
-use crate::link::flash::FlashLimiter;
-use crate::link::limits::{LightLimiter, LightLimits, LimitReached};
+use super::LinkSettings;
+use crate::link::flash::{mean_luminance, FlashLimiter};
+use crate::link::limits::{light_level, LightLimiter, LimitReached};
 use crate::link::slots::SlotClock;
-use crate::time::{DeviceTicks, FrameRate};
+use crate::planes::{PlaneSchedule, Raster};
+use crate::time::DeviceTicks;
 
 /// How long the device may continue to show its frames after the host has sent the order to go dark.
 const OBEYED_WITHIN_MS: u32 = 50;
 
 /// What a slot shows.
 #[derive(Clone, Copy, Debug)]
-pub(super) enum Shown {
-    /// A frame of this level.
-    New(u32),
+pub(super) enum Shown<'a> {
+    /// A frame of these planes.
+    New(&'a [u8]),
     /// The frame on the mirrors.
     Same,
     /// Nothing.
     Nothing,
 }
 
-/// The frame on the mirrors, as far as the host knows, and up to which slot it has been counted.
-#[derive(Debug, Default)]
-struct Held {
-    /// Last slot counted in this session.
-    slot: Option<u64>,
-    /// The first slot in which the frame no longer repeats by itself.
-    over: u64,
-    /// Its level or luminance; 0 for none.
-    value: u32,
+/// Which limit the field would exceed.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(super) enum Reached {
+    /// That of flashes.
+    Flashes,
+    /// One of those on light.
+    Light(LimitReached),
 }
 
-impl Held {
-    /// Slots are counted anew, from the dark. Earlier light still counts, as if no time had passed.
-    fn new_session(&mut self) {
-        (self.slot, self.value) = (None, 0);
+/// How bright the frame on the mirrors is; zeros for none.
+#[derive(Clone, Copy, Debug, Default)]
+struct Brightness {
+    /// By [`light_level`].
+    level: u32,
+    /// By [`mean_luminance`].
+    luminance: u32,
+}
+
+/// Counts light and flashes of frames in the slots that they are sent for, as the device does that shows them.
+#[derive(Debug)]
+pub(super) struct FieldCount {
+    raster: Raster,
+    schedule: PlaneSchedule,
+    light: Option<LightLimiter>,
+    flash: Option<FlashLimiter>,
+    /// Last slot counted in this session.
+    slot: Option<u64>,
+    /// The frame in it, and the first slot in which that frame no longer repeats by itself.
+    held: Brightness,
+    over: u64,
+}
+
+impl FieldCount {
+    pub(super) fn new(settings: &LinkSettings) -> Self {
+        let LinkSettings { raster, schedule, rate, .. } = *settings;
+        Self {
+            raster,
+            schedule,
+            light: LightLimiter::ahead(rate, &settings.limits, OBEYED_WITHIN_MS),
+            flash: settings.flash_limit.map(|limit| FlashLimiter::new(rate, limit)),
+            slot: None,
+            held: Brightness::default(),
+            over: 0,
+        }
     }
 
-    /// Counts on to the slot that `target_at` lies in, whose frame is lit until `dark_from`. Returns the light of the slots
-    /// before it, and how many they are: a slot without a frame of its own repeats the previous one, until the light of that
-    /// frame is over.
-    fn on_to(&mut self, clock: &SlotClock, [target_at, dark_from]: [DeviceTicks; 2]) -> [(u32, u64); 2] {
+    /// Slots are counted anew, from the dark. Earlier light and flashes still count, as if no time had passed.
+    pub(super) fn new_session(&mut self) {
+        (self.slot, self.held) = (None, Brightness::default());
+    }
+
+    /// Counts a frame for the slot that `times`, its target and the end of its light, lie in; returns the limit that it would
+    /// exceed. The device is dark then, until a frame is sent.
+    ///
+    /// What an order keeps from being shown counts neither as light nor as a flash.
+    pub(super) fn slot(
+        &mut self,
+        clock: &SlotClock,
+        times: [DeviceTicks; 2],
+        shown: Shown<'_>,
+    ) -> Option<Reached> {
+        let before = self.on_to(clock, times);
+        match shown {
+            Shown::New(planes) => self.held = self.brightness(planes),
+            Shown::Same => self.over = u64::MAX,
+            Shown::Nothing => self.held = Brightness::default(),
+        }
+        let slots = before.into_iter().chain([(self.held, 1)]);
+        let flashes = self.flash.as_mut().is_some_and(|limiter| {
+            let counts = matches!(shown, Shown::New(_));
+            let is_struck = counts
+                && slots.clone().fold(false, |struck, (b, n)| limiter.repeated(b.luminance, n) || struck);
+            if is_struck {
+                limiter.reset();
+            }
+            is_struck
+        });
+        let light = self.light.as_mut().and_then(|limiter| {
+            let [repeats, dark] = before;
+            limiter.repeated(repeats.0.level, repeats.1);
+            limiter.repeated(dark.0.level, dark.1);
+            limiter.observe(self.held.level)
+        });
+        let reached = light.map(Reached::Light).or(flashes.then_some(Reached::Flashes));
+        if reached.is_some() {
+            self.held = Brightness::default();
+        }
+        reached
+    }
+
+    /// Counts on to the slot of a frame. Returns the slots before it and how bright they are: a slot without a frame of its own
+    /// repeats the previous one, until the light of that frame is over.
+    fn on_to(
+        &mut self,
+        clock: &SlotClock,
+        [target_at, dark_from]: [DeviceTicks; 2],
+    ) -> [(Brightness, u64); 2] {
         let slot = clock.slot_at(target_at).unwrap_or(0);
         let [repeats, dark] = self.slot.map_or([0, 0], |last| {
             let between = slot.saturating_sub(last + 1);
@@ -48,99 +126,22 @@ impl Held {
         });
         self.slot = Some(self.slot.map_or(slot, |last| last.max(slot)));
         self.over = clock.slot_at(dark_from).map_or(slot, |k| k + 1);
-        [(self.value, repeats), (0, dark)]
-    }
-}
-
-/// Counts the light of frames in the slots that they are sent for.
-#[derive(Debug)]
-pub(super) struct LightCount {
-    limiter: Option<LightLimiter>,
-    held: Held,
-}
-
-impl LightCount {
-    pub(super) fn new(rate: FrameRate, limits: &LightLimits) -> Self {
-        Self { limiter: LightLimiter::ahead(rate, limits, OBEYED_WITHIN_MS), held: Held::default() }
+        [(self.held, repeats), (Brightness::default(), dark)]
     }
 
-    pub(super) fn is_off(&self) -> bool {
-        self.limiter.is_none()
-    }
-
-    /// The device is dark until a frame is sent.
-    pub(super) fn is_dark(&mut self) {
-        self.held.value = 0;
-    }
-
-    /// As [`Held::new_session`].
-    pub(super) fn new_session(&mut self) {
-        self.held.new_session();
-    }
-
-    /// Counts a frame for the slot that `times`, its target and the end of its light, lie in; returns the limit that its light
-    /// would exceed.
-    pub(super) fn slot(
-        &mut self,
-        clock: &SlotClock,
-        times: [DeviceTicks; 2],
-        shown: Shown,
-    ) -> Option<LimitReached> {
-        let limiter = self.limiter.as_mut()?;
-        for (level, slots) in self.held.on_to(clock, times) {
-            limiter.repeated(level, slots);
+    /// Of a frame of `planes`, for the limits that are on.
+    fn brightness(&self, planes: &[u8]) -> Brightness {
+        let of = |is_on: bool, measure: fn(Raster, &PlaneSchedule, &[u8]) -> u32| {
+            if is_on {
+                measure(self.raster, &self.schedule, planes)
+            } else {
+                0
+            }
+        };
+        Brightness {
+            level: of(self.light.is_some(), light_level),
+            luminance: of(self.flash.is_some(), mean_luminance),
         }
-        match shown {
-            Shown::New(level) => self.held.value = level,
-            Shown::Same => self.held.over = u64::MAX,
-            Shown::Nothing => self.held.value = 0,
-        }
-        limiter.observe(self.held.value)
-    }
-}
-
-/// Counts the flashes of frames in the slots that they are sent for, as the device does that shows them.
-#[derive(Debug)]
-pub(super) struct FlashCount {
-    limiter: FlashLimiter,
-    held: Held,
-}
-
-impl FlashCount {
-    pub(super) fn new(rate: FrameRate, limit: u8) -> Self {
-        Self { limiter: FlashLimiter::new(rate, limit), held: Held::default() }
-    }
-
-    /// The device is dark until a frame is sent.
-    pub(super) fn is_dark(&mut self) {
-        self.held.value = 0;
-    }
-
-    /// As [`Held::new_session`].
-    pub(super) fn new_session(&mut self) {
-        self.held.new_session();
-    }
-
-    /// Counts a frame of mean `luminance` for the slot that `times`, its target and the end of its light, lie in; `None` for a
-    /// frame that an order keeps dark, which counts neither as light nor as a flash. True if the field flashes too often: it
-    /// is counted from the dark then.
-    pub(super) fn slot(
-        &mut self,
-        clock: &SlotClock,
-        times: [DeviceTicks; 2],
-        luminance: Option<u32>,
-    ) -> bool {
-        let before = self.held.on_to(clock, times);
-        self.held.value = luminance.unwrap_or(0);
-        let Some(luminance) = luminance else { return false };
-        let mut is_struck = false;
-        for (luminance, slots) in before.into_iter().chain([(luminance, 1)]) {
-            is_struck |= self.limiter.repeated(luminance, slots);
-        }
-        if is_struck {
-            self.limiter.reset();
-        }
-        is_struck
     }
 }
 
@@ -148,7 +149,24 @@ impl FlashCount {
 mod tests {
     use super::*;
     use crate::link::flash::FULL_LUMINANCE;
+    use crate::link::{Epoch, LightLimits, Underrun};
     use crate::rng::Draws;
+    use crate::time::FrameRate;
+
+    fn settings(rate: FrameRate, flash_limit: u8) -> LinkSettings {
+        LinkSettings {
+            raster: Raster::new(8, 1).unwrap(),
+            schedule: PlaneSchedule::mono8(),
+            rate,
+            watchdog_us: 1,
+            underrun: Underrun::Repeat,
+            late_slots: 0,
+            epoch: Epoch::At(DeviceTicks(0)),
+            codecs: 0,
+            flash_limit: Some(flash_limit),
+            limits: LightLimits::OFF,
+        }
+    }
 
     /// A device that has no frame of its own for a slot shows the one before, and its limiter counts the slot: so does the
     /// host's, and strikes first, however many slots its frames are held for.
@@ -160,7 +178,7 @@ mod tests {
             let mut strikes = 0;
             for seed in 0..40 {
                 let draws = Draws::new(seed);
-                let mut host = FlashCount::new(rate, limit);
+                let mut host = FieldCount::new(&settings(rate, limit));
                 let mut device = FlashLimiter::backstop(rate, limit);
                 let (mut slot, mut on, mut left) = (0, false, 0);
                 for i in 0..4000 {
@@ -175,7 +193,8 @@ mod tests {
                     left -= held as i64;
                     let luminance = if on { FULL_LUMINANCE } else { 0 };
                     let times = [slot, slot + 100].map(|slot| clock.start(slot));
-                    if host.slot(&clock, times, Some(luminance)) {
+                    let planes = [if on { 0xff } else { 0 }; 8];
+                    if host.slot(&clock, times, Shown::New(&planes)) == Some(Reached::Flashes) {
                         strikes += 1;
                         break;
                     }
