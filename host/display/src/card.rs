@@ -41,8 +41,9 @@ const BLACK_PATIENCE: Duration = Duration::from_millis(200);
 /// Interval of such attempts.
 const STEP: Duration = Duration::from_millis(1);
 
-/// The descriptor of a graphics card.
-struct Node(OwnedFd);
+/// The descriptor of a graphics card, with the kernel's calls of the crate drm.
+#[derive(Debug)]
+pub struct Node(pub OwnedFd);
 
 impl AsFd for Node {
     fn as_fd(&self) -> BorrowedFd<'_> {

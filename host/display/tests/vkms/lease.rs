@@ -3,7 +3,7 @@
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::fs::File;
-use std::os::fd::{AsFd, BorrowedFd, OwnedFd};
+use std::os::fd::OwnedFd;
 use std::os::unix::net::UnixListener;
 use std::path::PathBuf;
 use std::process::{Child, Command};
@@ -13,7 +13,7 @@ use std::time::{Duration, Instant};
 
 use dpm_device::time::{HostClock, HostTime};
 use dpm_device::transport::Transport;
-use dpm_display::card::{cards, let_go, Card};
+use dpm_display::card::{cards, let_go, Card, Node};
 use dpm_display::encoding::Encoding;
 use dpm_display::lease::{opener, Access, Lender};
 use dpm_display::scan_out::DisplayError;
@@ -26,18 +26,6 @@ use crate::checksum::{checksum, checksums, wait_for};
 use crate::compositor::{Compositor, Manner, Seen};
 use crate::rig::{pixels, settings, stream, CONNECTOR, PATIENCE};
 use crate::ways_out::{this_program, HOLD};
-
-/// The card, as the desktop drives it.
-struct Node(File);
-
-impl AsFd for Node {
-    fn as_fd(&self) -> BorrowedFd<'_> {
-        self.0.as_fd()
-    }
-}
-
-impl Device for Node {}
-impl ControlDevice for Node {}
 
 /// A desktop that shows nothing, and lends its only connector.
 struct Desktop {
@@ -55,7 +43,7 @@ struct Desktop {
 impl Desktop {
     /// Drives the card, and listens where the environment says from now on.
     fn start() -> Arc<Self> {
-        let node = Node(File::options().read(true).write(true).open(&cards()[0]).unwrap());
+        let node = Node(File::options().read(true).write(true).open(&cards()[0]).unwrap().into());
         // The guardian of an earlier test looks from time to time whether the card is taken.
         until("nobody else drives the card", || node.acquire_master_lock().is_ok());
         node.set_client_capability(ClientCapability::UniversalPlanes, true).unwrap();

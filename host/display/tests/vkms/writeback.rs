@@ -3,9 +3,10 @@
 
 use std::fs::File;
 use std::io::{self, Write};
-use std::os::fd::{AsFd, BorrowedFd, OwnedFd};
+use std::os::fd::OwnedFd;
 use std::time::{Duration, Instant};
 
+use dpm_display::card::Node;
 use drm::buffer::{Buffer, DrmFourcc};
 use drm::control::atomic::AtomicModeReq;
 use drm::control::connector::Interface;
@@ -20,17 +21,6 @@ use crate::rig::{CRC, PATIENCE};
 
 /// A commit whose pixels have not come after this long waits for a composer that somebody switched off.
 const COMPOSER_PATIENCE: Duration = Duration::from_millis(400);
-
-struct Node(OwnedFd);
-
-impl AsFd for Node {
-    fn as_fd(&self) -> BorrowedFd<'_> {
-        self.0.as_fd()
-    }
-}
-
-impl Device for Node {}
-impl ControlDevice for Node {}
 
 /// Reads back what a CRTC composes.
 pub(crate) struct Reader {
