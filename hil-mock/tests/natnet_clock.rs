@@ -87,44 +87,41 @@ impl Loopback {
     }
 }
 
-/// Real sockets, real clocks. The true error lies inside the reported bound whatever the machine does meanwhile. How small it is depends
-/// on the round trips: at half of one the way there and the way back cannot be told apart. So the judged figures (10 us; 25 us with
-/// skew and stalls) are asked of runs whose round trips leave room for them, and of the best of four; where the machine is too busy
-/// for such round trips, what a busy one must still do.
+/// Runs of which the best is judged.
+const ATTEMPTS: usize = 4;
+
+/// Real sockets, real clocks. The true error lies inside the reported bound whatever the machine does meanwhile. How small the
+/// error is depends on the round trips, because within one the way there and the way back cannot be told apart. So the figures
+/// (10 us; 25 us with skew and stalls), or one round trip where that is longer, are asked of the best of a few runs. If the
+/// machine kept every run from being good, the error must still be less than 50 us beyond a round trip in each run that it let
+/// through without standing still.
 #[test]
 fn real_time_on_loopback_maps_the_clock_within_10_us_and_inside_its_bound() {
     for (skew_ppb, stalls, allowed_ns) in [(0, false, 10_000), (40_000, true, 25_000)] {
-        let mut busy_p99 = i64::MAX;
-        for attempt in 0..4 {
+        let mut undisturbed = Vec::new();
+        let was_good = (0..ATTEMPTS).any(|_| {
             let run = Loopback::run(skew_ppb, stalls);
             let at = |sorted: &[i64], p: usize| sorted[sorted.len() * p / 100];
             let (map_p99, sample_p99) = (at(&run.map_errors, 99), at(&run.sample_errors, 99));
-            println!(
+            let told = format!(
                 "loopback, {skew_ppb} ppb, stalls {stalls}, round trip {} ns: map p50 {} ns, p99 {map_p99} ns, bound up to {} ns, {:.4} inside; samples \
-                 p99 {sample_p99} ns; stood still: {}",
+                 p99 {sample_p99} ns; stood still: {}; {}",
                 run.round_trip_ns,
                 at(&run.map_errors, 50),
                 run.widest_ns,
                 run.inside,
-                run.stood_still
-            );
-            assert!(run.inside >= 0.999, "{} inside the bound: {}", run.inside, run.status);
-            if map_p99 <= allowed_ns && sample_p99 <= allowed_ns {
-                break;
-            }
-            assert!(
-                run.stood_still || run.round_trip_ns / 3 > allowed_ns / 2 || attempt < 3,
-                "p99 {map_p99} ns, samples {sample_p99} ns: {}",
+                run.stood_still,
                 run.status
             );
+            println!("{told}");
+            assert!(run.inside >= 0.999, "outside the bound: {told}");
+            let worst = map_p99.max(sample_p99);
             if !run.stood_still {
-                busy_p99 = busy_p99.min(sample_p99);
+                undisturbed.push((worst - run.round_trip_ns, told));
             }
-            assert!(
-                attempt < 3 || busy_p99 < 50_000 || busy_p99 == i64::MAX,
-                "{busy_p99} ns at best: {}",
-                run.status
-            );
-        }
+            worst <= allowed_ns.max(run.round_trip_ns)
+        });
+        let told = undisturbed.iter().find(|(beyond_ns, _)| !was_good && *beyond_ns > 50_000);
+        assert!(told.is_none(), "a machine that did not stand still, and an error that large: {told:?}");
     }
 }
