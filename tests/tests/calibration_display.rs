@@ -239,6 +239,26 @@ fn a_display_that_loses_a_tenth_of_the_frames_is_found_too() {
     is_found(&Rig { lost: 0.1, ..Rig::new(256, 192, 120.0, 3) }, 45.0);
 }
 
+/// Half of the pictures come too late there. The wand rests as long as it should, yet too few of its places are seen, and what
+/// is told of the pictures says why.
+#[test]
+fn of_a_display_that_loses_half_of_the_frames_it_is_told_that_they_were_lost() {
+    for lost in [0.2, 0.5] {
+        let rig = Rig { lost, ..Rig::new(128, 96, 120.0, 3) };
+        let code = InverseCode::new(rig.raster);
+        let (blocks, poses) = rig.record(&code, &visiting(), 60.0);
+        let decoded = decoded(&rig, &code, &blocks).unwrap();
+        assert!((decoded.carried - (1.0 - lost)).abs() < 0.03, "{}", decoded.carried);
+        let solved = solve_pairs(&code, &decoded, &Trajectory::new(&poses), &rig.settings());
+        match solved {
+            Ok(_) => assert!(lost < 0.5),
+            Err(why) => {
+                assert!(lost > 0.4 && matches!(why, SensorError::TooFewPlaces { .. }), "{lost}: {why}")
+            }
+        }
+    }
+}
+
 /// The hand moves in the inner half of the picture, which says next to nothing of k2 and k3: with the tracker's noise they
 /// come out anywhere, and a lens that is right where the hand was may fold in the corners. Each sweep must give a projector
 /// nevertheless, and its covariance must tell how far off the light in the corners may be.

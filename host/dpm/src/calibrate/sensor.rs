@@ -14,8 +14,8 @@ use dpm_calibration::pivot::trace;
 use dpm_calibration::projector::{Known, LensTerms, Priors, Volume};
 use dpm_calibration::sensor::{
     decode, decode_pairs, places_rested, solve, solve_latency, solve_latency_of_pairs, solve_pairs, Block,
-    Code, Coverage, Decoded, DecodedPairs, FrameLight, InverseCode, Latency, Mapped, Settings, Solution,
-    Timing, FEWEST_PLACES,
+    Code, Coverage, Decoded, DecodedPairs, FrameLight, InverseCode, Latency, Mapped, SensorError, Settings,
+    Solution, Timing, FEWEST_PLACES,
 };
 use dpm_calibration::trajectory::{Stamped, Trajectory};
 use dpm_common::clock::MonotonicClock;
@@ -64,6 +64,10 @@ const FRAMES: f64 = 1200.0;
 /// A sweep lasts at least so many frames: the solvers need 500 with light, and some are without.
 const LEAST_FRAMES: f64 = 700.0;
 
+/// A pair needs two pictures in a row. Where fewer of them than this share came in time, a round of pairs may take longer
+/// than the wand rests, and a slower rate helps.
+const CARRIED_FOR_PAIRS: f64 = 0.8;
+
 /// What was recorded, ready for a solver.
 struct Sweep {
     seen: SeenCode,
@@ -109,13 +113,27 @@ pub fn calibrate(
     tip: (DVec3, f64),
     monitor: &Arc<RunMonitor>,
 ) -> Result<Paced<Solution>, Failure> {
-    sweep(config, setup, tip, monitor)?.and_then(|s| {
-        let solved = match &s.seen {
-            SeenCode::Planes(code, decoded) => solve(code, decoded, &s.path, &s.settings),
-            SeenCode::Frames(code, decoded) => solve_pairs(code, decoded, &s.path, &s.settings),
-        };
-        solved.map_err(|e| s.clipped.refused(e))
-    })
+    let swept = match sweep(config, setup, tip, monitor)? {
+        Paced::Done(swept) => swept,
+        Paced::TooFast { carried_hz } => return Ok(Paced::TooFast { carried_hz }),
+    };
+    let solved = match &swept.seen {
+        SeenCode::Planes(code, decoded) => solve(code, decoded, &swept.path, &swept.settings),
+        SeenCode::Frames(code, decoded) => solve_pairs(code, decoded, &swept.path, &swept.settings),
+    };
+    if let (Err(error), SeenCode::Frames(_, decoded)) = (&solved, &swept.seen) {
+        if let Some(carried_hz) = carried_too_few(error, decoded.carried, config.projector.frame_rate.hz()) {
+            return Ok(Paced::TooFast { carried_hz });
+        }
+    }
+    solved.map(Paced::Done).map_err(|e| swept.clipped.refused(e))
+}
+
+/// Frames a second that were carried, if their number is why too few places were seen: the wand may have rested long
+/// enough, and the pictures not have come. `carried` is the share of the slots with a picture of its own.
+fn carried_too_few(error: &SensorError, carried: f64, rate_hz: f64) -> Option<f64> {
+    let is_short_of_places = matches!(error, SensorError::TooFewPlaces { .. });
+    (is_short_of_places && carried < CARRIED_FOR_PAIRS).then_some(carried * rate_hz)
 }
 
 /// Shows the code, records, and finds the latency of the projector `model`, which is known.
@@ -416,4 +434,18 @@ pub fn keep_latency(results: &mut Results, config: &RigConfig, wand: &str, l: &L
     let provenance = results.provenance(config, "", data, method);
     let (latency_us, sigma_us) = (1e-3 * l.latency_ns as f64, 1e-3 * l.sigma_ns);
     results.file.latency = Some(LatencySection { latency_us, sigma_us, provenance });
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_slower_rate_is_tried_where_late_pictures_are_why_places_were_not_seen() {
+        let short = SensorError::TooFewPlaces { places: 6, need: FEWEST_PLACES };
+        assert_eq!(carried_too_few(&short, 0.5, 120.0), Some(60.0));
+        assert_eq!(carried_too_few(&short, 0.95, 120.0), None, "the wand did not rest");
+        let other = SensorError::LatencyUncertain { us: 2000.0 };
+        assert_eq!(carried_too_few(&other, 0.5, 120.0), None);
+    }
 }

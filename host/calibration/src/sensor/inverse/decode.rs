@@ -58,6 +58,8 @@ pub struct DecodedPairs {
     pub pairs: Vec<Pair>,
     /// Pairs during which the sensor was covered, or outside the picture.
     pub dropped: usize,
+    /// Share of the slots with a picture of its own, 0 to 1: on a busy machine others repeat the picture before.
+    pub carried: f64,
     /// How much later than told the light came, nanoseconds.
     pub lag_ns: f64,
     /// Pairs of a hundred whose sign agrees with that of their stripes in the next round.
@@ -128,7 +130,7 @@ pub fn decode_pairs(
         return Err(DecodeError::NotFinite(bad));
     }
     let record = Record::new(blocks).ok_or(DecodeError::NoSamples)?;
-    let pairs = shown_pairs(timing, &record, shown);
+    let (pairs, carried) = shown_pairs(timing, &record, shown);
     let brightest = light.brightest();
     let search = Search { code, record: &record, pairs: &pairs, frame_ns: timing.frame_ns, brightest };
     let (lag_ns, identity_percent) = search.lag()?;
@@ -143,6 +145,7 @@ pub fn decode_pairs(
     Ok(DecodedPairs {
         pairs: levels,
         dropped,
+        carried,
         lag_ns,
         identity_percent,
         instants_ns,
@@ -155,11 +158,12 @@ fn within_tick(tick: usize) -> [f64; 2] {
     [tick as f64 + GUARD, tick as f64 + 1.0 - GUARD]
 }
 
-/// The pairs of which both frames were shown, with the first slot of each.
-fn shown_pairs(timing: &Timing, record: &Record, shown: &dyn Fn(u64) -> u64) -> Vec<Shown> {
+/// The pairs of which both frames were shown, with the first slot of each, and the share of the slots with a picture of its own.
+fn shown_pairs(timing: &Timing, record: &Record, shown: &dyn Fn(u64) -> u64) -> (Vec<Shown>, f64) {
     let begin = (record.base_ns.saturating_sub(timing.frame_zero_ns)) as f64;
     let slot = |ns: f64| ((begin + ns) / timing.frame_ns).max(0.0) as u64;
     let slots = slot(-LAGS_NS[1])..slot(record.length_ns() - LAGS_NS[0]);
+    let count = slots.end.saturating_sub(slots.start);
     let mut before = None;
     let fresh: Vec<(u64, u64)> = slots
         .filter_map(|slot| {
@@ -173,7 +177,8 @@ fn shown_pairs(timing: &Timing, record: &Record, shown: &dyn Fn(u64) -> u64) -> 
         (first % 2 == 0 && second == first + 1 && b - a <= 4)
             .then(|| Shown { pair: first / 2, begins_ns: [of_slot(a), of_slot(b)] })
     };
-    fresh.windows(2).filter_map(pair).collect()
+    let carried = fresh.len() as f64 / count.max(1) as f64;
+    (fresh.windows(2).filter_map(pair).collect(), carried)
 }
 
 struct Search<'a> {
