@@ -30,23 +30,41 @@ uvec2 place_of(uvec2 pixel, uint index) {
     return mover == 0u ? pixel : uvec2(ivec2(pixel) - movers[mover - 1u].centre);
 }
 
-// The blue noise of a place for a channel's remainders, and for the part at which it begins.
-uvec2 noise_of(uvec2 place, uint channel) {
+// The blue noise of a place for a channel's remainders.
+uint noise_of(uvec2 place, uint channel) {
     // The mask has two channels; the third of a frame is the first, half a mask aside.
     uint x = (place.x + (channel >> 1u) * (NOISE_SIZE / 2u)) % NOISE_SIZE;
     uint texel = ((frame.drawn % NOISE_FRAMES) * NOISE_SIZE + place.y % NOISE_SIZE) * NOISE_SIZE + x;
-    uint pair = (noise_bytes[texel >> 1u] >> ((texel & 1u) * 16u)) & 0xffffu;
-    uvec2 values = uvec2(pair & 255u, pair >> 8u);
-    return (channel & 1u) == 0u ? values : values.yx;
+    return (noise_bytes[texel >> 1u] >> ((texel & 1u) * 16u + (channel & 1u) * 8u)) & 255u;
 }
 
-// Parts that add up to `sum`: all the same number, or one more in some that are spread evenly, from part `phase` on.
+// The part at which the order of parts begins at a place: the same in each cell of 4 x 4 mirrors. Of four neighbouring cells each begins in another
+// quarter of the parts, of 16 each in another sixteenth, and so on.
+uint phase_of(uvec2 place) {
+    uvec2 cell = place % NOISE_SIZE / 4u;
+    uint rank = 0u;
+    for (uint level = 0u; level < 4u; level++) {
+        uint quarter = (((cell.x ^ cell.y) & 1u) << 1u) | (cell.y & 1u);
+        cell >>= 1u;
+        rank = (rank << 2u) | (quarter ^ (hash_u32((level << 16u) | (rank << 8u) | (cell.y << 4u) | cell.x) & 3u));
+    }
+    return (rank * HALFTONE_PARTS / 256u + 5u * (frame.drawn % HALFTONE_PARTS)) % HALFTONE_PARTS;
+}
+
+// Parts that add up to `sum`: all the same number, or one more in some, the first of the order that begins at part `phase`.
 uint spread(uint sum, uint phase) {
     uint each = sum / HALFTONE_PARTS;
     uint more = sum % HALFTONE_PARTS;
     uint word = 0u;
-    for (uint p = 0u; p < HALFTONE_PARTS; p++)
-        word |= (each + ((p * more + phase) % HALFTONE_PARTS < more ? 1u : 0u)) << (p * HALFTONE_DEPTH);
+    for (uint p = 0u; p < HALFTONE_PARTS; p++) word |= each << (p * HALFTONE_DEPTH);
+    // The order of the parts: by the bits of their numbers in reverse.
+    int bits = findMSB(HALFTONE_PARTS - 1u) + 1;
+    for (uint i = 0u; i < 1u << bits; i++) {
+        uint p = bitfieldReverse(i) >> (32 - bits);
+        if (p >= HALFTONE_PARTS || more == 0u) continue;
+        word += 1u << ((p + phase) % HALFTONE_PARTS * HALFTONE_DEPTH);
+        more--;
+    }
     return word;
 }
 
@@ -54,9 +72,8 @@ uint spread(uint sum, uint phase) {
 uint share_out(uint code, uvec2 place, uint channel) {
     uint i = gl_LocalInvocationIndex;
     uint rest = code * MOST % 255u;
-    uvec2 noise = noise_of(place, channel);
     // Unique, and above 0: the number of the mirror decides between equals.
-    uint key = rest > 0u ? ((rest + noise.x) << 6u) | i : 0u;
+    uint key = rest > 0u ? ((rest + noise_of(place, channel)) << 6u) | i : 0u;
     if (i == 0u) rests = 0u;
     barrier();
     keys[i] = key;
@@ -68,7 +85,7 @@ uint share_out(uint code, uvec2 place, uint channel) {
     uint sum = code * MOST / 255u + (key > 0u && before < extra ? 1u : 0u);
     // The next channel writes the same memory.
     barrier();
-    return spread(sum, noise.y % HALFTONE_PARTS);
+    return spread(sum, phase_of(place));
 }
 
 void main() {

@@ -305,13 +305,14 @@ fn an_eye_that_follows_sees_the_patterns_of_a_dlpc900_sharp() {
     with_gpu(|gpu| {
         let card = Card::new(gpu).unwrap();
         let panel = Panel::of_binary24();
-        // Two frames of nine levels leave 0.029 of a card at rest; places of halftones cannot be interpolated.
-        for (name, most) in [("at rest", 0.032), ("1 m/s", 0.047)] {
+        // Two frames of nine levels leave 0.029 of a card at rest. With mirrors that each begin at a part of their own it is
+        // 0.044 at 1 m/s.
+        for (name, most) in [("at rest", 0.032), ("1 m/s", 0.035)] {
             let motion = MOTIONS.iter().find(|motion| motion.name == name).expect("in the table");
             let row = card.measure(motion, &panel).unwrap();
             println!("{row:?}");
             assert!(row.follows.own <= most, "{row:?}");
-            assert!(name == "at rest" || row.follows.own <= 0.4 * row.follows.centre, "{row:?}");
+            assert!(name == "at rest" || row.follows.own <= 0.25 * row.follows.centre, "{row:?}");
         }
     });
 }
