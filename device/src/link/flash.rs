@@ -100,6 +100,14 @@ impl FlashLimiter {
         Self { allowed: (limiter.allowed + 2).min(limiter.changes.len() - 1), ..limiter }
     }
 
+    /// The next slot that is observed is number `slot`; the slots since the beginning of its average were dark. Averages begin at
+    /// multiples of their length, so both ends of the link see the same ones: otherwise a short darkness is one dark
+    /// average at one end, and two half-lit ones, too bright for a change, at the other.
+    pub fn begin_at(&mut self, slot: u64) {
+        self.sum = 0;
+        self.in_window = (slot % u64::from(self.slots_per_window)) as u32;
+    }
+
     /// Observes the light of the next slot (0 when dark). Returns `true` if this slot makes more flashes in the last
     /// second than allowed: the light must go off and stay off for [`REST_US`].
     pub fn observe(&mut self, luminance: u32) -> bool {
@@ -134,7 +142,7 @@ impl FlashLimiter {
 
     /// Restarts after a rest, from the dark.
     pub fn reset(&mut self) {
-        (self.sum, self.in_window, self.extreme, self.count) = (0, 0, 0, 0);
+        (self.sum, self.extreme, self.count) = (0, 0, 0);
         self.rising = None;
     }
 

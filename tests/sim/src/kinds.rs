@@ -220,6 +220,11 @@ kinds! {
 const FILES: &str = "scenes are read only when the program starts, before any light";
 
 impl Kind {
+    /// It strikes the tracker or its network, and nothing else.
+    pub fn is_of_tracker(self) -> bool {
+        (self as usize) <= Self::T18 as usize
+    }
+
     /// It strikes only where the projector follows tracks.
     pub fn needs_tracks(self) -> bool {
         self == Self::X8

@@ -98,6 +98,9 @@ pub struct Laws {
     rested_until: i64,
     /// A hang has been found by then.
     hidden_until: i64,
+    /// When something other than the tracker was struck last, and whether the projector's flash limit is latched.
+    elsewhere_at: i64,
+    has_flashed: bool,
     /// The operator was told that the body is dark, and not yet that it has light again.
     is_told: bool,
     /// Since then the light has been gone without a word to the operator.
@@ -151,6 +154,8 @@ impl Laws {
             slow_disk_until: 0,
             rested_until: 0,
             hidden_until: 0,
+            elsewhere_at: 0,
+            has_flashed: false,
             is_told: false,
             wordless_since: 0,
             worst_age_milli: 0,
@@ -195,6 +200,18 @@ impl Laws {
     /// The projector's or the host's clock moved.
     pub fn clock_moved(&mut self, t: i64) {
         self.clock_moved_at = self.clock_moved_at.max(t);
+    }
+
+    /// Whatever the tracker does, the host acts on flashes before the projector's own limit latches. Where frames are lost, late or
+    /// not drawn, the projector may flash without the host.
+    pub fn flashes(&mut self, t: i64, has_flashed: bool, is_tracker_alone: bool) {
+        if !is_tracker_alone {
+            self.elsewhere_at = t;
+        }
+        if has_flashed && !self.has_flashed && t - self.elsewhere_at > 3 * S {
+            self.fail(t, "the projector latched its flash limit before the host acted".into());
+        }
+        self.has_flashed = has_flashed;
     }
 
     /// The projector has a cause for a fault.

@@ -391,6 +391,8 @@ impl World {
         self.fold(1, kind as u64 * 8 + state as u64);
         self.tell(|| format!("{kind:?} strikes while {}: {}", state.word(), kind.text()));
         self.laws.disturbed(self.t);
+        let has_flashed = self.projector.status().faults & faults::FLASH_LIMIT != 0;
+        self.laws.flashes(self.t, has_flashed, kind.is_of_tracker());
         self.strike(kind, seed);
     }
 
@@ -437,6 +439,9 @@ impl World {
         }
         self.projector.advance_to(HostTime(self.t));
         self.see_light();
+        let is_tracker_alone = self.active.iter().flatten().all(|active| active.kind.is_of_tracker());
+        let has_flashed = self.projector.status().faults & faults::FLASH_LIMIT != 0;
+        self.laws.flashes(self.t, has_flashed, is_tracker_alone);
         let mut cable = lock(&self.cable);
         if cable.plugged {
             self.projector.replies(HostTime(self.t), &mut |_, packet| cable.reply(packet));

@@ -69,6 +69,10 @@ fn what_once_broke_a_law_of_tracks_keeps_them_all() {
         (149_400_595_585_016, 5),
         // A tracker that did not see the body, and light that followed what had been foretold: a bound that was too narrow.
         (20_000_012, 40),
+        // The projector latched its flash limit before the host acted: each averaged the light over slots of its own.
+        (149_400_595_584_904, 5),
+        // A cable damaged every frame for 1.5 s, and no note said why it was dark.
+        (70_000_281, 14),
     ];
     for (seed, seconds) in found {
         let lived = lived(&Order { follows: Some(true), ..order(seed, None, seconds) });

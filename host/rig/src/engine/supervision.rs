@@ -10,6 +10,7 @@
 use super::error::PipelineError;
 use super::facts::Facts;
 use super::pulse::{Pulse, Silence, StandingOf};
+use crate::telemetry::monitor::{ProjectorHealth, RunCounts};
 use dpm_device::time::HostTime;
 use dpm_render::gpu::{AfterLoss, LossBudget};
 use std::sync::atomic::Ordering;
@@ -23,6 +24,9 @@ const SLOW_MILLI: u64 = 1_500;
 /// The operator is informed that a frame stays on the GPU after this time, nanoseconds. A GPU that is still warming up
 /// is given up later than that.
 const STAYS_AFTER_NS: i64 = 1_000_000_000;
+/// The operator is informed that frames are made and none is lit after [`STAYS_AFTER_NS`] and so many frames: a slow renderer
+/// has fewer on the way.
+const UNLIT_FRAMES: u64 = 8;
 
 /// What is wrong with a crew.
 #[derive(Debug)]
@@ -125,6 +129,41 @@ pub(crate) struct Supervision {
     told_slow: bool,
     /// Since when the GPU has had the frame of which the operator was last informed.
     told_of_ns: i64,
+    unlit: Unlit,
+}
+
+/// Frames are made, and none reaches the light: a cable that damages all of them looks like a link that is up.
+#[derive(Debug, Default)]
+struct Unlit {
+    /// Frames that were lit, or dark as they were meant to be, until the last one was; and frames planned then.
+    results: u64,
+    planned: u64,
+    /// When that was, or later: when no frame had been planned since.
+    at: HostTime,
+    is_told: bool,
+}
+
+impl Unlit {
+    /// Looks at the counters of a run. What the operator is to be told: `Some(true)`, no frame is lit; `Some(false)`, they are
+    /// lit again.
+    fn observe(&mut self, counts: &RunCounts, is_up: bool, now: HostTime) -> Option<bool> {
+        let results = counts.frames_lit + counts.frames_dark + counts.frames_withheld;
+        if !is_up || results != self.results {
+            let are_lit_again = self.is_told && results != self.results;
+            let is_told = self.is_told && !are_lit_again;
+            *self = Self { results, planned: counts.frames_planned, at: now, is_told };
+            return are_lit_again.then_some(false);
+        }
+        if counts.frames_planned <= self.planned {
+            self.at = now;
+        }
+        let is_long = now.ns_since(self.at) >= STAYS_AFTER_NS;
+        if self.is_told || !is_long || counts.frames_planned < self.planned + UNLIT_FRAMES {
+            return None;
+        }
+        self.is_told = true;
+        Some(true)
+    }
 }
 
 impl Supervision {
@@ -139,6 +178,7 @@ impl Supervision {
             made_by: HostTime(i64::MAX),
             told_slow: false,
             told_of_ns: i64::MAX,
+            unlit: Unlit::default(),
         }
     }
 
@@ -153,6 +193,7 @@ impl Supervision {
     ) -> Option<Irreplaceable> {
         self.tell_if_slow();
         self.tell_if_gpu_stays(now);
+        self.tell_if_nothing_is_lit(now);
         if self.link.observe(link, now, step_ns, self.ask) {
             self.facts.fail(PipelineError::Hung { stage: link.name() });
             return Some(Irreplaceable::Link);
@@ -227,6 +268,24 @@ impl Supervision {
         );
     }
 
+    /// Informs the operator once when frames are made and none is lit for a second, and when they are lit again.
+    fn tell_if_nothing_is_lit(&mut self, now: HostTime) {
+        let monitor = &self.facts.monitor;
+        let is_up = monitor.projector() == ProjectorHealth::Up;
+        let Some(is_unlit) = self.unlit.observe(&monitor.counts(), is_up, now) else { return };
+        if !is_unlit {
+            return monitor.note("frames are lit again".into());
+        }
+        let why = monitor.carried().device.map_or_else(String::new, |d| {
+            format!(
+                "; so far {} packets came damaged to the projector, {} frames incomplete, and {} too late; is the cable \
+                 whole and fast enough? `dpm link-test` measures it",
+                d.damaged_packets, d.incomplete, d.too_late
+            )
+        });
+        monitor.note(format!("no frame has been lit for a second, although frames are made{why}"));
+    }
+
     /// Informs the operator once when the renderer becomes slower than its slots, and when it is fast again.
     fn tell_if_slow(&mut self) {
         let stride = self.facts.stride_milli.load(Ordering::Relaxed);
@@ -246,5 +305,27 @@ impl Supervision {
         } else {
             format!("the renderer keeps up: each of {hz:.1} slots per second gets a frame")
         });
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_second_of_frames_of_which_none_is_lit_is_told_once_and_its_end_too() {
+        let mut unlit = Unlit::default();
+        let mut look = |ms: i64, planned: u64, lit: u64, is_up: bool| {
+            let counts = RunCounts { frames_planned: planned, frames_lit: lit, ..RunCounts::default() };
+            unlit.observe(&counts, is_up, HostTime(ms * 1_000_000))
+        };
+        // The first frames are on their way.
+        assert_eq!((look(50_000, 0, 0, true), look(50_100, 9, 0, true)), (None, None));
+        assert_eq!((look(50_200, 12, 10, true), look(51_190, 40, 10, true)), (None, None));
+        assert_eq!((look(51_200, 40, 10, true), look(53_000, 90, 10, true)), (Some(true), None));
+        assert_eq!((look(53_100, 93, 11, true), look(53_200, 96, 14, true)), (Some(false), None));
+        // Few frames, or a projector that is dark by order, are no reason.
+        assert_eq!((look(55_000, 99, 14, true), look(56_000, 200, 14, false)), (None, None));
+        assert_eq!((look(56_900, 230, 14, true), look(57_000, 230, 14, true)), (None, Some(true)));
     }
 }
