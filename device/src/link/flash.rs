@@ -54,6 +54,15 @@ pub fn mean_luminance(raster: Raster, schedule: &PlaneSchedule, planes: &[u8]) -
     (light * u64::from(FULL_LUMINANCE) / full).min(u64::from(FULL_LUMINANCE)) as u32
 }
 
+/// True if light of these luminances, slot by slot, breaks a limit of `limit` flashes a second in some slot that it may begin in.
+pub fn breaks_limit(rate: FrameRate, limit: u8, light: impl Iterator<Item = u32> + Clone) -> bool {
+    (0..FlashLimiter::new(rate, limit).slots_per_window).any(|slot| {
+        let mut limiter = FlashLimiter::new(rate, limit);
+        limiter.begin_at(slot.into());
+        light.clone().any(|luminance| limiter.observe(luminance))
+    })
+}
+
 /// Counts flashes. Must observe every slot once, in order.
 #[derive(Clone, Debug)]
 pub struct FlashLimiter {

@@ -26,7 +26,9 @@ pub use crate::packet::{
     MAX_CONTROL_BYTES, MAX_PAYLOAD_BYTES, VERSION,
 };
 pub use codec::{rle_encode, CodecError, RleDecoder};
-pub use flash::{mean_luminance, FlashLimiter, FULL_LUMINANCE, HIGHEST_LIMIT, MAX_FLASHES_PER_S, REST_US};
+pub use flash::{
+    breaks_limit, mean_luminance, FlashLimiter, FULL_LUMINANCE, HIGHEST_LIMIT, MAX_FLASHES_PER_S, REST_US,
+};
 #[cfg(feature = "std")]
 pub use host::{
     DropReason, EchoSample, Epoch, HostLink, LinkCounters, LinkError, LinkSettings, LinkState, SendOutcome,

@@ -7,7 +7,7 @@ use super::recorder::Timed;
 use super::showing::Showing;
 use dpm_calibration::light::{steady, Channels, Next, Session, Steady};
 use dpm_calibration::sensor::Block;
-use dpm_device::link::{mean_luminance, FlashLimiter, FULL_LUMINANCE};
+use dpm_device::link::{breaks_limit, mean_luminance, FULL_LUMINANCE};
 use dpm_device::planes::{Channel, PlaneSchedule, Raster};
 use dpm_device::time::FrameRate;
 use dpm_render::pack::{pack, BitPlaneFrame, Kernel};
@@ -259,9 +259,8 @@ fn luminance(schedule: &PlaneSchedule, code: u32) -> u32 {
 
 /// True if levels of light, each for `hold` slots, over and over, break the limit.
 fn flashes_too_often(light: &[u32], hold: u64, rate: FrameRate, limit: u8) -> bool {
-    let mut limiter = FlashLimiter::new(rate, limit);
-    let mut around = light.iter().chain(light).flat_map(|l| std::iter::repeat_n(*l, hold as usize));
-    around.any(|l| limiter.observe(l))
+    let around = light.iter().chain(light).flat_map(|l| std::iter::repeat_n(*l, hold as usize));
+    breaks_limit(rate, limit, around)
 }
 
 /// Frequency of the lamps, and the light without the projector.

@@ -3,6 +3,7 @@
 use super::*;
 use dpm_calibration::sensor::Timing;
 use dpm_device::light::{LightEvent, LightKind};
+use dpm_device::link::FlashLimiter;
 use dpm_device::pose::Pose;
 use dpm_device::time::DeviceTicks;
 use dpm_device::time::HostTime;
@@ -71,10 +72,14 @@ fn the_limit_of_flashes_is_kept_by_the_limiter_itself() {
         let levels = Levels::new(&schedule, rate(), Field::Full(limit), CODES).unwrap();
         holds.push(levels.hold);
         let Some(limit) = limit else { continue };
-        let mut limiter = FlashLimiter::new(rate(), limit);
-        let slots = 12_345..12_345 + 2 * levels.steps.len() as u64 * levels.hold;
-        let mut light = slots.map(|s| luminance(&schedule, levels.steps[source_step(&levels, s)].code));
-        assert!(!light.any(|l| limiter.observe(l)), "limit {limit}");
+        // The averages of the limiter begin at other slots than the levels.
+        for first in 12_345..12_361 {
+            let mut limiter = FlashLimiter::new(rate(), limit);
+            limiter.begin_at(first);
+            let slots = first..first + 2 * levels.steps.len() as u64 * levels.hold;
+            let mut light = slots.map(|s| luminance(&schedule, levels.steps[source_step(&levels, s)].code));
+            assert!(!light.any(|l| limiter.observe(l)), "limit {limit} from slot {first}");
+        }
     }
     assert!(holds.is_sorted() && holds[3] > holds[0], "{holds:?}");
 }

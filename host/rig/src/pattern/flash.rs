@@ -4,7 +4,7 @@
 //! ones, so steps of equal light can count as flashes. The answer here is the limiter's own.
 
 use super::{Pattern, PatternShow};
-use dpm_device::link::{mean_luminance, FlashLimiter};
+use dpm_device::link::{breaks_limit, mean_luminance};
 use dpm_device::planes::PlaneSchedule;
 use dpm_device::time::FrameRate;
 use dpm_render::pack::{pack, BitPlaneFrame, Kernel};
@@ -29,11 +29,10 @@ fn means(show: &PatternShow, schedule: &PlaneSchedule) -> Vec<u32> {
 fn breaks(means: &[u32], hold: u64, rate: FrameRate, limit: u8) -> bool {
     let second = u64::from(rate.num()).div_ceil(u64::from(rate.den()));
     let hold = hold.min(LONGEST_S * second) as usize;
-    let mut limiter = FlashLimiter::new(rate, limit);
     // Twice through, and long enough for a full second in any case.
     let slots = (2 * means.len() * hold).max(2 * second as usize);
     let light = means.iter().flat_map(|&mean| std::iter::repeat_n(mean, hold)).cycle();
-    light.take(slots).any(|mean| limiter.observe(mean))
+    breaks_limit(rate, limit, light.take(slots))
 }
 
 /// True if the pattern's steps would break a limit of `limit` flashes a second (`None` for no limit).
