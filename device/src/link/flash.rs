@@ -56,22 +56,28 @@ pub fn mean_luminance(raster: Raster, schedule: &PlaneSchedule, planes: &[u8]) -
 
 /// True if light of these luminances, slot by slot, breaks a limit of `limit` flashes a second in some slot that it may begin in.
 pub fn breaks_limit(rate: FrameRate, limit: u8, light: impl Iterator<Item = u32> + Clone) -> bool {
-    (0..FlashLimiter::new(rate, limit).slots_per_window).any(|slot| {
+    (0..FlashLimiter::new(rate, limit).slots_per_window).any(|first| {
         let mut limiter = FlashLimiter::new(rate, limit);
-        limiter.begin_at(slot.into());
-        light.clone().any(|luminance| limiter.observe(luminance))
+        light.clone().zip(u64::from(first)..).any(|(luminance, slot)| limiter.observe(slot, luminance))
     })
 }
 
-/// Counts flashes. Must observe every slot once, in order.
+/// Counts flashes from the light of slots, each observed once, in order.
+///
+/// Averages begin at slots whose number is a multiple of their length, so both ends of the link see the same ones. Otherwise a
+/// short darkness is one dark average at one end, and two half-lit ones, too bright for a change, at the other. Where slots were
+/// left out, because the device was not armed or a session began, no time has passed, and those of the average that has begun
+/// were dark.
 #[derive(Clone, Debug)]
 pub struct FlashLimiter {
     slots_per_window: u32,
     windows_per_s: u32,
     /// Opposing changes that are allowed within a second: two per flash.
     allowed: usize,
-    sum: u64,
+    /// The slot after the last one observed, how many of its window are over, and the sum of their light.
+    next_slot: u64,
     in_window: u32,
+    sum: u64,
     window: u32,
     /// Lowest or highest window mean since the last change, and the direction of that change.
     extreme: u32,
@@ -92,8 +98,9 @@ impl FlashLimiter {
             slots_per_window,
             windows_per_s: per_s,
             allowed: 2 * limit.clamp(1, HIGHEST_LIMIT) as usize,
-            sum: 0,
+            next_slot: 0,
             in_window: 0,
+            sum: 0,
             window: 0,
             extreme: 0,
             rising: None,
@@ -109,24 +116,23 @@ impl FlashLimiter {
         Self { allowed: (limiter.allowed + 2).min(limiter.changes.len() - 1), ..limiter }
     }
 
-    /// The next slot that is observed is number `slot`; the slots since the beginning of its average were dark. Averages begin at
-    /// multiples of their length, so both ends of the link see the same ones: otherwise a short darkness is one dark
-    /// average at one end, and two half-lit ones, too bright for a change, at the other.
-    pub fn begin_at(&mut self, slot: u64) {
-        self.sum = 0;
-        self.in_window = (slot % u64::from(self.slots_per_window)) as u32;
-    }
-
-    /// Observes the light of the next slot (0 when dark). Returns `true` if this slot makes more flashes in the last
+    /// Observes the light of slot number `slot` (0 when dark). Returns `true` if this slot makes more flashes in the last
     /// second than allowed: the light must go off and stay off for [`REST_US`].
-    pub fn observe(&mut self, luminance: u32) -> bool {
-        self.repeated(luminance, 1)
+    pub fn observe(&mut self, slot: u64, luminance: u32) -> bool {
+        self.repeated(slot, luminance, 1)
     }
 
-    /// Observes `slots` slots of the same light. Returns `true` as [`FlashLimiter::observe`] does, if any of them is one too
+    /// Observes `slots` slots of the same light, from number `first` on. Returns `true` as [`FlashLimiter::observe`] does, if any of them is one too
     /// many.
-    pub fn repeated(&mut self, luminance: u32, slots: u64) -> bool {
+    pub fn repeated(&mut self, first: u64, luminance: u32, slots: u64) -> bool {
         let of_window = u64::from(self.slots_per_window);
+        if slots == 0 {
+            return false;
+        }
+        if first != self.next_slot {
+            (self.sum, self.in_window) = (0, (first % of_window) as u32);
+        }
+        self.next_slot = first.saturating_add(slots);
         // Light that has not changed for a second changes nothing more: whole windows only pass.
         let idle = (slots / of_window).saturating_sub(2 * u64::from(self.windows_per_s));
         let mut left = slots - idle * of_window;
@@ -202,8 +208,9 @@ mod tests {
     fn strikes(seconds: f64, f: impl Fn(f64) -> f64) -> Option<f64> {
         let mut limiter = FlashLimiter::new(rate(), MAX_FLASHES_PER_S);
         (0..(seconds * 947.0) as u64)
-            .map(|slot| (slot as f64 + 0.25) / 947.0)
-            .find(|t| limiter.observe((f(*t) * f64::from(FULL_LUMINANCE)) as u32))
+            .map(|slot| (slot, (slot as f64 + 0.25) / 947.0))
+            .find(|(slot, t)| limiter.observe(*slot, (f(*t) * f64::from(FULL_LUMINANCE)) as u32))
+            .map(|(_, t)| t)
     }
 
     fn square(hz: f64, low: f64, high: f64) -> impl Fn(f64) -> f64 {
@@ -231,6 +238,24 @@ mod tests {
         assert_eq!(strikes(5.0, |t| (t * 0.4).fract()), None, "slow ramps that fall at 0.4 Hz");
         assert_eq!(strikes(60.0, |_| 1.0), None);
         assert_eq!(strikes(5.0, |t| 0.5 + 0.04 * (t * 50.0).sin()), None);
+    }
+
+    /// Whichever slot a limiter begins with, and whichever dark slots it does not see, it strikes in the same slot as another: a
+    /// darkness of one average that begins amid two would not be seen in light that is this dim.
+    #[test]
+    fn averages_are_those_of_the_same_slots() {
+        let rate = FrameRate::new(240, 1).unwrap();
+        let light = |slot: u64| if slot < 120 || slot % 20 < 4 { 0 } else { FULL_LUMINANCE / 8 };
+        let strikes = |observed: &dyn Fn(&u64) -> bool| {
+            let mut limiter = FlashLimiter::new(rate, MAX_FLASHES_PER_S);
+            (0..480).filter(observed).find(|slot| limiter.observe(*slot, light(*slot)))
+        };
+        let all = strikes(&|_| true);
+        assert!(all.is_some_and(|slot| slot < 240), "{all:?}");
+        for first in 1..9 {
+            assert_eq!(strikes(&|slot| *slot >= first), all, "from slot {first}");
+            assert_eq!(strikes(&|slot| !(50..50 + first).contains(slot)), all, "{first} slots left out");
+        }
     }
 
     #[test]

@@ -99,9 +99,6 @@ impl Core {
         if self.mode == Mode::Disarmed {
             let now = self.ticks();
             self.next_slot = slots.slot_at(now).map_or(0, |k| k + 1);
-            if let Some(flash) = &mut self.flash {
-                flash.begin_at(self.next_slot);
-            }
             let dark_ns = self.counted_to.map_or(0, |to| self.now.ns_since(to).max(0));
             let rate = slots.rate();
             let dark = dark_ns as u128 * u128::from(rate.num()) / (u128::from(rate.den()) * 1_000_000_000);

@@ -94,7 +94,7 @@ impl Core {
         self.begin_planes(slots, slot);
         self.note_light(slots, slot, kind);
         let luminance = if self.lit_now { self.luminance } else { 0 };
-        if self.flash.as_mut().is_some_and(|f| f.observe(luminance)) {
+        if self.flash.as_mut().is_some_and(|f| f.observe(slot, luminance)) {
             self.rest(start, u64::from(REST_US));
             self.latch(faults::FLASH_LIMIT);
         }
@@ -121,7 +121,7 @@ impl Core {
             self.latch(faults::LIGHT_LIMIT);
         }
         let luminance = self.luminance;
-        if self.flash.as_mut().is_some_and(|f| f.observe(luminance)) {
+        if self.flash.as_mut().is_some_and(|f| f.observe(slot, luminance)) {
             self.rest(start, u64::from(REST_US));
             self.latch(faults::FLASH_LIMIT);
         }

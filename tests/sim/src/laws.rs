@@ -202,13 +202,16 @@ impl Laws {
         self.clock_moved_at = self.clock_moved_at.max(t);
     }
 
-    /// Whatever the tracker does, the host acts on flashes before the projector's own limit latches. Where frames are lost, late or
-    /// not drawn, the projector may flash without the host.
-    pub fn flashes(&mut self, t: i64, has_flashed: bool, is_tracker_alone: bool) {
-        if !is_tracker_alone {
-            self.elsewhere_at = t;
-        }
-        if has_flashed && !self.has_flashed && t - self.elsewhere_at > 3 * S {
+    /// Something other than the tracker is struck: frames may be lost, late or not drawn, and the projector may flash without
+    /// the host.
+    pub fn struck_elsewhere(&mut self, t: i64) {
+        self.elsewhere_at = t;
+    }
+
+    /// Whatever the tracker does, the host acts on flashes before the projector's own limit latches.
+    pub fn flashes(&mut self, t: i64, has_flashed: bool) {
+        // The limit counts what was within a second, and soon after the fault all frames are drawn and sent as usual.
+        if has_flashed && !self.has_flashed && t - self.elsewhere_at > 1_200 * MS {
             self.fail(t, "the projector latched its flash limit before the host acted".into());
         }
         self.has_flashed = has_flashed;

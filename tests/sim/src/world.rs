@@ -391,8 +391,9 @@ impl World {
         self.fold(1, kind as u64 * 8 + state as u64);
         self.tell(|| format!("{kind:?} strikes while {}: {}", state.word(), kind.text()));
         self.laws.disturbed(self.t);
-        let has_flashed = self.projector.status().faults & faults::FLASH_LIMIT != 0;
-        self.laws.flashes(self.t, has_flashed, kind.is_of_tracker());
+        if !kind.is_of_tracker() {
+            self.laws.struck_elsewhere(self.t);
+        }
         self.strike(kind, seed);
     }
 
@@ -439,9 +440,10 @@ impl World {
         }
         self.projector.advance_to(HostTime(self.t));
         self.see_light();
-        let is_tracker_alone = self.active.iter().flatten().all(|active| active.kind.is_of_tracker());
-        let has_flashed = self.projector.status().faults & faults::FLASH_LIMIT != 0;
-        self.laws.flashes(self.t, has_flashed, is_tracker_alone);
+        if self.active.iter().flatten().any(|active| !active.kind.is_of_tracker()) {
+            self.laws.struck_elsewhere(self.t);
+        }
+        self.laws.flashes(self.t, self.projector.status().faults & faults::FLASH_LIMIT != 0);
         let mut cable = lock(&self.cable);
         if cable.plugged {
             self.projector.replies(HostTime(self.t), &mut |_, packet| cable.reply(packet));

@@ -82,17 +82,22 @@ impl FieldCount {
         times: [DeviceTicks; 2],
         shown: Shown<'_>,
     ) -> Option<Reached> {
-        let before = self.on_to(clock, times);
+        let (slot, before) = self.on_to(clock, times);
         match shown {
             Shown::New(planes) => self.held = self.brightness(planes),
             Shown::Same => self.over = u64::MAX,
             Shown::Nothing => self.held = Brightness::default(),
         }
-        let slots = before.into_iter().chain([(self.held, 1)]);
         let flashes = self.flash.as_mut().is_some_and(|limiter| {
-            let counts = matches!(shown, Shown::New(_));
-            let is_struck = counts
-                && slots.clone().fold(false, |struck, (b, n)| limiter.repeated(b.luminance, n) || struck);
+            if matches!(shown, Shown::Nothing) {
+                return false;
+            }
+            let mut first = slot - before.iter().map(|(_, slots)| slots).sum::<u64>();
+            let mut is_struck = false;
+            for (light, slots) in before.into_iter().chain([(self.held, 1)]) {
+                is_struck |= limiter.repeated(first, light.luminance, slots);
+                first += slots;
+            }
             if is_struck {
                 limiter.reset();
             }
@@ -111,25 +116,22 @@ impl FieldCount {
         reached
     }
 
-    /// Counts on to the slot of a frame. Returns the slots before it and how bright they are: a slot without a frame of its own
-    /// repeats the previous one, until the light of that frame is over.
+    /// Counts on to the slot of a frame. Returns its number, and the slots before it and how bright they are: a slot without a
+    /// frame of its own repeats the previous one, until the light of that frame is over.
     fn on_to(
         &mut self,
         clock: &SlotClock,
         [target_at, dark_from]: [DeviceTicks; 2],
-    ) -> [(Brightness, u64); 2] {
+    ) -> (u64, [(Brightness, u64); 2]) {
         let slot = clock.slot_at(target_at).unwrap_or(0);
         let [repeats, dark] = self.slot.map_or([0, 0], |last| {
             let between = slot.saturating_sub(last + 1);
             let repeats = between.min(self.over.saturating_sub(last + 1));
             [repeats, between - repeats]
         });
-        if let (None, Some(flash)) = (self.slot, &mut self.flash) {
-            flash.begin_at(slot);
-        }
         self.slot = Some(self.slot.map_or(slot, |last| last.max(slot)));
         self.over = clock.slot_at(dark_from).map_or(slot, |k| k + 1);
-        [(self.held, repeats), (Brightness::default(), dark)]
+        (slot, [(self.held, repeats), (Brightness::default(), dark)])
     }
 
     /// Of a frame of `planes`, for the limits that are on.
@@ -185,8 +187,7 @@ mod tests {
                 let mut host = FieldCount::new(&settings(rate, limit));
                 let mut device = FlashLimiter::backstop(rate, limit);
                 let (armed, first) = (draws.bits(1 << 20) % 40, draws.bits(1 << 21) % 40);
-                device.begin_at(armed);
-                device.repeated(0, first);
+                device.repeated(armed, 0, first);
                 let pixels: u8 = if seed % 2 == 0 { 0xff } else { 0x10 };
                 let lit = FULL_LUMINANCE / 8 * pixels.count_ones();
                 let (mut slot, mut on, mut left) = (armed + first, false, 0);
@@ -211,7 +212,7 @@ mod tests {
                         break;
                     }
                     assert!(
-                        !device.repeated(luminance, held),
+                        !device.repeated(slot, luminance, held),
                         "the device strikes first: {rate:?}, seed {seed}, frame {i}"
                     );
                     slot += held;
@@ -228,12 +229,15 @@ mod tests {
             let rate = FrameRate::new(rate, 1).unwrap();
             let [mut at_once, mut one_by_one] = [FlashLimiter::new(rate, 3), FlashLimiter::new(rate, 3)];
             let draws = Draws::new(rate.num().into());
+            let mut slot = 0;
             for i in 0..400 {
                 let luminance = (draws.bits(2 * i) % 2) as u32 * FULL_LUMINANCE;
                 let slots = draws.bits(2 * i + 1) % (3 * u64::from(rate.num()));
                 let slots = if i % 3 == 0 { slots } else { slots % 40 };
-                let single = (0..slots).fold(false, |struck, _| one_by_one.observe(luminance) || struck);
-                assert_eq!(at_once.repeated(luminance, slots), single, "{rate:?}, {i}: {slots} slots");
+                let one_more = |struck, k| one_by_one.observe(slot + k, luminance) || struck;
+                let single = (0..slots).fold(false, one_more);
+                assert_eq!(at_once.repeated(slot, luminance, slots), single, "{rate:?}, {i}: {slots} slots");
+                slot += slots;
             }
         }
     }

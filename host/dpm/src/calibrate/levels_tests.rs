@@ -75,10 +75,9 @@ fn the_limit_of_flashes_is_kept_by_the_limiter_itself() {
         // The averages of the limiter begin at other slots than the levels.
         for first in 12_345..12_361 {
             let mut limiter = FlashLimiter::new(rate(), limit);
-            limiter.begin_at(first);
-            let slots = first..first + 2 * levels.steps.len() as u64 * levels.hold;
-            let mut light = slots.map(|s| luminance(&schedule, levels.steps[source_step(&levels, s)].code));
-            assert!(!light.any(|l| limiter.observe(l)), "limit {limit} from slot {first}");
+            let mut slots = first..first + 2 * levels.steps.len() as u64 * levels.hold;
+            let light = |slot| luminance(&schedule, levels.steps[source_step(&levels, slot)].code);
+            assert!(!slots.any(|s| limiter.observe(s, light(s))), "limit {limit} from slot {first}");
         }
     }
     assert!(holds.is_sorted() && holds[3] > holds[0], "{holds:?}");

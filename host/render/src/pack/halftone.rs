@@ -327,7 +327,7 @@ mod tests {
     }
 
     /// Cells that begin at the same part lie evenly: no part of a grey card has its centre far from that of the card.
-    /// Beginnings that are drawn at random put it 1.7 pixels aside.
+    /// Beginnings that are drawn at random fail this.
     #[test]
     fn no_part_shifts_the_centre_of_what_is_seen() {
         let raster = Raster::new(320, 240).unwrap();

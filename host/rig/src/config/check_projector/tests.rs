@@ -5,15 +5,18 @@ use dpm_device::dlpc900::lut::led;
 use dpm_device::planes::{Channel, PlaneSchedule};
 use std::path::Path;
 
+/// A template of a rig file, with some keys changed.
+fn template(name: &str, keys: &[&str]) -> Result<RigConfig, ConfigErrors> {
+    let path = Path::new(concat!(env!("CARGO_MANIFEST_DIR"), "/../../rigs")).join(name);
+    let flags = keys.iter().map(|k| (*k).to_owned()).collect();
+    RigConfig::load(&path, &Overrides { variables: vec![], flags })
+}
+
 /// The template of a display is a rig, and its light is later than its slots: by the time until the blank and until the
 /// middle row, and by the projector's own latency.
 #[test]
 fn the_light_of_a_display_is_later_than_its_slots() {
-    const RIG: &str = include_str!("../../../../../rigs/display.toml");
-    let parsed = |keys: &[&str]| {
-        let flags = keys.iter().map(|k| (*k).to_owned()).collect();
-        RigConfig::parse("rigs/display.toml", RIG, Path::new(""), &Overrides { variables: vec![], flags })
-    };
+    let parsed = |keys: &[&str]| template("display.toml", keys);
     let rig = parsed(&[]).unwrap_or_else(|e| panic!("{e}"));
     let ProjectorBackend::Display(display) = &rig.projector.backend else { panic!("a display") };
     assert_eq!((display.encoding, display.commit_us), (DisplayEncoding::Rgb8, None));
@@ -30,21 +33,9 @@ fn the_light_of_a_display_is_later_than_its_slots() {
     // 16 ms, 8 ms, and half of a sixtieth of a second.
     assert_eq!(rig.projector.light_delay_ns(), 24_000_000 + 8_333_333);
     assert!(rig.projector.plane_timing() == PlaneTiming::Held);
-    let alp = RigConfig::parse(
-        "rigs/alp.toml",
-        include_str!("../../../../../rigs/alp.toml"),
-        Path::new(""),
-        &Overrides { variables: vec![], flags: vec![] },
-    )
-    .unwrap_or_else(|e| panic!("{e}"));
+    let alp = template("alp.toml", &[]).unwrap_or_else(|e| panic!("{e}"));
     assert_eq!(alp.projector.plane_timing(), PlaneTiming::ByWeight);
-    let window = RigConfig::parse(
-        "rigs/window.toml",
-        include_str!("../../../../../rigs/window.toml"),
-        Path::new(""),
-        &Overrides { variables: vec![], flags: vec![] },
-    )
-    .unwrap_or_else(|e| panic!("{e}"));
+    let window = template("window.toml", &[]).unwrap_or_else(|e| panic!("{e}"));
     // Three quarters of a sixtieth of a second, and half of it.
     assert_eq!(window.projector.light_delay_ns(), 16_666_667 / 4 * 3 + 8_333_333);
     assert!(window.projector.plane_timing() == PlaneTiming::Held);
@@ -70,16 +61,7 @@ fn the_light_of_a_display_is_later_than_its_slots() {
 /// fit it is refused.
 #[test]
 fn a_controller_behind_a_display_shows_frames_that_have_arrived() {
-    const RIG: &str = include_str!("../../../../../rigs/dlpc900-live.toml");
-    let parsed = |keys: &[&str]| {
-        let flags = keys.iter().map(|k| (*k).to_owned()).collect();
-        RigConfig::parse(
-            "rigs/dlpc900-live.toml",
-            RIG,
-            Path::new(""),
-            &Overrides { variables: vec![], flags },
-        )
-    };
+    let parsed = |keys: &[&str]| template("dlpc900-live.toml", keys);
     let projector = parsed(&[]).unwrap_or_else(|e| panic!("{e}")).projector;
     assert_eq!(projector.light_delay_ns(), 8_000_000 + 2 * (16_666_667 / 2));
     assert_eq!(projector.plane_timing(), PlaneTiming::Equal);
