@@ -331,7 +331,9 @@ impl Laws {
     /// True if a second of peace is over in which nearly every slot has its own frame. `crew_ready`: when the last crew was.
     pub(crate) fn is_in_peace(&self, t: i64, calm_for: i64, crew_ready: i64) -> bool {
         let is_calm = calm_for > 2 * S && t - self.good_at < S && t - self.disturbed_at > 3 * S;
-        is_calm && self.is_quick && t - crew_ready > 3 * S && t - self.started_at > 4 * S
+        // The run may end when a hang is found.
+        let is_whole = t > self.hidden_until + S;
+        is_calm && is_whole && self.is_quick && t - crew_ready > 3 * S && t - self.started_at > 4 * S
     }
 
     pub(crate) fn remember(&mut self, beneath: &Arc<Mutex<Beneath>>) {

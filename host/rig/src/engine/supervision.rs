@@ -135,7 +135,8 @@ pub(crate) struct Supervision {
 /// Frames are made, and none reaches the light: a cable that damages all of them looks like a link that is up.
 #[derive(Debug, Default)]
 struct Unlit {
-    /// Frames that were lit, or dark as they were meant to be, until the last one was; and frames planned then.
+    /// Frames that were lit, or dark as they were meant to be, until the last one was, as the collector and the projector
+    /// count them: a collector that has fallen silent is another trouble. And frames planned then.
     results: u64,
     planned: u64,
     /// When that was, or later: when no frame had been planned since.
@@ -144,10 +145,10 @@ struct Unlit {
 }
 
 impl Unlit {
-    /// Looks at the counters of a run. What the operator is to be told: `Some(true)`, no frame is lit; `Some(false)`, they are
-    /// lit again.
-    fn observe(&mut self, counts: &RunCounts, is_up: bool, now: HostTime) -> Option<bool> {
-        let results = counts.frames_lit + counts.frames_dark + counts.frames_withheld;
+    /// Looks at the counters of a run, and at the projector's of `lit` frames. What the operator is to be told: `Some(true)`,
+    /// no frame is lit; `Some(false)`, they are lit again.
+    fn observe(&mut self, counts: &RunCounts, lit: u64, is_up: bool, now: HostTime) -> Option<bool> {
+        let results = counts.frames_lit + counts.frames_dark + counts.frames_withheld + lit;
         if !is_up || results != self.results {
             let are_lit_again = self.is_told && results != self.results;
             let is_told = self.is_told && !are_lit_again;
@@ -272,7 +273,8 @@ impl Supervision {
     fn tell_if_nothing_is_lit(&mut self, now: HostTime) {
         let monitor = &self.facts.monitor;
         let is_up = monitor.projector() == ProjectorHealth::Up;
-        let Some(is_unlit) = self.unlit.observe(&monitor.counts(), is_up, now) else { return };
+        let lit = monitor.link().lit_by_device();
+        let Some(is_unlit) = self.unlit.observe(&monitor.counts(), lit, is_up, now) else { return };
         if !is_unlit {
             return monitor.note("frames are lit again".into());
         }
@@ -316,8 +318,9 @@ mod tests {
     fn a_second_of_frames_of_which_none_is_lit_is_told_once_and_its_end_too() {
         let mut unlit = Unlit::default();
         let mut look = |ms: i64, planned: u64, lit: u64, is_up: bool| {
-            let counts = RunCounts { frames_planned: planned, frames_lit: lit, ..RunCounts::default() };
-            unlit.observe(&counts, is_up, HostTime(ms * 1_000_000))
+            // The collector has fallen silent: the projector alone tells what is lit.
+            let counts = RunCounts { frames_planned: planned, ..RunCounts::default() };
+            unlit.observe(&counts, lit, is_up, HostTime(ms * 1_000_000))
         };
         // The first frames are on their way.
         assert_eq!((look(50_000, 0, 0, true), look(50_100, 9, 0, true)), (None, None));

@@ -88,6 +88,11 @@ impl LinkGauges {
         self.milli_celsius.0.store(c.milli_celsius.map_or(NONE, i64::from), Ordering::Relaxed);
     }
 
+    /// Frames that the projector has lit by its own count; 0 for the mock in this process.
+    pub(crate) fn lit_by_device(&self) -> u64 {
+        self.device[0].load(Ordering::Relaxed)
+    }
+
     /// The figures as a report, with the name of the medium.
     pub(crate) fn report(&self, name: &str) -> ProjectorReport {
         let [sessions, rearmed, bytes, raw, coded, kept, tracks_sent, moved, clamped, stale, not_sent @ ..] =
