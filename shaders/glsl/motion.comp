@@ -22,6 +22,21 @@ ivec2 motion_of(uint mover, uint instance, vec3 world) {
     return ivec2(clamp(floor(moved * 64.0 + 0.5), -32767.0, 32767.0));
 }
 
+// Code values at a pixel, or at the nearest pixel of the raster.
+ivec3 codes_at(ivec2 pixel) {
+    pixel = clamp(pixel, ivec2(0), ivec2(frame.width, frame.height) - 1);
+    uint word = codes[uint(pixel.y) * frame.width + uint(pixel.x)];
+    return ivec3(word & 255u, (word >> 8u) & 255u, (word >> 16u) & 255u);
+}
+
+// True if the code values of a pixel are not about in the middle between those to its left and right, and of those above and below.
+bool is_rough(ivec2 pixel) {
+    ivec3 twice = 2 * codes_at(pixel);
+    ivec3 across = abs(codes_at(pixel - ivec2(1, 0)) - twice + codes_at(pixel + ivec2(1, 0)));
+    ivec3 down = abs(codes_at(pixel - ivec2(0, 1)) - twice + codes_at(pixel + ivec2(0, 1)));
+    return any(greaterThan(max(across, down), ivec3(ROUGH_STEP)));
+}
+
 void main() {
     uvec2 pixel;
     if (!tile_pixel(tiles[gl_WorkGroupID.x >> 2u], pixel)) return;
@@ -39,7 +54,9 @@ void main() {
         // The bits of positive numbers grow with them.
         depth = floatBitsToUint(distance_) >> 7u;
     }
-    motions[index].word = codes[index];
+    uint word = codes[index];
+    if (owner > OWNER_STILL && !WARP_WHOLE_WORDS && is_rough(ivec2(pixel))) word |= WORD_ROUGH;
+    motions[index].word = word;
     motions[index].motion = (uint(motion.x) & 0xffffu) | (uint(motion.y) << 16u);
     motions[index].owner_and_depth = (owner << 24u) | (depth & 0xffffffu);
 }

@@ -63,11 +63,26 @@ bool find(uint m, ivec2 pixel, int instant, Moved own, out ivec2 at, out uint de
     return owner_of(there) == owner;
 }
 
-// The word of mover `m` at a place. Halftones are taken whole; code values are between those of the pixels around the place that show the body.
-uint word_of(uint m, ivec2 at) {
+// True if a group shows all bits of each channel that it shows.
+bool has_whole_codes(uint mask) {
+    uvec3 bits = uvec3(mask, mask >> 8u, mask >> 16u) & 255u;
+    return all(equal(bits * (255u - bits), uvec3(0u)));
+}
+
+// The word of the pixel that this frame takes for a place between pixels. Frames take each of those around it as often as it is near.
+uint word_in_turn(uint m, ivec2 at, uint g) {
+    uvec2 turn = frame.drawn * uvec2(0x9E3779B9u, 0x6A09E667u) + g * uvec2(0x61C88647u, 0x3C6EF372u);
+    Moved there = moved_at(m, (at + ivec2(turn >> 26u)) >> 6);
+    return owner_of(there) == OWNER_STILL + 1u + m ? there.word : motions[index_of(nearest_pixel(at))].word;
+}
+
+// The word of mover `m` at a place, for group `g`. Halftones are taken whole. Code values are between those of the pixels around the place that
+// show the body. Where these are rough, bits of different groups would be those of codes that the picture does not have, and their sum would be
+// far off: there each frame takes the code of one pixel.
+uint word_of(uint m, ivec2 at, uint g) {
     if (WARP_WHOLE_WORDS) return motions[index_of(nearest_pixel(at))].word;
     uvec2 part = uvec2(at & 63);
-    uint weights = 0u;
+    uint weights = 0u, all_words = 0u;
     uvec3 sums = uvec3(0u);
     for (uint tap = 0u; tap < 4u; tap++) {
         uvec2 step_ = uvec2(tap & 1u, tap >> 1u);
@@ -76,15 +91,18 @@ uint word_of(uint m, ivec2 at) {
         Moved there = moved_at(m, pixel);
         uint weight = owner_of(there) == OWNER_STILL + 1u + m ? weight2.x * weight2.y : 0u;
         weights += weight;
+        all_words |= weight > 0u ? there.word : 0u;
         sums += weight * uvec3(there.word & 255u, (there.word >> 8u) & 255u, (there.word >> 16u) & 255u);
     }
+    if ((all_words & WORD_ROUGH) != 0u && !has_whole_codes(groups[g].mask)) return word_in_turn(m, at, g);
     // The nearest of the four shows the body, so the weights are positive.
     uvec3 code = (sums + weights / 2u) / max(weights, 1u);
     return code.r | (code.g << 8u) | (code.b << 16u);
 }
 
-// The bits that the mirror `pixel` shows at `instant`.
-uint word_at(ivec2 pixel, int instant, Moved own) {
+// The bits that the mirror `pixel` shows in the planes of group `g`.
+uint word_at(ivec2 pixel, uint g, Moved own) {
+    int instant = groups[g].instant;
     uint owner = owner_of(own), closest = 0xffffffffu, mover = NO_MOVER;
     if (owner == OWNER_STILL) closest = depth_of(own);
     ivec2 place;
@@ -97,7 +115,7 @@ uint word_at(ivec2 pixel, int instant, Moved own) {
             place = at;
         }
     }
-    if (mover != NO_MOVER) return word_of(mover, place);
+    if (mover != NO_MOVER) return word_of(mover, place, g);
     if (owner <= OWNER_STILL) return owner == OWNER_STILL ? own.word : 0u;
     // A body has left this mirror and uncovers what was hidden. What is seen behind its edge goes on here.
     Moved behind = moved_at(owner - OWNER_STILL - 1u, nearest_pixel(source(pixel, motion_of(own), instant)));
@@ -110,10 +128,10 @@ void main() {
     ivec2 pixel = ivec2(at);
     uint index = index_of(pixel);
     Moved own = Moved(motions[index].word, motions[index].motion, motions[index].owner_and_depth);
-    uint word = own.word;
+    uint word = WARP_WHOLE_WORDS ? own.word : own.word & ~WORD_ROUGH;
     for (uint g = 0u; g < frame.group_count; g++) {
         uint mask = groups[g].mask;
-        word = (word & ~mask) | (word_at(pixel, groups[g].instant, own) & mask);
+        word = (word & ~mask) | (word_at(pixel, g, own) & mask);
     }
     codes[index] = word;
 }

@@ -158,7 +158,7 @@ gpu_structs! {
 
     /// What was drawn at a pixel, and how it moves while the planes of the frame last.
     struct Moved {
-        /// The word whose bits the planes show.
+        /// The word whose bits the planes show. Code values of a mover have `WORD_ROUGH` beside them where they are rough.
         word: u32,
         /// Motion on the raster during the whole exposure, 1/64 pixel: to the right in the low half, down in the high half.
         motion: u32,
@@ -470,6 +470,8 @@ pub const CONSTANTS: &[(&str, u32)] = &[
     ("RESPONSE_CODES", RESPONSE_CODES),
     ("OWNER_NONE", OWNER_NONE),
     ("OWNER_STILL", OWNER_STILL),
+    ("WORD_ROUGH", WORD_ROUGH),
+    ("ROUGH_STEP", ROUGH_STEP),
     ("TRACE_LANES", TRACE_LANES),
     ("TRACE_GROUP_SAMPLES", TRACE_GROUP_SAMPLES),
     ("TRACE_PIXEL_SAMPLES", TRACE_PIXEL_SAMPLES),
@@ -560,6 +562,10 @@ pub const RESPONSE_CODES: u32 = 256;
 pub const OWNER_NONE: u32 = 0;
 /// What is at the pixel stays where it was drawn. The owners after it are the movers, in their order.
 pub const OWNER_STILL: u32 = 1;
+/// Bit of [`Moved::word`]: the code values of the pixel lie by more than [`ROUGH_STEP`] off the middle between two neighbours.
+pub const WORD_ROUGH: u32 = 1 << 31;
+/// Twice the distance, in code values, from the middle between the neighbours from which on a pixel is rough.
+pub const ROUGH_STEP: u32 = 48;
 /// Lanes of a workgroup of the pass `trace`.
 pub const TRACE_LANES: u32 = 64;
 /// On a GPU a workgroup of the pass `trace` takes the pixels whose first sample lies in its own range of so many: a little below three a lane,

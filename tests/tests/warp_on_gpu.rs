@@ -2,16 +2,17 @@
 //! as an eye sees their light that follows the body.
 
 use dpm_device::planes::{PlaneSchedule, Raster};
-use dpm_lab::error::planes::{centre_of, middle_of, Card, Panel, MOTIONS};
+use dpm_lab::error::planes::{centre_of, middle_of, Card, Panel, Pattern, MOTIONS};
 use dpm_lab::stability::gpu_shot::Shot;
 use dpm_render::gpu::Gpu;
-use dpm_render::warp::gather::{motion_of, owner_of, within, Drawn};
+use dpm_render::warp::gather::{is_rough, motion_of, owner_of, within, Drawn};
 use dpm_render::warp::{plane_groups, Sweep};
 use dpm_render::{FrameInputs, Renderer, RendererSettings};
+use dpm_rig::config::BitOrder;
 use dpm_scene::geometry::lens::Lens;
 use dpm_scene::geometry::projector::ProjectorCamera;
 use dpm_scene::{shapes, Material, Scene};
-use dpm_shaders::structs::{Moved, Mover, PlaneGroup, Surface, OWNER_NONE, OWNER_STILL};
+use dpm_shaders::structs::{Moved, Mover, PlaneGroup, Surface, OWNER_NONE, OWNER_STILL, WORD_ROUGH};
 use dpm_tests::gpu::with_gpu;
 use glam::{DAffine3, DQuat, DVec2, DVec3, Vec3};
 use std::sync::Arc;
@@ -133,7 +134,13 @@ fn planes_of_gpu_and_cpu_are_the_same_bits() {
                 let shown =
                     draw(&mut renderer(gpu, &scene, &camera, &groups), &camera, &now, Some((&first, &last)));
                 assert_eq!((shown.movers.len(), still.movers.len()), (2, 0), "{name}");
-                let drawn = Drawn { raster, pixels: &shown.motions, movers: &shown.movers, are_codes: true };
+                let drawn = Drawn {
+                    raster,
+                    pixels: &shown.motions,
+                    movers: &shown.movers,
+                    are_codes: true,
+                    before: 0,
+                };
                 let mut changed = 0;
                 for i in 0..raster.pixel_count() {
                     let pixel = [(i as u32 % WIDTH) as i32, (i as u32 / WIDTH) as i32];
@@ -179,7 +186,8 @@ fn every_plane_shows_the_bodies_at_its_own_instant() {
             let [now, first, last] = poses_of_frame(&twists(2.0), centre_of(&PlaneSchedule::rgb24()));
             let mut renderer = renderer(gpu, &scene, &camera, &groups);
             let shown = draw(&mut renderer, &camera, &now, Some((&first, &last)));
-            let drawn = Drawn { raster, pixels: &shown.motions, movers: &shown.movers, are_codes: true };
+            let drawn =
+                Drawn { raster, pixels: &shown.motions, movers: &shown.movers, are_codes: true, before: 0 };
             let point_at = |i: usize, instant: f64| {
                 let surface = &shown.surfaces[i];
                 let body = (surface.id >> 24) as usize;
@@ -242,8 +250,13 @@ fn silhouettes_are_those_of_the_instant() {
         let [now, first, last] = poses_of_frame(twists, centre_of(&PlaneSchedule::rgb24()));
         let mut renderer = renderer(gpu, &scene, &camera, &groups);
         let shown = draw(&mut renderer, &camera, &now, Some((&first, &last)));
-        let drawn =
-            Drawn { raster: camera.raster, pixels: &shown.motions, movers: &shown.movers, are_codes: true };
+        let drawn = Drawn {
+            raster: camera.raster,
+            pixels: &shown.motions,
+            movers: &shown.movers,
+            are_codes: true,
+            before: 0,
+        };
         let inside = |pixel: [i32; 2]| shown.movers.iter().any(|m| within(m, pixel));
         let (mut apart, mut before, mut edge) = (0, 0, 0);
         for group in &groups {
@@ -272,38 +285,83 @@ fn silhouettes_are_those_of_the_instant() {
     });
 }
 
-/// A textured body at 1 m/s, seen by an eye that follows it, errs by a quarter at most of what it errs by if all planes
-/// show the middle of the exposure. At rest nothing changes. An eye that rests loses little.
+/// A textured body at 1 m/s, seen by an eye that follows it, errs by a quarter of what it errs by if the planes, from the
+/// highest bit down, all show the middle of the exposure; with hard edges in the texture, by a third. At rest nothing
+/// changes. An eye that rests loses little.
 #[test]
 fn an_eye_that_follows_sees_the_texture_sharp() {
     with_gpu(|gpu| {
-        let card = Card::new(gpu).unwrap();
         let motion = |name: &str| MOTIONS.iter().find(|motion| motion.name == name).expect("in the table");
-        let measure = |name: &str, order| {
-            let row = card.measure(motion(name), &Panel::of_bits(order)).unwrap();
-            println!("{row:?}");
-            row
-        };
-        let (usual, amid) = ([7, 6, 5, 4, 3, 2, 1, 0], [0, 2, 4, 6, 7, 5, 3, 1]);
-        let rest = measure("at rest", usual);
-        assert_eq!(rest.follows, rest.rests);
-        assert!(rest.follows.own == rest.follows.centre && rest.follows.own < 0.002, "{rest:?}");
-        let passing = measure("1 m/s", usual);
-        // Before planes were aimed at the centre of their light, this was all that there was.
-        let before = passing.follows.middle;
-        for row in [passing, measure("1 m/s", amid), measure("1 m/s, turning at 4 rad/s", usual)] {
-            let (own, centre) = (row.follows.own, row.follows.centre);
-            assert!(own <= 0.25 * before && own <= 0.45 * centre && row.rests.own <= 0.015, "{row:?}");
+        let usual = BitOrder::default().0;
+        // If bits of rough places came from codes between those of the pixels, patches would err by 0.41 of it.
+        for (pattern, share, rests_at_most) in
+            [(Pattern::Noise, 0.25, 0.0108), (Pattern::Patches, 0.33, 0.01)]
+        {
+            let card = Card::new(gpu, pattern).unwrap();
+            let measure = |name: &str, order| {
+                let row = card.measure(motion(name), &Panel::of_bits(order)).unwrap();
+                println!("{row:?}");
+                row
+            };
+            // Before planes were aimed at the centre of their light, and before they followed, this was all that there was.
+            let falling = measure("1 m/s", [7, 6, 5, 4, 3, 2, 1, 0]);
+            let before = falling.follows.middle;
+            let passing = measure("1 m/s", usual);
+            for row in [&falling, &passing] {
+                let (own, centre) = (row.follows.own, row.follows.centre);
+                assert!(own <= share * before && own <= 0.7 * centre, "{row:?}");
+            }
+            assert!(passing.rests.own <= rests_at_most, "{passing:?}");
+            // Why this order is the default.
+            assert!(passing.follows.centre < 0.95 * falling.follows.centre, "{passing:?}");
+            assert!(passing.follows.own < 1.05 * falling.follows.own, "{passing:?}");
+            if pattern == Pattern::Noise {
+                assert!(passing.follows.centre < 0.7 * falling.follows.centre, "{passing:?}");
+                assert!(passing.rests.own < 0.9 * falling.rests.own, "{passing:?}");
+                let turning = measure("1 m/s, turning at 4 rad/s", usual);
+                assert!(turning.follows.own <= share * before, "{turning:?}");
+                let rest = measure("at rest", usual);
+                assert_eq!(rest.follows, rest.rests);
+                assert!(rest.follows.own == rest.follows.centre && rest.follows.own < 0.002, "{rest:?}");
+            }
         }
     });
 }
 
-/// What an eye that rests loses where planes follow is lost by any planes that follow: drawn by themselves for their own
-/// instants, they do not do better than warped ones. Not so for an eye that follows.
+/// The pass `motion` marks the pixels of a mover whose code values bend, and no others.
+#[test]
+fn rough_places_are_marked() {
+    with_gpu(|gpu| {
+        let (scene, camera) = (cards(), projector(Lens::default()));
+        let (groups, _) = groups_of(&PlaneSchedule::rgb24());
+        let [now, first, last] = poses_of_frame(&twists(2.0), centre_of(&PlaneSchedule::rgb24()));
+        let still = draw(&mut renderer(gpu, &scene, &camera, &[]), &camera, &now, None);
+        let shown = draw(&mut renderer(gpu, &scene, &camera, &groups), &camera, &now, Some((&first, &last)));
+        let (mut rough, mut even) = (0, 0);
+        for y in 1..HEIGHT - 1 {
+            for x in 1..WIDTH - 1 {
+                let i = (y * WIDTH + x) as usize;
+                if !shown.movers.iter().any(|m| within(m, [x as i32, y as i32])) {
+                    continue;
+                }
+                let row = WIDTH as usize;
+                let around = [i - 1, i + 1, i - row, i + row].map(|i| still.codes[i]);
+                let is_mover = owner_of(&shown.motions[i]) > OWNER_STILL;
+                let mark = if is_mover && is_rough(still.codes[i], around) { WORD_ROUGH } else { 0 };
+                assert_eq!(shown.motions[i].word, still.codes[i] | mark, "at {x}, {y}");
+                rough += u32::from(mark != 0);
+                even += u32::from(is_mover && mark == 0);
+            }
+        }
+        println!("{rough} rough pixels, {even} others");
+        assert!(rough > 500 && even > 5_000, "{rough} {even}");
+    });
+}
+
 #[test]
 fn an_eye_that_follows_sees_the_patterns_of_a_dlpc900_sharp() {
     with_gpu(|gpu| {
-        let card = Card::new(gpu).unwrap();
+        let card = Card::new(gpu, Pattern::Noise).unwrap();
         let panel = Panel::of_binary24();
         // Two frames of nine levels leave 0.029 of a card at rest. With mirrors that each begin at a part of their own it is
         // 0.044 at 1 m/s.
@@ -317,12 +375,14 @@ fn an_eye_that_follows_sees_the_patterns_of_a_dlpc900_sharp() {
     });
 }
 
+/// What an eye that rests loses where planes follow is lost by any planes that follow: drawn by themselves for their own
+/// instants, they do not do better than warped ones. Not so for an eye that follows.
 #[test]
 fn an_eye_that_rests_loses_nothing_by_the_warp() {
     with_gpu(|gpu| {
-        let card = Card::new(gpu).unwrap();
+        let card = Card::new(gpu, Pattern::Noise).unwrap();
         let motion = MOTIONS.iter().find(|motion| motion.name == "1 m/s").expect("in the table");
-        for order in [[7, 6, 5, 4, 3, 2, 1, 0], [0, 2, 4, 6, 7, 5, 3, 1]] {
+        for order in [BitOrder::default().0, [7, 6, 5, 4, 3, 2, 1, 0]] {
             let panel = Panel::of_bits(order);
             let warped = card.measure(motion, &panel).unwrap();
             let [follows, rests] = card.measure_drawn_anew(motion, &panel).unwrap();

@@ -50,7 +50,8 @@ fn warp_ms(raster: Raster, codes: &mut [u32]) -> f64 {
     let of = |&word: &u32| Moved { word, motion: 128, owner_and_depth: (OWNER_STILL + 1) << 24 };
     let pixels: Vec<Moved> = codes.iter().map(of).collect();
     median_ms(|| {
-        let drawn = Drawn { raster, pixels: black_box(&pixels), movers: &[mover], are_codes: true };
+        let drawn =
+            Drawn { raster, pixels: black_box(&pixels), movers: &[mover], are_codes: true, before: 0 };
         for (i, word) in codes.iter_mut().enumerate() {
             *word = drawn.word([i as i32 % width, i as i32 / width], &groups);
         }

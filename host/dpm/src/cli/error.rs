@@ -8,7 +8,7 @@ use dpm_common::files::check_folder;
 use dpm_device::planes::Raster;
 use dpm_lab::error::figure3::Figure3Group;
 use dpm_lab::error::plan::Setting;
-use dpm_lab::error::planes::{markdown, Card, Panel, MOTIONS};
+use dpm_lab::error::planes::{markdown, Card, Panel, Pattern, MOTIONS};
 use dpm_lab::error::runs::{ErrorOptions, Extent, GroupResult};
 use dpm_lab::error::table::TableGroup;
 use dpm_render::gpu::Gpu;
@@ -125,17 +125,23 @@ pub(super) fn execute(args: &ErrorArgs) -> Result<(), Failure> {
     }
 }
 
-/// Orders of the bits that `dpm error planes` compares.
-const ORDERS: [[u8; 8]; 2] = [[7, 6, 5, 4, 3, 2, 1, 0], [0, 2, 4, 6, 7, 5, 3, 1]];
+/// Orders of the bits that `dpm error planes` compares, the default first.
+const ORDERS: [[u8; 8]; 3] = [[4, 6, 7, 5, 3, 2, 1, 0], [7, 6, 5, 4, 3, 2, 1, 0], [0, 2, 4, 6, 7, 5, 3, 1]];
 
 /// Measures every motion with every order of the planes.
 fn planes(json: bool) -> Result<(), Failure> {
     let config = RigConfig::demo(&Overrides::default())?;
     let failed = |e| Failure::from(PipelineError::from(e));
-    let card = Card::new(&open_gpu(&config)?).map_err(failed)?;
-    let panels = ORDERS.into_iter().map(Panel::of_bits).chain([Panel::of_binary24()]);
-    let of = |panel: Panel| MOTIONS.iter().map(|motion| card.measure(motion, &panel)).collect::<Vec<_>>();
-    let rows = panels.flat_map(of).collect::<Result<Vec<_>, _>>().map_err(failed)?;
+    let gpu = open_gpu(&config)?;
+    let panels: Vec<Panel> = ORDERS.into_iter().map(Panel::of_bits).chain([Panel::of_binary24()]).collect();
+    let mut rows = Vec::new();
+    for pattern in [Pattern::Noise, Pattern::Patches] {
+        let card = Card::new(&gpu, pattern).map_err(failed)?;
+        for panel in &panels {
+            let measured = MOTIONS.iter().map(|motion| card.measure(motion, panel));
+            rows.extend(measured.collect::<Result<Vec<_>, _>>().map_err(failed)?);
+        }
+    }
     print(&if json { to_json(&serde_json::json!({ "planes": rows })) + "\n" } else { markdown(&rows) });
     Ok(())
 }

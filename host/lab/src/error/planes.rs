@@ -7,6 +7,7 @@
 
 use super::runs::EYE_FRAMES;
 use dpm_device::planes::{PlaneSchedule, Raster};
+use dpm_device::rng::Sampler;
 use dpm_render::drive::Drive;
 use dpm_render::gpu::{Gpu, GpuError};
 use dpm_render::method::Method;
@@ -14,7 +15,7 @@ use dpm_render::pack::{source_bits, Halftone};
 use dpm_render::warp::{plane_groups, Sweep};
 use dpm_render::{FrameInputs, FrameSlot, Output, RenderError, Renderer, RendererSettings};
 use dpm_scene::geometry::projector::ProjectorCamera;
-use dpm_scene::{shapes, Material, Scene};
+use dpm_scene::{shapes, Material, Scene, Texture, Wrap};
 use dpm_shaders::structs::PlaneGroup;
 use glam::{DAffine3, DMat3, DQuat, DVec2, DVec3, Vec3};
 use serde::{Deserialize, Serialize};
@@ -112,6 +113,8 @@ impl Panel {
 /// Errors of one motion and one kind of planes: root of the mean square over the pixels, full light is 1.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct PlanesRow {
+    /// What is on the card.
+    pub texture: String,
     /// How the card moves.
     pub motion: String,
     /// The bits in the order in which they are lit, or what shows them.
@@ -133,6 +136,16 @@ pub struct Remedies {
     pub own: f64,
 }
 
+/// What is on the card.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Pattern {
+    /// White noise of the full contrast, in grains of 6 x 8 mirrors: hardly a surface has more detail.
+    Noise,
+    /// Overlapping patches of 6 to 40 mirrors a side, mottled with noise that grows with its wavelength, as pictures of
+    /// surfaces are made up of \[Lee01\].
+    Patches,
+}
+
 /// How the planes of a frame are drawn.
 #[derive(Clone, Copy, PartialEq)]
 enum Drawing {
@@ -146,6 +159,7 @@ enum Drawing {
 
 /// A card before a part of 320 x 240 mirrors of a projector of 1024 x 768: one mirror is 0.58 mm.
 pub struct Card {
+    pattern: Pattern,
     gpu: Arc<Gpu>,
     scene: Scene,
     camera: ProjectorCamera,
@@ -158,16 +172,20 @@ pub struct Card {
 type LitFrame = (Vec<u32>, Vec<DMat3>);
 
 impl Card {
-    /// Draws the card at rest.
+    /// Draws the card at rest, with `pattern` on it.
     ///
     /// # Errors
     /// The renderer's.
     ///
     /// # Panics
     /// Never: the raster and the projector are given.
-    pub fn new(gpu: &Arc<Gpu>) -> Result<Self, RenderError> {
+    pub fn new(gpu: &Arc<Gpu>, pattern: Pattern) -> Result<Self, RenderError> {
         let mut scene = Scene::default();
-        let glow = shapes::use_texture(&mut scene, shapes::noise_texture(40, 5, 5, 255, false));
+        let texture = match pattern {
+            Pattern::Noise => shapes::noise_texture(40, 5, 5, 255, false),
+            Pattern::Patches => patches(),
+        };
+        let glow = shapes::use_texture(&mut scene, texture);
         let card = shapes::quad(Vec3::new(-0.15, -0.15, 0.0), Vec3::X * 0.3, Vec3::Y * 0.3);
         shapes::add(
             &mut scene,
@@ -178,7 +196,7 @@ impl Card {
         let angle = 2.0 * (f64::from(WIDTH) / 2.0 * 0.58e-3 / 1.1).atan();
         let camera = ProjectorCamera::look_at(raster, DVec3::Z * 1.1, DVec3::ZERO, DVec3::Y, angle)
             .expect("a projector before the card");
-        let mut card = Self { gpu: gpu.clone(), scene, camera, texture: Vec::new() };
+        let mut card = Self { pattern, gpu: gpu.clone(), scene, camera, texture: Vec::new() };
         let finer = Raster::new(WIDTH * FINER as u32, HEIGHT * FINER as u32).expect("a small raster");
         let fine = card.camera.at_raster(finer);
         let mut frames = card.frames(&fine, &[], None)?;
@@ -201,7 +219,12 @@ impl Card {
                 *[&mut remedies.middle, &mut remedies.centre, &mut remedies.own][way] = error;
             }
         }
-        Ok(PlanesRow { motion: motion.name.into(), planes: panel.name.clone(), follows, rests })
+        let texture = match self.pattern {
+            Pattern::Noise => "noise",
+            Pattern::Patches => "patches",
+        };
+        let (texture, motion, planes) = (texture.into(), motion.name.into(), panel.name.clone());
+        Ok(PlanesRow { texture, motion, planes, follows, rests })
     }
 
     /// The errors of an eye that follows and of one that rests if the planes of every bit were drawn by themselves for their
@@ -321,6 +344,63 @@ impl Card {
     }
 }
 
+/// Texels of one side of the patches, about as wide as a mirror.
+const PATCHES: usize = 256;
+
+/// The texture of [`Pattern::Patches`].
+fn patches() -> Texture {
+    let mut random = Sampler::new(4, 0);
+    let grey = mottled(&mut random, 0.16);
+    let tints = [(); 3].map(|()| mottled(&mut random, 0.07));
+    let mut factors = vec![1.0; PATCHES * PATCHES];
+    let mut between = |low: f64, high: f64| low + (high - low) * random.uniform();
+    // Enough to cover every texel several times.
+    for _ in 0..1500 {
+        let [width, height] = [(); 2].map(|()| between(6.0, 40.0) as usize);
+        let [left, top] = [(); 2].map(|()| between(0.0, PATCHES as f64) as usize);
+        let factor = if between(0.0, 1.0) < 0.8 { between(0.25, 1.25) } else { 0.0 };
+        for i in 0..width * height {
+            let (x, y) = ((left + i % width) % PATCHES, (top + i / width) % PATCHES);
+            factors[y * PATCHES + x] = factor;
+        }
+    }
+    let value = |i: usize, channel: usize| {
+        let light = (0.45 + grey[i] + tints[channel][i]) * factors[i];
+        (light.clamp(0.0, 1.0) * 255.0).round() as u8
+    };
+    let texels = (0..PATCHES * PATCHES).map(|i| [value(i, 0), value(i, 1), value(i, 2), 255]).collect();
+    let size = PATCHES as u32;
+    Texture {
+        width: size,
+        height: size,
+        texels,
+        srgb: false,
+        wrap_u: Wrap::Repeat,
+        wrap_v: Wrap::Repeat,
+        nearest: false,
+    }
+}
+
+/// Noise with the root of the mean square `rms`, of six octaves from 2 to 64 texels whose power grows with the wavelength.
+fn mottled(random: &mut Sampler, rms: f64) -> Vec<f64> {
+    let mut sum = vec![0.0; PATCHES * PATCHES];
+    for period in [2, 4, 8, 16, 32, 64] {
+        let cells = PATCHES / period;
+        let values: Vec<f64> = (0..cells * cells).map(|_| 2.0 * random.uniform() - 1.0).collect();
+        let at = |x: usize, y: usize| values[y % cells * cells + x % cells];
+        for (i, sum) in sum.iter_mut().enumerate() {
+            let (x, y) = (i % PATCHES, i / PATCHES);
+            let [u, v] = [x, y].map(|c| (c % period) as f64 / period as f64);
+            let (x, y) = (x / period, y / period);
+            let row = |y: usize| at(x, y) * (1.0 - u) + at(x + 1, y) * u;
+            *sum += (row(y) * (1.0 - v) + row(y + 1) * v) * (period as f64).sqrt();
+        }
+    }
+    let mean = sum.iter().sum::<f64>() / sum.len() as f64;
+    let spread = (sum.iter().map(|s| (s - mean).powi(2)).sum::<f64>() / sum.len() as f64).sqrt();
+    sum.iter().map(|s| (s - mean) / spread * rms).collect()
+}
+
 /// A renderer of the card.
 struct Frames {
     renderer: Renderer,
@@ -369,14 +449,16 @@ pub fn centre_of(schedule: &PlaneSchedule) -> f64 {
 /// The rows as a Markdown table.
 pub fn markdown(rows: &[PlanesRow]) -> String {
     let mut out = String::from(
-        "| motion | planes | eye | all for mid-exposure | all for the light's centre | each for its own instant |\n\
-         |---|---|---|---:|---:|---:|\n",
+        "| texture | motion | planes | eye | all for mid-exposure | all for the light's centre | \
+         each for its own instant |\n|---|---|---|---|---:|---:|---:|\n",
     );
     for row in rows {
         for (eye, errors) in [("follows", row.follows), ("rests", row.rests)] {
             let Remedies { middle, centre, own } = errors;
-            let (motion, planes) = (&row.motion, &row.planes);
-            out += &format!("| {motion} | {planes} | {eye} | {middle:.4} | {centre:.4} | {own:.4} |\n");
+            let PlanesRow { texture, motion, planes, .. } = row;
+            out += &format!(
+                "| {texture} | {motion} | {planes} | {eye} | {middle:.4} | {centre:.4} | {own:.4} |\n"
+            );
         }
     }
     out

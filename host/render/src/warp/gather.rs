@@ -1,7 +1,7 @@
 //! The CPU twin of `shaders/glsl/warp.comp`.
 
 use dpm_device::planes::Raster;
-use dpm_shaders::structs::{Moved, Mover, PlaneGroup, OWNER_NONE, OWNER_STILL};
+use dpm_shaders::structs::{Moved, Mover, PlaneGroup, OWNER_NONE, OWNER_STILL, ROUGH_STEP, WORD_ROUGH};
 
 /// A frame as it was drawn, and how its surfaces move.
 #[derive(Clone, Copy, Debug)]
@@ -14,6 +14,8 @@ pub struct Drawn<'a> {
     pub movers: &'a [Mover],
     /// The words are code values, and what lies between pixels is interpolated. Words of halftones are taken whole.
     pub are_codes: bool,
+    /// Frames that were drawn before: where code values are rough, each takes the pixels between which a place lies in turn.
+    pub before: u32,
 }
 
 /// What a mirror shows at an instant.
@@ -51,6 +53,29 @@ fn nearest(at: [i32; 2]) -> [i32; 2] {
     at.map(|c| (c + 32) >> 6)
 }
 
+/// True if the code values `here` are by more than half of [`ROUGH_STEP`] off the middle between those to the left and right, or
+/// above and below, in any channel.
+pub fn is_rough(here: u32, [left, right, above, below]: [u32; 4]) -> bool {
+    let codes = |word: u32| [0, 8, 16].map(|shift| (word >> shift & 0xff) as i32);
+    let bends = |a: u32, b: u32| {
+        let (a, here, b) = (codes(a), codes(here), codes(b));
+        (0..3).any(|c| (a[c] - 2 * here[c] + b[c]).unsigned_abs() > ROUGH_STEP)
+    };
+    bends(left, right) || bends(above, below)
+}
+
+/// What a frame adds to places of group `group` before their fraction is cut off, 0 to 63 in 1/64 pixel: multiples of the
+/// golden ratio and of the root of 2, which take all values evenly over the frames.
+fn turn_of(before: u32, group: u32) -> [i32; 2] {
+    let of = |step: u32, apart: u32| before.wrapping_mul(step).wrapping_add(group.wrapping_mul(apart)) >> 26;
+    [of(0x9E37_79B9, 0x61C8_8647), of(0x6A09_E667, 0x3C6E_F372)].map(|turn| turn as i32)
+}
+
+/// True if a group of planes shows all bits of each channel that it shows.
+fn has_whole_codes(mask: u32) -> bool {
+    [0, 8, 16].iter().all(|shift| matches!(mask >> shift & 0xff, 0 | 0xff))
+}
+
 impl Drawn<'_> {
     /// The word of a mirror whose planes follow: its bits are those of `groups` at their instants, and the bits that no
     /// group shows are as they were drawn.
@@ -58,9 +83,10 @@ impl Drawn<'_> {
     /// # Panics
     /// When the pixel lies outside the raster, or `pixels` is shorter than it.
     pub fn word(&self, pixel: [i32; 2], groups: &[PlaneGroup]) -> u32 {
-        let mut word = self.at(pixel).word;
-        for group in groups {
-            let there = self.place_at(pixel, group.instant).map_or(0, |place| self.word_at(place));
+        let mut word = self.without_mark(self.at(pixel).word);
+        for (group, number) in groups.iter().zip(0..) {
+            let place = self.place_at(pixel, group.instant);
+            let there = place.map_or(0, |place| self.word_at(place, group, number));
             word = (word & !group.mask) | (there & group.mask);
         }
         word
@@ -102,26 +128,43 @@ impl Drawn<'_> {
         behind.filter(|m| owner_of(m) != OWNER_NONE).map(|_| Place { at, owner: OWNER_NONE })
     }
 
-    /// The word at a place: that of its pixel, or code values between those of the pixels around it that show the same
-    /// body.
-    fn word_at(&self, Place { at, owner }: Place) -> u32 {
+    /// The word at a place for the planes of a group: that of its pixel, or code values between those of the pixels around it
+    /// that show the same body.
+    fn word_at(&self, Place { at, owner }: Place, group: &PlaneGroup, number: u32) -> u32 {
         if !self.are_codes || owner <= OWNER_STILL {
             return self.at(nearest(at)).word;
         }
         let mover = self.mover_of(owner);
+        let shows = |pixel| self.moved_at(mover, pixel).filter(|m| owner_of(m) == owner);
         let part = at.map(|c| (c & 63) as u32);
-        let (mut weights, mut sums) = (0, [0; 3]);
+        let (mut weights, mut words, mut sums) = (0, 0, [0; 3]);
         for step in [[0, 0], [1, 0], [0, 1], [1, 1]] {
-            let pixel = [0, 1].map(|c| (at[c] >> 6) + step[c]);
             let [x, y] = [0, 1].map(|c| if step[c] == 1 { part[c] } else { 64 - part[c] });
-            if let Some(there) = self.moved_at(mover, pixel).filter(|m| owner_of(m) == owner) {
+            let there = shows([0, 1].map(|c| (at[c] >> 6) + step[c]));
+            if let Some(there) = there.filter(|_| x * y > 0) {
                 weights += x * y;
+                words |= there.word;
                 (0..3).for_each(|c| sums[c] += x * y * ((there.word >> (8 * c)) & 0xff));
             }
+        }
+        // Bits of different groups would be those of codes that the picture does not have, and their sum would be far off.
+        if words & WORD_ROUGH != 0 && !has_whole_codes(group.mask) {
+            let turn = turn_of(self.before, number);
+            let there = shows([0, 1].map(|c| (at[c] + turn[c]) >> 6));
+            return there.unwrap_or(self.at(nearest(at))).word;
         }
         // The nearest of the four shows the body, so the weights are positive.
         let code = |c: usize| ((sums[c] + weights / 2) / weights) << (8 * c);
         code(0) | code(1) | code(2)
+    }
+
+    /// A word without the mark of what is rough.
+    fn without_mark(&self, word: u32) -> u32 {
+        if self.are_codes {
+            word & !WORD_ROUGH
+        } else {
+            word
+        }
     }
 
     fn mover_of(&self, owner: u32) -> &Mover {
@@ -151,4 +194,44 @@ fn start_of(mover: &Mover, pixel: [i32; 2]) -> [i32; 2] {
         (mover.start[c] + ((slope[0] * x + slope[1] * y) >> 12)).clamp(-32767, 32767)
     };
     [of(0), of(1)]
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// Whatever the fraction of a place, frames take the pixel behind it as often as it is near, to 2.1 frames over any 31 that
+    /// an eye collects; and what they take along rows says nothing of columns.
+    #[test]
+    fn frames_take_pixels_in_turn_as_often_as_they_are_near() {
+        for (group, begin) in [(0, 0), (3, 1000), (7, u32::MAX - 7)] {
+            for part in [1, 13, 32, 50, 63] {
+                let turns: Vec<[bool; 2]> = (0..31u32)
+                    .map(|k| turn_of(begin.wrapping_add(k), group).map(|turn| part + turn >= 64))
+                    .collect();
+                for c in 0..2 {
+                    let taken = turns.iter().filter(|t| t[c]).count() as f64;
+                    assert!((taken - 31.0 * f64::from(part) / 64.0).abs() <= 2.1, "{group} {part}: {taken}");
+                }
+            }
+        }
+        let both = (0..4096).filter(|k| turn_of(*k, 2).iter().all(|turn| *turn >= 32)).count();
+        assert!((both as f64 / 4096.0 - 0.25).abs() < 0.01, "{both}");
+    }
+
+    #[test]
+    fn codes_are_rough_where_they_bend() {
+        // A slope is not rough, however steep; a step is, in one channel and in one direction.
+        let grey = |code: u32| code * 0x01_0101;
+        assert!(!is_rough(grey(100), [grey(20), grey(180), grey(130), grey(70)]));
+        assert!(!is_rough(grey(100), [grey(100), grey(148), grey(100), grey(100)]));
+        assert!(is_rough(grey(100), [grey(100), grey(149), grey(100), grey(100)]));
+        assert!(is_rough(grey(100), [grey(60), grey(140), grey(100), grey(100) - (49 << 16)]));
+    }
+
+    #[test]
+    fn groups_of_all_bits_hold_whole_codes() {
+        assert!(has_whole_codes(0xff_ffff) && has_whole_codes(0xff00) && has_whole_codes(0));
+        assert!(!has_whole_codes(0x80_8080) && !has_whole_codes(0xff_0001));
+    }
 }

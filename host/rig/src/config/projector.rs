@@ -32,9 +32,9 @@ section! {
         /// bit-plane projector equal planes together give 128 / 255 of full white.
         weights: PlaneWeights = PlaneWeights::Binary, "", Any;
         /// The order in which a frame shows the bits of a code value, from its first plane on; red, green and blue in
-        /// turn for each bit. The light of "7 6 5 4 3 2 1 0" is over soonest. "0 2 4 6 7 5 3 1" puts most of it into
-        /// the middle of the frame, which smears a moving picture by a quarter less. Has no effect on planes of equal
-        /// weights.
+        /// turn for each bit. By default the highest bits are lit together, which smears a moving picture least. The
+        /// light of "7 6 5 4 3 2 1 0" is over soonest: its centre comes 0.12 ms earlier at 947 frames/s, and so needs
+        /// less prediction. Has no effect on planes of equal weights.
         plane_order: BitOrder = BitOrder::default(), "", Any;
         /// The instant for which each bit plane shows the bodies. "own": the planes of each bit (each plane, if all give equal
         /// light) are shown where the bodies are while these planes are lit, so that a moving picture is not smeared.
