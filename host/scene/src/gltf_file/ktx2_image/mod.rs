@@ -79,12 +79,13 @@ pub(super) fn decode(
     check_meaning(item, &file)?;
     let level = file.levels().next().ok_or_else(|| item.error("is a KTX2 image without a level"))?;
     let content = Content { item, file: &file, level: &level, size };
-    let texels = match (header.format, file.color_model()) {
+    let mut texels = match (header.format, file.color_model()) {
         (None, Some(ColorModel::ETC1S)) => basis::etc1s(&content)?,
         (None, Some(ColorModel::UASTC)) => basis::uastc(&content)?,
         (None, model) => return Err(content.unsupported(&format!("of the colour model {model:?}"))),
         (Some(format), _) => stored_texels(&content, format)?,
     };
+    swizzle(item, &file, &mut texels)?;
     let srgb = match file.transfer_function() {
         Some(TransferFunction::SRGB) => Some(true),
         Some(TransferFunction::Linear) => Some(false),
@@ -119,28 +120,43 @@ fn check_shape(item: &Item, header: &Header) -> Result<(), SceneError> {
     ))
 }
 
-/// Refuses what glTF forbids because it would change the picture: another orientation, other channels, and colours that
-/// are multiplied by alpha.
+/// Refuses what glTF forbids and what would change the picture: another orientation, and colours that are multiplied by
+/// alpha.
 fn check_meaning(item: &Item, file: &Reader<&[u8]>) -> Result<(), SceneError> {
-    for (key, value) in file.key_value_data() {
-        let expected = match key {
-            "KTXorientation" => "rd",
-            "KTXswizzle" => "rgba",
-            _ => continue,
-        };
-        let value = String::from_utf8_lossy(value);
-        let value = value.trim_end_matches('\0');
-        if value != expected {
-            return Err(item.error(format!(
-                "says that its {key} is '{}'; glTF allows only '{expected}': export it again",
-                shorten(value)
-            )));
-        }
+    if let Some(orientation) = note(file, "KTXorientation").filter(|o| o != "rd") {
+        return Err(item.error(format!(
+            "says that its KTXorientation is '{}'; glTF allows only 'rd': export it again",
+            shorten(&orientation)
+        )));
     }
     let premultiplied =
         file.basic_dfd().is_some_and(|d| d.flags.contains(DataFormatFlags::ALPHA_PREMULTIPLIED));
     if premultiplied {
         return Err(item.error("holds colours multiplied by alpha: export it with straight alpha"));
+    }
+    Ok(())
+}
+
+/// A note of the image, without the zero at its end.
+fn note(file: &Reader<&[u8]>, key: &str) -> Option<String> {
+    let (_, value) = file.key_value_data().find(|(name, _)| *name == key)?;
+    Some(String::from_utf8_lossy(value).trim_end_matches('\0').to_owned())
+}
+
+/// Puts the channels where the image's KTXswizzle wants them. glTF forbids one, but encoders leave 'rrr1' at grey images.
+fn swizzle(item: &Item, file: &Reader<&[u8]>, texels: &mut [[u8; 4]]) -> Result<(), SceneError> {
+    let Some(order) = note(file, "KTXswizzle").filter(|order| order != "rgba") else { return Ok(()) };
+    // The channels of a texel, and behind them the constants.
+    let sources: Option<Vec<usize>> = order.chars().map(|c| "rgba01".find(c)).collect();
+    let Some(&[r, g, b, a]) = sources.as_deref().and_then(<[usize]>::as_array) else {
+        return Err(item.error(format!(
+            "says that its KTXswizzle is '{}', which is none: export it again",
+            shorten(&order)
+        )));
+    };
+    for texel in texels {
+        let [red, green, blue, alpha] = *texel;
+        *texel = [r, g, b, a].map(|k| [red, green, blue, alpha, 0, 255][k]);
     }
     Ok(())
 }
