@@ -33,12 +33,12 @@ mod channel {
 
 /// The texels of ETC1S, which BasisLZ always compresses further.
 pub(super) fn etc1s(content: &Content) -> Result<Vec<[u8; 4]>, SceneError> {
-    let alpha = match channels(content)[..] {
+    let alpha = match content.file.descriptor.channels[..] {
         [channel::RGB | channel::ETC1S_RED] => false,
         [channel::RGB, channel::ALPHA] => true,
         _ => return Err(content.unsupported("of two channels, or of unknown ones")),
     };
-    if content.file.header().supercompression_scheme != Some(SupercompressionScheme::BasisLZ) {
+    if content.file.header.supercompression_scheme != Some(SupercompressionScheme::BasisLZ) {
         return Err(content
             .item
             .error("holds ETC1S without BasisLZ, which its format forbids: export it again"));
@@ -48,12 +48,12 @@ pub(super) fn etc1s(content: &Content) -> Result<Vec<[u8; 4]>, SceneError> {
     })?;
     let channels: &[u8] = if alpha { &[channel::RGB, channel::ALPHA] } else { &[channel::RGB] };
     let parts = Parts { format: None, model: ColorModel::ETC1S, block: [4, 4], channels, global };
-    transcode(content, &parts, content.level.data)
+    transcode(content, &parts, content.file.level)
 }
 
 /// The texels of UASTC.
 pub(super) fn uastc(content: &Content) -> Result<Vec<[u8; 4]>, SceneError> {
-    let channel = match channels(content)[..] {
+    let channel = match content.file.descriptor.channels[..] {
         [channel::RGB | channel::UASTC_RED] => channel::RGB,
         [channel::RGBA] => channel::RGBA,
         _ => return Err(content.unsupported("of two channels, or of unknown ones")),
@@ -65,32 +65,23 @@ pub(super) fn uastc(content: &Content) -> Result<Vec<[u8; 4]>, SceneError> {
 
 /// The texels of ASTC of low dynamic range. `format` is one of those that [`super::blocks::is_astc`] knows.
 pub(super) fn astc(content: &Content, format: Format) -> Result<Vec<[u8; 4]>, SceneError> {
-    let block = content.file.basic_dfd().map_or([4, 4], |d| {
-        let [width, height, ..] = d.texel_block_dimensions.map(|side| side.get());
-        [width, height]
-    });
+    let block = content.file.descriptor.block;
     let channels = &[channel::RGBA];
     let parts = Parts { format: Some(format), model: ColorModel::ASTC, block, channels, global: vec![] };
     transcode(content, &parts, &content.bytes(blocks(content, block) * BLOCK_BYTES)?)
 }
 
-/// The contents of the image's channels.
-fn channels(content: &Content) -> Vec<u8> {
-    let samples = content.file.basic_dfd().map_or(&[][..], |d| &d.sample_information);
-    samples.iter().map(|sample| sample.channel_type).collect()
-}
-
 /// The number of blocks that cover the picture.
-fn blocks(content: &Content, [width, height]: [u8; 2]) -> usize {
-    let across = content.size.width.div_ceil(width.into()) as usize;
-    across * content.size.height.div_ceil(height.into()) as usize
+fn blocks(content: &Content, [width, height]: [u32; 2]) -> usize {
+    let across = content.size.width.div_ceil(width) as usize;
+    across * content.size.height.div_ceil(height) as usize
 }
 
 /// The global data of ETC1S with the image of level 0 as the only one; nothing if it is not all there.
 fn single_image(content: &Content, alpha: bool) -> Option<Vec<u8>> {
-    let header = content.file.header();
+    let header = content.file.header;
     let images = header.level_count.max(1) as usize;
-    let global = content.file.supercompression_global_data();
+    let global = content.file.global;
     let (head, rest) = global.split_at_checked(HEAD_BYTES)?;
     let (descriptions, codebooks) = rest.split_at_checked(images.checked_mul(HEAD_BYTES)?)?;
     let word = |bytes: &[u8], at: usize| Some(u32::from_le_bytes(*bytes.get(at..)?.first_chunk()?));
@@ -101,7 +92,7 @@ fn single_image(content: &Content, alpha: bool) -> Option<Vec<u8>> {
     let image = descriptions.get(..HEAD_BYTES)?;
     for slice in if alpha { &[4, 12][..] } else { &[4] } {
         let (offset, length) = (word(image, *slice)? as usize, word(image, slice + 4)? as usize);
-        content.level.data.get(offset..offset.checked_add(length)?)?;
+        content.file.level.get(offset..offset.checked_add(length)?)?;
     }
     let is_whole = word(image, 0)? & DIFFERENCE == 0;
     // The last word of the head counts bytes of extensions, which nothing here reads.
@@ -112,8 +103,8 @@ fn single_image(content: &Content, alpha: bool) -> Option<Vec<u8>> {
 struct Parts<'a> {
     format: Option<Format>,
     model: ColorModel,
-    /// Texels along the sides of a block.
-    block: [u8; 2],
+    /// Texels along the sides of a block, 1 to 256.
+    block: [u32; 2],
     /// The content of each channel.
     channels: &'a [u8],
     /// The global data.
@@ -158,7 +149,7 @@ impl Parts<'_> {
     /// The data format descriptor: its own length, six words of a basic block, four words for each channel.
     fn descriptor(&self) -> Vec<u8> {
         let block_bytes = 24 + 16 * self.channels.len() as u32;
-        let [width, height] = self.block.map(|side| u32::from(side.saturating_sub(1)));
+        let [width, height] = self.block.map(|side| side - 1);
         // Version 2 of the block; primaries of BT.709 and a linear transfer, neither of which changes the texels.
         let model = u32::from(self.model.value()) | 1 << 8 | 1 << 16;
         let mut words = vec![block_bytes + 4, 0, 2 | block_bytes << 16, model, width | height << 8, 0, 0];

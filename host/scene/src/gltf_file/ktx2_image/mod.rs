@@ -6,12 +6,13 @@
 
 mod basis;
 mod blocks;
+mod container;
 mod plain;
 
 use std::borrow::Cow;
 
-use ktx2::dfd::DataFormatFlags;
-use ktx2::{ColorModel, Format, Header, Level, Reader, SupercompressionScheme, TransferFunction};
+use container::File;
+use ktx2::{ColorModel, Format, Header, SupercompressionScheme, TransferFunction};
 use ruzstd::decoding::FrameDecoder;
 use serde_json::{json, Value};
 
@@ -70,23 +71,22 @@ pub(super) fn decode(
     texels_so_far: u64,
     limits: &Limits,
 ) -> Result<Picture, SceneError> {
-    let file = Reader::new(bytes)
-        .map_err(|e| item.error(format!("is a KTX2 image that cannot be read ({e}): export it again")))?;
-    let header = file.header();
+    let file = File::of(bytes)
+        .ok_or_else(|| item.error("is a KTX2 image that is cut off or damaged: export it again"))?;
+    let header = file.header;
     check_shape(item, &header)?;
     let size = Size { width: header.pixel_width, height: header.pixel_height };
     check_size(item, size, texels_so_far, limits)?;
     check_meaning(item, &file)?;
-    let level = file.levels().next().ok_or_else(|| item.error("is a KTX2 image without a level"))?;
-    let content = Content { item, file: &file, level: &level, size };
-    let mut texels = match (header.format, file.color_model()) {
+    let content = Content { item, file: &file, size };
+    let mut texels = match (header.format, file.descriptor.model) {
         (None, Some(ColorModel::ETC1S)) => basis::etc1s(&content)?,
         (None, Some(ColorModel::UASTC)) => basis::uastc(&content)?,
         (None, model) => return Err(content.unsupported(&format!("of the colour model {model:?}"))),
         (Some(format), _) => stored_texels(&content, format)?,
     };
     swizzle(item, &file, &mut texels)?;
-    let srgb = match file.transfer_function() {
+    let srgb = match file.descriptor.transfer {
         Some(TransferFunction::SRGB) => Some(true),
         Some(TransferFunction::Linear) => Some(false),
         _ => None,
@@ -122,30 +122,22 @@ fn check_shape(item: &Item, header: &Header) -> Result<(), SceneError> {
 
 /// Refuses what glTF forbids and what would change the picture: another orientation, and colours that are multiplied by
 /// alpha.
-fn check_meaning(item: &Item, file: &Reader<&[u8]>) -> Result<(), SceneError> {
-    if let Some(orientation) = note(file, "KTXorientation").filter(|o| o != "rd") {
+fn check_meaning(item: &Item, file: &File) -> Result<(), SceneError> {
+    if let Some(orientation) = file.note("KTXorientation").filter(|o| o != "rd") {
         return Err(item.error(format!(
             "says that its KTXorientation is '{}'; glTF allows only 'rd': export it again",
             shorten(&orientation)
         )));
     }
-    let premultiplied =
-        file.basic_dfd().is_some_and(|d| d.flags.contains(DataFormatFlags::ALPHA_PREMULTIPLIED));
-    if premultiplied {
+    if file.descriptor.premultiplied {
         return Err(item.error("holds colours multiplied by alpha: export it with straight alpha"));
     }
     Ok(())
 }
 
-/// A note of the image, without the zero at its end.
-fn note(file: &Reader<&[u8]>, key: &str) -> Option<String> {
-    let (_, value) = file.key_value_data().find(|(name, _)| *name == key)?;
-    Some(String::from_utf8_lossy(value).trim_end_matches('\0').to_owned())
-}
-
 /// Puts the channels where the image's KTXswizzle wants them. glTF forbids one, but encoders leave 'rrr1' at grey images.
-fn swizzle(item: &Item, file: &Reader<&[u8]>, texels: &mut [[u8; 4]]) -> Result<(), SceneError> {
-    let Some(order) = note(file, "KTXswizzle").filter(|order| order != "rgba") else { return Ok(()) };
+fn swizzle(item: &Item, file: &File, texels: &mut [[u8; 4]]) -> Result<(), SceneError> {
+    let Some(order) = file.note("KTXswizzle").filter(|order| order != "rgba") else { return Ok(()) };
     // The channels of a texel, and behind them the constants.
     let sources: Option<Vec<usize>> = order.chars().map(|c| "rgba01".find(c)).collect();
     let Some(&[r, g, b, a]) = sources.as_deref().and_then(<[usize]>::as_array) else {
@@ -164,8 +156,7 @@ fn swizzle(item: &Item, file: &Reader<&[u8]>, texels: &mut [[u8; 4]]) -> Result<
 /// Level 0 of an image, and what errors call it.
 struct Content<'a> {
     item: &'a Item<'a>,
-    file: &'a Reader<&'a [u8]>,
-    level: &'a Level<'a>,
+    file: &'a File<'a>,
     size: Size,
 }
 
@@ -181,8 +172,8 @@ impl Content<'_> {
                 "holds {there} bytes of texels, but its size asks for {needed}: the data is cut off"
             ))
         };
-        let data = self.level.data;
-        match self.file.header().supercompression_scheme {
+        let data = self.file.level;
+        match self.file.header.supercompression_scheme {
             None => data.get(..needed).map(Cow::Borrowed).ok_or_else(|| cut_off(data.len())),
             Some(SupercompressionScheme::Zstandard) => {
                 if needed / MOST_FROM_A_BYTE > data.len() {
