@@ -154,7 +154,7 @@ impl Parts<'_> {
         let model = u32::from(self.model.value()) | 1 << 8 | 1 << 16;
         let mut words = vec![block_bytes + 4, 0, 2 | block_bytes << 16, model, width | height << 8, 0, 0];
         for (i, channel) in (0..).zip(self.channels) {
-            words.extend([64 * i | 63 << 16 | u32::from(*channel) << 24, 0, 0, u32::MAX]);
+            words.extend([(64 * i) | 63 << 16 | u32::from(*channel) << 24, 0, 0, u32::MAX]);
         }
         words.into_iter().flat_map(u32::to_le_bytes).collect()
     }

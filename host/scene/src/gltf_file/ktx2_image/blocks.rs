@@ -8,12 +8,14 @@ use super::Content;
 /// Texels along each side of a block.
 const SIDE: usize = 4;
 
+/// Writes the 16 texels of a block as RGBA; the last argument is the distance of their rows in bytes.
+type Decode = fn(&[u8], &mut [u8], usize);
+
 /// A format of blocks.
 pub(super) struct Block {
     /// Bytes of a block.
     bytes: usize,
-    /// Writes the 16 texels of a block; the last argument is the distance of its rows in bytes.
-    decode: fn(&[u8], &mut [u8], usize),
+    decode: Decode,
     /// Alpha counts; otherwise texels are opaque.
     alpha: bool,
 }
@@ -26,7 +28,7 @@ pub(super) fn is_astc(format: Format) -> bool {
 impl Block {
     /// The format of blocks with three or four channels of 8 bits.
     pub(super) fn of(format: Format) -> Option<Self> {
-        let (bytes, decode, alpha): (_, fn(&[u8], &mut [u8], usize), _) = match format {
+        let (bytes, decode, alpha): (_, Decode, _) = match format {
             Format::BC1_RGB_UNORM_BLOCK | Format::BC1_RGB_SRGB_BLOCK => (8, bcdec_rs::bc1, false),
             Format::BC1_RGBA_UNORM_BLOCK | Format::BC1_RGBA_SRGB_BLOCK => (8, bcdec_rs::bc1, true),
             Format::BC2_UNORM_BLOCK | Format::BC2_SRGB_BLOCK => (16, bcdec_rs::bc2, true),

@@ -75,7 +75,7 @@ impl Descriptor {
         Some(Self {
             model: ColorModel::new(model),
             transfer: TransferFunction::new(transfer),
-            premultiplied: DataFormatFlags::from_bits_truncate(flags.into())
+            premultiplied: DataFormatFlags::from_bits_truncate(flags)
                 .contains(DataFormatFlags::ALPHA_PREMULTIPLIED),
             block: [width, height].map(|side| u32::from(side) + 1),
             channels: samples.chunks_exact(16).map(|sample| sample[3] & 15).collect(),
