@@ -162,7 +162,8 @@ impl Parts<'_> {
 
 /// Decodes `data` as the level of a file with these parts.
 fn transcode(content: &Content, parts: &Parts, data: &[u8]) -> Result<Vec<[u8; 4]>, SceneError> {
-    let failed = |e| content.item.error(format!("cannot be decoded ({e:?}): it is damaged, export it again"));
+    // What the decoder calls the error says no more: it gives the same one for all damage.
+    let failed = |_| content.item.error("cannot be decoded: its data is damaged, export it again");
     let file = parts.file(content, data);
     let texture = Transcoder::new(&file).map_err(failed)?;
     let mut texels = vec![[0; 4]; content.size.texels()];
