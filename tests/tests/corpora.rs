@@ -232,6 +232,13 @@ fn files() -> Vec<(&'static str, &'static str, Vec<u8>)> {
         let text = serde_json::to_vec(&file.json).unwrap();
         seeds.push(("gltf_parts", name, [&text[..], &[0], &file.bin].concat()));
     }
+    for name in ["alpha_etc1s", "alpha_uastc"] {
+        let path = concat!(env!("CARGO_MANIFEST_DIR"), "/assets/ktx2");
+        let image = std::fs::read(PathBuf::from(path).join(name).with_extension("ktx2")).unwrap();
+        let file = with_image(&image);
+        let text = serde_json::to_vec(&file.json).unwrap();
+        seeds.push(("gltf_parts", name, [&text[..], &[0], &file.bin].concat()));
+    }
     let lit = r#"{"asset":{"version":"2.0"},"extensionsUsed":["KHR_lights_punctual"],"extensions":{"KHR_lights_punctual":
         {"lights":[{"type":"spot","spot":{"outerConeAngle":0.4},"intensity":7}]}},"scenes":[{"nodes":[0]}],"nodes":[{"children":[1,2],
         "scale":[1,2,1]},{"extensions":{"KHR_lights_punctual":{"light":0}}},{"mesh":0,"rotation":[0,0,0,1]}],"meshes":[{"primitives":

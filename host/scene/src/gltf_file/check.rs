@@ -10,9 +10,10 @@ use super::check_look::check_look;
 use super::compressed;
 use super::instancing::{self, read_instances, Instances};
 use super::json::{shorten, Item};
+use super::ktx2_image;
 
 /// Extensions that this program understands, or may ignore without a wrong picture.
-const UNDERSTOOD: [&str; 15] = [
+const UNDERSTOOD: [&str; 16] = [
     compressed::DRACO,
     compressed::MESHOPT[0],
     compressed::MESHOPT[1],
@@ -26,6 +27,7 @@ const UNDERSTOOD: [&str; 15] = [
     "KHR_materials_variants",
     "KHR_materials_volume",
     "KHR_mesh_quantization",
+    ktx2_image::BASISU,
     "KHR_texture_transform",
     "KHR_xmp_json_ld",
 ];
@@ -119,8 +121,8 @@ pub(crate) fn check_asset(root: &Item) -> Result<(), SceneError> {
             continue;
         }
         let remedy = match name {
-            "KHR_texture_basisu" | "EXT_texture_webp" | "EXT_texture_avif" | "MSFT_texture_dds" => {
-                "re-export with PNG or JPEG textures"
+            "EXT_texture_webp" | "EXT_texture_avif" | "MSFT_texture_dds" => {
+                "re-export with PNG, JPEG or KTX2 textures"
             }
             "KHR_materials_pbrSpecularGlossiness" => "convert the materials to metallic-roughness",
             _ => "re-export without it, or list it only in extensionsUsed if the scene can do without",

@@ -47,9 +47,8 @@ pub(crate) fn check_look(
     for texture in root.list("textures", "texture", limits.objects)? {
         texture.index("sampler", counts.samplers, "sampler")?;
         if texture.index("source", counts.images, "image")?.is_none() {
-            return Err(
-                texture.error("has no 'source' this program can read: re-export with PNG or JPEG textures")
-            );
+            return Err(texture
+                .error("has no 'source' this program can read: re-export with PNG, JPEG or KTX2 textures"));
         }
     }
     for material in root.list("materials", "material", limits.objects)? {

@@ -1,16 +1,15 @@
 //! Converts checked glTF materials, textures and images to [`Material`] and [`Texture`].
 
 use std::collections::HashMap;
-use std::io::Cursor;
 
 use glam::{Vec2, Vec3};
-use image::{ImageFormat, ImageReader};
 
 use super::super::limits::Cancel;
 use super::super::{Limits, Material, SceneError, Texture, TextureRef, Wrap};
 use super::accessor::Data;
 use super::container::{fetch, Folder};
 use super::json::Item;
+use super::picture::{self, Picture, Size};
 
 /// The result of [`read_look`].
 pub(super) struct Look {
@@ -85,8 +84,8 @@ struct Reader<'a> {
     folder: Option<&'a Folder>,
     limits: &'a Limits,
     cancel: &'a Cancel,
-    /// Decoded images: side lengths and texels.
-    images: HashMap<usize, (u32, u32, Vec<[u8; 4]>)>,
+    /// Decoded images.
+    images: HashMap<usize, Picture>,
     /// (glTF texture, sRGB) to index in `textures`.
     known: HashMap<(usize, bool), u32>,
     textures: Vec<Texture>,
@@ -161,7 +160,7 @@ impl Reader<'_> {
         let mut references = [None; 5];
         for (reference, u) in references.iter_mut().zip(&uses) {
             if let Some(u) = u {
-                *reference = Some(self.reference(u)?);
+                *reference = Some(self.reference(u, warnings)?);
             }
         }
         [
@@ -177,11 +176,11 @@ impl Reader<'_> {
         Ok((out, uv_set))
     }
 
-    fn reference(&mut self, u: &Use) -> Result<TextureRef, SceneError> {
+    fn reference(&mut self, u: &Use, warnings: &mut Vec<String>) -> Result<TextureRef, SceneError> {
         let texture = match self.known.get(&(u.texture, u.srgb)) {
             Some(&known) => known,
             None => {
-                let made = self.texture(u)?;
+                let made = self.texture(u, warnings)?;
                 self.textures.push(made);
                 let index = self.textures.len() as u32 - 1;
                 self.known.insert((u.texture, u.srgb), index);
@@ -196,7 +195,7 @@ impl Reader<'_> {
         })
     }
 
-    fn texture(&mut self, u: &Use) -> Result<Texture, SceneError> {
+    fn texture(&mut self, u: &Use, warnings: &mut Vec<String>) -> Result<Texture, SceneError> {
         let json = &self.document.as_json().textures[u.texture];
         let image = json.source.value();
         if !self.images.contains_key(&image) {
@@ -204,7 +203,15 @@ impl Reader<'_> {
             let decoded = self.decode(image)?;
             self.images.insert(image, decoded);
         }
-        let (width, height, ref texels) = self.images[&image];
+        let Picture { size: Size { width, height }, ref texels, srgb } = self.images[&image];
+        if srgb.is_some_and(|srgb| srgb != u.srgb) {
+            let (said, used) =
+                if u.srgb { ("linear", "colours in sRGB") } else { ("sRGB", "linear numbers") };
+            warnings.push(format!(
+                "{}: it says that it is {said}, but it is read as {used}, which glTF wants of a {} texture",
+                self.image_items[image].name, u.slot
+            ));
+        }
         self.texels += u64::from(width) * u64::from(height);
         SceneError::check_limit(
             "the number of texels in all textures",
@@ -232,7 +239,7 @@ impl Reader<'_> {
         })
     }
 
-    fn decode(&self, index: usize) -> Result<(u32, u32, Vec<[u8; 4]>), SceneError> {
+    fn decode(&self, index: usize) -> Result<Picture, SceneError> {
         let Some(item) = self.image_items.get(index) else {
             return Err(SceneError::broken("textures", format!("name image {index}, which is not there")));
         };
@@ -248,57 +255,8 @@ impl Reader<'_> {
             })?,
             (None, None) => return Err(item.error("has no data")),
         };
-        decode_image(item, bytes, self.texels, self.limits)
+        picture::decode(item, bytes, self.texels, self.limits)
     }
-}
-
-/// Decodes PNG or JPEG to 8-bit RGBA; checks its size before decoding.
-fn decode_image(
-    item: &Item,
-    bytes: &[u8],
-    texels_so_far: u64,
-    limits: &Limits,
-) -> Result<(u32, u32, Vec<[u8; 4]>), SceneError> {
-    let format = match image::guess_format(bytes) {
-        Ok(format @ (ImageFormat::Png | ImageFormat::Jpeg)) => format,
-        Ok(other) => {
-            return Err(SceneError::unsupported(
-                format!("{}: an image of format {other:?}", item.name),
-                "re-export with PNG or JPEG textures",
-            ))
-        }
-        Err(_) => return Err(item.error("is neither PNG nor JPEG: re-export with PNG or JPEG textures")),
-    };
-    let reader = || ImageReader::with_format(Cursor::new(bytes), format);
-    let failed = |e: image::ImageError| item.error(format!("cannot be decoded: {e}"));
-    let (width, height) = reader().into_dimensions().map_err(failed)?;
-    if width == 0 || height == 0 {
-        return Err(item.error("has no texels"));
-    }
-    let side = u64::from(width.max(height));
-    SceneError::check_limit(
-        &format!("the longer side of {}", item.name),
-        side,
-        limits.texture_side.into(),
-        "use a smaller texture",
-    )?;
-    let texels = texels_so_far + u64::from(width) * u64::from(height);
-    SceneError::check_limit(
-        "the number of texels in all textures",
-        texels,
-        limits.texels,
-        "use smaller textures",
-    )?;
-    let mut bounded = reader();
-    let mut memory = image::Limits::default();
-    memory.max_image_width = Some(width);
-    memory.max_image_height = Some(height);
-    // 16-bit RGBA is the widest decoded format; the rest is room for the decoder's own tables.
-    memory.max_alloc = Some(u64::from(width) * u64::from(height) * 8 + (16 << 20));
-    bounded.limits(memory);
-    let rgba = bounded.decode().map_err(failed)?.into_rgba8();
-    let texels = rgba.as_raw().chunks_exact(4).map(|c| [c[0], c[1], c[2], c[3]]).collect();
-    Ok((width, height, texels))
 }
 
 fn plain_use(slot: &'static str, info: &gltf::texture::Info, srgb: bool) -> Use {

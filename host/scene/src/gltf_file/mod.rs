@@ -1,5 +1,5 @@
-//! Reads a glTF file as a [`Scene`]: container, compressed meshes made plain, check, then the `gltf` crate's typed view
-//! of the checked document, look and geometry.
+//! Reads a glTF file as a [`Scene`]: container, compressed meshes and textures in KTX2 made plain, check, then the
+//! `gltf` crate's typed view of the checked document, look and geometry.
 
 mod accessor;
 mod check;
@@ -9,7 +9,9 @@ mod container;
 mod flatten;
 mod instancing;
 mod json;
+mod ktx2_image;
 mod look;
+mod picture;
 mod primitive;
 mod vertex_paint;
 
@@ -46,6 +48,7 @@ pub(super) fn read(
     check::check_asset(&root)?;
     let mut buffers = container::load_buffers(&root, binary, folder.as_ref(), limits)?;
     compressed::decompress(&mut tree, &mut buffers, limits, cancel)?;
+    ktx2_image::make_plain(&mut tree, limits)?;
     let root = Item::new(&tree, "document".into())?;
     let all_bytes = bytes.len() + buffers.iter().map(Vec::len).sum::<usize>();
     let limits = &limits.of_file(all_bytes as u64);
@@ -84,8 +87,9 @@ fn grouped(warnings: Vec<String>) -> Vec<String> {
     let mut told: Vec<(String, String, usize)> = vec![];
     for warning in warnings {
         // "material 3 'glass': ..." names an object, other lines with a colon do not.
-        let named =
-            |object: &str| ["material ", "mesh ", "node "].iter().any(|kind| object.starts_with(kind));
+        let named = |object: &str| {
+            ["image ", "material ", "mesh ", "node "].iter().any(|kind| object.starts_with(kind))
+        };
         let (object, what) =
             warning.split_once(": ").filter(|(object, _)| named(object)).unwrap_or(("", &warning));
         match told.iter_mut().find(|(first, said, _)| !first.is_empty() && !object.is_empty() && said == what)

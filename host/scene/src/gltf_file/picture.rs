@@ -1,0 +1,106 @@
+//! Decodes an image of a glTF file, PNG, JPEG or KTX2, to 8-bit RGBA; checks its size before anything of that size is
+//! taken.
+
+use std::io::Cursor;
+
+use image::{ImageFormat, ImageReader};
+
+use super::super::{Limits, SceneError};
+use super::json::Item;
+use super::ktx2_image;
+
+/// Texels along the sides of a picture, each above 0.
+#[derive(Clone, Copy)]
+pub(super) struct Size {
+    /// Texels in a row.
+    pub width: u32,
+    /// Rows.
+    pub height: u32,
+}
+
+impl Size {
+    /// All texels, after [`check_size`].
+    pub(super) fn texels(self) -> usize {
+        self.width as usize * self.height as usize
+    }
+}
+
+/// A decoded image.
+pub(super) struct Picture {
+    /// Its sides.
+    pub size: Size,
+    /// RGBA, row by row from the top.
+    pub texels: Vec<[u8; 4]>,
+    /// Whether red, green and blue are encoded as sRGB, if the image says so in words that glTF makes binding.
+    pub srgb: Option<bool>,
+}
+
+/// Decodes PNG, JPEG or KTX2. `texels_so_far` counts those of the scene's other textures.
+///
+/// # Errors
+/// Another format, damaged data, and sizes beyond the limits; the text names `item`.
+pub(super) fn decode(
+    item: &Item,
+    bytes: &[u8],
+    texels_so_far: u64,
+    limits: &Limits,
+) -> Result<Picture, SceneError> {
+    if ktx2_image::is_ktx2(bytes) {
+        return ktx2_image::decode(item, bytes, texels_so_far, limits);
+    }
+    let format = match image::guess_format(bytes) {
+        Ok(format @ (ImageFormat::Png | ImageFormat::Jpeg)) => format,
+        Ok(other) => {
+            return Err(SceneError::unsupported(
+                format!("{}: an image of format {other:?}", item.name),
+                "re-export with PNG or JPEG textures",
+            ))
+        }
+        Err(_) => {
+            return Err(
+                item.error("is neither PNG nor JPEG nor KTX2: re-export with PNG, JPEG or KTX2 textures")
+            )
+        }
+    };
+    let reader = || ImageReader::with_format(Cursor::new(bytes), format);
+    let failed = |e: image::ImageError| item.error(format!("cannot be decoded: {e}"));
+    let (width, height) = reader().into_dimensions().map_err(failed)?;
+    let size = Size { width, height };
+    check_size(item, size, texels_so_far, limits)?;
+    let mut bounded = reader();
+    let mut memory = image::Limits::default();
+    memory.max_image_width = Some(width);
+    memory.max_image_height = Some(height);
+    // 16-bit RGBA is the widest decoded format; the rest is room for the decoder's own tables.
+    memory.max_alloc = Some(u64::from(width) * u64::from(height) * 8 + (16 << 20));
+    bounded.limits(memory);
+    let rgba = bounded.decode().map_err(failed)?.into_rgba8();
+    let texels = rgba.as_raw().chunks_exact(4).map(|c| [c[0], c[1], c[2], c[3]]).collect();
+    Ok(Picture { size, texels, srgb: None })
+}
+
+/// Refuses a picture without texels, or with more than the limits allow.
+pub(super) fn check_size(
+    item: &Item,
+    size: Size,
+    texels_so_far: u64,
+    limits: &Limits,
+) -> Result<(), SceneError> {
+    let Size { width, height } = size;
+    if width == 0 || height == 0 {
+        return Err(item.error("has no texels"));
+    }
+    SceneError::check_limit(
+        &format!("the longer side of {}", item.name),
+        width.max(height).into(),
+        limits.texture_side.into(),
+        "use a smaller texture",
+    )?;
+    let texels = texels_so_far + u64::from(width) * u64::from(height);
+    SceneError::check_limit(
+        "the number of texels in all textures",
+        texels,
+        limits.texels,
+        "use smaller textures",
+    )
+}
