@@ -83,6 +83,8 @@ pub struct Laws {
     standing: Option<Standing>,
     stopped_at: Option<i64>,
     died_at: Option<i64>,
+    /// When the projector last heard of a program that had ended: a serial line finishes what it was given.
+    echoed_at: i64,
     started_at: i64,
     starts_in_calm: u32,
     /// Crews of this process.
@@ -142,6 +144,7 @@ impl Laws {
             standing: None,
             stopped_at: None,
             died_at: None,
+            echoed_at: 0,
             started_at: 0,
             starts_in_calm: 0,
             crews: 0,
@@ -235,6 +238,11 @@ impl Laws {
     /// The program was killed.
     pub fn died(&mut self, t: i64) {
         self.died_at = Some(t);
+    }
+
+    /// Bytes of a program that has ended reach the projector.
+    pub fn heard_of_the_dead(&mut self, t: i64) {
+        self.echoed_at = t;
     }
 
     /// The program starts.
@@ -393,7 +401,7 @@ impl Laws {
             }
         }
         if let Some(since) = self.died_at {
-            if at - since > self.watchdog_ns + self.slot_ns + 2 * MS {
+            if at - since.max(self.echoed_at) > self.watchdog_ns + self.slot_ns + 2 * MS {
                 self.fail(at, format!("{what} {} ms after the program died", (at - since) / MS));
             }
         }
