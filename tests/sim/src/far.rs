@@ -12,7 +12,8 @@ use hil_mock::projector::serial::SerialEnd;
 impl World {
     /// A piece of the stream arrives.
     pub(crate) fn hear_piece(&mut self, bytes: &[u8]) {
-        if self.process.is_none() {
+        let are_last_words = lock(&self.cable).line.as_ref().is_some_and(|line| line.has_words(self.t));
+        if self.process.is_none() && are_last_words {
             self.laws.heard_of_the_dead(self.t);
         }
         if let Some(far) = &mut self.far {
@@ -45,6 +46,22 @@ impl World {
     pub(crate) fn new_far_end(&mut self) {
         if self.far.is_some() {
             self.far = Some(SerialEnd::new(&self.projector));
+        }
+    }
+
+    /// Whoever takes a projector away switches it off. One on a serial line would not notice that it is alone.
+    pub(crate) fn switch_off(&mut self) {
+        if self.far.is_some() {
+            self.projector.bus_reset(HostTime(self.t));
+            self.see_light();
+        }
+    }
+
+    /// The program has ended. What its driver holds still goes out.
+    pub(crate) fn last_words(&mut self) {
+        let mut cable = lock(&self.cable);
+        if let Some(line) = &mut cable.line {
+            line.last_words();
         }
     }
 

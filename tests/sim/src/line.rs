@@ -77,6 +77,9 @@ struct Way {
     landing: VecDeque<(i64, Vec<u8>)>,
     /// Bytes that are still to be lost of a gap.
     gap: u64,
+    /// Bytes in the queue that a program left when it ended, and when the last of them arrives.
+    left: usize,
+    left_at: i64,
 }
 
 impl Way {
@@ -101,6 +104,10 @@ impl Way {
         while self.over_at <= now {
             let Some(byte) = self.queue.pop_front() else { break };
             let at = self.over_at;
+            if self.left > 0 {
+                self.left -= 1;
+                self.left_at = at + travel_ns;
+            }
             if !self.queue.is_empty() {
                 self.over_at += byte_ns;
             }
@@ -306,10 +313,21 @@ impl SerialLine {
     /// The adapter is pulled out of the host: what has left it arrives, and half a packet stays with the projector.
     pub fn pull(&mut self, now: i64) {
         self.out.queue.clear();
+        self.out.left = 0;
         self.out.land(now);
         self.back.begun.clear();
         self.back.landing.clear();
         self.input.clear();
+    }
+
+    /// The program has ended: nobody adds to what its driver holds.
+    pub fn last_words(&mut self) {
+        self.out.left = self.out.queue.len();
+    }
+
+    /// True while what a program left may still arrive.
+    pub fn has_words(&self, now: i64) -> bool {
+        self.out.left > 0 || self.out.left_at >= now
     }
 
     /// The projector starts anew: its replies are gone, and it makes some noise.

@@ -205,6 +205,7 @@ impl World {
         if kind == K::U9 && self.aside.is_none() {
             if let Ok(other) = projector_of(&self.setup, Raster::new(32, 24), self.t) {
                 self.pull();
+                self.switch_off();
                 let own = std::mem::replace(&mut self.projector, other);
                 self.aside = Some(own);
                 self.new_projector();
@@ -491,6 +492,7 @@ impl World {
             Undo::Projector => {
                 if let Some(own) = self.aside.take() {
                     self.pull();
+                    self.switch_off();
                     self.projector = own;
                     self.new_projector();
                     self.laws.acknowledged();

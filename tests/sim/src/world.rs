@@ -548,6 +548,7 @@ impl World {
         self.laws.exited(&exit, &counts, end.as_deref(), self.t);
         self.fold(4, self.t as u64);
         self.tell(|| format!("the program ends: {exit:?}"));
+        self.last_words();
         match exit {
             // The service manager does not start it again; whoever asked for the stop does.
             Exit::InOrder => self.needs_person = true,
@@ -564,6 +565,7 @@ impl World {
         self.laws.died(self.t);
         self.frozen_until = self.frozen_until.min(self.t);
         self.tell(|| "the program is killed".into());
+        self.last_words();
         self.restart_at = self.t + RESTART_NS;
     }
 
