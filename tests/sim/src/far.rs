@@ -21,6 +21,16 @@ impl World {
         }
     }
 
+    /// The laws know when the line is slower than its rate.
+    pub(crate) fn watch_line(&mut self) {
+        let cable = lock(&self.cable);
+        let is_slow = cable.line.is_some() && (cable.faults.stalled || cable.faults.slow_milli > 0);
+        drop(cable);
+        if is_slow {
+            self.laws.line_is_slow(self.t);
+        }
+    }
+
     /// A second program has the line, too: its `packets` come between the bytes of the first.
     pub(crate) fn hear_on_the_line(&mut self, packets: &[Vec<u8>]) {
         for packet in packets {
