@@ -75,7 +75,8 @@ impl OnALine {
         let is_drawn = dice.happens(ON_A_LINE);
         let drawn = dice.one_of(&LINE_RATES);
         let raster = dice.one_of(&[(16, 12), (16, 12), (8, 6)]);
-        let is_one = serial.unwrap_or(is_drawn && follows != Some(true)) && rate_hz.is_none_or(|hz| hz <= 1_000);
+        let is_one =
+            serial.unwrap_or(is_drawn && follows != Some(true)) && rate_hz.is_none_or(|hz| hz <= 1_000);
         is_one.then(|| Self { dice, rate_hz: rate_hz.unwrap_or(drawn), raster })
     }
 
@@ -110,7 +111,8 @@ impl Setup {
         let serial = on_a_line.as_mut().map(|line| line.line(planes));
         let raster = on_a_line.as_ref().map_or((16, 12), |line| line.raster);
         let line_ms = serial.map_or(0, |line| {
-            (frame_bytes(raster, planes) * 10_000 / u64::from(line.baud)) as i64 + line.reply_late_ns / 1_000_000
+            (frame_bytes(raster, planes) * 10_000 / u64::from(line.baud)) as i64
+                + line.reply_late_ns / 1_000_000
         });
         // What a frame needs from sample to light, twice; else the rig would be dark by its own file.
         let needed_ms = (2 * (3 + 2_000 / i64::from(tracker_hz)) + 8 * slot_us / 1000 + 20)

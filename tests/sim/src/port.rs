@@ -4,7 +4,9 @@ use crate::cable::Cable;
 use crate::line::{Driver, HungUp};
 use dpm_device::time::HostTime;
 use dpm_device::transport::serial::{Arrivals, Ports, SerialSettings, SharedClock};
-use serialport::{ClearBuffer, DataBits, Error, ErrorKind, FlowControl, Parity, Result, SerialPort, StopBits};
+use serialport::{
+    ClearBuffer, DataBits, Error, ErrorKind, FlowControl, Parity, Result, SerialPort, StopBits,
+};
 use std::io;
 use std::sync::{Arc, Mutex};
 use std::time::Duration;

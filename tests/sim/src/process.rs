@@ -1,15 +1,15 @@
 //! The rig's process: it starts, runs, ends, is killed, and is started again by the service manager.
 
 use crate::cable::{lock, Cable, HostEnd};
-use crate::port::SimPorts;
 use crate::disk::{Disk, SimFolder};
 use crate::machine::SimMachine;
+use crate::port::SimPorts;
 use dpm_device::time::HostTime;
 use dpm_device::transport::serial::{SerialSettings, SerialTransport};
 use dpm_device::transport::{Transport, TransportError};
 use dpm_rig::config::ProjectorBackend;
-use dpm_rig::pipeline::projector::frame_bytes;
 use dpm_rig::failure::{Failure, FailureKind};
+use dpm_rig::pipeline::projector::frame_bytes;
 use dpm_rig::pipeline::stepped::{SteppedEnd, SteppedOrders, SteppedRun};
 use dpm_rig::rig::Rig;
 use dpm_rig::standing::Identity;

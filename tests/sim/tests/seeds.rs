@@ -7,7 +7,16 @@ use std::collections::BTreeSet;
 
 fn order(seed: u64, rate_hz: Option<u32>, seconds: i64) -> Order {
     let length_ns = seconds * 1_000_000_000;
-    Order { seed, length_ns, rate_hz, follows: None, serial: None, without: BTreeSet::new(), until: None, is_loud: false }
+    Order {
+        seed,
+        length_ns,
+        rate_hz,
+        follows: None,
+        serial: None,
+        without: BTreeSet::new(),
+        until: None,
+        is_loud: false,
+    }
 }
 
 fn lived(order: &Order) -> Lived {
@@ -46,7 +55,8 @@ fn what_once_broke_a_law_keeps_them_all() {
     ];
     for (seed, rate_hz, seconds) in found {
         // They were found before there were tracks and serial lines; without them, a seed still describes the same life.
-        let lived = lived(&Order { follows: Some(false), serial: Some(false), ..order(seed, rate_hz, seconds) });
+        let lived =
+            lived(&Order { follows: Some(false), serial: Some(false), ..order(seed, rate_hz, seconds) });
         assert_eq!(
             lived.broken,
             None,
@@ -123,7 +133,10 @@ fn serial_lines_carry_their_frames_and_are_struck_by_faults_of_their_own() {
     let cells = |serial| {
         let setup = Setup::of(5, None, Some(false), Some(serial));
         let mut episodes = Episodes::new(&setup);
-        (0..2_000).flat_map(|_| episodes.next_episode().faults).filter(|fault| fault.kind.needs_line()).count()
+        (0..2_000)
+            .flat_map(|_| episodes.next_episode().faults)
+            .filter(|fault| fault.kind.needs_line())
+            .count()
     };
     assert!(cells(true) > 50 && cells(false) == 0);
     // Nobody sends tracks on such a line, so lives with tracks have none.
