@@ -445,7 +445,7 @@ fn a_line_tells_how_long_its_largest_frame_takes() {
     let transport = SerialTransport::with_port(slow, Box::new(line.clone()));
     let alone = transport.carriage_ns();
     let of = |bytes: i64| bytes * 10 * 1_000_000_000 / 115_200;
-    assert!((of(bytes)..of(bytes + bytes / 50)).contains(&alone), "{alone} ns for {bytes} bytes");
+    assert!((of(bytes)..of(bytes + bytes / 20)).contains(&alone), "{alone} ns for {bytes} bytes");
     line.0.lock().unwrap().queue.extend([0x55; 1_152]);
     assert_eq!((transport.carriage_ns() - alone) / 1_000_000, 100);
 }
