@@ -270,6 +270,11 @@ impl Core {
         };
         // Orders to go dark are accepted from any session.
         match message {
+            // This device's own answer, from a line that echoes: it proves no host alive.
+            HostMessage::Echo(echo) if echo.is_answer() => {
+                self.ignore();
+                return;
+            }
             HostMessage::Hello(hello) => {
                 let version = self.setup.version;
                 if session == 0 {

@@ -7,6 +7,8 @@
 
 mod reader;
 
+pub use reader::SharedClock;
+
 use std::io::{ErrorKind, Read, Write};
 use std::sync::{Arc, OnceLock};
 
@@ -18,7 +20,7 @@ use crate::packet::{packet_bytes, Packet, MAX_CONTROL_BYTES};
 use crate::planes::MAX_PLANES;
 use crate::time::{HostClock, HostTime};
 use crate::tty::{self, Refusal};
-use reader::{Reader, SharedClock};
+use reader::Reader;
 
 /// Bytes of control messages that may wait.
 const CONTROL_WAITING: usize = 4096;
@@ -52,12 +54,46 @@ pub struct SerialCounters {
     pub opened: u64,
 }
 
+/// Where a line finds its port, again after every loss: the operating system's, or those of a simulator.
+pub trait Ports: Send {
+    /// Opens the port of `settings`. Its reads and writes MUST never wait, see [`tty::never_wait`].
+    ///
+    /// # Errors
+    /// The library's: not found, no permission, in use.
+    fn open(&mut self, settings: &SerialSettings) -> serialport::Result<Box<dyn SerialPort>>;
+
+    /// Whoever reads `port` from now on and stamps by `clock` what arrives. `None` if nobody can: then the line reads
+    /// the port itself, and arrivals are stamped late.
+    fn arrivals(&mut self, port: &dyn SerialPort, clock: &SharedClock) -> Option<Box<dyn Arrivals>>;
+}
+
+/// What arrives on an open port, stamped. Dropping it ends the reading.
+pub trait Arrivals: Send {
+    /// Passes on the input with the instant of its arrival, or `now` without a clock. Returns the number of bytes, or
+    /// `None` once the line has ended and everything was passed on.
+    fn take(&mut self, now: HostTime, sink: &mut dyn FnMut(HostTime, &[u8])) -> Option<usize>;
+}
+
+/// The operating system's ports, each read by a thread of its own.
+struct SystemPorts;
+
+impl Ports for SystemPorts {
+    fn open(&mut self, settings: &SerialSettings) -> serialport::Result<Box<dyn SerialPort>> {
+        tty::open(&settings.path, settings.baud)
+    }
+
+    fn arrivals(&mut self, port: &dyn SerialPort, clock: &SharedClock) -> Option<Box<dyn Arrivals>> {
+        Some(Box::new(Reader::start(port, clock.clone())?))
+    }
+}
+
 /// The link over a serial port.
 pub struct SerialTransport {
     settings: SerialSettings,
+    ports: Box<dyn Ports>,
     port: Option<Box<dyn SerialPort>>,
-    /// Reads the port on its own thread; without it `receive` reads the port, and arrivals are stamped late.
-    reader: Option<Reader>,
+    /// Reads the port; without it `receive` does, and arrivals are stamped late.
+    reader: Option<Box<dyn Arrivals>>,
     clock: SharedClock,
     deframer: Deframer<[u8; DEFRAMED]>,
     /// Encoded packets of the frame that is going out, and where each ends.
@@ -79,23 +115,32 @@ impl SerialTransport {
     /// # Errors
     /// Not found; no permission (with the group to join); in use by another program.
     pub fn open(settings: SerialSettings) -> Result<Self, TransportError> {
-        let mut serial = Self::closed(settings);
+        Self::open_from(settings, Box::new(SystemPorts))
+    }
+
+    /// Opens a port of `ports`, now and after every loss.
+    ///
+    /// # Errors
+    /// As [`SerialTransport::open`].
+    pub fn open_from(settings: SerialSettings, ports: Box<dyn Ports>) -> Result<Self, TransportError> {
+        let mut serial = Self::closed(settings, ports);
         serial.reopen()?;
         Ok(serial)
     }
 
     /// Uses a port that is already open (a pseudo-terminal) and never blocks, see [`tty::never_wait`].
     pub fn with_port(settings: SerialSettings, port: Box<dyn SerialPort>) -> Self {
-        let mut serial = Self::closed(settings);
-        serial.reader = Reader::start(&*port, serial.clock.clone());
+        let mut serial = Self::closed(settings, Box::new(SystemPorts));
+        serial.reader = serial.ports.arrivals(&*port, &serial.clock);
         serial.port = Some(port);
         serial
     }
 
-    fn closed(settings: SerialSettings) -> Self {
+    fn closed(settings: SerialSettings, ports: Box<dyn Ports>) -> Self {
         let room = encoded_bytes(settings.frame_bytes) + 2 * (MAX_PLANES + 1);
         Self {
             settings,
+            ports,
             port: None,
             reader: None,
             clock: Arc::new(OnceLock::new()),
@@ -238,6 +283,13 @@ impl Transport for SerialTransport {
         }
     }
 
+    fn carriage_ns(&self) -> i64 {
+        let ahead = self.port.as_ref().and_then(|port| port.bytes_to_write().ok()).unwrap_or(0);
+        let bytes = ahead as usize + self.waiting() + self.data.len();
+        let bits = bytes as i64 * i64::from(BITS_PER_BYTE);
+        bits * 1_000_000_000 / i64::from(self.settings.baud.max(1))
+    }
+
     fn receive(
         &mut self,
         now: HostTime,
@@ -293,9 +345,8 @@ impl Transport for SerialTransport {
     fn reopen(&mut self) -> Result<(), TransportError> {
         // The reader's handle would also prevent the port from being reopened.
         (self.port, self.reader) = (None, None);
-        let path = &self.settings.path;
-        let port = tty::open(path, self.settings.baud).map_err(|e| open_error(path, e))?;
-        self.reader = Reader::start(&*port, self.clock.clone());
+        let port = self.ports.open(&self.settings).map_err(|e| open_error(&self.settings.path, e))?;
+        self.reader = self.ports.arrivals(&*port, &self.clock);
         self.port = Some(port);
         self.deframer.reset();
         self.control.clear();

@@ -14,30 +14,23 @@ const REPLIES_KEPT: usize = 16 * 1024;
 /// Bytes read in one call at most.
 const READ_AT_ONCE: usize = 256 * 1024;
 
-/// A [`MockProjector`] on a serial line.
+/// The projector's end of a serial line: what lies between the line's bytes and the projector's packets.
 #[derive(Debug)]
-pub struct SerialProjector {
-    projector: MockProjector,
+pub struct SerialEnd {
     deframer: Deframer<Vec<u8>>,
     out: Vec<u8>,
 }
 
-impl SerialProjector {
-    /// Connects `projector` to a line.
-    pub fn new(projector: MockProjector) -> Self {
+impl SerialEnd {
+    /// An end for `projector` that has heard nothing yet.
+    pub fn new(projector: &MockProjector) -> Self {
         let plane = projector.raster().plane_bytes().max(MAX_CONTROL_BYTES);
-        Self { deframer: Deframer::new(vec![0; packet_bytes(plane)]), projector, out: Vec::new() }
-    }
-
-    /// The projector inside.
-    pub fn projector(&mut self) -> &mut MockProjector {
-        &mut self.projector
+        Self { deframer: Deframer::new(vec![0; packet_bytes(plane)]), out: Vec::new() }
     }
 
     /// Bytes from the line.
-    pub fn receive(&mut self, now: HostTime, bytes: &[u8]) {
-        let Self { projector, deframer, .. } = self;
-        deframer.push(bytes, &mut |frame| {
+    pub fn receive(&mut self, projector: &mut MockProjector, now: HostTime, bytes: &[u8]) {
+        self.deframer.push(bytes, &mut |frame| {
             use MessageType::{FrameCommit, Plane, Sync};
             let kind = frame.get(5).copied().and_then(MessageType::from_code);
             let is_data = matches!(kind, Some(Plane | FrameCommit | Sync));
@@ -50,8 +43,8 @@ impl SerialProjector {
     /// Bytes for the line; the caller removes those that the line took from the front. While the line has not taken the
     /// last ones, no new ones are made: an older STATUS never delays a newer one, and an ECHO is stamped when it can
     /// leave.
-    pub fn replies(&mut self, now: HostTime) -> &mut Vec<u8> {
-        let Self { projector, out, .. } = self;
+    pub fn replies(&mut self, projector: &mut MockProjector, now: HostTime) -> &mut Vec<u8> {
+        let out = &mut self.out;
         if !out.is_empty() {
             projector.advance_to(now);
             return out;
@@ -65,6 +58,35 @@ impl SerialProjector {
             }
         });
         out
+    }
+}
+
+/// A [`MockProjector`] on a serial line.
+#[derive(Debug)]
+pub struct SerialProjector {
+    projector: MockProjector,
+    end: SerialEnd,
+}
+
+impl SerialProjector {
+    /// Connects `projector` to a line.
+    pub fn new(projector: MockProjector) -> Self {
+        Self { end: SerialEnd::new(&projector), projector }
+    }
+
+    /// The projector inside.
+    pub fn projector(&mut self) -> &mut MockProjector {
+        &mut self.projector
+    }
+
+    /// Bytes from the line, see [`SerialEnd::receive`].
+    pub fn receive(&mut self, now: HostTime, bytes: &[u8]) {
+        self.end.receive(&mut self.projector, now, bytes);
+    }
+
+    /// Bytes for the line, see [`SerialEnd::replies`].
+    pub fn replies(&mut self, now: HostTime) -> &mut Vec<u8> {
+        self.end.replies(&mut self.projector, now)
     }
 
     /// One round on a non-blocking line: reads the input, advances to now, writes what the line takes. `Ok(false)` when

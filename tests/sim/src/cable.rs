@@ -1,6 +1,8 @@
-//! The cable between host and projector: two lanes there, one back, with a speed, a delay, and faults.
+//! The cable between host and projector: two lanes there, one back, with a speed, a delay, and faults. Where the
+//! projector hangs on a serial line, the bytes are on [`crate::line`] instead.
 
 use crate::dice::Dice;
+use crate::line::{Echo, SerialLine};
 use dpm_device::link::Packet;
 use dpm_device::time::HostTime;
 use dpm_device::transport::{Lane, SendError, Transport, TransportError};
@@ -35,6 +37,12 @@ pub struct CableFaults {
     pub denied: bool,
     /// Packets on the control lane to the device arrive so much later.
     pub control_late_ns: i64,
+    /// Of a serial line: who hears itself.
+    pub echo: Echo,
+    /// Of a serial line: nothing arrives at either end, while the port stays open.
+    pub silent: bool,
+    /// Of a serial line: its ends run at different rates.
+    pub garbled: bool,
 }
 
 /// Bytes on their way.
@@ -67,6 +75,8 @@ pub struct Cable {
     pub travel_ns: i64,
     /// The faults.
     pub faults: CableFaults,
+    /// Where it is a serial line.
+    pub line: Option<SerialLine>,
     /// To the device.
     pub out: VecDeque<Transfer>,
     /// To the host: when each arrives.
@@ -96,6 +106,7 @@ impl Cable {
             ns_per_byte,
             travel_ns,
             faults: CableFaults::default(),
+            line: None,
             out: VecDeque::new(),
             back: VecDeque::new(),
             old_reply: Vec::new(),
@@ -111,11 +122,27 @@ impl Cable {
 
     /// When the next transfer reaches the device.
     pub fn due(&self) -> i64 {
-        self.out.front().map_or(i64::MAX, |t| t.at)
+        match &self.line {
+            Some(line) => line.due(&self.faults),
+            None => self.out.front().map_or(i64::MAX, |t| t.at),
+        }
+    }
+
+    /// It is `now`.
+    pub fn advance(&mut self, now: i64) {
+        self.now = now;
+        if let Some(line) = &mut self.line {
+            line.carry(now, &self.faults, self.plugged);
+            self.longest = self.longest.max(line.pieces());
+        }
     }
 
     /// The next transfer that has reached the device.
     pub fn arrived(&mut self) -> Option<Transfer> {
+        if let Some(line) = &mut self.line {
+            let (at, bytes) = line.arrived(self.now)?;
+            return Some(Transfer { at, lane: Lane::Data, bytes, cut: false });
+        }
         if self.out.front()?.at > self.now {
             return None;
         }
@@ -168,6 +195,9 @@ impl Cable {
         self.disturbed = true;
         self.out.clear();
         self.back.clear();
+        if let Some(line) = &mut self.line {
+            line.pull(self.now);
+        }
     }
 
     /// It is plugged in again.

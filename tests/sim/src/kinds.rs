@@ -215,6 +215,12 @@ kinds! {
     X7,
     /// The control lane is late: tracks arrive when they are old.
     X8,
+    /// A serial line echoes: one of its ends hears itself.
+    X9,
+    /// A serial line is silent both ways, while its port stays open.
+    X10,
+    /// The ends of a serial line run at different rates: every byte is another one.
+    X11,
 }
 
 const FILES: &str = "scenes are read only when the program starts, before any light";
@@ -228,6 +234,11 @@ impl Kind {
     /// It strikes only where the projector follows tracks.
     pub fn needs_tracks(self) -> bool {
         self == Self::X8
+    }
+
+    /// It strikes only where the projector hangs on a serial line.
+    pub fn needs_line(self) -> bool {
+        matches!(self, Self::X9 | Self::X10 | Self::X11)
     }
 
     /// Why this kind cannot strike in `state`; `None` if it can.

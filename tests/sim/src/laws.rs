@@ -83,6 +83,10 @@ pub struct Laws {
     standing: Option<Standing>,
     stopped_at: Option<i64>,
     died_at: Option<i64>,
+    /// When the projector last heard of a program that had ended: a serial line finishes what it was given.
+    echoed_at: i64,
+    /// When a serial line was last slower than its rate.
+    slow_line_at: i64,
     started_at: i64,
     starts_in_calm: u32,
     /// Crews of this process.
@@ -142,6 +146,8 @@ impl Laws {
             standing: None,
             stopped_at: None,
             died_at: None,
+            echoed_at: 0,
+            slow_line_at: -S,
             started_at: 0,
             starts_in_calm: 0,
             crews: 0,
@@ -235,6 +241,16 @@ impl Laws {
     /// The program was killed.
     pub fn died(&mut self, t: i64) {
         self.died_at = Some(t);
+    }
+
+    /// Bytes of a program that has ended reach the projector.
+    pub fn heard_of_the_dead(&mut self, t: i64) {
+        self.echoed_at = t;
+    }
+
+    /// A serial line stalls, or is slower than its rate.
+    pub fn line_is_slow(&mut self, t: i64) {
+        self.slow_line_at = t;
     }
 
     /// The program starts.
@@ -393,7 +409,7 @@ impl Laws {
             }
         }
         if let Some(since) = self.died_at {
-            if at - since > self.watchdog_ns + self.slot_ns + 2 * MS {
+            if at - since.max(self.echoed_at) > self.watchdog_ns + self.slot_ns + 2 * MS {
                 self.fail(at, format!("{what} {} ms after the program died", (at - since) / MS));
             }
         }
@@ -491,7 +507,11 @@ impl Laws {
         let age = at - lag - captured_at;
         let predict_ns = self.predict_ns.unwrap_or(sent.predict_ns);
         // The clocks are known to a fraction of a millisecond only.
-        let allowed = predict_ns + self.slot_ns + MS;
+        let mut allowed = predict_ns + self.slot_ns + MS;
+        // Nobody knows how long a frame will take on a line that stalls behind it; `dark from` bounds its light.
+        if sent.sent_at + lag <= self.slow_line_at + 100 * MS {
+            allowed += 4 * self.stride_ns + self.slot_ns + 4 * MS;
+        }
         self.worst_age_milli = self.worst_age_milli.max(age * 1000 / allowed);
         if age > allowed {
             let frame = sent.frame;

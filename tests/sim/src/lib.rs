@@ -8,13 +8,16 @@
 pub mod cable;
 pub mod dice;
 pub mod disk;
+mod far;
 pub mod follow;
 pub mod kinds;
 pub mod laws;
 pub mod life;
+pub mod line;
 pub mod machine;
 pub mod net;
 pub mod plan;
+pub mod port;
 pub mod process;
 pub mod strike;
 pub mod table;

@@ -18,6 +18,8 @@ pub struct Order {
     pub rate_hz: Option<u32>,
     /// Whether the projector follows tracks, if not as the seed says.
     pub follows: Option<bool>,
+    /// Whether the projector hangs on a serial line, if not as the seed says.
+    pub serial: Option<bool>,
     /// Faults that do not strike, by number.
     pub without: BTreeSet<u32>,
     /// Stop at this event.
@@ -60,7 +62,7 @@ pub struct Lived {
 /// # Errors
 /// The world cannot be made, which is a mistake in this program.
 pub fn live(order: &Order) -> Result<Lived, String> {
-    let setup = Setup::of(order.seed, order.rate_hz, order.follows);
+    let setup = Setup::of(order.seed, order.rate_hz, order.follows, order.serial);
     let mut world = World::new(setup.clone())?;
     world.is_loud = order.is_loud;
     world.laws.is_loud = order.is_loud;

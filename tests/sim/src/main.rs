@@ -15,6 +15,8 @@ dpm-sim: a simulated world around the rig, with every fault in every state
   --rate HZ       frames per second of every life; default: each seed's own
   --life S        simulated seconds of each seed; default 120
   --tracks WHO    all or none: whose projector follows tracks; default: a third of the seeds'
+  --serial WHO    all, none or some: whose projector hangs on a serial line; default: some, a fifth of the seeds'
+                  (none of --tracks all)
   --until EVENT   stop the (single) seed at this event and print what happened
   --without LIST  numbers of faults that do not strike, as a shrunk seed names them
   --minutes M     end after so many minutes of real time
@@ -31,6 +33,7 @@ struct Wish {
     rate: Option<u32>,
     life_s: f64,
     follows: Option<bool>,
+    serial: Option<bool>,
     until: Option<u64>,
     without: BTreeSet<u32>,
     minutes: Option<f64>,
@@ -48,6 +51,7 @@ fn wish() -> Result<Wish, String> {
         rate: None,
         life_s: 120.0,
         follows: None,
+        serial: None,
         until: None,
         without: BTreeSet::new(),
         minutes: None,
@@ -73,6 +77,12 @@ fn wish() -> Result<Wish, String> {
                 "none" => wish.follows = Some(false),
                 other => return Err(format!("--tracks {other:?}: give \"all\" or \"none\"")),
             },
+            "--serial" => match value()?.as_str() {
+                "all" => wish.serial = Some(true),
+                "none" => wish.serial = Some(false),
+                "some" => wish.serial = None,
+                other => return Err(format!("--serial {other:?}: give \"all\", \"none\" or \"some\"")),
+            },
             "--until" => wish.until = Some(number(&value()?)?),
             "--without" => {
                 for word in value()?.split(',').filter(|word| !word.is_empty()) {
@@ -92,6 +102,9 @@ fn wish() -> Result<Wish, String> {
     let is_number = |x: f64| x.is_finite() && x > 0.0;
     if !is_number(wish.hours) || !is_number(wish.life_s) || wish.rate == Some(0) {
         return Err("--hours, --life and --rate must be greater than 0".into());
+    }
+    if wish.serial == Some(true) && wish.follows == Some(true) {
+        return Err("--serial all and --tracks all: no tracks are sent on a serial line".into());
     }
     Ok(wish)
 }
@@ -113,6 +126,7 @@ struct Sum {
     slowest_return_ns: i64,
     lives: u64,
     following: u64,
+    on_lines: u64,
     planes_moved: u64,
     placed: Placed,
 }
@@ -133,8 +147,13 @@ fn report(lived: &Lived, order: &Order, shrinks: bool) -> Result<String, String>
         Some(false) => " --tracks none",
     };
     println!("  LAW: {told}");
+    let serial = match order.serial {
+        None => "",
+        Some(true) => " --serial all",
+        Some(false) => " --serial none",
+    };
     println!(
-        "  again: --seed {}{rate}{tracks} --life {:.0} --hours 0.0001 --loud --without {}",
+        "  again: --seed {}{rate}{tracks}{serial} --life {:.0} --hours 0.0001 --loud --without {}",
         order.seed,
         (least.length_ns as f64 * 1e-9).ceil() + 1.0,
         if without.is_empty() { "\"\"".into() } else { without.join(",") }
@@ -157,6 +176,7 @@ fn run() -> Result<bool, String> {
             length_ns: (wish.life_s * 1e9) as i64,
             rate_hz: wish.rate,
             follows: wish.follows,
+            serial: wish.serial,
             without: wish.without.clone(),
             until: wish.until,
             is_loud: wish.is_loud,
@@ -172,6 +192,7 @@ fn run() -> Result<bool, String> {
         sum.slowest_return_ns = sum.slowest_return_ns.max(lived.slowest_return_ns);
         sum.lives += 1;
         sum.following += u64::from(lived.setup.follows);
+        sum.on_lines += u64::from(lived.setup.serial.is_some());
         sum.planes_moved += lived.planes_moved;
         sum.placed.add(&lived.placed);
         if lived.broken.is_some() {
@@ -207,9 +228,10 @@ fn run() -> Result<bool, String> {
     let hours = sum.length_ns as f64 / 3.6e12;
     let below = sum.table.cells_below(1000);
     println!(
-        "{hours:.2} h in {} lives, {} faults, {} laws broken; cells below 1000: {below}; oldest pose {:.0} % of what is \
+        "{hours:.2} h in {} lives ({} on serial lines), {} faults, {} laws broken; cells below 1000: {below}; oldest pose {:.0} % of what is \
          allowed; slowest return of light {:.2} s; {:.0} s of real time",
         sum.lives,
+        sum.on_lines,
         sum.table.total(),
         sum.failures.len(),
         sum.worst_age_milli as f64 / 10.0,

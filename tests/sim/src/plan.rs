@@ -2,7 +2,10 @@
 
 use crate::dice::Dice;
 use crate::kinds::{Kind, State};
+use crate::line::SerialSetup;
 use crate::net::BodyMotion;
+use dpm_device::cobs::encoded_bytes;
+use dpm_device::link::{packet_bytes, COMMIT_BYTES};
 
 /// The rates at which rigs run, frames per second.
 pub const RATES: [u32; 6] = [24, 60, 120, 240, 947, 2000];
@@ -30,6 +33,8 @@ pub struct Setup {
     pub travel_ns: i64,
     /// The projector follows tracks, and the host sends some.
     pub follows: bool,
+    /// The projector hangs on a serial line.
+    pub serial: Option<SerialSetup>,
     /// Mirrors in a row, and rows.
     pub raster: (u32, u32),
     /// How the body moves.
@@ -39,9 +44,61 @@ pub struct Setup {
 /// The share of lives whose projector follows tracks.
 const FOLLOWING: f64 = 1.0 / 3.0;
 
+/// The share of lives whose projector hangs on a serial line.
+const ON_A_LINE: f64 = 1.0 / 5.0;
+/// The rates that such a life draws from: a line is for few and small frames.
+const LINE_RATES: [u32; 6] = [24, 24, 60, 60, 120, 240];
+/// The bits per second that adapters run at.
+const BAUDS: [u32; 6] = [115_200, 230_400, 460_800, 921_600, 3_000_000, 12_000_000];
+
+/// Bytes of a frame of `planes` planes on a serial line, if none of them can be compacted.
+fn frame_bytes(raster: (u32, u32), planes: u32) -> u64 {
+    let plane = (raster.0.div_ceil(8) * raster.1) as usize;
+    let bytes =
+        planes as usize * encoded_bytes(packet_bytes(plane)) + encoded_bytes(packet_bytes(COMMIT_BYTES));
+    bytes as u64
+}
+
+/// What is drawn of a life on a serial line, from a row of its own, so that other lives are what they were before there
+/// were any such lines.
+struct OnALine {
+    dice: Dice,
+    rate_hz: u32,
+    raster: (u32, u32),
+}
+
+impl OnALine {
+    /// `None` for the other lives. Nobody sends tracks on a serial line, so a life that has to have tracks is none of
+    /// these, and neither is one whose rate no line carries.
+    fn drawn(seed: u64, rate_hz: Option<u32>, follows: Option<bool>, serial: Option<bool>) -> Option<Self> {
+        let mut dice = Dice::new(seed, 0x5e71a);
+        let is_drawn = dice.happens(ON_A_LINE);
+        let drawn = dice.one_of(&LINE_RATES);
+        let raster = dice.one_of(&[(16, 12), (16, 12), (8, 6)]);
+        let is_one =
+            serial.unwrap_or(is_drawn && follows != Some(true)) && rate_hz.is_none_or(|hz| hz <= 1_000);
+        is_one.then(|| Self { dice, rate_hz: rate_hz.unwrap_or(drawn), raster })
+    }
+
+    /// A line that carries every frame of `planes` planes, with a tenth to spare for what else is told.
+    fn line(&mut self, planes: u32) -> SerialSetup {
+        let needed = frame_bytes(self.raster, planes) * 10 * u64::from(self.rate_hz) * 11 / 10;
+        let first = BAUDS.iter().position(|baud| u64::from(*baud) >= needed).unwrap_or(BAUDS.len() - 1);
+        let baud = BAUDS[(first + usize::from(self.dice.happens(0.5))).min(BAUDS.len() - 1)];
+        SerialSetup {
+            baud,
+            can_flush: self.dice.happens(0.7),
+            reply_late_ns: self.dice.one_of(&[0, 0, 1_000_000]),
+        }
+    }
+}
+
 impl Setup {
-    /// The rig that `seed` describes; `rate_hz` overrides its rate, and `follows` whether its projector follows tracks.
-    pub fn of(seed: u64, rate_hz: Option<u32>, follows: Option<bool>) -> Self {
+    /// The rig that `seed` describes. Others may decide its rate, whether its projector follows tracks, and whether it hangs
+    /// on a serial line.
+    pub fn of(seed: u64, rate_hz: Option<u32>, follows: Option<bool>, serial: Option<bool>) -> Self {
+        let mut on_a_line = OnALine::drawn(seed, rate_hz, follows, serial);
+        let rate_hz = on_a_line.as_ref().map_or(rate_hz, |line| Some(line.rate_hz));
         let mut dice = Dice::new(seed, 0x5e7);
         let drawn = dice.one_of(&RATES);
         let rate_hz = rate_hz.unwrap_or(drawn);
@@ -51,23 +108,31 @@ impl Setup {
         let is_slow = dice.happens(0.25) && rate_hz <= 240;
         let render_milli = if is_slow { dice.between(950, 3_000) } else { dice.between(100, 700) };
         let planes = if rate_hz > 947 || dice.happens(0.7) { 8 } else { 24 };
+        let serial = on_a_line.as_mut().map(|line| line.line(planes));
+        let raster = on_a_line.as_ref().map_or((16, 12), |line| line.raster);
+        let line_ms = serial.map_or(0, |line| {
+            (frame_bytes(raster, planes) * 10_000 / u64::from(line.baud)) as i64
+                + line.reply_late_ns / 1_000_000
+        });
         // What a frame needs from sample to light, twice; else the rig would be dark by its own file.
         let needed_ms = (2 * (3 + 2_000 / i64::from(tracker_hz)) + 8 * slot_us / 1000 + 20)
-            + slot_us * render_milli / 1_000_000 * 4;
+            + slot_us * render_milli / 1_000_000 * 4
+            + 2 * line_ms;
         let predict_ms = dice.happens(0.3).then(|| dice.between(needed_ms, 2 * needed_ms).min(1_000) as u32);
         // These have a row of their own, so that a life without tracks is what it was before there were any.
         let mut late = Dice::new(seed, 0x7ac);
         let drawn = late.happens(FOLLOWING);
         let turns = late.one_of(&[None, Some(10), Some(40)]);
-        let follows = follows.unwrap_or(drawn);
+        let follows = serial.is_none() && follows.unwrap_or(drawn);
         // Mirrors are small enough that a body can be elsewhere by some of them.
         let (raster, motion) = match turns {
             Some(acceleration) if follows => ((64, 48), BodyMotion::Turns(acceleration)),
             None if follows => ((64, 48), BodyMotion::Swings),
-            _ => ((16, 12), BodyMotion::Swings),
+            _ => (raster, BodyMotion::Swings),
         };
         Self {
             follows,
+            serial,
             raster,
             motion,
             seed,
@@ -130,7 +195,10 @@ impl Episodes {
     /// The episodes of a life.
     pub fn new(setup: &Setup) -> Self {
         let all = Kind::ALL.iter().copied();
-        let kinds = all.filter(|kind| setup.follows || !kind.needs_tracks()).collect();
+        let kinds = all
+            .filter(|kind| setup.follows || !kind.needs_tracks())
+            .filter(|kind| setup.serial.is_some() || !kind.needs_line())
+            .collect();
         let dice = Dice::new(setup.seed, 0xe915);
         let rests = setup.follows.then(|| Dice::new(setup.seed, 0x4e57));
         Self { dice, cells: Vec::new(), kinds, rests, next: 0 }

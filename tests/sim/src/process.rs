@@ -3,8 +3,13 @@
 use crate::cable::{lock, Cable, HostEnd};
 use crate::disk::{Disk, SimFolder};
 use crate::machine::SimMachine;
+use crate::port::SimPorts;
 use dpm_device::time::HostTime;
+use dpm_device::transport::serial::{SerialSettings, SerialTransport};
+use dpm_device::transport::{Transport, TransportError};
+use dpm_rig::config::ProjectorBackend;
 use dpm_rig::failure::{Failure, FailureKind};
+use dpm_rig::pipeline::projector::frame_bytes;
 use dpm_rig::pipeline::stepped::{SteppedEnd, SteppedOrders, SteppedRun};
 use dpm_rig::rig::Rig;
 use dpm_rig::standing::Identity;
@@ -28,6 +33,16 @@ pub enum Exit {
     Again(String),
     /// With an error that a new start does not cure.
     ForGood(String),
+}
+
+/// Opens the way to the projector.
+fn medium(rig: &Rig, cable: &Arc<Mutex<Cable>>) -> Result<Box<dyn Transport>, TransportError> {
+    let ProjectorBackend::Serial(serial) = &rig.config.projector.backend else {
+        return Ok(Box::new(HostEnd::open(cable)?));
+    };
+    let frame_bytes = frame_bytes(rig.camera.raster, rig.config.projector.schedule().len());
+    let settings = SerialSettings { path: serial.port.clone(), baud: serial.baud, frame_bytes };
+    Ok(Box::new(SerialTransport::open_from(settings, Box::new(SimPorts::new(cable.clone())))?))
 }
 
 /// A process that runs.
@@ -63,8 +78,8 @@ impl Process {
         let identity = Identity::of(&rig.config.projector.backend);
         let orders = SteppedOrders::begin(Box::new(SimFolder(disk.clone())), identity, monitor.clone())
             .map_err(Exit::ForGood)?;
-        let medium = HostEnd::open(cable).map_err(|e| Exit::Again(e.to_string()))?;
-        let run = SteppedRun::begin(rig.clone(), monitor.clone(), Box::new(medium), machine, HostTime(now));
+        let medium = medium(rig, cable).map_err(|e| Exit::Again(e.to_string()))?;
+        let run = SteppedRun::begin(rig.clone(), monitor.clone(), medium, machine, HostTime(now));
         let disk = disk.clone();
         Ok(Self {
             run,

@@ -17,12 +17,13 @@ use dpm_rig::pipeline::stepped::Part;
 
 /// A transport that keeps what is sent: the words of a second host.
 #[derive(Default)]
-struct Words(Vec<u8>);
+pub(crate) struct Words(pub(crate) Vec<u8>, pub(crate) Vec<Vec<u8>>);
 
 impl Transport for Words {
     fn send(&mut self, _: HostTime, _: Lane, packets: &[Packet<'_>]) -> Result<(), SendError> {
         for packet in packets {
             packet.parts().into_iter().for_each(|part| self.0.extend_from_slice(part));
+            self.1.push(packet.parts().concat());
         }
         Ok(())
     }
@@ -86,6 +87,7 @@ impl World {
                 lock(&self.cable).faults.control_late_ns = dice.decades(200_000, 30_000_000);
                 self.lasts(kind, dice.decades(2, 1_500) * MS, Undo::Cable);
             }
+            K::X9 | K::X10 | K::X11 => self.strike_line(kind, &mut dice),
             K::T18 | K::G3 | K::G9 => self.lasts(kind, MS, Undo::Nothing),
         }
     }
@@ -203,6 +205,7 @@ impl World {
         if kind == K::U9 && self.aside.is_none() {
             if let Ok(other) = projector_of(&self.setup, Raster::new(32, 24), self.t) {
                 self.pull();
+                self.switch_off();
                 let own = std::mem::replace(&mut self.projector, other);
                 self.aside = Some(own);
                 self.new_projector();
@@ -217,7 +220,10 @@ impl World {
 
     fn pull(&mut self) {
         lock(&self.cable).pull();
-        self.projector.bus_reset(HostTime(self.t));
+        if self.far.is_none() {
+            // On a serial line a projector does not notice.
+            self.projector.bus_reset(HostTime(self.t));
+        }
         self.see_light();
         if let Some(tracks) = &mut self.tracks {
             tracks.no_session(&self.projector);
@@ -226,6 +232,7 @@ impl World {
 
     /// Another projector is at the end of the cable, or this one has lost its memory.
     fn new_projector(&mut self) {
+        self.new_far_end();
         if let Some(tracks) = &mut self.tracks {
             tracks.new_device();
         }
@@ -261,6 +268,7 @@ impl World {
                 self.projector.power_cycle(now);
                 self.see_light();
                 self.new_projector();
+                self.boot_noise();
                 if self.projector.status().faults == 0 {
                     self.laws.acknowledged();
                 }
@@ -453,8 +461,13 @@ impl World {
         link.connect();
         let _ = link.poll(HostTime(self.t), &mut words);
         if lock(&self.cable).plugged {
-            self.hear(&words.0, false);
-            self.projector.receive(HostTime(self.t), Lane::Control, &words.0);
+            match self.far {
+                Some(_) => self.hear_on_the_line(&words.1),
+                None => {
+                    self.hear(&words.0, false);
+                    self.projector.receive(HostTime(self.t), Lane::Control, &words.0);
+                }
+            }
             self.see_light();
         }
         self.plan(self.t + 10 * MS, Action::Again(kind, seed, rounds - 1));
@@ -479,6 +492,7 @@ impl World {
             Undo::Projector => {
                 if let Some(own) = self.aside.take() {
                     self.pull();
+                    self.switch_off();
                     self.projector = own;
                     self.new_projector();
                     self.laws.acknowledged();

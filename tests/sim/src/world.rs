@@ -4,6 +4,7 @@ use crate::cable::{lock, Cable};
 use crate::disk::Disk;
 use crate::kinds::{Kind, State};
 use crate::laws::Laws;
+use crate::line::SerialLine;
 use crate::machine::{Beneath, SimMachine};
 use crate::net::{Net, ServerKind};
 use crate::plan::{Episode, Setup};
@@ -18,6 +19,7 @@ use dpm_rig::config::{Overrides, RigConfig};
 use dpm_rig::order::Order;
 use dpm_rig::rig::Rig;
 use dpm_rig::telemetry::monitor::ProjectorHealth;
+use hil_mock::projector::serial::SerialEnd;
 use hil_mock::projector::{DeviceClock, MockConfig, MockProjector, GREATEST_SHIFT};
 use std::cmp::Reverse;
 use std::collections::{BinaryHeap, VecDeque};
@@ -119,6 +121,8 @@ pub struct World {
     clock: Arc<AtomicI64>,
     lag: Arc<AtomicI64>,
     pub(crate) projector: MockProjector,
+    /// Its end of a serial line.
+    pub(crate) far: Option<SerialEnd>,
     /// The projector that belongs here, while another one is in its place.
     pub(crate) aside: Option<MockProjector>,
     pub(crate) process: Option<Process>,
@@ -169,9 +173,13 @@ const ASSETS: &str = concat!(env!("CARGO_MANIFEST_DIR"), "/assets");
 fn rig_of(setup: &Setup, acknowledges: bool) -> Result<Rig, String> {
     let tracks = if setup.follows { "tracks = \"auto\"\nhorizontal_fov_deg = 20\n" } else { "" };
     let predict = setup.predict_ms.map_or(String::new(), |ms| format!("predict_ms = {ms}\n"));
+    let backend = match setup.serial {
+        Some(line) => format!("kind = \"serial\", port = \"/dev/simulated\", baud = {}", line.baud),
+        None => "kind = \"usb\"".into(),
+    };
     let text = format!(
         "[tracker]\nkind = \"natnet\"\nserver = \"10.0.0.2\"\nlocal = \"10.0.0.1\"\nrate_hz = {}\n\
-         [projector]\nwidth = {}\nheight = {}\nplanes = {}\nframe_rate = {}\nbackend = {{ kind = \"usb\" }}\n{tracks}\
+         [projector]\nwidth = {}\nheight = {}\nplanes = {}\nframe_rate = {}\nbackend = {{ {backend} }}\n{tracks}\
          [scene]\nfile = \"triangle.gltf\"\n[[scene.bodies]]\nname = \"a\"\n[safety]\nacknowledge_faults = {acknowledges}\n{predict}",
         setup.tracker_hz, setup.raster.0, setup.raster.1, setup.planes, setup.rate_hz
     );
@@ -210,17 +218,20 @@ impl World {
         let seed = setup.seed;
         let mut cable = Cable::new(seed, setup.ns_per_byte, setup.travel_ns);
         cable.keeps_order = setup.follows;
+        cable.line = setup.serial.map(|line| SerialLine::new(seed, line, setup.travel_ns));
         let laws = Laws::new(&rig, &setup);
         let tracks = setup.follows.then(|| TrackLaws::new(&rig, &setup)).transpose()?;
+        let projector = projector_of(&setup, None, 0)?;
         Ok(Self {
             t: 0,
+            far: setup.serial.map(|_| SerialEnd::new(&projector)),
             cable: Arc::new(Mutex::new(cable)),
             net: Arc::new(Mutex::new(Net::new(seed, kind)?)),
             beneath: Arc::new(Mutex::new(Beneath::new(seed, slot_ns * setup.render_milli / 1000))),
             disk: Arc::default(),
             clock: Arc::default(),
             lag: Arc::default(),
-            projector: projector_of(&setup, None, 0)?,
+            projector,
             aside: None,
             process: None,
             frozen_until: 0,
@@ -348,7 +359,8 @@ impl World {
             }
             net.now = self.t;
         }
-        lock(&self.cable).now = self.t;
+        lock(&self.cable).advance(self.t);
+        self.watch_line();
         self.act();
         self.move_projector();
         self.move_process();
@@ -429,6 +441,11 @@ impl World {
         loop {
             let arrived = lock(&self.cable).arrived();
             let Some(transfer) = arrived else { break };
+            if self.far.is_some() {
+                self.hear_piece(&transfer.bytes);
+                lock(&self.cable).recycle(transfer.bytes);
+                continue;
+            }
             if transfer.lane == Lane::Control {
                 self.hear(&transfer.bytes, transfer.cut);
             }
@@ -444,6 +461,9 @@ impl World {
             self.laws.struck_elsewhere(self.t);
         }
         self.laws.flashes(self.t, self.projector.status().faults & faults::FLASH_LIMIT != 0);
+        if self.far.is_some() {
+            return self.reply_on_the_line();
+        }
         let mut cable = lock(&self.cable);
         if cable.plugged {
             self.projector.replies(HostTime(self.t), &mut |_, packet| cable.reply(packet));
@@ -529,6 +549,7 @@ impl World {
         self.laws.exited(&exit, &counts, end.as_deref(), self.t);
         self.fold(4, self.t as u64);
         self.tell(|| format!("the program ends: {exit:?}"));
+        self.last_words();
         match exit {
             // The service manager does not start it again; whoever asked for the stop does.
             Exit::InOrder => self.needs_person = true,
@@ -545,6 +566,7 @@ impl World {
         self.laws.died(self.t);
         self.frozen_until = self.frozen_until.min(self.t);
         self.tell(|| "the program is killed".into());
+        self.last_words();
         self.restart_at = self.t + RESTART_NS;
     }
 

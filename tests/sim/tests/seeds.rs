@@ -1,13 +1,22 @@
 //! Seeds that once broke a law, shrunk to what they need, and what a life has to be besides lawful: the same every time.
 
 use dpm_sim::life::{live, Lived, Order};
-use dpm_sim::plan::Setup;
+use dpm_sim::plan::{Episodes, Setup};
 use dpm_sim::tracks::Placed;
 use std::collections::BTreeSet;
 
 fn order(seed: u64, rate_hz: Option<u32>, seconds: i64) -> Order {
     let length_ns = seconds * 1_000_000_000;
-    Order { seed, length_ns, rate_hz, follows: None, without: BTreeSet::new(), until: None, is_loud: false }
+    Order {
+        seed,
+        length_ns,
+        rate_hz,
+        follows: None,
+        serial: None,
+        without: BTreeSet::new(),
+        until: None,
+        is_loud: false,
+    }
 }
 
 fn lived(order: &Order) -> Lived {
@@ -45,8 +54,9 @@ fn what_once_broke_a_law_keeps_them_all() {
         (5_007_078, None, 42),
     ];
     for (seed, rate_hz, seconds) in found {
-        // They were found before there were tracks; without them, a seed still describes the same life.
-        let lived = lived(&Order { follows: Some(false), ..order(seed, rate_hz, seconds) });
+        // They were found before there were tracks and serial lines; without them, a seed still describes the same life.
+        let lived =
+            lived(&Order { follows: Some(false), serial: Some(false), ..order(seed, rate_hz, seconds) });
         assert_eq!(
             lived.broken,
             None,
@@ -84,6 +94,55 @@ fn what_once_broke_a_law_of_tracks_keeps_them_all() {
     }
 }
 
+/// The same for lives in which the projector hangs on a serial line.
+#[test]
+fn what_once_broke_a_law_on_a_serial_line_keeps_them_all() {
+    let found = [
+        // The line echoed while the link came up: the host took its own ECHO for the quickest of all answers, its map of the
+        // projector's clock was wrong, and all was dark for seconds ...
+        (91, 30),
+        (143, 30),
+        // ... without a word ...
+        (194, 31),
+        // ... or lit with poses that were too old.
+        (114, 13),
+        // A key frame after frames that had been small: it was thought to arrive as soon as they did.
+        (44, 20),
+        // A line of 3 Mbaud became slower while a frame was on it, which no host can know: the law says what bounds it then.
+        (40_000_631, 14),
+        // A projector that was replaced stayed on, because nobody on a serial line notices: the simulator's own mistake.
+        (39, 17),
+        (6, 15),
+    ];
+    for (seed, seconds) in found {
+        let lived = lived(&Order { serial: Some(true), ..order(seed, None, seconds) });
+        assert_eq!(lived.broken, None, "seed {seed}");
+        assert!(lived.table.total() > 0 && lived.setup.serial.is_some(), "seed {seed} has no faults");
+    }
+}
+
+/// A fifth of the lives have a serial line, which carries every frame that its projector may be sent.
+#[test]
+fn serial_lines_carry_their_frames_and_are_struck_by_faults_of_their_own() {
+    let lives = (0..3_000).map(|seed| Setup::of(seed, None, None, None));
+    let on_lines: Vec<Setup> = lives.filter(|setup| setup.serial.is_some()).collect();
+    assert!((500..700).contains(&on_lines.len()), "{} of 3000 lives", on_lines.len());
+    let bauds: BTreeSet<u32> = on_lines.iter().filter_map(|setup| Some(setup.serial?.baud)).collect();
+    assert!(bauds.contains(&115_200) && bauds.contains(&3_000_000), "{bauds:?}");
+    assert!(on_lines.iter().all(|setup| !setup.follows && setup.rate_hz <= 240));
+    let cells = |serial| {
+        let setup = Setup::of(5, None, Some(false), Some(serial));
+        let mut episodes = Episodes::new(&setup);
+        (0..2_000)
+            .flat_map(|_| episodes.next_episode().faults)
+            .filter(|fault| fault.kind.needs_line())
+            .count()
+    };
+    assert!(cells(true) > 50 && cells(false) == 0);
+    // Nobody sends tracks on such a line, so lives with tracks have none.
+    assert!((0..300).all(|seed| Setup::of(seed, None, Some(true), None).serial.is_none()));
+}
+
 #[test]
 fn the_same_seed_is_the_same_life_and_another_is_not() {
     let (a, b) = (lived(&order(77, Some(120), 20)), lived(&order(77, Some(120), 20)));
@@ -93,12 +152,15 @@ fn the_same_seed_is_the_same_life_and_another_is_not() {
     let with_tracks = |seed| lived(&Order { follows: Some(true), ..order(seed, Some(60), 20) });
     let (a, b) = (with_tracks(77), with_tracks(77));
     assert_eq!((a.trace, a.events, a.planes_moved), (b.trace, b.events, b.planes_moved));
+    let on_a_line = |seed| lived(&Order { serial: Some(true), ..order(seed, Some(60), 20) });
+    let (a, b) = (on_a_line(77), on_a_line(77));
+    assert_eq!((a.trace, a.events), (b.trace, b.events));
 }
 
 /// A third of the lives have tracks, in which light is moved, and moved to where the body is.
 #[test]
 fn tracks_move_light_nearer_to_its_body() {
-    let following = (0..3_000).filter(|seed| Setup::of(*seed, None, None).follows).count();
+    let following = (0..3_000).filter(|seed| Setup::of(*seed, None, None, Some(false)).follows).count();
     assert!((900..1_100).contains(&following), "{following} of 3000 lives have tracks");
     let mut sum = Placed::default();
     for seed in 400..408 {
@@ -121,11 +183,13 @@ fn a_fault_that_is_dropped_does_not_strike() {
 #[test]
 fn a_life_without_faults_is_light() {
     for rate_hz in dpm_sim::plan::RATES {
-        for follows in [false, true] {
+        for (follows, serial) in [(false, false), (true, false), (false, true)] {
             let without = (0..10_000).collect();
-            let quiet = Order { without, follows: Some(follows), ..order(3, Some(rate_hz), 10) };
+            let (follows, serial) = (Some(follows), Some(serial));
+            let quiet = Order { without, follows, serial, ..order(3, Some(rate_hz), 10) };
             let lived = lived(&quiet);
-            assert_eq!((lived.broken, lived.table.total()), (None, 0), "{rate_hz}, tracks {follows}");
+            let what = format!("{rate_hz}, tracks {follows:?}, serial line {serial:?}");
+            assert_eq!((lived.broken, lived.table.total()), (None, 0), "{what}");
         }
     }
 }

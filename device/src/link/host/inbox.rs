@@ -53,6 +53,8 @@ impl PacketSink for Inbox {
         }
         let header = *assembly.header();
         match DeviceMessage::parse(header.kind, assembly.payload()) {
+            // The host's own question, from a line that echoes. As an answer it would be the quickest of all, and wrong.
+            Ok(DeviceMessage::Echo(echo)) if !echo.is_answer() => self.ignored += 1,
             Ok(message) if header.session == self.session => self.apply(&message),
             // The device lost its power or its memory: it answers, but does not know this session.
             Ok(DeviceMessage::Status(_)) if header.session == 0 => {

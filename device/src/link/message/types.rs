@@ -273,6 +273,13 @@ pub struct Echo {
     pub device_sent: DeviceTicks,
 }
 
+impl Echo {
+    /// True for a device's answer, false for a host's question. On a line that echoes, each side hears its own.
+    pub const fn is_answer(&self) -> bool {
+        self.device_received.0 != 0 || self.device_sent.0 != 0
+    }
+}
+
 /// What a FAULT message is about.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 #[repr(u16)]

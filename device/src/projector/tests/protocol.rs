@@ -2,7 +2,7 @@
 //! questions).
 
 use super::*;
-use crate::link::{Commit, HostHello, HostMessage};
+use crate::link::{Commit, Echo, HostHello, HostMessage};
 
 /// A packet of a host.
 fn packet(session: u32, message: &HostMessage) -> Vec<u8> {
@@ -253,6 +253,28 @@ fn a_target_anywhere_in_a_slot_means_that_slot() {
 }
 
 /// Only intact packets feed the watchdog: an intact header in front of damaged planes does not.
+/// Found in the simulated world: on a line that echoes, a device hears its own answers. They are no word of a host.
+#[test]
+fn its_own_answers_do_not_feed_the_watchdog_and_are_not_answered() {
+    for is_answer in [false, true] {
+        let (mut rig, session) = armed();
+        rig.step(1);
+        let heard = rig.now;
+        let at = DeviceTicks(u64::from(is_answer) * 77);
+        let echo = Echo { host_sent_ns: 5, device_received: at, device_sent: at };
+        let echo = packet(session, &HostMessage::Echo(echo));
+        let mut answered = 0;
+        for ms in 1..=60 {
+            let now = heard.plus_ns(ms * 1_000_000);
+            rig.cable.device_mut().receive(now, Lane::Control, &echo);
+            let all = answers(rig.cable.device_mut(), now);
+            answered += all.iter().filter(|(_, m)| matches!(m, DeviceMessage::Echo(_))).count();
+        }
+        let faults = rig.cable.device().status().faults;
+        assert_eq!((faults, answered), if is_answer { (faults::WATCHDOG, 0) } else { (0, 60) });
+    }
+}
+
 #[test]
 fn damaged_planes_do_not_feed_the_watchdog() {
     for damaged in [false, true] {

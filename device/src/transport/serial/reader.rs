@@ -11,9 +11,10 @@ use serialport::SerialPort;
 
 use crate::time::{HostClock, HostTime};
 use crate::transport::priority::Follower;
+use crate::transport::serial::Arrivals;
 
-/// The transport's clock, once it was set.
-pub(super) type SharedClock = Arc<OnceLock<Arc<dyn HostClock>>>;
+/// The clock of a line, once it was set.
+pub type SharedClock = Arc<OnceLock<Arc<dyn HostClock>>>;
 
 /// Bytes of one chunk.
 const CHUNK_BYTES: usize = 1024;
@@ -57,10 +58,10 @@ impl Reader {
         let thread = std::thread::Builder::new().name("dpm-serial-in".into()).spawn(run).ok()?;
         Some(Self { chunks, ended, stop, thread: Some(thread), follower: Follower::new() })
     }
+}
 
-    /// Passes on the input with the instant of its arrival, or `now` without a clock. Returns the number of bytes, or
-    /// `None` once the line has ended and everything was passed on.
-    pub(super) fn take(&mut self, now: HostTime, sink: &mut dyn FnMut(HostTime, &[u8])) -> Option<usize> {
+impl Arrivals for Reader {
+    fn take(&mut self, now: HostTime, sink: &mut dyn FnMut(HostTime, &[u8])) -> Option<usize> {
         if let Some(thread) = &self.thread {
             self.follower.follow(now, thread);
         }
