@@ -252,7 +252,6 @@ fn a_target_anywhere_in_a_slot_means_that_slot() {
     }
 }
 
-/// Only intact packets feed the watchdog: an intact header in front of damaged planes does not.
 /// Found in the simulated world: on a line that echoes, a device hears its own answers. They are no word of a host.
 #[test]
 fn its_own_answers_do_not_feed_the_watchdog_and_are_not_answered() {
@@ -275,6 +274,7 @@ fn its_own_answers_do_not_feed_the_watchdog_and_are_not_answered() {
     }
 }
 
+/// Only intact packets feed the watchdog: an intact header in front of damaged planes does not.
 #[test]
 fn damaged_planes_do_not_feed_the_watchdog() {
     for damaged in [false, true] {
