@@ -383,6 +383,10 @@ impl NatNetServer {
 
     fn send_report(&mut self, k: u64, now: HostTime, send: &mut dyn FnMut(&[u8], SocketAddrV4)) {
         self.frames_sent += 1;
+        let waits = |c: &Client| !c.is_told && now.ns_since(c.connected_at) < Self::GRACE_NS;
+        if matches!(self.config.streaming, Streaming::Unicast(_)) && self.clients.iter().all(waits) {
+            return;
+        }
         self.fill(k);
         match self.config.streaming {
             Streaming::Multicast(group) => {
@@ -392,15 +396,21 @@ impl NatNetServer {
                 }
             }
             Streaming::Unicast(to) => {
+                // The datagram is a function of the report and the version: one for all clients in a row of the same version.
+                let mut written = None;
                 for i in 0..self.clients.len() {
                     let client = self.clients[i];
-                    if !client.is_told && now.ns_since(client.connected_at) < Self::GRACE_NS {
+                    if waits(&client) {
                         continue;
                     }
-                    if self.encode(client.version, k, now).is_err() {
-                        continue;
+                    if written != Some(client.version) {
+                        written = None;
+                        if self.encode(client.version, k, now).is_err() {
+                            continue;
+                        }
+                        self.spoil(k);
+                        written = Some(client.version);
                     }
-                    self.spoil(k);
                     if to != UnicastTo::DataPort {
                         send(&self.datagram, client.address);
                     }

@@ -70,7 +70,7 @@ struct LitSlot {
 }
 
 /// The tracks that a device keeps, and the planes that they move.
-#[derive(Debug, Default)]
+#[derive(Clone, Debug, Default)]
 pub(super) struct Following {
     /// Of the frame that is lit, and of another one.
     kept: [Option<Tracks>; 2],

@@ -33,7 +33,7 @@ pub(super) struct Held {
 }
 
 /// All buffers. `capacity` frames may wait; one is lit, one is being written, one may serve as the base of the next.
-#[derive(Debug)]
+#[derive(Clone, Debug)]
 pub(super) struct FrameStore {
     buffers: Vec<Box<[u8]>>,
     pub assembling: Option<Assembling>,

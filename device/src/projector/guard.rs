@@ -5,7 +5,7 @@ use crate::planes::{PlaneSchedule, Raster};
 use crate::time::FrameRate;
 
 /// One set of limits and its counts.
-#[derive(Debug)]
+#[derive(Clone, Debug)]
 struct Counted {
     limits: LightLimits,
     rate: FrameRate,
@@ -13,7 +13,7 @@ struct Counted {
 }
 
 /// Counts the light of every slot.
-#[derive(Debug, Default)]
+#[derive(Clone, Debug, Default)]
 pub(super) struct LightGuard {
     /// The limits of the host, and those of the device's owner.
     counted: [Option<Counted>; 2],

@@ -61,15 +61,16 @@ enum Mode {
     Frozen,
 }
 
-/// A projector. See the module's documentation.
-#[derive(Debug)]
+/// A projector. See the module's documentation. A clone is in the same state, but has no room set aside: it allocates when
+/// it first needs some.
+#[derive(Clone, Debug)]
 pub struct ProjectorFirmware {
     decoders: [Decoder; 2],
     core: Core,
 }
 
 /// Everything but the decoders, so that packets that a decoder finds can act on it.
-#[derive(Debug)]
+#[derive(Clone, Debug)]
 struct Core {
     setup: FirmwareConfig,
     now: HostTime,

@@ -11,7 +11,7 @@ use super::frames::{Assembling, Held, Pending};
 use super::{Core, Mode, ECHOES_KEPT, MAX_LEAD_S};
 
 /// The packet that is arriving on a lane.
-#[derive(Debug, Default)]
+#[derive(Clone, Debug, Default)]
 #[allow(clippy::large_enum_variant)] // There are two, and nothing may be allocated for a packet.
 pub(super) enum Incoming {
     #[default]
@@ -27,7 +27,7 @@ pub(super) enum Incoming {
 }
 
 /// Encoding of an arriving plane.
-#[derive(Debug)]
+#[derive(Clone, Debug)]
 pub(super) enum Form {
     /// The bytes are the bits; the number counts those written.
     Raw { filled: usize },

@@ -149,14 +149,17 @@ impl<const OUT: usize> Sensor<OUT> {
 
     /// Bytes of the host, which had arrived at `now`.
     pub fn on_bytes(&mut self, bytes: &[u8], now: u64, adc: &mut impl Adc) {
+        let mut packet = [0; MAX_HOST_PACKET];
         // Read byte by byte: the sink cannot borrow the whole sensor.
         for &byte in bytes {
-            let mut packet = [0; MAX_HOST_PACKET];
             let mut length = 0;
             self.deframer.push(&[byte], &mut |p| {
                 length = p.len();
                 packet[..length].copy_from_slice(p);
             });
+            if length == 0 {
+                continue;
+            }
             if let Ok(message) = SensorMessage::decode(&packet[..length]) {
                 self.on_message(&message, now, adc);
             }

@@ -13,7 +13,7 @@ use crate::time::HostTime;
 
 /// Calls the device as part of `send` and `receive`: nothing is copied or queued, and a run is a function of its
 /// inputs. The device's time advances exactly to the `now` that it is called with.
-#[derive(Debug)]
+#[derive(Clone, Debug)]
 pub struct Direct<D> {
     device: D,
 }

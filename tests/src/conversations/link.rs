@@ -13,14 +13,18 @@ use hil_mock::projector::{MockConfig, MockProjector};
 
 /// A cable that records the session and what was sent, and that can be given replies.
 struct Cable {
-    device: Direct<MockProjector>,
+    /// `None` while its answers are played back.
+    device: Option<Direct<MockProjector>>,
     session: u32,
     sent: Vec<MessageType>,
     /// Every packet, for seeds.
     kept: Option<(Vec<u8>, Vec<u8>)>,
     /// Replies that replace the device's own, if there are any.
-    inbound: Option<Vec<u8>>,
+    inbound: Option<Answers>,
 }
+
+/// What a device says to one poll.
+type Answers = Vec<(Lane, Vec<u8>)>;
 
 impl Transport for Cable {
     fn send(&mut self, now: HostTime, lane: Lane, packets: &[Packet<'_>]) -> Result<(), SendError> {
@@ -32,7 +36,7 @@ impl Transport for Cable {
                 to_device.extend(packet.parts().concat());
             }
         }
-        self.device.send(now, lane, packets)
+        self.device.as_mut().map_or(Ok(()), |device| device.send(now, lane, packets))
     }
 
     fn receive(
@@ -40,15 +44,14 @@ impl Transport for Cable {
         now: HostTime,
         sink: &mut dyn FnMut(Lane, HostTime, &[u8]),
     ) -> Result<(), TransportError> {
-        match &mut self.inbound {
-            Some(bytes) => sink(Lane::Control, now, &std::mem::take(bytes)),
-            None => {
-                let kept = &mut self.kept;
-                self.device.receive(now, &mut |lane, at, bytes| {
-                    kept.iter_mut().for_each(|(_, to_host)| to_host.extend_from_slice(bytes));
-                    sink(lane, at, bytes);
-                })?;
-            }
+        let Self { device, kept, inbound, .. } = self;
+        match (inbound, device) {
+            (Some(answers), _) => answers.drain(..).for_each(|(lane, bytes)| sink(lane, now, &bytes)),
+            (None, Some(device)) => device.receive(now, &mut |lane, at, bytes| {
+                kept.iter_mut().for_each(|(_, to_host)| to_host.extend_from_slice(bytes));
+                sink(lane, at, bytes);
+            })?,
+            (None, None) => {}
         }
         Ok(())
     }
@@ -72,7 +75,7 @@ fn mock_config() -> MockConfig {
     MockConfig { events_kept: 0, moves_kept: 2, greatest_shift, ..MockConfig::new(raster()) }
 }
 
-/// A link that has not said a word, and its cable to a mock.
+/// A link that has not said a word, and its cable, at whose other end is nothing yet.
 fn silent() -> (HostLink, Cable) {
     let raster = raster();
     let schedule = PlaneSchedule::mono8();
@@ -91,20 +94,22 @@ fn silent() -> (HostLink, Cable) {
     // Always the same session, because a fuzzer's findings must be reproducible.
     let mut link = HostLink::with_sessions(settings, SessionNumbers::from_source(|| 1));
     link.want_tracks();
-    let mock = MockProjector::new(mock_config());
-    (link, Cable { device: Direct::new(mock), session: 0, sent: Vec::new(), kept: None, inbound: None })
+    (link, Cable { device: None, session: 0, sent: Vec::new(), kept: None, inbound: None })
 }
 
-/// A link that is streaming, and its clock.
-fn streaming(keep: bool) -> (HostLink, Cable, HostTime) {
+fn mock() -> Direct<MockProjector> {
+    Direct::new(MockProjector::new(mock_config()))
+}
+
+/// Leads the link to where it streams, and returns its time then. `before` runs before each of its polls.
+fn stream(link: &mut HostLink, cable: &mut Cable, mut before: impl FnMut(&mut Cable, HostTime)) -> HostTime {
     let (raster, schedule) = (raster(), PlaneSchedule::mono8());
-    let (mut link, mut cable) = silent();
-    cable.kept = keep.then(Default::default);
     let mut now = HostTime(0);
     link.connect();
     while link.state() != LinkState::Streaming {
         now = now.plus_ns(1_000_000);
-        link.poll(now, &mut cable).expect("the mock answers");
+        before(cable, now);
+        link.poll(now, cable).expect("the mock answers");
         if link.state() == LinkState::Ready {
             link.arm(0);
         }
@@ -112,7 +117,7 @@ fn streaming(keep: bool) -> (HostLink, Cable, HostTime) {
     for id in 1..=PLANES as u64 {
         let planes = vec![id as u8; raster.plane_bytes() * schedule.len()];
         let slots = link.slots().expect("slots");
-        link.send_frame(now, id, slots.start(id + 4), slots.dark_from(id + 4, 0), &planes, &mut cable);
+        link.send_frame(now, id, slots.start(id + 4), slots.dark_from(id + 4, 0), &planes, cable);
     }
     let mut tracks = Tracks::new(1, 0, DeviceTicks(now.0 as u64), MAX_TRACK_US);
     let area = Area { left: 1, top: 0, width: 12, height: 2 };
@@ -123,8 +128,49 @@ fn streaming(keep: bool) -> (HostLink, Cable, HostTime) {
         velocity: [64, 0],
         ..Region::default()
     });
-    link.send_tracks(now, &tracks, &mut cable).expect("room");
-    (link, cable, now)
+    link.send_tracks(now, &tracks, cable).expect("room");
+    now
+}
+
+/// A stream that a link and a mock have led to once: every conversation begins with it, and leading to it takes longer than
+/// most conversations do.
+struct Begun {
+    mock: Direct<MockProjector>,
+    session: u32,
+    now: HostTime,
+    /// What the mock said to each poll.
+    answers: Vec<Answers>,
+}
+
+thread_local! {
+    static BEGUN: Begun = Begun::new();
+}
+
+impl Begun {
+    fn new() -> Self {
+        let (mut link, mut cable) = silent();
+        cable.device = Some(mock());
+        let mut answers = Vec::new();
+        let now = stream(&mut link, &mut cable, |cable, now| {
+            let mut said = Answers::new();
+            let device = cable.device.as_mut().expect("it was put there");
+            device.receive(now, &mut |lane, _, bytes| said.push((lane, bytes.to_vec()))).expect("in memory");
+            answers.push(said.clone());
+            cable.inbound = Some(said);
+        });
+        Self { mock: cable.device.expect("still there"), session: cable.session, now, answers }
+    }
+}
+
+/// A link that is streaming to a mock, and its time.
+fn streaming() -> (HostLink, Cable, HostTime) {
+    BEGUN.with(|begun| {
+        let (mut link, mut cable) = silent();
+        let mut answers = begun.answers.iter().cloned();
+        let now = stream(&mut link, &mut cable, |cable, _| cable.inbound = answers.next());
+        (cable.device, cable.inbound) = (Some(begun.mock.clone()), None);
+        (link, cable, now)
+    })
 }
 
 /// Makes packets from `bytes`, each with correct checksums: kind, codec, plane, frame, target, lane, elapsed time,
@@ -180,9 +226,8 @@ fn answers(mock: &mut MockProjector, now: HostTime) {
 
 /// Sends arbitrary packets to an armed projector.
 pub fn projector(bytes: &[u8]) {
-    let (_, mut cable, mut now) = streaming(false);
-    let session = cable.session;
-    let mock = cable.device.device_mut();
+    let (mut device, session, mut now) = BEGUN.with(|begun| (begun.mock.clone(), begun.session, begun.now));
+    let mock = device.device_mut();
     packets(bytes, |wait, lane, make| {
         now = now.plus_ns(wait);
         mock.receive(now, lane, &make(session));
@@ -210,12 +255,12 @@ pub fn projector_hello(bytes: &[u8]) {
 /// Sends arbitrary packets from the device to a streaming host: the host grants itself no credit and never requests
 /// light by itself.
 pub fn host_link(bytes: &[u8]) {
-    let (mut link, mut cable, mut now) = streaming(false);
+    let (mut link, mut cable, mut now) = streaming();
     let session = cable.session;
     cable.sent.clear();
     packets(bytes, |wait, _, make| {
         now = now.plus_ns(wait);
-        cable.inbound = Some(make(session));
+        cable.inbound = Some(vec![(Lane::Control, make(session))]);
         let _ = link.poll(now, &mut cable);
         assert!(link.credit() <= i32::MAX as u32);
         link.take_echoes(|_| ());
@@ -227,11 +272,12 @@ pub fn host_link(bytes: &[u8]) {
 /// does, and no frame is sent before.
 pub fn host_hello(bytes: &[u8]) {
     let (mut link, mut cable) = silent();
+    cable.device = Some(mock());
     let (mut now, mut armed) = (HostTime(0), false);
     link.connect();
     packets(bytes, |wait, _, make| {
         now = now.plus_ns(wait);
-        cable.inbound = Some(make(cable.session));
+        cable.inbound = Some(vec![(Lane::Control, make(cable.session))]);
         let _ = link.poll(now, &mut cable);
         if !armed {
             assert!(!cable.sent.contains(&MessageType::Arm), "light without the operator's word");
@@ -278,11 +324,33 @@ fn script(mut wire: &[u8]) -> Vec<u8> {
 }
 
 pub(super) fn recorded() -> Vec<(&'static str, &'static str, Vec<u8>)> {
-    let (_, cable, _) = streaming(true);
+    let (mut link, mut cable) = silent();
+    (cable.device, cable.kept) = (Some(mock()), Some(Default::default()));
+    stream(&mut link, &mut cable, |_, _| ());
     let (to_device, to_host) = cable.kept.expect("kept");
     let (to_device, to_host) = (script(&to_device), script(&to_host));
     vec![
         ("projector_hello", "recorded", to_device[..to_device.len().min(700)].to_vec()),
         ("host_hello", "recorded", to_host[..to_host.len().min(700)].to_vec()),
     ]
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// What is played back leads to where the ends lead each other.
+    #[test]
+    fn a_stream_that_was_begun_is_the_stream_itself() {
+        let (mut link, mut cable) = silent();
+        cable.device = Some(mock());
+        let now = stream(&mut link, &mut cable, |_, _| ());
+        let (again, cable_again, then) = streaming();
+        assert_eq!(
+            (format!("{link:?}"), now, cable.session),
+            (format!("{again:?}"), then, cable_again.session)
+        );
+        assert_eq!(format!("{:?}", cable.device), format!("{:?}", cable_again.device));
+        assert_eq!(cable.sent, cable_again.sent);
+    }
 }

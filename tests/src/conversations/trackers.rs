@@ -11,6 +11,7 @@ use dpm_device::tracker::natnet::wire::{begin, finish, id, split};
 use dpm_device::tracker::natnet::Version;
 use dpm_device::tracker::serial::client::{SerialTracker, SerialTrackerConfig};
 use dpm_device::tracker::serial::wire::{SerialMessage, VERSION};
+use dpm_device::tracker::udp::{Arrival, Datagrams};
 use dpm_device::tracker::vrpn::client::{VrpnClient, VrpnConfig};
 use dpm_device::tracker::vrpn::wire as vrpn;
 use dpm_device::tracker::{BodyKey, Tracker, TrackerCounters, TrackerSample};
@@ -21,7 +22,7 @@ use hil_mock::tracker::{MockTrackerConfig, SampleSource};
 use hil_mock::vrpn_server::{VrpnConnection, VrpnNames, VrpnReports};
 use std::collections::VecDeque;
 use std::io::{self, Read, Write};
-use std::net::{Ipv4Addr, SocketAddr, SocketAddrV4, UdpSocket};
+use std::net::{Ipv4Addr, SocketAddr, SocketAddrV4};
 use std::sync::{Arc, Mutex};
 
 /// When every conversation begins: not at zero, so that an instant before it exists.
@@ -111,16 +112,65 @@ impl Write for Memory {
 const VERSIONS: [Version; 5] =
     [Version::V3_0, Version::new(3, 1), Version::V4_0, Version::V4_1, Version::V4_2];
 
-thread_local! {
-    /// The command ports of a server, and of a stranger on the same machine.
-    static SERVER: (UdpSocket, UdpSocket) = {
-        let port = || {
-            let socket = UdpSocket::bind((Ipv4Addr::LOCALHOST, 0)).expect("a port");
-            socket.set_nonblocking(true).expect("a socket");
-            socket
+/// A socket in memory, whose far end is the test. One of the system takes a hundred times as long to open as a
+/// conversation takes, and its port is another one in every run.
+#[derive(Clone, Default)]
+struct MemoryPort(Arc<Mutex<Waiting>>);
+
+#[derive(Default)]
+struct Waiting {
+    arrived: VecDeque<(Vec<u8>, SocketAddrV4)>,
+    sent: Vec<(Vec<u8>, SocketAddrV4)>,
+    only: Option<(Ipv4Addr, Vec<u16>)>,
+}
+
+impl MemoryPort {
+    /// The port of every client.
+    const LOCAL: SocketAddrV4 = SocketAddrV4::new(Ipv4Addr::LOCALHOST, 4000);
+
+    fn say(&self, datagram: &[u8], from: SocketAddrV4) {
+        let mut inside = self.0.lock().expect("no panic");
+        let is_kept = inside.only.as_ref().is_none_or(|(source, ports)| {
+            from.ip() == source && (ports.is_empty() || ports.contains(&from.port()))
+        });
+        if is_kept {
+            inside.arrived.push_back((datagram.to_vec(), from));
+        }
+    }
+
+    fn heard(&self) -> Vec<(Vec<u8>, SocketAddrV4)> {
+        std::mem::take(&mut self.0.lock().expect("no panic").sent)
+    }
+}
+
+impl Datagrams for MemoryPort {
+    fn receive(&self, buffer: &mut [u8]) -> io::Result<Option<Arrival>> {
+        let Some((datagram, from)) = self.0.lock().expect("no panic").arrived.pop_front() else {
+            return Ok(None);
         };
-        (port(), port())
-    };
+        let len = datagram.len().min(buffer.len());
+        buffer[..len].copy_from_slice(&datagram[..len]);
+        Ok(Some(Arrival { len, from, kernel_ns: None, cut: len < datagram.len() }))
+    }
+
+    fn send(&self, bytes: &[u8], to: SocketAddrV4) -> io::Result<()> {
+        self.0.lock().expect("no panic").sent.push((bytes.to_vec(), to));
+        Ok(())
+    }
+
+    fn keep_only(&self, source: Ipv4Addr, ports: &[u16]) -> io::Result<()> {
+        self.0.lock().expect("no panic").only = Some((source, ports.to_vec()));
+        Ok(())
+    }
+
+    fn keep_all(&self) -> io::Result<()> {
+        self.0.lock().expect("no panic").only = None;
+        Ok(())
+    }
+
+    fn local(&self) -> io::Result<SocketAddrV4> {
+        Ok(Self::LOCAL)
+    }
 }
 
 /// The datagram of a step, for a client whose newest echo request has `stamp`.
@@ -194,46 +244,44 @@ fn natnet_answer(step: &Step<'_>, stamp: u64, out: &mut Vec<u8>) {
     }
 }
 
-/// A NatNet client and any server, over the loopback interface. The stamps of the client's echo requests are patched
-/// into the answers.
+/// A NatNet client and any server, in memory. The stamps of the client's echo requests are patched into the answers.
 pub fn natnet_client(bytes: &[u8]) {
-    SERVER.with(|(server, stranger)| {
-        let clock = Moved::at(BEGIN_NS);
-        let port = server.local_addr().expect("a port").port();
-        let mut heard = [0u8; 2048];
-        while server.recv_from(&mut heard).is_ok() {}
-        let config = NatNetConfig {
-            local: Ipv4Addr::LOCALHOST,
-            command_port: port,
-            data_port: 0,
-            bitstream: bytes.first().filter(|b| **b & 1 != 0).map(|_| Version::V4_1),
-            kernel_stamps: false,
-            ..NatNetConfig::unicast(Ipv4Addr::LOCALHOST, bodies())
-        };
-        let mut client = NatNetClient::open(config, clock.clone()).expect("a client");
-        let to = (Ipv4Addr::LOCALHOST, client.command_port());
-        let (mut laws, mut stamp, mut datagram) = (Laws::default(), 0, Vec::new());
-        for step in Script(bytes) {
-            natnet_answer(&step, stamp, &mut datagram);
-            // One of 32 comes from another port.
-            let from = if step.how >> 3 == 31 { stranger } else { server };
-            from.send_to(&datagram, to).expect("loopback");
-            let now = clock.forward(step.wait_ns);
-            let delivered = client.poll(now, &mut |s| laws.hold(s, now)).expect("loopback");
-            assert!(delivered <= 2047 / 38);
-            while let Ok((n, _)) = server.recv_from(&mut heard) {
-                if let Ok((id::ECHO_REQUEST, payload)) = split(&heard[..n]) {
-                    stamp = natnet::decode_echo_request(payload).expect("the client's own");
-                }
+    // The command port of the server, and a port of a stranger on the same machine.
+    let server = SocketAddrV4::new(Ipv4Addr::LOCALHOST, 1510);
+    let stranger = SocketAddrV4::new(Ipv4Addr::LOCALHOST, 2000);
+    let clock = Moved::at(BEGIN_NS);
+    let config = NatNetConfig {
+        local: Ipv4Addr::LOCALHOST,
+        command_port: server.port(),
+        data_port: 0,
+        bitstream: bytes.first().filter(|b| **b & 1 != 0).map(|_| Version::V4_1),
+        kernel_stamps: false,
+        ..NatNetConfig::unicast(Ipv4Addr::LOCALHOST, bodies())
+    };
+    let port = MemoryPort::default();
+    let data: Box<dyn Datagrams> = Box::new(MemoryPort::default());
+    let mut client = NatNetClient::with_ports(config, clock.clone(), Box::new(port.clone()), Some(data));
+    let (mut laws, mut stamp, mut datagram) = (Laws::default(), 0, Vec::new());
+    for step in Script(bytes) {
+        natnet_answer(&step, stamp, &mut datagram);
+        // One of 32 comes from another port.
+        port.say(&datagram, if step.how >> 3 == 31 { stranger } else { server });
+        let now = clock.forward(step.wait_ns);
+        let delivered = client.poll(now, &mut |s| laws.hold(s, now)).expect("ports in memory");
+        assert!(delivered <= 2047 / 38);
+        for (said, to) in port.heard() {
+            assert_eq!(to, server);
+            if let Ok((id::ECHO_REQUEST, payload)) = split(&said) {
+                stamp = natnet::decode_echo_request(payload).expect("the client's own");
             }
         }
-        if let Some(map) = client.clock_map() {
-            assert!(map.exchanges() > 0);
-        }
-        let _ = (client.silence(), client.warning(), client.contradicted());
-        assert!(client.counters().packets.received <= Script(bytes).count() as u64);
-        laws.end(client.counters(), &client.status());
-    });
+    }
+    if let Some(map) = client.clock_map() {
+        assert!(map.exchanges() > 0);
+    }
+    let _ = (client.silence(), client.warning(), client.contradicted());
+    assert!(client.counters().packets.received <= Script(bytes).count() as u64);
+    laws.end(client.counters(), &client.status());
 }
 
 /// A NatNet server and any clients: it answers where the question came from, once, and streams to a bounded number.
@@ -296,6 +344,8 @@ pub fn natnet_server(bytes: &[u8]) {
         });
         if step.wait_ns > 5_000_000_000 {
             now = now.plus_ns(NatNetServer::CLIENT_TIMEOUT_NS);
+            // Of what is captured in these seconds only what is still under way then is sent.
+            server.begin_at(now);
             server.stream(now, &mut |_, _| {});
             assert!(server.client_count() == 0 || how >> 6 == 0);
         }
