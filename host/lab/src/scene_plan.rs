@@ -413,7 +413,8 @@ mod tests {
         assert!(plan(&[]).entries.iter().all(|e| !e.switched_off));
     }
 
-    /// Two pixels in a frame at 1 m/s, of which 0.82 are after the centre of the light: from 0.17 m/s on.
+    /// 1.7 pixels in a frame at 1 m/s, of which 1.1 are between the centre of the light and the last planes: from 0.23 m/s
+    /// on.
     #[test]
     fn planes_that_follow_are_needed_where_planes_and_tracked_bodies_are() {
         let entry = |flags: &[&str]| {
@@ -424,7 +425,7 @@ mod tests {
                 .expect("in every plan")
         };
         let own = entry(&[]);
-        assert!(own.needed && own.why.starts_with("8 groups of planes; for bodies at 0.1"), "{own:?}");
+        assert!(own.needed && own.why.starts_with("8 groups of planes; for bodies at 0.2"), "{own:?}");
         let off = entry(&["projector.plane_poses=\"frame\""]);
         assert!(off.left_out && off.switched_off && off.why.contains("plane_poses"), "{off:?}");
         let equal = entry(&["projector.weights=\"equal\""]);
