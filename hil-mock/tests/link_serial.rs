@@ -434,22 +434,6 @@ mod slow_line {
     }
 }
 
-/// Found in the simulated world: on a slow line, a frame takes as long as its bytes and what waits before them.
-#[test]
-fn a_line_tells_how_long_its_largest_frame_takes() {
-    let queue = std::collections::VecDeque::new();
-    let state = SlowLineState { queue, replies: Vec::new(), can_flush: true };
-    let line = SlowLine(Arc::new(Mutex::new(state)));
-    let slow = SerialSettings { baud: 115_200, ..settings("slow") };
-    let bytes = slow.frame_bytes as i64;
-    let transport = SerialTransport::with_port(slow, Box::new(line.clone()));
-    let alone = transport.carriage_ns();
-    let of = |bytes: i64| bytes * 10 * 1_000_000_000 / 115_200;
-    assert!((of(bytes)..of(bytes + bytes / 20)).contains(&alone), "{alone} ns for {bytes} bytes");
-    line.0.lock().unwrap().queue.extend([0x55; 1_152]);
-    assert_eq!((transport.carriage_ns() - alone) / 1_000_000, 100);
-}
-
 /// Found in use, R2 and its siblings: dark within 50 ms of the order, on a line that is full of planes, whether its driver can take
 /// back what it was given or not, and whatever the order cuts.
 #[test]

@@ -131,12 +131,6 @@ pub trait Transport: Send {
         true
     }
 
-    /// How long the largest frame is on its way if it is sent now, nanoseconds, as far as the rate of the medium tells; 0
-    /// where that is no matter. Never waits.
-    fn carriage_ns(&self) -> i64 {
-        0
-    }
-
     /// The temperature of the device's hottest sensor, thousandths of a degree Celsius, when it was last looked at; `None`
     /// for a device that tells none. Never waits.
     fn milli_celsius(&self) -> Option<i32> {
@@ -181,9 +175,6 @@ impl<T: Transport + ?Sized> Transport for &mut T {
     }
     fn has_room(&mut self, lane: Lane) -> bool {
         (**self).has_room(lane)
-    }
-    fn carriage_ns(&self) -> i64 {
-        (**self).carriage_ns()
     }
     fn set_clock(&mut self, clock: Arc<dyn HostClock>) {
         (**self).set_clock(clock);

@@ -283,13 +283,6 @@ impl Transport for SerialTransport {
         }
     }
 
-    fn carriage_ns(&self) -> i64 {
-        let ahead = self.port.as_ref().and_then(|port| port.bytes_to_write().ok()).unwrap_or(0);
-        let bytes = ahead as usize + self.waiting() + self.data.len();
-        let bits = bytes as i64 * i64::from(BITS_PER_BYTE);
-        bits * 1_000_000_000 / i64::from(self.settings.baud.max(1))
-    }
-
     fn receive(
         &mut self,
         now: HostTime,

@@ -21,13 +21,11 @@ impl World {
         }
     }
 
-    /// The laws know when the line is slower than its rate.
+    /// The laws know that there is a line, on which nobody knows how long a frame will take.
     pub(crate) fn watch_line(&mut self) {
-        let cable = lock(&self.cable);
-        let is_slow = cable.line.is_some() && (cable.faults.stalled || cable.faults.slow_milli > 0);
-        drop(cable);
-        if is_slow {
-            self.laws.line_is_slow(self.t);
+        let is_line = lock(&self.cable).line.is_some();
+        if is_line {
+            self.laws.is_on_a_line();
         }
     }
 

@@ -85,8 +85,8 @@ pub struct Laws {
     died_at: Option<i64>,
     /// When the projector last heard of a program that had ended: a serial line finishes what it was given.
     echoed_at: i64,
-    /// When a serial line was last slower than its rate.
-    slow_line_at: i64,
+    /// The projector hangs on a serial line.
+    is_line: bool,
     started_at: i64,
     starts_in_calm: u32,
     /// Crews of this process.
@@ -147,7 +147,7 @@ impl Laws {
             stopped_at: None,
             died_at: None,
             echoed_at: 0,
-            slow_line_at: -S,
+            is_line: false,
             started_at: 0,
             starts_in_calm: 0,
             crews: 0,
@@ -248,9 +248,9 @@ impl Laws {
         self.echoed_at = t;
     }
 
-    /// A serial line stalls, or is slower than its rate.
-    pub fn line_is_slow(&mut self, t: i64) {
-        self.slow_line_at = t;
+    /// The projector hangs on a serial line.
+    pub fn is_on_a_line(&mut self) {
+        self.is_line = true;
     }
 
     /// The program starts.
@@ -508,8 +508,9 @@ impl Laws {
         let predict_ns = self.predict_ns.unwrap_or(sent.predict_ns);
         // The clocks are known to a fraction of a millisecond only.
         let mut allowed = predict_ns + self.slot_ns + MS;
-        // Nobody knows how long a frame will take on a line that stalls behind it; `dark from` bounds its light.
-        if sent.sent_at + lag <= self.slow_line_at + 100 * MS {
+        // The host knows how long frames took on a line, not how long the next one takes: the line may stall, or the last ones
+        // were smaller. It does not trust the port's rate either, which many adapters ignore. `dark from` bounds the light.
+        if self.is_line {
             allowed += 4 * self.stride_ns + self.slot_ns + 4 * MS;
         }
         self.worst_age_milli = self.worst_age_milli.max(age * 1000 / allowed);

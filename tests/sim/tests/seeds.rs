@@ -106,7 +106,7 @@ fn what_once_broke_a_law_on_a_serial_line_keeps_them_all() {
         (194, 31),
         // ... or lit with poses that were too old.
         (114, 13),
-        // A key frame after frames that had been small: it was thought to arrive as soon as they did.
+        // A key frame after frames that had been small: it is thought to arrive as soon as they did, which the law allows.
         (44, 20),
         // A line of 3 Mbaud became slower while a frame was on it, which no host can know: the law says what bounds it then.
         (40_000_631, 14),

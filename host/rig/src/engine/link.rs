@@ -175,7 +175,7 @@ impl<P: Pace> LinkStage<P> {
             self.credit_until = now;
         }
         self.waited_ns = Some(now.ns_since(ready_at) + queued_ns);
-        if is_too_old(note, self.lit_at(note, now, transport), self.slot_ns) {
+        if is_too_old(note, self.lit_at(note, now), self.slot_ns) {
             // The lead learns from this frame too: the next one should begin earlier.
             note.fate = Fate::TooOld;
             return Offer::Settled;
@@ -213,11 +213,9 @@ impl<P: Pace> LinkStage<P> {
     }
 
     /// When a frame that is sent at `now` will be lit: in its slot, or in the first one that begins after it arrives.
-    fn lit_at(&self, note: &FrameNote, now: HostTime, transport: &dyn Transport) -> HostTime {
+    fn lit_at(&self, note: &FrameNote, now: HostTime) -> HostTime {
         let due_at = note.timeline.due_at;
-        // What frames took until now says little where they are of different sizes and the medium is slow.
-        let travel_ns = self.keeper.travel_ns().max(transport.carriage_ns());
-        let arrives_at = now.plus_ns(travel_ns + P::RECEIPT_NS);
+        let arrives_at = now.plus_ns(self.keeper.travel_ns() + P::RECEIPT_NS);
         if arrives_at <= due_at {
             return due_at;
         }
