@@ -299,7 +299,7 @@ impl PlaneSchedule {
     }
 
     /// The bits of a code value from the most significant down.
-    pub const DESCENDING: [u8; 8] = [7, 6, 5, 4, 3, 2, 1, 0];
+    const DESCENDING: [u8; 8] = [7, 6, 5, 4, 3, 2, 1, 0];
 
     /// 24 planes: for each of `bits` in turn red, green, blue. `None` if a bit occurs twice or is above 7.
     pub fn rgb24_in(bits: [u8; 8]) -> Option<Self> {

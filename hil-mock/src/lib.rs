@@ -33,6 +33,7 @@
 pub mod dlpc900;
 pub mod faults;
 pub mod hand;
+pub mod line_port;
 pub mod monotonic;
 pub mod motion;
 mod motion_spec;

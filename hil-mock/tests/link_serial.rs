@@ -16,6 +16,7 @@ use dpm_device::time::{DeviceTicks, FrameRate, HostTime};
 use dpm_device::transport::serial::{SerialSettings, SerialTransport};
 use dpm_device::transport::{Lane, SendError, Transport, TransportError};
 use dpm_device::tty::never_wait;
+use hil_mock::line_port::{Line, LinePort};
 use hil_mock::projector::serial::SerialProjector;
 use hil_mock::projector::{MockConfig, MockProjector};
 use serialport::{SerialPort, TTYPort};
@@ -312,124 +313,30 @@ struct SlowLineState {
 /// What the kernel takes at once.
 const KERNEL_BYTES: usize = 64 * 1024;
 
-impl std::io::Write for SlowLine {
+impl Line for SlowLine {
     fn write(&mut self, bytes: &[u8]) -> std::io::Result<usize> {
         let queue = &mut self.0.lock().unwrap().queue;
         let n = bytes.len().min(KERNEL_BYTES - queue.len());
         queue.extend(&bytes[..n]);
-        if n == 0 {
-            return Err(std::io::ErrorKind::WouldBlock.into());
-        }
         Ok(n)
     }
-    fn flush(&mut self) -> std::io::Result<()> {
-        Ok(())
-    }
-}
 
-impl std::io::Read for SlowLine {
     fn read(&mut self, bytes: &mut [u8]) -> std::io::Result<usize> {
         let replies = &mut self.0.lock().unwrap().replies;
         let n = bytes.len().min(replies.len());
         bytes[..n].copy_from_slice(&replies[..n]);
         replies.drain(..n);
-        if n == 0 {
-            return Err(std::io::ErrorKind::WouldBlock.into());
-        }
         Ok(n)
     }
-}
 
-mod slow_line {
-    use super::SlowLine;
-    use serialport::{
-        ClearBuffer, DataBits, Error, ErrorKind, FlowControl, Parity, Result, SerialPort, StopBits,
-    };
-    use std::time::Duration;
-
-    fn absent<T>() -> Result<T> {
-        Err(Error::new(ErrorKind::Unknown, "this line has no such thing"))
+    fn waiting(&self) -> std::io::Result<usize> {
+        Ok(self.0.lock().unwrap().queue.len())
     }
 
-    impl SerialPort for SlowLine {
-        fn bytes_to_write(&self) -> Result<u32> {
-            Ok(self.0.lock().unwrap().queue.len() as u32)
-        }
-        fn clear(&self, buffer: ClearBuffer) -> Result<()> {
-            let mut state = self.0.lock().unwrap();
-            if buffer == ClearBuffer::Output && state.can_flush {
-                state.queue.clear();
-            }
-            Ok(())
-        }
-        fn name(&self) -> Option<String> {
-            None
-        }
-        fn baud_rate(&self) -> Result<u32> {
-            absent()
-        }
-        fn data_bits(&self) -> Result<DataBits> {
-            absent()
-        }
-        fn flow_control(&self) -> Result<FlowControl> {
-            absent()
-        }
-        fn parity(&self) -> Result<Parity> {
-            absent()
-        }
-        fn stop_bits(&self) -> Result<StopBits> {
-            absent()
-        }
-        fn timeout(&self) -> Duration {
-            Duration::ZERO
-        }
-        fn set_baud_rate(&mut self, _: u32) -> Result<()> {
-            absent()
-        }
-        fn set_data_bits(&mut self, _: DataBits) -> Result<()> {
-            absent()
-        }
-        fn set_flow_control(&mut self, _: FlowControl) -> Result<()> {
-            absent()
-        }
-        fn set_parity(&mut self, _: Parity) -> Result<()> {
-            absent()
-        }
-        fn set_stop_bits(&mut self, _: StopBits) -> Result<()> {
-            absent()
-        }
-        fn set_timeout(&mut self, _: Duration) -> Result<()> {
-            Ok(())
-        }
-        fn write_request_to_send(&mut self, _: bool) -> Result<()> {
-            absent()
-        }
-        fn write_data_terminal_ready(&mut self, _: bool) -> Result<()> {
-            absent()
-        }
-        fn read_clear_to_send(&mut self) -> Result<bool> {
-            absent()
-        }
-        fn read_data_set_ready(&mut self) -> Result<bool> {
-            absent()
-        }
-        fn read_ring_indicator(&mut self) -> Result<bool> {
-            absent()
-        }
-        fn read_carrier_detect(&mut self) -> Result<bool> {
-            absent()
-        }
-        fn bytes_to_read(&self) -> Result<u32> {
-            absent()
-        }
-        fn try_clone(&self) -> Result<Box<dyn SerialPort>> {
-            absent()
-        }
-        fn set_break(&self) -> Result<()> {
-            absent()
-        }
-        fn clear_break(&self) -> Result<()> {
-            absent()
+    fn discard_output(&self) {
+        let mut state = self.0.lock().unwrap();
+        if state.can_flush {
+            state.queue.clear();
         }
     }
 }
@@ -449,7 +356,7 @@ fn stop_means_dark_within_50_ms_on_a_line_that_is_full() {
             let far = SerialProjector::new(MockProjector::new(MockConfig::new(raster())));
             let mut far = far;
             let near_end = SerialSettings { baud, ..settings("slow") };
-            let near_end = SerialTransport::with_port(near_end, Box::new(line.clone()));
+            let near_end = SerialTransport::with_port(near_end, Box::new(LinePort(line.clone())));
             let mut near = Near::new(near_end, Codec::Raw.mask());
             near.link.connect();
             let (mut ordered_at, mut dark_at) = (None, None);

@@ -122,8 +122,8 @@ impl FlashLimiter {
         self.repeated(slot, luminance, 1)
     }
 
-    /// Observes `slots` slots of the same light, from number `first` on. Returns `true` as [`FlashLimiter::observe`] does, if any of them is one too
-    /// many.
+    /// Observes `slots` slots of the same light, from number `first` on. Returns `true` as [`FlashLimiter::observe`] does, if
+    /// any of them is one too many.
     pub fn repeated(&mut self, first: u64, luminance: u32, slots: u64) -> bool {
         let of_window = u64::from(self.slots_per_window);
         if slots == 0 {

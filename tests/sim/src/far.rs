@@ -21,14 +21,6 @@ impl World {
         }
     }
 
-    /// The laws know that there is a line, on which nobody knows how long a frame will take.
-    pub(crate) fn watch_line(&mut self) {
-        let is_line = lock(&self.cable).line.is_some();
-        if is_line {
-            self.laws.is_on_a_line();
-        }
-    }
-
     /// A second program has the line, too: its `packets` come between the bytes of the first.
     pub(crate) fn hear_on_the_line(&mut self, packets: &[Vec<u8>]) {
         for packet in packets {

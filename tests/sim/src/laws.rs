@@ -147,7 +147,7 @@ impl Laws {
             stopped_at: None,
             died_at: None,
             echoed_at: 0,
-            is_line: false,
+            is_line: setup.serial.is_some(),
             started_at: 0,
             starts_in_calm: 0,
             crews: 0,
@@ -246,11 +246,6 @@ impl Laws {
     /// Bytes of a program that has ended reach the projector.
     pub fn heard_of_the_dead(&mut self, t: i64) {
         self.echoed_at = t;
-    }
-
-    /// The projector hangs on a serial line.
-    pub fn is_on_a_line(&mut self) {
-        self.is_line = true;
     }
 
     /// The program starts.

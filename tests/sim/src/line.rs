@@ -5,7 +5,9 @@
 
 use crate::cable::{lock, Cable, CableFaults};
 use crate::dice::Dice;
+use hil_mock::line_port::Line;
 use std::collections::VecDeque;
+use std::io;
 use std::sync::{Arc, Mutex};
 
 /// What a driver takes from its program before it takes no more.
@@ -197,18 +199,23 @@ impl SerialLine {
         }
     }
 
+    /// How long a byte takes from the host, nanoseconds.
     fn byte_ns(&self, faults: &CableFaults) -> i64 {
-        let ns = BITS * 1_000_000_000 / i64::from(self.setup.baud);
         if faults.slow_milli > 0 {
-            ns * faults.slow_milli / 1000
+            self.full_byte_ns() * faults.slow_milli / 1000
         } else {
-            ns
+            self.full_byte_ns()
         }
+    }
+
+    /// How long a byte takes at the line's rate, nanoseconds.
+    fn full_byte_ns(&self) -> i64 {
+        BITS * 1_000_000_000 / i64::from(self.setup.baud)
     }
 
     /// When something happens on it.
     pub fn due(&self, faults: &CableFaults) -> i64 {
-        let byte_ns = BITS * 1_000_000_000 / i64::from(self.setup.baud);
+        let byte_ns = self.full_byte_ns();
         let out = match faults.stalled {
             true => self.out.landing.front().map_or(i64::MAX, |(at, _)| *at),
             false => self.out.due(self.byte_ns(faults)),
@@ -222,7 +229,7 @@ impl SerialLine {
     /// Carries everything up to `now`.
     pub fn carry(&mut self, now: i64, faults: &CableFaults, is_plugged: bool) {
         let byte_ns = self.byte_ns(faults);
-        let full_ns = BITS * 1_000_000_000 / i64::from(self.setup.baud);
+        let full_ns = self.full_byte_ns();
         let (mut told, mut replied) = (Vec::new(), Vec::new());
         let share = |of: f64| of / PACKET_BYTES;
         let silent = faults.silent || !is_plugged;
@@ -306,7 +313,7 @@ impl SerialLine {
 
     /// The projector replies.
     pub fn reply(&mut self, bytes: &[u8], now: i64) {
-        let byte_ns = BITS * 1_000_000_000 / i64::from(self.setup.baud);
+        let byte_ns = self.full_byte_ns();
         self.back.put(bytes, now, byte_ns);
     }
 
@@ -354,6 +361,12 @@ pub(crate) struct Driver {
 #[derive(Debug)]
 pub(crate) struct HungUp;
 
+impl From<HungUp> for io::Error {
+    fn from(HungUp: HungUp) -> Self {
+        io::ErrorKind::BrokenPipe.into()
+    }
+}
+
 impl Driver {
     /// Opens the port: what waits in it is discarded. Why not, in the words of the operating system.
     pub(crate) fn open(cable: &Arc<Mutex<Cable>>) -> Result<Self, &'static str> {
@@ -381,34 +394,39 @@ impl Driver {
         }
     }
 
-    /// Takes as much as fits into the driver.
-    pub(crate) fn write(&self, bytes: &[u8]) -> Result<usize, HungUp> {
-        self.with(|line, now, faults| {
+    /// The next piece that has arrived, and when on the host's clock.
+    pub(crate) fn next_piece(&self) -> Result<Option<(i64, Vec<u8>)>, HungUp> {
+        let lag = lock(&self.cable).host_lag;
+        let piece = self.with(|line, _, _| line.input.pop_front())?;
+        Ok(piece.map(|(at, bytes)| (at - lag, bytes)))
+    }
+}
+
+impl Line for Driver {
+    fn write(&mut self, bytes: &[u8]) -> io::Result<usize> {
+        Ok(self.with(|line, now, faults| {
             let n = bytes.len().min(DRIVER_BYTES.saturating_sub(line.out.queue.len()));
             let byte_ns = line.byte_ns(faults);
             line.out.put(&bytes[..n], now, byte_ns);
             n
-        })
+        })?)
     }
 
-    /// Bytes that have not left the driver.
-    pub(crate) fn waiting(&self) -> Result<usize, HungUp> {
-        self.with(|line, _, _| line.out.queue.len())
+    fn read(&mut self, _: &mut [u8]) -> io::Result<usize> {
+        // Whoever reads the port takes `next_piece`, with its instant.
+        Ok(0)
     }
 
-    /// Discards them, if this driver can. The byte in transmission is finished.
-    pub(crate) fn discard_output(&self) {
+    fn waiting(&self) -> io::Result<usize> {
+        Ok(self.with(|line, _, _| line.out.queue.len())?)
+    }
+
+    fn discard_output(&self) {
+        // The byte in transmission is finished.
         let _ = self.with(|line, _, _| {
             if line.setup.can_flush {
                 line.out.queue.truncate(1);
             }
         });
-    }
-
-    /// The next piece that has arrived, and when on the host's clock.
-    pub(crate) fn read(&self) -> Result<Option<(i64, Vec<u8>)>, HungUp> {
-        let lag = lock(&self.cable).host_lag;
-        let piece = self.with(|line, _, _| line.input.pop_front())?;
-        Ok(piece.map(|(at, bytes)| (at - lag, bytes)))
     }
 }

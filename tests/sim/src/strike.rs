@@ -17,14 +17,11 @@ use dpm_rig::pipeline::stepped::Part;
 
 /// A transport that keeps what is sent: the words of a second host.
 #[derive(Default)]
-pub(crate) struct Words(pub(crate) Vec<u8>, pub(crate) Vec<Vec<u8>>);
+struct Words(Vec<Vec<u8>>);
 
 impl Transport for Words {
     fn send(&mut self, _: HostTime, _: Lane, packets: &[Packet<'_>]) -> Result<(), SendError> {
-        for packet in packets {
-            packet.parts().into_iter().for_each(|part| self.0.extend_from_slice(part));
-            self.1.push(packet.parts().concat());
-        }
+        self.0.extend(packets.iter().map(|packet| packet.parts().concat()));
         Ok(())
     }
 
@@ -462,10 +459,11 @@ impl World {
         let _ = link.poll(HostTime(self.t), &mut words);
         if lock(&self.cable).plugged {
             match self.far {
-                Some(_) => self.hear_on_the_line(&words.1),
+                Some(_) => self.hear_on_the_line(&words.0),
                 None => {
-                    self.hear(&words.0, false);
-                    self.projector.receive(HostTime(self.t), Lane::Control, &words.0);
+                    let bytes = words.0.concat();
+                    self.hear(&bytes, false);
+                    self.projector.receive(HostTime(self.t), Lane::Control, &bytes);
                 }
             }
             self.see_light();

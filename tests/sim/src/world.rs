@@ -360,7 +360,6 @@ impl World {
             net.now = self.t;
         }
         lock(&self.cable).advance(self.t);
-        self.watch_line();
         self.act();
         self.move_projector();
         self.move_process();
