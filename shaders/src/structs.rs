@@ -562,9 +562,9 @@ pub const RESPONSE_CODES: u32 = 256;
 pub const OWNER_NONE: u32 = 0;
 /// What is at the pixel stays where it was drawn. The owners after it are the movers, in their order.
 pub const OWNER_STILL: u32 = 1;
-/// Bit of [`Moved::word`]: the code values of the pixel lie by more than [`ROUGH_STEP`] off the middle between two neighbours.
+/// Bit of [`Moved::word`]: the pixel is rough. Its code values lie by more than half of [`ROUGH_STEP`] off the middle between two neighbours.
 pub const WORD_ROUGH: u32 = 1 << 31;
-/// Twice the distance, in code values, from the middle between the neighbours from which on a pixel is rough.
+/// Twice the distance from the middle between the neighbours beyond which a pixel is rough, code values.
 pub const ROUGH_STEP: u32 = 48;
 /// Lanes of a workgroup of the pass `trace`.
 pub const TRACE_LANES: u32 = 64;

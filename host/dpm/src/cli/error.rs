@@ -12,7 +12,7 @@ use dpm_lab::error::planes::{markdown, Card, Panel, Pattern, MOTIONS};
 use dpm_lab::error::runs::{ErrorOptions, Extent, GroupResult};
 use dpm_lab::error::table::TableGroup;
 use dpm_render::gpu::Gpu;
-use dpm_rig::config::{Overrides, RigConfig};
+use dpm_rig::config::{BitOrder, Overrides, RigConfig};
 use dpm_rig::failure::{Failure, FailureKind};
 use dpm_rig::pipeline::PipelineError;
 use dpm_rig::rig::Rig;
@@ -125,15 +125,17 @@ pub(super) fn execute(args: &ErrorArgs) -> Result<(), Failure> {
     }
 }
 
-/// Orders of the bits that `dpm error planes` compares, the default first.
-const ORDERS: [[u8; 8]; 3] = [[4, 6, 7, 5, 3, 2, 1, 0], [7, 6, 5, 4, 3, 2, 1, 0], [0, 2, 4, 6, 7, 5, 3, 1]];
+/// Orders of the bits that `dpm error planes` compares with the default: that whose light is over soonest, and that with most
+/// of the light amid the frame.
+const OTHER_ORDERS: [[u8; 8]; 2] = [[7, 6, 5, 4, 3, 2, 1, 0], [0, 2, 4, 6, 7, 5, 3, 1]];
 
 /// Measures every motion with every order of the planes.
 fn planes(json: bool) -> Result<(), Failure> {
     let config = RigConfig::demo(&Overrides::default())?;
     let failed = |e| Failure::from(PipelineError::from(e));
     let gpu = open_gpu(&config)?;
-    let panels: Vec<Panel> = ORDERS.into_iter().map(Panel::of_bits).chain([Panel::of_binary24()]).collect();
+    let orders = [BitOrder::default().0].into_iter().chain(OTHER_ORDERS);
+    let panels: Vec<Panel> = orders.map(Panel::of_bits).chain([Panel::of_binary24()]).collect();
     let mut rows = Vec::new();
     for pattern in [Pattern::Noise, Pattern::Patches] {
         let card = Card::new(&gpu, pattern).map_err(failed)?;
