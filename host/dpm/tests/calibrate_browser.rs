@@ -11,6 +11,7 @@ use browser::{Browser, PATIENCE};
 use cli_common::{own_folder, start, Folder};
 use hil_mock::projector::MockConfig;
 use link_common::{raster, served_time, Projector, PtyProjector};
+use serde_json::json;
 use std::net::TcpListener;
 use std::path::{Path, PathBuf};
 
@@ -124,7 +125,8 @@ fn the_page_leads_through_a_calibration(program: &Path) {
     check_layout(&mut browser, 1280);
     browser.picture(&pictures.join("desktop-whole.png"), true);
     let token = std::fs::read_to_string(own_folder("state").join("page.token")).unwrap();
-    browser.value(&format!("location.href = '/#token={}'; location.reload()", token.trim()));
+    browser.value(&format!("location.hash = '#token={}'", token.trim()));
+    browser.call("Page.reload", json!({}));
     browser.wait("buttons", "document.querySelector('.run') && !document.querySelector('.run').disabled");
     light_and_dark(&mut browser, &projector);
     // A tracker that does not answer is told as on a terminal.

@@ -111,6 +111,11 @@ impl Browser {
 
     /// Calls a method and returns its result.
     pub(crate) fn call(&mut self, method: &str, parameters: Value) -> Value {
+        self.try_call(method, parameters).unwrap_or_else(|error| panic!("{method}: {error}"))
+    }
+
+    /// Calls a method and returns its result, or the error that the browser answers.
+    fn try_call(&mut self, method: &str, parameters: Value) -> Result<Value, Value> {
         self.number += 1;
         let mut message = json!({ "id": self.number, "method": method, "params": parameters });
         if !self.session.is_empty() {
@@ -125,8 +130,8 @@ impl Browser {
                 panic!("no answer to {method}: {log}");
             };
             if told["id"] == self.number {
-                assert!(told["error"].is_null(), "{method}: {}", told["error"]);
-                return told["result"].take();
+                let (error, result) = (told["error"].take(), told["result"].take());
+                return if error.is_null() { Ok(result) } else { Err(error) };
             }
             self.listen(&told);
         }
@@ -150,16 +155,26 @@ impl Browser {
 
     /// The value of a JavaScript expression; of what it promises, if it is a promise.
     pub(crate) fn value(&mut self, expression: &str) -> Value {
-        let asked = json!({ "expression": expression, "returnByValue": true, "awaitPromise": true });
-        let told = self.call("Runtime.evaluate", asked);
-        assert!(told["exceptionDetails"].is_null(), "{expression}: {}", told["exceptionDetails"]);
-        told["result"]["value"].clone()
+        self.try_value(expression).unwrap_or_else(|error| panic!("{expression}: {error}"))
     }
 
-    /// Waits until the expression is true.
+    /// The same, or the error that the browser answers.
+    fn try_value(&mut self, expression: &str) -> Result<Value, Value> {
+        let asked = json!({ "expression": expression, "returnByValue": true, "awaitPromise": true });
+        let told = self.try_call("Runtime.evaluate", asked)?;
+        assert!(told["exceptionDetails"].is_null(), "{expression}: {}", told["exceptionDetails"]);
+        Ok(told["result"]["value"].clone())
+    }
+
+    /// Waits until the expression is true. A page that is just being replaced answers nothing, so it is asked again.
     pub(crate) fn wait(&mut self, what: &str, expression: &str) {
         let begin = Instant::now();
-        while self.value(expression) != true {
+        loop {
+            match self.try_value(expression) {
+                Ok(value) if value == true => return,
+                Err(error) if !is_of_navigation(&error) => panic!("{expression}: {error}"),
+                _ => {}
+            }
             if begin.elapsed() > PATIENCE {
                 let text = self.value("document.body.innerText");
                 panic!("no {what} ({expression}): {text}; {:?}", self.complaints);
@@ -217,6 +232,14 @@ impl Browser {
         let png = BASE64_STANDARD.decode(told["data"].as_str().unwrap()).unwrap();
         std::fs::write(file, png).unwrap();
     }
+}
+
+/// Whether an expression was not evaluated because its page was left meanwhile.
+fn is_of_navigation(error: &Value) -> bool {
+    let message = error["message"].as_str().unwrap_or_default();
+    ["navigated", "context was destroyed", "find context", "find default execution context"]
+        .iter()
+        .any(|part| message.contains(part))
 }
 
 impl Drop for Browser {
