@@ -148,7 +148,7 @@ impl Recorder<'_> {
             d.cmd_bind_descriptor_sets(
                 self.list.buffer,
                 vk::PipelineBindPoint::COMPUTE,
-                pipeline.layout,
+                pipeline.table.layouts.pipeline,
                 0,
                 &[set.set],
                 &[],

@@ -4,6 +4,7 @@ use super::address_space;
 use super::devices::{candidates, compute_family, usable, Candidate, DeviceId, DeviceSummary};
 use super::error::GpuError;
 use super::instance::{create_instance, Instance};
+use super::kept::Kept;
 use super::turn::{Held, Turn};
 use ash::{khr, vk};
 use std::ffi::CString;
@@ -51,6 +52,8 @@ pub struct Gpu {
     pub(super) options: GpuOptions,
     /// Calls that ask what the compiler made of a pipeline, if the options asked for them.
     pub(super) statistics: Option<khr::pipeline_executable_properties::Device>,
+    /// Layouts and compiled pipelines of renderers that are gone.
+    pub(super) kept: Kept,
     instance: ManuallyDrop<Instance>,
     /// One of [`State`].
     state: AtomicU8,
@@ -214,6 +217,7 @@ impl Gpu {
                 id,
                 options: options.clone(),
                 statistics,
+                kept: Kept::default(),
                 instance: ManuallyDrop::new(instance),
                 state: AtomicU8::new(State::Well as u8),
                 held_bytes: AtomicU64::new(0),
@@ -388,6 +392,14 @@ impl Drop for Gpu {
         // SAFETY: everything made from the device holds an Arc to this, so it is all gone, and every submission was waited for by its
         // fence (or is over because the device is lost): there is nothing left to wait for. The instance goes last.
         unsafe {
+            let (pipelines, layouts) = self.kept.empty();
+            for pipeline in pipelines {
+                self.device.destroy_pipeline(pipeline, None);
+            }
+            for layouts in layouts {
+                self.device.destroy_pipeline_layout(layouts.pipeline, None);
+                self.device.destroy_descriptor_set_layout(layouts.set, None);
+            }
             self.device.destroy_device(None);
             ManuallyDrop::drop(&mut self.instance);
         }

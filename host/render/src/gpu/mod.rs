@@ -15,6 +15,7 @@ mod context;
 mod devices;
 mod error;
 mod instance;
+mod kept;
 mod loss;
 mod pipeline;
 mod reopen;

@@ -3,6 +3,7 @@
 use super::buffer::Buffer;
 use super::context::{Gpu, On as _};
 use super::error::GpuError;
+use super::kept::{Layouts, PipelineKey};
 use ash::vk;
 use dpm_shaders::{structs, Shader};
 use std::sync::Arc;
@@ -40,10 +41,9 @@ pub fn shared_bindings(texel: bool) -> Vec<(u32, BindingKind)> {
         .collect()
 }
 
-/// The layout of set 0: the kind of each binding.
+/// The layout of set 0: the kind of each binding. The device keeps one layout of each list of bindings.
 pub struct BindingTable {
-    layout: vk::DescriptorSetLayout,
-    pipeline_layout: vk::PipelineLayout,
+    pub(super) layouts: Layouts,
     bindings: Vec<(u32, BindingKind)>,
     pub(super) gpu: Arc<Gpu>,
 }
@@ -52,6 +52,14 @@ impl BindingTable {
     /// # Errors
     /// A call of Vulkan failed.
     pub fn new(gpu: &Arc<Gpu>, bindings: &[(u32, BindingKind)]) -> Result<Arc<Self>, GpuError> {
+        let layouts = match gpu.kept.layouts(bindings) {
+            Some(layouts) => layouts,
+            None => Self::make(gpu, bindings)?,
+        };
+        Ok(Arc::new(Self { layouts, bindings: bindings.to_vec(), gpu: gpu.clone() }))
+    }
+
+    fn make(gpu: &Gpu, bindings: &[(u32, BindingKind)]) -> Result<Layouts, GpuError> {
         let entries: Vec<_> = bindings
             .iter()
             .map(|&(binding, kind)| {
@@ -64,32 +72,22 @@ impl BindingTable {
             .collect();
         let info = vk::DescriptorSetLayoutCreateInfo::default().bindings(&entries);
         gpu.alive("making a descriptor layout")?;
-        let pipeline_layout = vk::PipelineLayout::null();
-        // SAFETY: valid create infos; destroyed in Drop, which a null layout passes by.
+        // SAFETY: valid create infos. The device destroys what it keeps when it goes, and nobody has the others.
         unsafe {
-            let layout = gpu
+            let set = gpu
                 .device
                 .create_descriptor_set_layout(&info, None)
                 .on(gpu, "creating a descriptor layout")?;
-            let mut table = Self { layout, pipeline_layout, bindings: bindings.to_vec(), gpu: gpu.clone() };
-            let layouts = [layout];
+            let layouts = [set];
             let info = vk::PipelineLayoutCreateInfo::default().set_layouts(&layouts);
-            table.pipeline_layout =
-                gpu.device.create_pipeline_layout(&info, None).on(gpu, "creating a pipeline layout")?;
-            Ok(Arc::new(table))
-        }
-    }
-}
-
-impl Drop for BindingTable {
-    fn drop(&mut self) {
-        if self.gpu.is_abandoned() {
-            return;
-        }
-        // SAFETY: pipelines and sets that use these hold an Arc to this.
-        unsafe {
-            self.gpu.device.destroy_pipeline_layout(self.pipeline_layout, None);
-            self.gpu.device.destroy_descriptor_set_layout(self.layout, None);
+            let made = gpu.device.create_pipeline_layout(&info, None).on(gpu, "creating a pipeline layout");
+            let made = made.inspect_err(|_| gpu.device.destroy_descriptor_set_layout(set, None));
+            let made = Layouts { set, pipeline: made? };
+            gpu.kept.keep_layouts(bindings, made).or_else(|made| {
+                gpu.device.destroy_pipeline_layout(made.pipeline, None);
+                gpu.device.destroy_descriptor_set_layout(made.set, None);
+                Ok(gpu.kept.layouts(bindings).expect("another thread has just kept them"))
+            })
         }
     }
 }
@@ -124,7 +122,7 @@ impl BindingSet {
             let pool =
                 gpu.device.create_descriptor_pool(&info, None).on(gpu, "creating a descriptor pool")?;
             let mut bound = Self { set: vk::DescriptorSet::null(), pool, table: table.clone() };
-            let layouts = [table.layout];
+            let layouts = [table.layouts.set];
             let info = vk::DescriptorSetAllocateInfo::default().descriptor_pool(pool).set_layouts(&layouts);
             bound.set = gpu.device.allocate_descriptor_sets(&info).on(gpu, "allocating a descriptor set")?[0];
             for &(binding, kind) in &table.bindings {
@@ -165,12 +163,14 @@ impl Drop for BindingSet {
 /// A compiled shader with its specialization constants.
 pub struct ComputePipeline {
     pub(super) pipeline: vk::Pipeline,
-    pub(super) layout: vk::PipelineLayout,
     pub(super) table: Arc<BindingTable>,
+    /// What it was compiled from.
+    pub(super) key: PipelineKey,
 }
 
 impl ComputePipeline {
-    /// Compiles `shader` with specialization constants `(id, value as 32 bits)`. Booleans are 0 and 1.
+    /// Compiles `shader` with specialization constants `(id, value as 32 bits)`, or takes the pipeline that the device has kept of
+    /// them. Booleans are 0 and 1.
     ///
     /// # Errors
     /// A call of Vulkan failed.
@@ -180,6 +180,14 @@ impl ComputePipeline {
         constants: &[(u32, u32)],
     ) -> Result<Self, GpuError> {
         let gpu = &table.gpu;
+        let key = PipelineKey {
+            layout: table.layouts.pipeline,
+            spirv: shader.spirv,
+            constants: constants.to_vec(),
+        };
+        if let Some(pipeline) = gpu.kept.take(&key) {
+            return Ok(Self { pipeline, table: table.clone(), key });
+        }
         let words: Vec<u32> =
             shader.spirv.chunks_exact(4).map(|c| u32::from_le_bytes([c[0], c[1], c[2], c[3]])).collect();
         let module_info = vk::ShaderModuleCreateInfo::default().code(&words);
@@ -213,21 +221,25 @@ impl ComputePipeline {
             let info = [vk::ComputePipelineCreateInfo::default()
                 .flags(flags)
                 .stage(stage)
-                .layout(table.pipeline_layout)];
+                .layout(table.layouts.pipeline)];
             let result = gpu.device.create_compute_pipelines(vk::PipelineCache::null(), &info, None);
             gpu.device.destroy_shader_module(module, None);
             let pipeline = result.map_err(|(_, e)| e).on(gpu, "compiling a compute pipeline")?[0];
-            Ok(Self { pipeline, layout: table.pipeline_layout, table: table.clone() })
+            Ok(Self { pipeline, table: table.clone(), key })
         }
     }
 }
 
 impl Drop for ComputePipeline {
     fn drop(&mut self) {
-        if self.table.gpu.is_abandoned() {
+        let gpu = &self.table.gpu;
+        if gpu.is_abandoned() {
             return;
         }
-        // SAFETY: owners wait for the GPU before dropping.
-        unsafe { self.table.gpu.device.destroy_pipeline(self.pipeline, None) }
+        // Owners wait for the GPU before dropping, so the next owner may have it at once.
+        if let Some(oldest) = gpu.kept.give_back(self.key.clone(), self.pipeline) {
+            // SAFETY: it was given back by its owner, as above, and nobody has taken it since.
+            unsafe { gpu.device.destroy_pipeline(oldest, None) }
+        }
     }
 }
