@@ -317,13 +317,18 @@ impl Card {
             for i in (0..schedule.len()).filter(|i| bits[*i] < 8) {
                 let back = moved[i].inverse();
                 let light = full * f64::from(1u32 << schedule.planes()[i].bit);
+                // Of every mirror once, and only of those that are looked at.
+                let mut off_at = vec![f64::NAN; words.len()];
                 for fine in 0..LOOK * FINER * LOOK * FINER {
                     let (x, y) = (fine % (LOOK * FINER), fine / (LOOK * FINER));
                     let place = DVec2::new(x as f64 + 0.5, y as f64 + 0.5) / FINER as f64 + LOOK_FROM;
                     let mirror = if follows { mapped(&moved[i], place) } else { place }.floor();
-                    let word = words[mirror.y as usize * WIDTH as usize + mirror.x as usize];
-                    let texture = self.texture_at(mapped(&back, mirror + 0.5)) / 8.0;
-                    off[y / FINER * LOOK + x / FINER] += f64::from(word >> bits[i] & 1) * light - texture;
+                    let at = mirror.y as usize * WIDTH as usize + mirror.x as usize;
+                    if off_at[at].is_nan() {
+                        let texture = self.texture_at(mapped(&back, mirror + 0.5)) / 8.0;
+                        off_at[at] = f64::from(words[at] >> bits[i] & 1) * light - texture;
+                    }
+                    off[y / FINER * LOOK + x / FINER] += off_at[at];
                 }
             }
         }
