@@ -18,7 +18,7 @@ const MOST_KEPT: usize = 32;
 /// What a pipeline was compiled from.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub(super) struct PipelineKey {
-    /// The layout of its bindings. There is one of each kind on a device ([`Kept::table`]).
+    /// The layout of its bindings. There is one of each kind on a device ([`Kept::layouts`]).
     pub layout: vk::PipelineLayout,
     /// Its shader.
     pub spirv: &'static [u8],
