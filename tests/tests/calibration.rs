@@ -86,43 +86,26 @@ fn errors_in_the_beam(file: &CalibrationFile, truth: &ProjectorOptics) -> Vec<f6
     errors
 }
 
-/// Measures the projector of 128 x 96 pixels from nothing, once more if light falls further off than `times` as far as was
-/// predicted: a shared machine may stand still in one sweep, but not in both.
-fn measured_within_prediction(folder: &Folder, arguments: &[&str], times: f64) -> CalibrationFile {
-    let mut told = Vec::new();
-    for _ in 0..2 {
-        // What a sweep finds of the wand would be the next one's beginning.
-        let _ = std::fs::remove_file(folder.0.path().join("calibration.toml"));
-        folder.done(&["calibrate", "wand", "rig.toml", "--tip", "11,-4,119"]);
-        println!("{}", folder.done(arguments));
-        let file = folder.calibration();
-        let errors = errors_in_the_beam(&file, &truth(128, 96, 225.0));
-        let predicted = file.projector.as_ref().unwrap().predicted_p99_px;
-        told.push(format!(
-            "light off by {:.4} px median, {:.4} px 99th percentile, {predicted:.4} px predicted; {:?}",
-            errors[500], errors[989], file.latency
-        ));
-        println!("{}", told[told.len() - 1]);
-        if errors[989] < times * predicted {
-            return file;
-        }
-    }
-    panic!("{told:#?}");
-}
-
 #[test]
 fn a_wand_with_a_sensor_finds_lens_pose_tip_and_latency() {
     let mock =
         Mock::start(&["--raster", "128x96", "--focal", "225", "--command-port", "15710", "--seed", "7"]);
     let folder = Folder::new("sensor");
     folder.write("rig.toml", &mock.rig([128, 96], 48, 15710));
-    let sweep = ["calibrate", "projector", "rig.toml", "--sensor", &mock.sensor, "--seconds", "20"];
-    // The prediction covers 98 of 100 draws; half as much again covers a busy machine, too.
-    let file = measured_within_prediction(&folder, &sweep, 1.5);
+    folder.done(&["calibrate", "wand", "rig.toml", "--tip", "11,-4,119"]);
+    let told =
+        folder.done(&["calibrate", "projector", "rig.toml", "--sensor", &mock.sensor, "--seconds", "20"]);
+    println!("{told}");
+    let file = folder.calibration();
+    let errors = errors_in_the_beam(&file, &truth(128, 96, 225.0));
+    let section = file.projector.unwrap();
+    let (p50, p99) = (errors[500], errors[989]);
+    println!("light off by {p50:.4} px median, {p99:.4} px 99th percentile of 128 x 96");
     // A pixel of this raster is 6 mm wide, and most of the error is that of the sensor's place in the wand, which the
-    // prediction knows.
-    let predicted = file.projector.as_ref().unwrap().predicted_p99_px;
+    // prediction knows. It covers 98 of 100 draws; half as much again covers a busy machine, too.
+    let predicted = section.predicted_p99_px;
     assert!(predicted < 0.4, "the prediction is worth nothing: {predicted} px");
+    assert!(p99 < 1.5 * predicted, "{p50} px, {p99} px, predicted {predicted} px");
     let wand = file.wand.unwrap();
     let off = (DVec3::from_array(wand.tip) - DVec3::new(0.01, -0.005, 0.12)).length();
     assert!(off < 1.5e-3, "the sensor is {:.2} mm beside its place", 1e3 * off);
@@ -144,12 +127,17 @@ fn frames_and_their_inverse_do_the_same_on_a_projector_of_binary_planes() {
     let too_bright = folder.dpm(&[&frames[..], &["--seconds", "6"]].concat());
     assert_eq!(too_bright.status.code(), Some(2), "{}", text(&too_bright));
     assert!(text(&too_bright).contains("choose a lower --gain"), "{}", text(&too_bright));
-    let sweep = [&frames[..], &["--gain", "6", "--seconds", "60"]].concat();
-    // Of this code the prediction promises too much: 1.7, 1.6 and 0.7 times as much was seen, where 1 should be rare.
-    let file = measured_within_prediction(&folder, &sweep, 2.0);
+    let told = folder.done(&[&frames[..], &["--gain", "6", "--seconds", "60"]].concat());
+    let file = folder.calibration();
+    let errors = errors_in_the_beam(&file, &truth(128, 96, 225.0));
     let predicted = file.projector.as_ref().unwrap().predicted_p99_px;
-    assert!(predicted < 1.0, "the prediction is worth nothing: {predicted} px");
     let latency = file.latency.unwrap();
+    println!(
+        "{told}light off by {:.3} px median, {:.3} px 99th percentile; {latency:?}",
+        errors[500], errors[989]
+    );
+    // As above, half as much again covers a busy machine.
+    assert!(predicted < 1.0 && errors[989] < 1.5 * predicted, "{}, predicted {predicted}", errors[989]);
     // On an idle machine it is a tenth of a millisecond; builds beside it made it 0.18 ms. The middle of the slot instead of the
     // centre of its light would be 2.6 ms off.
     assert!(latency.latency_us.abs() < 600.0 && latency.sigma_us < 300.0, "{latency:?}");
