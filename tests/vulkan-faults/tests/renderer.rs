@@ -46,6 +46,29 @@ fn within<T>(limit: Duration, what: &str, work: impl FnOnce() -> T) -> T {
     out
 }
 
+/// A pipeline has one owner at a time: a renderer beside another one compiles its own.
+#[test]
+fn a_renderer_takes_the_pipelines_of_one_that_is_gone_and_draws_the_same() {
+    let session = layer("");
+    let compiled = |bench: &dyn Fn() -> Bench| {
+        let before = session.count(Call::Pipeline);
+        (bench(), session.count(Call::Pipeline) - before)
+    };
+    let (first, all) = compiled(&Bench::open);
+    assert!(all > 5, "{all}");
+    let gpu = first.gpu.clone();
+    let on_gpu = || Bench::on(gpu.clone()).unwrap_or_else(|e| panic!("{e}"));
+    let (second, of_second) = compiled(&on_gpu);
+    assert_eq!(of_second, all);
+    drop(shows_the_right_pictures(first));
+    let (third, of_third) = compiled(&on_gpu);
+    assert_eq!(of_third, 0);
+    shows_the_right_pictures(third);
+    shows_the_right_pictures(second);
+    drop(gpu);
+    assert_no_validation_messages();
+}
+
 #[test]
 fn after_a_loss_nothing_more_is_asked_of_the_device_and_another_one_goes_on() {
     let session = layer("");

@@ -397,8 +397,7 @@ impl Drop for Gpu {
                 self.device.destroy_pipeline(pipeline, None);
             }
             for layouts in layouts {
-                self.device.destroy_pipeline_layout(layouts.pipeline, None);
-                self.device.destroy_descriptor_set_layout(layouts.set, None);
+                layouts.destroy(&self.device);
             }
             self.device.destroy_device(None);
             ManuallyDrop::drop(&mut self.instance);

@@ -30,7 +30,7 @@ pub(super) struct PipelineKey {
 type Bindings = Vec<(u32, BindingKind)>;
 
 /// The layout of set 0, and that of the pipelines that use it.
-#[derive(Clone, Copy, Debug)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) struct Layouts {
     pub set: vk::DescriptorSetLayout,
     pub pipeline: vk::PipelineLayout,
@@ -51,18 +51,19 @@ impl Kept {
         held(&self.layouts).iter().find(|(known, _)| known == bindings).map(|(_, layouts)| *layouts)
     }
 
-    /// Keeps layouts until the device goes. Where another thread was quicker, `Err` has those that are to be destroyed.
+    /// Keeps layouts until the device goes. Returns those of these bindings, and the others where another thread was quicker,
+    /// to be destroyed.
     pub(super) fn keep_layouts(
         &self,
         bindings: &[(u32, BindingKind)],
         made: Layouts,
-    ) -> Result<Layouts, Layouts> {
+    ) -> (Layouts, Option<Layouts>) {
         let mut all = held(&self.layouts);
-        if all.iter().any(|(known, _)| known == bindings) {
-            return Err(made);
+        if let Some((_, first)) = all.iter().find(|(known, _)| known == bindings) {
+            return (*first, Some(made));
         }
         all.push((bindings.to_vec(), made));
-        Ok(made)
+        (made, None)
     }
 
     /// A pipeline of this program that nobody uses.
@@ -144,12 +145,11 @@ mod tests {
         };
         let (few, more) = ([(0, BindingKind::Storage)], [(0, BindingKind::Storage), (1, BindingKind::Texel)]);
         assert!(kept.layouts(&few).is_none());
-        assert!(kept.keep_layouts(&few, layouts(1)).is_ok());
+        assert_eq!(kept.keep_layouts(&few, layouts(1)), (layouts(1), None));
         assert!(kept.layouts(&more).is_none());
-        assert!(kept.keep_layouts(&more, layouts(2)).is_ok());
-        let late = kept.keep_layouts(&few, layouts(3)).unwrap_err();
-        assert_eq!(late.set, layouts(3).set);
-        assert_eq!(kept.layouts(&few).unwrap().set, layouts(1).set);
-        assert_eq!(kept.layouts(&more).unwrap().set, layouts(2).set);
+        assert_eq!(kept.keep_layouts(&more, layouts(2)), (layouts(2), None));
+        assert_eq!(kept.keep_layouts(&few, layouts(3)), (layouts(1), Some(layouts(3))));
+        assert_eq!(kept.layouts(&few), Some(layouts(1)));
+        assert_eq!(kept.layouts(&more), Some(layouts(2)));
     }
 }

@@ -83,11 +83,25 @@ impl BindingTable {
             let made = gpu.device.create_pipeline_layout(&info, None).on(gpu, "creating a pipeline layout");
             let made = made.inspect_err(|_| gpu.device.destroy_descriptor_set_layout(set, None));
             let made = Layouts { set, pipeline: made? };
-            gpu.kept.keep_layouts(bindings, made).or_else(|made| {
-                gpu.device.destroy_pipeline_layout(made.pipeline, None);
-                gpu.device.destroy_descriptor_set_layout(made.set, None);
-                Ok(gpu.kept.layouts(bindings).expect("another thread has just kept them"))
-            })
+            let (layouts, spare) = gpu.kept.keep_layouts(bindings, made);
+            if let Some(spare) = spare {
+                spare.destroy(&gpu.device);
+            }
+            Ok(layouts)
+        }
+    }
+}
+
+impl Layouts {
+    /// Destroys them.
+    ///
+    /// # Safety
+    /// Nothing that was made with them is used any more.
+    pub(super) unsafe fn destroy(self, device: &ash::Device) {
+        // SAFETY: the caller's.
+        unsafe {
+            device.destroy_pipeline_layout(self.pipeline, None);
+            device.destroy_descriptor_set_layout(self.set, None);
         }
     }
 }
