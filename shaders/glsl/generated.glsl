@@ -210,6 +210,8 @@ struct Mover {
     ivec2 centre;
     ivec2 start;
     ivec4 slope;
+    int instant;
+    uvec2 in_turn;
 };
 
 struct Moved {

@@ -23,9 +23,14 @@ uint depth_of(Moved moved) { return moved.owner_and_depth & 0xffffffu; }
 
 ivec2 motion_of(Moved moved) { return ivec2(bitfieldExtract(int(moved.motion), 0, 16), bitfieldExtract(int(moved.motion), 16, 16)); }
 
-// The place that a point comes from which reaches the middle of `pixel` at `instant` and moves by `motion` during the exposure, in 1/64 pixel. The
-// centre of a pixel is a multiple of 64.
-ivec2 source(ivec2 pixel, ivec2 motion, int instant) { return (pixel << 6) - ((motion * instant + 32768) >> 16); }
+// How far a point has moved at an instant that moves by `motion` during the exposure, in 1/64 pixel.
+ivec2 moved_by(ivec2 motion, int instant) { return (motion * instant + 32768) >> 16; }
+
+// The place at which a point is drawn that reaches the middle of `pixel` at `instant`, in 1/64 pixel. It moves by `motion` during the exposure and
+// belongs to mover `m`. The centre of a pixel is a multiple of 64.
+ivec2 source(uint m, ivec2 pixel, ivec2 motion, int instant) {
+    return (pixel << 6) - moved_by(motion, instant) + moved_by(motion, movers[m].instant);
+}
 
 // The pixel in which a place is.
 ivec2 nearest_pixel(ivec2 at) { return (at + 32) >> 6; }
@@ -55,8 +60,8 @@ bool find(uint m, ivec2 pixel, int instant, Moved own, out ivec2 at, out uint de
     uint owner = OWNER_STILL + 1u + m;
     // The point's motion is that of the point that is here now, or of what is about where it comes from.
     Moved near = own;
-    if (owner_of(near) != owner) near = moved_at(m, nearest_pixel(source(pixel, start_of(m, pixel), instant)));
-    at = source(pixel, motion_of(near), instant);
+    if (owner_of(near) != owner) near = moved_at(m, nearest_pixel(source(m, pixel, start_of(m, pixel), instant)));
+    at = source(m, pixel, motion_of(near), instant);
     Moved there = NOTHING;
     if (owner_of(near) == owner) there = moved_at(m, nearest_pixel(at));
     depth = depth_of(there);
@@ -69,10 +74,12 @@ bool has_whole_codes(uint mask) {
     return all(equal(bits * (255u - bits), uvec3(0u)));
 }
 
-// The word of the pixel that this frame takes for a place between pixels. Frames take each of those around it as often as it is near.
-uint word_in_turn(uint m, ivec2 at, uint g) {
+// The word of the pixel that this frame takes for a place between pixels. Frames take each of those around it as often as it is near: in turn, or
+// because the instants for which the body is drawn spread the places over a pixel.
+uint word_of_one(uint m, ivec2 at, uint g) {
     uvec2 turn = frame.drawn * uvec2(0x9E3779B9u, 0x6A09E667u) + g * uvec2(0x61C88647u, 0x3C6EF372u);
-    Moved there = moved_at(m, (at + ivec2(turn >> 26u)) >> 6);
+    ivec2 step_ = mix(ivec2(32), ivec2(turn >> 26u), equal(movers[m].in_turn, uvec2(1u)));
+    Moved there = moved_at(m, (at + step_) >> 6);
     return owner_of(there) == OWNER_STILL + 1u + m ? there.word : motions[index_of(nearest_pixel(at))].word;
 }
 
@@ -94,7 +101,7 @@ uint word_of(uint m, ivec2 at, uint g) {
         all_words |= weight > 0u ? there.word : 0u;
         sums += weight * uvec3(there.word & 255u, (there.word >> 8u) & 255u, (there.word >> 16u) & 255u);
     }
-    if ((all_words & WORD_ROUGH) != 0u && !has_whole_codes(groups[g].mask)) return word_in_turn(m, at, g);
+    if ((all_words & WORD_ROUGH) != 0u && !has_whole_codes(groups[g].mask)) return word_of_one(m, at, g);
     // The nearest of the four shows the body, so the weights are positive.
     uvec3 code = (sums + weights / 2u) / max(weights, 1u);
     return code.r | (code.g << 8u) | (code.b << 16u);
@@ -118,7 +125,8 @@ uint word_at(ivec2 pixel, uint g, Moved own) {
     if (mover != NO_MOVER) return word_of(mover, place, g);
     if (owner <= OWNER_STILL) return owner == OWNER_STILL ? own.word : 0u;
     // A body has left this mirror and uncovers what was hidden. What is seen behind its edge goes on here.
-    Moved behind = moved_at(owner - OWNER_STILL - 1u, nearest_pixel(source(pixel, motion_of(own), instant)));
+    uint left = owner - OWNER_STILL - 1u;
+    Moved behind = moved_at(left, nearest_pixel(source(left, pixel, motion_of(own), instant)));
     return owner_of(behind) == OWNER_NONE ? 0u : behind.word;
 }
 

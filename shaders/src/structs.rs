@@ -154,6 +154,10 @@ gpu_structs! {
         start: [i32; 2],
         /// By how much more it moves at the next pixel, in 2^-12 of that: to the right with x and with y, then down with x and with y.
         slope: [i32; 4],
+        /// Time from the frame's instant to the one for which the body is drawn, in 2^-16 of the exposure.
+        instant: i32,
+        /// Along columns and rows: 1 if frames take the pixels around a place in turn where codes are rough, 0 if they take the nearest.
+        in_turn: [u32; 2],
     }
 
     /// What was drawn at a pixel, and how it moves while the planes of the frame last.

@@ -113,6 +113,14 @@ fn poses_of_frame(twists: &[(DVec3, DVec3)], centre: f64) -> [Vec<DAffine3>; 3] 
     [0.0, -centre, 1.0 - centre].map(|share| poses_at(twists, share * EXPOSURE_S))
 }
 
+/// The pose `now` of a body that moves evenly from `first` to `last` during the exposure, so many exposures later.
+fn later([now, first, last]: [&DAffine3; 3], share: f64) -> DAffine3 {
+    DAffine3 {
+        matrix3: now.matrix3 + (last.matrix3 - first.matrix3) * share,
+        translation: now.translation + (last.translation - first.translation) * share,
+    }
+}
+
 /// The wall stands; the cards pass one another, turn, and come nearer.
 fn twists(fast: f64) -> Vec<(DVec3, DVec3)> {
     vec![
@@ -271,12 +279,8 @@ fn silhouettes_are_those_of_the_instant() {
         let (mut apart, mut before, mut edge) = (0, 0, 0);
         for group in &groups {
             let share = f64::from(group.instant) / 65536.0;
-            let poses: Vec<DAffine3> = (0..now.len())
-                .map(|i| DAffine3 {
-                    matrix3: now[i].matrix3 + (last[i].matrix3 - first[i].matrix3) * share,
-                    translation: now[i].translation + (last[i].translation - first[i].translation) * share,
-                })
-                .collect();
+            let poses: Vec<DAffine3> =
+                (0..now.len()).map(|i| later([&now[i], &first[i], &last[i]], share)).collect();
             let then = draw(&mut renderer, &camera, &poses, None);
             let wanted =
                 |pixel: [i32; 2]| then.codes[(pixel[1] as u32 * WIDTH + pixel[0] as u32) as usize] != 0;
@@ -296,20 +300,21 @@ fn silhouettes_are_those_of_the_instant() {
 }
 
 /// A textured body at 1 m/s, seen by an eye that follows it, errs by a quarter of what it errs by if the planes, from the
-/// highest bit down, all show the middle of the exposure; with hard edges in the texture, by a third. At rest nothing
-/// changes. An eye that rests loses little: what it loses is lost by any planes that follow. Planes drawn by themselves for
-/// their own instants do not do better there than warped ones, but they do for an eye that follows.
+/// highest bit down, all show the middle of the exposure. At rest nothing changes. An eye that rests errs by 0.01 of full light
+/// at most: what it loses is lost by any planes that follow. Planes drawn by themselves for their own instants do not do better
+/// there than warped ones, but they do for an eye that follows.
 #[test]
 fn an_eye_that_follows_sees_noise_sharp_and_one_that_rests_loses_nothing_by_the_warp() {
     with_gpu(|gpu| {
         let card = Card::new(gpu, Pattern::Noise).unwrap();
-        let [falling, passing] = check_texture(&card, 0.25, 0.0108);
+        let [falling, passing] = check_texture(&card, 0.25, 0.01);
         for row in [&falling, &passing] {
             check_beside_drawn_anew(&card, row, 2.0);
         }
         // Why this order is the default.
         assert!(passing.follows.centre < 0.7 * falling.follows.centre, "{passing:?}");
         assert!(passing.rests.own < 0.9 * falling.rests.own, "{passing:?}");
+        assert!(passing.follows.own < 0.9 * falling.follows.own, "{passing:?}");
         let turning = measured(&card, "1 m/s, turning at 4 rad/s", BitOrder::default().0);
         assert!(turning.follows.own <= 0.25 * falling.follows.middle, "{turning:?}");
         let rest = measured(&card, "at rest", BitOrder::default().0);
@@ -319,14 +324,14 @@ fn an_eye_that_follows_sees_noise_sharp_and_one_that_rests_loses_nothing_by_the_
 }
 
 /// The same with hard edges. If bits of rough places came from codes between those of the pixels, patches would err by 0.41
-/// of what they err by if all planes show the middle of the exposure. Edges are drawn too coarsely for a warp to be as good
-/// as planes drawn anew.
+/// of what they err by if all planes show the middle of the exposure, and if every frame were drawn for the centre of its
+/// light, by 0.29. Edges are drawn too coarsely for a warp to be as good as planes drawn anew.
 #[test]
 fn an_eye_that_follows_sees_patches_sharp_and_one_that_rests_loses_nothing_by_the_warp() {
     with_gpu(|gpu| {
         let card = Card::new(gpu, Pattern::Patches).unwrap();
-        let [_, passing] = check_texture(&card, 0.31, 0.01);
-        check_beside_drawn_anew(&card, &passing, 2.2);
+        let [_, passing] = check_texture(&card, 0.25, 0.01);
+        check_beside_drawn_anew(&card, &passing, 1.8);
     });
 }
 
@@ -354,7 +359,6 @@ fn check_texture(card: &Card, share: f64, rests_at_most: f64) -> [PlanesRow; 2] 
     assert!(passing.rests.own <= rests_at_most, "{passing:?}");
     // Why this order is the default.
     assert!(passing.follows.centre < 0.95 * falling.follows.centre, "{passing:?}");
-    assert!(passing.follows.own < 1.05 * falling.follows.own, "{passing:?}");
     [falling, passing]
 }
 
@@ -379,8 +383,15 @@ fn rough_places_are_marked() {
         let (scene, camera) = (cards(), projector(Lens::default()));
         let (groups, _) = groups_of(&PlaneSchedule::rgb24());
         let [now, first, last] = poses_of_frame(&twists(2.0), centre_of(&PlaneSchedule::rgb24()));
-        let still = draw(&mut renderer(gpu, &scene, &camera, &[]), &camera, &now, None);
         let shown = draw(&mut renderer(gpu, &scene, &camera, &groups), &camera, &now, Some((&first, &last)));
+        // The first body stands, and the others are drawn where they are at instants of their own.
+        let drawn: Vec<DAffine3> = (0..now.len())
+            .map(|i| {
+                let share = i.checked_sub(1).map_or(0.0, |m| f64::from(shown.movers[m].instant) / 65536.0);
+                later([&now[i], &first[i], &last[i]], share)
+            })
+            .collect();
+        let still = draw(&mut renderer(gpu, &scene, &camera, &[]), &camera, &drawn, None);
         let (mut rough, mut even) = (0, 0);
         for y in 1..HEIGHT - 1 {
             for x in 1..WIDTH - 1 {

@@ -260,8 +260,7 @@ impl Pass {
             (Grid::Planes, Some(schedule)) => pack::gpu::constants(settings.raster, schedule).to_vec(),
             _ => {
                 let halftone = settings.halftone.into_iter().flat_map(pack::Halftone::constants);
-                let whole_words =
-                    (ids::WARP_WHOLE_WORDS, u32::from(settings.halftone.is_some_and(|h| !h.is_exact())));
+                let whole_words = (ids::WARP_WHOLE_WORDS, u32::from(settings.shows_halftones()));
                 shared.iter().copied().chain(halftone).chain([whole_words]).collect()
             }
         }

@@ -105,7 +105,7 @@ impl Renderer {
         let last = LastFrame::none(tracked.len());
         let tile_list = TileList::new(settings.raster, settings.lens.as_ref());
         let rated = vec![false; tile_list.len()];
-        let movers = Movers::new(data.bodies.len(), &settings.plane_groups);
+        let movers = Movers::new(data.bodies.len(), &settings.plane_groups, !settings.shows_halftones());
         Ok(Self {
             resources: Arc::new(Resources { pipelines, table, shared, scene: scene_gpu }),
             data,
@@ -269,9 +269,18 @@ impl Renderer {
                 gpu_structs::INSTANCE_PROJECTED,
             );
         }
-        self.movers.find(inputs.camera, &self.data.bodies, inputs.poses, inputs.sweep, &mut slot.tile_list);
-        slot.buffers.movers.host.write(self.movers.movers());
         let turn = self.last.turn_of(inputs.frame);
+        self.movers.find(
+            inputs.camera,
+            &self.data.bodies,
+            inputs.poses,
+            inputs.sweep,
+            turn.drawn,
+            &mut slot.tile_list,
+        );
+        slot.buffers.movers.host.write(self.movers.movers());
+        // From here on the bodies are where this frame draws them.
+        let inputs = &FrameInputs { poses: self.movers.poses(), ..*inputs };
         // A tile has four workgroups of 8 x 8 pixels, and one workgroup in the pass that decides rates, which runs in every second frame that is
         // drawn. The checkerboard uses the same count of frames, so that both of its halves are traced at one rate.
         let decides_rates = self.decides_rates && turn.drawn.is_multiple_of(2);

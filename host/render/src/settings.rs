@@ -61,6 +61,13 @@ impl Output {
     }
 }
 
+impl RendererSettings {
+    /// The words of pixels are halftones, of which nothing lies between two pixels, and not code values.
+    pub(crate) fn shows_halftones(&self) -> bool {
+        self.halftone.is_some_and(|halftone| !halftone.is_exact())
+    }
+}
+
 /// What changes from frame to frame. It is small, because it is written just before the GPU starts.
 #[derive(Clone, Copy, Debug)]
 pub struct FrameInputs<'a> {

@@ -12,6 +12,7 @@ use dpm_lab::error::planes::{markdown, Card, Panel, Pattern, MOTIONS};
 use dpm_lab::error::runs::{ErrorOptions, Extent, GroupResult};
 use dpm_lab::error::table::TableGroup;
 use dpm_render::gpu::Gpu;
+use dpm_render::warp::FOLLOW_SHARE;
 use dpm_rig::config::{BitOrder, Overrides, RigConfig};
 use dpm_rig::failure::{Failure, FailureKind};
 use dpm_rig::pipeline::PipelineError;
@@ -96,6 +97,9 @@ enum ErrorCommand {
     },
     /// What an eye sees of a moving texture, plane by plane: motion times what the planes are drawn for
     Planes {
+        /// How far the planes of each bit follow, 0 to 1, like projector.plane_follow; those of binary24 always follow wholly
+        #[arg(long, value_name = "SHARE", default_value_t = FOLLOW_SHARE, value_parser = share)]
+        follow: f64,
         /// Print one JSON object
         #[arg(long)]
         json: bool,
@@ -109,7 +113,7 @@ enum ErrorCommand {
 pub(super) fn execute(args: &ErrorArgs) -> Result<(), Failure> {
     match &args.command {
         Some(ErrorCommand::Merge { out, json }) => return merge(out, *json),
-        Some(ErrorCommand::Planes { json }) => return planes(*json),
+        Some(ErrorCommand::Planes { follow, json }) => return planes(*follow, *json),
         None => {}
     }
     args.flags.refuse("dpm error", &["--frames", "--seconds", "--no-prediction"])?;
@@ -129,13 +133,24 @@ pub(super) fn execute(args: &ErrorArgs) -> Result<(), Failure> {
 /// of the light amid the frame.
 const OTHER_ORDERS: [[u8; 8]; 2] = [[7, 6, 5, 4, 3, 2, 1, 0], [0, 2, 4, 6, 7, 5, 3, 1]];
 
-/// Measures every motion with every order of the planes.
-fn planes(json: bool) -> Result<(), Failure> {
+/// A number from 0 to 1.
+fn share(text: &str) -> Result<f64, String> {
+    let share: f64 = text.parse().map_err(|_| "not a number")?;
+    if (0.0..=1.0).contains(&share) {
+        Ok(share)
+    } else {
+        Err("not from 0 to 1".to_owned())
+    }
+}
+
+/// Measures every motion with every order of the planes, which follow by a share of their way.
+fn planes(follow: f64, json: bool) -> Result<(), Failure> {
     let config = RigConfig::demo(&Overrides::default())?;
     let failed = |e| Failure::from(PipelineError::from(e));
     let gpu = open_gpu(&config)?;
     let orders = [BitOrder::default().0].into_iter().chain(OTHER_ORDERS);
-    let panels: Vec<Panel> = orders.map(Panel::of_bits).chain([Panel::of_binary24()]).collect();
+    let panels = orders.map(|order| Panel::of_bits(order).following(follow));
+    let panels: Vec<Panel> = panels.chain([Panel::of_binary24()]).collect();
     let mut rows = Vec::new();
     for pattern in [Pattern::Noise, Pattern::Patches] {
         let card = Card::new(&gpu, pattern).map_err(failed)?;

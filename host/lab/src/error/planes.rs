@@ -12,7 +12,7 @@ use dpm_render::drive::Drive;
 use dpm_render::gpu::{Gpu, GpuError};
 use dpm_render::method::Method;
 use dpm_render::pack::{source_bits, Halftone};
-use dpm_render::warp::{plane_groups, Sweep};
+use dpm_render::warp::{plane_groups, Sweep, FOLLOW_SHARE};
 use dpm_render::{FrameInputs, FrameSlot, Output, RenderError, Renderer, RendererSettings};
 use dpm_scene::geometry::projector::ProjectorCamera;
 use dpm_scene::{shapes, Material, Scene, Texture, Wrap};
@@ -76,6 +76,8 @@ pub struct Panel {
     frames: i32,
     /// From the beginning of a frame to the middle of each plane, in frames.
     middles: Vec<f64>,
+    /// How far planes that follow go from the centre of the light to their own instant.
+    follow: f64,
 }
 
 impl Panel {
@@ -87,14 +89,19 @@ impl Panel {
         let schedule = PlaneSchedule::rgb24_in(order).expect("each bit once");
         let middles = (0..schedule.len()).map(|i| middle_of(&schedule, i)).collect();
         let name = order.map(|bit| bit.to_string()).join(" ");
-        Self { name, schedule, frame_s: EXPOSURE_S, frames: EYE_FRAMES as i32, middles }
+        Self { name, schedule, frame_s: EXPOSURE_S, frames: EYE_FRAMES as i32, middles, follow: FOLLOW_SHARE }
+    }
+
+    /// The same, with planes that go this share of their way from the centre of the light to their own instant, 0 to 1.
+    pub fn following(self, share: f64) -> Self {
+        Self { follow: share, ..self }
     }
 
     /// A DLPC900 behind a display of 60 frames/s that shows 24 halftones of one bit, red, green and blue in turn, 620 us each.
     pub fn of_binary24() -> Self {
         let (schedule, frame_s) = (PlaneSchedule::equal_rgb24().filled(), 1.0 / 60.0);
         let middles = (0..schedule.len()).map(|i| (i as f64 + 0.5) * 620e-6 / frame_s).collect();
-        Self { name: "binary24, 60 Hz".into(), schedule, frame_s, frames: 2, middles }
+        Self { name: "binary24, 60 Hz".into(), schedule, frame_s, frames: 2, middles, follow: 1.0 }
     }
 
     /// The centre of the light of a frame, in frames from its beginning on.
@@ -271,7 +278,7 @@ impl Card {
         drawing: Drawing,
     ) -> Result<Vec<LitFrame>, RenderError> {
         let Panel { schedule, middles, .. } = panel;
-        let instants: Vec<f64> = middles.iter().map(|middle| middle - aim).collect();
+        let instants: Vec<f64> = middles.iter().map(|middle| (middle - aim) * panel.follow).collect();
         let groups = if drawing == Drawing::Warped { plane_groups(schedule, &instants) } else { Vec::new() };
         let mut frames = self.frames(&self.camera, &groups, Halftone::of(schedule))?;
         let at_rest = self.picture_of(&DAffine3::IDENTITY).inverse();
@@ -455,7 +462,7 @@ pub fn centre_of(schedule: &PlaneSchedule) -> f64 {
 pub fn markdown(rows: &[PlanesRow]) -> String {
     let mut out = String::from(
         "| texture | motion | planes | eye | all for mid-exposure | all for the light's centre | \
-         each for its own instant |\n|---|---|---|---|---:|---:|---:|\n",
+         on the way to its own instant |\n|---|---|---|---|---:|---:|---:|\n",
     );
     for row in rows {
         for (eye, errors) in [("follows", row.follows), ("rests", row.rests)] {

@@ -42,10 +42,11 @@ fn depth_of(moved: &Moved) -> u32 {
     moved.owner_and_depth & 0xff_ffff
 }
 
-/// The place that a point comes from which reaches the middle of `pixel` at `instant` and moves by `motion` during the
-/// exposure, in 1/64 pixel.
-fn source(pixel: [i32; 2], motion: [i32; 2], instant: i32) -> [i32; 2] {
-    [0, 1].map(|c| (pixel[c] << 6) - ((motion[c] * instant + 32768) >> 16))
+/// The place at which a point of `mover` is drawn that reaches the middle of `pixel` at `instant` and moves by `motion`
+/// during the exposure, in 1/64 pixel.
+fn source(mover: &Mover, pixel: [i32; 2], motion: [i32; 2], instant: i32) -> [i32; 2] {
+    let moved_by = |c: usize, instant: i32| (motion[c] * instant + 32768) >> 16;
+    [0, 1].map(|c| (pixel[c] << 6) - moved_by(c, instant) + moved_by(c, mover.instant))
 }
 
 /// The pixel in which a place is.
@@ -72,7 +73,7 @@ fn turn_of(before: u32, group: u32) -> [i32; 2] {
 }
 
 /// True if a group of planes shows all bits of each channel that it shows.
-fn has_whole_codes(mask: u32) -> bool {
+pub(super) fn has_whole_codes(mask: u32) -> bool {
     [0, 8, 16].iter().all(|shift| matches!(mask >> shift & 0xff, 0 | 0xff))
 }
 
@@ -111,9 +112,9 @@ impl Drawn<'_> {
             let of_mover = |at| self.moved_at(mover, nearest(at)).filter(|m| owner_of(m) == number);
             // The point's motion is that of the point that is here now, or of what is about where it comes from.
             let here = (owner == number).then_some(own);
-            let near = here.or_else(|| of_mover(source(pixel, start_of(mover, pixel), instant)));
+            let near = here.or_else(|| of_mover(source(mover, pixel, start_of(mover, pixel), instant)));
             let Some(near) = near else { continue };
-            let at = source(pixel, motion_of(near), instant);
+            let at = source(mover, pixel, motion_of(near), instant);
             let Some(there) = of_mover(at) else { continue };
             if depth_of(there) < closest {
                 (closest, found) = (depth_of(there), Some(Place { at, owner: number }));
@@ -123,8 +124,9 @@ impl Drawn<'_> {
             return found;
         }
         // A body has left this mirror and uncovers what was hidden. What is seen behind its edge goes on here.
-        let at = source(pixel, motion_of(own), instant);
-        let behind = self.moved_at(self.mover_of(owner), nearest(at));
+        let mover = self.mover_of(owner);
+        let at = source(mover, pixel, motion_of(own), instant);
+        let behind = self.moved_at(mover, nearest(at));
         behind.filter(|m| owner_of(m) != OWNER_NONE).map(|_| Place { at, owner: OWNER_NONE })
     }
 
@@ -150,7 +152,8 @@ impl Drawn<'_> {
         // Bits of different groups would be those of codes that the picture does not have, and their sum would be far off.
         if words & WORD_ROUGH != 0 && !has_whole_codes(group.mask) {
             let turn = turn_of(self.before, number);
-            let there = shows([0, 1].map(|c| (at[c] + turn[c]) >> 6));
+            let step = [0, 1].map(|c| if mover.in_turn[c] == 1 { turn[c] } else { 32 });
+            let there = shows([0, 1].map(|c| (at[c] + step[c]) >> 6));
             return there.unwrap_or(self.at(nearest(at))).word;
         }
         // The nearest of the four shows the body, so the weights are positive.

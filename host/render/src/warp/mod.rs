@@ -19,6 +19,11 @@ use dpm_device::planes::PlaneSchedule;
 use dpm_shaders::structs::PlaneGroup;
 use glam::DAffine3;
 
+/// How far on the way from the frame's instant to its own each bit of a code value is shown, unless the configuration says
+/// otherwise. An eye that follows a body sees a picture best with 1. Before an eye that rests the bits of a passing picture come
+/// from places that lie apart, and their errors add up; 0.8 takes a tenth from these (`dpm error planes`, docs/lab/ERROR.md).
+pub const FOLLOW_SHARE: f64 = 0.8;
+
 /// Motion between the frame's instant and that of any plane below which a body is left as it was drawn, pixels.
 pub const LEAST_MOTION_PX: f64 = 0.25;
 
@@ -32,7 +37,7 @@ pub struct Sweep<'a> {
 }
 
 /// The groups of planes that are warped together. `instants` gives for each plane of `schedule` the time from the
-/// frame's instant to the middle of the plane, as a share of the exposure, -1 to 1. Neighbours that are lit together are one
+/// frame's instant to the one that it shows, as a share of the exposure, -1 to 1. Neighbours that are lit together are one
 /// group, and so are neighbours that show the same bit of different channels, at their mean instant. Of code values that are
 /// shown in parts, every part is a group of its own.
 pub fn plane_groups(schedule: &PlaneSchedule, instants: &[f64]) -> Vec<PlaneGroup> {

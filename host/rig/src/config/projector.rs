@@ -8,6 +8,7 @@ use dpm_common::keys::Rate;
 use dpm_common::{kinds, section, words};
 use dpm_device::planes::{PlaneSchedule, Raster};
 use dpm_device::time::FrameRate;
+use dpm_render::warp::FOLLOW_SHARE;
 use dpm_scene::camera_files::LensKind;
 use glam::DAffine3;
 use std::path::PathBuf;
@@ -40,6 +41,13 @@ section! {
         /// light) are shown where the bodies are while these planes are lit, so that a moving picture is not smeared.
         /// "frame": all planes show the bodies at the centre of the frame's light, which saves two passes where bodies move.
         plane_poses: PlanePoses = PlanePoses::Own, "", Any;
+        /// How far the planes of each bit go on the way from the centre of the frame's light to their own instant with
+        /// `plane_poses = "own"`: 1 shows each where the bodies are while it is lit, 0 shows all where they are at the centre.
+        /// An eye that follows a body sees its picture sharpest with 1; one that rests sees a picture that passes with less
+        /// noise if the number is smaller. Change it to 1 if all who watch follow the bodies. The share is that at 947
+        /// frames/s or more. In longer frames the same time is left of the way and not the same share. Planes of equal weights,
+        /// and those that show a whole code value, always go to their own instant.
+        plane_follow: f64 = FOLLOW_SHARE, "", Within(0.0, 1.0);
         /// Whether the projector is told between frames where the bodies are by now, so that it moves their light while the
         /// planes are lit. "auto": if it offers that (the link's TRACKS), and not on a serial line. "off": never. Change it to
         /// "auto" if bodies turn sharply and the projector can; it has not been tried on real hardware.

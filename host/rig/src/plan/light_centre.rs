@@ -8,7 +8,7 @@ use crate::config::{PlanePoses, PlaneTiming};
 use crate::rig::Rig;
 use dpm_device::planes::{PlaneSchedule, PlaneSpec};
 use dpm_device::time::HostTime;
-use dpm_render::pack::source_bits;
+use dpm_render::pack::{source_bits, Halftone};
 use dpm_render::warp::plane_groups;
 use dpm_shaders::structs::PlaneGroup;
 use glam::DAffine3;
@@ -59,15 +59,19 @@ pub(crate) fn groups_that_follow(rig: &Rig) -> Vec<PlaneGroup> {
         return Vec::new();
     }
     let lights = Lights::of(rig);
-    plane_groups(lights.schedule, &lights.shares())
+    let share = lights.follow(rig.config.projector.plane_follow);
+    plane_groups(lights.schedule, &lights.shares().map(|own| own * share).collect::<Vec<_>>())
 }
+
+/// Length of the frames of which `projector.plane_follow` is a share, nanoseconds: 947 frames/s.
+const SHARE_IS_OF_NS: f64 = 1e9 / 947.0;
 
 /// When the planes of a frame are lit, and how much light they give.
 #[derive(Clone, Copy)]
 struct Lights<'a> {
     schedule: &'a PlaneSchedule,
     timing: PlaneTiming,
-    /// How long the planes are lit together, and how long the frame lasts; in the same unit.
+    /// How long the planes are lit together, and how long the frame lasts, nanoseconds.
     lit: [i64; 2],
 }
 
@@ -75,6 +79,18 @@ impl<'a> Lights<'a> {
     fn of(rig: &'a Rig) -> Self {
         let projector = &rig.config.projector;
         Self { schedule: &rig.schedule, timing: projector.plane_timing(), lit: projector.lit_of_frame_ns() }
+    }
+
+    /// How far planes go on the way from the centre of the light to their own instant, if those of a projector at 947 frames/s
+    /// that shows bits go the share `told`. In longer frames the same time is left of the way: it is worth while as long as
+    /// bodies move by few pixels in it. Halftones, and patterns of several bits, which are lit whole, go all of it.
+    fn follow(self, told: f64) -> f64 {
+        let is_lit_by_bits = !matches!(self.timing, PlaneTiming::Together { .. });
+        if is_lit_by_bits && Halftone::of(self.schedule).is_none() {
+            1.0 - (1.0 - told) * (SHARE_IS_OF_NS / self.lit[1] as f64).min(1.0)
+        } else {
+            1.0
+        }
     }
 
     /// How long a plane lasts, in units that all planes share.
@@ -123,12 +139,12 @@ impl<'a> Lights<'a> {
     }
 
     /// For each plane the time from the centre of the light to its middle, as a share of the frame.
-    fn shares(self) -> Vec<f64> {
+    fn shares(self) -> impl Iterator<Item = f64> + 'a {
         let [moments, light] = self.moments();
         let centre = moments as f64 / light as f64;
         let [lit, frame] = self.lit.map(|ns| ns as f64);
         let share = lit / frame / (2 * self.whole()) as f64;
-        self.planes().map(|(_, halves)| (halves as f64 - centre) * share).collect()
+        self.planes().map(move |(_, halves)| (halves as f64 - centre) * share)
     }
 
     /// As [`light_centre_ns`].
@@ -154,6 +170,24 @@ mod tests {
 
     fn centre_ns(schedule: &PlaneSchedule, timing: PlaneTiming, exposure_ns: i64) -> i64 {
         Lights { schedule, timing, lit: [1, 1] }.centre_ns(exposure_ns)
+    }
+
+    /// A plane is left behind its own instant by no more time in a long frame than in one of 947 a second.
+    #[test]
+    fn planes_of_bits_follow_by_a_share_that_leaves_no_more_time_in_longer_frames() {
+        let follow = |schedule: &PlaneSchedule, timing, frame_ns| {
+            Lights { schedule, timing, lit: [frame_ns, frame_ns] }.follow(0.8)
+        };
+        let bits = PlaneSchedule::rgb24();
+        let left_us =
+            |frame_ns: i64| (1.0 - follow(&bits, PlaneTiming::Equal, frame_ns)) * frame_ns as f64 / 1000.0;
+        assert_eq!(follow(&bits, PlaneTiming::Equal, 500_000), 0.8);
+        for frame_ns in [SLOT, 4 * SLOT, 41_666_667] {
+            assert!((left_us(frame_ns) - 0.2 * SLOT as f64 / 1000.0).abs() < 1e-3, "{}", left_us(frame_ns));
+        }
+        // Grey of these does not come from bits that are lit apart.
+        assert_eq!(follow(&PlaneSchedule::equal_rgb24(), PlaneTiming::Equal, SLOT), 1.0);
+        assert_eq!(follow(&bits, PlaneTiming::Together { planes: 8 }, SLOT), 1.0);
     }
 
     #[test]
@@ -213,7 +247,7 @@ mod tests {
         let middles = |schedule: &PlaneSchedule, timing, lit_ns| -> Vec<i64> {
             let lights = Lights { schedule, timing, lit: [lit_ns, frame_ns] };
             let centre = lights.centre_ns(frame_ns);
-            let from_shares = lights.shares().into_iter().map(|s| centre + (s * frame_ns as f64) as i64);
+            let from_shares = lights.shares().map(|s| centre + (s * frame_ns as f64) as i64);
             let all = lights.planes().map(|(_, halves)| lights.instant_ns(halves, 1, frame_ns));
             assert!(all.zip(from_shares).all(|(a, b)| (a - b).abs() <= 2));
             lights.planes().map(|(_, halves)| lights.instant_ns(halves, 1, frame_ns)).collect()
@@ -237,7 +271,7 @@ mod tests {
             let all = Lights { schedule: &schedule, timing, lit: [lit_ns, frame_ns] };
             assert!((all.centre_ns(frame_ns) - lit_ns / 2).abs() <= 1, "the middle of all");
             // Planes that are lit together follow together: a pattern is a group, at its own instant.
-            let groups = plane_groups(&schedule, &all.shares());
+            let groups = plane_groups(&schedule, &all.shares().collect::<Vec<_>>());
             assert_eq!(groups.len(), 24 / usize::from(depth));
             assert!(groups.windows(2).all(|pair| pair[0].instant < pair[1].instant));
             assert!(
