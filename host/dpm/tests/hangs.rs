@@ -53,8 +53,13 @@ impl Stopped {
 impl Drop for Stopped {
     fn drop(&mut self) {
         let none = std::ptr::null_mut::<libc::c_void>();
-        // SAFETY: as above; it does no harm if the thread is gone.
-        unsafe { libc::ptrace(libc::PTRACE_DETACH, self.thread, none, none) };
+        // SAFETY: as above; it does no harm if the thread is gone. Nobody sees the end of the process before the tracer has
+        // acknowledged that of the thread.
+        unsafe {
+            if libc::ptrace(libc::PTRACE_DETACH, self.thread, none, none) != 0 {
+                libc::waitpid(self.thread, std::ptr::null_mut(), libc::__WALL | libc::WNOHANG);
+            }
+        }
     }
 }
 

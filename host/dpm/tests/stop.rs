@@ -58,8 +58,13 @@ impl Stopped {
 impl Drop for Stopped {
     fn drop(&mut self) {
         let none = std::ptr::null_mut::<libc::c_void>();
-        // SAFETY: a request without addresses; it fails if the thread is gone.
-        unsafe { libc::ptrace(libc::PTRACE_DETACH, self.tid, none, none) };
+        // SAFETY: a request without addresses; it fails if the thread is gone, and a null status is allowed. Nobody sees the
+        // end of the process before the tracer has acknowledged that of the thread.
+        unsafe {
+            if libc::ptrace(libc::PTRACE_DETACH, self.tid, none, none) != 0 {
+                libc::waitpid(self.tid, std::ptr::null_mut(), libc::__WALL | libc::WNOHANG);
+            }
+        }
     }
 }
 
