@@ -11,6 +11,7 @@ use dpm_common::stopping;
 use std::io;
 use std::sync::atomic::{AtomicBool, AtomicU32, Ordering};
 use std::sync::Once;
+use std::time::Duration;
 
 /// Signals that request an orderly stop. Supervisors send some of them twice, so the second one has no effect. The
 /// third one ends the process at once (the projector's watchdog then makes it dark).
@@ -23,6 +24,8 @@ const GONE_WITHIN_S: libc::time_t = 1;
 const FILES_STEP_US: libc::suseconds_t = 200_000;
 /// ... and at most this many times: ten seconds.
 const FILES_STEPS: u32 = 50;
+/// How often [`wait`] looks for a signal.
+const LOOK: Duration = Duration::from_millis(50);
 /// Exit code after a panic, the same as Rust's own.
 const PANIC_CODE: libc::c_int = 101;
 
@@ -154,6 +157,13 @@ fn unblock() -> io::Result<()> {
         return Err(io::Error::from_raw_os_error(result));
     }
     Ok(())
+}
+
+/// Waits until a signal requests a stop. For a thread whose program works on others.
+pub(crate) fn wait() {
+    while received().is_none() {
+        std::thread::sleep(LOOK);
+    }
 }
 
 /// The name of the signal that requested a stop; `None` if there was none.

@@ -71,6 +71,27 @@ fn bad_usage_ends_with_2() {
 }
 
 #[test]
+fn an_overview_of_rigs_refuses_what_it_cannot_show() {
+    let many: Vec<String> = (1..=33).map(|port| format!("127.0.0.1:{port}")).collect();
+    let many: Vec<&str> = many.iter().map(String::as_str).collect();
+    for (args, why) in [
+        (&["a=192.168.1.5:8947"][..], "192.168.1.5 is not an address of this machine"),
+        (&["stage"], "write HOST:PORT"),
+        (&["127.0.0.1:0"], "ports from 1 to 65535"),
+        (&["a=127.0.0.1:1", "a=127.0.0.1:2"], "two rigs are called \"a\""),
+        (&["a=127.0.0.1:1", "b=localhost:1/8947"], "have the same address"),
+        (&["a=127.0.0.1:8940"], "--listen 127.0.0.1:8940: this is the address of the rig \"a\""),
+        (&["127.0.0.1:1", "--listen", "0.0.0.0:8940"], "listen on 127.0.0.1"),
+        (&["127.0.0.1:1", "--listen", "8940"], "--listen"),
+        (&many, "33 rigs are named; an overview shows 1 to 32"),
+        (&[], "Usage"),
+    ] {
+        let output = dpm(&[&["rigs"], args].concat(), &[]);
+        assert!(code(&output) == 2 && err(&output).contains(why), "{args:?}: {}", err(&output));
+    }
+}
+
+#[test]
 fn no_colour_is_honoured_and_a_pipe_gets_none() {
     for variables in [&[][..], &[("NO_COLOR", "1")]] {
         let output = dpm(&["frobnicate"], variables);

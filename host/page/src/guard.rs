@@ -10,6 +10,8 @@ use std::net::SocketAddr;
 /// The header that carries the token of an order.
 pub const TOKEN: HeaderName = HeaderName::from_static("x-dpm-token");
 const FETCH_SITE: HeaderName = HeaderName::from_static("sec-fetch-site");
+const FETCH_MODE: HeaderName = HeaderName::from_static("sec-fetch-mode");
+const FETCH_DEST: HeaderName = HeaderName::from_static("sec-fetch-dest");
 
 /// What a request is refused for.
 #[derive(Clone, Debug, PartialEq, Eq)]
@@ -30,6 +32,8 @@ pub(crate) struct Guard {
     hosts: Vec<String>,
     origins: Vec<String>,
     token: Option<Token>,
+    /// What to do about a request that named another host.
+    remedy: &'static str,
 }
 
 impl Guard {
@@ -44,7 +48,12 @@ impl Guard {
         // Beyond this machine there is TLS only.
         origins.extend(names.iter().map(|name| format!("https://{}", name.to_ascii_lowercase())));
         hosts.extend(names.iter().map(|name| name.to_ascii_lowercase()));
-        Self { hosts, origins, token }
+        Self { hosts, origins, token, remedy: "; add a proxy's name to page.hosts" }
+    }
+
+    /// For an overview of several rigs at `address`, which has no rig file and no orders.
+    pub(crate) fn of_overview(address: SocketAddr) -> Self {
+        Self { remedy: "", ..Self::new(address, &[], None) }
     }
 
     /// Any request: it was sent to this page by name, and not by another site.
@@ -54,15 +63,13 @@ impl Guard {
             _ => {
                 return Err(refused(
                     421,
-                    format!(
-                        "this page answers to {} only; add a proxy's name to page.hosts",
-                        self.hosts.join(", ")
-                    ),
+                    format!("this page answers to {} only{}", self.hosts.join(", "), self.remedy),
                 ))
             }
         }
         if headers.contains_key(FETCH_SITE)
             && !single(headers, &FETCH_SITE).is_some_and(|site| ["same-origin", "none"].contains(&site))
+            && !is_link_on_this_machine(headers)
         {
             return Err(refused(403, "refused: another site asks"));
         }
@@ -87,6 +94,14 @@ impl Guard {
             _ => Err(refused(403, "wrong token: open the page by the link that the rig has printed")),
         }
     }
+}
+
+/// A link on a page of this machine was followed, as those of the overview of several rigs. To a browser all ports of
+/// one address are one site. The page that has the link can read nothing of this one and cannot show it in a frame.
+fn is_link_on_this_machine(headers: &HeaderMap) -> bool {
+    [(FETCH_SITE, "same-site"), (FETCH_MODE, "navigate"), (FETCH_DEST, "document")]
+        .iter()
+        .all(|(name, value)| single(headers, name) == Some(*value))
 }
 
 /// The value of a header that occurs exactly once.
@@ -158,6 +173,27 @@ mod tests {
         {
             assert_eq!(guard().check(&headers(&[host, ("sec-fetch-site", site)])).is_ok(), may, "{site}");
         }
+    }
+
+    #[test]
+    fn a_link_on_this_machine_may_be_followed_and_nothing_else_of_another_page() {
+        let asked = |site, mode, dest, more: &[(&str, &str)]| {
+            let all = [
+                ("host", "127.0.0.1:8947"),
+                ("sec-fetch-site", site),
+                ("sec-fetch-mode", mode),
+                ("sec-fetch-dest", dest),
+            ];
+            guard().check(&headers(&[&all, more].concat())).is_ok()
+        };
+        assert!(asked("same-site", "navigate", "document", &[]));
+        assert!(!asked("cross-site", "navigate", "document", &[]), "from the network");
+        assert!(!asked("same-site", "navigate", "iframe", &[]), "in a frame");
+        assert!(!asked("same-site", "cors", "empty", &[]), "by a script");
+        assert!(!asked("same-site", "no-cors", "image", &[]), "as a picture");
+        let form = [("origin", "http://127.0.0.1:8940")];
+        assert!(!asked("same-site", "navigate", "document", &form), "a form");
+        assert!(!asked("same-site", "navigate", "document", &[("sec-fetch-site", "same-site")]), "twice");
     }
 
     #[test]

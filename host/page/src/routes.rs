@@ -1,14 +1,15 @@
 //! From a request to its answer.
 
-use crate::calibration;
+use crate::calibration::{self, Guide};
 use crate::connections::{Connection, Doing};
 use crate::events::Events;
 use crate::guard::Refused;
 use crate::metrics;
 use crate::orders;
 use crate::parameters;
+use crate::rigs::Rigs;
 use crate::shared::Shared;
-use crate::site::Site;
+use crate::site::{Serves, Site};
 use crate::state::State;
 use base64::prelude::{Engine, BASE64_STANDARD};
 use dpm_device::regular_file;
@@ -23,13 +24,18 @@ use std::sync::Arc;
 use std::task::{Context, Poll};
 use std::time::Duration;
 
-/// The live page, and that of a calibration. Scripts and styles are marked with a number that is drawn for each answer.
+/// The live page, that of a calibration, and the overview of several rigs. Scripts and styles are marked with a number
+/// that is drawn for each answer.
 const PAGE: &str = include_str!("page.html");
 const CALIBRATION: &str = include_str!("calibration.html");
-/// What stands for that number in a page, and for what both pages share.
+const RIGS: &str = include_str!("rigs/rigs.html");
+/// What stands for that number in a page, and for what pages share.
 const NONCE: &str = "{{nonce}}";
-const SHARED: [(&str, &str); 2] =
-    [("{{style}}", include_str!("shared.css")), ("{{script}}", include_str!("shared.js"))];
+const SHARED: [(&str, &str); 3] = [
+    ("{{style}}", include_str!("shared.css")),
+    ("{{script}}", include_str!("shared.js")),
+    ("{{token}}", include_str!("token.js")),
+];
 /// Longest page of a flight, bytes.
 const MAX_FLIGHT_BYTES: u64 = 1 << 20;
 /// How long the metrics wait for fresh figures.
@@ -131,22 +137,37 @@ async fn route(
     site: &Arc<Site>,
 ) -> Response<Answer> {
     let path = request.uri().path();
-    if let (Some(word), Some(run)) = (path.strip_prefix("/api/orders/"), &site.run) {
+    if let (Some(word), Some(run)) = (path.strip_prefix("/api/orders/"), site.serves.run()) {
         return order(request, word, connection, (site, run)).await;
     }
     tokio::time::sleep(site.door.pace()).await;
-    if let (Some(word), Some(run)) = (path.strip_prefix("/api/parameters/"), &site.run) {
+    match &site.serves {
+        Serves::Run(run, guide) => of_rig(request, connection, site, (guide, Some(run))).await,
+        Serves::Calibration(guide) => of_rig(request, connection, site, (guide, None)).await,
+        Serves::Rigs(rigs) => of_rigs(request, rigs),
+    }
+}
+
+/// What there is of one rig: the steps of its calibration, and its run where it runs.
+async fn of_rig(
+    request: &Request<Incoming>,
+    connection: &Arc<Connection>,
+    site: &Arc<Site>,
+    (guide, run): (&Arc<dyn Guide>, Option<&Arc<Shared>>),
+) -> Response<Answer> {
+    let path = request.uri().path();
+    if let (Some(word), Some(run)) = (path.strip_prefix("/api/parameters/"), run) {
         return change(request, word, (site, run)).await;
     }
     if let Some(word) = path.strip_prefix("/api/calibration/") {
-        return calibrate(request, word, site).await;
+        return calibrate(request, word, (site, guide)).await;
     }
     if request.method() != Method::GET {
         return plain(StatusCode::METHOD_NOT_ALLOWED, "only GET, and POST for orders and parameters");
     }
-    match (path, &site.run) {
+    match (path, run) {
         ("/calibration", _) | ("/", None) => page(CALIBRATION),
-        ("/api/calibration", _) => match calibration::told(&site.guide, site.run.is_some()).await {
+        ("/api/calibration", _) => match calibration::told(guide, run.is_some()).await {
             Some(told) => json(StatusCode::OK, &told),
             None => plain(StatusCode::INTERNAL_SERVER_ERROR, "the calibration file could not be read"),
         },
@@ -157,6 +178,18 @@ async fn route(
         ("/favicon.ico", _) => plain(StatusCode::NOT_FOUND, "none"),
         (_, Some(run)) => of_run(path, connection, run).await,
         _ => plain(StatusCode::NOT_FOUND, "there is / and /api/calibration"),
+    }
+}
+
+/// What there is of several rigs.
+fn of_rigs(request: &Request<Incoming>, rigs: &Rigs) -> Response<Answer> {
+    if request.method() != Method::GET {
+        return plain(StatusCode::METHOD_NOT_ALLOWED, "only GET; orders are given on the rigs' own pages");
+    }
+    match request.uri().path() {
+        "/" => page(RIGS),
+        "/api/rigs" => json(StatusCode::OK, &rigs.look()),
+        _ => plain(StatusCode::NOT_FOUND, "there is / and /api/rigs"),
     }
 }
 
@@ -237,14 +270,18 @@ async fn change(
 }
 
 /// An act of a calibration, by whoever knows the token.
-async fn calibrate(request: &Request<Incoming>, word: &str, site: &Arc<Site>) -> Response<Answer> {
+async fn calibrate(
+    request: &Request<Incoming>,
+    word: &str,
+    (site, guide): (&Site, &Arc<dyn Guide>),
+) -> Response<Answer> {
     if let Err(refused) = site.door.guard.check_token(request.headers()) {
         return refusal(refused);
     }
     if request.method() != Method::POST {
         return plain(StatusCode::METHOD_NOT_ALLOWED, "an act of a calibration is a POST");
     }
-    match calibration::act(word, request.uri().query().unwrap_or_default(), &site.guide).await {
+    match calibration::act(word, request.uri().query().unwrap_or_default(), guide).await {
         Some(Ok(())) => plain(StatusCode::OK, "ok"),
         Some(Err(why)) => plain(StatusCode::BAD_REQUEST, why),
         None => plain(StatusCode::NOT_FOUND, "there is start, answer, stop, keep and discard"),

@@ -5,14 +5,16 @@ use crate::connections::{Connection, Connections};
 use crate::guard::Guard;
 use crate::notes::Notes;
 use crate::pictures::Pictures;
+use crate::rigs::Rigs;
 use crate::routes;
 use crate::shared::Shared;
-use crate::site::{Door, Site};
+use crate::site::{Door, Serves, Site};
+use crate::stream::Stream;
 use crate::token::Token;
 use dpm_common::realtime::os::give_way;
 use dpm_rig::control::orders::Orders;
 use dpm_rig::telemetry::monitor::RunMonitor;
-use hyper::rt::{Read, ReadBufCursor, Sleep, Timer, Write};
+use hyper::rt::{Sleep, Timer};
 use hyper::server::conn::http1;
 use hyper::service::service_fn;
 use std::future::Future;
@@ -20,7 +22,7 @@ use std::io;
 use std::net::SocketAddr;
 use std::pin::Pin;
 use std::sync::{mpsc, Arc};
-use std::task::{ready, Context, Poll};
+use std::task::{Context, Poll};
 use std::thread::JoinHandle;
 use std::time::{Duration, Instant};
 use tokio::net::{TcpListener, TcpStream};
@@ -53,6 +55,14 @@ pub struct Settings {
     pub guide: Arc<dyn Guide>,
 }
 
+impl Settings {
+    /// The checks of requests, once the address that is listened on is known.
+    fn guard(&self) -> impl FnOnce(SocketAddr) -> Guard {
+        let (hosts, token) = (self.hosts.clone(), self.token.clone());
+        move |address| Guard::new(address, &hosts, token)
+    }
+}
+
 /// Why there is no page.
 #[derive(Debug, thiserror::Error)]
 pub enum PageError {
@@ -60,7 +70,9 @@ pub enum PageError {
     #[error("{0} can be reached from other machines, and the page has no encryption of its own; listen on 127.0.0.1")]
     NotLoopback(SocketAddr),
     /// The address cannot be listened on.
-    #[error("cannot listen on {address}: {source}; choose another port with page.listen")]
+    #[error(
+        "cannot listen on {address}: {source}; choose another port with page.listen, --page or --listen"
+    )]
     Listen {
         /// The address.
         address: SocketAddr,
@@ -93,9 +105,10 @@ impl Page {
         orders: Arc<Orders>,
         notes: Arc<Notes>,
     ) -> Result<Self, PageError> {
-        Self::start(settings, || {
+        let guard = settings.guard();
+        Self::start(settings.address, guard, || {
             let pictures = Pictures::start(monitor.clone()).map_err(PageError::Thread)?;
-            Ok(Some(Arc::new(Shared::new(monitor, orders, notes, pictures))))
+            Ok(Serves::Run(Arc::new(Shared::new(monitor, orders, notes, pictures)), settings.guide))
         })
     }
 
@@ -104,14 +117,25 @@ impl Page {
     /// # Errors
     /// As [`Page::serve`].
     pub fn serve_calibration(settings: Settings) -> Result<Self, PageError> {
-        Self::start(settings, || Ok(None))
+        let guard = settings.guard();
+        Self::start(settings.address, guard, || Ok(Serves::Calibration(settings.guide)))
     }
 
+    /// Serves the overview of several rigs at `address`. It gives no orders, so it has no token.
+    ///
+    /// # Errors
+    /// As [`Page::serve`].
+    pub fn serve_rigs(address: SocketAddr, rigs: Rigs) -> Result<Self, PageError> {
+        Self::start(address, Guard::of_overview, || Ok(Serves::Rigs(rigs)))
+    }
+
+    /// Serves at `wanted`. `guard` makes the checks of requests for the address that is listened on, and `serves` what
+    /// is served, when it is known that there can be a page.
     fn start(
-        settings: Settings,
-        run: impl FnOnce() -> Result<Option<Arc<Shared>>, PageError>,
+        wanted: SocketAddr,
+        guard: impl FnOnce(SocketAddr) -> Guard,
+        serves: impl FnOnce() -> Result<Serves, PageError>,
     ) -> Result<Self, PageError> {
-        let wanted = settings.address;
         if !wanted.ip().is_loopback() {
             return Err(PageError::NotLoopback(wanted));
         }
@@ -127,8 +151,7 @@ impl Page {
             .enable_time()
             .build()
             .map_err(PageError::Thread)?;
-        let door = Door::new(Guard::new(address, &settings.hosts, settings.token));
-        let site = Arc::new(Site { door, run: run()?, guide: settings.guide });
+        let site = Arc::new(Site { door: Door::new(guard(address)), serves: serves()? });
         let stop = Arc::new(Notify::new());
         let (ended, over) = mpsc::channel::<()>();
         let thread = std::thread::Builder::new()
@@ -141,6 +164,9 @@ impl Page {
                     // The stages of the rig come first where there are no real-time rights.
                     give_way(5);
                     runtime.block_on(async {
+                        if let Serves::Rigs(rigs) = &site.serves {
+                            rigs.follow();
+                        }
                         tokio::spawn(take_connections(listener, site));
                         stop.notified().await;
                     });
@@ -198,7 +224,7 @@ async fn take_connections(listener: std::net::TcpListener, site: Arc<Site>) {
 
 async fn serve(stream: TcpStream, connection: Arc<Connection>, site: Arc<Site>) {
     let _ = stream.set_nodelay(true);
-    let io = Stream { stream, connection: connection.clone() };
+    let io = Stream::new(stream, connection.clone());
     let service = service_fn(|request| routes::answer(request, connection.clone(), site.clone()));
     // An error is the client's: it went away, or sent no HTTP.
     let _ = http1::Builder::new()
@@ -208,59 +234,6 @@ async fn serve(stream: TcpStream, connection: Arc<Connection>, site: Arc<Site>) 
         .max_headers(HEAD_LINES)
         .serve_connection(io, service)
         .await;
-}
-
-/// A socket as the HTTP library wants it, which notes when bytes move.
-struct Stream {
-    stream: TcpStream,
-    connection: Arc<Connection>,
-}
-
-impl Read for Stream {
-    fn poll_read(
-        self: Pin<&mut Self>,
-        cx: &mut Context<'_>,
-        mut buf: ReadBufCursor<'_>,
-    ) -> Poll<io::Result<()>> {
-        let mut bytes = [0u8; 2048];
-        let room = buf.remaining().min(bytes.len());
-        loop {
-            ready!(self.stream.poll_read_ready(cx))?;
-            match self.stream.try_read(&mut bytes[..room]) {
-                Ok(n) => {
-                    self.connection.moved();
-                    buf.put_slice(&bytes[..n]);
-                    return Poll::Ready(Ok(()));
-                }
-                Err(e) if e.kind() == io::ErrorKind::WouldBlock => {}
-                Err(e) => return Poll::Ready(Err(e)),
-            }
-        }
-    }
-}
-
-impl Write for Stream {
-    fn poll_write(self: Pin<&mut Self>, cx: &mut Context<'_>, bytes: &[u8]) -> Poll<io::Result<usize>> {
-        loop {
-            ready!(self.stream.poll_write_ready(cx))?;
-            match self.stream.try_write(bytes) {
-                Ok(n) => {
-                    self.connection.moved();
-                    return Poll::Ready(Ok(n));
-                }
-                Err(e) if e.kind() == io::ErrorKind::WouldBlock => {}
-                Err(e) => return Poll::Ready(Err(e)),
-            }
-        }
-    }
-
-    fn poll_flush(self: Pin<&mut Self>, _: &mut Context<'_>) -> Poll<io::Result<()>> {
-        Poll::Ready(Ok(()))
-    }
-
-    fn poll_shutdown(self: Pin<&mut Self>, cx: &mut Context<'_>) -> Poll<io::Result<()>> {
-        tokio::io::AsyncWrite::poll_shutdown(Pin::new(&mut self.get_mut().stream), cx)
-    }
 }
 
 /// The runtime's clock, for the HTTP library.

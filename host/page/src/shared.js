@@ -1,17 +1,7 @@
-// What the live page and the page of a calibration share.
+// What all pages share.
 const $ = id => document.getElementById(id);
 function span(name, text) { const s = document.createElement("span"); s.className = name; s.textContent = text; return s; }
-
-// The secret for orders comes in the part of the link that no browser sends, and goes from there.
-const KEY = "dpm-token";
-const fromLink = /[#&]token=([0-9a-f]{64})/.exec(location.hash);
-if (fromLink) { localStorage.setItem(KEY, fromLink[1]); history.replaceState(null, "", location.pathname); }
-let token = localStorage.getItem(KEY);
-// True if the rig takes orders with the token that this browser has; null if the rig does not answer.
-async function tokenHolds() {
-  if (!token) return false;
-  try { return (await fetch("/api/token", { headers: { "X-Dpm-Token": token } })).ok; } catch { return null; }
-}
-function onToken(check) {
-  $("token").addEventListener("submit", e => { e.preventDefault(); token = $("secret").value.trim(); localStorage.setItem(KEY, token); $("secret").value = ""; check(); });
-}
+// The class of a projector's state, from its word in any case; shared.css has the colours.
+const CLASSES = { up: "up", safe: "bad", frozen: "frozen", lost: "bad blink", faulted: "bad", interlock: "warn", resting: "warn", connecting: "warn" };
+const stateClass = word => "word " + (Object.hasOwn(CLASSES, word.toLowerCase()) ? CLASSES[word.toLowerCase()] : "");
+const share = v => v === 0 ? "0 %" : v < 0.0001 ? "< 0.01 %" : (v * 100).toFixed(v < 0.1 ? 2 : 1) + " %";

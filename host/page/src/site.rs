@@ -1,7 +1,8 @@
-//! What a server serves: a calibration guide, and a run where there is one; and who may ask how often.
+//! What a server serves: a run, the steps of a calibration, or what several rigs say; and who may ask how often.
 
 use crate::calibration::Guide;
 use crate::guard::Guard;
+use crate::rigs::Rigs;
 use crate::shared::Shared;
 use std::sync::{Arc, Mutex, PoisonError};
 use std::time::{Duration, Instant};
@@ -34,12 +35,30 @@ impl Door {
     }
 }
 
-/// What a server serves.
+/// A server: who may ask it, and what it serves.
 pub(crate) struct Site {
     pub(crate) door: Door,
-    /// The run; `None` where a rig is only calibrated.
-    pub(crate) run: Option<Arc<Shared>>,
-    pub(crate) guide: Arc<dyn Guide>,
+    pub(crate) serves: Serves,
+}
+
+/// What a server serves.
+pub(crate) enum Serves {
+    /// A run, and the steps of its rig's calibration.
+    Run(Arc<Shared>, Arc<dyn Guide>),
+    /// The steps of the calibration of a rig that does not run.
+    Calibration(Arc<dyn Guide>),
+    /// What several rigs say of themselves.
+    Rigs(Rigs),
+}
+
+impl Serves {
+    /// The run, where one is served.
+    pub(crate) fn run(&self) -> Option<&Arc<Shared>> {
+        match self {
+            Self::Run(run, _) => Some(run),
+            Self::Calibration(_) | Self::Rigs(_) => None,
+        }
+    }
 }
 
 #[cfg(test)]

@@ -23,6 +23,7 @@ mod progress;
 mod record;
 mod report;
 mod rig_args;
+mod rigs;
 pub mod run;
 mod session;
 mod set;
@@ -88,6 +89,11 @@ enum Command {
     /// A change is used from one frame on, and the answer names the frame. --undo takes the last change back, and --save
     /// writes the values into the rig file and the calibration file for the next run.
     Set(set::SetArgs),
+    /// Show several running rigs on one page: state, rates, what is dark and why; without orders
+    ///
+    /// Asks the live pages of the rigs, once a second while somebody looks. A rig on another machine comes through a
+    /// tunnel: ssh -N -L 8948:127.0.0.1:8948 rig2
+    Rigs(rigs::RigsArgs),
     /// Show a pattern on a rig's projector, for aiming, focusing and calibrating, or write it as PNG files
     Pattern(pattern::PatternArgs),
     /// Measure what a rig needs to know: wand, projector, bodies, latency, light
@@ -183,6 +189,7 @@ fn dispatch(command: &Command) -> Result<(), Failure> {
         Command::Safe(args) => order::execute(args, Order::Safe),
         Command::Arm(args) => order::execute(args, Order::Arm),
         Command::Set(args) => set::execute(args),
+        Command::Rigs(args) => rigs::execute(args),
         Command::Pattern(args) => pattern::execute(args),
         Command::Calibrate(args) => calibrate::execute(args),
         Command::Record(args) => record::execute(args),

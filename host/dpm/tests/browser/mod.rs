@@ -1,4 +1,5 @@
 //! Drives a headless Chromium over its debugging pipe: JSON messages that end with a zero byte.
+#![allow(dead_code)] // Every test file uses a part of it.
 
 use base64::prelude::{Engine, BASE64_STANDARD};
 use serde_json::{json, Value};

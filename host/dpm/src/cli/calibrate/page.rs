@@ -10,10 +10,6 @@ use dpm_rig::failure::{Failure, FailureKind};
 use std::net::SocketAddr;
 use std::path::PathBuf;
 use std::sync::Arc;
-use std::time::Duration;
-
-/// How often to look whether the page should end.
-const LOOK: Duration = Duration::from_millis(50);
 
 #[derive(clap::Args, Clone, Debug)]
 pub(super) struct GuideArgs {
@@ -53,9 +49,7 @@ impl GuideArgs {
         let (Link::Secret(told) | Link::Open(told)) = link(page.address(), token);
         eprintln!("{told}");
         eprintln!("Nothing is lit before you start a step there. Ctrl-C ends the page and the step.");
-        while signals::received().is_none() {
-            std::thread::sleep(LOOK);
-        }
+        signals::wait();
         Ok(())
     }
 }
