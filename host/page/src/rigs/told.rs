@@ -45,14 +45,27 @@ pub(super) struct Answer {
 struct Now {
     pid: u32,
     up_s: f64,
+    counts: Counts,
+    #[serde(flatten)]
+    state: State,
+}
+
+/// What is passed on as the rig tells it.
+#[derive(Clone, Debug, Deserialize, Serialize)]
+struct State {
+    /// The projector's state as a word, and as a sentence.
     projector: Short,
     told: Short,
+    /// Light may come out of the projector.
     is_light: bool,
+    /// The order that is kept over restarts.
     standing: Option<Short>,
+    /// On what light depends, and whether it is permitted.
     interlock: Option<(Short, bool)>,
+    /// What the tracker says of bodies that it has not seen.
     tracker: Option<Short>,
+    /// The run is asked to end.
     is_stopping: bool,
-    counts: Counts,
 }
 
 #[derive(Clone, Copy, Debug, Deserialize)]
@@ -96,19 +109,8 @@ pub(super) struct Body {
 /// What the overview shows of a rig.
 #[derive(Clone, Debug, Serialize)]
 pub(super) struct Told {
-    /// The projector's state as a word, and as a sentence.
-    projector: Short,
-    told: Short,
-    /// Light may come out of the projector.
-    is_light: bool,
-    /// The order that is kept over restarts.
-    standing: Option<Short>,
-    /// On what light depends, and whether it is permitted.
-    interlock: Option<(Short, bool)>,
-    /// What the tracker says of bodies that it has not seen.
-    tracker: Option<Short>,
-    /// The run is asked to end.
-    is_stopping: bool,
+    #[serde(flatten)]
+    state: State,
     /// Frames lit a second, over the last seconds; `None` before the second answer.
     lit_per_s: Option<f64>,
     /// Share of the slots of the last minute, or of the time for which somebody has looked, that were missed, 0 to 1.
@@ -129,13 +131,7 @@ impl Answer {
         minute.add(Counted { pid: now.pid, up_s: now.up_s, counts: now.counts });
         figures.bodies.truncate(MAX_BODIES);
         Told {
-            projector: now.projector,
-            told: now.told,
-            is_light: now.is_light,
-            standing: now.standing,
-            interlock: now.interlock,
-            tracker: now.tracker,
-            is_stopping: now.is_stopping,
+            state: now.state,
             lit_per_s: minute.lit_per_s(),
             missed: minute.missed(),
             celsius: figures.link.celsius,
