@@ -99,21 +99,32 @@ impl Facts {
 }
 
 /// The GPU's queue and its time per frame, shared by planning and packing.
-#[derive(Debug, Default)]
+#[derive(Debug)]
 pub(crate) struct GpuPace {
+    slot_ns: i64,
     submitted: AtomicU64,
     finished: AtomicU64,
     frame_ns: AtomicI64,
+    is_slow: AtomicBool,
 }
 
 impl GpuPace {
     /// Share of a slot beyond which frames are begun one at a time. A slower GPU would only queue frames up, and each
-    /// frame's poses would grow old in the queue.
-    const SLOW: f64 = 0.9;
+    /// frame's poses would grow old in the queue. It is above the share beyond which the budget cuts samples: a GPU
+    /// that the budget holds in its slot never counts as slow.
+    const SLOW: f64 = 0.96;
+    /// Share below which a slow GPU is quick again.
+    const QUICK: f64 = 0.9;
 
-    /// For a GPU that took `frame_ns` for a frame while it was otherwise idle.
-    pub(crate) fn new(frame_ns: i64) -> Self {
-        Self { frame_ns: AtomicI64::new(frame_ns), ..Self::default() }
+    /// For a GPU that took `frame_ns` for a frame while it was otherwise idle, with slots of `slot_ns`.
+    pub(crate) fn new(frame_ns: i64, slot_ns: i64) -> Self {
+        Self {
+            slot_ns,
+            submitted: AtomicU64::new(0),
+            finished: AtomicU64::new(0),
+            frame_ns: AtomicI64::new(frame_ns),
+            is_slow: AtomicBool::new(frame_ns as f64 > Self::SLOW * slot_ns as f64),
+        }
     }
 
     /// A frame was handed to the GPU.
@@ -121,11 +132,13 @@ impl GpuPace {
         self.submitted.fetch_add(1, Ordering::Relaxed);
     }
 
-    /// The GPU has finished a frame, which took `took_ns`.
+    /// The GPU has finished a frame, which kept it busy for `took_ns`.
     pub(crate) fn finish(&self, took_ns: i64) {
         let before = self.frame_ns.load(Ordering::Relaxed);
         let mean = if before == 0 { took_ns } else { before + (took_ns - before) / 8 };
         self.frame_ns.store(mean, Ordering::Relaxed);
+        let share = if self.is_slow() { Self::QUICK } else { Self::SLOW };
+        self.is_slow.store(mean as f64 > share * self.slot_ns as f64, Ordering::Relaxed);
         // Release: a reader that sees the frame finished also sees its time.
         self.finished.fetch_add(1, Ordering::Release);
     }
@@ -137,8 +150,8 @@ impl GpuPace {
     }
 
     /// True when a frame takes about a slot or more.
-    pub(crate) fn is_slow(&self, slot_ns: i64) -> bool {
-        self.frame_ns.load(Ordering::Relaxed) as f64 > Self::SLOW * slot_ns as f64
+    pub(crate) fn is_slow(&self) -> bool {
+        self.is_slow.load(Ordering::Relaxed)
     }
 }
 
@@ -153,8 +166,8 @@ pub(crate) struct CrewFacts {
 }
 
 impl CrewFacts {
-    /// For a crew that begins, on a GPU that took `frame_ns` for a frame while it was otherwise idle.
-    pub(crate) fn new(frame_ns: i64) -> Self {
-        Self { gpu: GpuPace::new(frame_ns), budget_milli: AtomicU64::new(u64::MAX) }
+    /// For a crew that begins, on a GPU that took `frame_ns` for a frame while it was otherwise idle, with slots of `slot_ns`.
+    pub(crate) fn new(frame_ns: i64, slot_ns: i64) -> Self {
+        Self { gpu: GpuPace::new(frame_ns, slot_ns), budget_milli: AtomicU64::new(u64::MAX) }
     }
 }

@@ -83,16 +83,12 @@ impl<P: Pace> PlanStage<P> {
 
     /// A GPU that needs about a slot or more for a frame gets frames one at a time. False while it is busy.
     pub(crate) fn may_begin(&self) -> bool {
-        !self.is_slow() || self.crew.gpu.in_flight() == 0
-    }
-
-    fn is_slow(&self) -> bool {
-        self.crew.gpu.is_slow(self.slot_ns)
+        !self.crew.gpu.is_slow() || self.crew.gpu.in_flight() == 0
     }
 
     /// Chooses the slot of the next frame at `now`. `None` if that slot lies beyond the end of the run.
     pub(crate) fn choose_slot(&mut self, time: &LinkTime, now: HostTime) -> Option<Latch> {
-        let leads = P::leads(&self.facts, self.is_slow());
+        let leads = P::leads(&self.facts, self.crew.gpu.is_slow());
         let first = time.slot_after(now.plus_ns(leads.needed_ns));
         // A slot far ahead was chosen by a map of the projector's clock that has since been corrected.
         let ahead = self.next_slot.saturating_sub(first) as i64;

@@ -69,7 +69,7 @@ fn bench(flags: &[&str], options: RunOptions) -> Bench {
     let lead = LeadEstimator::new(slot_ns, 3 * MS, slot_ns / 2, 2 * slot_ns);
     let facts = Arc::new(Facts::new(rig.clone(), monitor, options, &lead, now));
     let keeper = LinkKeeper::new(time, &link, None);
-    let crew = Arc::new(CrewFacts::new(0));
+    let crew = Arc::new(CrewFacts::new(0, slot_ns));
     Bench { facts, crew, link: Some((link, keeper)), cable, lead, time, now, slot_ns }
 }
 
@@ -300,7 +300,7 @@ fn a_crew_in_trouble_is_made_anew_three_times_a_minute_and_the_fourth_ends_the_r
 fn a_frame_that_stays_on_the_gpu_for_a_second_is_told_once() {
     let bench = bench(&[], RunOptions::default());
     let mut mind = supervision(&bench.facts);
-    let crew = Arc::new(CrewFacts::new(0));
+    let crew = Arc::new(CrewFacts::new(0, bench.slot_ns));
     let mut stage = PackStage::new(bench.facts.clone(), crew, None);
     let note = FrameNote::new(&bench.facts.rig);
     let (link, collector) = (Pulse::new("link"), Pulse::new("collector"));

@@ -117,7 +117,7 @@ impl Crew {
         let CrewParts { tracking, renderer, pictures, kernel, budget, memory, frame_ns } = parts;
         let rig = &shared.facts.rig;
         let policy = policy(rig);
-        let facts = Arc::new(CrewFacts::new(frame_ns));
+        let facts = Arc::new(CrewFacts::new(frame_ns, rig.rate().slot_len_ns(0)));
         let stage = PackStage::new(shared.facts.clone(), facts.clone(), budget);
         // There is room for all of them: no stage ever finds the next one's channel full.
         let jobs = memory.len();

@@ -67,7 +67,7 @@ pub(super) fn run_at_virtual_pace(
     })?;
     let lead = lead_estimator(rig, &link, 0);
     let facts = Arc::new(Facts::new(rig.clone(), monitor.clone(), options, &lead, now));
-    let crew = Arc::new(CrewFacts::new(0));
+    let crew = Arc::new(CrewFacts::new(0, rig.rate().slot_len_ns(0)));
     let keeper = LinkKeeper::new(time, &link, None);
     let (done, finished) = channel(NOTES, WaitPolicy::Park);
     let free: Vec<_> = std::mem::take(&mut parts.memory).into_iter().map(Box::new).collect();

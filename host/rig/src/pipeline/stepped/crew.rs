@@ -133,7 +133,7 @@ impl Crew {
         line: &mut Line,
         now: HostTime,
     ) -> Self {
-        let crew = Arc::new(CrewFacts::new(parts.frame_ns));
+        let crew = Arc::new(CrewFacts::new(parts.frame_ns, facts.rig.rate().slot_len_ns(0)));
         let (publisher, reader) = latest(TrackSnapshot::empty(facts.rig.bodies.len()));
         let to_link = facts.rig.wants_tracks().then(|| {
             let (to_link, newest) = latest(TrackSnapshot::empty(facts.rig.bodies.len()));
