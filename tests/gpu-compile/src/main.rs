@@ -1,8 +1,8 @@
 //! Compiles every pipeline for GPUs that are not there, and prints or records what their compilers made of it.
 //!
-//! `gpu-compile [--drivers DIR] [--only TEXT] [--json] [--record | --anew]`
+//! `gpu-compile [--drivers DIR] [--only TEXT] [--json] [--record | --anew]`, or `gpu-compile --here` for the GPU of this machine
 
-use gpu_compile::table::{compile, inputs, Row, Table};
+use gpu_compile::table::{compile, everything_said, inputs, Row, Table};
 use gpu_compile::targets::{Target, ALL};
 use gpu_compile::{cases, laws, page};
 use std::path::{Path, PathBuf};
@@ -11,11 +11,13 @@ use std::sync::atomic::{AtomicUsize, Ordering};
 use std::sync::Mutex;
 
 const USAGE: &str = "usage: gpu-compile [--drivers DIR] [--only TEXT] [--json] [--record | --anew]
+       gpu-compile --here
   --drivers DIR  where tests/gpu-compile/drivers has unpacked the drivers (target/gpu-drivers)
   --only TEXT    only targets whose name contains TEXT, such as navi31; nothing is compared or recorded
   --json         print the table as JSON
   --record       write the table into docs/lab, unless a row of it is worse than the one that is there
-  --anew         write it in any case";
+  --anew         write it in any case
+  --here         compile for the device of this machine, and print all that its driver says; nothing is compared or recorded";
 
 struct Arguments {
     drivers: PathBuf,
@@ -23,6 +25,8 @@ struct Arguments {
     json: bool,
     record: bool,
     anew: bool,
+    /// Compile for the device of this machine.
+    here: bool,
     /// Compile for this target in this process.
     one: Option<String>,
 }
@@ -34,6 +38,7 @@ fn arguments() -> Result<Arguments, String> {
         json: false,
         record: false,
         anew: false,
+        here: false,
         one: None,
     };
     let mut all = std::env::args().skip(1);
@@ -42,6 +47,7 @@ fn arguments() -> Result<Arguments, String> {
             "--drivers" => found.drivers = all.next().ok_or(USAGE)?.into(),
             "--only" => found.only = Some(all.next().ok_or(USAGE)?),
             "--one" => found.one = Some(all.next().ok_or(USAGE)?),
+            "--here" => found.here = true,
             "--json" => found.json = true,
             "--record" => found.record = true,
             "--anew" => (found.record, found.anew) = (true, true),
@@ -54,6 +60,7 @@ fn arguments() -> Result<Arguments, String> {
 fn main() -> ExitCode {
     let done = arguments().map_err(|e| (2, e)).and_then(|arguments| match &arguments.one {
         Some(name) => one(name).map_err(|e| (1, e)),
+        None if arguments.here => here().map_err(|e| (1, e)),
         None => all(&arguments).map_err(|e| (1, e)),
     });
     match done {
@@ -63,6 +70,12 @@ fn main() -> ExitCode {
             ExitCode::from(code)
         }
     }
+}
+
+/// Prints what the driver of this machine's device says of every program.
+fn here() -> Result<(), String> {
+    println!("{}", everything_said(&cases::all()?)?.join("\n"));
+    Ok(())
 }
 
 /// Prints the driver and the rows of one target, whose driver this process has.

@@ -118,6 +118,35 @@ pub fn compile(cases: &[Case], target: &Target) -> Result<(String, Vec<Row>), St
     Ok((format!("{}, {}", summary.name, summary.driver.trim()), rows))
 }
 
+/// Compiles every pipeline of all cases on the device that this process sees, and returns a line for each program: all that the driver says of it.
+///
+/// # Errors
+/// The driver refuses something.
+pub fn everything_said(cases: &[Case]) -> Result<Vec<String>, String> {
+    let options = GpuOptions { statistics: true, ..GpuOptions::default() };
+    let gpu = Gpu::open(&options).map_err(|e| e.to_string())?;
+    let summary = gpu.summary();
+    let mut lines = vec![format!("{}, {}", summary.name, summary.driver.trim())];
+    for case in cases {
+        let started = std::time::Instant::now();
+        for (program, made) in case.plan.compile(&gpu).map_err(|e| e.to_string())? {
+            lines.extend(made.iter().map(|m| {
+                let said: Vec<_> =
+                    m.statistics.iter().map(|(name, value)| format!("{name} {value}")).collect();
+                format!(
+                    "{}, {}: {}, subgroups of {}",
+                    case.name,
+                    program.pass,
+                    said.join(", "),
+                    m.subgroup_size
+                )
+            }));
+        }
+        lines.push(format!("{}: all compiled in {:.1} s", case.name, started.elapsed().as_secs_f64()));
+    }
+    Ok(lines)
+}
+
 impl Table {
     /// One line for each pass and driver: the worst of all cases.
     pub fn markdown(&self) -> String {
