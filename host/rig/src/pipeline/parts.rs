@@ -17,7 +17,7 @@ use crate::plan::link_time::LinkTime;
 use crate::rig::{Rig, RigError};
 use crate::telemetry::monitor::RunMonitor;
 use crate::tracks::{open_for, NoTracker, TrackingStage};
-use dpm_common::clock::MonotonicClock;
+use dpm_common::clock::{MonotonicClock, Stopwatch};
 use dpm_device::link::{HostLink, LinkSettings};
 use dpm_device::time::{HostClock, HostTime};
 use dpm_device::tracker::Tracker;
@@ -30,6 +30,9 @@ use std::sync::Arc;
 /// How long the first frame may take, nanoseconds. Drivers translate shaders for it, which takes minutes on a slow,
 /// busy machine.
 pub(super) const FIRST_FRAME_TIMEOUT_NS: u64 = 180_000_000_000;
+/// A GPU that has been idle for some seconds runs at a fraction of its clock (an H100 at 345 of 1980 MHz) and needs up to
+/// half a second of work to raise it, nanoseconds.
+const WAKE_NS: u64 = 700_000_000;
 
 /// Slots whose shifts wait in the mock to be recorded.
 const MOVES_KEPT: usize = 64;
@@ -131,19 +134,27 @@ impl CrewParts {
         })
     }
 
-    /// Prepares the parts for real pace. They draw two frames that are never shown: the first one absorbs one-time
-    /// work of the driver before a slot depends on it, and the second one measures the time of a frame. From then on
+    /// Prepares the parts for real pace. They draw frames that are never shown: the first one absorbs one-time work of
+    /// the driver before a slot depends on it, a GPU then draws until it has raised its clock, and the last one measures
+    /// the time of a frame. From then on
     /// the ray budget follows the frame times. At virtual pace it must not, because there the pictures may not depend
     /// on the machine's speed.
     ///
     /// # Errors
     /// The GPU does not finish, or is lost.
-    pub(super) fn at_real_pace(mut self, rig: &Rig) -> Result<Self, PipelineError> {
+    pub(super) fn at_real_pace(mut self, rig: &Rig, origin: &Origin) -> Result<Self, PipelineError> {
         let slot = self.memory.first_mut().and_then(|memory| memory.gpu.as_mut());
         if let (Some(renderer), Some(slot)) = (&mut self.renderer, slot) {
-            for _ in 0..2 {
-                self.frame_ns = crate::render::warm_up(slot, rig, renderer, FIRST_FRAME_TIMEOUT_NS)
-                    .map_err(RenderError::from)?;
+            let is_gpu = origin.gpu().is_some_and(|gpu| !gpu.summary().software);
+            let wake_ns = if is_gpu { WAKE_NS } else { 0 };
+            let mut draw = || crate::render::warm_up(slot, rig, renderer, FIRST_FRAME_TIMEOUT_NS);
+            draw().map_err(RenderError::from)?;
+            let watch = Stopwatch::start();
+            loop {
+                self.frame_ns = draw().map_err(RenderError::from)?;
+                if watch.elapsed_ns() >= wake_ns {
+                    break;
+                }
             }
             if rig.config.render.method == RenderMethod::Dpm {
                 self.budget = budget_controller(rig);

@@ -133,7 +133,7 @@ fn crew_parts(
     options: RunOptions,
     clock: MonotonicClock,
 ) -> Result<CrewParts, PipelineError> {
-    CrewParts::new(rig, origin, options, Arc::new(move || clock.now()))?.at_real_pace(rig)
+    CrewParts::new(rig, origin, options, Arc::new(move || clock.now()))?.at_real_pace(rig, origin)
 }
 
 /// Makes crews that take over. A GPU that failed is reopened with the same options.
