@@ -156,6 +156,8 @@ layout(constant_id = 29) const uint PLANE_OF_BITS_20 = 4294967295u;
 layout(constant_id = 30) const uint WALK_STACK = 24u;
 // On GPUs: a pixel may have more than `TRACE_PIXEL_SAMPLES` samples, so that those of a workgroup may take several rounds. The loop over the rounds costs registers even where there is one.
 layout(constant_id = 31) const bool MANY_SAMPLES = true;
+// On GPUs: workgroups of the pass `trace` that keep the whole device busy to the end. A list that has too few samples for so many is cut into shorter ranges, because a lane that takes three samples one after the other while others idle makes the pass longer.
+layout(constant_id = 32) const uint TRACE_GROUPS = 1024u;
 
 struct Frame {
     vec3 projector_position;

@@ -2,6 +2,7 @@
 // lane that is free takes the next sample, whichever pixel it belongs to, and the light of each lies in shared memory until all are done. Then each
 // pixel's samples are added in their order, so that no sum depends on which lane was free.
 #extension GL_KHR_shader_subgroup_ballot : require
+#include "group_samples.glsl"
 
 // For each sample first its pixel, its number among the pixel's samples, and how many those are; while it is traced its pixel, and the index and the
 // seed of its random numbers; then its light, as bits.
@@ -42,10 +43,10 @@ uint find_item(uint sample_index, uint first, uint end) {
 
 void find_range() {
     WorkList list = work_list();
-    uint group = group_index();
-    uint first = find_item(group * TRACE_GROUP_SAMPLES, 0u, list.items);
+    uint group = group_index(), length = group_samples(list.items, list.samples);
+    uint first = find_item(group * length, 0u, list.items);
     // Every item has a sample at least.
-    uint end = find_item((group + 1u) * TRACE_GROUP_SAMPLES, first, min(list.items, first + TRACE_GROUP_SAMPLES));
+    uint end = find_item((group + 1u) * length, first, min(list.items, first + length));
     if (gl_LocalInvocationIndex == 0u) range = Range(first, end, first_sample_of(list, first), first_sample_of(list, end));
 }
 

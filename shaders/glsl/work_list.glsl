@@ -15,13 +15,15 @@ const uint GROUPS_IN_A_ROW = 32768u;
 bool camera_is_eye() { return (frame.flags & FRAME_CAMERA_IS_EYE) != 0u; }
 uint samples_of_camera(uint at) { return surface_at(at).id == NO_HIT ? 1u : frame.spp; }
 
+#include "group_samples.glsl"
+
 // Workgroups of the pass `trace` for a list that ends with these items and samples: on software Vulkan a lane takes an item, on a GPU a workgroup
 // takes the items of a range of samples.
 uint groups_of(uvec2 end) {
 #ifdef TEXEL_TABLES
     return (end.x + TRACE_LANES - 1u) / TRACE_LANES;
 #else
-    return (end.y + TRACE_GROUP_SAMPLES - 1u) / TRACE_GROUP_SAMPLES;
+    return (end.y + group_samples(end.x, end.y) - 1u) / group_samples(end.x, end.y);
 #endif
 }
 

@@ -115,4 +115,7 @@ specialization_constants! {
     /// On GPUs: a pixel may have more than `TRACE_PIXEL_SAMPLES` samples, so that those of a workgroup may take several rounds. The loop over the
     /// rounds costs registers even where there is one.
     MANY_SAMPLES: bool = true;
+    /// On GPUs: workgroups of the pass `trace` that keep the whole device busy to the end. A list that has too few samples for so many is cut into
+    /// shorter ranges, because a lane that takes three samples one after the other while others idle makes the pass longer.
+    TRACE_GROUPS: uint = 1024;
 }

@@ -572,9 +572,21 @@ pub const WORD_ROUGH: u32 = 1 << 31;
 pub const ROUGH_STEP: u32 = 48;
 /// Lanes of a workgroup of the pass `trace`.
 pub const TRACE_LANES: u32 = 64;
-/// On a GPU a workgroup of the pass `trace` takes the pixels whose first sample lies in its own range of so many: a little below three a lane,
-/// because the samples of the last pixel may reach beyond the range.
+/// On a GPU a workgroup of the pass `trace` takes the pixels whose first sample lies in its own range of at most so many: a little below three a
+/// lane, because the samples of the last pixel may reach beyond the range.
 pub const TRACE_GROUP_SAMPLES: u32 = 180;
+
+/// How long the range of a workgroup of the pass `trace` is on a GPU that wants `groups` of them, for a list of so many items and samples. As
+/// `shaders/glsl/group_samples.glsl`.
+pub fn group_samples([items, samples]: [u32; 2], groups: u32) -> u32 {
+    let each = samples / groups.max(1);
+    match samples.div_ceil(items.max(1)) {
+        0..=2 if each <= TRACE_LANES => TRACE_LANES - 4,
+        0..=4 if each <= 2 * TRACE_LANES => 2 * TRACE_LANES - 8,
+        _ => TRACE_GROUP_SAMPLES,
+    }
+}
+
 /// Samples of a pixel, unless [`crate::specialization::MANY_SAMPLES`] is set.
 pub const TRACE_PIXEL_SAMPLES: u32 = 128;
 /// Samples for whose light such a workgroup has room: those of its range, and those of the last pixel beyond it.

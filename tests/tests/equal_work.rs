@@ -4,7 +4,7 @@
 use dpm_device::planes::Raster;
 use dpm_lab::lanes::{Lanes, WIDTHS};
 use dpm_lab::sequence::{draw, poses_at};
-use dpm_render::{FrameCost, Keep, Renderer, RendererSettings};
+use dpm_render::{trace_groups, FrameCost, Keep, Renderer, RendererSettings};
 use dpm_rig::config::RenderMethod;
 use dpm_rig::pipeline::renderer_settings;
 use dpm_rig::rig::Rig;
@@ -19,6 +19,8 @@ struct Drawn {
     work: Vec<WorkItem>,
     samples: u32,
     cost: FrameCost,
+    /// Workgroups that keep the device busy.
+    wanted: u32,
 }
 
 /// The fourth frame of `rig` by a method, with `spp` samples a pixel or on average; `storage_tables`: as GPUs draw it.
@@ -42,6 +44,7 @@ fn drawn(rig: &Rig, which: RenderMethod, spp: u32, storage_tables: bool) -> Draw
                 work: work.to_vec(),
                 samples,
                 cost,
+                wanted: trace_groups(gpu.summary()),
             });
         }
     });
@@ -67,7 +70,9 @@ fn every_sample_is_traced_once_and_lanes_are_busy() {
         if which != RenderMethod::Dpm {
             assert_eq!(traced, [gpu.samples; 2], "{what}");
         }
-        for lanes in WIDTHS.map(|width| Lanes::of(&gpu.work, gpu.samples, width).expect("there is work")) {
+        for lanes in
+            WIDTHS.map(|width| Lanes::of(&gpu.work, gpu.samples, width, gpu.wanted).expect("there is work"))
+        {
             assert!(lanes.busy >= 0.8 && lanes.longest <= 8, "{what}: {lanes:?}");
         }
     }

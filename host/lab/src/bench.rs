@@ -7,7 +7,9 @@ use crate::error::plan::switched_method_of;
 use crate::gpu_model::{modelled, FrameWork, Modelled};
 use crate::lanes::{Lanes, WIDTHS};
 use dpm_render::gpu::Gpu;
-use dpm_render::{traffic, FrameCost, Keep, Output, RenderError, Renderer, RendererSettings, PASSES};
+use dpm_render::{
+    trace_groups, traffic, FrameCost, Keep, Output, RenderError, Renderer, RendererSettings, PASSES,
+};
 use dpm_rig::config::RenderMethod;
 use dpm_rig::pipeline::{output, renderer_settings};
 use dpm_rig::rig::Rig;
@@ -26,6 +28,8 @@ pub const METHODS: [RenderMethod; 5] = [
 
 /// Frames drawn before those that count: histories fill, the driver settles.
 const WARM_UP: u32 = 4;
+/// A GPU that has just been idle runs at a fraction of its clock and needs a while to raise it, so it draws for this long before anything counts.
+const WAKE: Duration = Duration::from_millis(1000);
 /// So many frames are measured however slow the device is ...
 const FEWEST: usize = 3;
 /// ... and no more once a method has taken this long.
@@ -109,6 +113,9 @@ fn measure(rig: &Rig, gpu: &Arc<Gpu>, frames: u32, which: RenderMethod) -> Resul
     let spp = rig.config.render.spp;
     let method = switched_method_of(&rig.config.render, which);
     let settings = RendererSettings { method, output: output(rig, gpu, false), ..renderer_settings(rig) };
+    if !gpu.summary().software {
+        wake(rig, gpu, settings.clone())?;
+    }
     let mut renderer = Renderer::new(gpu, &rig.scene, settings)?;
     let mut slot = renderer.create_slot(false)?;
     let (mut costs, mut walls): (Vec<FrameCost>, Vec<f64>) = (Vec::new(), Vec::new());
@@ -125,7 +132,8 @@ fn measure(rig: &Rig, gpu: &Arc<Gpu>, frames: u32, which: RenderMethod) -> Resul
             }
         }
     }
-    let work = count_work(rig, &mut renderer, (costs.len() as u32 + WARM_UP, which))?;
+    let work =
+        count_work(rig, &mut renderer, (costs.len() as u32 + WARM_UP, which), trace_groups(gpu.summary()))?;
     let n = costs.len() as f64;
     let mean = |of: &dyn Fn(&FrameCost) -> u64| costs.iter().map(of).sum::<u64>() as f64 / n;
     let rays_per_frame = mean(&|c| u64::from(c.counters().rays));
@@ -153,11 +161,24 @@ fn measure(rig: &Rig, gpu: &Arc<Gpu>, frames: u32, which: RenderMethod) -> Resul
     })
 }
 
+/// Draws frames that do not count, until the GPU has the clock at which it will draw those that do.
+fn wake(rig: &Rig, gpu: &Arc<Gpu>, settings: RendererSettings) -> Result<(), RenderError> {
+    let spp = rig.config.render.spp;
+    let mut renderer = Renderer::new(gpu, &rig.scene, settings)?;
+    let mut slot = renderer.create_slot(false)?;
+    let started = Instant::now();
+    for k in (0..).take_while(|_| started.elapsed() < WAKE) {
+        draw(rig, &mut renderer, &mut slot, &poses_at(rig, u64::from(k)), k, spp, spp as f32)?;
+    }
+    Ok(())
+}
+
 /// Draws one more frame and counts its work. Its time does not count.
 fn count_work(
     rig: &Rig,
     renderer: &mut Renderer,
     (frame, which): (u32, RenderMethod),
+    wanted: u32,
 ) -> Result<FrameWork, RenderError> {
     let spp = rig.config.render.spp;
     let mut slot = renderer.create_slot(true)?;
@@ -165,7 +186,7 @@ fn count_work(
     let (items, samples) = slot.work().unwrap_or((&[], 0));
     let traffic = traffic(&settings_of_planes(rig, which), Keep::default());
     Ok(FrameWork {
-        lanes: WIDTHS.iter().filter_map(|width| Lanes::of(items, samples, *width)).collect(),
+        lanes: WIDTHS.iter().filter_map(|width| Lanes::of(items, samples, *width, wanted)).collect(),
         listed_pixels: slot.listed_pixels(),
         bytes_per_pixel: traffic.iter().map(|t| t.read + t.written).sum(),
         recorded_passes: traffic.len() as u32,

@@ -4,7 +4,7 @@
 //! after the other (`shaders/glsl/trace_gpu.glsl`). The lanes of a subgroup end together, so those that have one sample
 //! less than another wait for it.
 
-use dpm_shaders::structs::{WorkItem, TRACE_GROUP_SAMPLES, TRACE_LANES, TRACE_SLOTS};
+use dpm_shaders::structs::{group_samples, WorkItem, TRACE_LANES, TRACE_SLOTS};
 use serde::Serialize;
 
 /// Widths of the subgroups of GPUs: NVIDIA's and AMD's narrow one, AMD's wide one.
@@ -24,10 +24,10 @@ pub struct Lanes {
 
 impl Lanes {
     /// Of the list `work`, in the order of the samples, which are so many together, with subgroups of `width` lanes, at
-    /// most those of a workgroup; `None` without work.
-    pub fn of(work: &[WorkItem], samples: u32, width: usize) -> Option<Self> {
+    /// most those of a workgroup, on a GPU that wants `wanted` workgroups; `None` without work.
+    pub fn of(work: &[WorkItem], samples: u32, width: usize, wanted: u32) -> Option<Self> {
         let (mut room, mut longest) = (0, 0);
-        for group in groups(work, samples) {
+        for group in groups(work, samples, wanted) {
             // The samples that each lane takes of a round: the first lanes may have one more than the last.
             let rounds = (0..group).step_by(TRACE_SLOTS as usize).map(|done| (group - done).min(TRACE_SLOTS));
             let taken = |n: u32, lane: u32| n.saturating_sub(lane).div_ceil(TRACE_LANES);
@@ -41,8 +41,9 @@ impl Lanes {
 }
 
 /// The samples of each workgroup that has any.
-fn groups(work: &[WorkItem], samples: u32) -> Vec<u32> {
-    let group_of = |item: &WorkItem| item.first / TRACE_GROUP_SAMPLES;
+fn groups(work: &[WorkItem], samples: u32, wanted: u32) -> Vec<u32> {
+    let length = group_samples([work.len() as u32, samples], wanted);
+    let group_of = |item: &WorkItem| item.first / length;
     let firsts: Vec<u32> =
         work.chunk_by(|a, b| group_of(a) == group_of(b)).map(|group| group[0].first).collect();
     let ends = firsts.iter().skip(1).chain(std::iter::once(&samples));
@@ -53,7 +54,12 @@ fn groups(work: &[WorkItem], samples: u32) -> Vec<u32> {
 mod tests {
     use super::*;
 
+    /// On a GPU that is busy with two workgroups, or with `wanted`.
     fn lanes(spp: &[u32], width: usize) -> Option<Lanes> {
+        lanes_where(spp, width, 2)
+    }
+
+    fn lanes_where(spp: &[u32], width: usize, wanted: u32) -> Option<Lanes> {
         let mut samples = 0;
         let list: Vec<_> = (0..)
             .zip(spp)
@@ -62,7 +68,7 @@ mod tests {
                 WorkItem { pixel, first: samples - n }
             })
             .collect();
-        Lanes::of(&list, samples, width)
+        Lanes::of(&list, samples, width, wanted)
     }
 
     #[test]
@@ -72,6 +78,11 @@ mod tests {
             assert_eq!(lanes(&[1; 360], width), Some(Lanes { width, busy: 0.9375, longest: 3 }));
         }
         assert_eq!(lanes(&[2; 180], 32), lanes(&[1; 360], 32));
+        // A GPU with room for more gets six workgroups of 60 samples, so that no lane has more than one.
+        for width in WIDTHS {
+            let each = Lanes { width, busy: 0.9375, longest: 1 };
+            assert_eq!(lanes_where(&[1; 360], width, 100), Some(each));
+        }
         assert_eq!(lanes(&[], 32), None);
     }
 

@@ -42,7 +42,7 @@ pub mod warp;
 
 pub use memory::least_memory_bytes;
 pub use passes::{traffic, Traffic, PASSES};
-pub use plan::{Program, RendererPlan};
+pub use plan::{trace_groups, Program, RendererPlan};
 pub use renderer::Renderer;
 pub use scene_data::Keep;
 pub use settings::{FrameInputs, Output, RenderError, RendererSettings};

@@ -3,7 +3,7 @@
 use super::error::GpuError;
 use super::pipeline::{shared_bindings, BindingKind};
 use super::GpuOptions;
-use ash::{khr, vk};
+use ash::{amd, khr, nv, vk};
 use std::ffi::CStr;
 
 /// A device as `dpm doctor` lists it.
@@ -29,6 +29,8 @@ pub struct DeviceSummary {
     pub timestamp_period_ns: f32,
     /// Lanes in a subgroup.
     pub subgroup_size: u32,
+    /// Multiprocessors (NVIDIA) or compute units (AMD); `None`: the driver does not say.
+    pub processors: Option<u32>,
     /// Frames go to a queue that does not draw, so they do not share its time with a desktop.
     pub own_queue: bool,
 }
@@ -186,6 +188,28 @@ fn own_memory(instance: &ash::Instance, physical: vk::PhysicalDevice) -> u64 {
     own.map(|h| h.size).max().unwrap_or(0)
 }
 
+/// How many multiprocessors or compute units there are, if the driver says so in its maker's way.
+fn processors(instance: &ash::Instance, physical: vk::PhysicalDevice) -> Option<u32> {
+    let mut nvidia = vk::PhysicalDeviceShaderSMBuiltinsPropertiesNV::default();
+    let mut amd = vk::PhysicalDeviceShaderCorePropertiesAMD::default();
+    let (has_nvidia, has_amd) = (
+        has_extension(instance, physical, nv::shader_sm_builtins::NAME),
+        has_extension(instance, physical, amd::shader_core_properties::NAME),
+    );
+    let mut props = vk::PhysicalDeviceProperties2::default();
+    if has_nvidia {
+        props = props.push_next(&mut nvidia);
+    }
+    if has_amd {
+        props = props.push_next(&mut amd);
+    }
+    // SAFETY: `props` chains valid structures, of extensions that the device has.
+    unsafe { instance.get_physical_device_properties2(physical, &mut props) };
+    let units =
+        amd.shader_engine_count * amd.shader_arrays_per_engine_count * amd.compute_units_per_shader_array;
+    Some(nvidia.shader_sm_count.max(units)).filter(|&n| n > 0)
+}
+
 /// The first Mesa whose driver for AMD's GPUs was seen to compile every pass without spilling a register (docs/lab/GPU.md).
 const GOOD_RADV: u32 = 25;
 
@@ -259,6 +283,7 @@ fn summarise(
             0.0
         },
         subgroup_size: subgroup.subgroup_size,
+        processors: processors(instance, physical),
         own_queue: compute_family(instance, physical)
             .is_some_and(|family| !draws(instance, physical, family)),
     };
