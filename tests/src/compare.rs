@@ -72,3 +72,32 @@ impl Demands for Comparison {
         }
     }
 }
+
+/// The bits of a picture.
+pub fn bits(radiance: &[[f32; 4]]) -> Vec<[u32; 4]> {
+    radiance.iter().map(|r| r.map(f32::to_bits)).collect()
+}
+
+/// Largest share of pixels that two programs of one method may draw differently on a GPU.
+const OTHERWISE: f64 = 0.02;
+
+/// Checks that two programs drew the same picture: on software Vulkan bit for bit. The compilers of GPUs join a
+/// multiplication and an addition into one operation, in each program where it suits them. So there a pixel is the same
+/// up to rounding, and few pixels may differ by more, where rounding has decided a branch.
+///
+/// # Panics
+/// The pictures differ: a failure of the test.
+pub fn assert_same_picture(gpu: &Gpu, a: &[[f32; 4]], b: &[[f32; 4]], what: &str) {
+    let (a_bits, b_bits) = (bits(a), bits(b));
+    let otherwise = a_bits.iter().zip(&b_bits).filter(|(a, b)| a != b).count();
+    if gpu.summary().software {
+        assert_eq!(otherwise, 0, "{what}: pixels that differ");
+        return;
+    }
+    let differs = |(a, b): &(&f32, &f32)| (*a - *b).abs() > 1e-4 + 1e-3 * a.abs();
+    let more = a.iter().zip(b).filter(|(a, b)| a[..3].iter().zip(&b[..3]).any(|pair| differs(&pair))).count();
+    let mean = |p: &[[f32; 4]]| p.iter().map(|r| f64::from(r[1])).sum::<f64>() / p.len() as f64;
+    println!("{what}: {otherwise} of {} pixels differ, {more} by more than rounding", a.len());
+    assert!(more as f64 <= OTHERWISE * a.len() as f64, "{what}: {more} of {} pixels differ", a.len());
+    assert!((mean(a) - mean(b)).abs() <= 0.01 * mean(a), "{what}: {} and {}", mean(a), mean(b));
+}

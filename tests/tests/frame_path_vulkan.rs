@@ -29,7 +29,10 @@ fn rendered_frames_only_wait_and_wake_and_the_driver_does_what_is_listed() {
     }
     let seen = frame_law::seen();
     println!("{}\n{}", gpu.summary().driver, seen.table(frames));
-    let driver: &[&str] =
-        if gpu.summary().software { &SOFTWARE_DRIVER } else { &["memory", "pthread_mutex_lock", "ioctl"] };
+    let driver: &[&str] = if gpu.summary().software {
+        &SOFTWARE_DRIVER
+    } else {
+        &["memory", "pthread_mutex_lock", "ioctl", "poll"]
+    };
     seen.check(&[], &[(Place::Vulkan, driver)]);
 }

@@ -1,5 +1,5 @@
 //! What a scene does not need is compiled away, and tables are read in the way that suits the device. This may affect
-//! only the speed: every pixel stays the same, bit for bit.
+//! only the speed: every pixel stays the same, on software Vulkan bit for bit.
 
 use dpm_lab::scene_plan::scene_plan;
 use dpm_lab::sequence::{draw, poses_at};
@@ -11,6 +11,7 @@ use dpm_rig::pipeline::renderer_settings;
 use dpm_rig::rig::Rig;
 use dpm_scene::shapes::*;
 use dpm_scene::{Material, PunctualKind, PunctualLight, Scene};
+use dpm_tests::compare::{assert_same_picture, bits};
 use dpm_tests::gpu::with_gpu;
 use glam::{DVec3, Vec3};
 
@@ -87,20 +88,18 @@ fn leaving_out_changes_no_bit() {
             };
             let lean = shot.draw(gpu);
             let full = Shot { leave_nothing_out: true, ..shot.clone() }.draw(gpu);
-            let bits = |p: &dpm_lab::stability::gpu_shot::Picture| -> Vec<[u32; 4]> {
-                p.radiance.iter().map(|r| r.map(f32::to_bits)).collect()
-            };
             let lit = lean.lit_estimates().count();
             assert!(lit > 200, "{name}: {lit}");
             assert!(lean.radiance.iter().any(|r| r[0] > 0.0), "{name} is black");
-            assert_eq!(lean.surfaces, full.surfaces, "{name}");
-            let (a, b) = (bits(&lean), bits(&full));
-            let different = a.iter().zip(&b).filter(|(a, b)| a != b).count();
-            assert_eq!(different, 0, "{name}: pixels that differ");
-            assert_eq!(lean.codes, full.codes, "{name}");
-            assert_eq!(lean.counters, full.counters, "{name}");
+            assert_same_picture(gpu, &lean.radiance, &full.radiance, name);
+            if gpu.summary().software {
+                assert_eq!(lean.surfaces, full.surfaces, "{name}");
+                assert_eq!(lean.codes, full.codes, "{name}");
+                assert_eq!(lean.counters, full.counters, "{name}");
+            }
             let stored = shot.draw_keeping(gpu, Keep { storage_tables: true, ..Keep::default() });
-            assert_eq!((&a, &lean.codes), (&bits(&stored), &stored.codes), "{name}: tables in storage");
+            assert_eq!(bits(&lean.radiance), bits(&stored.radiance), "{name}: tables in storage");
+            assert_eq!(lean.codes, stored.codes, "{name}: tables in storage");
         }
     });
 }
@@ -129,21 +128,22 @@ fn neither_changes_a_bit_of_a_method_with_histories() {
                 for frame in 0..6 {
                     let poses = poses_at(&rig, u64::from(frame));
                     draw(&rig, &mut renderer, &mut slot, &poses, frame, 2, 2.0).expect("the frame ends");
-                    let bits = |r: &[f32; 4]| r.map(f32::to_bits);
-                    let radiance: Vec<_> = slot.radiance().expect("a debug slot").iter().map(bits).collect();
-                    frames.push((radiance, slot.codes().to_vec()));
+                    frames.push((slot.radiance().expect("a debug slot").to_vec(), slot.codes().to_vec()));
                 }
                 frames
             };
             let lean = shown(false, false);
             let (full, stored) = (shown(true, false), shown(false, true));
             for (frame, (lean, full)) in lean.iter().zip(&full).enumerate() {
-                assert!(*lean == stored[frame], "{which:?}, frame {frame}: tables in storage");
+                let what = format!("{which:?}, frame {frame}");
+                assert_eq!(bits(&lean.0), bits(&stored[frame].0), "{what}: tables in storage");
+                assert_eq!(lean.1, stored[frame].1, "{what}: tables in storage");
                 let lit = lean.1.iter().filter(|c| **c != 0).count();
-                assert!(lit > 50, "{which:?}, frame {frame}: {lit} pixels are lit");
-                let different = lean.0.iter().zip(&full.0).filter(|(a, b)| a != b).count();
-                assert_eq!(different, 0, "{which:?}, frame {frame}: pixels that differ");
-                assert_eq!(lean.1, full.1, "{which:?}, frame {frame}");
+                assert!(lit > 50, "{what}: {lit} pixels are lit");
+                assert_same_picture(gpu, &lean.0, &full.0, &what);
+                if gpu.summary().software {
+                    assert_eq!(lean.1, full.1, "{what}");
+                }
             }
         }
     });

@@ -3,15 +3,17 @@
 //! pixel waits forever, and that broken histories are forgotten.
 
 use dpm_device::planes::Raster;
-use dpm_lab::sequence::{eye_mean, rmse, Span, Theatre};
+use dpm_lab::sequence::{eye_mean, poses_at, rmse, submit, Span, Theatre, FRAME_WAIT_NS};
 use dpm_render::gpu::{validation_messages, Gpu};
 use dpm_render::method::{Method, SamplerKind};
-use dpm_render::{FrameInputs, Renderer, RendererSettings};
+use dpm_render::{FrameInputs, Output, Overlapping, Renderer, RendererSettings};
 use dpm_rig::config::{Overrides, RenderMethod, RigConfig};
 use dpm_rig::pipeline::renderer_settings;
 use dpm_rig::rig::{affine, Rig};
 use dpm_rig::run_rig::{open_gpu, traced_raster};
 use dpm_scene::geometry::projector::ProjectorCamera;
+use dpm_tests::gpu::with_gpu;
+use dpm_tests::rigs::demo_rig;
 use glam::{DAffine3, DVec3};
 use std::sync::Arc;
 
@@ -184,4 +186,44 @@ fn what_a_frame_shows_does_not_depend_on_the_slot_that_draws_it() {
         }
     }
     no_validation_messages();
+}
+
+/// The codes of ten frames of bodies that move, of which three are on their way at any time.
+fn codes_in_line(gpu: &Arc<Gpu>, which: RenderMethod, overlap: Overlapping) -> Vec<Vec<u32>> {
+    let rig = demo_rig(96, 72, &[]);
+    let mut render = rig.config.render.clone();
+    render.method = which;
+    let output = Output::Both(rig.schedule);
+    let settings =
+        RendererSettings { method: render.to_method(), output, overlap, ..renderer_settings(&rig) };
+    let mut renderer = Renderer::new(gpu, &rig.scene, settings).expect("the demo fits the GPU");
+    let mut slots: Vec<_> = (0..3).map(|_| renderer.create_slot(false).expect("memory")).collect();
+    let mut codes = Vec::new();
+    for k in 0..13 {
+        let slot = &mut slots[k % 3];
+        if k >= 3 {
+            let cost = slot.wait(FRAME_WAIT_NS).expect("the frame ends");
+            codes.push(slot.codes().to_vec());
+            assert_eq!(cost.overlaps, overlap == Overlapping::Always);
+            assert!(cost.occupied_ns() > 0 || gpu.summary().timestamp_period_ns == 0.0);
+        }
+        if k < 10 {
+            let poses = poses_at(&rig, 8 * k as u64);
+            submit(&rig, &mut renderer, slot, &poses, k as u32, 2, 2.0).expect("the frame begins");
+        }
+    }
+    codes
+}
+
+/// Also where the device has one queue, to which the parts of frames then go in the order that semaphores give them.
+#[test]
+fn frames_that_overlap_show_what_frames_one_after_the_other_show() {
+    with_gpu(|gpu| {
+        for which in [RenderMethod::Dpm, RenderMethod::Paper, RenderMethod::Full] {
+            let [alone, together] =
+                [Overlapping::Never, Overlapping::Always].map(|overlap| codes_in_line(gpu, which, overlap));
+            assert!(alone.len() == 10 && alone[9].iter().any(|&code| code != 0), "{which:?}");
+            assert!(alone == together, "{which:?}: the pictures differ");
+        }
+    });
 }

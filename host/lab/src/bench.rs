@@ -1,7 +1,7 @@
 //! A rig into what each method costs on this device: rays, samples, and milliseconds of every pass.
 
 use super::median::{median, median_ms};
-use super::sequence::{draw, poses_at};
+use super::sequence::{draw, poses_at, submit, FRAME_WAIT_NS};
 use super::stamp::Stamp;
 use crate::error::plan::switched_method_of;
 use crate::gpu_model::{modelled, FrameWork, Modelled};
@@ -30,6 +30,8 @@ pub const METHODS: [RenderMethod; 5] = [
 const WARM_UP: u32 = 4;
 /// A GPU that has just been idle runs at a fraction of its clock and needs a while to raise it, so it draws for this long before anything counts.
 const WAKE: Duration = Duration::from_millis(1000);
+/// Frames on their way to measure how fast they follow each other, as many as in a rig.
+const IN_LINE: u32 = 3;
 /// So many frames are measured however slow the device is ...
 const FEWEST: usize = 3;
 /// ... and no more once a method has taken this long.
@@ -64,6 +66,8 @@ pub struct MethodCost {
     pub gpu_ms: Option<f64>,
     /// From recording to the end of waiting, ms.
     pub wall_ms: f64,
+    /// From the end of a frame to the end of the next one while [`IN_LINE`] frames are on their way, ms. This is what bounds the frame rate.
+    pub in_line_ms: f64,
     /// Rays by `gpu_ms`, or by `wall_ms` where there are no time stamps, 1/s.
     pub rays_per_s: f64,
     /// Samples in the same way, 1/s.
@@ -134,6 +138,7 @@ fn measure(rig: &Rig, gpu: &Arc<Gpu>, frames: u32, which: RenderMethod) -> Resul
     }
     let work =
         count_work(rig, &mut renderer, (costs.len() as u32 + WARM_UP, which), trace_groups(gpu.summary()))?;
+    let in_line_ms = in_line(rig, &mut renderer, costs.len() as u32)?;
     let n = costs.len() as f64;
     let mean = |of: &dyn Fn(&FrameCost) -> u64| costs.iter().map(of).sum::<u64>() as f64 / n;
     let rays_per_frame = mean(&|c| u64::from(c.counters().rays));
@@ -155,6 +160,7 @@ fn measure(rig: &Rig, gpu: &Arc<Gpu>, frames: u32, which: RenderMethod) -> Resul
         work,
         gpu_ms,
         wall_ms,
+        in_line_ms,
         rays_per_s: rays_per_frame / seconds,
         samples_per_s: samples_per_frame / seconds,
         passes: if gpu_ms.is_some() { passes.collect() } else { Vec::new() },
@@ -171,6 +177,26 @@ fn wake(rig: &Rig, gpu: &Arc<Gpu>, settings: RendererSettings) -> Result<(), Ren
         draw(rig, &mut renderer, &mut slot, &poses_at(rig, u64::from(k)), k, spp, spp as f32)?;
     }
     Ok(())
+}
+
+/// Mean distance of so many frames that stand in line, ms. They are of the first poses, and continue the renderer's histories.
+fn in_line(rig: &Rig, renderer: &mut Renderer, frames: u32) -> Result<f64, RenderError> {
+    let spp = rig.config.render.spp;
+    let mut slots = (0..IN_LINE).map(|_| renderer.create_slot(false)).collect::<Result<Vec<_>, _>>()?;
+    let mut started = Instant::now();
+    for k in 0..frames + IN_LINE {
+        if k == IN_LINE {
+            started = Instant::now();
+        }
+        let slot = &mut slots[(k % IN_LINE) as usize];
+        if k >= IN_LINE {
+            slot.wait(FRAME_WAIT_NS)?;
+        }
+        submit(rig, renderer, slot, &poses_at(rig, u64::from(k)), WARM_UP + frames + k, spp, spp as f32)?;
+    }
+    let seconds = started.elapsed().as_secs_f64();
+    slots.iter_mut().try_for_each(|slot| slot.wait(FRAME_WAIT_NS).map(drop))?;
+    Ok(seconds * 1e3 / f64::from(frames))
 }
 
 /// Draws one more frame and counts its work. Its time does not count.

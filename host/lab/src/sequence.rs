@@ -319,10 +319,29 @@ pub fn draw(
     spp: u32,
     budget_spp: f32,
 ) -> Result<FrameCost, GpuError> {
+    submit(rig, renderer, slot, poses, frame, spp, budget_spp)?;
+    slot.wait(FRAME_WAIT_NS)
+}
+
+/// How long to wait for a frame, nanoseconds.
+pub const FRAME_WAIT_NS: u64 = 120_000_000_000;
+
+/// As [`draw`], but does not wait for the end.
+///
+/// # Errors
+/// The renderer's.
+pub fn submit(
+    rig: &Rig,
+    renderer: &mut Renderer,
+    slot: &mut FrameSlot,
+    poses: &[DAffine3],
+    frame: u32,
+    spp: u32,
+    budget_spp: f32,
+) -> Result<(), GpuError> {
     let tracked = tracked_poses(rig, poses);
     let still = FrameInputs::new(&rig.camera, rig.observer.eye_and_gaze(&tracked), poses);
-    renderer.submit(slot, &FrameInputs { frame, spp, budget_spp, ..still })?;
-    slot.wait(120_000_000_000)
+    renderer.submit(slot, &FrameInputs { frame, spp, budget_spp, ..still })
 }
 
 /// Mean over the last `window` frames at every probe, frames without light left out: what an eye of that integration time saw.

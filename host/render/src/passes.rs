@@ -20,6 +20,8 @@ pub(super) struct Pass {
     pub grid: Grid,
     /// Its rays walk through the scene.
     pub walks: bool,
+    /// The next frame may begin meanwhile: it needs nothing that this pass writes, and writes nothing that it reads.
+    pub overlaps: bool,
 }
 
 /// The shader of a pass.
@@ -73,6 +75,7 @@ pub(super) const TABLE: [Pass; 12] = [
         when: |_, _| true,
         grid: Grid::Tiles,
         walks: true,
+        overlaps: false,
     },
     Pass {
         name: "reproject",
@@ -91,6 +94,7 @@ pub(super) const TABLE: [Pass; 12] = [
         when: |s, _| s.method.needs_history(),
         grid: Grid::Tiles,
         walks: false,
+        overlaps: false,
     },
     Pass {
         name: "rate map",
@@ -102,6 +106,7 @@ pub(super) const TABLE: [Pass; 12] = [
         when: |s, keep| s.method.needs_rates() || keep.rate_map && s.method.needs_history(),
         grid: Grid::Rates,
         walks: false,
+        overlaps: false,
     },
     Pass {
         name: "schedule",
@@ -120,6 +125,7 @@ pub(super) const TABLE: [Pass; 12] = [
         when: |_, _| true,
         grid: Grid::Tiles,
         walks: false,
+        overlaps: false,
     },
     Pass {
         name: "trace",
@@ -131,6 +137,7 @@ pub(super) const TABLE: [Pass; 12] = [
         when: |_, _| true,
         grid: Grid::Work,
         walks: true,
+        overlaps: false,
     },
     Pass {
         name: "accumulate",
@@ -149,6 +156,7 @@ pub(super) const TABLE: [Pass; 12] = [
         when: |s, _| s.method.needs_history(),
         grid: Grid::Tiles,
         walks: false,
+        overlaps: false,
     },
     Pass {
         name: "spatial",
@@ -167,6 +175,7 @@ pub(super) const TABLE: [Pass; 12] = [
         when: |s, _| s.method.needs_spatial(),
         grid: Grid::Tiles,
         walks: false,
+        overlaps: true,
     },
     Pass {
         name: "compensate",
@@ -178,6 +187,7 @@ pub(super) const TABLE: [Pass; 12] = [
         when: |_, _| true,
         grid: Grid::Tiles,
         walks: false,
+        overlaps: true,
     },
     Pass {
         name: "halftone",
@@ -189,6 +199,7 @@ pub(super) const TABLE: [Pass; 12] = [
         when: |s, _| s.halftone.is_some(),
         grid: Grid::Tiles,
         walks: false,
+        overlaps: true,
     },
     Pass {
         name: "motion",
@@ -200,6 +211,7 @@ pub(super) const TABLE: [Pass; 12] = [
         when: |s, _| !s.plane_groups.is_empty(),
         grid: Grid::Moving,
         walks: false,
+        overlaps: true,
     },
     Pass {
         name: "warp",
@@ -211,6 +223,7 @@ pub(super) const TABLE: [Pass; 12] = [
         when: |s, _| !s.plane_groups.is_empty(),
         grid: Grid::Moving,
         walks: false,
+        overlaps: true,
     },
     Pass {
         name: "pack",
@@ -218,8 +231,18 @@ pub(super) const TABLE: [Pass; 12] = [
         when: |s, _| s.output.schedule().is_some(),
         grid: Grid::Planes,
         walks: false,
+        overlaps: true,
     },
 ];
+
+/// Passes before those that overlap with the next frame. They end a frame: none of the others comes after them.
+pub(super) const FIRST_PASSES: usize = {
+    let mut i = 0;
+    while !TABLE[i].overlaps {
+        i += 1;
+    }
+    i
+};
 
 /// Names of the passes whose ends have time stamps, in order. The last one copies what the host reads.
 pub const PASSES: &[&str] = &{
@@ -420,6 +443,23 @@ mod tests {
         }
     }
 
+    /// What the next frame reads or writes meanwhile, no pass that overlaps with it writes. These are the buffers of which a renderer has one for all
+    /// frames, but for the history that such passes read: a frame that would write it waits.
+    #[test]
+    fn passes_that_overlap_with_the_next_frame_end_a_frame_and_keep_away_from_what_it_uses() {
+        assert!(TABLE[FIRST_PASSES..].iter().all(|pass| pass.overlaps));
+        for (pass, kernel) in kernels(true).chain(kernels(false)) {
+            let overlaps = TABLE.iter().any(|row| row.name == pass && row.overlaps);
+            for name in ["B_HISTORY", "B_FORMER", "B_RATES"] {
+                assert!(!overlaps || !kernel.writes.contains(&name), "{pass} writes {name}");
+                assert!(
+                    !overlaps || name == "B_HISTORY" || !kernel.reads.contains(&name),
+                    "{pass} reads {name}"
+                );
+            }
+        }
+    }
+
     /// A shader that no method runs would be dead, and one that a row names twice is likely a slip.
     #[test]
     fn every_shader_belongs_to_one_pass() {
@@ -455,6 +495,7 @@ mod tests {
             halftone: None,
             plane_groups: Vec::new(),
             output: crate::Output::Planes(dpm_device::planes::PlaneSchedule::rgb24()),
+            overlap: crate::Overlapping::Never,
         }
     }
 

@@ -5,16 +5,18 @@ use super::frame_buffers::FrameBuffers;
 use super::last_frame::{LastFrame, Turn};
 use super::memory::SharedBuffers;
 use super::optics::OpticsLayout;
-use super::passes::{Grid, PASSES, TABLE};
+use super::passes::{Grid, FIRST_PASSES, PASSES, TABLE};
 use super::plan::{Pipelines, RendererPlan};
 use super::resources::Resources;
 use super::scene_data::{rows, world_bounds, Keep, SceneData};
 use super::scene_gpu::SceneGpu;
-use super::settings::{FrameInputs, RenderError, RendererSettings};
+use super::settings::{FrameInputs, Overlapping, RenderError, RendererSettings};
 use super::slot::FrameSlot;
 use super::tiles::TileList;
 use super::warp::Movers;
-use crate::gpu::{BindingSet, CommandList, FrameFence, Gpu, GpuError, Recorder};
+use crate::gpu::{
+    submit_frame, BindingSet, CommandList, FrameFence, Gpu, GpuError, Order, Overlap, Recorder,
+};
 use crate::pack;
 use bytemuck::Zeroable;
 use dpm_scene::Scene;
@@ -49,6 +51,10 @@ pub struct Renderer {
     tile_list: TileList,
     /// The bodies that move while the planes of a frame last.
     movers: Movers,
+    /// Number of the last frame that was to be submitted, which orders frames that overlap.
+    numbered: u64,
+    /// For each of the two histories the last frame that has it, by that number.
+    ended_by_parity: [u64; 2],
     optics: OpticsLayout,
     pub(super) gpu: Arc<Gpu>,
 }
@@ -102,12 +108,18 @@ impl Renderer {
         let Pipelines { table, each: pipelines } = plan.pipelines(gpu)?;
         let decides_rates =
             TABLE.iter().zip(&pipelines).any(|(pass, p)| pass.grid == Grid::Rates && p.is_some());
+        let overlaps = match settings.overlap {
+            Overlapping::Never => false,
+            Overlapping::WhereItCan => gpu.has_two_queues(),
+            Overlapping::Always => true,
+        };
+        let overlap = overlaps.then(|| Overlap::new(gpu)).transpose()?;
         let last = LastFrame::none(tracked.len());
         let tile_list = TileList::new(settings.raster, settings.lens.as_ref());
         let rated = vec![false; tile_list.len()];
         let movers = Movers::new(data.bodies.len(), &settings.plane_groups, !settings.shows_halftones());
         Ok(Self {
-            resources: Arc::new(Resources { pipelines, table, shared, scene: scene_gpu }),
+            resources: Arc::new(Resources { pipelines, table, shared, scene: scene_gpu, overlap }),
             data,
             settings,
             keep,
@@ -117,6 +129,8 @@ impl Renderer {
             rated,
             tile_list,
             movers,
+            numbered: 0,
+            ended_by_parity: [0; 2],
             optics,
             gpu: gpu.clone(),
         })
@@ -165,13 +179,22 @@ impl Renderer {
             BindingSet::new(&resources.table, &bindings)
         };
         let sets = [set_of(0)?, set_of(1)?];
-        let list = |parity: usize| {
-            CommandList::record(gpu, PASSES.len() as u32 + 1, |r| {
-                self.record_passes(r, &sets[parity], &buffers, parity);
-                self.record_readback(r, &buffers, parity, tile_list.len());
-            })
+        let lists = |parity: usize| -> Result<[CommandList; 2], GpuError> {
+            let (set, stamps) = (&sets[parity], [FIRST_PASSES, PASSES.len() - FIRST_PASSES]);
+            let [first, second] = stamps.map(|passes| passes as u32 + 1);
+            Ok([
+                CommandList::record(gpu, first, |r| {
+                    self.record_latch(r, &buffers);
+                    self.record_passes(r, 0..FIRST_PASSES, set, &buffers, parity);
+                })?,
+                CommandList::record(gpu, second, |r| {
+                    r.stamp();
+                    self.record_passes(r, FIRST_PASSES..TABLE.len(), set, &buffers, parity);
+                    self.record_readback(r, &buffers, parity, tile_list.len());
+                })?,
+            ])
         };
-        let lists = [list(0)?, list(1)?];
+        let lists = [lists(0)?, lists(1)?];
         Ok(FrameSlot {
             fence: FrameFence::new(gpu)?,
             lists,
@@ -180,23 +203,33 @@ impl Renderer {
             tile_list,
             raster: settings.raster,
             parity: 0,
-            stamps: [0; PASSES.len() + 1],
-            _resources: resources.clone(),
+            stamps: [0; PASSES.len() + 2],
+            resources: resources.clone(),
         })
     }
 
-    /// Records the frame in the order of [`TABLE`], with a barrier after each pass. Of a pass that the method does not need only the time stamp is
-    /// recorded.
-    fn record_passes(&self, r: &mut Recorder<'_>, set: &BindingSet, b: &FrameBuffers, parity: usize) {
-        let (resources, raster) = (&self.resources, self.settings.raster);
+    /// Records what comes before the passes: counters are cleared, and what the host has written is copied.
+    fn record_latch(&self, r: &mut Recorder<'_>, b: &FrameBuffers) {
         r.clear(&b.counters);
-        r.copy(&resources.shared.schedule_start, &b.schedule, size_of::<Schedule>());
+        r.copy(&self.resources.shared.schedule_start, &b.schedule, size_of::<Schedule>());
         for latched in [&b.frame, &b.instances, &b.movers] {
             r.copy(&latched.host, &latched.device, latched.len_bytes);
         }
         r.barrier();
         r.stamp();
-        for (pass, pipeline) in TABLE.iter().zip(&resources.pipelines) {
+    }
+
+    /// Records `rows` of [`TABLE`] in their order, with a barrier after each. Of a pass that the method does not need only the time stamp is recorded.
+    fn record_passes(
+        &self,
+        r: &mut Recorder<'_>,
+        rows: Range<usize>,
+        set: &BindingSet,
+        b: &FrameBuffers,
+        parity: usize,
+    ) {
+        let (resources, raster) = (&self.resources, self.settings.raster);
+        for (pass, pipeline) in TABLE[rows.clone()].iter().zip(&resources.pipelines[rows]) {
             if let Some(pipeline) = pipeline {
                 match pass.grid {
                     Grid::Tiles => r.dispatch_indirect(pipeline, set, &b.arguments, PER_TILE_QUARTER),
@@ -299,7 +332,13 @@ impl Renderer {
         let frame = self.frame_constants(inputs, &turn, (tile_count, slot.tile_list.tiles_x()));
         slot.buffers.frame.host.write(&[frame]);
         slot.parity = 1 - self.last.parity;
-        slot.lists[slot.parity].submit(&mut slot.fence)?;
+        let [first, second] = &slot.lists[slot.parity];
+        self.numbered += 1;
+        // The frame before the last has read the history that this one writes.
+        let order = Order { number: self.numbered, after: self.ended_by_parity[slot.parity] };
+        let overlap = self.resources.overlap.as_ref().map(|overlap| (overlap, order));
+        submit_frame([first, second], overlap, &mut slot.fence)?;
+        self.ended_by_parity[slot.parity] = order.number;
         if decides_rates {
             self.rated.copy_from_slice(slot.tile_list.active());
         }

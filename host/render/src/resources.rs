@@ -2,7 +2,7 @@
 
 use super::memory::SharedBuffers;
 use super::scene_gpu::SceneGpu;
-use crate::gpu::{BindingTable, ComputePipeline};
+use crate::gpu::{BindingTable, ComputePipeline, Overlap};
 use std::sync::Arc;
 
 /// What submissions read. The renderer and every slot hold it, so it is freed after the last submission has ended, in whatever order they are
@@ -14,4 +14,6 @@ pub(super) struct Resources {
     pub(super) table: Arc<BindingTable>,
     pub(super) shared: SharedBuffers,
     pub(super) scene: SceneGpu,
+    /// The order of frames that share the device; `None`: each begins when the one before has ended.
+    pub(super) overlap: Option<Overlap>,
 }

@@ -38,6 +38,20 @@ pub struct RendererSettings {
     pub plane_groups: Vec<PlaneGroup>,
     /// What the host reads back.
     pub output: Output,
+    /// Whether the end of a frame and the beginning of the next one share the device.
+    pub overlap: Overlapping,
+}
+
+/// Whether a frame begins before the one before it has ended.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub enum Overlapping {
+    /// Never.
+    Never,
+    /// On devices with two queues for it.
+    #[default]
+    WhereItCan,
+    /// In the same order, whatever queues there are (tests).
+    Always,
 }
 
 /// What a frame brings to the host.

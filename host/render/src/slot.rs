@@ -1,7 +1,7 @@
 //! One frame in flight: its memory on the GPU and on the host, what it cost, and what can be read back.
 
 use super::frame_buffers::FrameBuffers;
-use super::passes::PASSES;
+use super::passes::{FIRST_PASSES, PASSES};
 use super::resources::Resources;
 use super::tiles::{TileList, TILE};
 use crate::gpu::{BindingSet, CommandList, FrameFence, GpuError, Place};
@@ -16,12 +16,26 @@ pub struct FrameCost {
     pub counters: [u32; size_of::<Counters>() / 4],
     /// GPU time of each pass of [`PASSES`], nanoseconds; 0 if the device has no time stamps.
     pub pass_ns: [u64; PASSES.len()],
+    /// The next frame could begin before this one had ended.
+    pub overlaps: bool,
 }
 
 impl FrameCost {
     /// The counters by name.
     pub fn counters(&self) -> Counters {
         bytemuck::cast(self.counters)
+    }
+
+    /// For how long the frame kept the GPU from another one, nanoseconds: all its passes, or where frames overlap the longer of its two parts. 0 if
+    /// the device has no time stamps.
+    pub fn occupied_ns(&self) -> u64 {
+        let [first, second] =
+            [&self.pass_ns[..FIRST_PASSES], &self.pass_ns[FIRST_PASSES..]].map(|part| part.iter().sum());
+        if self.overlaps {
+            u64::max(first, second)
+        } else {
+            first + second
+        }
     }
 }
 
@@ -30,17 +44,17 @@ impl FrameCost {
 pub struct FrameSlot {
     // Dropped first, because it waits until the GPU no longer uses the rest.
     pub(super) fence: FrameFence,
-    /// One for each of the two history buffers that a frame may write.
-    pub(super) lists: [CommandList; 2],
+    /// Two for each of the two history buffers that a frame may write: the passes that the next frame waits for, and the others.
+    pub(super) lists: [[CommandList; 2]; 2],
     pub(super) _sets: [BindingSet; 2],
     pub(super) buffers: FrameBuffers,
     pub(super) tile_list: TileList,
     pub(super) raster: Raster,
     /// The list that ran last.
     pub(super) parity: usize,
-    pub(super) stamps: [u64; PASSES.len() + 1],
+    pub(super) stamps: [u64; PASSES.len() + 2],
     // Dropped last, because the submission uses these pipelines and buffers.
-    pub(super) _resources: Arc<Resources>,
+    pub(super) resources: Arc<Resources>,
 }
 
 impl FrameSlot {
@@ -68,10 +82,13 @@ impl FrameSlot {
             counters: bytemuck::cast(self.buffers.counters_host.read::<Counters>(1)[0]),
             ..FrameCost::default()
         };
-        let n = self.lists[self.parity].stamps_ns(&mut self.stamps);
-        if n == self.stamps.len() {
-            for (i, pass) in cost.pass_ns.iter_mut().enumerate() {
-                *pass = self.stamps[i + 1].saturating_sub(self.stamps[i]);
+        cost.overlaps = self.resources.overlap.is_some();
+        let [first, second] = &self.lists[self.parity];
+        let (of_first, of_second) = self.stamps.split_at_mut(FIRST_PASSES + 1);
+        if first.stamps_ns(of_first) == of_first.len() && second.stamps_ns(of_second) == of_second.len() {
+            let ends = of_first.windows(2).chain(of_second.windows(2));
+            for (pass, ends) in cost.pass_ns.iter_mut().zip(ends) {
+                *pass = ends[1].saturating_sub(ends[0]);
             }
         }
         cost

@@ -38,13 +38,14 @@ pub(crate) struct BenchArgs {
 fn lines(c: &MethodCost) -> String {
     let gpu = c.gpu_ms.map_or("-".into(), |ms| format!("{ms:.3}"));
     let mut text = format!(
-        "{:<9} {:>10.2} {:>10.2} {:>11.0} {:>11.0} {gpu:>10} {:>10.3}\n",
+        "{:<9} {:>10.2} {:>10.2} {:>11.0} {:>11.0} {gpu:>10} {:>10.3} {:>10.3}\n",
         c.method,
         c.rays_per_s * 1e-6,
         c.samples_per_s * 1e-6,
         c.rays_per_frame,
         c.samples_per_frame,
-        c.wall_ms
+        c.wall_ms,
+        c.in_line_ms
     );
     let told: Vec<String> =
         c.passes.iter().filter(|p| p.ms > 0.0).map(|p| format!("{} {:.3}", p.pass, p.ms)).collect();
@@ -80,7 +81,7 @@ pub(super) fn execute(args: &BenchArgs) -> Result<(), Failure> {
             config.render.spp,
             config.render.depth
         ));
-        print("method      Mrays/s Msamples/s  rays/frame  samples/fr     GPU ms    wall ms\n");
+        print("method      Mrays/s Msamples/s  rays/frame  samples/fr     GPU ms    wall ms    in line\n");
     }
     let report = bench(&rig, &gpu, args.count, &args.method, &mut |cost| {
         if !args.json {

@@ -13,7 +13,7 @@ use dpm_render::gpu::{Gpu, GpuError};
 use dpm_render::method::Method;
 use dpm_render::pack::{source_bits, Halftone};
 use dpm_render::warp::{plane_groups, Sweep, FOLLOW_SHARE};
-use dpm_render::{FrameInputs, FrameSlot, Output, RenderError, Renderer, RendererSettings};
+use dpm_render::{FrameInputs, FrameSlot, Output, Overlapping, RenderError, Renderer, RendererSettings};
 use dpm_scene::geometry::projector::ProjectorCamera;
 use dpm_scene::{shapes, Material, Scene, Texture, Wrap};
 use dpm_shaders::structs::PlaneGroup;
@@ -263,6 +263,7 @@ impl Card {
             halftone,
             plane_groups: groups.to_vec(),
             output: Output::Codes,
+            overlap: Overlapping::Never,
         };
         let renderer = Renderer::new(&self.gpu, &self.scene, settings)?;
         let slot = renderer.create_slot(false)?;

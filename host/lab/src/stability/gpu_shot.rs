@@ -5,7 +5,7 @@ use dpm_render::drive::Drive;
 use dpm_render::gpu::Gpu;
 use dpm_render::method::Method;
 use dpm_render::scene_data::Keep;
-use dpm_render::{FrameInputs, FrameSlot, Output, Renderer, RendererSettings};
+use dpm_render::{FrameInputs, FrameSlot, Output, Overlapping, Renderer, RendererSettings};
 use dpm_scene::geometry::projector::ProjectorCamera;
 use dpm_scene::Scene;
 use dpm_shaders::structs::{Counters, Surface, NO_HIT};
@@ -100,6 +100,7 @@ impl<'a> Shot<'a> {
             halftone: None,
             plane_groups: Vec::new(),
             output: Output::Codes,
+            overlap: Overlapping::Never,
         }
     }
 

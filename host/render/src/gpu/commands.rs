@@ -10,12 +10,12 @@ use std::sync::Arc;
 
 /// A list of passes that the GPU runs in order. Recorded once; each submission runs it again.
 pub struct CommandList {
-    buffer: vk::CommandBuffer,
+    pub(super) buffer: vk::CommandBuffer,
     pool: vk::CommandPool,
     queries: Option<vk::QueryPool>,
     stamps: u32,
     max_stamps: u32,
-    gpu: Arc<Gpu>,
+    pub(super) gpu: Arc<Gpu>,
 }
 
 impl CommandList {
@@ -81,22 +81,25 @@ impl CommandList {
     /// Device lost or given up, [`GpuError::InFlight`] when the fence's last submission was not waited for to its end, out of memory in
     /// the driver.
     pub fn submit(&self, fence: &mut FrameFence) -> Result<(), GpuError> {
-        let gpu = &self.gpu;
-        fence.check_free()?;
-        let buffers = [self.buffer];
-        let info = [vk::SubmitInfo::default().command_buffers(&buffers)];
-        let (queue, _turn) = gpu.queue()?;
-        // SAFETY: the fence is unsignalled and unused: `wait` consumed its last run.
-        within(Place::Vulkan, || unsafe { gpu.device.reset_fences(&[fence.fence]) })
-            .on(gpu, "resetting a fence")?;
-        // Another thread may have noticed meanwhile that the device is lost.
-        gpu.alive("submitting a frame")?;
-        // SAFETY: the same, and the turn at the queue is this thread's.
-        within(Place::Vulkan, || unsafe { gpu.device.queue_submit(queue, &info, fence.fence) })
-            .on(gpu, "submitting a frame")?;
-        fence.pending = true;
-        Ok(())
+        submit_in_turn(&[self.buffer], fence)
     }
+}
+
+/// Runs command buffers one after the other on the first queue. `fence` is signalled when all are done.
+///
+/// # Errors
+/// As [`CommandList::submit`].
+pub(super) fn submit_in_turn(buffers: &[vk::CommandBuffer], fence: &mut FrameFence) -> Result<(), GpuError> {
+    let gpu = fence.gpu.clone();
+    fence.check_free()?;
+    let info = [vk::SubmitInfo::default().command_buffers(buffers)];
+    let ([queue, _], _turn) = gpu.queues()?;
+    fence.reset()?;
+    // SAFETY: the fence is unsignalled, and the turn at the queue is this thread's.
+    within(Place::Vulkan, || unsafe { gpu.device.queue_submit(queue, &info, fence.fence) })
+        .on(&gpu, "submitting a frame")?;
+    fence.pending = true;
+    Ok(())
 }
 
 impl Drop for CommandList {
@@ -235,13 +238,13 @@ impl Recorder<'_> {
 }
 
 /// How long to wait for the end of a submission before its memory is freed. After that the device is given up and keeps the memory.
-const LAST_WAIT_NS: u64 = 2_000_000_000;
+pub(super) const LAST_WAIT_NS: u64 = 2_000_000_000;
 
 /// Signals when a submission is done. Dropping it waits for the submission, at most 2 s, and not at all if the device is lost or was given up.
 pub struct FrameFence {
-    fence: vk::Fence,
-    pending: bool,
-    gpu: Arc<Gpu>,
+    pub(super) fence: vk::Fence,
+    pub(super) pending: bool,
+    pub(super) gpu: Arc<Gpu>,
 }
 
 impl FrameFence {
@@ -289,6 +292,18 @@ impl FrameFence {
             // The submission may still be pending, unless the device is lost, which the device remembers.
             Err(e) => Err(e).on(&self.gpu, "waiting for a frame"),
         }
+    }
+
+    /// Makes the fence ready for a submission, unless another thread has noticed that the device is lost.
+    ///
+    /// # Errors
+    /// Device lost or given up.
+    pub(super) fn reset(&mut self) -> Result<(), GpuError> {
+        let gpu = &self.gpu;
+        // SAFETY: the fence is unused: `wait` consumed its last run.
+        within(Place::Vulkan, || unsafe { gpu.device.reset_fences(&[self.fence]) })
+            .on(gpu, "resetting a fence")?;
+        gpu.alive("submitting a frame")
     }
 
     /// Refuses to be used for two submissions at once.

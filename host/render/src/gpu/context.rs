@@ -1,7 +1,9 @@
 //! Picks a device and opens it.
 
 use super::address_space;
-use super::devices::{candidates, compute_family, usable, Candidate, DeviceId, DeviceSummary};
+use super::devices::{
+    candidates, compute_family, has_timelines, queue_count, usable, Candidate, DeviceId, DeviceSummary,
+};
 use super::error::GpuError;
 use super::instance::{create_instance, Instance};
 use super::kept::Kept;
@@ -39,7 +41,8 @@ pub struct GpuOptions {
 /// given. So nothing of it is freed, and its memory stays allocated until the process ends ([`memory_given_up`] returns how much).
 pub struct Gpu {
     pub(super) device: ash::Device,
-    queue: vk::Queue,
+    /// Where frames begin and where they end. The same queue twice where the device has one.
+    queues: [vk::Queue; 2],
     /// Whose turn it is to submit.
     turn: Turn,
     pub(super) queue_family: u32,
@@ -103,13 +106,22 @@ pub fn memory_given_up() -> MemoryGivenUp {
     }
 }
 
-/// Creates the device with its queue. Returns it with the queue's family and the most that buffers may take of the address space.
+/// What [`create`] has made.
+struct Created {
+    device: ash::Device,
+    queue_family: u32,
+    queues: [vk::Queue; 2],
+    /// Most that buffers may take of the address space.
+    most_bytes: Option<u64>,
+}
+
+/// Creates the device with its queues.
 fn create(
     instance: &ash::Instance,
     physical: vk::PhysicalDevice,
     summary: &DeviceSummary,
     options: &GpuOptions,
-) -> Result<(ash::Device, u32, Option<u64>), GpuError> {
+) -> Result<Created, GpuError> {
     let name: Arc<str> = summary.name.as_str().into();
     let most_bytes =
         if summary.software { address_space::for_buffers().map_err(|e| e.on(&name))? } else { None };
@@ -117,10 +129,14 @@ fn create(
         found: summary.name.clone(),
         needed: "a compute queue".into(),
     })?;
-    let priorities = [1.0];
+    let has_timelines = has_timelines(instance, physical);
+    let queue_count = if has_timelines { queue_count(instance, physical, queue_family) } else { 1 };
+    // What ends a frame goes first, because its light waits for it.
+    let priorities = &[0.5, 1.0][2 - queue_count as usize..];
     let queues =
-        [vk::DeviceQueueCreateInfo::default().queue_family_index(queue_family).queue_priorities(&priorities)];
+        [vk::DeviceQueueCreateInfo::default().queue_family_index(queue_family).queue_priorities(priorities)];
     let mut vulkan12 = vk::PhysicalDeviceVulkan12Features::default()
+        .timeline_semaphore(has_timelines)
         .scalar_block_layout(true)
         .shader_buffer_int64_atomics(true);
     let features = vk::PhysicalDeviceFeatures::default().shader_int64(true);
@@ -137,7 +153,9 @@ fn create(
     // SAFETY: `info` and what it points to live until the call returns.
     let device = unsafe { instance.create_device(physical, &info, None) }
         .map_err(|e| GpuError::from_result(e, "opening the Vulkan device", &name, summary.memory_mib))?;
-    Ok((device, queue_family, most_bytes))
+    // SAFETY: the device was created with so many queues of this family.
+    let queues = [0, queue_count - 1].map(|i| unsafe { device.get_device_queue(queue_family, i) });
+    Ok(Created { device, queue_family, queues, most_bytes })
 }
 
 impl Gpu {
@@ -185,19 +203,18 @@ impl Gpu {
         let mut first_error = None;
         for Candidate { physical, summary, id } in usable {
             let name: Arc<str> = summary.name.as_str().into();
-            let (device, queue_family, most_bytes) = match create(&instance, physical, &summary, options) {
-                Ok(created) => created,
-                Err(error) => {
-                    tracing::warn!("{name} is passed over: {error}");
-                    first_error.get_or_insert(error);
-                    continue;
-                }
-            };
+            let Created { device, queue_family, queues, most_bytes } =
+                match create(&instance, physical, &summary, options) {
+                    Ok(created) => created,
+                    Err(error) => {
+                        tracing::warn!("{name} is passed over: {error}");
+                        first_error.get_or_insert(error);
+                        continue;
+                    }
+                };
             let statistics = options
                 .statistics
                 .then(|| khr::pipeline_executable_properties::Device::new(&instance.handle, &device));
-            // SAFETY: the device was created with one queue of this family.
-            let queue = unsafe { device.get_device_queue(queue_family, 0) };
             // SAFETY: plain queries.
             let (memory, limits) = unsafe {
                 (
@@ -207,7 +224,7 @@ impl Gpu {
             };
             return Ok(Arc::new(Self {
                 device,
-                queue,
+                queues,
                 turn: Turn::default(),
                 queue_family,
                 memory,
@@ -341,10 +358,15 @@ impl Gpu {
         self.state() == State::GivenUp
     }
 
-    /// The queue, for one submission: as long as the turn is held. In a rig one thread submits, so the turn is free.
-    pub(super) fn queue(&self) -> Result<(vk::Queue, Held<'_>), GpuError> {
+    /// The queues, for one submission: as long as the turn is held. In a rig one thread submits, so the turn is free.
+    pub(super) fn queues(&self) -> Result<([vk::Queue; 2], Held<'_>), GpuError> {
         let turn = self.turn.take().map_or_else(|| self.wait_for_turn(), Ok)?;
-        Ok((self.queue, turn))
+        Ok((self.queues, turn))
+    }
+
+    /// Whether a frame can begin on one queue while the one before ends on another.
+    pub fn has_two_queues(&self) -> bool {
+        self.queues[0] != self.queues[1]
     }
 
     /// Waits for another thread's submission: one of an abandoned crew, or of another renderer in a test.

@@ -239,6 +239,22 @@ pub(super) fn compute_family(instance: &ash::Instance, physical: vk::PhysicalDev
         .map(|i| i as u32)
 }
 
+/// Whether the device has semaphores that count. The standard asks it of every device of Vulkan 1.2.
+pub(super) fn has_timelines(instance: &ash::Instance, physical: vk::PhysicalDevice) -> bool {
+    let mut vulkan12 = vk::PhysicalDeviceVulkan12Features::default();
+    let mut features = vk::PhysicalDeviceFeatures2::default().push_next(&mut vulkan12);
+    // SAFETY: `features` chains a valid structure.
+    unsafe { instance.get_physical_device_features2(physical, &mut features) };
+    vulkan12.timeline_semaphore != 0
+}
+
+/// Queues of this family that frames use: two if there are, so that the end of one frame and the beginning of the next share the device.
+pub(super) fn queue_count(instance: &ash::Instance, physical: vk::PhysicalDevice, family: u32) -> u32 {
+    // SAFETY: plain query.
+    let families = unsafe { instance.get_physical_device_queue_family_properties(physical) };
+    families.get(family as usize).map_or(1, |f| f.queue_count.clamp(1, 2))
+}
+
 /// Whether queues of this family draw.
 fn draws(instance: &ash::Instance, physical: vk::PhysicalDevice, family: u32) -> bool {
     // SAFETY: plain query.

@@ -67,6 +67,13 @@ impl FrameNote {
         i64::try_from(ns).ok().filter(|&ns| ns > 0)
     }
 
+    /// For how long the frame kept the next one from the GPU if the two could overlap there, nanoseconds; `None` if they
+    /// could not.
+    pub(crate) fn occupied_ns(&self) -> Option<i64> {
+        let cost = self.cost.filter(|cost| cost.overlaps)?;
+        i64::try_from(cost.occupied_ns()).ok().filter(|&ns| ns > 0)
+    }
+
     /// True if the link accepted it.
     pub(crate) fn is_sent(&self) -> bool {
         self.fate == Fate::Offered(SendOutcome::Sent)

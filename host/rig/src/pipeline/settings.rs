@@ -10,7 +10,7 @@ use crate::rig::Rig;
 use dpm_device::link::HostLink;
 use dpm_render::gpu::Gpu;
 use dpm_render::pack::Halftone;
-use dpm_render::{Output, RendererSettings};
+use dpm_render::{Output, Overlapping, RendererSettings};
 
 /// Longest reserve in the lead, nanoseconds.
 const RESERVE_NS: i64 = 528_000;
@@ -67,6 +67,7 @@ pub fn renderer_settings(rig: &Rig) -> RendererSettings {
         halftone: Halftone::of(&rig.schedule),
         plane_groups: groups_that_follow(rig),
         output: Output::Codes,
+        overlap: if r.overlap { Overlapping::WhereItCan } else { Overlapping::Never },
     }
 }
 
