@@ -35,8 +35,17 @@ pub(crate) fn submit(
     )
 }
 
-/// Renders one frame that is never shown, so that one-time work of the driver (translating shaders) is done before a
-/// slot depends on it. Returns the wall time that the frame took, in nanoseconds.
+/// What a frame that is never shown took, nanoseconds.
+#[derive(Clone, Copy, Debug, Default)]
+pub(crate) struct WarmUp {
+    /// From its beginning until the host had it.
+    pub wall_ns: i64,
+    /// The GPU's own time for it; `None` if the device has no time stamps.
+    pub gpu_ns: Option<i64>,
+}
+
+/// Renders one frame that is never shown, with at most `budget_milli` thousandths of a sample per pixel, so that one-time
+/// work of the driver (translating shaders) is done before a slot depends on it.
 ///
 /// # Errors
 /// The GPU did not finish within `timeout_ns`, or was lost.
@@ -44,16 +53,19 @@ pub(crate) fn warm_up(
     slot: &mut FrameSlot,
     rig: &Rig,
     renderer: &mut Renderer,
+    budget_milli: u64,
     timeout_ns: u64,
-) -> Result<i64, GpuError> {
+) -> Result<WarmUp, GpuError> {
     let watch = Stopwatch::start();
     let mut plan = FramePlan::empty(rig);
     plan.tracked_poses.extend(rig.bodies.iter().map(|b| affine(&b.rest)));
     rig.scene_poses(&plan.tracked_poses, &mut plan.scene_poses);
     (plan.eye, plan.gaze) = rig.observer.eye_and_gaze(&plan.tracked_poses);
-    plan.budget_milli = u64::from(rig.config.render.spp) * 1000;
+    plan.budget_milli = budget_milli;
     submit(&plan, slot, renderer)?;
-    slot.wait(timeout_ns).map(|_| watch.elapsed_ns() as i64)
+    let cost = slot.wait(timeout_ns)?;
+    let gpu_ns = cost.pass_ns.iter().sum::<u64>() as i64;
+    Ok(WarmUp { wall_ns: watch.elapsed_ns() as i64, gpu_ns: Some(gpu_ns).filter(|&ns| ns > 0) })
 }
 
 /// The longest single wait for the GPU.

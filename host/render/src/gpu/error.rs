@@ -11,9 +11,9 @@ pub enum GpuError {
         "no Vulkan loader: {0}. Install it (Debian, Ubuntu: apt-get install libvulkan1 mesa-vulkan-drivers)"
     )]
     NoLoader(String),
-    /// The loader found no driver.
+    /// The loader found no driver that starts.
     #[error(
-        "no Vulkan driver: {0}. Install your GPU vendor's driver, or software Vulkan (Debian, Ubuntu: apt-get install \
+        "no Vulkan driver works: {0}. Install your GPU vendor's driver, or software Vulkan (Debian, Ubuntu: apt-get install \
          mesa-vulkan-drivers); VK_ICD_FILENAMES and VK_DRIVER_FILES, if set, must name existing files"
     )]
     NoDriver(String),

@@ -102,7 +102,9 @@ pub(super) fn create_instance(validation: bool) -> Result<Instance, GpuError> {
     }
     // SAFETY: `info` and what it points to live until the call returns.
     let handle = unsafe { entry.create_instance(&info, None) }.map_err(|e| match e {
-        vk::Result::ERROR_INCOMPATIBLE_DRIVER => GpuError::NoDriver(format!("{e:?}")),
+        vk::Result::ERROR_INCOMPATIBLE_DRIVER => {
+            GpuError::NoDriver(format!("{e:?}: {}", super::manifests::told()))
+        }
         result => GpuError::without_device("creating the Vulkan instance")(result),
     })?;
     let mut instance = Instance { debug: None, handle, _entry: entry };

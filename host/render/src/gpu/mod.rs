@@ -17,6 +17,7 @@ mod error;
 mod instance;
 mod kept;
 mod loss;
+mod manifests;
 mod overlap;
 mod pipeline;
 mod reopen;

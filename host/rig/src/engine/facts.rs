@@ -41,6 +41,8 @@ pub(crate) struct Facts {
     pub end_slot: AtomicU64,
     /// Slots from one planned frame to the next, in thousandths, averaged over the last frames.
     pub stride_milli: AtomicU64,
+    /// The GPU needs about a slot or more for a frame.
+    pub gpu_is_slow: AtomicBool,
     /// The longest time for which prediction may extend a body's track, nanoseconds.
     pub predict_ns: AtomicI64,
     /// Since when packing has been waiting for the GPU to finish a frame; `i64::MAX` while it does not wait.
@@ -71,6 +73,7 @@ impl Facts {
             next_frame: AtomicU64::new(0),
             end_slot: AtomicU64::new(0),
             stride_milli: AtomicU64::new(1000),
+            gpu_is_slow: AtomicBool::new(false),
             predict_ns: AtomicI64::new(predict_ns),
             gpu_since_ns: AtomicI64::new(i64::MAX),
             is_complete: AtomicBool::new(false),

@@ -23,6 +23,7 @@ pub(crate) mod pace;
 pub(crate) mod pack;
 pub(crate) mod plan;
 pub(crate) mod pulse;
+mod slowness;
 pub(crate) mod supervision;
 
 #[cfg(test)]

@@ -106,6 +106,7 @@ impl PackStage {
         let took_ns = self.times.finished(note.timeline.submitted_at, now, gpu_ns);
         // Where frames overlap each ends about a slot after the one before, whatever it took.
         self.crew.gpu.finish(occupied_ns.unwrap_or(took_ns));
+        self.facts.gpu_is_slow.store(self.crew.gpu.is_slow(), Ordering::Relaxed);
         if let (Some(controller), Some(gpu_ns)) = (&mut self.budget, gpu_ns) {
             controller.within(note.plan.most_milli);
             // The whole frame counts, although the next one may begin before its end. If only its longer part had to fit, 45 % more

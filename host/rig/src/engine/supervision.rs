@@ -10,6 +10,7 @@
 use super::error::PipelineError;
 use super::facts::Facts;
 use super::pulse::{Pulse, Silence, StandingOf};
+use super::slowness::{told, Slowness};
 use crate::telemetry::monitor::{ProjectorHealth, RunCounts};
 use dpm_device::time::HostTime;
 use dpm_render::gpu::{AfterLoss, LossBudget};
@@ -18,9 +19,6 @@ use std::sync::Arc;
 
 /// How long it may take to make a new crew, nanoseconds: drivers translate shaders for it.
 const MADE_WITHIN_NS: i64 = 180_000_000_000;
-/// The operator is informed that the renderer is slower than its slots from this many slots per frame on, in
-/// thousandths.
-const SLOW_MILLI: u64 = 1_500;
 /// The operator is informed that a frame stays on the GPU after this time, nanoseconds. A GPU that is still warming up
 /// is given up later than that.
 const STAYS_AFTER_NS: i64 = 1_000_000_000;
@@ -126,7 +124,7 @@ pub(crate) struct Supervision {
     collector: Silence,
     ask: StandingOf,
     made_by: HostTime,
-    told_slow: bool,
+    slowness: Slowness,
     /// Since when the GPU has had the frame of which the operator was last informed.
     told_of_ns: i64,
     unlit: Unlit,
@@ -177,7 +175,7 @@ impl Supervision {
             collector: Silence::default(),
             ask,
             made_by: HostTime(i64::MAX),
-            told_slow: false,
+            slowness: Slowness::default(),
             told_of_ns: i64::MAX,
             unlit: Unlit::default(),
         }
@@ -192,7 +190,7 @@ impl Supervision {
         now: HostTime,
         step_ns: i64,
     ) -> Option<Irreplaceable> {
-        self.tell_if_slow();
+        self.tell_if_slow(now);
         self.tell_if_gpu_stays(now);
         self.tell_if_nothing_is_lit(now);
         if self.link.observe(link, now, step_ns, self.ask) {
@@ -288,25 +286,17 @@ impl Supervision {
         monitor.note(format!("no frame has been lit for a second, although frames are made{why}"));
     }
 
-    /// Informs the operator once when the renderer becomes slower than its slots, and when it is fast again.
-    fn tell_if_slow(&mut self) {
-        let stride = self.facts.stride_milli.load(Ordering::Relaxed);
-        let is_slow = stride >= SLOW_MILLI;
-        if is_slow == self.told_slow || !self.facts.options.tells_slow {
+    /// Informs the operator when frames come for every n-th slot only, and when they come for each slot again.
+    fn tell_if_slow(&mut self, now: HostTime) {
+        let facts = &self.facts;
+        if !facts.options.tells_slow {
             return;
         }
-        self.told_slow = is_slow;
-        let hz = self.facts.rig.rate().hz();
-        self.facts.monitor.note(if is_slow {
-            let every = stride as f64 / 1e3;
-            format!(
-                "the renderer is slower than its slots: one frame per {every:.1} slots, {:.1} of {hz:.1} per second; \
-                 a smaller raster, fewer samples (render.spp) or another method make it faster",
-                hz / every
-            )
-        } else {
-            format!("the renderer keeps up: each of {hz:.1} slots per second gets a frame")
-        });
+        let stride_milli = facts.stride_milli.load(Ordering::Relaxed);
+        if let Some(is_slow) = self.slowness.observe(stride_milli, now) {
+            let by_gpu = facts.gpu_is_slow.load(Ordering::Relaxed);
+            facts.monitor.note(told(is_slow, stride_milli, facts.rig.rate().hz(), by_gpu));
+        }
     }
 }
 

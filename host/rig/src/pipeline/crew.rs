@@ -114,10 +114,12 @@ impl Crew {
         parts: CrewParts,
         notes_back: &NotesBack,
     ) -> Result<(Self, Port), PipelineError> {
-        let CrewParts { tracking, renderer, pictures, kernel, budget, memory, frame_ns } = parts;
+        let CrewParts { tracking, renderer, pictures, kernel, budget, memory, first, budget_milli } = parts;
         let rig = &shared.facts.rig;
         let policy = policy(rig);
+        let frame_ns = first.gpu_ns.unwrap_or(first.wall_ns);
         let facts = Arc::new(CrewFacts::new(frame_ns, rig.rate().slot_len_ns(0)));
+        facts.budget_milli.store(budget_milli, Ordering::Relaxed);
         let stage = PackStage::new(shared.facts.clone(), facts.clone(), budget);
         // There is room for all of them: no stage ever finds the next one's channel full.
         let jobs = memory.len();

@@ -14,6 +14,7 @@ use crate::pack::source::{PatternPainter, PatternSource, Pictures};
 use crate::pipeline::projector;
 use crate::plan::budget::BudgetController;
 use crate::plan::link_time::LinkTime;
+use crate::render::WarmUp;
 use crate::rig::{Rig, RigError};
 use crate::telemetry::monitor::RunMonitor;
 use crate::tracks::{open_for, NoTracker, TrackingStage};
@@ -95,8 +96,10 @@ pub(super) struct CrewParts {
     pub(super) budget: Option<BudgetController>,
     /// Memory for the frames.
     pub(super) memory: Vec<FrameMemory>,
-    /// Time that a frame took while the GPU was otherwise idle, nanoseconds; 0 if not measured.
-    pub(super) frame_ns: i64,
+    /// Time that a frame took while the GPU was otherwise idle.
+    pub(super) first: WarmUp,
+    /// Samples with which a frame then fitted into its slot, in thousandths; `u64::MAX` if that is not known.
+    pub(super) budget_milli: u64,
 }
 
 impl CrewParts {
@@ -130,13 +133,14 @@ impl CrewParts {
             kernel: Kernel::best(),
             budget: None,
             memory,
-            frame_ns: 0,
+            first: WarmUp::default(),
+            budget_milli: u64::MAX,
         })
     }
 
     /// Prepares the parts for real pace. They draw frames that are never shown: the first one absorbs one-time work of
-    /// the driver before a slot depends on it, a GPU then draws until it has raised its clock, and the last one measures
-    /// the time of a frame. From then on
+    /// the driver before a slot depends on it, a GPU then draws until it has raised its clock and the ray budget has found
+    /// what fits, and the last one measures the time of a frame. From then on
     /// the ray budget follows the frame times. At virtual pace it must not, because there the pictures may not depend
     /// on the machine's speed.
     ///
@@ -147,17 +151,29 @@ impl CrewParts {
         if let (Some(renderer), Some(slot)) = (&mut self.renderer, slot) {
             let is_gpu = origin.gpu().is_some_and(|gpu| !gpu.summary().software);
             let wake_ns = if is_gpu { WAKE_NS } else { 0 };
-            let mut draw = || crate::render::warm_up(slot, rig, renderer, FIRST_FRAME_TIMEOUT_NS);
-            draw().map_err(RenderError::from)?;
+            if rig.config.render.method == RenderMethod::Dpm {
+                self.budget = budget_controller(rig);
+            }
+            let full = u64::from(rig.config.render.spp) * 1000;
+            let mut draw = |budget: &Option<BudgetController>| {
+                let budget_milli = budget.as_ref().map_or(full, BudgetController::rays);
+                crate::render::warm_up(slot, rig, renderer, budget_milli, FIRST_FRAME_TIMEOUT_NS)
+                    .map_err(RenderError::from)
+            };
+            draw(&self.budget)?;
             let watch = Stopwatch::start();
             loop {
-                self.frame_ns = draw().map_err(RenderError::from)?;
+                let given = self.budget.as_ref().map(BudgetController::rays);
+                self.first = draw(&self.budget)?;
+                if let (true, Some(budget), Some(given), Some(gpu_ns)) =
+                    (is_gpu, &mut self.budget, given, self.first.gpu_ns)
+                {
+                    budget.measured(given, gpu_ns);
+                    self.budget_milli = budget.rays();
+                }
                 if watch.elapsed_ns() >= wake_ns {
                     break;
                 }
-            }
-            if rig.config.render.method == RenderMethod::Dpm {
-                self.budget = budget_controller(rig);
             }
         }
         if rig.wants_tracks() {

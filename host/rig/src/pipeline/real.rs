@@ -74,7 +74,7 @@ pub(super) fn run_at_real_pace(
     let (link, time) = bring_up(rig, far.medium.as_mut(), monitor, &mut || {
         clock.wait_until(clock.now().plus_ns(CONNECT_STEP_NS))
     })?;
-    let lead = lead_estimator(rig, &link, parts.frame_ns);
+    let lead = lead_estimator(rig, &link, parts.first.wall_ns);
     let facts = Arc::new(Facts::new(rig.clone(), monitor.clone(), options, &lead, clock.now()));
     tell_horizon(&facts);
     let keeper = LinkKeeper::new(

@@ -14,6 +14,7 @@ use crate::pack::prepared::PreparedFrames;
 use crate::pipeline::parts::CrewParts;
 use crate::pipeline::threads::{POLL_NS, STEP_NS, WAIT_NS};
 use crate::plan::link_time::LinkTime;
+use crate::render::WarmUp;
 use crate::rig::Rig;
 use crate::tracks::{TrackSnapshot, TrackingStage};
 use dpm_device::time::HostTime;
@@ -45,7 +46,8 @@ impl CrewParts {
             kernel: Kernel::best(),
             budget: None,
             memory: (0..in_flight.max(2)).map(|_| memory()).collect(),
-            frame_ns,
+            first: WarmUp { wall_ns: frame_ns, gpu_ns: None },
+            budget_milli: u64::MAX,
         }
     }
 }
@@ -133,7 +135,7 @@ impl Crew {
         line: &mut Line,
         now: HostTime,
     ) -> Self {
-        let crew = Arc::new(CrewFacts::new(parts.frame_ns, facts.rig.rate().slot_len_ns(0)));
+        let crew = Arc::new(CrewFacts::new(parts.first.wall_ns, facts.rig.rate().slot_len_ns(0)));
         let (publisher, reader) = latest(TrackSnapshot::empty(facts.rig.bodies.len()));
         let to_link = facts.rig.wants_tracks().then(|| {
             let (to_link, newest) = latest(TrackSnapshot::empty(facts.rig.bodies.len()));
