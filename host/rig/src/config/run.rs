@@ -33,7 +33,8 @@ section! {
         clamp_indirect: f64 = 0.0, "scene units", Within(0.0, 1e9);
         /// The Vulkan device: its number in `dpm doctor` or a part of its name; the fastest kind if left out.
         gpu: Option<String> = None, "", NotEmpty;
-        /// Whether a GPU with two queues begins a frame while the one before it ends. More samples fit into a slot then.
+        /// Whether a GPU with two queues begins a frame while the one before it ends. Frames that take it about a slot or
+        /// more follow each other faster then.
         overlap: bool = true, "", Any;
         /// Which processor packs the picture into bit planes.
         packer: Packer = Packer::Auto, "", Any;
