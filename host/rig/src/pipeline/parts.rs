@@ -139,47 +139,52 @@ impl CrewParts {
     }
 
     /// Prepares the parts for real pace. They draw frames that are never shown: the first one absorbs one-time work of
-    /// the driver before a slot depends on it, a GPU then draws until it has raised its clock and the ray budget has found
-    /// what fits, and the last one measures the time of a frame. From then on
-    /// the ray budget follows the frame times. At virtual pace it must not, because there the pictures may not depend
-    /// on the machine's speed.
+    /// the driver before a slot depends on it, and the last one measures the time of a frame. From then on the ray budget
+    /// follows the frame times. At virtual pace it must not, because there the pictures may not depend on the machine's
+    /// speed. `wakes`: a GPU draws for as long as it needs to raise its clock, and the budget finds what fits. A crew that
+    /// takes over finds the GPU awake, and is in a hurry.
     ///
     /// # Errors
     /// The GPU does not finish, or is lost.
-    pub(super) fn at_real_pace(mut self, rig: &Rig, origin: &Origin) -> Result<Self, PipelineError> {
-        let slot = self.memory.first_mut().and_then(|memory| memory.gpu.as_mut());
-        if let (Some(renderer), Some(slot)) = (&mut self.renderer, slot) {
-            let is_gpu = origin.gpu().is_some_and(|gpu| !gpu.summary().software);
-            let wake_ns = if is_gpu { WAKE_NS } else { 0 };
-            if rig.config.render.method == RenderMethod::Dpm {
-                self.budget = budget_controller(rig);
+    pub(super) fn at_real_pace(
+        mut self,
+        rig: &Rig,
+        origin: &Origin,
+        wakes: bool,
+    ) -> Result<Self, PipelineError> {
+        if rig.config.render.method == RenderMethod::Dpm && self.renderer.is_some() {
+            self.budget = budget_controller(rig);
+        }
+        self.draw_unseen(rig)?;
+        let watch = Stopwatch::start();
+        let is_gpu = origin.gpu().is_some_and(|gpu| !gpu.summary().software);
+        loop {
+            let given = self.draw_unseen(rig)?;
+            if !is_gpu || !wakes || watch.elapsed_ns() >= WAKE_NS {
+                break;
             }
-            let full = u64::from(rig.config.render.spp) * 1000;
-            let mut draw = |budget: &Option<BudgetController>| {
-                let budget_milli = budget.as_ref().map_or(full, BudgetController::rays);
-                crate::render::warm_up(slot, rig, renderer, budget_milli, FIRST_FRAME_TIMEOUT_NS)
-                    .map_err(RenderError::from)
-            };
-            draw(&self.budget)?;
-            let watch = Stopwatch::start();
-            loop {
-                let given = self.budget.as_ref().map(BudgetController::rays);
-                self.first = draw(&self.budget)?;
-                if let (true, Some(budget), Some(given), Some(gpu_ns)) =
-                    (is_gpu, &mut self.budget, given, self.first.gpu_ns)
-                {
-                    budget.measured(given, gpu_ns);
-                    self.budget_milli = budget.rays();
-                }
-                if watch.elapsed_ns() >= wake_ns {
-                    break;
-                }
+            if let (Some(budget), Some(gpu_ns)) = (&mut self.budget, self.first.gpu_ns) {
+                budget.measured(given, gpu_ns);
+                self.budget_milli = budget.rays();
             }
         }
         if rig.wants_tracks() {
             self.tracking = self.tracking.with_lively(rig);
         }
         Ok(self)
+    }
+
+    /// Draws a frame that is never shown, if a GPU draws, and keeps what it took. Returns the samples that it had, in
+    /// thousandths.
+    fn draw_unseen(&mut self, rig: &Rig) -> Result<u64, PipelineError> {
+        let full = u64::from(rig.config.render.spp) * 1000;
+        let budget_milli = self.budget.as_ref().map_or(full, BudgetController::rays);
+        let slot = self.memory.first_mut().and_then(|memory| memory.gpu.as_mut());
+        if let (Some(renderer), Some(slot)) = (&mut self.renderer, slot) {
+            self.first = crate::render::warm_up(slot, rig, renderer, budget_milli, FIRST_FRAME_TIMEOUT_NS)
+                .map_err(RenderError::from)?;
+        }
+        Ok(budget_milli)
     }
 }
 

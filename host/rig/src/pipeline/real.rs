@@ -64,7 +64,7 @@ pub(super) fn run_at_real_pace(
     // On a machine with fewer cores than stages, a spinning thread delays the very stages that it waits for.
     let spin_ns = if usable_cores() > STAGE_THREADS { 50_000 } else { 0 };
     let clock = origin.clock().map_or_else(|| MonotonicClock::new(spin_ns), |clock| clock.spinning(spin_ns));
-    let parts = crew_parts(rig, origin, options, clock)?;
+    let parts = crew_parts(rig, origin, options, clock, true)?;
     let (lights_in, lights) = light_channel();
     let rights = Arc::new(Rights::new(&rig.config.real_time));
     let standstill =
@@ -132,8 +132,9 @@ fn crew_parts(
     origin: &Origin,
     options: RunOptions,
     clock: MonotonicClock,
+    wakes: bool,
 ) -> Result<CrewParts, PipelineError> {
-    CrewParts::new(rig, origin, options, Arc::new(move || clock.now()))?.at_real_pace(rig, origin)
+    CrewParts::new(rig, origin, options, Arc::new(move || clock.now()))?.at_real_pace(rig, origin, wakes)
 }
 
 /// Makes crews that take over. A GPU that failed is reopened with the same options.
@@ -145,7 +146,7 @@ fn maker(rig: &Arc<Rig>, origin: Origin, options: RunOptions, clock: MonotonicCl
         if let (Origin::Gpu(old), Remake::CrewAndGpu) = (&mut *origin, remake) {
             *old = old.reopen().map_err(RenderError::from)?;
         }
-        crew_parts(&rig, &origin, options, clock)
+        crew_parts(&rig, &origin, options, clock, false)
     })
 }
 
