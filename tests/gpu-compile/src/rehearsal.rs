@@ -111,7 +111,10 @@ pub fn validated() -> Result<Vec<String>, String> {
     if !summary.own_queue {
         return Err(format!("{} gave a queue that draws", summary.name));
     }
-    let mut seen = vec![format!("{} ({}), queue without graphics", summary.name, summary.driver.trim())];
+    let queues = if gpu.has_two_queues() { "two queues" } else { "one queue" };
+    let first = if gpu.goes_first() { ", before other programs" } else { "" };
+    let mut seen =
+        vec![format!("{} ({}), {queues} without graphics{first}", summary.name, summary.driver.trim())];
     for method in METHODS {
         let rig = rig(method, &[])?;
         let settings = RendererSettings { output: Output::Both(rig.schedule), ..renderer_settings(&rig) };
@@ -142,17 +145,13 @@ pub fn validated() -> Result<Vec<String>, String> {
     Ok(seen)
 }
 
-/// Runs every method at the projector's pace for so many slots. Other programs may keep the threads from their cores in one run, but hardly in each of
+/// Runs a method at the projector's pace for so many slots. Other programs may keep the threads from their cores in one run, but hardly in each of
 /// three: a run that takes too much of a slot is repeated, and the best one counts.
 ///
 /// # Errors
 /// A run fails.
-pub fn paced(slots: u64) -> Result<Vec<Share>, String> {
-    let gpu = open(false)?;
-    METHODS.into_iter().map(|method| best_of_three(&gpu, method, slots)).collect()
-}
-
-fn best_of_three(gpu: &Arc<Gpu>, method: RenderMethod, slots: u64) -> Result<Share, String> {
+pub fn paced(method: RenderMethod, slots: u64) -> Result<Share, String> {
+    let gpu = &open(false)?;
     let rig = rig(method, &["real_time.pace=\"real\""])?;
     let mut best: Option<Share> = None;
     for runs in 1..=3 {

@@ -2,14 +2,15 @@
 
 use super::address_space;
 use super::devices::{
-    candidates, compute_family, has_timelines, queue_count, usable, Candidate, DeviceId, DeviceSummary,
+    candidates, compute_family, has_priorities, has_timelines, queue_count, usable, Candidate, DeviceId,
+    DeviceSummary,
 };
 use super::error::GpuError;
 use super::instance::{create_instance, Instance};
 use super::kept::Kept;
 use super::turn::{Held, Turn};
 use ash::{khr, vk};
-use std::ffi::CString;
+use std::ffi::{CStr, CString};
 use std::mem::ManuallyDrop;
 use std::sync::atomic::{AtomicU64, AtomicU8, Ordering};
 use std::sync::Arc;
@@ -43,6 +44,7 @@ pub struct Gpu {
     pub(super) device: ash::Device,
     /// Where frames begin and where they end. The same queue twice where the device has one.
     queues: [vk::Queue; 2],
+    goes_first: bool,
     /// Whose turn it is to submit.
     turn: Turn,
     pub(super) queue_family: u32,
@@ -111,6 +113,8 @@ struct Created {
     device: ash::Device,
     queue_family: u32,
     queues: [vk::Queue; 2],
+    /// Frames go before the work of other programs.
+    goes_first: bool,
     /// Most that buffers may take of the address space.
     most_bytes: Option<u64>,
 }
@@ -133,8 +137,42 @@ fn create(
     let queue_count = if has_timelines { queue_count(instance, physical, queue_family) } else { 1 };
     // What ends a frame goes first, because its light waits for it.
     let priorities = &[0.5, 1.0][2 - queue_count as usize..];
-    let queues =
-        [vk::DeviceQueueCreateInfo::default().queue_family_index(queue_family).queue_priorities(priorities)];
+    // On a desktop the compositor's work would stand before a frame for a millisecond or more. Drivers give way to programs that the system lets.
+    let asks_first = if summary.software { None } else { has_priorities(instance, physical) };
+    let device = |first: Option<&'static CStr>| {
+        open_with(instance, physical, (queue_family, priorities), has_timelines, first, options)
+    };
+    let (device, goes_first) = match asks_first.and_then(|extension| device(Some(extension)).ok()) {
+        Some(device) => (device, true),
+        None => (
+            device(None).map_err(|e| {
+                GpuError::from_result(e, "opening the Vulkan device", &name, summary.memory_mib)
+            })?,
+            false,
+        ),
+    };
+    // SAFETY: the device was created with so many queues of this family.
+    let queues = [0, queue_count - 1].map(|i| unsafe { device.get_device_queue(queue_family, i) });
+    Ok(Created { device, queue_family, queues, goes_first, most_bytes })
+}
+
+/// The device with the features that the shaders need. `first`: the extension by which its queues go before those of other programs.
+fn open_with(
+    instance: &ash::Instance,
+    physical: vk::PhysicalDevice,
+    (queue_family, priorities): (u32, &[f32]),
+    has_timelines: bool,
+    first: Option<&'static CStr>,
+    options: &GpuOptions,
+) -> Result<ash::Device, vk::Result> {
+    let mut before_others = vk::DeviceQueueGlobalPriorityCreateInfoKHR::default()
+        .global_priority(vk::QueueGlobalPriorityKHR::HIGH);
+    let mut queue =
+        vk::DeviceQueueCreateInfo::default().queue_family_index(queue_family).queue_priorities(priorities);
+    if first.is_some() {
+        queue = queue.push_next(&mut before_others);
+    }
+    let queues = [queue];
     let mut vulkan12 = vk::PhysicalDeviceVulkan12Features::default()
         .timeline_semaphore(has_timelines)
         .scalar_block_layout(true)
@@ -146,16 +184,14 @@ fn create(
         .push_next(&mut vulkan12);
     let mut executable =
         vk::PhysicalDevicePipelineExecutablePropertiesFeaturesKHR::default().pipeline_executable_info(true);
-    let extensions = [khr::pipeline_executable_properties::NAME.as_ptr()];
+    let statistics = options.statistics.then_some(khr::pipeline_executable_properties::NAME);
+    let extensions: Vec<_> = statistics.into_iter().chain(first).map(CStr::as_ptr).collect();
+    info = info.enabled_extension_names(&extensions);
     if options.statistics {
-        info = info.enabled_extension_names(&extensions).push_next(&mut executable);
+        info = info.push_next(&mut executable);
     }
     // SAFETY: `info` and what it points to live until the call returns.
-    let device = unsafe { instance.create_device(physical, &info, None) }
-        .map_err(|e| GpuError::from_result(e, "opening the Vulkan device", &name, summary.memory_mib))?;
-    // SAFETY: the device was created with so many queues of this family.
-    let queues = [0, queue_count - 1].map(|i| unsafe { device.get_device_queue(queue_family, i) });
-    Ok(Created { device, queue_family, queues, most_bytes })
+    unsafe { instance.create_device(physical, &info, None) }
 }
 
 impl Gpu {
@@ -203,7 +239,7 @@ impl Gpu {
         let mut first_error = None;
         for Candidate { physical, summary, id } in usable {
             let name: Arc<str> = summary.name.as_str().into();
-            let Created { device, queue_family, queues, most_bytes } =
+            let Created { device, queue_family, queues, goes_first, most_bytes } =
                 match create(&instance, physical, &summary, options) {
                     Ok(created) => created,
                     Err(error) => {
@@ -225,6 +261,7 @@ impl Gpu {
             return Ok(Arc::new(Self {
                 device,
                 queues,
+                goes_first,
                 turn: Turn::default(),
                 queue_family,
                 memory,
@@ -362,6 +399,11 @@ impl Gpu {
     pub(super) fn queues(&self) -> Result<([vk::Queue; 2], Held<'_>), GpuError> {
         let turn = self.turn.take().map_or_else(|| self.wait_for_turn(), Ok)?;
         Ok((self.queues, turn))
+    }
+
+    /// Whether frames go before the work of other programs, because the driver offers that and the system lets this program.
+    pub fn goes_first(&self) -> bool {
+        self.goes_first
     }
 
     /// Whether a frame can begin on one queue while the one before ends on another.

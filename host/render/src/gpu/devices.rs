@@ -3,7 +3,7 @@
 use super::error::GpuError;
 use super::pipeline::{shared_bindings, BindingKind};
 use super::GpuOptions;
-use ash::{amd, khr, nv, vk};
+use ash::{amd, ext, khr, nv, vk};
 use std::ffi::CStr;
 
 /// A device as `dpm doctor` lists it.
@@ -237,6 +237,15 @@ pub(super) fn compute_family(instance: &ash::Instance, physical: vk::PhysicalDev
         })
         .or_else(|| families.iter().position(compute))
         .map(|i| i as u32)
+}
+
+/// The extension by which queues go before those of other programs, if the device has it.
+pub(super) fn has_priorities(
+    instance: &ash::Instance,
+    physical: vk::PhysicalDevice,
+) -> Option<&'static CStr> {
+    let names = [khr::global_priority::NAME, ext::global_priority::NAME];
+    names.into_iter().find(|name| has_extension(instance, physical, name))
 }
 
 /// Whether the device has semaphores that count. The standard asks it of every device of Vulkan 1.2.

@@ -158,9 +158,12 @@ impl CrewParts {
         self.draw_unseen(rig)?;
         let watch = Stopwatch::start();
         let is_gpu = origin.gpu().is_some_and(|gpu| !gpu.summary().software);
+        // A GPU that needs a small part of a slot keeps up at any clock.
+        let small_ns = rig.rate().slot_len_ns(0) / 4;
         loop {
             let given = self.draw_unseen(rig)?;
-            if !is_gpu || !wakes || watch.elapsed_ns() >= WAKE_NS {
+            let is_awake = watch.elapsed_ns() >= WAKE_NS || self.first.wall_ns < small_ns;
+            if !is_gpu || !wakes || is_awake {
                 break;
             }
             if let (Some(budget), Some(gpu_ns)) = (&mut self.budget, self.first.gpu_ns) {

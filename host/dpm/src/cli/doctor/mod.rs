@@ -11,6 +11,7 @@ use super::rig_args::RigArgs;
 use super::watch::print;
 use dpm_common::realtime::{self, Refusal};
 use dpm_display::kms::Connector;
+use dpm_render::gpu::{DeviceSummary, GpuOptions};
 use dpm_rig::failure::{Failure, FailureKind};
 use dpm_rig::telemetry::report::to_json;
 use std::fs;
@@ -153,12 +154,28 @@ fn vulkan(findings: &mut Vec<Finding>) -> bool {
         };
         findings.push(Finding::new(&format!("Vulkan device {i}"), state, found, remedy));
     }
+    findings.extend(priority_of_frames(&devices));
     if devices.is_empty() {
         let remedy =
             "install the GPU vendor's driver, or software Vulkan: apt-get install mesa-vulkan-drivers";
         findings.push(Finding::new("Vulkan", State::Missing, "found a Vulkan loader but no device", remedy));
     }
     usable
+}
+
+/// Whether frames go before the work of other programs on the GPU that a run would take.
+fn priority_of_frames(devices: &[DeviceSummary]) -> Option<Finding> {
+    devices.iter().find(|device| !device.software && device.refused.is_none())?;
+    let gpu = dpm_render::gpu::Gpu::open(&GpuOptions::default()).ok()?;
+    let (found, remedy) = if gpu.goes_first() {
+        ("frames go before the work of other programs", "")
+    } else {
+        (
+            "frames share the GPU with other programs as equals",
+            "on a machine with a desktop: give the service AmbientCapabilities=CAP_SYS_NICE",
+        )
+    };
+    Some(Finding::new("GPU priority", State::Info, found, remedy))
 }
 
 fn cores(count: usize) -> Finding {
