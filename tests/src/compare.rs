@@ -1,7 +1,7 @@
 //! Compares a picture of the GPU with the f64 reference: it must have the same surfaces, the same light, and only
 //! errors that the variances explain.
 
-use dpm_lab::stability::gpu_compare::{self, Comparison};
+use dpm_lab::stability::gpu_compare::{self, Comparison, Rounding};
 use dpm_lab::stability::gpu_shot::Shot;
 use dpm_render::gpu::Gpu;
 use std::sync::Arc;
@@ -78,26 +78,16 @@ pub fn bits(radiance: &[[f32; 4]]) -> Vec<[u32; 4]> {
     radiance.iter().map(|r| r.map(f32::to_bits)).collect()
 }
 
-/// Largest share of pixels that two programs of one method may draw differently on a GPU.
-const OTHERWISE: f64 = 0.02;
-
-/// Checks that two programs drew the same picture: on software Vulkan bit for bit. The compilers of GPUs join a
-/// multiplication and an addition into one operation, in each program where it suits them. So there a pixel is the same
-/// up to rounding, and few pixels may differ by more, where rounding has decided a branch.
+/// Checks that two programs of one method drew the same picture, up to what [`Rounding`] allows the device.
 ///
 /// # Panics
 /// The pictures differ: a failure of the test.
 pub fn assert_same_picture(gpu: &Gpu, a: &[[f32; 4]], b: &[[f32; 4]], what: &str) {
-    let (a_bits, b_bits) = (bits(a), bits(b));
-    let otherwise = a_bits.iter().zip(&b_bits).filter(|(a, b)| a != b).count();
-    if gpu.summary().software {
-        assert_eq!(otherwise, 0, "{what}: pixels that differ");
-        return;
-    }
-    let differs = |(a, b): &(&f32, &f32)| (*a - *b).abs() > 1e-4 + 1e-3 * a.abs();
-    let more = a.iter().zip(b).filter(|(a, b)| a[..3].iter().zip(&b[..3]).any(|pair| differs(&pair))).count();
+    let (rounding, pixels) = (Rounding::of(gpu), a.len());
+    let (bits, more) =
+        (bits(a).iter().zip(&bits(b)).filter(|(a, b)| a != b).count(), rounding.different(a, b));
+    println!("{what}: {bits} of {pixels} pixels differ, {more} by more than rounding");
+    assert!(more <= rounding.few_of(pixels), "{what}: {more} of {pixels} pixels differ");
     let mean = |p: &[[f32; 4]]| p.iter().map(|r| f64::from(r[1])).sum::<f64>() / p.len() as f64;
-    println!("{what}: {otherwise} of {} pixels differ, {more} by more than rounding", a.len());
-    assert!(more as f64 <= OTHERWISE * a.len() as f64, "{what}: {more} of {} pixels differ", a.len());
     assert!((mean(a) - mean(b)).abs() <= 0.01 * mean(a), "{what}: {} and {}", mean(a), mean(b));
 }

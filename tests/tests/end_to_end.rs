@@ -44,7 +44,7 @@ fn the_light_is_the_rendered_picture_in_all_24_planes() {
             rig.scene_poses(&record.tracked_poses, &mut poses);
             assert_eq!(rig.observer.eye_and_gaze(&record.tracked_poses).0, record.eye);
             let spp = rig.config.render.spp;
-            draw(&rig, &mut renderer, &mut slot, &poses, light.frame, spp, spp as f32).unwrap();
+            draw(&rig, &mut renderer, &mut slot, &poses, light.frame, spp as f32).unwrap();
             for (i, (code, fell)) in slot.codes().iter().zip(&light.codes).enumerate() {
                 let rendered = [*code as u8, (*code >> 8) as u8, (*code >> 16) as u8];
                 assert_eq!(rendered, *fell, "frame {} pixel {i}", light.frame);

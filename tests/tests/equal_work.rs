@@ -8,7 +8,7 @@ use dpm_render::{trace_groups, FrameCost, Keep, Renderer, RendererSettings};
 use dpm_rig::config::RenderMethod;
 use dpm_rig::pipeline::renderer_settings;
 use dpm_rig::rig::Rig;
-use dpm_shaders::structs::WorkItem;
+use dpm_shaders::structs::{group_samples, WorkItem};
 use dpm_tests::gpu::with_gpu;
 use dpm_tests::rigs::demo_rig;
 use std::collections::BTreeSet;
@@ -19,8 +19,9 @@ struct Drawn {
     work: Vec<WorkItem>,
     samples: u32,
     cost: FrameCost,
-    /// Workgroups that keep the device busy.
+    /// Workgroups that keep the device busy, and those that were asked for.
     wanted: u32,
+    asked: u32,
 }
 
 /// The fourth frame of `rig` by a method, with `spp` samples a pixel or on average; `storage_tables`: as GPUs draw it.
@@ -35,8 +36,7 @@ fn drawn(rig: &Rig, which: RenderMethod, spp: u32, storage_tables: bool) -> Draw
         let mut slot = renderer.create_slot(true).expect("memory for a small frame");
         for k in 0..4 {
             let poses = poses_at(rig, u64::from(k));
-            let cost =
-                draw(rig, &mut renderer, &mut slot, &poses, k, spp, spp as f32).expect("the frame ends");
+            let cost = draw(rig, &mut renderer, &mut slot, &poses, k, spp as f32).expect("the frame ends");
             let radiance = slot.radiance().expect("a debug slot");
             let (work, samples) = slot.work().expect("a debug slot");
             frame = Some(Drawn {
@@ -45,6 +45,7 @@ fn drawn(rig: &Rig, which: RenderMethod, spp: u32, storage_tables: bool) -> Draw
                 samples,
                 cost,
                 wanted: trace_groups(gpu.summary()),
+                asked: slot.asked_groups().expect("a debug slot"),
             });
         }
     });
@@ -69,6 +70,13 @@ fn every_sample_is_traced_once_and_lanes_are_busy() {
         assert!(traced[0] <= traced[1] && traced[1] <= gpu.samples, "{what}: {traced:?} of {}", gpu.samples);
         if which != RenderMethod::Dpm {
             assert_eq!(traced, [gpu.samples; 2], "{what}");
+        }
+        // A range for each workgroup, and not fewer workgroups where the list was shorter when they were asked for.
+        let length = group_samples([gpu.work.len() as u32, gpu.samples], gpu.wanted);
+        let least = gpu.samples.div_ceil(length);
+        assert!(gpu.asked >= least, "{what}: {} workgroups for {least} ranges", gpu.asked);
+        if which == RenderMethod::Full {
+            assert_eq!(gpu.asked, least, "{what}: every pixel has as many samples");
         }
         for lanes in
             WIDTHS.map(|width| Lanes::of(&gpu.work, gpu.samples, width, gpu.wanted).expect("there is work"))

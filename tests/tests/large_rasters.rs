@@ -33,7 +33,7 @@ fn a_raster_is_traced_where_the_buffers_of_its_method_fit() {
             // The buffers that are read back afterwards fit too.
             let mut slot = renderer.create_slot(true).unwrap_or_else(|e| panic!("{what}: {e}"));
             let poses = poses_at(&rig, 0);
-            let mut frame = |k| draw(&rig, &mut renderer, &mut slot, &poses, k, 1, 1.0).map(|c| c.counters());
+            let mut frame = |k| draw(&rig, &mut renderer, &mut slot, &poses, k, 1.0).map(|c| c.counters());
             // Both of the buffers that frames write alternately.
             let counted = [frame(0).unwrap(), frame(1).unwrap()];
             for c in counted {

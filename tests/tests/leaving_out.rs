@@ -127,7 +127,7 @@ fn neither_changes_a_bit_of_a_method_with_histories() {
                 let mut frames = Vec::new();
                 for frame in 0..6 {
                     let poses = poses_at(&rig, u64::from(frame));
-                    draw(&rig, &mut renderer, &mut slot, &poses, frame, 2, 2.0).expect("the frame ends");
+                    draw(&rig, &mut renderer, &mut slot, &poses, frame, 2.0).expect("the frame ends");
                     frames.push((slot.radiance().expect("a debug slot").to_vec(), slot.codes().to_vec()));
                 }
                 frames

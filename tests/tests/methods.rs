@@ -209,7 +209,7 @@ fn codes_in_line(gpu: &Arc<Gpu>, which: RenderMethod, overlap: Overlapping) -> V
         }
         if k < 10 {
             let poses = poses_at(&rig, 8 * k as u64);
-            submit(&rig, &mut renderer, slot, &poses, k as u32, 2, 2.0).expect("the frame begins");
+            submit(&rig, &mut renderer, slot, &poses, k as u32, 2.0).expect("the frame begins");
         }
     }
     codes

@@ -36,7 +36,7 @@ fn codes() -> Vec<Vec<u32>> {
             let mut slot = renderer.create_slot(false).expect("memory for a small frame");
             for frame in 0..3 {
                 let poses = poses_at(&rig, u64::from(frame));
-                draw(&rig, &mut renderer, &mut slot, &poses, frame, 2, 2.0).expect("the frame ends");
+                draw(&rig, &mut renderer, &mut slot, &poses, frame, 2.0).expect("the frame ends");
             }
             all.push(slot.codes().to_vec());
         }

@@ -282,7 +282,7 @@ fn load(
             break;
         }
         let poses = poses_at(&rig, k);
-        draw(&rig, &mut renderer, &mut slot, &poses, k as u32, spp, spp as f32)
+        draw(&rig, &mut renderer, &mut slot, &poses, k as u32, spp as f32)
             .map_err(|source| PipelineError::Gpu { frame: k, source })?;
         let mut frame = BitPlaneFrame::new(rig.camera.raster, schedule);
         pack(Kernel::best(), slot.codes(), &mut frame);

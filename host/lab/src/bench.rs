@@ -28,8 +28,6 @@ pub const METHODS: [RenderMethod; 5] = [
 
 /// Frames drawn before those that count: histories fill, the driver settles.
 const WARM_UP: u32 = 4;
-/// A GPU that has just been idle runs at a fraction of its clock and needs a while to raise it, so it draws for this long before anything counts.
-const WAKE: Duration = Duration::from_millis(1000);
 /// Frames on their way to measure how fast they follow each other, as many as in a rig.
 const IN_LINE: u32 = 3;
 /// So many frames are measured however slow the device is ...
@@ -117,9 +115,7 @@ fn measure(rig: &Rig, gpu: &Arc<Gpu>, frames: u32, which: RenderMethod) -> Resul
     let spp = rig.config.render.spp;
     let method = switched_method_of(&rig.config.render, which);
     let settings = RendererSettings { method, output: output(rig, gpu, false), ..renderer_settings(rig) };
-    if !gpu.summary().software {
-        wake(rig, gpu, settings.clone())?;
-    }
+    wake(rig, gpu, settings.clone())?;
     let mut renderer = Renderer::new(gpu, &rig.scene, settings)?;
     let mut slot = renderer.create_slot(false)?;
     let (mut costs, mut walls): (Vec<FrameCost>, Vec<f64>) = (Vec::new(), Vec::new());
@@ -127,7 +123,7 @@ fn measure(rig: &Rig, gpu: &Arc<Gpu>, frames: u32, which: RenderMethod) -> Resul
     for k in 0..WARM_UP + frames.max(FEWEST as u32) {
         let poses = poses_at(rig, u64::from(k));
         let before = Instant::now();
-        let cost = draw(rig, &mut renderer, &mut slot, &poses, k, spp, spp as f32)?;
+        let cost = draw(rig, &mut renderer, &mut slot, &poses, k, spp as f32)?;
         if k >= WARM_UP {
             walls.push(before.elapsed().as_secs_f64() * 1e3);
             costs.push(cost);
@@ -169,12 +165,15 @@ fn measure(rig: &Rig, gpu: &Arc<Gpu>, frames: u32, which: RenderMethod) -> Resul
 
 /// Draws frames that do not count, until the GPU has the clock at which it will draw those that do.
 fn wake(rig: &Rig, gpu: &Arc<Gpu>, settings: RendererSettings) -> Result<(), RenderError> {
-    let spp = rig.config.render.spp;
+    let (spp, wake) = (rig.config.render.spp, gpu.summary().wakes_within());
+    if wake.is_zero() {
+        return Ok(());
+    }
     let mut renderer = Renderer::new(gpu, &rig.scene, settings)?;
     let mut slot = renderer.create_slot(false)?;
     let started = Instant::now();
-    for k in (0..).take_while(|_| started.elapsed() < WAKE) {
-        draw(rig, &mut renderer, &mut slot, &poses_at(rig, u64::from(k)), k, spp, spp as f32)?;
+    for k in (0..).take_while(|_| started.elapsed() < wake) {
+        draw(rig, &mut renderer, &mut slot, &poses_at(rig, u64::from(k)), k, spp as f32)?;
     }
     Ok(())
 }
@@ -192,7 +191,7 @@ fn in_line(rig: &Rig, renderer: &mut Renderer, frames: u32) -> Result<f64, Rende
         if k >= IN_LINE {
             slot.wait(FRAME_WAIT_NS)?;
         }
-        submit(rig, renderer, slot, &poses_at(rig, u64::from(k)), WARM_UP + frames + k, spp, spp as f32)?;
+        submit(rig, renderer, slot, &poses_at(rig, u64::from(k)), WARM_UP + frames + k, spp as f32)?;
     }
     let seconds = started.elapsed().as_secs_f64();
     slots.iter_mut().try_for_each(|slot| slot.wait(FRAME_WAIT_NS).map(drop))?;
@@ -208,7 +207,7 @@ fn count_work(
 ) -> Result<FrameWork, RenderError> {
     let spp = rig.config.render.spp;
     let mut slot = renderer.create_slot(true)?;
-    draw(rig, renderer, &mut slot, &poses_at(rig, u64::from(frame)), frame, spp, spp as f32)?;
+    draw(rig, renderer, &mut slot, &poses_at(rig, u64::from(frame)), frame, spp as f32)?;
     let (items, samples) = slot.work().unwrap_or((&[], 0));
     let traffic = traffic(&settings_of_planes(rig, which), Keep::default());
     Ok(FrameWork {

@@ -92,7 +92,7 @@ impl Content {
         let mut frames = Vec::new();
         for k in 0..count.max(1) {
             let poses = poses_at(rig, u64::from(k));
-            draw(rig, &mut renderer, &mut slot, &poses, k, spp, spp as f32).map_err(RenderError::from)?;
+            draw(rig, &mut renderer, &mut slot, &poses, k, spp as f32).map_err(RenderError::from)?;
             let mut frame = BitPlaneFrame::new(rig.camera.raster, rig.config.projector.schedule());
             pack(kernel, slot.codes(), &mut frame);
             frames.push(frame);

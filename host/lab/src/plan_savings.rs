@@ -189,7 +189,7 @@ pub(crate) fn compare(
         let poses = poses_at(rig, u64::from(k));
         for (i, renderer) in renderers.iter_mut().enumerate() {
             let watch = Stopwatch::start();
-            let cost = draw(rig, renderer, &mut slots[i], &poses, k, spp, spp as f32)?;
+            let cost = draw(rig, renderer, &mut slots[i], &poses, k, spp as f32)?;
             let gpu_ns: u64 = cost.pass_ns.iter().sum();
             times[i].push(if gpu_ns > 0 { gpu_ns } else { watch.elapsed_ns() });
             let counters = cost.counters();

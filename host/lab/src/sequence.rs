@@ -131,7 +131,7 @@ impl Theatre {
         let mut renderer = Renderer::new(&gpu, &rig.scene, settings)?;
         let mut slot = renderer.create_slot(true)?;
         let poses = poses_at(&rig, span.last_slot);
-        draw(&rig, &mut renderer, &mut slot, &poses, 0, 1, 1.0)?;
+        draw(&rig, &mut renderer, &mut slot, &poses, 0, 1.0)?;
         let (surfaces, guides) = (slot.surfaces().unwrap_or(&[]), slot.guides().unwrap_or(&[]));
         let width = rig.camera.raster.width();
         let probes = surfaces
@@ -189,7 +189,7 @@ impl Theatre {
         let total = self.span.warm_up + self.span.kept;
         for k in 0..total {
             let poses = self.poses(k, total);
-            let cost = draw(rig, &mut renderer, &mut slot, &poses, k, spp_of_frame(spp, k), spp)?;
+            let cost = draw(rig, &mut renderer, &mut slot, &poses, k, spp)?;
             each(k, &slot);
             if k >= self.span.warm_up {
                 let c = cost.counters();
@@ -231,7 +231,7 @@ impl Theatre {
             let poses = self.poses(k, total);
             for (renderer, slot, spp, gpu, wall) in &mut all {
                 let watch = Stopwatch::start();
-                let cost = draw(rig, renderer, slot, &poses, k, spp_of_frame(*spp, k), *spp)?;
+                let cost = draw(rig, renderer, slot, &poses, k, *spp)?;
                 if k >= RACE_WARM_UP {
                     wall.push(watch.elapsed_ns() as f64 * 1e-6);
                     gpu.push(cost.pass_ns.iter().sum::<u64>() as f64 * 1e-6);
@@ -306,7 +306,7 @@ fn tracked_poses(rig: &Rig, poses: &[DAffine3]) -> Vec<DAffine3> {
     (0..rig.bodies.len()).map(|i| carried(i).map_or(DAffine3::IDENTITY, |b| poses[b])).collect()
 }
 
-/// Draws one frame of poses and waits for it, at most two minutes.
+/// Draws one frame of poses, with `spp` samples a pixel on average over the frames, and waits for it, at most two minutes.
 ///
 /// # Errors
 /// The GPU's.
@@ -316,10 +316,9 @@ pub fn draw(
     slot: &mut FrameSlot,
     poses: &[DAffine3],
     frame: u32,
-    spp: u32,
-    budget_spp: f32,
+    spp: f32,
 ) -> Result<FrameCost, GpuError> {
-    submit(rig, renderer, slot, poses, frame, spp, budget_spp)?;
+    submit(rig, renderer, slot, poses, frame, spp)?;
     slot.wait(FRAME_WAIT_NS)
 }
 
@@ -336,12 +335,12 @@ pub fn submit(
     slot: &mut FrameSlot,
     poses: &[DAffine3],
     frame: u32,
-    spp: u32,
-    budget_spp: f32,
+    spp: f32,
 ) -> Result<(), GpuError> {
     let tracked = tracked_poses(rig, poses);
     let still = FrameInputs::new(&rig.camera, rig.observer.eye_and_gaze(&tracked), poses);
-    renderer.submit(slot, &FrameInputs { frame, spp, budget_spp, ..still })
+    let drawn = FrameInputs { frame, spp: spp_of_frame(spp, frame), budget_spp: spp, ..still };
+    renderer.submit(slot, &drawn)
 }
 
 /// Mean over the last `window` frames at every probe, frames without light left out: what an eye of that integration time saw.

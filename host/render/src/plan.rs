@@ -78,8 +78,8 @@ impl RendererPlan {
         let mut constants = needs.constants();
         constants.extend(self.settings.method.constants());
         constants.extend(optics.constants());
-        // A level's group waits while the next level is open, so the deepest one never does.
         constants.push((ids::TRACE_GROUPS, groups));
+        // A level's group waits while the next level is open, so the deepest one never does.
         constants.push((ids::WALK_STACK, self.data.levels.saturating_sub(1).max(1)));
         constants
     }

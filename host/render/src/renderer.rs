@@ -15,7 +15,7 @@ use super::slot::FrameSlot;
 use super::tiles::TileList;
 use super::warp::Movers;
 use crate::gpu::{
-    submit_frame, BindingSet, CommandList, FrameFence, Gpu, GpuError, Order, Overlap, Recorder,
+    submit_frame, BindingSet, CommandList, FrameFence, Gpu, GpuError, Orders, Overlap, Recorder,
 };
 use crate::pack;
 use bytemuck::Zeroable;
@@ -51,10 +51,8 @@ pub struct Renderer {
     tile_list: TileList,
     /// The bodies that move while the planes of a frame last.
     movers: Movers,
-    /// Number of the last frame that was to be submitted, which orders frames that overlap.
-    numbered: u64,
-    /// For each of the two histories the last frame that has it, by that number.
-    ended_by_parity: [u64; 2],
+    /// The order of frames that overlap.
+    orders: Orders,
     optics: OpticsLayout,
     pub(super) gpu: Arc<Gpu>,
 }
@@ -129,8 +127,7 @@ impl Renderer {
             rated,
             tile_list,
             movers,
-            numbered: 0,
-            ended_by_parity: [0; 2],
+            orders: Orders::default(),
             optics,
             gpu: gpu.clone(),
         })
@@ -333,12 +330,10 @@ impl Renderer {
         slot.buffers.frame.host.write(&[frame]);
         slot.parity = 1 - self.last.parity;
         let [first, second] = &slot.lists[slot.parity];
-        self.numbered += 1;
-        // The frame before the last has read the history that this one writes.
-        let order = Order { number: self.numbered, after: self.ended_by_parity[slot.parity] };
+        let order = self.orders.next(slot.parity);
         let overlap = self.resources.overlap.as_ref().map(|overlap| (overlap, order));
         submit_frame([first, second], overlap, &mut slot.fence)?;
-        self.ended_by_parity[slot.parity] = order.number;
+        self.orders.submitted(slot.parity, order);
         if decides_rates {
             self.rated.copy_from_slice(slot.tile_list.active());
         }

@@ -160,6 +160,12 @@ impl FrameSlot {
         Some((debug.work.read(items.min(self.raster.pixel_count())), (listed >> 32) as u32))
     }
 
+    /// Workgroups of the pass `trace` that the pass `schedule` asked for. Only with `debug` at creation.
+    pub fn asked_groups(&self) -> Option<u32> {
+        let [x, y, _] = self.buffers.debug_host.as_ref()?.schedule.read::<Schedule>(1)[0].groups;
+        Some(x * y)
+    }
+
     /// Pixels of the tiles that the frame worked on.
     pub fn listed_pixels(&self) -> u64 {
         let tiles = self.tile_list.active().iter().filter(|is_active| **is_active).count();

@@ -261,8 +261,7 @@ impl<'a> Player<'a> {
         let spp = config.render.spp;
         for k in 0..=frame {
             self.poses = poses_at(rig, u64::from(k));
-            draw(rig, &mut self.renderer, &mut self.slot, &self.poses, k, spp, spp as f32)
-                .map_err(gpu_failure)?;
+            draw(rig, &mut self.renderer, &mut self.slot, &self.poses, k, spp as f32).map_err(gpu_failure)?;
             // Rates are decided in every second frame.
             if self.method.needs_rates() && k % 2 == 0 && k + 2 > frame {
                 self.errors = tile_errors(rig.camera.raster, &self.method, &self.slot);

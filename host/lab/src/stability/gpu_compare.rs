@@ -21,6 +21,57 @@ pub struct Comparison {
     pub met: usize,
 }
 
+/// Largest share of pixels that two programs of one method may draw otherwise on a GPU.
+const OTHERWISE: f64 = 0.02;
+
+/// By how much two programs of one method may draw a value differently: not at all on software Vulkan. The compilers of GPUs join a multiplication and
+/// an addition into one operation, in each program where it suits it. So there a pixel is the same up to rounding, and few pixels differ by more, where
+/// rounding has decided a branch.
+#[derive(Clone, Copy, Debug)]
+pub struct Rounding {
+    is_exact: bool,
+}
+
+impl Rounding {
+    /// That of the compiler of `gpu`.
+    pub fn of(gpu: &Gpu) -> Self {
+        Self { is_exact: gpu.summary().software }
+    }
+
+    /// What a value as large as this may differ by.
+    pub fn of_value(self, value: f64) -> f64 {
+        if self.is_exact {
+            0.0
+        } else {
+            1e-4 + 1e-3 * value.abs()
+        }
+    }
+
+    /// How many of `pixels` may differ by more.
+    pub fn few_of(self, pixels: usize) -> usize {
+        if self.is_exact {
+            0
+        } else {
+            (OTHERWISE * pixels as f64) as usize
+        }
+    }
+
+    /// Pixels of two pictures that differ: by any bit, or by more than rounding.
+    pub fn different(self, a: &[[f32; 4]], b: &[[f32; 4]]) -> usize {
+        let differs = |a: f32, b: f32| {
+            let (a, b) = (f64::from(a), f64::from(b));
+            // NaN is near to nothing.
+            let is_near = (a - b).abs() <= self.of_value(a);
+            !is_near
+        };
+        let is_other = |(a, b): &(&[f32; 4], &[f32; 4])| {
+            let bits = |p: &[f32; 4]| p.map(f32::to_bits);
+            bits(a) != bits(b) && (self.is_exact || a.iter().zip(*b).any(|(a, b)| differs(*a, *b)))
+        };
+        a.iter().zip(b).filter(is_other).count()
+    }
+}
+
 /// Relative difference of distances above which two surfaces are not the same.
 const SAME_DISTANCE: f64 = 1e-4;
 

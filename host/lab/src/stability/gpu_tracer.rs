@@ -2,7 +2,7 @@
 
 use super::estimate::{pooled, Estimate};
 use super::gpu::GpuCase;
-use super::gpu_compare::compare;
+use super::gpu_compare::{compare, Rounding};
 use super::gpu_shot::{Picture, Shot};
 use crate::reference::microfacet::fresnel_dielectric;
 use dpm_render::gpu::Gpu;
@@ -579,32 +579,22 @@ fn firefly_limit(gpu: &Arc<Gpu>, seed: u64) -> f64 {
     let shot = Shot { spp: 32, depth: 5, seed: seed as u32, ..Shot::new(&scene, camera) };
     let draw = |depth, limit| Shot { depth, clamp_indirect: limit, ..shot.clone() }.draw(gpu);
     let (free, tight, loose) = (draw(5, None), draw(5, Some(0.02)), draw(5, Some(1e30)));
-    // A limit is another program. The compilers of GPUs join a multiplication and an addition where it suits a program, so that pixels differ by
-    // rounding, and few by more, where rounding has decided a branch.
-    let is_exact = gpu.summary().software;
-    let few = if is_exact { 0 } else { free.radiance.len() as u32 / 50 };
-    let slack = |y: f64| if is_exact { 0.0 } else { 1e-4 + 1e-3 * y };
-    let is_other = |(a, b): &(&[f32; 4], &[f32; 4])| {
-        a[..3].iter().zip(&b[..3]).any(|(a, b)| {
-            let (a, b) = (f64::from(*a), f64::from(*b));
-            a.to_bits() != b.to_bits() && (a - b).abs() >= slack(a.abs())
-        })
-    };
-    let others = |a: &Picture, b: &Picture| {
-        let n = a.radiance.iter().zip(&b.radiance).filter(is_other).count() as u32;
-        n.saturating_sub(few)
-    };
+    // A limit is another program.
+    let rounding = Rounding::of(gpu);
+    let few = rounding.few_of(free.radiance.len()) as u32;
+    let others =
+        |a: &Picture, b: &Picture| (rounding.different(&a.radiance, &b.radiance) as u32).saturating_sub(few);
     let mut faults = others(&free, &loose);
     faults += free.counters[0].clamped_samples + loose.counters[0].clamped_samples;
     faults += u32::from(tight.counters[0].clamped_samples <= 100);
-    let added = |(a, b): &(&Estimate, &Estimate)| a.mean[1] > b.mean[1] + 1e-6 + slack(b.mean[1]);
+    let added = |(a, b): &(&Estimate, &Estimate)| a.mean[1] > b.mean[1] + 1e-6 + rounding.of_value(b.mean[1]);
     faults += (tight.estimates.iter().zip(&free.estimates).filter(added).count() as u32).saturating_sub(few);
     // Of paths that end at their third vertex a sample of a light and a hit are indirect, neither beyond the limit; without one some are.
     let (two, three, beyond) = (draw(2, None), draw(3, Some(0.002)), draw(3, None));
     let luminance = |m: &[f64; 3]| 0.2126 * m[0] + 0.7152 * m[1] + 0.0722 * m[2];
     let over = |p: &Picture| {
         let pairs = p.estimates.iter().zip(&two.estimates);
-        let most = |b: &Estimate| 2.0 * 0.002 + 1e-5 + slack(luminance(&b.mean));
+        let most = |b: &Estimate| 2.0 * 0.002 + 1e-5 + rounding.of_value(luminance(&b.mean));
         pairs.filter(|(a, b)| luminance(&a.mean) - luminance(&b.mean) > most(b)).count() as u32
     };
     faults += over(&three).saturating_sub(few) + u32::from(over(&beyond) < 10 + few);

@@ -5,6 +5,7 @@ use super::pipeline::{shared_bindings, BindingKind};
 use super::GpuOptions;
 use ash::{amd, ext, khr, nv, vk};
 use std::ffi::CStr;
+use std::time::Duration;
 
 /// A device as `dpm doctor` lists it.
 #[derive(Clone, Debug)]
@@ -33,6 +34,18 @@ pub struct DeviceSummary {
     pub processors: Option<u32>,
     /// Frames go to a queue that does not draw, so they do not share its time with a desktop.
     pub own_queue: bool,
+}
+
+impl DeviceSummary {
+    /// How long it has to draw until it has raised its clock. A GPU that has been idle for some seconds runs at a fraction of it (an H100 at 345 of
+    /// 1980 MHz) and needs up to half a second of work.
+    pub fn wakes_within(&self) -> Duration {
+        if self.software {
+            Duration::ZERO
+        } else {
+            Duration::from_millis(700)
+        }
+    }
 }
 
 /// Identifies a device in several lists of the same machine.

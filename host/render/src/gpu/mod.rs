@@ -32,6 +32,6 @@ pub use devices::DeviceSummary;
 pub use error::{GpuError, MemoryPool};
 pub use instance::validation_messages;
 pub use loss::{AfterLoss, LossBudget};
-pub(crate) use overlap::{submit_frame, Order, Overlap};
+pub(crate) use overlap::{submit_frame, Orders, Overlap};
 pub use pipeline::{shared_bindings, BindingKind, BindingSet, BindingTable, ComputePipeline};
 pub use statistics::Executable;

@@ -19,12 +19,33 @@ pub(crate) struct Overlap {
 }
 
 /// A frame's place in the order.
-#[derive(Clone, Copy, Debug)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) struct Order {
-    /// Its number: above those of all frames before.
-    pub number: u64,
+    /// Its number: above those of all frames before, those that could not be submitted included.
+    number: u64,
     /// The frame whose second list must have ended before; 0: none.
-    pub after: u64,
+    after: u64,
+}
+
+/// Gives frames their places. Frames write two histories in turns, and the second list of a frame reads the one that its first has written.
+#[derive(Clone, Copy, Debug, Default)]
+pub(crate) struct Orders {
+    numbered: u64,
+    /// For each history the last frame that has it.
+    has: [u64; 2],
+}
+
+impl Orders {
+    /// The place of the next frame, which writes the history `parity`.
+    pub(crate) fn next(&mut self, parity: usize) -> Order {
+        self.numbered += 1;
+        Order { number: self.numbered, after: self.has[parity] }
+    }
+
+    /// The frame of this place was submitted.
+    pub(crate) fn submitted(&mut self, parity: usize, order: Order) {
+        self.has[parity] = order.number;
+    }
 }
 
 impl Overlap {
@@ -121,5 +142,25 @@ pub(crate) fn submit_frame(
     match overlap {
         Some((overlap, order)) => overlap.submit(lists, order, fence),
         None => submit_in_turn(&lists.map(|list| list.buffer), fence),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_frame_waits_for_the_last_one_that_reads_the_history_it_writes() {
+        let mut orders = Orders::default();
+        let mut frame = |parity, is_submitted: bool| {
+            let order = orders.next(parity);
+            if is_submitted {
+                orders.submitted(parity, order);
+            }
+            (order.number, order.after)
+        };
+        assert_eq!([frame(1, true), frame(0, true), frame(1, true)], [(1, 0), (2, 0), (3, 1)]);
+        // A frame that was not submitted signals nothing, and the next one takes its turn and another number.
+        assert_eq!([frame(0, false), frame(0, true), frame(1, true)], [(4, 2), (5, 2), (6, 3)]);
     }
 }

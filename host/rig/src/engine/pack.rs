@@ -40,8 +40,14 @@ impl GpuTimes {
     /// To start the GPU and to wake the thread that waits for it takes time too, and delays the frame. But it keeps
     /// the GPU from nothing: while a frame is drawn, the next one is started. So of a frame that found the GPU idle its
     /// own time counts, and the distance from the frame before only where frames stand in line. That distance is the
-    /// host's to measure, which may have been held up, so it counts within bounds.
-    fn finished(&mut self, submitted_at: HostTime, done_at: HostTime, own_ns: Option<i64>) -> i64 {
+    /// host's to measure, which may have been held up, so it counts within bounds. Where frames overlap (`overlaps`) each
+    /// ends about a slot after the one before, whatever it took, and its own time counts.
+    fn finished(
+        &mut self,
+        (submitted_at, done_at): (HostTime, HostTime),
+        own_ns: Option<i64>,
+        overlaps: bool,
+    ) -> i64 {
         let took = done_at.ns_since(submitted_at);
         self.recent[self.count % self.recent.len()] = took;
         self.count += 1;
@@ -49,7 +55,7 @@ impl GpuTimes {
         let alone = done_at.ns_since(submitted_at.max(self.last_done_at));
         self.last_done_at = done_at;
         match own_ns {
-            Some(own) if waited => alone.clamp(own, own.saturating_mul(MOST_OF_OWN)),
+            Some(own) if waited && !overlaps => alone.clamp(own, own.saturating_mul(MOST_OF_OWN)),
             Some(own) => own,
             None => alone,
         }
@@ -103,15 +109,15 @@ impl PackStage {
     /// The GPU finished a frame at `now`.
     pub(crate) fn rendered(&mut self, note: &FrameNote, now: HostTime) {
         let (gpu_ns, occupied_ns) = (note.gpu_ns(), note.occupied_ns());
-        let took_ns = self.times.finished(note.timeline.submitted_at, now, gpu_ns);
-        // Where frames overlap each ends about a slot after the one before, whatever it took.
+        let span = (note.timeline.submitted_at, now);
+        let took_ns = self.times.finished(span, gpu_ns, occupied_ns.is_some());
         self.crew.gpu.finish(occupied_ns.unwrap_or(took_ns));
         self.facts.gpu_is_slow.store(self.crew.gpu.is_slow(), Ordering::Relaxed);
-        if let (Some(controller), Some(gpu_ns)) = (&mut self.budget, gpu_ns) {
+        if let (Some(controller), Some(_)) = (&mut self.budget, gpu_ns) {
             controller.within(note.plan.most_milli);
             // The whole frame counts, although the next one may begin before its end. If only its longer part had to fit, 45 % more
             // rays would fit, and light would come a slot later (measured on an H100).
-            controller.measured(note.plan.budget_milli, if occupied_ns.is_some() { gpu_ns } else { took_ns });
+            controller.measured(note.plan.budget_milli, took_ns);
             self.crew.budget_milli.store(controller.rays(), Ordering::Relaxed);
         }
     }
@@ -153,20 +159,20 @@ mod tests {
         let at = |ms: i64| HostTime(ms * 1_000_000);
         for i in 0..40 {
             // Two in flight: each takes 80 ms, of which 40 are its own.
-            let alone = times.finished(at(40 * i), at(40 * i + 80), None);
+            let alone = times.finished((at(40 * i), at(40 * i + 80)), None, false);
             assert!(i == 0 || alone == 40_000_000, "{alone}");
         }
         assert_eq!(times.limit_ns(), 320_000_000);
         times.forget();
         assert_eq!(times.limit_ns(), 2_000_000_000, "more samples are asked for");
         for i in 0..16 {
-            times.finished(at(1700 + 10 * i), at(1701 + 10 * i), None);
+            times.finished((at(1700 + 10 * i), at(1701 + 10 * i)), None, false);
         }
         assert_eq!(times.limit_ns(), 320_000_000, "warm again");
-        times.finished(at(5000), at(9000), None);
+        times.finished((at(5000), at(9000)), None, false);
         assert_eq!(times.limit_ns(), 2_000_000_000, "never longer than two seconds");
         for i in 0..64 {
-            times.finished(at(10_000 + 10 * i), at(10_001 + 10 * i), None);
+            times.finished((at(10_000 + 10 * i), at(10_001 + 10 * i)), None, false);
         }
         assert_eq!(times.limit_ns(), 100_000_000);
     }
@@ -183,7 +189,7 @@ mod tests {
             let submitted_at = HostTime(i * SLOT_NS);
             let noise = if i % 7 == 0 { SLOT_NS / 8 } else { 0 };
             let seen_at = submitted_at.plus_ns(SLOT_NS * 9 / 10 + noise);
-            let took = times.finished(submitted_at, seen_at, Some(own));
+            let took = times.finished((submitted_at, seen_at), Some(own), false);
             assert!((own..SLOT_NS * 9 / 10).contains(&took), "{took}");
             crew.gpu.finish(took);
             assert!(i < 20 || !crew.gpu.is_slow(), "at frame {i}");
@@ -192,14 +198,18 @@ mod tests {
         let mut at = HostTime(2000 * SLOT_NS);
         for i in 0..100 {
             let done_at = at.plus_ns(SLOT_NS * 11 / 10);
-            let took = times.finished(at.plus_ns(-SLOT_NS), done_at, Some(own));
+            let took = times.finished((at.plus_ns(-SLOT_NS), done_at), Some(own), false);
             assert!(i == 0 || took == SLOT_NS * 11 / 10, "{took}");
             crew.gpu.finish(took);
             at = done_at;
         }
         assert!(crew.gpu.is_slow());
+        // Where frames overlap, each comes a slot after the one before, however quick the GPU is.
+        let overlapping = times.finished((at.plus_ns(-SLOT_NS), at.plus_ns(SLOT_NS)), Some(own), true);
+        assert_eq!(overlapping, own);
+        at = at.plus_ns(SLOT_NS);
         // A thread that was held up for a second says nothing about the GPU.
-        let took = times.finished(at.plus_ns(-SLOT_NS), at.plus_ns(1_000_000_000), Some(own));
+        let took = times.finished((at.plus_ns(-SLOT_NS), at.plus_ns(1_000_000_000)), Some(own), false);
         assert_eq!(took, MOST_OF_OWN * own);
     }
 }

@@ -27,13 +27,11 @@ use dpm_render::gpu::Gpu;
 use dpm_render::pack::{BitPlaneFrame, Kernel};
 use dpm_render::{RenderError, Renderer, RendererSettings};
 use std::sync::Arc;
+use std::time::Duration;
 
 /// How long the first frame may take, nanoseconds. Drivers translate shaders for it, which takes minutes on a slow,
 /// busy machine.
 pub(super) const FIRST_FRAME_TIMEOUT_NS: u64 = 180_000_000_000;
-/// A GPU that has been idle for some seconds runs at a fraction of its clock (an H100 at 345 of 1980 MHz) and needs up to
-/// half a second of work to raise it, nanoseconds.
-const WAKE_NS: u64 = 700_000_000;
 
 /// Slots whose shifts wait in the mock to be recorded.
 const MOVES_KEPT: usize = 64;
@@ -157,13 +155,13 @@ impl CrewParts {
         }
         self.draw_unseen(rig)?;
         let watch = Stopwatch::start();
-        let is_gpu = origin.gpu().is_some_and(|gpu| !gpu.summary().software);
+        let wake = origin.gpu().map_or(Duration::ZERO, |gpu| gpu.summary().wakes_within());
         // A GPU that needs a small part of a slot keeps up at any clock.
         let small_ns = rig.rate().slot_len_ns(0) / 4;
         loop {
             let given = self.draw_unseen(rig)?;
-            let is_awake = watch.elapsed_ns() >= WAKE_NS || self.first.wall_ns < small_ns;
-            if !is_gpu || !wakes || is_awake {
+            let is_awake = watch.elapsed_ns() >= wake.as_nanos() as u64 || self.first.wall_ns < small_ns;
+            if !wakes || is_awake {
                 break;
             }
             if let (Some(budget), Some(gpu_ns)) = (&mut self.budget, self.first.gpu_ns) {

@@ -163,7 +163,7 @@ fn vulkan(findings: &mut Vec<Finding>) -> bool {
     usable
 }
 
-/// Whether frames go before the work of other programs on the GPU that a run would take.
+/// Whether frames go before the work of other programs on the GPU that a run takes if its rig file names none.
 fn priority_of_frames(devices: &[DeviceSummary]) -> Option<Finding> {
     devices.iter().find(|device| !device.software && device.refused.is_none())?;
     let gpu = dpm_render::gpu::Gpu::open(&GpuOptions::default()).ok()?;
