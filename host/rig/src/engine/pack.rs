@@ -115,7 +115,7 @@ impl PackStage {
         self.facts.gpu_is_slow.store(self.crew.gpu.is_slow(), Ordering::Relaxed);
         if let (Some(controller), Some(_)) = (&mut self.budget, gpu_ns) {
             controller.within(note.plan.most_milli);
-            // The whole frame counts, although the next one may begin before its end. If only its longer part had to fit, 45 % more
+            // The whole frame counts, although the next one may begin before its end. If only its longer part had to fit, a third more
             // rays would fit, and light would come a slot later (measured on an H100).
             controller.measured(note.plan.budget_milli, took_ns);
             self.crew.budget_milli.store(controller.rays(), Ordering::Relaxed);
