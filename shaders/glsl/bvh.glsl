@@ -158,6 +158,25 @@ uint next_body(uint first, vec3 origin, vec3 inverse, uint mask, float t_max) {
     return i;
 }
 
+// The next body in the tree from its node `at` on, and `at` moves behind it. NO_INSTANCE: there is none. Otherwise as above. Bodies come about in
+// the order in which the ray meets them, because the nodes of each octant of directions stand in that order.
+uint next_in_tree(inout uint at, vec3 origin, vec3 inverse, uint mask, float t_max) {
+    uint first = ((inverse.x < 0.0 ? 1u : 0u) | (inverse.y < 0.0 ? 2u : 0u) | (inverse.z < 0.0 ? 4u : 0u)) * frame.body_nodes;
+    uint body = BODY_NODE_INNER;
+    do {
+        if (at < frame.body_nodes) {
+            BodyNode node = body_node_at(first + at);
+            bool enters = (mask == 0u || ((node.body >> 8u) & mask) != 0u) && enters_bounds(origin, inverse, node.lower, node.upper, t_max);
+            body = enters ? node.body : BODY_NODE_INNER;
+            at = enters ? at + 1u : node.after;
+        }
+    } while ((body & BODY_NODE_INNER) != 0u && at < frame.body_nodes);
+    return (body & BODY_NODE_INNER) != 0u ? NO_INSTANCE : body & 255u;
+}
+
+// Where a walk has been at all bodies.
+uint end_of_bodies() { return HAS_BODY_TREE ? frame.body_nodes : frame.instance_count; }
+
 #ifdef TEXEL_TABLES
 #include "walk_software.glsl"
 #else

@@ -10,6 +10,7 @@
 #define NO_FRAME 4294967295u
 #define INSTANCE_PROJECTED 1u
 #define INSTANCE_EMPTY 2u
+#define BODY_NODE_INNER 2147483648u
 #define MATERIAL_DOUBLE_SIDED 1u
 #define MATERIAL_THIN 2u
 #define MATERIAL_TRANSMISSIVE 4u
@@ -72,7 +73,7 @@
 #define B_GUIDES 17u
 #define B_HISTORY 18u
 #define B_RATES 19u
-#define B_RATE_TABLE 20u
+#define B_BODY_NODES 20u
 #define B_SCHEDULE 21u
 #define B_WORK 22u
 #define B_NOISE 23u
@@ -112,52 +113,54 @@ layout(constant_id = 7) const uint ENVIRONMENT_KIND = 2u;
 layout(constant_id = 8) const bool HAS_CLAMP = true;
 // A material of the scene has a diffuse lobe: it is not metallic everywhere.
 layout(constant_id = 9) const bool HAS_DIFFUSE = true;
+// The scene has so many bodies that rays look for them in a tree. Of few they ask each.
+layout(constant_id = 10) const bool HAS_BODY_TREE = true;
 // Where random numbers come from, as `SAMPLER_*`.
-layout(constant_id = 10) const uint SAMPLER = 0u;
+layout(constant_id = 11) const uint SAMPLER = 0u;
 // Guides are written, because a pass between tracing and compensation reads them.
-layout(constant_id = 11) const bool HAS_GUIDES = true;
+layout(constant_id = 12) const bool HAS_GUIDES = true;
 // Radiance is divided by the albedo of the surface before it is filtered.
-layout(constant_id = 12) const bool HAS_DEMODULATION = true;
+layout(constant_id = 13) const bool HAS_DEMODULATION = true;
 // The picture is filtered in space.
-layout(constant_id = 13) const bool HAS_FILTER = true;
+layout(constant_id = 14) const bool HAS_FILTER = true;
 // How the projector's lens bends rays, as `LENS_*`.
-layout(constant_id = 14) const uint LENS = 0u;
+layout(constant_id = 15) const uint LENS = 0u;
 // The projector's light is not proportional to the code value.
-layout(constant_id = 15) const bool HAS_RESPONSE = false;
+layout(constant_id = 16) const bool HAS_RESPONSE = false;
 // The projector's pixels are not equally bright.
-layout(constant_id = 16) const bool HAS_FLAT_FIELD = false;
+layout(constant_id = 17) const bool HAS_FLAT_FIELD = false;
 // The albedo of some body's real surface is a picture over its texture coordinates.
-layout(constant_id = 17) const bool HAS_ALBEDO_MAPS = false;
+layout(constant_id = 18) const bool HAS_ALBEDO_MAPS = false;
 // Parts of a frame in which each channel shows its code value.
-layout(constant_id = 18) const uint HALFTONE_PARTS = 8u;
+layout(constant_id = 19) const uint HALFTONE_PARTS = 8u;
 // Bits of a part.
-layout(constant_id = 19) const uint HALFTONE_DEPTH = 1u;
+layout(constant_id = 20) const uint HALFTONE_DEPTH = 1u;
 // The planes are white, and show the green code value.
-layout(constant_id = 20) const bool HALFTONE_WHITE = false;
+layout(constant_id = 21) const bool HALFTONE_WHITE = false;
 // Planes that follow are taken from whole words, which are halftones and hold no code values.
-layout(constant_id = 21) const bool WARP_WHOLE_WORDS = false;
+layout(constant_id = 22) const bool WARP_WHOLE_WORDS = false;
 // Width of the bit planes, pixels.
-layout(constant_id = 22) const uint PLANE_WIDTH = 1u;
+layout(constant_id = 23) const uint PLANE_WIDTH = 1u;
 // Height of the bit planes, pixels.
-layout(constant_id = 23) const uint PLANE_HEIGHT = 1u;
+layout(constant_id = 24) const uint PLANE_HEIGHT = 1u;
 // Which planes show bits 0 to 3 of a code value, a byte each from the lowest on; 255: none does.
-layout(constant_id = 24) const uint PLANE_OF_BITS_0 = 4294967295u;
+layout(constant_id = 25) const uint PLANE_OF_BITS_0 = 4294967295u;
 // The same for bits 4 to 7.
-layout(constant_id = 25) const uint PLANE_OF_BITS_4 = 4294967295u;
+layout(constant_id = 26) const uint PLANE_OF_BITS_4 = 4294967295u;
 // The same for bits 8 to 11.
-layout(constant_id = 26) const uint PLANE_OF_BITS_8 = 4294967295u;
+layout(constant_id = 27) const uint PLANE_OF_BITS_8 = 4294967295u;
 // The same for bits 12 to 15.
-layout(constant_id = 27) const uint PLANE_OF_BITS_12 = 4294967295u;
+layout(constant_id = 28) const uint PLANE_OF_BITS_12 = 4294967295u;
 // The same for bits 16 to 19.
-layout(constant_id = 28) const uint PLANE_OF_BITS_16 = 4294967295u;
+layout(constant_id = 29) const uint PLANE_OF_BITS_16 = 4294967295u;
 // The same for bits 20 to 23.
-layout(constant_id = 29) const uint PLANE_OF_BITS_20 = 4294967295u;
+layout(constant_id = 30) const uint PLANE_OF_BITS_20 = 4294967295u;
 // On GPUs: groups of nodes that may wait while a ray walks through a body, at most one for each level of the deepest tree.
-layout(constant_id = 30) const uint WALK_STACK = 24u;
+layout(constant_id = 31) const uint WALK_STACK = 24u;
 // On GPUs: a pixel may have more than `TRACE_PIXEL_SAMPLES` samples, so that those of a workgroup may take several rounds. The loop over the rounds costs registers even where there is one.
-layout(constant_id = 31) const bool MANY_SAMPLES = true;
+layout(constant_id = 32) const bool MANY_SAMPLES = true;
 // On GPUs: workgroups of the pass `trace` that keep the whole device busy to the end. A list that has too few samples for so many is cut into shorter ranges, because a lane that takes three samples one after the other while others idle makes the pass longer.
-layout(constant_id = 32) const uint TRACE_GROUPS = 1024u;
+layout(constant_id = 33) const uint TRACE_GROUPS = 1024u;
 
 struct Frame {
     vec3 projector_position;
@@ -201,8 +204,10 @@ struct Frame {
     float lens_limit;
     uint rays_at;
     uint flat_field_at;
+    uint rate_table_at;
     uint mover_count;
     uint group_count;
+    uint body_nodes;
 };
 
 struct Mover {
@@ -283,6 +288,13 @@ struct Instance {
     uint mover;
     vec3 drive_gain;
     uint albedo_map;
+};
+
+struct BodyNode {
+    vec3 lower;
+    uint after;
+    vec3 upper;
+    uint body;
 };
 
 struct Vertex {

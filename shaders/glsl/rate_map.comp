@@ -9,7 +9,6 @@ layout(local_size_x = 16) in;
 
 layout(set = 0, binding = B_TILES, scalar) readonly buffer Tiles { uint tiles[]; };
 layout(set = 0, binding = B_RATES, scalar) writeonly buffer Rates { uint rates[]; };
-layout(set = 0, binding = B_RATE_TABLE, scalar) readonly buffer RateTable { vec2 rate_table[]; };
 
 // What the pixels of one row of a tile contribute to the tile's rate.
 struct Row {
@@ -33,18 +32,20 @@ uint full_half_quarter(vec2 b, float square, float pairs, float size, float tau,
     return 1u;
 }
 
+vec2 rate_entry(uint i) { return vec2(optics[frame.rate_table_at + 2u * i], optics[frame.rate_table_at + 2u * i + 1u]); }
+
 // b_H and b_Q of [Yang19] from a table: linear in v between entries that are 2^-10 of an octave apart, and (1, 2.13) at rest.
 vec2 blur(float v) {
     if (v < 0.015625) {
-        precise vec2 low = vec2(1.0, 2.13) + (rate_table[0] - vec2(1.0, 2.13)) * (v * 64.0);
+        precise vec2 low = vec2(1.0, 2.13) + (rate_entry(0) - vec2(1.0, 2.13)) * (v * 64.0);
         return low;
     }
     uint bits = floatBitsToUint(v) - floatBitsToUint(0.015625);
     uint entry = bits >> 13u;
-    if (entry + 1u >= RATE_TABLE_OCTAVE * RATE_TABLE_OCTAVES) return rate_table[RATE_TABLE_OCTAVE * RATE_TABLE_OCTAVES - 1u];
+    if (entry + 1u >= RATE_TABLE_OCTAVE * RATE_TABLE_OCTAVES) return rate_entry(RATE_TABLE_OCTAVE * RATE_TABLE_OCTAVES - 1u);
     float f = float(bits & 8191u) * (1.0 / 8192.0);
-    precise vec2 a = rate_table[entry];
-    precise vec2 r = a + (rate_table[entry + 1u] - a) * f;
+    precise vec2 a = rate_entry(entry);
+    precise vec2 r = a + (rate_entry(entry + 1u) - a) * f;
     return r;
 }
 

@@ -45,7 +45,7 @@ bool finite3(vec3 v) { return finite(v.x) && finite(v.y) && finite(v.z); }
 #define COUNT_RARE(counter, value) { if ((value) != 0u) atomicAdd(counters.counter, value); }
 
 // What differs from pixel to pixel and does not change while the rig runs: thresholds of the response, flat field, straight rays;
-// and albedo maps.
+// albedo maps; and the blur of a moving eye.
 layout(set = 0, binding = B_OPTICS, scalar) readonly buffer Optics { float optics[]; };
 
 // The straight ray of a pixel's centre: x / z to the right and y / z down, before the lens.

@@ -53,6 +53,26 @@ Instance instance_at(uint i) {
 #endif
 
 #ifdef TEXEL_TABLES
+layout(set = 0, binding = B_BODY_NODES, rgba32ui) uniform readonly uimageBuffer body_node_rows;
+BodyNode body_node_at(uint i) {
+    uvec4 r0 = imageLoad(body_node_rows, int(i) * 2 + 0);
+    uvec4 r1 = imageLoad(body_node_rows, int(i) * 2 + 1);
+    return BodyNode(vec3(uintBitsToFloat(r0.x), uintBitsToFloat(r0.y), uintBitsToFloat(r0.z)),
+        r0.w,
+        vec3(uintBitsToFloat(r1.x), uintBitsToFloat(r1.y), uintBitsToFloat(r1.z)),
+        r1.w);
+}
+#else
+layout(set = 0, binding = B_BODY_NODES, scalar) readonly buffer body_node_block { BodyNode body_node_table[]; };
+BodyNode body_node_at(uint i) {
+    return BodyNode(body_node_table[i].lower,
+        body_node_table[i].after,
+        body_node_table[i].upper,
+        body_node_table[i].body);
+}
+#endif
+
+#ifdef TEXEL_TABLES
 layout(set = 0, binding = B_VERTICES, rgba32ui) uniform readonly uimageBuffer vertex_rows;
 Vertex vertex_at(uint i) {
     uvec4 r0 = imageLoad(vertex_rows, int(i) * 3 + 0);

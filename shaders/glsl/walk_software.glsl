@@ -13,7 +13,7 @@ struct Traversal {
     bool any_hit;   // The ray stops at the first surface.
     Hit hit;        // The nearest hit so far. Its `t` limits the ray.
     uint body;      // The body that is being traversed.
-    uint next;      // The body after it; the number of bodies: there is none.
+    uint next;      // The body after it, or where to look for it in the tree; `end_of_bodies()`: there is none.
     LocalRay local;
     uint node_base;
     uint triangle_base;
@@ -40,20 +40,21 @@ void begin_ray(inout Traversal t, vec3 origin, vec3 direction, uint mask, bool a
     t.triangles = uvec2(0u);
     t.displaced = 0u;
     t.depth = 0u;
-    t.next = next_body(0u, origin, t.inverse, mask, t_max);
+    t.next = HAS_BODY_TREE ? 0u : next_body(0u, origin, t.inverse, mask, t_max);
 }
 
-// Continues with the next body. There must be one.
+// Continues with the next body. In a list there must be one; in the tree there may be none, and then no node is opened.
 void enter_next_body(inout Traversal t) {
-    t.body = min(t.next, max(frame.instance_count, 1u) - 1u);
-    t.next = next_body(t.body + 1u, t.origin, t.inverse, t.mask, t.hit.t);
+    uint body = HAS_BODY_TREE ? next_in_tree(t.next, t.origin, t.inverse, t.mask, t.hit.t) : t.next;
+    t.body = min(body, max(frame.instance_count, 1u) - 1u);
+    if (!HAS_BODY_TREE) t.next = next_body(t.body + 1u, t.origin, t.inverse, t.mask, t.hit.t);
     t.local = local_ray(transform_point(instance_at(t.body).object_from_world, t.origin),
                         transform_vector(instance_at(t.body).object_from_world, t.direction));
     t.node_base = instance_at(t.body).node_offset;
     t.triangle_base = instance_at(t.body).triangle_offset;
     bvec3 negative = lessThan(t.local.inverse, vec3(0.0));
     t.octant = (negative.x ? 0u : 4u) | (negative.y ? 0u : 2u) | (negative.z ? 0u : 1u);
-    t.group = 1u << t.octant; // The root.
+    t.group = HAS_BODY_TREE && body == NO_INSTANCE ? 0u : 1u << t.octant; // The root.
     t.newest = uvec4(0u);
     t.older = uvec4(0u);
 }
@@ -63,7 +64,7 @@ bool at_triangles(Traversal t) { return t.triangles.y != 0u; }
 bool at_node(Traversal t) { return t.group != 0u && t.displaced == 0u && !at_triangles(t); }
 
 // The ray needed only one surface and has it, or nothing is left in this body and no other follows.
-bool at_end(Traversal t) { return t.any_hit && t.hit.id != NO_HIT || t.group == 0u && t.depth == 0u && t.next >= frame.instance_count; }
+bool at_end(Traversal t) { return t.any_hit && t.hit.id != NO_HIT || t.group == 0u && t.depth == 0u && t.next >= end_of_bodies(); }
 
 // Steps that are needed once in many nodes: room in the registers, the group that waited longest, or the next body.
 void go_on(inout Traversal t) {

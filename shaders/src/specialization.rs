@@ -70,6 +70,8 @@ specialization_constants! {
     HAS_CLAMP: bool = true;
     /// A material of the scene has a diffuse lobe: it is not metallic everywhere.
     HAS_DIFFUSE: bool = true;
+    /// The scene has so many bodies that rays look for them in a tree. Of few they ask each.
+    HAS_BODY_TREE: bool = true;
     /// Where random numbers come from, as `SAMPLER_*`.
     SAMPLER: uint = 0;
     /// Guides are written, because a pass between tracing and compensation reads them.

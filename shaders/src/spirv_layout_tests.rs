@@ -63,6 +63,7 @@ fn parse(spirv: &[u8]) -> Module {
 const BLOCKS: &[(&str, &str, usize)] = &[
     ("B_FRAME", "Frame", size_of::<structs::Frame>()),
     ("B_INSTANCES", "Instance", size_of::<structs::Instance>()),
+    ("B_BODY_NODES", "BodyNode", size_of::<structs::BodyNode>()),
     ("B_TRIANGLE_REFS", "TriangleRef", size_of::<structs::TriangleRef>()),
     ("B_VERTICES", "Vertex", size_of::<structs::Vertex>()),
     ("B_MATERIALS", "Material", size_of::<structs::Material>()),

@@ -134,10 +134,14 @@ gpu_structs! {
         rays_at: u32,
         /// First element of the flat field, three numbers a pixel, in the table of optics.
         flat_field_at: u32,
+        /// First element of the blur of a moving eye, two numbers a speed, in the table of optics.
+        rate_table_at: u32,
         /// Bodies in the table of movers.
         mover_count: u32,
         /// Groups of planes that follow the bodies.
         group_count: u32,
+        /// Nodes of the tree over the bodies, for each octant of directions.
+        body_nodes: u32,
     }
 
     /// A body that moves while the planes of a frame last. Motions are those of the whole exposure.
@@ -283,6 +287,19 @@ gpu_structs! {
         drive_gain: [f32; 3],
         /// Where the body's albedo map is in the table of optics: its width, its height, then three numbers a texel. `NO_ALBEDO_MAP`: it has none.
         albedo_map: u32,
+    }
+
+    /// A node of the tree over the bodies. The nodes of an octant of directions stand in the order in which a ray meets them, nearest first, each
+    /// before all that are below it.
+    struct BodyNode {
+        /// Lower corner, world space.
+        lower: [f32; 3],
+        /// Where a ray goes on that does not enter it: the node after all that are below it, counted from the first of its octant.
+        after: u32,
+        /// Upper corner, world space.
+        upper: [f32; 3],
+        /// The body in bits 0 to 7, or `BODY_NODE_INNER`; in bits 8 to 15 the flags that any body below it has.
+        body: u32,
     }
 
     /// Attributes of one vertex.
@@ -442,6 +459,7 @@ pub const CONSTANTS: &[(&str, u32)] = &[
     ("NO_FRAME", NO_FRAME),
     ("INSTANCE_PROJECTED", INSTANCE_PROJECTED),
     ("INSTANCE_EMPTY", INSTANCE_EMPTY),
+    ("BODY_NODE_INNER", BODY_NODE_INNER),
     ("MATERIAL_DOUBLE_SIDED", MATERIAL_DOUBLE_SIDED),
     ("MATERIAL_THIN", MATERIAL_THIN),
     ("MATERIAL_TRANSMISSIVE", MATERIAL_TRANSMISSIVE),
@@ -495,6 +513,8 @@ pub const NO_ALBEDO_MAP: u32 = u32::MAX;
 pub const NO_LIGHT: u32 = u32::MAX;
 /// No frame has this number: what the history holds before the first.
 pub const NO_FRAME: u32 = u32::MAX;
+/// Bit of [`BodyNode::body`]: the node has two nodes below it, and is no body.
+pub const BODY_NODE_INNER: u32 = 1 << 31;
 /// Not carried by a body.
 pub const NO_INSTANCE: u32 = u32::MAX;
 /// The projector's light falls on it.
@@ -638,6 +658,7 @@ macro_rules! tables {
 
 tables! {
     Instance "instance", "B_INSTANCES" or "B_INSTANCES";
+    BodyNode "body_node", "B_BODY_NODES" or "B_BODY_NODES";
     Vertex "vertex", "B_VERTICES" or "B_VERTICES";
     TriangleRef "triangle_ref", "B_TRIANGLE_REFS" or "B_TRIANGLE_REFS";
     Material "material", "B_MATERIALS" or "B_MATERIALS";
@@ -671,7 +692,7 @@ pub const BINDINGS: &[(&str, u32)] = &[
     ("B_GUIDES", 17),
     ("B_HISTORY", 18),
     ("B_RATES", 19),
-    ("B_RATE_TABLE", 20),
+    ("B_BODY_NODES", 20),
     ("B_SCHEDULE", 21),
     ("B_WORK", 22),
     ("B_NOISE", 23),

@@ -70,6 +70,7 @@ pub(super) fn keeping(feature: &str, method: &Method) -> Option<Keep> {
         "emissive" => &mut keep.needs.emissive,
         "punctual lights" => &mut keep.needs.punctual,
         "firefly clamp" => &mut keep.needs.clamp,
+        "tree over bodies" => &mut keep.needs.body_tree,
         "tiles without bodies" => &mut keep.every_tile,
         "pixels out of the light" if method.dpm => &mut keep.every_pixel,
         // Its decisions are read only where the frame's flag says so; without a history it has nothing to decide from.
@@ -260,11 +261,11 @@ mod tests {
             features.iter().filter_map(|f| Some(format!("{:?}", keeping(f, &history)?))).collect();
         kept.sort();
         kept.dedup();
-        assert_eq!(kept.len(), 11, "each puts back another part: {kept:#?}");
-        assert_eq!(with(&history), 11, "the switches of SceneNeeds but the environment's, and those of Keep");
-        assert_eq!(with(&Method { dpm: true, ..history.clone() }), 12, "what the last frame told");
-        assert_eq!(with(&Method::full(1)), 10, "without a history there are no rates");
-        assert_eq!(with(&Method { rate_map: true, ..history }), 10, "rates that are read are no spare code");
+        assert_eq!(kept.len(), 12, "each puts back another part: {kept:#?}");
+        assert_eq!(with(&history), 12, "the switches of SceneNeeds but the environment's, and those of Keep");
+        assert_eq!(with(&Method { dpm: true, ..history.clone() }), 13, "what the last frame told");
+        assert_eq!(with(&Method::full(1)), 11, "without a history there are no rates");
+        assert_eq!(with(&Method { rate_map: true, ..history }), 11, "rates that are read are no spare code");
     }
 
     #[test]
@@ -304,7 +305,11 @@ mod tests {
         let (scene, needs) = (&rig.scene, |s: &Scene| SceneData::build(s).unwrap().needs);
         let own = needs(scene);
         let changes: Vec<_> = features.iter().filter_map(|f| Some((*f, changed(f, scene)?))).collect();
-        assert_eq!(changes.len(), 11 - 1, "all parts of scenes but the clamp, which is a setting");
+        assert_eq!(
+            changes.len(),
+            12 - 2,
+            "all parts of scenes but the clamp, which is a setting, and the tree"
+        );
         for (feature, other) in changes {
             let other = needs(&other);
             let gone = match feature {

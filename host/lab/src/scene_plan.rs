@@ -141,6 +141,12 @@ pub(crate) fn scene_entries(scene: &Scene, needs: &SceneNeeds, clamp: f64) -> Ve
             Some(format!("render.clamp_indirect = {clamp}")),
             "render.clamp_indirect = 0",
         ),
+        part(
+            "tree over bodies",
+            needs.body_tree,
+            Some(format!("{} bodies", scene.bodies.len())),
+            "rays ask each of so few bodies",
+        ),
     ]
 }
 
@@ -326,6 +332,7 @@ pub fn scene_plan(config: &RigConfig, measure: bool) -> Result<PlanReport, Failu
         // A pixel that only another body's motion uncovers may be lit three frames later.
         every_pixel: false,
         storage_tables: false,
+        body_list: false,
     };
     report.together = Some(pair(mine, Side { keep: all, ..mine })?);
     let changed: Vec<&str> = (report.entries.iter())

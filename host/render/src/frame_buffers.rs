@@ -7,7 +7,7 @@ use super::settings::{Output, RendererSettings};
 use crate::gpu::{Buffer, Gpu, GpuError, MemoryKind, Place};
 use crate::pack;
 use bytemuck::Zeroable;
-use dpm_shaders::structs::{Counters, Frame, Guide, Instance, Mover, Schedule, Surface, NO_HIT};
+use dpm_shaders::structs::{BodyNode, Counters, Frame, Guide, Instance, Mover, Schedule, Surface, NO_HIT};
 use std::sync::Arc;
 
 /// The buffers of one frame in flight.
@@ -16,6 +16,8 @@ pub(super) struct FrameBuffers {
     /// memory: the host's lies behind a bus.
     pub frame: Latched,
     pub instances: Latched,
+    /// The tree over the bodies; of no use where rays ask each body.
+    pub body_nodes: Latched,
     pub arguments: Buffer,
     pub tiles: Buffer,
     pub counters: Buffer,
@@ -71,14 +73,14 @@ pub(super) struct DebugBuffers {
 }
 
 impl FrameBuffers {
-    /// Memory for a scene of `bodies` bodies and a raster of `tiles` tiles. `debug` adds the copies for debugging.
+    /// Memory for a scene of `bodies` bodies, with `body_nodes` nodes of the tree over them, and a raster of `tiles` tiles. `debug` adds the copies for debugging.
     ///
     /// # Errors
     /// Out of memory.
     pub(super) fn new(
         gpu: &Arc<Gpu>,
         settings: &RendererSettings,
-        (bodies, tiles): (usize, usize),
+        (bodies, body_nodes, tiles): (usize, usize, usize),
         debug: bool,
     ) -> Result<Self, GpuError> {
         use MemoryKind::{Device, Readback, Upload};
@@ -101,6 +103,7 @@ impl FrameBuffers {
         Ok(Self {
             frame: latched("frame uniforms", size_of::<Frame>())?,
             instances: latched("instances", size_of::<Instance>() * bodies.max(1))?,
+            body_nodes: latched("tree over the bodies", size_of::<BodyNode>() * body_nodes.max(1))?,
             arguments: size("dispatch arguments", 48, Upload)?,
             tiles: size("tile list", tiles * 4, Upload)?,
             counters: size("counters", size_of::<Counters>(), Device)?,
@@ -156,6 +159,7 @@ impl FrameBuffers {
         let of_shaders = [
             ("frame uniforms", &self.frame.device),
             ("instances", &self.instances.device),
+            ("tree over the bodies", &self.body_nodes.device),
             ("movers", &self.movers.device),
             ("counters", &self.counters),
             ("surfaces", &self.surfaces),
@@ -188,6 +192,7 @@ impl FrameBuffers {
         match name {
             "B_FRAME" => &self.frame.device,
             "B_INSTANCES" => &self.instances.device,
+            "B_BODY_NODES" => &self.body_nodes.device,
             "B_NODES" => &scene.nodes,
             "B_TRIANGLES" => &scene.triangles,
             "B_TRIANGLE_REFS" => &scene.refs,
@@ -207,7 +212,6 @@ impl FrameBuffers {
             "B_HISTORY" | "B_HISTORY_ROWS" => &shared.history[parity],
             "B_FORMER" => &shared.history[1 - parity],
             "B_RATES" => &shared.rates,
-            "B_RATE_TABLE" => &shared.rate_table,
             "B_SCHEDULE" => &self.schedule,
             "B_WORK" => &self.work,
             "B_NOISE" => &shared.noise,

@@ -18,6 +18,7 @@
 
 pub mod albedo_map;
 pub mod blue_noise;
+mod body_tree;
 pub mod drive;
 mod fill;
 mod frame_buffers;

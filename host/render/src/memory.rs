@@ -5,7 +5,6 @@ use super::blue_noise;
 use super::fill::fill;
 use super::method::Method;
 use super::optics::OpticsLayout;
-use super::rate_table;
 use super::scene_gpu::table_buffer;
 use super::settings::{RasterTooLarge, RenderError, RendererSettings};
 use super::tiles::TILE;
@@ -146,9 +145,8 @@ pub(super) struct SharedBuffers {
     /// Two buffers with one entry a pixel. Frames write them in turns, and read the other.
     pub history: [Buffer; 2],
     pub rates: Buffer,
-    pub rate_table: Buffer,
     pub noise: Buffer,
-    /// Response, flat field and rays of the projector's pixels, and albedo maps.
+    /// Response, flat field and rays of the projector's pixels, albedo maps, and the blur of a moving eye.
     pub optics: Buffer,
     /// Groups of planes that follow the bodies.
     pub plane_groups: Buffer,
@@ -164,7 +162,7 @@ impl SharedBuffers {
     pub(crate) fn new(gpu: &Arc<Gpu>, settings: &RendererSettings) -> Result<Self, RenderError> {
         let raster = settings.raster;
         check_raster(raster, &settings.method, gpu.max_buffer_bytes(), &gpu.summary().name)?;
-        let optics = OpticsLayout::new(raster, &settings.drive, settings.lens.as_ref());
+        let optics = OpticsLayout::new(settings);
         let pixels = if settings.method.needs_history() { raster.pixel_count() } else { 1 };
         let history = || -> Result<Buffer, GpuError> {
             let buffer = table_buffer(gpu, "history", pixels * size_of::<History>(), MemoryKind::Device)?;
@@ -176,7 +174,6 @@ impl SharedBuffers {
         Ok(Self {
             history: [history()?, history()?],
             rates: Buffer::from_slice(gpu, "shading rates", &vec![0u32; tiles as usize])?,
-            rate_table: Buffer::from_slice(gpu, "rate table", &rate_table::rate_table())?,
             optics: Buffer::from_slice(
                 gpu,
                 "optics",

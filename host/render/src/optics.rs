@@ -1,13 +1,17 @@
 //! The table of what differs from pixel to pixel or over a surface and never changes: thresholds of the response, flat field, the straight rays of
-//! the lens, and albedo maps.
+//! the lens, and albedo maps. Behind them stands the blur of a moving eye, by its speed.
 
 use super::albedo_map::AlbedoMap;
 use super::drive::Drive;
-use dpm_device::planes::Raster;
+use super::rate_table::rate_table;
+use super::settings::RendererSettings;
 use dpm_scene::geometry::lens::LensModel;
 use dpm_scene::geometry::projector::ProjectorCamera;
 use dpm_shaders::specialization as ids;
-use dpm_shaders::structs::{Frame, LENS_BROWN, LENS_FISHEYE, LENS_NONE, NO_ALBEDO_MAP, RESPONSE_CODES};
+use dpm_shaders::structs::{
+    Frame, LENS_BROWN, LENS_FISHEYE, LENS_NONE, NO_ALBEDO_MAP, RATE_TABLE_OCTAVE, RATE_TABLE_OCTAVES,
+    RESPONSE_CODES,
+};
 use glam::DVec2;
 
 /// Where each part of the table begins, and which parts there are.
@@ -19,11 +23,13 @@ pub(super) struct OpticsLayout {
     pixels: u32,
     /// Of each body of the scene that has an albedo map or comes before one that has: the map's numbers; 0: it has none.
     maps: Vec<u32>,
+    rates: bool,
 }
 
 impl OpticsLayout {
-    /// The parts that a rig needs: `lens` is its projector if that has a lens to be compensated.
-    pub(super) fn new(raster: Raster, drive: &Drive, lens: Option<&ProjectorCamera>) -> Self {
+    /// The parts that a rig needs.
+    pub(super) fn new(settings: &RendererSettings) -> Self {
+        let (drive, lens) = (&settings.drive, settings.lens.as_ref());
         Self {
             response: drive.response.is_some(),
             flat_field: drive.flat_field.is_some(),
@@ -32,8 +38,10 @@ impl OpticsLayout {
                 LensModel::Brown(_) => LENS_BROWN,
                 LensModel::Fisheye(_) => LENS_FISHEYE,
             }),
-            pixels: raster.pixel_count() as u32,
+            pixels: settings.raster.pixel_count() as u32,
             maps: drive.albedo_maps.iter().map(|m| m.as_ref().map_or(0, |m| numbers_of(m))).collect(),
+            // Shading rates are decided by methods with a history only.
+            rates: settings.method.needs_history(),
         }
     }
 
@@ -61,9 +69,14 @@ impl OpticsLayout {
         }
     }
 
+    fn rate_table_at(&self) -> u32 {
+        self.maps_at() + self.maps.iter().sum::<u32>()
+    }
+
     /// Size of the table.
     pub(super) fn len_bytes(&self) -> usize {
-        4 * (self.maps_at() as usize + self.maps.iter().map(|&n| n as usize).sum::<usize>())
+        let rates = if self.rates { 2 * (RATE_TABLE_OCTAVE * RATE_TABLE_OCTAVES) as usize } else { 0 };
+        4 * (self.rate_table_at() as usize + rates)
     }
 
     /// The specialization constants that leave out the parts that are not there.
@@ -93,6 +106,9 @@ impl OpticsLayout {
             table.extend([map.width() as f32, map.height() as f32]);
             table.extend(map.texels().iter().flatten());
         }
+        if self.rates {
+            table.extend(rate_table().iter().flatten());
+        }
         if table.is_empty() {
             table.push(0.0);
         }
@@ -103,6 +119,7 @@ impl OpticsLayout {
     pub(super) fn describe(&self, camera: &ProjectorCamera, frame: &mut Frame) {
         frame.flat_field_at = self.flat_field_at();
         frame.rays_at = self.rays_at();
+        frame.rate_table_at = self.rate_table_at();
         frame.lens_limit = camera.lens.limit() as f32;
         let coefficients = match camera.lens.model() {
             LensModel::Pinhole => return,

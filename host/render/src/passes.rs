@@ -327,6 +327,7 @@ mod tests {
     const INPUTS: [&str; 18] = [
         "B_FRAME",
         "B_INSTANCES",
+        "B_BODY_NODES",
         "B_NODES",
         "B_TRIANGLES",
         "B_TRIANGLE_REFS",
@@ -338,7 +339,6 @@ mod tests {
         "B_ENVIRONMENT",
         "B_ALBEDO",
         "B_TILES",
-        "B_RATE_TABLE",
         "B_NOISE",
         "B_OPTICS",
         "B_MOVERS",

@@ -3,6 +3,7 @@
 use super::optics::OpticsLayout;
 use super::passes::TABLE;
 use super::scene_data::{Keep, SceneData, SceneDataError};
+use super::scene_needs::SceneNeeds;
 use super::settings::RendererSettings;
 use crate::gpu::{shared_bindings, BindingTable, ComputePipeline, DeviceSummary, Executable, Gpu, GpuError};
 use dpm_scene::Scene;
@@ -68,14 +69,25 @@ impl RendererPlan {
         gpu.summary().software && !self.keep.storage_tables
     }
 
-    /// Specialization constants of all passes that read the scene, each as id and value. `groups`: see [`trace_groups`].
-    fn constants(&self, optics: &OpticsLayout, groups: u32) -> Vec<(u32, u32)> {
+    /// What of the tracer is compiled.
+    fn needs(&self) -> SceneNeeds {
         let mut needs = self.data.needs.with(self.keep.needs);
         needs.clamp |= self.settings.clamp_indirect.is_some();
         if self.settings.leave_nothing_out {
             needs = needs.everything();
         }
-        let mut constants = needs.constants();
+        needs.body_tree &= !self.keep.body_list;
+        needs
+    }
+
+    /// Whether rays look for bodies in a tree.
+    pub(super) fn asks_body_tree(&self) -> bool {
+        self.needs().body_tree
+    }
+
+    /// Specialization constants of all passes that read the scene, each as id and value. `groups`: see [`trace_groups`].
+    fn constants(&self, optics: &OpticsLayout, groups: u32) -> Vec<(u32, u32)> {
+        let mut constants = self.needs().constants();
         constants.extend(self.settings.method.constants());
         constants.extend(optics.constants());
         constants.push((ids::TRACE_GROUPS, groups));
@@ -88,7 +100,7 @@ impl RendererPlan {
     /// [`trace_groups`].
     fn wanted(&self, texel: bool, groups: u32) -> impl Iterator<Item = Option<Program>> + '_ {
         let settings = &self.settings;
-        let optics = OpticsLayout::new(settings.raster, &settings.drive, settings.lens.as_ref());
+        let optics = OpticsLayout::new(settings);
         let shared = self.constants(&optics, groups);
         TABLE.iter().map(move |pass| {
             (pass.when)(settings, self.keep).then(|| Program {

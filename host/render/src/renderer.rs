@@ -1,5 +1,6 @@
 //! One frame on the GPU, from surfaces over radiance to code values. `Renderer::create_slot` records the passes in their order.
 
+use super::body_tree::BodyTree;
 use super::fill;
 use super::frame_buffers::FrameBuffers;
 use super::last_frame::{LastFrame, Turn};
@@ -51,6 +52,10 @@ pub struct Renderer {
     tile_list: TileList,
     /// The bodies that move while the planes of a frame last.
     movers: Movers,
+    /// Empty where rays ask each body.
+    body_tree: BodyTree,
+    /// The bodies as this frame draws them.
+    instances: Vec<Instance>,
     /// The order of frames that overlap.
     orders: Orders,
     optics: OpticsLayout,
@@ -102,7 +107,7 @@ impl Renderer {
         let RendererPlan { data, settings, keep, tracked } = plan.clone();
         let shared = SharedBuffers::new(gpu, &settings)?;
         let scene_gpu = SceneGpu::new(gpu, &data, plan.reads_texels(gpu))?;
-        let optics = OpticsLayout::new(settings.raster, &settings.drive, settings.lens.as_ref());
+        let optics = OpticsLayout::new(&settings);
         let Pipelines { table, each: pipelines } = plan.pipelines(gpu)?;
         let decides_rates =
             TABLE.iter().zip(&pipelines).any(|(pass, p)| pass.grid == Grid::Rates && p.is_some());
@@ -115,6 +120,8 @@ impl Renderer {
         let last = LastFrame::none(tracked.len());
         let tile_list = TileList::new(settings.raster, settings.lens.as_ref());
         let rated = vec![false; tile_list.len()];
+        let body_tree = BodyTree::new(if plan.asks_body_tree() { data.bodies.len() } else { 0 });
+        let instances = vec![Instance::zeroed(); data.bodies.len()];
         let movers = Movers::new(data.bodies.len(), &settings.plane_groups, !settings.shows_halftones());
         Ok(Self {
             resources: Arc::new(Resources { pipelines, table, shared, scene: scene_gpu, overlap }),
@@ -127,6 +134,8 @@ impl Renderer {
             rated,
             tile_list,
             movers,
+            body_tree,
+            instances,
             orders: Orders::default(),
             optics,
             gpu: gpu.clone(),
@@ -165,7 +174,12 @@ impl Renderer {
     pub fn create_slot(&self, debug: bool) -> Result<FrameSlot, GpuError> {
         let (gpu, resources, settings) = (&self.gpu, &self.resources, &self.settings);
         let tile_list = self.tile_list.clone();
-        let buffers = FrameBuffers::new(gpu, settings, (self.data.bodies.len(), tile_list.len()), debug)?;
+        let buffers = FrameBuffers::new(
+            gpu,
+            settings,
+            (self.data.bodies.len(), self.body_tree.most_nodes(), tile_list.len()),
+            debug,
+        )?;
         buffers.clear(gpu, settings)?;
         let set_of = |parity| {
             let all = (&resources.shared, &resources.scene);
@@ -209,7 +223,7 @@ impl Renderer {
     fn record_latch(&self, r: &mut Recorder<'_>, b: &FrameBuffers) {
         r.clear(&b.counters);
         r.copy(&self.resources.shared.schedule_start, &b.schedule, size_of::<Schedule>());
-        for latched in [&b.frame, &b.instances, &b.movers] {
+        for latched in [&b.frame, &b.instances, &b.body_nodes, &b.movers] {
             r.copy(&latched.host, &latched.device, latched.len_bytes);
         }
         r.barrier();
@@ -322,11 +336,15 @@ impl Renderer {
         let rate_tiles = if decides_rates { tile_count } else { 0 };
         let groups = [tile_count * 4, rate_tiles, moving_tiles * 4];
         slot.buffers.arguments.write(&groups.map(|groups| [groups, 1u32, 1, 0]));
-        let instances = slot.buffers.instances.host.bytes_mut().chunks_exact_mut(size_of::<Instance>());
-        for (i, to) in instances.take(inputs.poses.len()).enumerate() {
-            to.copy_from_slice(bytemuck::bytes_of(&self.instance(i, inputs)));
+        for i in 0..inputs.poses.len() {
+            self.instances[i] = self.instance(i, inputs);
         }
-        let frame = self.frame_constants(inputs, &turn, (tile_count, slot.tile_list.tiles_x()));
+        slot.buffers.instances.host.write(&self.instances);
+        let mut frame = self.frame_constants(inputs, &turn, (tile_count, slot.tile_list.tiles_x()));
+        if self.body_tree.most_nodes() > 0 {
+            let nodes = bytemuck::cast_slice_mut(slot.buffers.body_nodes.host.bytes_mut());
+            frame.body_nodes = self.body_tree.write(self.instances.iter(), nodes);
+        }
         slot.buffers.frame.host.write(&[frame]);
         slot.parity = 1 - self.last.parity;
         let [first, second] = &slot.lists[slot.parity];

@@ -1,5 +1,6 @@
 //! A scene into the flat arrays that the shaders read: BVHs, vertices, materials, texels, lights and the environment.
 
+use super::body_tree::FEWEST_BODIES;
 pub use super::scene_needs::SceneNeeds;
 use bytemuck::Zeroable;
 use dpm_scene::albedo_table::{tabulated, AlbedoTable, ALBEDO_NODES};
@@ -126,6 +127,8 @@ pub struct Keep {
     pub every_pixel: bool,
     /// Tables in storage buffers, as on a GPU, where software Vulkan would read texel buffers.
     pub storage_tables: bool,
+    /// Rays that ask each body, however many there are. This measures what the tree over bodies saves.
+    pub body_list: bool,
 }
 
 /// Why a scene cannot be drawn.
@@ -199,6 +202,8 @@ impl SceneData {
         for (i, body) in scene.bodies.iter().enumerate() {
             data.add_body(scene, i, body, &mut powers)?;
         }
+        let has_surface = |body: &&BodyData| body.flags & gpu::INSTANCE_EMPTY == 0;
+        data.needs.body_tree = data.bodies.iter().filter(has_surface).count() >= FEWEST_BODIES;
         let radius = data.scene_radius(scene);
         data.add_punctual(scene, radius, &mut powers);
         let light_power: f32 = powers.iter().sum();

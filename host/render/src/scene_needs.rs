@@ -49,6 +49,8 @@ scene_needs! {
     emissive => HAS_EMISSIVE,
     /// There is a punctual light.
     punctual => HAS_PUNCTUAL,
+    /// There are so many bodies that rays look for them in a tree.
+    body_tree => HAS_BODY_TREE,
     /// The luminance of indirect contributions is limited.
     clamp => HAS_CLAMP,
 }
