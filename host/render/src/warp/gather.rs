@@ -67,7 +67,7 @@ pub fn is_rough(here: u32, [left, right, above, below]: [u32; 4]) -> bool {
 
 /// What a frame adds to places of group `group` before their fraction is cut off, 0 to 63 in 1/64 pixel: multiples of the
 /// golden ratio and of the root of 2, which take all values evenly over the frames.
-fn turn_of(before: u32, group: u32) -> [i32; 2] {
+pub(super) fn turn_of(before: u32, group: u32) -> [i32; 2] {
     let of = |step: u32, apart: u32| before.wrapping_mul(step).wrapping_add(group.wrapping_mul(apart)) >> 26;
     [of(0x9E37_79B9, 0x61C8_8647), of(0x6A09_E667, 0x3C6E_F372)].map(|turn| turn as i32)
 }
@@ -190,7 +190,7 @@ pub fn within(mover: &Mover, pixel: [i32; 2]) -> bool {
 }
 
 /// How the body moves at a pixel, about: all that is known where the pixel does not show it.
-fn start_of(mover: &Mover, pixel: [i32; 2]) -> [i32; 2] {
+pub(super) fn start_of(mover: &Mover, pixel: [i32; 2]) -> [i32; 2] {
     let [x, y] = [0, 1].map(|c| pixel[c] - mover.centre[c]);
     let of = |c: usize| {
         let slope = [mover.slope[2 * c], mover.slope[2 * c + 1]];

@@ -1,0 +1,274 @@
+//! Blocks on silhouettes and at the borders of areas: all that the plain twin does, for all mirrors at once.
+
+use super::lanes::Lanes;
+use super::pure::turns;
+use super::rows::{Rows, MOTION, OWNER_AND_DEPTH, WORD};
+use super::{columns_and_rows, keys, motions, offset, unmarked, Block, Body, Group, Plan, MOST_LANES};
+use dpm_shaders::structs::{Moved, OWNER_NONE, OWNER_STILL, WORD_ROUGH};
+
+/// A block, and the pixels that it has itself.
+#[derive(Clone, Copy)]
+struct Own<'a, L: Lanes> {
+    rows: &'a Rows,
+    plan: &'a Plan<'a>,
+    block: Block,
+    x: L::V,
+    y: L::V,
+    word: L::V,
+    motion: [L::V; 2],
+    owner: L::V,
+    depth: L::V,
+    /// In the area of a mover.
+    inside: L::M,
+}
+
+/// What mirrors show at an instant.
+#[derive(Clone, Copy)]
+struct Found<L: Lanes> {
+    /// The owner of the nearest surface, `OWNER_NONE` where there is none.
+    owner: L::V,
+    depth: L::V,
+    /// Where it is drawn, from the mirror on, in 1/64 pixel.
+    at: [L::V; 2],
+}
+
+/// The block's words.
+#[inline(always)]
+pub(super) fn warp<'a, L: Lanes>(
+    l: L,
+    rows: &Rows,
+    plan: &Plan<'_>,
+    bodies: impl Iterator<Item = &'a Body> + Clone,
+    block: Block,
+) -> L::V {
+    let owner_and_depth = rows.load(l, OWNER_AND_DEPTH, block.index);
+    let (x, y) = (l.add(l.numbers(), l.splat(block.at[0])), l.splat(block.at[1]));
+    let mut inside = l.greater(x, x);
+    for body in bodies.clone() {
+        inside = l.either(inside, body.within(l, x, y));
+    }
+    let own: Own<'_, L> = Own {
+        rows,
+        plan,
+        block,
+        x,
+        y,
+        word: rows.load(l, WORD, block.index),
+        motion: motions(l, rows.load(l, MOTION, block.index)),
+        owner: l.shr::<24>(owner_and_depth),
+        depth: l.and(owner_and_depth, l.splat(0xff_ffff)),
+        inside,
+    };
+    let mut word = unmarked(l, plan, own.word);
+    for group in plan.groups {
+        let mut found = own.still(l);
+        for body in bodies.clone() {
+            found = own.nearer(l, body, group, found);
+        }
+        let mut there = l.choose(l.equal(found.owner, l.splat(OWNER_STILL as i32)), own.word, l.splat(0));
+        for body in bodies.clone() {
+            let shown = l.equal(found.owner, l.splat(body.owner as i32));
+            if l.bits(shown) != 0 {
+                there = l.choose(shown, own.word_of(l, body, group, found.at, shown), there);
+            }
+        }
+        there = own.uncovered(l, group, found, there);
+        word = l.merge(l.splat(group.mask), there, word);
+    }
+    word
+}
+
+impl<L: Lanes> Own<'_, L> {
+    /// What is there if nothing moves.
+    #[inline(always)]
+    fn still(&self, l: L) -> Found<L> {
+        let (zero, still) = (l.splat(OWNER_NONE as i32), l.splat(OWNER_STILL as i32));
+        let stands = l.equal(self.owner, still);
+        Found {
+            owner: l.choose(stands, still, zero),
+            depth: l.choose(stands, self.depth, l.splat(i32::MAX)),
+            at: [zero; 2],
+        }
+    }
+
+    /// Which of `wanted` the pixels `off` beside them in the area of `body` are there, and their fields.
+    #[inline(always)]
+    fn look<const K: usize>(
+        &self,
+        l: L,
+        body: &Body,
+        fields: [usize; K],
+        off: [L::V; 2],
+        wanted: L::M,
+    ) -> (L::M, [L::V; K]) {
+        let within = body.within(l, l.add(self.x, off[0]), l.add(self.y, off[1]));
+        let wanted = l.both(wanted, within);
+        let mut out = [l.splat(0); K];
+        let mut bits = l.bits(wanted);
+        let keys = keys(l, off);
+        let mut list = [0; MOST_LANES];
+        l.store(keys, &mut list);
+        while bits != 0 {
+            let first = bits.trailing_zeros();
+            let off = columns_and_rows(list[first as usize] as i32);
+            let at = [self.block.at[0] + off[0], self.block.at[1] + off[1]];
+            if self.rows.keeps(off) {
+                let same = l.both(l.equal(keys, l.splat(list[first as usize] as i32)), wanted);
+                let index = self.rows.index(at);
+                for (out, field) in out.iter_mut().zip(fields) {
+                    *out = l.choose(same, self.rows.load(l, field, index), *out);
+                }
+                bits &= !l.bits(same);
+            } else {
+                let here = l.equal(l.numbers(), l.splat(first as i32));
+                let far = self.far([at[0] + first as i32, at[1]]);
+                for (out, field) in out.iter_mut().zip(fields) {
+                    *out = l.choose(here, l.splat(far[field] as i32), *out);
+                }
+                bits &= bits - 1;
+            }
+        }
+        (wanted, out)
+    }
+
+    /// The fields of a pixel of a row that is not kept.
+    #[cold]
+    fn far(&self, [x, y]: [i32; 2]) -> [u32; 3] {
+        let drawn = self.plan.drawn;
+        let Moved { word, motion, owner_and_depth } =
+            drawn.pixels[y as usize * drawn.raster.width() as usize + x as usize];
+        [word, motion, owner_and_depth]
+    }
+
+    /// `found`, and what of `body` is nearer.
+    #[inline(always)]
+    fn nearer(&self, l: L, body: &Body, group: &Group, found: Found<L>) -> Found<L> {
+        let number = l.splat(body.owner as i32);
+        let is_of = |of: L::V| l.equal(l.shr::<24>(of), number);
+        let inside = body.within(l, self.x, self.y);
+        let is_here = l.both(inside, l.equal(self.owner, number));
+        let elsewhere = l.except(inside, is_here);
+        let (mut near, mut motion) = (is_here, self.motion);
+        if l.bits(elsewhere) != 0 {
+            let at = offset(l, body, self.start_of(l, body), group.instant);
+            let (there, [moves, of]) =
+                self.look(l, body, [MOTION, OWNER_AND_DEPTH], nearest(l, at), elsewhere);
+            let hit = l.both(there, is_of(of));
+            let moves = motions(l, moves);
+            motion = [0, 1].map(|c| l.choose(hit, moves[c], motion[c]));
+            near = l.either(near, hit);
+        }
+        if l.bits(near) == 0 {
+            return found;
+        }
+        let at = offset(l, body, motion, group.instant);
+        let (there, [of]) = self.look(l, body, [OWNER_AND_DEPTH], nearest(l, at), near);
+        let depth = l.and(of, l.splat(0xff_ffff));
+        let wins = l.both(l.both(there, is_of(of)), l.greater(found.depth, depth));
+        Found {
+            owner: l.choose(wins, number, found.owner),
+            depth: l.choose(wins, depth, found.depth),
+            at: [0, 1].map(|c| l.choose(wins, at[c], found.at[c])),
+        }
+    }
+
+    /// How a body moves at the mirrors, about.
+    #[inline(always)]
+    fn start_of(&self, l: L, body: &Body) -> [L::V; 2] {
+        let mover = &body.mover;
+        let x = l.sub(self.x, l.splat(mover.centre[0]));
+        let y = l.sub(self.y, l.splat(mover.centre[1]));
+        [0, 1].map(|c| {
+            let along = l.mul(l.splat(mover.slope[2 * c]), x);
+            let sum = l.add(along, l.mul(l.splat(mover.slope[2 * c + 1]), y));
+            let start = l.add(l.splat(mover.start[c]), l.sar::<12>(sum));
+            l.min(l.max(start, l.splat(-32767)), l.splat(32767))
+        })
+    }
+
+    /// The words of `body` at places, where they are `wanted`.
+    #[inline(always)]
+    fn word_of(&self, l: L, body: &Body, group: &Group, at: [L::V; 2], wanted: L::M) -> L::V {
+        if !self.plan.drawn.are_codes {
+            return self.look(l, body, [WORD], nearest(l, at), wanted).1[0];
+        }
+        let (zero, number) = (l.splat(0), l.splat(body.owner as i32));
+        let whole = at.map(|c| l.sar::<6>(c));
+        let part = at.map(|c| l.and(c, l.splat(63)));
+        let (mut weights, mut any, mut sums) = (zero, zero, [zero; 3]);
+        for step in [[0, 0], [1, 0], [0, 1], [1, 1]] {
+            let share = |c: usize| if step[c] == 1 { part[c] } else { l.sub(l.splat(64), part[c]) };
+            let weight = l.mul(share(0), share(1));
+            let counts = l.both(wanted, l.greater(weight, zero));
+            if l.bits(counts) == 0 {
+                continue;
+            }
+            let off = [0, 1].map(|c| l.add(whole[c], l.splat(step[c])));
+            let (there, [word, of]) = self.look(l, body, [WORD, OWNER_AND_DEPTH], off, counts);
+            let shows = l.both(there, l.equal(l.shr::<24>(of), number));
+            let weight = l.choose(shows, weight, zero);
+            weights = l.add(weights, weight);
+            any = l.or(any, l.choose(shows, word, zero));
+            let channels = [word, l.shr::<8>(word), l.shr::<16>(word)];
+            for (sum, channel) in sums.iter_mut().zip(channels) {
+                *sum = l.add(*sum, l.pairs16(weight, l.and(channel, l.splat(0xff))));
+            }
+        }
+        let code = mean(l, weights, sums);
+        let rough = l.both(wanted, l.greater(zero, l.and(any, l.splat(WORD_ROUGH as i32))));
+        if group.whole || l.bits(rough) == 0 {
+            return code;
+        }
+        let turn = turns(body, group);
+        let off = [0, 1].map(|c| l.sar::<6>(l.add(at[c], l.splat(turn[c]))));
+        let (there, [word, of]) = self.look(l, body, [WORD, OWNER_AND_DEPTH], off, rough);
+        let shows = l.both(there, l.equal(l.shr::<24>(of), number));
+        let (_, [near]) = self.look(l, body, [WORD], nearest(l, at), l.except(rough, shows));
+        l.choose(rough, l.choose(shows, word, near), code)
+    }
+
+    /// `there`, and what is seen where a body has left and nothing was found.
+    #[inline(always)]
+    fn uncovered(&self, l: L, group: &Group, found: Found<L>, mut there: L::V) -> L::V {
+        let left = l.both(self.inside, l.greater(self.owner, l.splat(OWNER_STILL as i32)));
+        let mut open = l.both(left, l.equal(found.owner, l.splat(OWNER_NONE as i32)));
+        let mut owners = [0; MOST_LANES];
+        while l.bits(open) != 0 {
+            l.store(self.owner, &mut owners);
+            let owner = owners[l.bits(open).trailing_zeros() as usize];
+            let body = &self.plan.bodies[(owner - OWNER_STILL - 1) as usize];
+            let of_body = l.both(open, l.equal(self.owner, l.splat(owner as i32)));
+            let at = offset(l, body, self.motion, group.instant);
+            let (is, [word, of]) =
+                self.look(l, body, [WORD, OWNER_AND_DEPTH], nearest(l, at), of_body);
+            let seen = l.both(is, l.greater(l.shr::<24>(of), l.splat(OWNER_NONE as i32)));
+            there = l.choose(seen, word, there);
+            open = l.except(open, of_body);
+        }
+        there
+    }
+}
+
+/// The pixels in which places are.
+#[inline(always)]
+fn nearest<L: Lanes>(l: L, at: [L::V; 2]) -> [L::V; 2] {
+    at.map(|c| l.sar::<6>(l.add(c, l.splat(32))))
+}
+
+/// Sums of codes by their weights. Where nothing counts the result means nothing.
+#[inline(always)]
+fn mean<L: Lanes>(l: L, weights: L::V, sums: [L::V; 3]) -> L::V {
+    let half = l.shr::<1>(weights);
+    let all = l.splat(4096);
+    let is_full = l.bits(l.equal(weights, all)) == u32::MAX >> (32 - L::N);
+    let divisor = l.max(weights, l.splat(1));
+    let code = |sum| {
+        let sum = l.add(sum, half);
+        if is_full {
+            l.shr::<12>(sum)
+        } else {
+            l.quotient(sum, divisor)
+        }
+    };
+    l.or(code(sums[0]), l.or(l.shl::<8>(code(sums[1])), l.shl::<16>(code(sums[2]))))
+}
