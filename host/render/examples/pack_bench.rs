@@ -5,9 +5,9 @@
 
 use dpm_device::planes::{PlaneSchedule, Raster};
 use dpm_render::pack::{pack, quantise, BitPlaneFrame, Kernel};
-use dpm_render::warp::gather::Drawn;
-use dpm_render::warp::plane_groups;
-use dpm_shaders::structs::{Moved, Mover, OWNER_STILL};
+use dpm_render::warp::gather::{within, Drawn};
+use dpm_render::warp::{plane_groups, Warper};
+use dpm_shaders::structs::{Moved, Mover, PlaneGroup, OWNER_STILL, WORD_ROUGH};
 use std::hint::black_box;
 use std::time::Instant;
 
@@ -24,38 +24,148 @@ fn main() {
         black_box(&mut copy);
     });
     println!("{:22} {copying:7.3} ms", "memcpy of 2.36 MB");
+    let mut packing = Vec::new();
     for &kernel in Kernel::available() {
         let ms = median_ms(|| {
             pack(kernel, black_box(&codes), &mut frame);
             black_box(&mut frame);
         });
         println!("{:22} {ms:7.3} ms  {:5.2} x memcpy", format!("pack {}", kernel.name()), ms / copying);
+        packing.push(ms);
     }
     let ms = median_ms(|| {
         black_box(quantise(black_box(&drive), None, &mut codes));
     });
     println!("{:22} {ms:7.3} ms  {:5.2} x memcpy", "quantise", ms / copying);
-    let ms = warp_ms(raster, &mut codes);
-    println!("{:22} {ms:7.3} ms  {:5.2} x memcpy", "warp, scalar twin", ms / copying);
+    let packing: Vec<(Kernel, f64)> = Kernel::available().iter().copied().zip(packing).collect();
+    println!("warp of the words of mirrors where a body may be; packing is that of as many mirrors by the same kernel");
+    for scene in scenes(raster) {
+        print_warp(&scene, raster, &packing);
+    }
 }
 
-/// Time in which the twin of the warp makes the words of a frame that one body fills, which moves by 2 pixels to the right
-/// during the exposure.
-fn warp_ms(raster: Raster, codes: &mut [u32]) -> f64 {
-    let schedule = PlaneSchedule::rgb24();
-    let instant = |i: usize| (i as f64 + 0.5) / schedule.len() as f64 - 0.18;
-    let groups = plane_groups(&schedule, &(0..schedule.len()).map(instant).collect::<Vec<_>>());
-    let (width, height) = (raster.width() as i32, raster.height() as i32);
-    let mover = Mover { upper: [width, height], start: [128, 0], ..bytemuck::Zeroable::zeroed() };
-    let of = |&word: &u32| Moved { word, motion: 128, owner_and_depth: (OWNER_STILL + 1) << 24 };
-    let pixels: Vec<Moved> = codes.iter().map(of).collect();
-    median_ms(|| {
-        let drawn =
-            Drawn { raster, pixels: black_box(&pixels), movers: &[mover], are_codes: true, before: 0 };
-        for (i, word) in codes.iter_mut().enumerate() {
-            *word = drawn.word([i as i32 % width, i as i32 / width], &groups);
+/// Prints what the warp of a scene takes by each kernel, as printed by the clock and beside packing.
+fn print_warp(scene: &WarpScene, raster: Raster, packing: &[(Kernel, f64)]) {
+    let Shot { pixels, movers, groups, are_codes, .. } = &scene.shot;
+    let places = (0..raster.pixel_count() as u32).map(|i| place(raster, i));
+    let count = places.filter(|at| movers.iter().any(|m| within(m, *at))).count();
+    let mut words: Vec<u32> = pixels.iter().map(|moved| moved.word).collect();
+    println!("{} ({count} mirrors, {} groups)", scene.name, groups.len());
+    for (kernel, pack_ms) in packing {
+        let mut warper = Warper::new(*kernel);
+        let ms = median_ms(|| {
+            let drawn =
+                Drawn { raster, pixels: black_box(pixels), movers, are_codes: *are_codes, before: 0 };
+            warper.warp(&drawn, groups, &mut words);
+            black_box(&mut words);
+        });
+        let share = count as f64 / raster.pixel_count() as f64;
+        let pack_ms = pack_ms * share;
+        let beside = if count == 0 { String::new() } else { format!("{:7.1} x packing", ms / pack_ms) };
+        println!("  {:20} {ms:9.4} ms, packing {pack_ms:7.4} ms {beside}", kernel.name());
+    }
+}
+
+fn place(raster: Raster, i: u32) -> [i32; 2] {
+    [i % raster.width(), i / raster.width()].map(|c| c as i32)
+}
+
+/// A frame that was drawn.
+struct Shot {
+    raster: Raster,
+    pixels: Vec<Moved>,
+    movers: Vec<Mover>,
+    groups: Vec<PlaneGroup>,
+    are_codes: bool,
+}
+
+struct WarpScene {
+    name: &'static str,
+    shot: Shot,
+}
+
+impl Shot {
+    /// A wall that stands, of a smooth picture.
+    fn wall(raster: Raster, schedule: PlaneSchedule) -> Self {
+        let instant = |i: usize| (i as f64 + 0.5) / schedule.len() as f64 - 0.18;
+        let groups = plane_groups(&schedule, &(0..schedule.len()).map(instant).collect::<Vec<_>>());
+        let of = |i: u32| {
+            let [x, y] = place(raster, i).map(f64::from);
+            let code = |k: f64| ((x * k / 90.0 + y * k / 70.0).sin() * 120.0 + 128.0) as u32;
+            let word = code(1.0) | code(1.3) << 8 | code(0.7) << 16;
+            Moved { word, motion: 0, owner_and_depth: OWNER_STILL << 24 | 1000 }
+        };
+        let pixels = (0..raster.pixel_count() as u32).map(of).collect();
+        Self { raster, pixels, movers: Vec::new(), groups, are_codes: true }
+    }
+
+    /// Adds a body in `area`, left, top, right and bottom, in an ellipse or all of it, that moves by `start` in its middle and
+    /// turns by `turn` of 2^-12 of 1/64 pixel a pixel.
+    fn with(mut self, area: [i32; 4], is_round: bool, start: [i32; 2], turn: i32) -> Self {
+        let [left, top, right, bottom] = area;
+        let (centre, half) =
+            ([(left + right) / 2, (top + bottom) / 2], [(right - left) / 2, (bottom - top) / 2]);
+        // Bodies that come later are nearer.
+        let depth = 900 - 100 * self.movers.len() as u32;
+        let owner = OWNER_STILL + 1 + self.movers.len() as u32;
+        // The area of a body that has margins for its motion.
+        let margin = if is_round { 4 } else { 0 };
+        self.movers.push(Mover {
+            lower: [left - margin, top - margin],
+            upper: [right + margin, bottom + margin],
+            centre,
+            start,
+            slope: [0, -turn, turn, 0],
+            ..bytemuck::Zeroable::zeroed()
+        });
+        for (pixel, i) in self.pixels.iter_mut().zip(0..) {
+            let [x, y] = place(self.raster, i);
+            let from = [x - centre[0], y - centre[1]];
+            let is_in = x >= left && x < right && y >= top && y < bottom;
+            let far = (0..2).map(|c| (f64::from(from[c]) / f64::from(half[c])).powi(2)).sum::<f64>();
+            if is_in && (!is_round || far < 1.0) {
+                let motion = [start[0] - ((turn * from[1]) >> 12), start[1] + ((turn * from[0]) >> 12)];
+                pixel.motion = (motion[0] as u32 & 0xffff) | (motion[1] as u32) << 16;
+                pixel.owner_and_depth = owner << 24 | depth;
+                pixel.word ^= 0x3f_3f3f;
+            }
         }
-    })
+        self
+    }
+
+    /// Marks one of so many pixels, on lines, as rough.
+    fn rough(mut self, every: usize) -> Self {
+        let lines = self.pixels.iter_mut().skip(every / 2).step_by(every);
+        lines.filter(|pixel| pixel.owner_and_depth >> 24 > OWNER_STILL).for_each(|p| p.word |= WORD_ROUGH);
+        self
+    }
+}
+
+/// What may move in a frame of 1024 x 768.
+fn scenes(raster: Raster) -> Vec<WarpScene> {
+    let rgb = || Shot::wall(raster, PlaneSchedule::rgb24());
+    let all = [0, 0, 1024, 768];
+    let two = || {
+        let far = rgb().with([150, 150, 650, 650], true, [130, 40], 300);
+        far.with([450, 200, 850, 600], true, [-200, 90], -900)
+    };
+    let halftone = Shot::wall(raster, PlaneSchedule::equal_rgb24());
+    let scene = |name, shot| WarpScene { name, shot };
+    vec![
+        scene("every mirror moves along the rows", rgb().with(all, false, [128, 0], 0)),
+        scene("every mirror moves aslant", rgb().with(all, false, [128, 45], 0)),
+        scene("every mirror moves aslant, a tenth rough", rgb().with(all, false, [128, 45], 0).rough(10)),
+        scene("every mirror turns", rgb().with(all, false, [30, 20], 1100)),
+        scene("every mirror turns, a tenth rough", rgb().with(all, false, [30, 20], 1100).rough(10)),
+        scene("two round bodies before a wall", two()),
+        scene("two round bodies before a wall, a tenth rough", two().rough(10)),
+        scene("a tenth of the raster moves aslant", rgb().with([400, 200, 680, 481], false, [128, 45], 0)),
+        scene("nothing moves", rgb()),
+        scene(
+            "every mirror moves aslant, halftones",
+            Shot { are_codes: false, ..halftone.with(all, false, [128, 45], 0) },
+        ),
+    ]
 }
 
 /// Median of about 300 ms of runs.

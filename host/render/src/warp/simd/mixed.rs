@@ -144,7 +144,6 @@ impl<L: Lanes> Own<'_, L> {
     #[inline(always)]
     fn nearer(&self, l: L, body: &Body, group: &Group, found: Found<L>) -> Found<L> {
         let number = l.splat(body.owner as i32);
-        let is_of = |of: L::V| l.equal(l.shr::<24>(of), number);
         let inside = body.within(l, self.x, self.y);
         let is_here = l.both(inside, l.equal(self.owner, number));
         let elsewhere = l.except(inside, is_here);
@@ -153,9 +152,9 @@ impl<L: Lanes> Own<'_, L> {
             let at = offset(l, body, self.start_of(l, body), group.instant);
             let (there, [moves, of]) =
                 self.look(l, body, [MOTION, OWNER_AND_DEPTH], nearest(l, at), elsewhere);
-            let hit = l.both(there, is_of(of));
+            let hit = l.both(there, l.equal(l.shr::<24>(of), number));
             let moves = motions(l, moves);
-            motion = [0, 1].map(|c| l.choose(hit, moves[c], motion[c]));
+            motion = choose_two(l, hit, moves, motion);
             near = l.either(near, hit);
         }
         if l.bits(near) == 0 {
@@ -164,11 +163,11 @@ impl<L: Lanes> Own<'_, L> {
         let at = offset(l, body, motion, group.instant);
         let (there, [of]) = self.look(l, body, [OWNER_AND_DEPTH], nearest(l, at), near);
         let depth = l.and(of, l.splat(0xff_ffff));
-        let wins = l.both(l.both(there, is_of(of)), l.greater(found.depth, depth));
+        let wins = l.both(l.both(there, l.equal(l.shr::<24>(of), number)), l.greater(found.depth, depth));
         Found {
             owner: l.choose(wins, number, found.owner),
             depth: l.choose(wins, depth, found.depth),
-            at: [0, 1].map(|c| l.choose(wins, at[c], found.at[c])),
+            at: choose_two(l, wins, at, found.at),
         }
     }
 
@@ -178,12 +177,14 @@ impl<L: Lanes> Own<'_, L> {
         let mover = &body.mover;
         let x = l.sub(self.x, l.splat(mover.centre[0]));
         let y = l.sub(self.y, l.splat(mover.centre[1]));
-        [0, 1].map(|c| {
+        let mut starts = [x; 2];
+        for (c, start) in starts.iter_mut().enumerate() {
             let along = l.mul(l.splat(mover.slope[2 * c]), x);
             let sum = l.add(along, l.mul(l.splat(mover.slope[2 * c + 1]), y));
-            let start = l.add(l.splat(mover.start[c]), l.sar::<12>(sum));
-            l.min(l.max(start, l.splat(-32767)), l.splat(32767))
-        })
+            let sum = l.add(l.splat(mover.start[c]), l.sar::<12>(sum));
+            *start = l.min(l.max(sum, l.splat(-32767)), l.splat(32767));
+        }
+        starts
     }
 
     /// The words of `body` at places, where they are `wanted`.
@@ -193,17 +194,21 @@ impl<L: Lanes> Own<'_, L> {
             return self.look(l, body, [WORD], nearest(l, at), wanted).1[0];
         }
         let (zero, number) = (l.splat(0), l.splat(body.owner as i32));
-        let whole = at.map(|c| l.sar::<6>(c));
-        let part = at.map(|c| l.and(c, l.splat(63)));
+        let whole = [l.sar::<6>(at[0]), l.sar::<6>(at[1])];
+        let part = [l.and(at[0], l.splat(63)), l.and(at[1], l.splat(63))];
+        let rest = [l.sub(l.splat(64), part[0]), l.sub(l.splat(64), part[1])];
         let (mut weights, mut any, mut sums) = (zero, zero, [zero; 3]);
         for step in [[0, 0], [1, 0], [0, 1], [1, 1]] {
-            let share = |c: usize| if step[c] == 1 { part[c] } else { l.sub(l.splat(64), part[c]) };
-            let weight = l.mul(share(0), share(1));
+            let [right, down] = step;
+            let weight = l.pairs16(
+                if right == 1 { part[0] } else { rest[0] },
+                if down == 1 { part[1] } else { rest[1] },
+            );
             let counts = l.both(wanted, l.greater(weight, zero));
             if l.bits(counts) == 0 {
                 continue;
             }
-            let off = [0, 1].map(|c| l.add(whole[c], l.splat(step[c])));
+            let off = [l.add(whole[0], l.splat(right)), l.add(whole[1], l.splat(down))];
             let (there, [word, of]) = self.look(l, body, [WORD, OWNER_AND_DEPTH], off, counts);
             let shows = l.both(there, l.equal(l.shr::<24>(of), number));
             let weight = l.choose(shows, weight, zero);
@@ -220,7 +225,8 @@ impl<L: Lanes> Own<'_, L> {
             return code;
         }
         let turn = turns(body, group);
-        let off = [0, 1].map(|c| l.sar::<6>(l.add(at[c], l.splat(turn[c]))));
+        let off = [l.add(at[0], l.splat(turn[0])), l.add(at[1], l.splat(turn[1]))];
+        let off = [l.sar::<6>(off[0]), l.sar::<6>(off[1])];
         let (there, [word, of]) = self.look(l, body, [WORD, OWNER_AND_DEPTH], off, rough);
         let shows = l.both(there, l.equal(l.shr::<24>(of), number));
         let (_, [near]) = self.look(l, body, [WORD], nearest(l, at), l.except(rough, shows));
@@ -249,10 +255,16 @@ impl<L: Lanes> Own<'_, L> {
     }
 }
 
+/// Numbers of `yes` where `m` is true, else those of `no`.
+#[inline(always)]
+fn choose_two<L: Lanes>(l: L, m: L::M, yes: [L::V; 2], no: [L::V; 2]) -> [L::V; 2] {
+    [l.choose(m, yes[0], no[0]), l.choose(m, yes[1], no[1])]
+}
+
 /// The pixels in which places are.
 #[inline(always)]
 fn nearest<L: Lanes>(l: L, at: [L::V; 2]) -> [L::V; 2] {
-    at.map(|c| l.sar::<6>(l.add(c, l.splat(32))))
+    [l.sar::<6>(l.add(at[0], l.splat(32))), l.sar::<6>(l.add(at[1], l.splat(32)))]
 }
 
 /// Sums of codes by their weights. Where nothing counts the result means nothing.
@@ -262,13 +274,10 @@ fn mean<L: Lanes>(l: L, weights: L::V, sums: [L::V; 3]) -> L::V {
     let all = l.splat(4096);
     let is_full = l.bits(l.equal(weights, all)) == u32::MAX >> (32 - L::N);
     let divisor = l.max(weights, l.splat(1));
-    let code = |sum| {
-        let sum = l.add(sum, half);
-        if is_full {
-            l.shr::<12>(sum)
-        } else {
-            l.quotient(sum, divisor)
-        }
-    };
-    l.or(code(sums[0]), l.or(l.shl::<8>(code(sums[1])), l.shl::<16>(code(sums[2]))))
+    let mut codes = sums;
+    for code in &mut codes {
+        let sum = l.add(*code, half);
+        *code = if is_full { l.shr::<12>(sum) } else { l.quotient(sum, divisor) };
+    }
+    l.or(codes[0], l.or(l.shl::<8>(codes[1]), l.shl::<16>(codes[2])))
 }

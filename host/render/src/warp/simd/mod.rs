@@ -4,6 +4,9 @@
 //! is near is one mover, every lookup finds it, and what is left is interpolation (`pure`). Else all is done that the plain
 //! twin does, for all mirrors of the block at once (`mixed`).
 //!
+//! What is done with registers stands in functions that are always inlined, and in no closure: a closure is a function of its own,
+//! compiled for any CPU, and would call each instruction.
+//!
 //! No block gathers. Mirrors of a block that look in the same direction by as many whole pixels take neighbours from
 //! neighbours, so that one load serves all of them, and mostly that is all there is.
 #![allow(unsafe_code)]
@@ -332,8 +335,9 @@ fn moved_by<L: Lanes>(l: L, motion: L::V, instant: i32) -> L::V {
 /// How far from their mirrors points are drawn that reach them at `instant`, in 1/64 pixel.
 #[inline(always)]
 fn offset<L: Lanes>(l: L, body: &Body, motion: [L::V; 2], instant: i32) -> [L::V; 2] {
-    let of = |motion| l.sub(moved_by(l, motion, body.mover.instant), moved_by(l, motion, instant));
-    [of(motion[0]), of(motion[1])]
+    let [x, y] = motion;
+    let drawn = [moved_by(l, x, body.mover.instant), moved_by(l, y, body.mover.instant)];
+    [l.sub(drawn[0], moved_by(l, x, instant)), l.sub(drawn[1], moved_by(l, y, instant))]
 }
 
 /// The motions of pixels, to the right and down.

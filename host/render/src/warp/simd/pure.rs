@@ -77,8 +77,8 @@ pub(super) fn warp<L: Lanes>(
 ) -> Option<L::V> {
     let motion = rows.load(l, MOTION, block.index);
     let each = motions(l, motion);
-    let too_fast = |motion| l.greater(l.abs(motion), l.splat(body.limit));
-    if l.bits(l.either(too_fast(each[0]), too_fast(each[1]))) != 0 {
+    let fastest = l.max(l.abs(each[0]), l.abs(each[1]));
+    if l.bits(l.greater(fastest, l.splat(body.limit))) != 0 {
         return None;
     }
     let mut first = [0; MOST_LANES];
@@ -109,12 +109,9 @@ fn even_codes<L: Lanes>(l: L, rows: &Rows, steps: &[Step], block: Block) -> L::V
     for step in steps {
         if off != Some(step.off) {
             off = Some(step.off);
-            let pairs = |down: i32| {
-                let at = rows.index([block.at[0] + step.off[0], block.at[1] + step.off[1] + down]);
-                let (left, right) = (rows.load(l, WORD, at), rows.load(l, WORD, at + 1));
-                [l.low8(left, right), l.high8(left, right)]
-            };
-            (upper, lower) = (pairs(0), pairs(1));
+            let [a, b, c, d] = four(l, rows, [block.at[0] + step.off[0], block.at[1] + step.off[1]]);
+            upper = [l.low8(a, b), l.high8(a, b)];
+            lower = [l.low8(c, d), l.high8(c, d)];
         }
         let (columns, mask) = (l.splat(step.columns), l.splat_four16(step.mask));
         let below = l.splat(step.rows);
@@ -129,6 +126,18 @@ fn even_codes<L: Lanes>(l: L, rows: &Rows, steps: &[Step], block: Block) -> L::V
         }
     }
     l.pack16(l.shr16::<6>(codes[0]), l.shr16::<6>(codes[1]))
+}
+
+/// The words of the block that begins at pixel [x, y], of that to the right of it, and of those below both.
+#[inline(always)]
+fn four<L: Lanes>(l: L, rows: &Rows, [x, y]: [i32; 2]) -> [L::V; 4] {
+    let (upper, lower) = (rows.index([x, y]), rows.index([x, y + 1]));
+    [
+        rows.load(l, WORD, upper),
+        rows.load(l, WORD, upper + 1),
+        rows.load(l, WORD, lower),
+        rows.load(l, WORD, lower + 1),
+    ]
 }
 
 /// Words of a block that moves evenly, taken whole.
@@ -180,9 +189,7 @@ fn codes<L: Lanes>(
         while bits != 0 {
             let key = list[bits.trailing_zeros() as usize] as i32;
             let [right, down] = columns_and_rows(key);
-            let at = [block.at[0] + right, block.at[1] + down];
-            let (upper, lower) = (rows.index(at), rows.index([at[0], at[1] + 1]));
-            let four = [upper, upper + 1, lower, lower + 1].map(|at| rows.load(l, WORD, at));
+            let four = four(l, rows, [block.at[0] + right, block.at[1] + down]);
             let mut code = l.and(weights.interpolate(l, four), l.splat(CODE));
             if rough && !group.whole {
                 let one = one_of(l, four, part, turns(body, group));
@@ -210,8 +217,8 @@ fn words<L: Lanes>(
 ) -> L::V {
     let mut word = own;
     for group in plan.groups {
-        let at = offset(l, body, motion, group.instant).map(|c| l.add(c, l.splat(32)));
-        let (keys, list, _) = parted(l, at);
+        let [x, y] = offset(l, body, motion, group.instant);
+        let (keys, list, _) = parted(l, [l.add(x, l.splat(32)), l.add(y, l.splat(32))]);
         let mut bits = u32::MAX >> (32 - L::N);
         let mut found = l.splat(0);
         while bits != 0 {
@@ -273,7 +280,8 @@ pub(super) fn turns(body: &Body, group: &Group) -> [i32; 2] {
 /// The word of the neighbour that a place reaches by `turn`.
 #[inline(always)]
 fn one_of<L: Lanes>(l: L, [a, b, c, d]: [L::V; 4], part: [L::V; 2], turn: [i32; 2]) -> L::V {
-    let [right, down] = [0, 1].map(|c| l.greater(l.add(part[c], l.splat(turn[c])), l.splat(63)));
+    let right = l.greater(l.add(part[0], l.splat(turn[0])), l.splat(63));
+    let down = l.greater(l.add(part[1], l.splat(turn[1])), l.splat(63));
     l.choose(down, l.choose(right, d, c), l.choose(right, b, a))
 }
 
@@ -281,8 +289,8 @@ fn one_of<L: Lanes>(l: L, [a, b, c, d]: [L::V; 4], part: [L::V; 2], turn: [i32; 
 #[inline(always)]
 fn is_rough<L: Lanes>(l: L, [a, b, c, d]: [L::V; 4], part: [L::V; 2]) -> L::M {
     let zero = l.splat(0);
-    let [right, down] = [0, 1].map(|c| l.greater(part[c], zero));
+    let (right, down) = (l.greater(part[0], zero), l.greater(part[1], zero));
     let lower = l.or(c, l.choose(right, d, zero));
     let any = l.or(l.or(a, l.choose(right, b, zero)), l.choose(down, lower, zero));
-    l.greater(l.splat(0), l.and(any, l.splat(WORD_ROUGH as i32)))
+    l.greater(zero, l.and(any, l.splat(WORD_ROUGH as i32)))
 }

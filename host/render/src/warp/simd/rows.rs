@@ -88,18 +88,18 @@ impl Rows {
         let row = y as usize * drawn.raster.width() as usize;
         let pixels = &drawn.pixels[row + self.columns.start as usize..row + self.columns.end as usize];
         let at = self.slot(y) + PAD as usize;
-        let [words, motions, owners] = self.fields.each_mut().map(|f| &mut f[at..at + pixels.len()]);
+        let [words, motions, owners] = &mut self.fields;
+        let kept = at..at + pixels.len();
+        let (words, motions, owners) =
+            (&mut words[kept.clone()], &mut motions[kept.clone()], &mut owners[kept]);
         for (((pixel, word), motion), owner) in pixels.iter().zip(words).zip(motions).zip(owners) {
             (*word, *motion, *owner) = (pixel.word, pixel.motion, pixel.owner_and_depth);
         }
-        let [words, _, owners] = self.fields.each_ref().map(|f| &f[at..at + pixels.len()]);
+        let (words, owners) =
+            (&self.fields[WORD][at..][..pixels.len()], &self.fields[OWNER_AND_DEPTH][at..][..pixels.len()]);
         for ((cell, words), owners) in self.cells.iter_mut().zip(words.chunks(CELL)).zip(owners.chunks(CELL))
         {
-            let (least, most, all) = match (<&[u32; CELL]>::try_from(words), <&[u32; CELL]>::try_from(owners))
-            {
-                (Ok(words), Ok(owners)) => summary(words, owners),
-                _ => summary(words, owners),
-            };
+            let (least, most, all) = summary(words, owners);
             let owner = match (least >> 24, most >> 24) {
                 (_, most) if most <= OWNER_STILL => 0,
                 (least, most) if least == most => most,
@@ -162,6 +162,13 @@ impl Rows {
 #[inline(always)]
 fn summary(words: &[u32], owners: &[u32]) -> (u32, u32, u32) {
     let mut found = (u32::MAX, 0, 0);
+    // A whole cell is of known length, and a few instructions.
+    if let (Ok(words), Ok(owners)) = (<&[u32; CELL]>::try_from(words), <&[u32; CELL]>::try_from(owners)) {
+        for i in 0..CELL {
+            found = (found.0.min(owners[i]), found.1.max(owners[i]), found.2 | words[i]);
+        }
+        return found;
+    }
     for (word, owner) in words.iter().zip(owners) {
         found = (found.0.min(*owner), found.1.max(*owner), found.2 | word);
     }
