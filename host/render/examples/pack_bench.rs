@@ -1,7 +1,7 @@
 //! Times of copying, packing and quantising one 1024 x 768 frame of 24 planes on one core, as text, and of what the CPU twin
 //! of the pass `warp` takes for such a frame whose every mirror moves.
 //!
-//! `cargo run --release -p dpm-render --example pack_bench`
+//! `cargo run --release -p dpm-render --example pack_bench`, with a word of its name for one frame of the warp only
 
 use dpm_device::planes::{PlaneSchedule, Raster};
 use dpm_render::pack::{pack, quantise, BitPlaneFrame, Kernel};
@@ -39,8 +39,9 @@ fn main() {
     println!("{:22} {ms:7.3} ms  {:5.2} x memcpy", "quantise", ms / copying);
     let packing: Vec<(Kernel, f64)> = Kernel::available().iter().copied().zip(packing).collect();
     println!("warp of the words of mirrors where a body may be; packing is that of as many mirrors by the same kernel");
-    for scene in scenes(raster) {
-        print_warp(&scene, raster, &packing);
+    let wanted = std::env::args().nth(1).unwrap_or_default();
+    for scene in scenes(raster).iter().filter(|scene| scene.name.contains(&wanted)) {
+        print_warp(scene, raster, &packing);
     }
 }
 

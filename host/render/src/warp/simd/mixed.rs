@@ -34,17 +34,18 @@ struct Found<L: Lanes> {
 
 /// The block's words.
 #[inline(always)]
-pub(super) fn warp<'a, L: Lanes>(
+pub(super) fn warp<L: Lanes>(
     l: L,
     rows: &Rows,
     plan: &Plan<'_>,
-    bodies: impl Iterator<Item = &'a Body> + Clone,
+    near: &[u8],
     block: Block,
 ) -> L::V {
     let owner_and_depth = rows.load(l, OWNER_AND_DEPTH, block.index);
     let (x, y) = (l.add(l.numbers(), l.splat(block.at[0])), l.splat(block.at[1]));
     let mut inside = l.greater(x, x);
-    for body in bodies.clone() {
+    for &number in near {
+        let body = &plan.bodies[usize::from(number)];
         inside = l.either(inside, body.within(l, x, y));
     }
     let own: Own<'_, L> = Own {
@@ -62,11 +63,13 @@ pub(super) fn warp<'a, L: Lanes>(
     let mut word = unmarked(l, plan, own.word);
     for group in plan.groups {
         let mut found = own.still(l);
-        for body in bodies.clone() {
+        for &number in near {
+            let body = &plan.bodies[usize::from(number)];
             found = own.nearer(l, body, group, found);
         }
         let mut there = l.choose(l.equal(found.owner, l.splat(OWNER_STILL as i32)), own.word, l.splat(0));
-        for body in bodies.clone() {
+        for &number in near {
+            let body = &plan.bodies[usize::from(number)];
             let shown = l.equal(found.owner, l.splat(body.owner as i32));
             if l.bits(shown) != 0 {
                 there = l.choose(shown, own.word_of(l, body, group, found.at, shown), there);

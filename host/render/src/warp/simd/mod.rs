@@ -19,7 +19,7 @@ mod rows;
 use super::gather::{has_whole_codes, start_of, turn_of, Drawn};
 use dpm_shaders::structs::{Mover, PlaneGroup, OWNER_STILL, WORD_ROUGH};
 use lanes::{Avx2, Avx512, Lanes};
-use rows::{Around, Rows, MOST_REACH, WORD};
+use rows::{Around, Rows, MOST_REACH, OWNER_AND_DEPTH, WORD};
 use std::ops::Range;
 
 /// Most numbers in a register.
@@ -58,13 +58,6 @@ impl Body {
             && x + count + reach < upper[0]
             && y - reach >= lower[1]
             && y + reach + 1 < upper[1]
-    }
-
-    /// True if a block of `count` pixels has pixels in its area.
-    #[inline(always)]
-    fn meets(&self, [x, y]: [i32; 2], count: i32) -> bool {
-        let Mover { lower, upper, .. } = &self.mover;
-        y >= lower[1] && y < upper[1] && x + count > lower[0] && x < upper[0]
     }
 
     /// The pixels of `x` in row `y` that lie in its area.
@@ -208,69 +201,123 @@ fn run<L: Lanes>(l: L, work: &mut Work<'_>, words: &mut [u32]) {
         work.rows.advance(work.plan.drawn, y);
         let row = &mut words[y as usize * width..][..width];
         let to_end = &mut row[first as usize..work.columns.end as usize];
+        let (mut near, mut until) = (Near::default(), i32::MIN);
+        let mut stretch = Stretch::NONE;
         for (block, x) in to_end.chunks_mut(L::N).zip((first..).step_by(L::N)) {
-            let near = Near::of(work.plan.bodies, [x, y], L::N as i32);
+            if x >= until {
+                (near, until) = Near::of(work.plan.bodies, [x, y], L::N as i32);
+                stretch = Stretch::NONE;
+            }
             if near.count > 0 {
-                warp_block(l, work, &near, [x, y], block);
+                warp_block(l, work, &near, &mut stretch, [x, y], block);
             }
         }
     }
 }
 
+/// Blocks of a row around which the same is.
+#[derive(Clone, Copy)]
+struct Stretch {
+    /// Blocks that begin from this column on are others.
+    until: i32,
+    kind: Kind,
+}
+
+#[derive(Clone, Copy)]
+enum Kind {
+    Still,
+    /// All is of the mover with this number in the plan; some words may be rough.
+    Pure(usize, bool),
+    Mixed,
+}
+
+impl Stretch {
+    const NONE: Self = Self { until: i32::MIN, kind: Kind::Mixed };
+
+    /// The stretch that begins with a block of `count` pixels, near `bodies`.
+    #[inline(always)]
+    fn of(rows: &Rows, plan: &Plan<'_>, near: &[u8], at: [i32; 2], count: i32) -> Self {
+        let bodies = || near.iter().map(|&number| &plan.bodies[usize::from(number)]);
+        let all_near_but = |owner: u32| bodies().all(|body| body.is_near || body.owner == owner);
+        let (around, until) = rows.around(at, count, rows.reach);
+        let until = if until == i32::MAX { until } else { until.saturating_sub(count + rows.reach) };
+        match around {
+            Around::Still if all_near_but(0) => Self { until, kind: Kind::Still },
+            Around::Mover { owner, rough } if all_near_but(owner) => {
+                let number = (owner - OWNER_STILL - 1) as usize;
+                match plan.bodies.get(number).filter(|body| body.holds(at, count, rows.reach)) {
+                    Some(body) => {
+                        let inside = body.mover.upper[0] - count - rows.reach;
+                        Self { until: until.min(inside), kind: Kind::Pure(number, rough) }
+                    }
+                    None => Self::NONE,
+                }
+            }
+            _ => Self::NONE,
+        }
+    }
+}
+
 /// The movers in whose areas a block has pixels.
+#[derive(Default)]
 struct Near {
     numbers: [u8; MOST_NEAR],
     count: usize,
 }
 
 impl Near {
-    #[inline(always)]
-    fn of(bodies: &[Body], at: [i32; 2], count: i32) -> Self {
-        let mut near = Self { numbers: [0; MOST_NEAR], count: 0 };
-        for (number, body) in bodies.iter().enumerate() {
-            if body.meets(at, count) {
-                if near.count < MOST_NEAR {
-                    near.numbers[near.count] = number as u8;
-                }
-                near.count += 1;
+    /// The movers near a block of `count` pixels, and the column up to which the same are near blocks that follow.
+    fn of(bodies: &[Body], at: [i32; 2], count: i32) -> (Self, i32) {
+        let (mut near, mut until) = (Self::default(), i32::MAX);
+        for (number, Body { mover, .. }) in bodies.iter().enumerate() {
+            let is_in_row = at[1] >= mover.lower[1] && at[1] < mover.upper[1];
+            if !is_in_row || at[0] >= mover.upper[0] {
+                continue;
             }
+            if at[0] + count <= mover.lower[0] {
+                until = until.min(mover.lower[0] - count + 1);
+                continue;
+            }
+            until = until.min(mover.upper[0]);
+            if near.count < MOST_NEAR {
+                near.numbers[near.count] = number as u8;
+            }
+            near.count += 1;
         }
-        near
-    }
-
-    /// `None`: there are too many.
-    #[inline(always)]
-    fn bodies<'a>(&'a self, all: &'a [Body]) -> Option<impl Iterator<Item = &'a Body> + Clone> {
-        Some(self.numbers.get(..self.count)?.iter().map(|&number| &all[usize::from(number)]))
+        (near, until)
     }
 }
 
 /// Warps the pixels of a block that lie in the area of a mover.
 #[inline(always)]
-fn warp_block<L: Lanes>(l: L, work: &mut Work<'_>, near: &Near, at: [i32; 2], words: &mut [u32]) {
-    let Some(bodies) = near.bodies(work.plan.bodies) else {
-        return plain_block(&work.plan, at, words);
+fn warp_block<L: Lanes>(
+    l: L,
+    work: &mut Work<'_>,
+    near: &Near,
+    stretch: &mut Stretch,
+    at: [i32; 2],
+    words: &mut [u32],
+) {
+    let Work { rows, steps, plan, .. } = work;
+    let Some(numbers) = near.numbers.get(..near.count) else {
+        return plain_block(plan, at, words);
     };
-    let (count, reach) = (L::N as i32, work.rows.reach);
-    let block = Block { at, index: work.rows.index(at) };
-    let all_near_but = |owner: u32| bodies.clone().all(|body| body.is_near || body.owner == owner);
-    let of_mover = |owner: u32| {
-        let body = bodies.clone().find(|body| body.owner == owner)?;
-        (body.holds(at, count, reach) && all_near_but(owner)).then_some(body)
-    };
-    let done = match work.rows.around(at, count, reach) {
-        Around::Still => all_near_but(0).then(|| still_block(l, work, block)),
-        Around::Mover { owner, rough } => match of_mover(owner) {
-            Some(body) => pure::warp(l, work.rows, work.steps, &work.plan, body, block, rough),
-            None => None,
-        },
-        Around::Mixed => None,
+    if at[0] >= stretch.until {
+        *stretch = Stretch::of(rows, plan, numbers, at, L::N as i32);
+    }
+    let block = Block { at, index: rows.index(at) };
+    let done = match stretch.kind {
+        Kind::Still => Some(still_block(l, rows, plan, block)),
+        Kind::Pure(number, rough) => {
+            pure::warp(l, rows, steps, plan, &plan.bodies[number], block, rough)
+        }
+        Kind::Mixed => None,
     };
     let result = match done {
         Some(result) => result,
-        None => mixed::warp(l, work.rows, &work.plan, bodies.clone(), block),
+        None => mixed::warp(l, rows, plan, numbers, block),
     };
-    store(l, work.plan.bodies, near, at, result, words);
+    store(l, plan.bodies, numbers, at, result, words);
 }
 
 /// Where a block is: its first pixel, and that pixel's index in the rows that are kept.
@@ -282,16 +329,19 @@ struct Block {
 
 /// Stores what lies in the area of a mover.
 #[inline(always)]
-fn store<L: Lanes>(l: L, all: &[Body], near: &Near, at: [i32; 2], result: L::V, words: &mut [u32]) {
-    let Some(bodies) = near.bodies(all) else { return };
-    let covers = |body: &Body| at[0] >= body.mover.lower[0] && at[0] + L::N as i32 <= body.mover.upper[0];
-    if words.len() == L::N && bodies.clone().any(covers) {
+fn store<L: Lanes>(l: L, all: &[Body], near: &[u8], at: [i32; 2], result: L::V, words: &mut [u32]) {
+    let last = at[0] + L::N as i32 - 1;
+    let holds = |number: &u8, x: i32| {
+        let mover = &all[usize::from(*number)].mover;
+        x >= mover.lower[0] && x < mover.upper[0]
+    };
+    if words.len() == L::N && near.iter().any(|number| holds(number, at[0]) && holds(number, last)) {
         return l.store(result, words);
     }
-    let mut all = [0; MOST_LANES];
-    l.store(result, &mut all);
-    for ((word, new), x) in words.iter_mut().zip(all).zip(at[0]..) {
-        if bodies.clone().any(|body| x >= body.mover.lower[0] && x < body.mover.upper[0]) {
+    let mut new = [0; MOST_LANES];
+    l.store(result, &mut new);
+    for ((word, new), x) in words.iter_mut().zip(new).zip(at[0]..) {
+        if near.iter().any(|number| holds(number, x)) {
             *word = new;
         }
     }
@@ -319,11 +369,11 @@ fn unmarked<L: Lanes>(l: L, plan: &Plan<'_>, word: L::V) -> L::V {
 
 /// A block near which nothing moves: what stands shows its own bits, and nothing shows none.
 #[inline(always)]
-fn still_block<L: Lanes>(l: L, work: &Work<'_>, block: Block) -> L::V {
-    let word = work.rows.load(l, WORD, block.index);
-    let owner = l.shr::<24>(work.rows.load(l, rows::OWNER_AND_DEPTH, block.index));
+fn still_block<L: Lanes>(l: L, rows: &Rows, plan: &Plan<'_>, block: Block) -> L::V {
+    let word = rows.load(l, WORD, block.index);
+    let owner = l.shr::<24>(rows.load(l, OWNER_AND_DEPTH, block.index));
     let shown = l.choose(l.equal(owner, l.splat(OWNER_STILL as i32)), word, l.splat(0));
-    l.merge(l.splat(work.plan.masks), shown, unmarked(l, &work.plan, word))
+    l.merge(l.splat(plan.masks), shown, unmarked(l, plan, word))
 }
 
 /// How far points have moved at an instant that move by `motion` during the exposure, in 1/64 pixel.

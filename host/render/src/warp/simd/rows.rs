@@ -114,24 +114,32 @@ impl Rows {
         }
     }
 
-    /// What is around `count` pixels of row `y`, from column `x` on, `wide` pixels to the left and right.
+    /// What is around `count` pixels of row `y`, from column `x` on, `wide` pixels to the left and right; and up to which column
+    /// the same is around all that follow.
     #[inline(always)]
-    pub(super) fn around(&self, [x, y]: [i32; 2], count: i32, wide: i32) -> Around {
+    pub(super) fn around(&self, [x, y]: [i32; 2], count: i32, wide: i32) -> (Around, i32) {
         let first = (x - wide).max(self.columns.start) - self.columns.start;
         let last = (x + count + wide).min(self.columns.end - 1) - self.columns.start;
-        let cells = &self.cells[first as usize / CELL..=last as usize / CELL];
-        let owner = cells[0].owner;
+        let (first, last) = (first as usize / CELL, last as usize / CELL);
         let top = (y - self.reach).max(self.rows.start);
-        let (mut is_one, mut rough) = (owner != MIXED, i32::MIN);
-        for cell in cells {
-            is_one &= cell.owner == owner && cell.since <= top;
-            rough = rough.max(cell.rough);
+        let Cell { owner, rough, .. } = self.cells[first];
+        let is_alike = |cell: &Cell| {
+            cell.owner == owner && owner != MIXED && cell.since <= top && (cell.rough >= top) == (rough >= top)
+        };
+        if self.cells[first..=last].iter().all(is_alike) {
+            let more = self.cells[last..].iter().take_while(|cell| is_alike(cell)).count();
+            let until = ((last + more) * CELL) as i32 + self.columns.start;
+            let until = if until >= self.columns.end { i32::MAX } else { until };
+            let around = if owner == 0 { Around::Still } else { Around::Mover { owner, rough: rough >= top } };
+            return (around, until);
         }
-        match owner {
-            _ if !is_one => Around::Mixed,
-            0 => Around::Still,
-            owner => Around::Mover { owner, rough: rough >= top },
-        }
+        let cells = &self.cells[first..=last];
+        let around = match cells.iter().all(|cell| cell.owner == owner && cell.since <= top) {
+            true if owner == 0 => Around::Still,
+            true if owner != MIXED => Around::Mover { owner, rough: true },
+            _ => Around::Mixed,
+        };
+        (around, i32::MIN)
     }
 
     /// Where row `y` begins in each field.
