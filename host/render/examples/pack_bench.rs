@@ -24,47 +24,77 @@ fn main() {
         black_box(&mut copy);
     });
     println!("{:22} {copying:7.3} ms", "memcpy of 2.36 MB");
-    let mut packing = Vec::new();
+    // What a warp of every mirror reads at least.
+    let moved = vec![<Moved as bytemuck::Zeroable>::zeroed(); raster.pixel_count()];
+    let reading = median_ms(|| {
+        black_box(black_box(&moved).iter().fold(0, |all, pixel| all | pixel.word | pixel.owner_and_depth));
+    });
+    println!("{:22} {reading:7.3} ms  {:5.2} x memcpy", "reading 9.4 MB", reading / copying);
     for &kernel in Kernel::available() {
         let ms = median_ms(|| {
             pack(kernel, black_box(&codes), &mut frame);
             black_box(&mut frame);
         });
         println!("{:22} {ms:7.3} ms  {:5.2} x memcpy", format!("pack {}", kernel.name()), ms / copying);
-        packing.push(ms);
     }
     let ms = median_ms(|| {
         black_box(quantise(black_box(&drive), None, &mut codes));
     });
     println!("{:22} {ms:7.3} ms  {:5.2} x memcpy", "quantise", ms / copying);
-    let packing: Vec<(Kernel, f64)> = Kernel::available().iter().copied().zip(packing).collect();
-    println!("warp of the words of mirrors where a body may be; packing is that of as many mirrors by the same kernel");
+    println!("warp of the mirrors of the areas in which bodies move, by turns with packing as many of them");
+    println!("{:20}       warp ms           packing ms        warp / packing", "");
+    println!("{:20}   median  fastest    median  fastest   medians  fastest", "");
     let wanted = std::env::args().nth(1).unwrap_or_default();
     for scene in scenes(raster).iter().filter(|scene| scene.name.contains(&wanted)) {
-        print_warp(scene, raster, &packing);
+        print_warp(scene, &mut frame);
     }
 }
 
-/// Prints what the warp of a scene takes by each kernel, as printed by the clock and beside packing.
-fn print_warp(scene: &WarpScene, raster: Raster, packing: &[(Kernel, f64)]) {
-    let Shot { pixels, movers, groups, are_codes, .. } = &scene.shot;
-    let places = (0..raster.pixel_count() as u32).map(|i| place(raster, i));
+/// Prints what the warp of a scene takes by each kernel, and packing by the same.
+fn print_warp(scene: &WarpScene, frame: &mut BitPlaneFrame) {
+    let Shot { raster, pixels, movers, groups, are_codes } = &scene.shot;
+    let places = (0..raster.pixel_count() as u32).map(|i| place(*raster, i));
     let count = places.filter(|at| movers.iter().any(|m| within(m, *at))).count();
+    let share = count as f64 / raster.pixel_count() as f64;
     let mut words: Vec<u32> = pixels.iter().map(|moved| moved.word).collect();
     println!("{} ({count} mirrors, {} groups)", scene.name, groups.len());
-    for (kernel, pack_ms) in packing {
-        let mut warper = Warper::new(*kernel);
-        let ms = median_ms(|| {
+    for &kernel in Kernel::available() {
+        let mut warper = Warper::new(kernel);
+        let (mut warps, mut packs) = (Vec::new(), Vec::new());
+        let begin = Instant::now();
+        while warps.len() < 5 || begin.elapsed().as_millis() < 600 {
             let drawn =
-                Drawn { raster, pixels: black_box(pixels), movers, are_codes: *are_codes, before: 0 };
-            warper.warp(&drawn, groups, &mut words);
-            black_box(&mut words);
-        });
-        let share = count as f64 / raster.pixel_count() as f64;
-        let pack_ms = pack_ms * share;
-        let beside = if count == 0 { String::new() } else { format!("{:7.1} x packing", ms / pack_ms) };
-        println!("  {:20} {ms:9.4} ms, packing {pack_ms:7.4} ms {beside}", kernel.name());
+                Drawn { raster: *raster, pixels: black_box(pixels), movers, are_codes: *are_codes, before: 0 };
+            warps.push(time_ms(|| warper.warp(&drawn, groups, black_box(&mut words))));
+            packs.push(share * time_ms(|| pack(kernel, black_box(&words), frame)));
+        }
+        let (warp, pack) = (Times::of(warps), Times::of(packs));
+        print!("  {:18} {:8.4} {:8.4}", kernel.name(), warp.median, warp.fastest);
+        print!("  {:8.4} {:8.4}", pack.median, pack.fastest);
+        match count {
+            0 => println!(),
+            _ => println!("  {:8.1} {:8.1}", warp.median / pack.median, warp.fastest / pack.fastest),
+        }
     }
+}
+
+/// What several runs took, ms.
+struct Times {
+    median: f64,
+    fastest: f64,
+}
+
+impl Times {
+    fn of(mut times: Vec<f64>) -> Self {
+        times.sort_unstable_by(f64::total_cmp);
+        Self { median: times[times.len() / 2], fastest: times[0] }
+    }
+}
+
+fn time_ms(work: impl FnOnce()) -> f64 {
+    let start = Instant::now();
+    work();
+    start.elapsed().as_secs_f64() * 1e3
 }
 
 fn place(raster: Raster, i: u32) -> [i32; 2] {
@@ -174,10 +204,7 @@ fn median_ms(mut work: impl FnMut()) -> f64 {
     let begin = Instant::now();
     let mut times = Vec::new();
     while times.len() < 5 || begin.elapsed().as_millis() < 300 {
-        let start = Instant::now();
-        work();
-        times.push(start.elapsed().as_secs_f64() * 1e3);
+        times.push(time_ms(&mut work));
     }
-    times.sort_unstable_by(f64::total_cmp);
-    times[times.len() / 2]
+    Times::of(times).median
 }
