@@ -63,8 +63,13 @@ fn print_warp(scene: &WarpScene, frame: &mut BitPlaneFrame) {
         let (mut warps, mut packs) = (Vec::new(), Vec::new());
         let begin = Instant::now();
         while warps.len() < 5 || begin.elapsed().as_millis() < 600 {
-            let drawn =
-                Drawn { raster: *raster, pixels: black_box(pixels), movers, are_codes: *are_codes, before: 0 };
+            let drawn = Drawn {
+                raster: *raster,
+                pixels: black_box(pixels),
+                movers,
+                are_codes: *are_codes,
+                before: 0,
+            };
             warps.push(time_ms(|| warper.warp(&drawn, groups, black_box(&mut words))));
             packs.push(share * time_ms(|| pack(kernel, black_box(&words), frame)));
         }

@@ -62,7 +62,11 @@ fn groups(dice: &mut Dice) -> Vec<PlaneGroup> {
 fn mover(dice: &mut Dice, [width, height]: [i32; 2], fast: i32) -> Mover {
     let mut side = |size: i32| {
         let low = dice.from(0, size);
-        if dice.once_in(3) { (0, size) } else { (low, dice.from(low, size) + 1) }
+        if dice.once_in(3) {
+            (0, size)
+        } else {
+            (low, dice.from(low, size) + 1)
+        }
     };
     let (columns, rows) = (side(width), side(height));
     let steep = dice.one_of(&[0, 0, 700, 9000]);
@@ -121,9 +125,7 @@ fn pixel(dice: &mut Dice, at: [i32; 2], movers: &[Mover], look: &Look, are_codes
     if owner > OWNER_STILL {
         let mover = &movers[(owner - OWNER_STILL - 1) as usize];
         motion = gather::start_of(mover, at);
-        motion = motion.map(|c| {
-            (c + dice.from(-look.trembles, look.trembles + 1)).clamp(-32767, 32767)
-        });
+        motion = motion.map(|c| (c + dice.from(-look.trembles, look.trembles + 1)).clamp(-32767, 32767));
     }
     let smooth = (at[0] * 3 + at[1] * 5) as u32 & 0xff;
     let mut word = smooth | (255 - smooth) << 8 | (smooth / 2) << 16;
@@ -198,9 +200,8 @@ fn every_fraction_of_a_pixel_is_interpolated_alike() {
                 .map(|_| Moved { word: of(&mut dice), motion, owner_and_depth: (OWNER_STILL + 1) << 24 })
                 .collect();
             // Half an exposure before and after, and what is between.
-            let groups = (0..8)
-                .map(|bit| PlaneGroup { mask: 0x01_0101 << bit, instant: (bit - 4) * 16000 })
-                .collect();
+            let groups =
+                (0..8).map(|bit| PlaneGroup { mask: 0x01_0101 << bit, instant: (bit - 4) * 16000 }).collect();
             let movers = vec![mover];
             let picture = Picture { raster, pixels, movers, groups, are_codes: true, before: 0 };
             check(&mut warper, &picture, &format!("{kernel:?}, {start:?}"));

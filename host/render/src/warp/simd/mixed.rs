@@ -32,15 +32,17 @@ struct Found<L: Lanes> {
     at: [L::V; 2],
 }
 
+/// A pixel beside a place, where it is in the area of the mover.
+#[derive(Clone, Copy)]
+struct Neighbour<L: Lanes> {
+    is_there: L::M,
+    word: L::V,
+    owner_and_depth: L::V,
+}
+
 /// The block's words.
 #[inline(always)]
-pub(super) fn warp<L: Lanes>(
-    l: L,
-    rows: &Rows,
-    plan: &Plan<'_>,
-    near: &[u8],
-    block: Block,
-) -> L::V {
+pub(super) fn warp<L: Lanes>(l: L, rows: &Rows, plan: &Plan<'_>, near: &[u8], block: Block) -> L::V {
     let owner_and_depth = rows.load(l, OWNER_AND_DEPTH, block.index);
     let (x, y) = (l.add(l.numbers(), l.splat(block.at[0])), l.splat(block.at[1]));
     let mut inside = l.greater(x, x);
@@ -134,6 +136,56 @@ impl<L: Lanes> Own<'_, L> {
         (wanted, out)
     }
 
+    /// The pixels in the area of `body` between which places are, where they are `wanted`: left and right above, left and right
+    /// below.
+    #[inline(always)]
+    fn look_at_four(&self, l: L, body: &Body, at: [L::V; 2], wanted: L::M) -> [Neighbour<L>; 4] {
+        let (one, zero) = (l.splat(1), l.splat(0));
+        let off = [l.sar::<6>(at[0]), l.sar::<6>(at[1])];
+        let (left, above) = (l.add(self.x, off[0]), l.add(self.y, off[1]));
+        let (right, below) = (l.add(left, one), l.add(above, one));
+        let [left, right] = [body.columns(l, left), body.columns(l, right)];
+        let [above, below] = [l.both(wanted, body.rows(l, above)), l.both(wanted, body.rows(l, below))];
+        let is_there = [l.both(left, above), l.both(right, above), l.both(left, below), l.both(right, below)];
+        let mut four = [Neighbour { is_there: is_there[0], word: zero, owner_and_depth: zero }; 4];
+        for (neighbour, is_there) in four.iter_mut().zip(is_there) {
+            neighbour.is_there = is_there;
+        }
+        let keys = keys(l, off);
+        let mut list = [0; MOST_LANES];
+        l.store(keys, &mut list);
+        let mut bits = l.bits(wanted);
+        while bits != 0 {
+            let first = bits.trailing_zeros();
+            let off = columns_and_rows(list[first as usize] as i32);
+            let at = [self.block.at[0] + off[0], self.block.at[1] + off[1]];
+            if self.rows.keeps(off) {
+                let same = l.equal(keys, l.splat(list[first as usize] as i32));
+                let (above, below) = (self.rows.index(at), self.rows.index([at[0], at[1] + 1]));
+                for (neighbour, index) in four.iter_mut().zip([above, above + 1, below, below + 1]) {
+                    neighbour.word = l.choose(same, self.rows.load(l, WORD, index), neighbour.word);
+                    let owner_and_depth = self.rows.load(l, OWNER_AND_DEPTH, index);
+                    neighbour.owner_and_depth = l.choose(same, owner_and_depth, neighbour.owner_and_depth);
+                }
+                bits &= !l.bits(same);
+            } else {
+                let here = l.equal(l.numbers(), l.splat(first as i32));
+                for (i, neighbour) in four.iter_mut().enumerate() {
+                    if l.bits(neighbour.is_there) >> first & 1 == 1 {
+                        let [word, _, owner_and_depth] =
+                            self.far([at[0] + (first + i as u32 % 2) as i32, at[1] + i as i32 / 2]);
+                        neighbour.word = l.choose(here, l.splat(word as i32), neighbour.word);
+                        let owner_and_depth = l.splat(owner_and_depth as i32);
+                        neighbour.owner_and_depth =
+                            l.choose(here, owner_and_depth, neighbour.owner_and_depth);
+                    }
+                }
+                bits &= bits - 1;
+            }
+        }
+        four
+    }
+
     /// The fields of a pixel of a row that is not kept.
     #[cold]
     fn far(&self, [x, y]: [i32; 2]) -> [u32; 3] {
@@ -197,30 +249,23 @@ impl<L: Lanes> Own<'_, L> {
             return self.look(l, body, [WORD], nearest(l, at), wanted).1[0];
         }
         let (zero, number) = (l.splat(0), l.splat(body.owner as i32));
-        let whole = [l.sar::<6>(at[0]), l.sar::<6>(at[1])];
         let part = [l.and(at[0], l.splat(63)), l.and(at[1], l.splat(63))];
         let rest = [l.sub(l.splat(64), part[0]), l.sub(l.splat(64), part[1])];
+        let four = self.look_at_four(l, body, at, wanted);
         let (mut weights, mut any, mut sums) = (zero, zero, [zero; 3]);
-        for step in [[0, 0], [1, 0], [0, 1], [1, 1]] {
-            let [right, down] = step;
+        for (i, Neighbour { is_there, word, owner_and_depth }) in four.into_iter().enumerate() {
             let weight = l.pairs16(
-                if right == 1 { part[0] } else { rest[0] },
-                if down == 1 { part[1] } else { rest[1] },
+                if i % 2 == 1 { part[0] } else { rest[0] },
+                if i / 2 == 1 { part[1] } else { rest[1] },
             );
-            let counts = l.both(wanted, l.greater(weight, zero));
-            if l.bits(counts) == 0 {
-                continue;
-            }
-            let off = [l.add(whole[0], l.splat(right)), l.add(whole[1], l.splat(down))];
-            let (there, [word, of]) = self.look(l, body, [WORD, OWNER_AND_DEPTH], off, counts);
-            let shows = l.both(there, l.equal(l.shr::<24>(of), number));
+            let shows = l.both(is_there, l.equal(l.shr::<24>(owner_and_depth), number));
             let weight = l.choose(shows, weight, zero);
             weights = l.add(weights, weight);
-            any = l.or(any, l.choose(shows, word, zero));
-            let channels = [word, l.shr::<8>(word), l.shr::<16>(word)];
-            for (sum, channel) in sums.iter_mut().zip(channels) {
-                *sum = l.add(*sum, l.pairs16(weight, l.and(channel, l.splat(0xff))));
-            }
+            any = l.or(any, l.choose(l.greater(weight, zero), word, zero));
+            let byte = l.splat(0xff);
+            sums[0] = l.add(sums[0], l.pairs16(weight, l.and(word, byte)));
+            sums[1] = l.add(sums[1], l.pairs16(weight, l.and(l.shr::<8>(word), byte)));
+            sums[2] = l.add(sums[2], l.pairs16(weight, l.and(l.shr::<16>(word), byte)));
         }
         let code = mean(l, weights, sums);
         let rough = l.both(wanted, l.greater(zero, l.and(any, l.splat(WORD_ROUGH as i32))));
@@ -248,8 +293,7 @@ impl<L: Lanes> Own<'_, L> {
             let body = &self.plan.bodies[(owner - OWNER_STILL - 1) as usize];
             let of_body = l.both(open, l.equal(self.owner, l.splat(owner as i32)));
             let at = offset(l, body, self.motion, group.instant);
-            let (is, [word, of]) =
-                self.look(l, body, [WORD, OWNER_AND_DEPTH], nearest(l, at), of_body);
+            let (is, [word, of]) = self.look(l, body, [WORD, OWNER_AND_DEPTH], nearest(l, at), of_body);
             let seen = l.both(is, l.greater(l.shr::<24>(of), l.splat(OWNER_NONE as i32)));
             there = l.choose(seen, word, there);
             open = l.except(open, of_body);

@@ -60,13 +60,24 @@ impl Body {
             && y + reach + 1 < upper[1]
     }
 
-    /// The pixels of `x` in row `y` that lie in its area.
+    /// Which columns its area has.
+    #[inline(always)]
+    fn columns<L: Lanes>(&self, l: L, x: L::V) -> L::M {
+        let Mover { lower, upper, .. } = &self.mover;
+        l.except(l.greater(l.splat(upper[0]), x), l.greater(l.splat(lower[0]), x))
+    }
+
+    /// Which rows its area has.
+    #[inline(always)]
+    fn rows<L: Lanes>(&self, l: L, y: L::V) -> L::M {
+        let Mover { lower, upper, .. } = &self.mover;
+        l.except(l.greater(l.splat(upper[1]), y), l.greater(l.splat(lower[1]), y))
+    }
+
+    /// Which pixels lie in its area.
     #[inline(always)]
     fn within<L: Lanes>(&self, l: L, x: L::V, y: L::V) -> L::M {
-        let Mover { lower, upper, .. } = &self.mover;
-        let columns = l.except(l.greater(l.splat(upper[0]), x), l.greater(l.splat(lower[0]), x));
-        let rows = l.except(l.greater(l.splat(upper[1]), y), l.greater(l.splat(lower[1]), y));
-        l.both(columns, rows)
+        l.both(self.columns(l, x), self.rows(l, y))
     }
 }
 
@@ -308,9 +319,7 @@ fn warp_block<L: Lanes>(
     let block = Block { at, index: rows.index(at) };
     let done = match stretch.kind {
         Kind::Still => Some(still_block(l, rows, plan, block)),
-        Kind::Pure(number, rough) => {
-            pure::warp(l, rows, steps, plan, &plan.bodies[number], block, rough)
-        }
+        Kind::Pure(number, rough) => pure::warp(l, rows, steps, plan, &plan.bodies[number], block, rough),
         Kind::Mixed => None,
     };
     let result = match done {

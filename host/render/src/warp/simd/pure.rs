@@ -1,9 +1,9 @@
 //! Blocks near which there is one mover only: every lookup finds it, all four neighbours of a place count, and what is left is
 //! interpolation.
 
+use super::lanes::Lanes;
 use super::rows::{Rows, MOTION, WORD};
 use super::{columns_and_rows, keys, motions, offset, unmarked, Block, Body, Group, Plan, MOST_LANES};
-use super::lanes::Lanes;
 use dpm_shaders::structs::WORD_ROUGH;
 
 /// Bits of code values.
@@ -261,8 +261,7 @@ impl<L: Lanes> Weights<L> {
         let lower = [l.low8(c, d), l.high8(c, d)];
         let mut codes = upper;
         for i in 0..2 {
-            let (above, below) =
-                (l.pairs8(upper[i], self.columns[i]), l.pairs8(lower[i], self.columns[i]));
+            let (above, below) = (l.pairs8(upper[i], self.columns[i]), l.pairs8(lower[i], self.columns[i]));
             let apart = l.sub16(below, above);
             let code = l.add16(above, l.upper16(l.add16(apart, apart), self.rows[i]));
             codes[i] = l.shr16::<6>(l.add16(code, l.splat(0x20_0020)));

@@ -124,13 +124,17 @@ impl Rows {
         let top = (y - self.reach).max(self.rows.start);
         let Cell { owner, rough, .. } = self.cells[first];
         let is_alike = |cell: &Cell| {
-            cell.owner == owner && owner != MIXED && cell.since <= top && (cell.rough >= top) == (rough >= top)
+            cell.owner == owner
+                && owner != MIXED
+                && cell.since <= top
+                && (cell.rough >= top) == (rough >= top)
         };
         if self.cells[first..=last].iter().all(is_alike) {
             let more = self.cells[last..].iter().take_while(|cell| is_alike(cell)).count();
             let until = ((last + more) * CELL) as i32 + self.columns.start;
             let until = if until >= self.columns.end { i32::MAX } else { until };
-            let around = if owner == 0 { Around::Still } else { Around::Mover { owner, rough: rough >= top } };
+            let around =
+                if owner == 0 { Around::Still } else { Around::Mover { owner, rough: rough >= top } };
             return (around, until);
         }
         let cells = &self.cells[first..=last];
