@@ -41,12 +41,12 @@ struct Picture {
     before: u32,
 }
 
-/// Groups of single bits of all channels, of single planes, of whole codes, or of any bits.
+/// Groups of single bits of all channels, of single planes, of whole codes (with a bit beside them that no code has), or of any bits.
 fn groups(dice: &mut Dice) -> Vec<PlaneGroup> {
     let masks: Vec<u32> = match dice.from(0, 5) {
         0 | 1 => [4, 6, 7, 5, 3, 2, 1, 0].map(|bit| 0x01_0101 << bit).into(),
         2 => (0..24).map(|bit| 1 << bit).collect(),
-        3 => vec![0xff, 0xff00, 0xff_0000],
+        3 => vec![0xff, 0x8000_ff00, 0xff_0000],
         _ => (0..dice.from(0, 6)).map(|_| dice.next() as u32).collect(),
     };
     let first = dice.one_of(&[-65535, -40000, -20000, 0]);
@@ -136,8 +136,7 @@ fn pixel(dice: &mut Dice, at: [i32; 2], movers: &[Mover], look: &Look, are_codes
         word |= WORD_ROUGH;
     }
     let depth = dice.one_of(&[0, 1, 1, 0xff_fffe, 0xff_ffff]);
-    let motion = (motion[0] as u32 & 0xffff) | (motion[1] as u32) << 16;
-    Moved { word, motion, owner_and_depth: owner << 24 | depth }
+    Moved { word, motion: motion_word(motion), owner_and_depth: owner << 24 | depth }
 }
 
 fn picture(seed: u64) -> Picture {
@@ -184,27 +183,123 @@ fn every_kernel_warps_as_the_plain_twin_does() {
     }
 }
 
-/// A body that fills the raster and moves evenly, by any fraction of a pixel along columns and rows.
+/// A motion as pixels hold it.
+fn motion_word(motion: [i32; 2]) -> u32 {
+    (motion[0] as u32 & 0xffff) | (motion[1] as u32) << 16
+}
+
+/// Eight bits whose instants lie before and after the frame's.
+fn eight_groups(apart: i32) -> Vec<PlaneGroup> {
+    (0..8).map(|bit| PlaneGroup { mask: 0x01_0101 << bit, instant: (bit - 4) * apart }).collect()
+}
+
+/// A mover whose area is all of `raster`.
+fn mover_of_all(raster: Raster, start: [i32; 2]) -> Mover {
+    let upper = [raster.width(), raster.height()].map(|c| c as i32);
+    Mover { upper, start, ..bytemuck::Zeroable::zeroed() }
+}
+
+/// One or two bodies that fill the raster and move evenly and alike, by any fraction of a pixel along columns and rows, and are drawn for
+/// instants of their own. Frames with other instants follow one another.
 #[test]
 fn every_fraction_of_a_pixel_is_interpolated_alike() {
+    let raster = Raster::new(140, 24).unwrap();
     for &kernel in Kernel::available() {
         let mut warper = Warper::new(kernel);
         for turn in 0..if cfg!(miri) { 1 } else { 64 } {
             let mut dice = Dice(turn);
-            let raster = Raster::new(70, 24).unwrap();
-            let start = [turn as i32 * 5 % 64 - 32, turn as i32 - 32];
-            let mover = Mover { upper: [70, 24], start, ..bytemuck::Zeroable::zeroed() };
-            let motion = (start[0] as u32 & 0xffff) | (start[1] as u32) << 16;
+            let start = [turn as i32 * 5 % 64 - 32, 3 * (turn as i32 - 32)];
             let of = |dice: &mut Dice| dice.next() as u32 & 0xff_ffff;
-            let pixels = (0..raster.pixel_count())
-                .map(|_| Moved { word: of(&mut dice), motion, owner_and_depth: (OWNER_STILL + 1) << 24 })
+            let owner = |i: usize| OWNER_STILL + if turn % 2 == 0 || i % 140 < 70 { 1 } else { 2 };
+            let motion = motion_word(start);
+            let pixels: Vec<Moved> = (0..raster.pixel_count())
+                .map(|i| Moved { word: of(&mut dice), motion, owner_and_depth: owner(i) << 24 })
                 .collect();
-            // Half an exposure before and after, and what is between.
-            let groups =
-                (0..8).map(|bit| PlaneGroup { mask: 0x01_0101 << bit, instant: (bit - 4) * 16000 }).collect();
-            let movers = vec![mover];
-            let picture = Picture { raster, pixels, movers, groups, are_codes: true, before: 0 };
-            check(&mut warper, &picture, &format!("{kernel:?}, {start:?}"));
+            for apart in [16000, -9000] {
+                let mover = |instant: i32| Mover { instant, ..mover_of_all(raster, start) };
+                let (pixels, movers) = (pixels.clone(), vec![mover(0), mover(19000)]);
+                let groups = eight_groups(apart);
+                let picture = Picture { raster, pixels, movers, groups, are_codes: true, before: 0 };
+                check(&mut warper, &picture, &format!("{kernel:?}, {start:?}, {apart}"));
+            }
+        }
+    }
+}
+
+/// A wide body has an edge at each column, or is rough from there on: what is around its blocks is looked at for many of them at
+/// once, and no longer holds there.
+#[test]
+fn what_is_around_blocks_ends_at_any_column() {
+    let raster = Raster::new(160, 36).unwrap();
+    for &kernel in Kernel::available() {
+        let mut warper = Warper::new(kernel);
+        for edge in 96..if cfg!(miri) { 98 } else { 130 } {
+            for (motion, beyond) in [([-800, 30], 0), ([-330, -90], 1), ([300, 0], 2), ([-300, 100], 2)] {
+                let mut dice = Dice(edge);
+                let pixels = (0..raster.pixel_count() as u64).map(|i| {
+                    let is_beyond = i % 160 >= edge;
+                    let owner = if is_beyond && beyond < 2 { beyond } else { OWNER_STILL + 1 };
+                    let mark = if is_beyond && beyond == 2 && i / 160 % 2 == 0 { WORD_ROUGH } else { 0 };
+                    let word = dice.next() as u32 & 0xff_ffff | mark;
+                    Moved { word, motion: motion_word(motion), owner_and_depth: owner << 24 }
+                });
+                let (pixels, movers) = (pixels.collect(), vec![mover_of_all(raster, motion)]);
+                let groups = eight_groups(16000);
+                let picture = Picture { raster, pixels, movers, groups, are_codes: true, before: 5 };
+                check(&mut warper, &picture, &format!("{kernel:?}, edge {edge}, {motion:?}, {beyond}"));
+            }
+        }
+    }
+}
+
+/// A body that is fast comes from farther than the rows and columns around a block tell of, over another body or a wall.
+#[test]
+fn a_body_comes_from_far_away() {
+    let raster = Raster::new(200, 70).unwrap();
+    for &kernel in Kernel::available() {
+        let mut warper = Warper::new(kernel);
+        for (fast, behind) in
+            [[-4000, 0], [0, -3000], [-4000, 2500]].into_iter().zip([OWNER_STILL + 1, OWNER_STILL, 0])
+        {
+            let mut dice = Dice(7);
+            let pixels = (0..raster.pixel_count() as i32).map(|i| {
+                let is_fast = i % 200 > 110 || i / 200 > 40;
+                let (owner, motion) = if is_fast { (OWNER_STILL + 2, fast) } else { (behind, [20, 10]) };
+                let depth = if is_fast { 5 } else { 900 };
+                let word = dice.next() as u32 & 0xff_ffff;
+                Moved { word, motion: motion_word(motion), owner_and_depth: owner << 24 | depth }
+            });
+            let pixels = pixels.collect();
+            let movers = [[20, 10], fast].map(|start| mover_of_all(raster, start)).into();
+            let groups = eight_groups(16000);
+            let picture = Picture { raster, pixels, movers, groups, are_codes: true, before: 5 };
+            check(&mut warper, &picture, &format!("{kernel:?}, {fast:?}"));
+        }
+    }
+}
+
+/// What a mover's slopes tell far from its middle is cut off at what a pixel can hold.
+#[test]
+fn a_body_is_looked_for_no_farther_than_pixels_can_tell() {
+    let raster = Raster::new(90, 20).unwrap();
+    for &kernel in Kernel::available() {
+        for [start, steep] in [[32000, 131_072], [-32000, -131_072]] {
+            let mut dice = Dice(11);
+            let pixels = (0..raster.pixel_count()).map(|_| {
+                let owner = OWNER_STILL + dice.from(0, 2) as u32;
+                let motion = motion_word([dice.from(-32767, 32768), dice.from(-3000, 3000)]);
+                Moved {
+                    word: dice.next() as u32 & 0xff_ffff,
+                    motion,
+                    owner_and_depth: owner << 24 | (9 - owner),
+                }
+            });
+            let pixels = pixels.collect();
+            let slope = [steep, 0, steep, steep];
+            let movers = vec![Mover { slope, ..mover_of_all(raster, [start, start]) }];
+            let groups = eight_groups(130);
+            let picture = Picture { raster, pixels, movers, groups, are_codes: true, before: 5 };
+            check(&mut Warper::new(kernel), &picture, &format!("{kernel:?}, {start}"));
         }
     }
 }

@@ -118,7 +118,7 @@ impl<L: Lanes> Own<'_, L> {
             let off = columns_and_rows(list[first as usize] as i32);
             let at = [self.block.at[0] + off[0], self.block.at[1] + off[1]];
             if self.rows.keeps(off) {
-                let same = l.both(l.equal(keys, l.splat(list[first as usize] as i32)), wanted);
+                let same = l.equal(keys, l.splat(list[first as usize] as i32));
                 let index = self.rows.index(at);
                 for (out, field) in out.iter_mut().zip(fields) {
                     *out = l.choose(same, self.rows.load(l, field, index), *out);

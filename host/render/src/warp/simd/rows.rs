@@ -105,7 +105,7 @@ impl Rows {
                 (least, most) if least == most => most,
                 _ => MIXED,
             };
-            if owner != cell.owner || owner == MIXED {
+            if owner != cell.owner {
                 (cell.owner, cell.since) = (owner, y);
             }
             if all & WORD_ROUGH != 0 {
