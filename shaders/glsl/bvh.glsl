@@ -2,7 +2,8 @@
 // children. `BodyBvh` of the host builds it and lays out the children.
 //
 // Nodes and triangles are read through NODE and TRI: from texel buffers on software Vulkan, where that is twice as fast, and from storage buffers
-// on GPUs. The two also differ in how they keep what waits, see `walk_software.glsl` and `walk_gpu.glsl`.
+// on GPUs. The two also differ in how they keep what waits, see `walk_software.glsl` and `walk_gpu.glsl`. With RAY_QUERY the device traces rays by its
+// own trees, see `walk_query.glsl`.
 #ifdef TEXEL_TABLES
 layout(set = 0, binding = B_NODES, rgba32ui) uniform readonly uimageBuffer node_texels;
 layout(set = 0, binding = B_TRIANGLES, rgba32f) uniform readonly imageBuffer triangle_texels;
@@ -179,6 +180,8 @@ uint end_of_bodies() { return HAS_BODY_TREE ? frame.body_nodes : frame.instance_
 
 #ifdef TEXEL_TABLES
 #include "walk_software.glsl"
+#elif defined(RAY_QUERY)
+#include "walk_query.glsl"
 #else
 #include "walk_gpu.glsl"
 #endif

@@ -8,8 +8,13 @@
 
 // A storage block, although it is small. Mesa's software Vulkan compiles a shader again for every value of a uniform block that a branch or loop
 // reads, which took 15 ms of every frame. The block is read once, where every lane is active, because elsewhere software Vulkan reads lane by lane.
+// With ray queries it is read where it is used: held from the start to the end it would fill the scalar registers of AMD's GPUs, which queries need.
+#ifdef RAY_QUERY
+layout(set = 0, binding = B_FRAME, scalar) readonly buffer FrameBlock { Frame frame; };
+#else
 layout(set = 0, binding = B_FRAME, scalar) readonly buffer FrameBlock { Frame frame_block; };
 Frame frame = frame_block;
+#endif
 layout(set = 0, binding = B_COUNTERS, scalar) buffer CountersBlock { Counters counters; };
 
 const float PI = 3.14159265358979;

@@ -86,7 +86,7 @@ pub fn generated_glsl() -> String {
         "// Written by build-shaders from shaders/src/structs.rs and shaders/src/specialization.rs. Do not edit.\n\n\
          #extension GL_EXT_shader_explicit_arithmetic_types_int64 : require\n\n",
     );
-    for (name, value) in structs::CONSTANTS.iter().chain(structs::BINDINGS) {
+    for (name, value) in structs::CONSTANTS.iter().chain(structs::BINDINGS).chain([&structs::TREE_BINDING]) {
         out.push_str(&format!("#define {name} {value}u\n"));
     }
     out.push_str(&format!("// Sobol dimensions 1 to 3 of the lowest {SOBOL_BITS} bits of an index, without branch or table look-up.\n"));

@@ -6,11 +6,15 @@
 //! # Example
 //!
 //! ```
-//! use dpm_shaders::{generate::generated_glsl, structs::Frame, ALL, TRACE};
+//! use dpm_shaders::{generate::generated_glsl, structs::Frame, Reading, ALL, COMPENSATE, TRACE};
 //!
 //! // Software Vulkan reads tables through texel buffers, GPUs through storage buffers.
-//! assert_eq!(TRACE.reading(true).name, "trace.texel");
-//! assert_eq!(TRACE.reading(false).name, "trace.storage");
+//! assert_eq!(TRACE.reading(Reading::Texels).name, "trace.texel");
+//! assert_eq!(TRACE.reading(Reading::Storage).name, "trace.storage");
+//!
+//! // On devices that trace rays themselves the shaders that walk through the scene leave that to them; the others are as on any GPU.
+//! assert_eq!(TRACE.reading(Reading::Query).name, "trace.query");
+//! assert_eq!(COMPENSATE.reading(Reading::Query).name, "compensate.storage");
 //!
 //! // Every shader is SPIR-V, ready for `vkCreateShaderModule`.
 //! for shader in ALL {
@@ -38,22 +42,35 @@ pub struct Shader {
     pub spirv: &'static [u8],
 }
 
-/// A shader that reads tables, built for either way of reading them.
+/// How shaders read tables and find what a ray meets.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Reading {
+    /// Tables through texel buffers, and their own walk through the scene: software Vulkan.
+    Texels,
+    /// Tables through storage buffers, and their own walk: GPUs.
+    Storage,
+    /// Tables through storage buffers; the device finds what a ray meets (ray query).
+    Query,
+}
+
+/// A shader that reads tables, built for every way of reading them.
 #[derive(Clone, Copy, Debug)]
 pub struct TableShader {
     /// Through texel buffers: software Vulkan.
     pub texel: Shader,
     /// Through storage buffers: GPUs.
     pub storage: Shader,
+    /// The same with ray queries; `None`: it traces no rays.
+    pub query: Option<Shader>,
 }
 
 impl TableShader {
-    /// The one that reads through texel buffers, or the other.
-    pub fn reading(&self, texel: bool) -> Shader {
-        if texel {
-            self.texel
-        } else {
-            self.storage
+    /// The one that reads in this way.
+    pub fn reading(&self, reading: Reading) -> Shader {
+        match reading {
+            Reading::Texels => self.texel,
+            Reading::Storage => self.storage,
+            Reading::Query => self.query.unwrap_or(self.storage),
         }
     }
 }
@@ -65,19 +82,22 @@ macro_rules! spirv {
 }
 
 macro_rules! table_shaders {
-    ($($(#[$doc:meta])* $konst:ident = $name:literal;)*) => {
-        $($(#[$doc])* pub const $konst: TableShader =
-            TableShader { texel: spirv!(concat!($name, ".texel")), storage: spirv!(concat!($name, ".storage")) };)*
+    ($($(#[$doc:meta])* $konst:ident = $name:literal $(with $query:literal)?;)*) => {
+        $($(#[$doc])* pub const $konst: TableShader = TableShader {
+            texel: spirv!(concat!($name, ".texel")),
+            storage: spirv!(concat!($name, ".storage")),
+            query: [$(Some(spirv!($query)),)? None][0],
+        };)*
         /// Every shader in the crate.
-        pub const ALL: &[Shader] = &[$($konst.texel, $konst.storage,)* PACK];
+        pub const ALL: &[Shader] = &[$($konst.texel, $konst.storage, $(spirv!($query),)?)* PACK];
     };
 }
 
 table_shaders! {
     /// Primary visibility.
-    PRIMARY = "primary";
+    PRIMARY = "primary" with "primary.query";
     /// Path tracing.
-    TRACE = "trace";
+    TRACE = "trace" with "trace.query";
     /// Histories moved to the pixels in which their surface points are now (method dpm).
     REPROJECT_POINT = "reproject_point";
     /// Histories fetched bilinearly where each surface point was (methods paper and miyamoto).

@@ -710,6 +710,9 @@ pub const BINDINGS: &[(&str, u32)] = &[
     ("B_PLANE_GROUPS", 35),
 ];
 
+/// The binding after them, of the shaders that ask the device for hits: no buffer, but the tree over the bodies of the frame.
+pub const TREE_BINDING: (&str, u32) = ("B_BODY_TREE", 36);
+
 impl Surface {
     /// Light falls on it: something was met, and the eye sees it. As `is_lit` of the shaders.
     pub fn is_lit(&self) -> bool {

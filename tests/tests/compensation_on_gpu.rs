@@ -15,6 +15,7 @@ use dpm_shaders::structs::{
     Counters, Frame, Instance, Rows, Surface, TriangleRef, Vertex, BINDINGS, LENS_BROWN, LENS_NONE,
     NO_ALBEDO_MAP, NO_HIT, TEXEL_BINDINGS,
 };
+use dpm_shaders::Reading;
 use dpm_tests::gpu::with_gpu;
 use std::mem::size_of;
 use std::sync::Arc;
@@ -119,7 +120,8 @@ fn on_gpu_through(gpu: &Arc<Gpu>, input: &Input, texel: bool) -> (Vec<u32>, Coun
     let table = BindingTable::new(gpu, &kinds).unwrap();
     let mut constants = SceneNeeds::default().everything().constants();
     constants.extend(optics_constants);
-    let pipeline = ComputePipeline::new(&table, dpm_shaders::COMPENSATE.reading(texel), &constants).unwrap();
+    let shader = dpm_shaders::COMPENSATE.reading(if texel { Reading::Texels } else { Reading::Storage });
+    let pipeline = ComputePipeline::new(&table, shader, &constants).unwrap();
     let buffers: Vec<(u32, &Buffer)> = bound()
         .map(|&(name, binding)| {
             let buffer = match name {

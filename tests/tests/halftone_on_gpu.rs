@@ -10,6 +10,7 @@ use dpm_render::pack::{halftone, halftone_of_bodies, Halftone};
 use dpm_rig::light::recorder::LightFrame;
 use dpm_shaders::specialization as ids;
 use dpm_shaders::structs::{Frame, Instance, Mover, Surface, NO_HIT};
+use dpm_shaders::Reading;
 use dpm_tests::gpu::{run_shader, uploaded, with_gpu};
 use dpm_tests::rigs::{demo_rig, run};
 use std::sync::Arc;
@@ -83,12 +84,12 @@ fn on_gpu(
         ("B_INSTANCES", &instances),
         ("B_MOVERS", &movers),
     ];
-    let through = |texel| {
-        let shader = dpm_shaders::HALFTONE.reading(texel);
+    let through = |reading| {
+        let shader = dpm_shaders::HALFTONE.reading(reading);
         let len = codes.len() * 4;
         run_shader(gpu, (shader, &constants), [4 * tiles_x * tiles_y, 1, 1], &buffers, ("B_CODES", len))
     };
-    bytemuck::pod_collect_to_vec(&through(false))
+    bytemuck::pod_collect_to_vec(&through(Reading::Storage))
 }
 
 /// Planes of equal light, and parts of more bits.

@@ -81,6 +81,8 @@ pub struct BenchReport {
     pub stamp: Stamp,
     /// Samples a pixel where no angle decides.
     pub spp: u32,
+    /// The device finds itself what a ray meets, and not the shaders.
+    pub ray_query: bool,
     /// One a method.
     pub methods: Vec<MethodCost>,
     /// What frames with these counts might take on GPUs that are not there; never measured.
@@ -108,7 +110,8 @@ pub fn bench(
     let counts = methods.iter().map(|m| (m.method, m.rays_per_frame, &m.work));
     let modelled_not_measured = modelled(counts);
     let (stamp, spp) = (Stamp::new(rig, gpu.summary()), rig.config.render.spp);
-    Ok(BenchReport { stamp, spp, methods, modelled_not_measured })
+    let ray_query = renderer_settings(rig).tracing.asks_device(gpu.summary());
+    Ok(BenchReport { stamp, spp, ray_query, methods, modelled_not_measured })
 }
 
 fn measure(rig: &Rig, gpu: &Arc<Gpu>, frames: u32, which: RenderMethod) -> Result<MethodCost, RenderError> {

@@ -98,22 +98,25 @@ impl BodyTree {
         self.most * OCTANTS
     }
 
-    /// Builds the tree over the bodies that have surfaces, and writes its nodes, octant after octant. Bit 0 of an octant's number: the direction goes
-    /// down along x; bit 1: along y; bit 2: along z. Returns how many nodes an octant has.
-    ///
-    /// # Panics
-    /// If there are more bodies than there is room for, or `out` is shorter than [`BodyTree::most_nodes`].
-    pub(crate) fn write<'a>(
-        &mut self,
-        instances: impl Iterator<Item = &'a Instance>,
-        out: &mut [BodyNode],
-    ) -> u32 {
+    /// Forgets all bodies.
+    pub(crate) fn clear(&mut self) {
         self.leaves.clear();
-        for instance in instances.filter(|i| i.flags & INSTANCE_EMPTY == 0) {
-            assert!(2 * self.leaves.len() < self.most, "room for every body");
+    }
+
+    /// Adds a body where it is in this frame. One without surfaces is left out, and so is every body where no tree is built.
+    pub(crate) fn add(&mut self, instance: &Instance) {
+        if instance.flags & INSTANCE_EMPTY == 0 && 2 * self.leaves.len() < self.most {
             let bounds = Box3 { lower: instance.bounds_min.into(), upper: instance.bounds_max.into() };
             self.leaves.push(Leaf { bounds, body: instance.body | instance.flags << 8 });
         }
+    }
+
+    /// Builds the tree over the bodies that were added, and writes its nodes, octant after octant. Bit 0 of an octant's number: the direction goes
+    /// down along x; bit 1: along y; bit 2: along z. Returns how many nodes an octant has.
+    ///
+    /// # Panics
+    /// If `out` is shorter than [`BodyTree::most_nodes`].
+    pub(crate) fn write(&mut self, out: &mut [BodyNode]) -> u32 {
         self.build();
         let count = self.nodes.len();
         for octant in 0..OCTANTS {
@@ -258,7 +261,8 @@ mod tests {
     fn written(instances: &[Instance]) -> (Vec<BodyNode>, usize) {
         let mut tree = BodyTree::new(instances.len());
         let mut out = vec![BodyNode::zeroed(); tree.most_nodes()];
-        let count = tree.write(instances.iter(), &mut out) as usize;
+        instances.iter().for_each(|instance| tree.add(instance));
+        let count = tree.write(&mut out) as usize;
         (out, count)
     }
 

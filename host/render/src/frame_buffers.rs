@@ -1,10 +1,11 @@
 //! The memory of one frame in flight, on the GPU and on the host, and the buffer of each binding of the shaders.
 
+use super::body_tree::BodyTree;
 use super::fill::fill;
 use super::memory::{BytesPerPixel, SharedBuffers};
 use super::scene_gpu::{table_buffer, SceneGpu};
 use super::settings::{Output, RendererSettings};
-use crate::gpu::{Buffer, Gpu, GpuError, MemoryKind, Place};
+use crate::gpu::{Buffer, FrameTree, Gpu, GpuError, MemoryKind, Place};
 use crate::pack;
 use bytemuck::Zeroable;
 use dpm_shaders::structs::{BodyNode, Counters, Frame, Guide, Instance, Mover, Schedule, Surface, NO_HIT};
@@ -18,6 +19,8 @@ pub(super) struct FrameBuffers {
     pub instances: Latched,
     /// The tree over the bodies; of no use where rays ask each body.
     pub body_nodes: Latched,
+    /// Builds it.
+    pub body_tree: BodyTree,
     pub arguments: Buffer,
     pub tiles: Buffer,
     pub counters: Buffer,
@@ -47,6 +50,8 @@ pub(super) struct FrameBuffers {
     pub motion: Buffer,
     /// The bodies that move while the planes last.
     pub movers: Latched,
+    /// The tree over the bodies, in which the device finds what a ray meets; `None`: the shaders walk.
+    pub device_tree: Option<FrameTree>,
 }
 
 /// A buffer that the host writes, with its copy for the shaders. The frame's first commands make the copy.
@@ -73,15 +78,17 @@ pub(super) struct DebugBuffers {
 }
 
 impl FrameBuffers {
-    /// Memory for a scene of `bodies` bodies, with `body_nodes` nodes of the tree over them, and a raster of `tiles` tiles. `debug` adds the copies for debugging.
+    /// Memory for a scene of `bodies` bodies and a raster of `tiles` tiles. `debug` adds the copies for debugging, `asks_device` the tree over the
+    /// bodies of a device that traces rays itself.
     ///
     /// # Errors
     /// Out of memory.
     pub(super) fn new(
         gpu: &Arc<Gpu>,
         settings: &RendererSettings,
-        (bodies, body_nodes, tiles): (usize, usize, usize),
-        debug: bool,
+        (bodies, tiles): (usize, usize),
+        body_tree: BodyTree,
+        (debug, asks_device): (bool, bool),
     ) -> Result<Self, GpuError> {
         use MemoryKind::{Device, Readback, Upload};
         let pixels = settings.raster.pixel_count();
@@ -103,7 +110,11 @@ impl FrameBuffers {
         Ok(Self {
             frame: latched("frame uniforms", size_of::<Frame>())?,
             instances: latched("instances", size_of::<Instance>() * bodies.max(1))?,
-            body_nodes: latched("tree over the bodies", size_of::<BodyNode>() * body_nodes.max(1))?,
+            body_nodes: latched(
+                "tree over the bodies",
+                size_of::<BodyNode>() * body_tree.most_nodes().max(1),
+            )?,
+            body_tree,
             arguments: size("dispatch arguments", 48, Upload)?,
             tiles: size("tile list", tiles * 4, Upload)?,
             counters: size("counters", size_of::<Counters>(), Device)?,
@@ -122,6 +133,7 @@ impl FrameBuffers {
             filtered_shown: with("shown radiance", each.shown)?,
             motion: with("motion of surfaces", each.motion)?,
             movers: latched("movers", size_of::<Mover>() * bodies.max(1))?,
+            device_tree: asks_device.then(|| FrameTree::new(gpu, bodies)).transpose()?,
             debug_host: debug.then(|| DebugBuffers::new(gpu, pixels, tiles, each)).transpose()?,
             each,
         })

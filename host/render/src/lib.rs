@@ -46,5 +46,5 @@ pub use passes::{traffic, Traffic, PASSES};
 pub use plan::{trace_groups, Program, RendererPlan};
 pub use renderer::Renderer;
 pub use scene_data::Keep;
-pub use settings::{FrameInputs, Output, Overlapping, RenderError, RendererSettings};
+pub use settings::{FrameInputs, Output, Overlapping, RenderError, RendererSettings, Tracing};
 pub use slot::{FrameCost, FrameSlot};

@@ -6,7 +6,7 @@ use super::scene_data::Keep;
 use super::settings::RendererSettings;
 use crate::pack;
 use dpm_shaders as shaders;
-use dpm_shaders::{specialization as ids, Shader};
+use dpm_shaders::{specialization as ids, Reading, Shader};
 
 /// One pass of a frame.
 pub(super) struct Pass {
@@ -39,8 +39,8 @@ pub(super) enum Code {
 
 /// A shader with the buffers that it uses.
 pub(super) struct Kernel {
-    /// The shader; `true` asks for the one that reads tables through texel buffers.
-    pub shader: fn(bool) -> Shader,
+    /// The shader that reads in this way.
+    pub shader: fn(Reading) -> Shader,
     /// Buffers that an earlier pass of this frame, or the frame before, has written and that this shader reads. Inputs that no pass writes
     /// are not listed: the frame's constants, the tiles, the scene, the noise and the table of rates.
     pub reads: &'static [&'static str],
@@ -68,7 +68,7 @@ pub(super) const TABLE: [Pass; 12] = [
     Pass {
         name: "primary",
         code: Code::OfAll(Kernel {
-            shader: |texel| shaders::PRIMARY.reading(texel),
+            shader: |reading| shaders::PRIMARY.reading(reading),
             reads: &["B_COUNTERS", "B_FORMER"],
             writes: &["B_SURFACES", "B_COUNTERS", "B_GUIDES"],
         }),
@@ -81,12 +81,12 @@ pub(super) const TABLE: [Pass; 12] = [
         name: "reproject",
         code: Code::ByMethod {
             dpm: Kernel {
-                shader: |texel| shaders::REPROJECT_POINT.reading(texel),
+                shader: |reading| shaders::REPROJECT_POINT.reading(reading),
                 reads: &["B_SURFACES", "B_GUIDES", "B_SCHEDULE", "B_FORMER"],
                 writes: &["B_HISTORY", "B_SCHEDULE", "B_SHOWN"],
             },
             others: Kernel {
-                shader: |texel| shaders::REPROJECT_BILINEAR.reading(texel),
+                shader: |reading| shaders::REPROJECT_BILINEAR.reading(reading),
                 reads: &["B_SURFACES", "B_GUIDES", "B_FORMER"],
                 writes: &["B_HISTORY"],
             },
@@ -99,7 +99,7 @@ pub(super) const TABLE: [Pass; 12] = [
     Pass {
         name: "rate map",
         code: Code::OfAll(Kernel {
-            shader: |texel| shaders::RATE_MAP.reading(texel),
+            shader: |reading| shaders::RATE_MAP.reading(reading),
             reads: &["B_SURFACES", "B_GUIDES", "B_HISTORY"],
             writes: &["B_RATES"],
         }),
@@ -112,12 +112,12 @@ pub(super) const TABLE: [Pass; 12] = [
         name: "schedule",
         code: Code::ByMethod {
             dpm: Kernel {
-                shader: |texel| shaders::SCHEDULE_BUDGET.reading(texel),
+                shader: |reading| shaders::SCHEDULE_BUDGET.reading(reading),
                 reads: &["B_SURFACES", "B_HISTORY", "B_SCHEDULE"],
                 writes: &["B_RADIANCE", "B_SCHEDULE", "B_WORK"],
             },
             others: Kernel {
-                shader: |texel| shaders::SCHEDULE_BLOCKS.reading(texel),
+                shader: |reading| shaders::SCHEDULE_BLOCKS.reading(reading),
                 reads: &["B_SURFACES", "B_GUIDES", "B_RATES", "B_SCHEDULE"],
                 writes: &["B_RADIANCE", "B_SCHEDULE", "B_WORK"],
             },
@@ -130,7 +130,7 @@ pub(super) const TABLE: [Pass; 12] = [
     Pass {
         name: "trace",
         code: Code::OfAll(Kernel {
-            shader: |texel| shaders::TRACE.reading(texel),
+            shader: |reading| shaders::TRACE.reading(reading),
             reads: &["B_SURFACES", "B_COUNTERS", "B_HISTORY", "B_SCHEDULE", "B_WORK"],
             writes: &["B_RADIANCE", "B_COUNTERS", "B_FILTERED"],
         }),
@@ -143,12 +143,12 @@ pub(super) const TABLE: [Pass; 12] = [
         name: "accumulate",
         code: Code::ByMethod {
             dpm: Kernel {
-                shader: |texel| shaders::ACCUMULATE_SAMPLES.reading(texel),
+                shader: |reading| shaders::ACCUMULATE_SAMPLES.reading(reading),
                 reads: &["B_SURFACES", "B_RADIANCE", "B_GUIDES", "B_HISTORY", "B_FILTERED", "B_SHOWN"],
                 writes: &["B_HISTORY", "B_FILTERED"],
             },
             others: Kernel {
-                shader: |texel| shaders::ACCUMULATE_FRAMES.reading(texel),
+                shader: |reading| shaders::ACCUMULATE_FRAMES.reading(reading),
                 reads: &["B_SURFACES", "B_RADIANCE", "B_GUIDES", "B_HISTORY", "B_RATES"],
                 writes: &["B_HISTORY", "B_FILTERED"],
             },
@@ -162,12 +162,12 @@ pub(super) const TABLE: [Pass; 12] = [
         name: "spatial",
         code: Code::ByMethod {
             dpm: Kernel {
-                shader: |texel| shaders::SPATIAL_REGRESSION.reading(texel),
+                shader: |reading| shaders::SPATIAL_REGRESSION.reading(reading),
                 reads: &["B_SURFACES", "B_GUIDES", "B_HISTORY", "B_FILTERED"],
                 writes: &["B_SHOWN"],
             },
             others: Kernel {
-                shader: |texel| shaders::SPATIAL_DISK.reading(texel),
+                shader: |reading| shaders::SPATIAL_DISK.reading(reading),
                 reads: &["B_SURFACES", "B_GUIDES", "B_HISTORY", "B_FILTERED"],
                 writes: &["B_SHOWN"],
             },
@@ -180,7 +180,7 @@ pub(super) const TABLE: [Pass; 12] = [
     Pass {
         name: "compensate",
         code: Code::OfAll(Kernel {
-            shader: |texel| shaders::COMPENSATE.reading(texel),
+            shader: |reading| shaders::COMPENSATE.reading(reading),
             reads: &["B_SURFACES", "B_COUNTERS", "B_SHOWN"],
             writes: &["B_CODES", "B_COUNTERS"],
         }),
@@ -192,7 +192,7 @@ pub(super) const TABLE: [Pass; 12] = [
     Pass {
         name: "halftone",
         code: Code::OfAll(Kernel {
-            shader: |texel| shaders::HALFTONE.reading(texel),
+            shader: |reading| shaders::HALFTONE.reading(reading),
             reads: &["B_SURFACES", "B_CODES"],
             writes: &["B_CODES"],
         }),
@@ -204,7 +204,7 @@ pub(super) const TABLE: [Pass; 12] = [
     Pass {
         name: "motion",
         code: Code::OfAll(Kernel {
-            shader: |texel| shaders::MOTION.reading(texel),
+            shader: |reading| shaders::MOTION.reading(reading),
             reads: &["B_SURFACES", "B_CODES"],
             writes: &["B_MOTION"],
         }),
@@ -216,7 +216,7 @@ pub(super) const TABLE: [Pass; 12] = [
     Pass {
         name: "warp",
         code: Code::OfAll(Kernel {
-            shader: |texel| shaders::WARP.reading(texel),
+            shader: |reading| shaders::WARP.reading(reading),
             reads: &["B_MOTION"],
             writes: &["B_CODES"],
         }),
@@ -272,9 +272,9 @@ impl Code {
 }
 
 impl Pass {
-    /// The shader of a method; `texel` asks for the one that reads tables through texel buffers.
-    pub(super) fn shader(&self, method: &Method, texel: bool) -> Shader {
-        (self.code.kernel(method.dpm).shader)(texel)
+    /// The shader of a method that reads in this way.
+    pub(super) fn shader(&self, method: &Method, reading: Reading) -> Shader {
+        (self.code.kernel(method.dpm).shader)(reading)
     }
 
     /// Specialization constants. Passes that read the scene have the `shared` ones and those of halftones; packing has its own.
@@ -320,8 +320,10 @@ pub fn traffic(settings: &RendererSettings, keep: Keep) -> Vec<Traffic> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use dpm_shaders::structs::BINDINGS;
+    use dpm_shaders::structs::{BINDINGS, TREE_BINDING};
     use std::collections::{BTreeSet, HashMap};
+
+    const READINGS: [Reading; 3] = [Reading::Texels, Reading::Storage, Reading::Query];
 
     /// Buffers that no pass writes. The host fills them, at the start or before a frame.
     const INPUTS: [&str; 18] = [
@@ -396,6 +398,8 @@ mod tests {
             variables
                 .into_iter()
                 .filter_map(|v| binding.get(&v))
+                // The tree over the bodies is no buffer.
+                .filter(|b| **b != TREE_BINDING.1)
                 .map(|b| BINDINGS.iter().find(|(_, known)| known == b).expect("a known binding").0)
                 .map(|name| match name {
                     "B_SURFACE_ROWS" => "B_SURFACES",
@@ -418,8 +422,8 @@ mod tests {
     #[test]
     fn every_row_says_what_its_shader_reads_and_writes() {
         for (_, kernel) in kernels(true).chain(kernels(false)) {
-            for texel in [true, false] {
-                let shader = (kernel.shader)(texel);
+            for reading in READINGS {
+                let shader = (kernel.shader)(reading);
                 let listed = [kernel.reads, kernel.writes].map(|names| names.iter().copied().collect());
                 let [loads, stores] = loads_and_stores(&shader);
                 assert_eq!([loads, stores], listed, "{}: [reads, writes]", shader.name);
@@ -470,8 +474,8 @@ mod tests {
                 named.push(others);
             }
         }
-        let names = |texel| named.iter().map(move |kernel| (kernel.shader)(texel).name);
-        let mut found: Vec<_> = names(true).chain(names(false)).collect();
+        let names = |reading| named.iter().map(move |kernel| (kernel.shader)(reading).name);
+        let mut found: Vec<_> = READINGS.into_iter().flat_map(names).collect();
         found.sort_unstable();
         found.dedup();
         let mut all: Vec<_> = shaders::ALL.iter().map(|shader| shader.name).collect();
@@ -496,6 +500,7 @@ mod tests {
             plane_groups: Vec::new(),
             output: crate::Output::Planes(dpm_device::planes::PlaneSchedule::rgb24()),
             overlap: crate::Overlapping::Never,
+            tracing: crate::Tracing::Auto,
         }
     }
 

@@ -4,11 +4,11 @@ use super::optics::OpticsLayout;
 use super::passes::TABLE;
 use super::scene_data::{Keep, SceneData, SceneDataError};
 use super::scene_needs::SceneNeeds;
-use super::settings::RendererSettings;
+use super::settings::{RendererSettings, Tracing};
 use crate::gpu::{shared_bindings, BindingTable, ComputePipeline, DeviceSummary, Executable, Gpu, GpuError};
 use dpm_scene::Scene;
 use dpm_shaders::specialization as ids;
-use dpm_shaders::Shader;
+use dpm_shaders::{Reading, Shader};
 use std::sync::Arc;
 
 /// What a renderer is made from, without a device. It is kept so that the renderer can be made again on another device without preparing the
@@ -64,9 +64,20 @@ impl RendererPlan {
         Ok(Self { data, settings, keep, tracked })
     }
 
-    /// Whether shaders read tables through texel buffers on this device, as software Vulkan should.
-    pub(super) fn reads_texels(&self, gpu: &Gpu) -> bool {
-        gpu.summary().software && !self.keep.storage_tables
+    /// How the shaders read tables and find what a ray meets on this device. Software Vulkan should read texel buffers.
+    ///
+    /// # Errors
+    /// Ray queries are asked for, and the device has none.
+    pub(super) fn reading(&self, device: &DeviceSummary) -> Result<Reading, GpuError> {
+        let tracing = self.settings.tracing;
+        match tracing.asks_device(device) {
+            true => Ok(Reading::Query),
+            false if tracing == Tracing::RayQuery => {
+                Err(GpuError::NoRayQuery { device: device.name.as_str().into() })
+            }
+            false if device.software && !self.keep.storage_tables => Ok(Reading::Texels),
+            false => Ok(Reading::Storage),
+        }
     }
 
     /// What of the tracer is compiled.
@@ -80,9 +91,9 @@ impl RendererPlan {
         needs
     }
 
-    /// Whether rays look for bodies in a tree.
-    pub(super) fn asks_body_tree(&self) -> bool {
-        self.needs().body_tree
+    /// Whether rays look for bodies in a tree that the host builds. A device that traces rays itself has its own.
+    pub(super) fn walks_body_tree(&self, reading: Reading) -> bool {
+        self.needs().body_tree && reading != Reading::Query
     }
 
     /// Specialization constants of all passes that read the scene, each as id and value. `groups`: see [`trace_groups`].
@@ -96,9 +107,8 @@ impl RendererPlan {
         constants
     }
 
-    /// The programs of the passes that the plan needs; `None` for the others. `texel`: they read tables through texel buffers. `groups`: see
-    /// [`trace_groups`].
-    fn wanted(&self, texel: bool, groups: u32) -> impl Iterator<Item = Option<Program>> + '_ {
+    /// The programs of the passes that the plan needs; `None` for the others. `groups`: see [`trace_groups`].
+    fn wanted(&self, reading: Reading, groups: u32) -> impl Iterator<Item = Option<Program>> + '_ {
         let settings = &self.settings;
         let optics = OpticsLayout::new(settings);
         let shared = self.constants(&optics, groups);
@@ -106,7 +116,7 @@ impl RendererPlan {
             (pass.when)(settings, self.keep).then(|| Program {
                 pass: pass.name,
                 walks: pass.walks,
-                shader: pass.shader(&settings.method, texel),
+                shader: pass.shader(&settings.method, reading),
                 constants: pass.constants(&shared, settings),
             })
         })
@@ -117,18 +127,24 @@ impl RendererPlan {
     /// # Errors
     /// The GPU's own.
     pub(super) fn pipelines(&self, gpu: &Arc<Gpu>) -> Result<Pipelines, GpuError> {
-        let texel = self.reads_texels(gpu);
-        let table = BindingTable::new(gpu, &shared_bindings(texel))?;
+        let reading = self.reading(gpu.summary())?;
+        let table = BindingTable::new(gpu, &shared_bindings(reading))?;
         let compiled = |p: Program| ComputePipeline::new(&table, p.shader, &p.constants);
-        let each =
-            self.wanted(texel, trace_groups(gpu.summary())).map(|program| program.map(compiled).transpose());
+        let wanted = self.wanted(reading, trace_groups(gpu.summary()));
+        let each = wanted.map(|program| program.map(compiled).transpose());
         let each = each.collect::<Result<_, _>>()?;
         Ok(Pipelines { table, each })
     }
 
-    /// The programs that a GPU whose driver does not say how large it is would be given for this plan, in the order in which they run.
+    /// The programs that a GPU whose driver does not say how large it is would be given for this plan, in the order in which they run. None of them
+    /// has ray queries.
     pub fn programs(&self) -> Vec<Program> {
-        self.wanted(false, TRACE_GROUPS).flatten().collect()
+        self.wanted(Reading::Storage, TRACE_GROUPS).flatten().collect()
+    }
+
+    /// Those that it would be given in place of them if it has ray queries.
+    pub fn programs_with_queries(&self) -> Vec<Program> {
+        self.wanted(Reading::Query, TRACE_GROUPS).flatten().filter(|program| program.walks).collect()
     }
 
     /// What the device's driver makes of each of [`RendererPlan::programs`], if it was opened with [`crate::gpu::GpuOptions::statistics`]. Nothing is sent
@@ -137,13 +153,30 @@ impl RendererPlan {
     /// # Errors
     /// The GPU's own.
     pub fn compile(&self, gpu: &Arc<Gpu>) -> Result<Vec<(Program, Vec<Executable>)>, GpuError> {
-        let table = BindingTable::new(gpu, &shared_bindings(false))?;
-        let programs = self.programs().into_iter();
-        programs
-            .map(|p| {
-                let made = ComputePipeline::new(&table, p.shader, &p.constants)?.executables()?;
-                Ok((p, made))
-            })
-            .collect()
+        compile(gpu, Reading::Storage, self.programs())
     }
+
+    /// The same of each of [`RendererPlan::programs_with_queries`].
+    ///
+    /// # Errors
+    /// The device has no ray queries, or the GPU's own.
+    pub fn compile_with_queries(&self, gpu: &Arc<Gpu>) -> Result<Vec<(Program, Vec<Executable>)>, GpuError> {
+        if !gpu.summary().ray_query {
+            return Err(GpuError::NoRayQuery { device: gpu.summary().name.as_str().into() });
+        }
+        compile(gpu, Reading::Query, self.programs_with_queries())
+    }
+}
+
+fn compile(
+    gpu: &Arc<Gpu>,
+    reading: Reading,
+    programs: Vec<Program>,
+) -> Result<Vec<(Program, Vec<Executable>)>, GpuError> {
+    let table = BindingTable::new(gpu, &shared_bindings(reading))?;
+    let made = |p: Program| {
+        let made = ComputePipeline::new(&table, p.shader, &p.constants)?.executables()?;
+        Ok((p, made))
+    };
+    programs.into_iter().map(made).collect()
 }

@@ -52,10 +52,8 @@ pub struct Renderer {
     tile_list: TileList,
     /// The bodies that move while the planes of a frame last.
     movers: Movers,
-    /// Empty where rays ask each body.
-    body_tree: BodyTree,
-    /// The bodies as this frame draws them.
-    instances: Vec<Instance>,
+    /// Rays look for bodies in a tree that the host builds.
+    walks_tree: bool,
     /// The order of frames that overlap.
     orders: Orders,
     optics: OpticsLayout,
@@ -106,7 +104,8 @@ impl Renderer {
     pub fn from_plan(gpu: &Arc<Gpu>, plan: &RendererPlan) -> Result<Self, RenderError> {
         let RendererPlan { data, settings, keep, tracked } = plan.clone();
         let shared = SharedBuffers::new(gpu, &settings)?;
-        let scene_gpu = SceneGpu::new(gpu, &data, plan.reads_texels(gpu))?;
+        let reading = plan.reading(gpu.summary())?;
+        let scene_gpu = SceneGpu::new(gpu, &data, reading)?;
         let optics = OpticsLayout::new(&settings);
         let Pipelines { table, each: pipelines } = plan.pipelines(gpu)?;
         let decides_rates =
@@ -120,8 +119,6 @@ impl Renderer {
         let last = LastFrame::none(tracked.len());
         let tile_list = TileList::new(settings.raster, settings.lens.as_ref());
         let rated = vec![false; tile_list.len()];
-        let body_tree = BodyTree::new(if plan.asks_body_tree() { data.bodies.len() } else { 0 });
-        let instances = vec![Instance::zeroed(); data.bodies.len()];
         let movers = Movers::new(data.bodies.len(), &settings.plane_groups, !settings.shows_halftones());
         Ok(Self {
             resources: Arc::new(Resources { pipelines, table, shared, scene: scene_gpu, overlap }),
@@ -134,12 +131,16 @@ impl Renderer {
             rated,
             tile_list,
             movers,
-            body_tree,
-            instances,
+            walks_tree: plan.walks_body_tree(reading),
             orders: Orders::default(),
             optics,
             gpu: gpu.clone(),
         })
+    }
+
+    /// Whether the device finds itself what a ray meets (ray query), or the shaders do.
+    pub fn asks_device(&self) -> bool {
+        self.resources.scene.trees.is_some()
     }
 
     /// Interpolated normal of a surface, in its body's space and without the normal map.
@@ -174,12 +175,10 @@ impl Renderer {
     pub fn create_slot(&self, debug: bool) -> Result<FrameSlot, GpuError> {
         let (gpu, resources, settings) = (&self.gpu, &self.resources, &self.settings);
         let tile_list = self.tile_list.clone();
-        let buffers = FrameBuffers::new(
-            gpu,
-            settings,
-            (self.data.bodies.len(), self.body_tree.most_nodes(), tile_list.len()),
-            debug,
-        )?;
+        let asks_device = resources.scene.trees.is_some();
+        let body_tree = BodyTree::new(if self.walks_tree { self.data.bodies.len() } else { 0 });
+        let sizes = (self.data.bodies.len(), tile_list.len());
+        let buffers = FrameBuffers::new(gpu, settings, sizes, body_tree, (debug, asks_device))?;
         buffers.clear(gpu, settings)?;
         let set_of = |parity| {
             let all = (&resources.shared, &resources.scene);
@@ -187,7 +186,7 @@ impl Renderer {
                 .iter()
                 .map(|&(name, binding)| (binding, buffers.of(name, parity, settings, all)))
                 .collect();
-            BindingSet::new(&resources.table, &bindings)
+            BindingSet::with_tree(&resources.table, &bindings, buffers.device_tree.as_ref())
         };
         let sets = [set_of(0)?, set_of(1)?];
         let lists = |parity: usize| -> Result<[CommandList; 2], GpuError> {
@@ -219,12 +218,16 @@ impl Renderer {
         })
     }
 
-    /// Records what comes before the passes: counters are cleared, and what the host has written is copied.
+    /// Records what comes before the passes: counters are cleared, what the host has written is copied, and where the device finds what a ray meets,
+    /// it builds the tree over the bodies at the same poses.
     fn record_latch(&self, r: &mut Recorder<'_>, b: &FrameBuffers) {
         r.clear(&b.counters);
         r.copy(&self.resources.shared.schedule_start, &b.schedule, size_of::<Schedule>());
         for latched in [&b.frame, &b.instances, &b.body_nodes, &b.movers] {
             r.copy(&latched.host, &latched.device, latched.len_bytes);
+        }
+        if let Some(tree) = &b.device_tree {
+            r.build_frame_tree(tree);
         }
         r.barrier();
         r.stamp();
@@ -336,15 +339,9 @@ impl Renderer {
         let rate_tiles = if decides_rates { tile_count } else { 0 };
         let groups = [tile_count * 4, rate_tiles, moving_tiles * 4];
         slot.buffers.arguments.write(&groups.map(|groups| [groups, 1u32, 1, 0]));
-        for i in 0..inputs.poses.len() {
-            self.instances[i] = self.instance(i, inputs);
-        }
-        slot.buffers.instances.host.write(&self.instances);
-        let mut frame = self.frame_constants(inputs, &turn, (tile_count, slot.tile_list.tiles_x()));
-        if self.body_tree.most_nodes() > 0 {
-            let nodes = bytemuck::cast_slice_mut(slot.buffers.body_nodes.host.bytes_mut());
-            frame.body_nodes = self.body_tree.write(self.instances.iter(), nodes);
-        }
+        let body_nodes = self.write_bodies(&mut slot.buffers, inputs);
+        let constants = self.frame_constants(inputs, &turn, (tile_count, slot.tile_list.tiles_x()));
+        let frame = Frame { body_nodes, ..constants };
         slot.buffers.frame.host.write(&[frame]);
         slot.parity = 1 - self.last.parity;
         let [first, second] = &slot.lists[slot.parity];
@@ -358,6 +355,22 @@ impl Renderer {
         let lost = (0..inputs.poses.len()).map(|i| is_lost(&self.tracked, i, inputs.lost));
         self.last.becomes(inputs, slot.parity, lost);
         Ok(())
+    }
+
+    /// Writes where the bodies are: for the shaders, and for whatever tree rays find them in. Returns how many nodes of the tree over bodies an octant
+    /// of directions has.
+    fn write_bodies(&self, buffers: &mut FrameBuffers, inputs: &FrameInputs<'_>) -> u32 {
+        buffers.body_tree.clear();
+        let instances = buffers.instances.host.bytes_mut().chunks_exact_mut(size_of::<Instance>());
+        for (i, to) in instances.take(inputs.poses.len()).enumerate() {
+            let instance = self.instance(i, inputs);
+            to.copy_from_slice(bytemuck::bytes_of(&instance));
+            buffers.body_tree.add(&instance);
+            if let (Some(tree), Some(trees)) = (&mut buffers.device_tree, &self.resources.scene.trees) {
+                tree.place(i, &instance, trees);
+            }
+        }
+        buffers.body_tree.write(bytemuck::cast_slice_mut(buffers.body_nodes.host.bytes_mut()))
     }
 
     /// Changes what is kept of past frames at a range of pixels, in both buffers: for checks that something broken is forgotten. No frame

@@ -2,6 +2,7 @@
 
 use super::body_tree::FEWEST_BODIES;
 pub use super::scene_needs::SceneNeeds;
+use crate::gpu::BodyTriangles;
 use bytemuck::Zeroable;
 use dpm_scene::albedo_table::{tabulated, AlbedoTable, ALBEDO_NODES};
 use dpm_scene::bvh::BodyBvh;
@@ -521,6 +522,22 @@ impl SceneData {
                 small.push(l);
             }
         }
+    }
+}
+
+impl SceneData {
+    /// The triangles of each body, and whether shaders must look for holes in them.
+    pub(crate) fn triangles_of_bodies(&self) -> Vec<BodyTriangles> {
+        let ends = self.bodies.iter().skip(1).map(|next| next.triangle_offset);
+        let ends = ends.chain([self.refs.len() as u32]);
+        let has_hole = |t: &TriangleRef| self.materials[t.material as usize].alpha_cutoff >= 0.0;
+        (self.bodies.iter().zip(ends))
+            .map(|(body, end)| {
+                let range = body.triangle_offset..end;
+                let refs = &self.refs[range.start as usize..range.end as usize];
+                BodyTriangles { range, has_holes: refs.iter().any(has_hole) }
+            })
+            .collect()
     }
 }
 

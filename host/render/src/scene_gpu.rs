@@ -1,8 +1,9 @@
 //! A scene's flat arrays into GPU buffers.
 
 use super::scene_data::SceneData;
-use crate::gpu::{Buffer, Gpu, GpuError, MemoryKind};
+use crate::gpu::{triangle_buffer, BodyTrees, Buffer, Gpu, GpuError, MemoryKind};
 use bytemuck::cast_slice;
+use dpm_shaders::Reading;
 use std::sync::Arc;
 
 /// The buffers of one scene; immutable after creation.
@@ -17,17 +18,20 @@ pub(crate) struct SceneGpu {
     pub(super) lights: Buffer,
     pub(super) environment: Buffer,
     pub(super) albedo: Buffer,
+    /// The trees in which the device finds what a ray meets; `None`: the shaders walk through the nodes.
+    pub(super) trees: Option<BodyTrees>,
 }
 
 impl SceneGpu {
-    /// Uploads `data`. `texel`: geometry and materials through texel buffers.
+    /// Uploads `data` for shaders that read it in this way, and has the device build its trees if they ask it for hits.
     ///
     /// # Errors
     /// Out of memory or beyond the device's limits.
-    pub(crate) fn new(gpu: &Arc<Gpu>, data: &SceneData, texel: bool) -> Result<Self, GpuError> {
+    pub(crate) fn new(gpu: &Arc<Gpu>, data: &SceneData, reading: Reading) -> Result<Self, GpuError> {
+        let (texel, query) = (reading == Reading::Texels, reading == Reading::Query);
         // Buffers cannot be empty; one element of padding is never read.
         let empty = [[0u32; 4]; 5];
-        let nodes = if data.nodes.is_empty() { &empty[..] } else { &data.nodes };
+        let nodes = if data.nodes.is_empty() || query { &empty[..] } else { &data.nodes };
         let triangles = if data.triangles.is_empty() { &empty[..] } else { &data.triangles };
         let rows = |what, words: &[[u32; 4]], float| {
             if texel {
@@ -36,9 +40,17 @@ impl SceneGpu {
                 Buffer::from_slice(gpu, what, words)
             }
         };
+        let (triangles, trees) = if query {
+            let triangles = triangle_buffer(gpu, triangles)?;
+            let trees = BodyTrees::new(gpu, &triangles, &data.triangles_of_bodies())?;
+            (triangles, Some(trees))
+        } else {
+            (rows("triangles", triangles, true)?, None)
+        };
         Ok(Self {
             nodes: rows("BVH nodes", nodes, false)?,
-            triangles: rows("triangles", triangles, true)?,
+            triangles,
+            trees,
             refs: rows("triangle indices", cast_slice(&data.refs), false)?,
             vertices: rows("vertices", cast_slice(&data.vertices), false)?,
             materials: rows("materials", cast_slice(&data.materials), false)?,

@@ -3,7 +3,7 @@
 use super::drive::Drive;
 use super::method::Method;
 use super::scene_data::SceneDataError;
-use crate::gpu::GpuError;
+use crate::gpu::{DeviceSummary, GpuError};
 use crate::pack::Halftone;
 use crate::warp::Sweep;
 use dpm_device::planes::{PlaneSchedule, Raster};
@@ -40,6 +40,32 @@ pub struct RendererSettings {
     pub output: Output,
     /// Whether the end of a frame and the beginning of the next one share the device.
     pub overlap: Overlapping,
+    /// Who finds what a ray meets.
+    pub tracing: Tracing,
+}
+
+/// Who finds what a ray meets. The same triangles are found, but for those that are equally near.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub enum Tracing {
+    /// The device, if it can and is not software; else the shaders.
+    #[default]
+    Auto,
+    /// The shaders, which walk through trees that the host has built.
+    Walk,
+    /// The device, software or not (ray query). One that cannot is refused.
+    RayQuery,
+}
+
+impl Tracing {
+    /// Whether this device finds itself what a ray meets (ray query). It cannot if it is refused. Software Vulkan walks faster than it answers
+    /// queries, so it does so only if it is asked to.
+    pub fn asks_device(self, device: &DeviceSummary) -> bool {
+        match self {
+            Self::Auto => device.ray_query && !device.software,
+            Self::Walk => false,
+            Self::RayQuery => device.ray_query,
+        }
+    }
 }
 
 /// Whether a frame begins before the one before it has ended.

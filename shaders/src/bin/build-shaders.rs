@@ -5,7 +5,7 @@
 use std::path::Path;
 use std::process::{Command, ExitCode};
 
-/// Sources that read tables: each is built twice.
+/// Sources that read tables: each is built twice, and some a third time.
 const WITH_TABLES: &[&str] = &[
     "primary",
     "trace",
@@ -24,19 +24,29 @@ const WITH_TABLES: &[&str] = &[
     "warp",
 ];
 
-/// Output stem, source, extra defines.
-fn variants() -> Vec<(String, String, Option<&'static str>)> {
+/// Those of them whose rays walk through the scene: each is built a third time, for devices that trace rays themselves.
+const WITH_QUERIES: &[&str] = &["primary", "trace"];
+
+/// Version of Vulkan for all shaders but those with ray queries.
+const VULKAN: &str = "--target-env=vulkan1.1";
+/// The same for shaders with ray queries, whose SPIR-V names the tree over the bodies among the inputs of its entry point.
+const VULKAN_OF_QUERIES: &str = "--target-env=vulkan1.2";
+
+/// Output stem, source, extra defines, version of Vulkan.
+fn variants() -> Vec<(String, String, Option<&'static str>, &'static str)> {
     let source = |name: &str| format!("{name}.comp");
     let mut all: Vec<_> = WITH_TABLES
         .iter()
         .flat_map(|name| {
             [
-                (format!("{name}.texel"), source(name), Some("-DTEXEL_TABLES")),
-                (format!("{name}.storage"), source(name), None),
+                (format!("{name}.texel"), source(name), Some("-DTEXEL_TABLES"), VULKAN),
+                (format!("{name}.storage"), source(name), None, VULKAN),
             ]
         })
         .collect();
-    all.push(("pack".to_owned(), source("pack"), None));
+    let query = |name: &&str| (format!("{name}.query"), source(name), Some("-DRAY_QUERY"), VULKAN_OF_QUERIES);
+    all.extend(WITH_QUERIES.iter().map(query));
+    all.push(("pack".to_owned(), source("pack"), None, VULKAN));
     all
 }
 
@@ -49,10 +59,10 @@ fn main() -> ExitCode {
     std::fs::write(glsl.join("tables.glsl"), dpm_shaders::generate::tables_glsl())
         .expect("write tables.glsl");
     std::fs::create_dir_all(&spv).expect("create spv");
-    for (stem, source, define) in variants() {
+    for (stem, source, define, vulkan) in variants() {
         let output = spv.join(format!("{stem}.spv"));
         let status = Command::new("glslc")
-            .args(["--target-env=vulkan1.1", "-O", "-Werror", "-I"])
+            .args([vulkan, "-O", "-Werror", "-I"])
             .arg(&glsl)
             .args(define)
             .arg(glsl.join(&source))

@@ -58,6 +58,19 @@ pub struct Table {
     pub passes: Vec<Row>,
 }
 
+/// What is added to the name of a pass whose shader leaves to the device what its rays meet.
+pub const BY_QUERY: &str = " by ray query";
+
+/// The name of a program in the table.
+fn name_of(program: &Program, by_query: bool) -> String {
+    format!("{}{}", program.pass, if by_query { BY_QUERY } else { "" })
+}
+
+/// Whether rays of this pass are traced by the device, if it can.
+pub fn is_by_query(pass: &str) -> bool {
+    pass.ends_with(BY_QUERY)
+}
+
 /// The digests of all programs of a case.
 pub fn inputs(case: &Case) -> Vec<Input> {
     let digest = |program: &Program| {
@@ -69,8 +82,13 @@ pub fn inputs(case: &Case) -> Vec<Input> {
         let parts = [("spirv", program.shader.spirv), ("constants", &constants)];
         format!("{:016x}", dpm_shaders::generate::source_hash(parts.into_iter()))
     };
-    let input = |p: &Program| Input { case: case.name.clone(), pass: p.pass.into(), digest: digest(p) };
-    case.plan.programs().iter().map(input).collect()
+    let input = |p: &Program, by_query| Input {
+        case: case.name.clone(),
+        pass: name_of(p, by_query),
+        digest: digest(p),
+    };
+    let (walks, queries) = (case.plan.programs(), case.plan.programs_with_queries());
+    walks.iter().map(|p| input(p, false)).chain(queries.iter().map(|p| input(p, true))).collect()
 }
 
 /// The first of these statistics that the driver has.
@@ -79,7 +97,12 @@ fn first(made: &[Executable], names: &[&str]) -> Option<u32> {
     names.iter().find_map(value).map(|v| v as u32)
 }
 
-fn row(case: &str, target: &Target, program: &Program, made: &[Executable]) -> Result<Row, String> {
+fn row(
+    case: &str,
+    target: &Target,
+    (program, by_query): (&Program, bool),
+    made: &[Executable],
+) -> Result<Row, String> {
     let need = |names: &[&str]| {
         let have: Vec<_> = made.iter().flat_map(|m| m.statistics.iter().map(|s| s.0.as_str())).collect();
         first(made, names)
@@ -87,7 +110,7 @@ fn row(case: &str, target: &Target, program: &Program, made: &[Executable]) -> R
     };
     Ok(Row {
         case: case.to_owned(),
-        pass: program.pass.to_owned(),
+        pass: name_of(program, by_query),
         target: target.name.to_owned(),
         registers: need(&["VGPRs", "Number of GPRs"])?,
         spills: first(made, &["Spilled VGPRs"]).unwrap_or(0) + first(made, &["Spilled SGPRs"]).unwrap_or(0),
@@ -101,21 +124,39 @@ fn row(case: &str, target: &Target, program: &Program, made: &[Executable]) -> R
     })
 }
 
-/// Compiles every pipeline of all cases on the device that this process sees, as `target`. Returns the driver's own name with the rows.
+/// Compiles every pipeline of all cases on the device that this process sees, as `target`. Returns the driver's own name with the rows. Shaders with
+/// ray queries are left out for drivers that have none.
 ///
 /// # Errors
-/// The driver refuses something or does not say what it made.
+/// The driver refuses something, does not say what it made, or has no ray query although the target should.
 pub fn compile(cases: &[Case], target: &Target) -> Result<(String, Vec<Row>), String> {
     let options = GpuOptions { statistics: true, ..GpuOptions::default() };
     let gpu = Gpu::open(&options).map_err(|e| e.to_string())?;
+    let summary = gpu.summary();
+    if summary.ray_query != target.ray_query {
+        return Err(format!("{}: its driver {} ray query", target.name, has(summary.ray_query)));
+    }
     let mut rows = Vec::new();
     for case in cases {
         for (program, made) in case.plan.compile(&gpu).map_err(|e| e.to_string())? {
-            rows.push(row(&case.name, target, &program, &made)?);
+            rows.push(row(&case.name, target, (&program, false), &made)?);
+        }
+        if !target.ray_query {
+            continue;
+        }
+        for (program, made) in case.plan.compile_with_queries(&gpu).map_err(|e| e.to_string())? {
+            rows.push(row(&case.name, target, (&program, true), &made)?);
         }
     }
-    let summary = gpu.summary();
     Ok((format!("{}, {}", summary.name, summary.driver.trim()), rows))
+}
+
+fn has(it: bool) -> &'static str {
+    if it {
+        "has"
+    } else {
+        "has no"
+    }
 }
 
 /// Compiles every pipeline of all cases on the device that this process sees, and returns a line for each program: all that the driver says of it.
@@ -129,14 +170,19 @@ pub fn everything_said(cases: &[Case]) -> Result<Vec<String>, String> {
     let mut lines = vec![format!("{}, {}", summary.name, summary.driver.trim())];
     for case in cases {
         let started = std::time::Instant::now();
-        for (program, made) in case.plan.compile(&gpu).map_err(|e| e.to_string())? {
+        let mut all: Vec<_> = case.plan.compile(&gpu).map_err(|e| e.to_string())?;
+        let by_walk = all.len();
+        if summary.ray_query {
+            all.extend(case.plan.compile_with_queries(&gpu).map_err(|e| e.to_string())?);
+        }
+        for (i, (program, made)) in all.iter().enumerate() {
             lines.extend(made.iter().map(|m| {
                 let said: Vec<_> =
                     m.statistics.iter().map(|(name, value)| format!("{name} {value}")).collect();
                 format!(
                     "{}, {}: {}, subgroups of {}",
                     case.name,
-                    program.pass,
+                    name_of(program, i >= by_walk),
                     said.join(", "),
                     m.subgroup_size
                 )
@@ -147,6 +193,16 @@ pub fn everything_said(cases: &[Case]) -> Result<Vec<String>, String> {
     Ok(lines)
 }
 
+/// The line of a target whose driver has no ray query.
+fn lacking(target: &str) -> String {
+    match Target::named(target) {
+        Some(target) if !target.ray_query => {
+            format!("| no pass{BY_QUERY}: the driver has none | {} | - | - | - | - | - | - |\n", target.name)
+        }
+        _ => String::new(),
+    }
+}
+
 impl Table {
     /// One line for each pass and driver: the worst of all cases.
     pub fn markdown(&self) -> String {
@@ -155,7 +211,11 @@ impl Table {
              |---|---|---:|---:|---:|---:|---:|---:|\n",
         );
         let mut seen = Vec::new();
+        let mut target = None;
         for row in &self.passes {
+            if let Some(last) = target.replace(&row.target).filter(|last| **last != row.target) {
+                text.push_str(&lacking(last));
+            }
             let key = (&row.pass, &row.target);
             if seen.contains(&key) {
                 continue;
@@ -176,6 +236,7 @@ impl Table {
                 f64::from(most(|r| r.code_bytes)) / 1024.0
             );
         }
+        text.push_str(&target.map_or(String::new(), |last| lacking(last)));
         text
     }
 

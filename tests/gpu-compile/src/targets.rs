@@ -21,6 +21,8 @@ pub struct Target {
     pub current: bool,
     /// The maker of the GPU.
     pub maker: Maker,
+    /// The driver has ray query.
+    pub ray_query: bool,
 }
 
 /// Who made a GPU.
@@ -30,6 +32,8 @@ pub enum Maker {
     Amd,
     /// NVIDIA, with Mesa's driver NVK. NVIDIA's own driver has another compiler.
     Nvidia,
+    /// Nobody: Mesa's driver runs on the CPU.
+    Software,
 }
 
 const RADV: &str = "libvulkan_radeon.so";
@@ -57,6 +61,20 @@ pub const DRY_RUN: Target = Target {
     environment: &[("AMDGPU_GPU_ID", "navi21")],
     current: true,
     maker: Maker::Amd,
+    ray_query: true,
+};
+
+/// Software Vulkan that has ray query, which that of Debian 12 has not. It draws.
+pub const SOFTWARE: Target = Target {
+    name: "llvmpipe, Mesa 25.0",
+    gpu: "software Vulkan",
+    release: "backports",
+    driver: "libvulkan_lvp.so",
+    shim: "",
+    environment: &[],
+    current: true,
+    maker: Maker::Software,
+    ray_query: true,
 };
 
 type Environment = &'static [(&'static str, &'static str)];
@@ -68,7 +86,17 @@ const fn amd(
     environment: Environment,
     current: bool,
 ) -> Target {
-    Target { name, gpu, release, driver: RADV, shim: "", environment, current, maker: Maker::Amd }
+    Target {
+        name,
+        gpu,
+        release,
+        driver: RADV,
+        shim: "",
+        environment,
+        current,
+        maker: Maker::Amd,
+        ray_query: true,
+    }
 }
 
 const fn nvidia(name: &'static str, gpu: &'static str, environment: Environment) -> Target {
@@ -81,6 +109,7 @@ const fn nvidia(name: &'static str, gpu: &'static str, environment: Environment)
         environment,
         current: true,
         maker: Maker::Nvidia,
+        ray_query: false,
     }
 }
 

@@ -6,7 +6,7 @@ use dpm_lab::bench::{bench, MethodCost, METHODS};
 use dpm_lab::gpu_model;
 use dpm_rig::config::RenderMethod;
 use dpm_rig::failure::Failure;
-use dpm_rig::pipeline::PipelineError;
+use dpm_rig::pipeline::{renderer_settings, PipelineError};
 use dpm_rig::rig::Rig;
 use dpm_rig::run_rig::open_gpu;
 use dpm_rig::telemetry::report::to_json;
@@ -73,13 +73,14 @@ pub(super) fn execute(args: &BenchArgs) -> Result<(), Failure> {
     if !args.json {
         let (device, raster) = (gpu.summary(), rig.camera.raster);
         print(&format!(
-            "{} ({}), {} x {}, spp {}, depth {}\n",
+            "{} ({}), {} x {}, spp {}, depth {}, {}\n",
             device.name,
             device.driver,
             raster.width(),
             raster.height(),
             config.render.spp,
-            config.render.depth
+            config.render.depth,
+            if renderer_settings(&rig).tracing.asks_device(device) { "ray query" } else { "own walk" }
         ));
         print("method      Mrays/s Msamples/s  rays/frame  samples/fr     GPU ms    wall ms    in line\n");
     }

@@ -13,7 +13,9 @@ use dpm_render::gpu::{Gpu, GpuError};
 use dpm_render::method::Method;
 use dpm_render::pack::{source_bits, Halftone};
 use dpm_render::warp::{plane_groups, Sweep, FOLLOW_SHARE};
-use dpm_render::{FrameInputs, FrameSlot, Output, Overlapping, RenderError, Renderer, RendererSettings};
+use dpm_render::{
+    FrameInputs, FrameSlot, Output, Overlapping, RenderError, Renderer, RendererSettings, Tracing,
+};
 use dpm_scene::geometry::projector::ProjectorCamera;
 use dpm_scene::{shapes, Material, Scene, Texture, Wrap};
 use dpm_shaders::structs::PlaneGroup;
@@ -264,6 +266,7 @@ impl Card {
             plane_groups: groups.to_vec(),
             output: Output::Codes,
             overlap: Overlapping::Never,
+            tracing: Tracing::Auto,
         };
         let renderer = Renderer::new(&self.gpu, &self.scene, settings)?;
         let slot = renderer.create_slot(false)?;

@@ -5,7 +5,7 @@ use dpm_render::drive::Drive;
 use dpm_render::gpu::Gpu;
 use dpm_render::method::Method;
 use dpm_render::scene_data::Keep;
-use dpm_render::{FrameInputs, FrameSlot, Output, Overlapping, Renderer, RendererSettings};
+use dpm_render::{FrameInputs, FrameSlot, Output, Overlapping, Renderer, RendererSettings, Tracing};
 use dpm_scene::geometry::projector::ProjectorCamera;
 use dpm_scene::Scene;
 use dpm_shaders::structs::{Counters, Surface, NO_HIT};
@@ -51,6 +51,8 @@ pub struct Shot<'a> {
     pub leave_nothing_out: bool,
     /// How rays are spent; `None`: [`Method::full`].
     pub method: Option<Method>,
+    /// Who finds what a ray meets.
+    pub tracing: Tracing,
 }
 
 impl<'a> Shot<'a> {
@@ -73,6 +75,7 @@ impl<'a> Shot<'a> {
             ambient: [0.0; 3],
             leave_nothing_out: false,
             method: None,
+            tracing: Tracing::Auto,
         }
     }
 
@@ -101,6 +104,7 @@ impl<'a> Shot<'a> {
             plane_groups: Vec::new(),
             output: Output::Codes,
             overlap: Overlapping::Never,
+            tracing: self.tracing,
         }
     }
 

@@ -10,6 +10,9 @@ use std::sync::Arc;
 /// Largest buffer of [`MemoryKind::Upload`] that goes to the GPU's own memory, bytes.
 const MOST_UPLOAD_ON_DEVICE: u64 = 65_536;
 
+/// The buffer has an address, and its memory too.
+const ADDRESS: vk::BufferUsageFlags = vk::BufferUsageFlags::SHADER_DEVICE_ADDRESS;
+
 /// Where a buffer lives and who touches it.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum MemoryKind {
@@ -134,6 +137,41 @@ impl Buffer {
         Ok(self)
     }
 
+    /// An uninitialised buffer with an address of its own, for what ray tracing reads and writes.
+    ///
+    /// # Errors
+    /// As [`Buffer::new`], but storage buffers may be smaller.
+    pub(super) fn addressed(
+        gpu: &Arc<Gpu>,
+        what: &str,
+        len_bytes: u64,
+        kind: MemoryKind,
+        extra: vk::BufferUsageFlags,
+    ) -> Result<Self, GpuError> {
+        Self::with_usage(gpu, what, len_bytes as usize, kind, extra | ADDRESS)
+    }
+
+    /// A device buffer filled with bytes, with an address of its own.
+    ///
+    /// # Errors
+    /// As [`Buffer::from_slice`].
+    pub(super) fn filled_addressed(
+        gpu: &Arc<Gpu>,
+        what: &str,
+        bytes: &[u8],
+        extra: vk::BufferUsageFlags,
+    ) -> Result<Self, GpuError> {
+        Self::check_storage(gpu, what, bytes.len())?;
+        Self::filled(gpu, what, bytes, extra | ADDRESS)
+    }
+
+    /// Where the device finds an addressed buffer.
+    pub(super) fn address(&self) -> u64 {
+        let info = vk::BufferDeviceAddressInfo::default().buffer(self.handle);
+        // SAFETY: the buffer is alive and was made with this usage; only devices that were opened with the feature have such buffers.
+        unsafe { self.gpu.device.get_buffer_device_address(&info) }
+    }
+
     fn filled(
         gpu: &Arc<Gpu>,
         what: &str,
@@ -157,7 +195,7 @@ impl Buffer {
         extra: vk::BufferUsageFlags,
     ) -> Result<Self, GpuError> {
         let len_bytes = len_bytes.max(16);
-        if !extra.contains(vk::BufferUsageFlags::STORAGE_TEXEL_BUFFER) {
+        if !extra.intersects(vk::BufferUsageFlags::STORAGE_TEXEL_BUFFER | ADDRESS) {
             Self::check_storage(gpu, what, len_bytes)?;
         }
         let usage = vk::BufferUsageFlags::STORAGE_BUFFER
@@ -173,7 +211,7 @@ impl Buffer {
             let handle = gpu.device.create_buffer(&info, None).on(gpu, "creating a buffer")?;
             let needs = gpu.device.get_buffer_memory_requirements(handle);
             let (memory, properties) =
-                match gpu.takes(needs.size).and_then(|()| Self::allocate(gpu, what, needs, kind)) {
+                match gpu.takes(needs.size).and_then(|()| Self::allocate(gpu, what, needs, kind, extra)) {
                     Ok(memory) => memory,
                     Err(e) => {
                         gpu.device.destroy_buffer(handle, None);
@@ -210,6 +248,7 @@ impl Buffer {
         what: &str,
         needs: vk::MemoryRequirements,
         kind: MemoryKind,
+        usage: vk::BufferUsageFlags,
     ) -> Result<(vk::DeviceMemory, vk::MemoryPropertyFlags), GpuError> {
         use vk::MemoryPropertyFlags as P;
         let coherent = P::HOST_VISIBLE | P::HOST_COHERENT;
@@ -232,8 +271,13 @@ impl Buffer {
                 if needs.memory_type_bits & (1 << i) == 0 || !t.property_flags.contains(wish) {
                     continue;
                 }
-                let info =
+                let mut addressed =
+                    vk::MemoryAllocateFlagsInfo::default().flags(vk::MemoryAllocateFlags::DEVICE_ADDRESS);
+                let mut info =
                     vk::MemoryAllocateInfo::default().allocation_size(needs.size).memory_type_index(i as u32);
+                if usage.contains(ADDRESS) {
+                    info = info.push_next(&mut addressed);
+                }
                 // SAFETY: valid allocate info; freed in Buffer's Drop.
                 match unsafe { gpu.device.allocate_memory(&info, None) } {
                     Ok(memory) => return Ok((memory, t.property_flags)),

@@ -119,7 +119,7 @@ impl Drop for CommandList {
 
 /// Records passes.
 pub struct Recorder<'a> {
-    list: &'a mut CommandList,
+    pub(super) list: &'a mut CommandList,
 }
 
 impl Recorder<'_> {
@@ -185,7 +185,7 @@ impl Recorder<'_> {
         self.pipeline_barrier(S::COMPUTE_SHADER | S::TRANSFER, S::HOST, barrier);
     }
 
-    fn pipeline_barrier(
+    pub(super) fn pipeline_barrier(
         &mut self,
         from: vk::PipelineStageFlags,
         to: vk::PipelineStageFlags,

@@ -2,8 +2,8 @@
 
 use super::address_space;
 use super::devices::{
-    candidates, compute_family, has_priorities, has_timelines, queue_count, usable, Candidate, DeviceId,
-    DeviceSummary,
+    candidates, compute_family, has_priorities, has_timelines, queue_count, scratch_alignment, usable,
+    Candidate, DeviceId, DeviceSummary, RAY_QUERY,
 };
 use super::error::GpuError;
 use super::instance::{create_instance, Instance};
@@ -57,6 +57,10 @@ pub struct Gpu {
     pub(super) options: GpuOptions,
     /// Calls that ask what the compiler made of a pipeline, if the options asked for them.
     pub(super) statistics: Option<khr::pipeline_executable_properties::Device>,
+    /// Calls for the trees of ray tracing, if the device has ray queries.
+    pub(super) acceleration: Option<khr::acceleration_structure::Device>,
+    /// At which multiples of an address such trees may be built, bytes.
+    pub(super) scratch_alignment: u64,
     /// Layouts and compiled pipelines of renderers that are gone.
     pub(super) kept: Kept,
     instance: ManuallyDrop<Instance>,
@@ -140,7 +144,8 @@ fn create(
     // On a desktop the compositor's work would stand before a frame for a millisecond or more. Drivers give way to programs that the system lets.
     let asks_first = if summary.software { None } else { has_priorities(instance, physical) };
     let device = |first: Option<&'static CStr>| {
-        open_with(instance, physical, (queue_family, priorities), has_timelines, first, options)
+        let has = (has_timelines, summary.ray_query);
+        open_with(instance, physical, (queue_family, priorities), has, first, options)
     };
     let (device, goes_first) = match asks_first.and_then(|extension| device(Some(extension)).ok()) {
         Some(device) => (device, true),
@@ -156,12 +161,13 @@ fn create(
     Ok(Created { device, queue_family, queues, goes_first, most_bytes })
 }
 
-/// The device with the features that the shaders need. `first`: the extension by which its queues go before those of other programs.
+/// The device with the features that the shaders need, and with semaphores that count and ray queries where it has them. `first`: the extension by
+/// which its queues go before those of other programs.
 fn open_with(
     instance: &ash::Instance,
     physical: vk::PhysicalDevice,
     (queue_family, priorities): (u32, &[f32]),
-    has_timelines: bool,
+    (has_timelines, has_ray_queries): (bool, bool),
     first: Option<&'static CStr>,
     options: &GpuOptions,
 ) -> Result<ash::Device, vk::Result> {
@@ -175,6 +181,7 @@ fn open_with(
     let queues = [queue];
     let mut vulkan12 = vk::PhysicalDeviceVulkan12Features::default()
         .timeline_semaphore(has_timelines)
+        .buffer_device_address(has_ray_queries)
         .scalar_block_layout(true)
         .shader_buffer_int64_atomics(true);
     let features = vk::PhysicalDeviceFeatures::default().shader_int64(true);
@@ -185,8 +192,16 @@ fn open_with(
     let mut executable =
         vk::PhysicalDevicePipelineExecutablePropertiesFeaturesKHR::default().pipeline_executable_info(true);
     let statistics = options.statistics.then_some(khr::pipeline_executable_properties::NAME);
-    let extensions: Vec<_> = statistics.into_iter().chain(first).map(CStr::as_ptr).collect();
+    let of_queries = RAY_QUERY.into_iter().filter(|_| has_ray_queries);
+    let extensions: Vec<_> =
+        statistics.into_iter().chain(first).chain(of_queries).map(CStr::as_ptr).collect();
     info = info.enabled_extension_names(&extensions);
+    let mut trees =
+        vk::PhysicalDeviceAccelerationStructureFeaturesKHR::default().acceleration_structure(true);
+    let mut queries = vk::PhysicalDeviceRayQueryFeaturesKHR::default().ray_query(true);
+    if has_ray_queries {
+        info = info.push_next(&mut trees).push_next(&mut queries);
+    }
     if options.statistics {
         info = info.push_next(&mut executable);
     }
@@ -251,6 +266,11 @@ impl Gpu {
             let statistics = options
                 .statistics
                 .then(|| khr::pipeline_executable_properties::Device::new(&instance.handle, &device));
+            let acceleration = summary
+                .ray_query
+                .then(|| khr::acceleration_structure::Device::new(&instance.handle, &device));
+            let scratch_alignment =
+                if summary.ray_query { scratch_alignment(&instance, physical) } else { 1 };
             // SAFETY: plain queries.
             let (memory, limits) = unsafe {
                 (
@@ -271,6 +291,8 @@ impl Gpu {
                 id,
                 options: options.clone(),
                 statistics,
+                acceleration,
+                scratch_alignment,
                 kept: Kept::default(),
                 instance: ManuallyDrop::new(instance),
                 state: AtomicU8::new(State::Well as u8),

@@ -4,6 +4,7 @@ use super::error::GpuError;
 use super::pipeline::{shared_bindings, BindingKind};
 use super::GpuOptions;
 use ash::{amd, ext, khr, nv, vk};
+use dpm_shaders::Reading;
 use std::ffi::CStr;
 use std::time::Duration;
 
@@ -22,7 +23,7 @@ pub struct DeviceSummary {
     pub refused: Option<String>,
     /// What is known to be slow about its driver, and what to do.
     pub advice: Option<String>,
-    /// Ray queries are there.
+    /// It can find itself what a ray meets (ray query).
     pub ray_query: bool,
     /// Device-local memory in MiB.
     pub memory_mib: u64,
@@ -105,6 +106,11 @@ fn version_text(v: u32) -> String {
     format!("{}.{}.{}", vk::api_version_major(v), vk::api_version_minor(v), vk::api_version_patch(v))
 }
 
+/// The bindings that every device must have: those of the shaders' own walk.
+fn bindings_of(software: bool) -> Vec<(u32, BindingKind)> {
+    shared_bindings(if software { Reading::Texels } else { Reading::Storage })
+}
+
 impl Abilities {
     fn of(instance: &ash::Instance, physical: vk::PhysicalDevice) -> Self {
         let mut scalar = vk::PhysicalDeviceScalarBlockLayoutFeatures::default();
@@ -158,7 +164,7 @@ impl Abilities {
         if !self.compute_queue {
             missing.push("a compute queue".to_owned());
         }
-        let bindings = shared_bindings(software);
+        let bindings = bindings_of(software);
         let bound = |kind| bindings.iter().filter(|b| b.1 == kind).count() as u32;
         let mut at_least = |what: &str, due: u32, has: u32| {
             if has < due {
@@ -190,6 +196,37 @@ fn has_extension(instance: &ash::Instance, physical: vk::PhysicalDevice, name: &
     // SAFETY: plain query.
     let all = unsafe { instance.enumerate_device_extension_properties(physical) }.unwrap_or_default();
     all.iter().any(|e| e.extension_name_as_c_str() == Ok(name))
+}
+
+/// The extensions that a device is opened with if it can find itself what a ray meets.
+pub(super) const RAY_QUERY: [&CStr; 3] =
+    [khr::acceleration_structure::NAME, khr::ray_query::NAME, khr::deferred_host_operations::NAME];
+
+/// Whether a device has ray queries, with all that they need.
+fn has_ray_queries(instance: &ash::Instance, physical: vk::PhysicalDevice) -> bool {
+    let mut trees = vk::PhysicalDeviceAccelerationStructureFeaturesKHR::default();
+    let mut queries = vk::PhysicalDeviceRayQueryFeaturesKHR::default();
+    let mut addresses = vk::PhysicalDeviceBufferDeviceAddressFeatures::default();
+    if !RAY_QUERY.iter().all(|name| has_extension(instance, physical, name)) {
+        return false;
+    }
+    let mut features = vk::PhysicalDeviceFeatures2::default()
+        .push_next(&mut trees)
+        .push_next(&mut queries)
+        .push_next(&mut addresses);
+    // SAFETY: `features` chains valid structures, of extensions that the device has.
+    unsafe { instance.get_physical_device_features2(physical, &mut features) };
+    let all = [trees.acceleration_structure, queries.ray_query, addresses.buffer_device_address];
+    all.iter().all(|&has| has != 0)
+}
+
+/// At which multiples of an address trees may be built, bytes.
+pub(super) fn scratch_alignment(instance: &ash::Instance, physical: vk::PhysicalDevice) -> u64 {
+    let mut trees = vk::PhysicalDeviceAccelerationStructurePropertiesKHR::default();
+    let mut props = vk::PhysicalDeviceProperties2::default().push_next(&mut trees);
+    // SAFETY: `props` chains a valid structure, of an extension that the device has.
+    unsafe { instance.get_physical_device_properties2(physical, &mut props) };
+    u64::from(trees.min_acceleration_structure_scratch_offset_alignment).max(1)
 }
 
 /// Size of the largest heap of the device's own memory, bytes.
@@ -313,7 +350,7 @@ fn summarise(
         software,
         refused: Abilities::of(instance, physical).lacks(software, options),
         advice: advice_on(driver.driver_id, base.driver_version),
-        ray_query: has_extension(instance, physical, khr::ray_query::NAME),
+        ray_query: has_ray_queries(instance, physical),
         memory_mib: own_memory(instance, physical) >> 20,
         timestamp_period_ns: if base.limits.timestamp_compute_and_graphics != 0 {
             base.limits.timestamp_period
@@ -375,7 +412,7 @@ mod tests {
 
     /// A device that has just what is needed, by the shaders' own tables.
     fn able(software: bool) -> Abilities {
-        let bindings = shared_bindings(software);
+        let bindings = bindings_of(software);
         let bound = |kind| bindings.iter().filter(|b| b.1 == kind).count() as u32;
         Abilities {
             api_version: vk::make_api_version(0, 1, 2, 0),
@@ -477,8 +514,8 @@ mod tests {
             }
         }
         assert_eq!((operations, largest), (SUBGROUP_OPERATIONS, INVOCATIONS));
-        // Shader, Int64, Int64Atomics and ImageBuffer.
-        assert_eq!(features, [1, 11, 12, 47].into());
+        // Shader, Int64, Int64Atomics and ImageBuffer; and RayQueryKHR, which only devices that have it are given.
+        assert_eq!(features, [1, 11, 12, 47, 4472].into());
     }
 
     #[test]

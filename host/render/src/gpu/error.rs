@@ -56,6 +56,15 @@ pub enum GpuError {
         /// Size of the device's largest heap.
         heap_mib: u64,
     },
+    /// The device cannot find itself what a ray meets.
+    #[error(
+        "{device} has no ray query (VK_KHR_ray_query with acceleration structures). Set render.tracing to \"auto\" or to \"walk\", or \
+         choose another device with render.gpu"
+    )]
+    NoRayQuery {
+        /// Which device.
+        device: Arc<str>,
+    },
     /// A limit of the device is too small.
     #[error(
         "{what}: {needed} is beyond this device's limit of {limit}; use a smaller scene or a smaller raster"

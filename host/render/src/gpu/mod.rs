@@ -8,6 +8,7 @@
 //! by `_exit`, because what drivers run at an orderly exit may wait for the threads that hang.
 #![allow(unsafe_code)]
 
+mod acceleration;
 mod address_space;
 mod buffer;
 mod commands;
@@ -24,6 +25,7 @@ mod reopen;
 mod statistics;
 mod turn;
 
+pub(crate) use acceleration::{triangle_buffer, BodyTrees, BodyTriangles, FrameTree};
 pub use buffer::{Buffer, MemoryKind, Place};
 pub(crate) use commands::run_now;
 pub use commands::{CommandList, FrameFence, Recorder};

@@ -1,11 +1,12 @@
 //! Compute pipelines and the one table of bindings that all shaders share.
 
+use super::acceleration::FrameTree;
 use super::buffer::Buffer;
 use super::context::{Gpu, On as _};
 use super::error::GpuError;
 use super::kept::{Layouts, PipelineKey};
 use ash::vk;
-use dpm_shaders::{structs, Shader};
+use dpm_shaders::{structs, Reading, Shader};
 use std::sync::Arc;
 
 /// What a binding holds.
@@ -17,6 +18,8 @@ pub enum BindingKind {
     Storage,
     /// Storage texel buffer, which the driver reads by image instructions.
     Texel,
+    /// The tree over the bodies of a frame, in which the device finds what a ray meets.
+    BodyTree,
 }
 
 impl BindingKind {
@@ -25,19 +28,23 @@ impl BindingKind {
             Self::Uniform => vk::DescriptorType::UNIFORM_BUFFER,
             Self::Storage => vk::DescriptorType::STORAGE_BUFFER,
             Self::Texel => vk::DescriptorType::STORAGE_TEXEL_BUFFER,
+            Self::BodyTree => vk::DescriptorType::ACCELERATION_STRUCTURE_KHR,
         }
     }
 }
 
-/// The bindings that all shaders share, with their kinds. The second bindings of a buffer, as texels, are bound only for shaders that read tables so
-/// (`texel`), because devices bind a limited number.
-pub fn shared_bindings(texel: bool) -> Vec<(u32, BindingKind)> {
+/// The bindings that all shaders share, with their kinds. The second bindings of a buffer, as texels, are bound only for shaders that read tables so,
+/// because devices bind a limited number; and the tree over the bodies only for those that ask the device for hits.
+pub fn shared_bindings(reading: Reading) -> Vec<(u32, BindingKind)> {
+    let texel = reading == Reading::Texels;
+    let tree = (reading == Reading::Query).then_some((structs::TREE_BINDING.1, BindingKind::BodyTree));
     (structs::BINDINGS.iter())
         .filter(|(name, _)| texel || !name.ends_with("_ROWS"))
         .map(|&(name, binding)| {
             let rows = texel && structs::TEXEL_BINDINGS.contains(&name);
             (binding, if rows { BindingKind::Texel } else { BindingKind::Storage })
         })
+        .chain(tree)
         .collect()
 }
 
@@ -114,7 +121,7 @@ pub struct BindingSet {
 }
 
 impl BindingSet {
-    /// Binds every entry of the table.
+    /// Binds every entry of a table that has no tree.
     ///
     /// # Errors
     /// A call of Vulkan failed.
@@ -122,9 +129,25 @@ impl BindingSet {
     /// # Panics
     /// If an entry of the table is missing from `buffers`, which is a mistake of the caller.
     pub fn new(table: &Arc<BindingTable>, buffers: &[(u32, &Buffer)]) -> Result<Self, GpuError> {
+        Self::with_tree(table, buffers, None)
+    }
+
+    /// Binds every entry of the table. `tree`: that of the frame in flight.
+    ///
+    /// # Errors
+    /// As [`BindingSet::new`].
+    ///
+    /// # Panics
+    /// If an entry of the table is missing, which is a mistake of the caller.
+    pub(crate) fn with_tree(
+        table: &Arc<BindingTable>,
+        buffers: &[(u32, &Buffer)],
+        tree: Option<&FrameTree>,
+    ) -> Result<Self, GpuError> {
         let gpu = &table.gpu;
         let count = |kind| table.bindings.iter().filter(|b| b.1 == kind).count() as u32;
-        let sizes: Vec<_> = [BindingKind::Uniform, BindingKind::Storage, BindingKind::Texel]
+        let kinds = [BindingKind::Uniform, BindingKind::Storage, BindingKind::Texel, BindingKind::BodyTree];
+        let sizes: Vec<_> = kinds
             .iter()
             .map(|&k| vk::DescriptorPoolSize { ty: k.vulkan(), descriptor_count: count(k) })
             .filter(|s| s.descriptor_count > 0)
@@ -140,27 +163,50 @@ impl BindingSet {
             let info = vk::DescriptorSetAllocateInfo::default().descriptor_pool(pool).set_layouts(&layouts);
             bound.set = gpu.device.allocate_descriptor_sets(&info).on(gpu, "allocating a descriptor set")?[0];
             for &(binding, kind) in &table.bindings {
+                if kind == BindingKind::BodyTree {
+                    bound.bind_tree(binding, tree.unwrap_or_else(|| panic!("binding {binding} has no tree")));
+                    continue;
+                }
                 let buffer = buffers
                     .iter()
                     .find(|b| b.0 == binding)
                     .unwrap_or_else(|| panic!("binding {binding} has no buffer"))
                     .1;
-                let infos =
-                    [vk::DescriptorBufferInfo { buffer: buffer.handle, offset: 0, range: vk::WHOLE_SIZE }];
-                let views = [buffer.view.unwrap_or_default()];
-                let write = vk::WriteDescriptorSet::default()
-                    .dst_set(bound.set)
-                    .dst_binding(binding)
-                    .descriptor_count(1)
-                    .descriptor_type(kind.vulkan());
-                let write = match kind {
-                    BindingKind::Texel => write.texel_buffer_view(&views),
-                    _ => write.buffer_info(&infos),
-                };
-                gpu.device.update_descriptor_sets(&[write], &[]);
+                bound.bind(binding, kind, buffer);
             }
             Ok(bound)
         }
+    }
+
+    /// Binds a buffer.
+    fn bind(&self, binding: u32, kind: BindingKind, buffer: &Buffer) {
+        let infos = [vk::DescriptorBufferInfo { buffer: buffer.handle, offset: 0, range: vk::WHOLE_SIZE }];
+        let views = [buffer.view.unwrap_or_default()];
+        let write = self.write_of(binding, kind);
+        let write = match kind {
+            BindingKind::Texel => write.texel_buffer_view(&views),
+            _ => write.buffer_info(&infos),
+        };
+        // SAFETY: the set is not in use yet, and the buffer is alive.
+        unsafe { self.table.gpu.device.update_descriptor_sets(&[write], &[]) }
+    }
+
+    /// Binds the tree of a frame.
+    fn bind_tree(&self, binding: u32, tree: &FrameTree) {
+        let trees = [tree.handle()];
+        let mut bound =
+            vk::WriteDescriptorSetAccelerationStructureKHR::default().acceleration_structures(&trees);
+        let write = self.write_of(binding, BindingKind::BodyTree).push_next(&mut bound);
+        // SAFETY: the set is not in use yet, and the tree is alive.
+        unsafe { self.table.gpu.device.update_descriptor_sets(&[write], &[]) }
+    }
+
+    fn write_of(&self, binding: u32, kind: BindingKind) -> vk::WriteDescriptorSet<'static> {
+        vk::WriteDescriptorSet::default()
+            .dst_set(self.set)
+            .dst_binding(binding)
+            .descriptor_count(1)
+            .descriptor_type(kind.vulkan())
     }
 }
 

@@ -36,6 +36,8 @@ section! {
         /// Whether a GPU with two queues begins a frame while the one before it ends. Frames that take it about a slot or
         /// more follow each other faster then.
         overlap: bool = true, "", Any;
+        /// Who finds what a ray meets. The pictures are the same, but for surfaces that are equally near.
+        tracing: Tracing = Tracing::Auto, "", Any;
         /// Which processor packs the picture into bit planes.
         packer: Packer = Packer::Auto, "", Any;
         /// Constants of the paper.
@@ -137,6 +139,18 @@ impl RenderConfig {
             spatial_filter: e.spatial_filter.unwrap_or(own),
             spp_by_angle: e.spp_by_angle.unwrap_or(shared),
         }
+    }
+}
+
+words! {
+    /// Who finds what a ray meets.
+    pub enum Tracing {
+        /// The GPU itself where its driver has ray queries, else the shaders; with software Vulkan the shaders.
+        Auto = "auto",
+        /// The shaders, which walk through the program's own trees.
+        Walk = "walk",
+        /// The device by ray queries, software or not. A device without them is refused.
+        Query = "query",
     }
 }
 

@@ -1,7 +1,7 @@
 //! Settings of a run, from the rig file: the renderer's settings, the first guess of the lead, the limits of the ray
 //! budget.
 
-use crate::config::Packer;
+use crate::config::{self, Packer};
 use crate::engine::facts::RECEIPT_NS;
 use crate::plan::budget::{BudgetConfig, BudgetController, FEWEST_OF_MOST};
 use crate::plan::lead::LeadEstimator;
@@ -10,7 +10,7 @@ use crate::rig::Rig;
 use dpm_device::link::HostLink;
 use dpm_render::gpu::Gpu;
 use dpm_render::pack::Halftone;
-use dpm_render::{Output, Overlapping, RendererSettings};
+use dpm_render::{Output, Overlapping, RendererSettings, Tracing};
 
 /// Longest reserve in the lead, nanoseconds.
 const RESERVE_NS: i64 = 528_000;
@@ -68,6 +68,11 @@ pub fn renderer_settings(rig: &Rig) -> RendererSettings {
         plane_groups: groups_that_follow(rig),
         output: Output::Codes,
         overlap: if r.overlap { Overlapping::WhereItCan } else { Overlapping::Never },
+        tracing: match r.tracing {
+            config::Tracing::Auto => Tracing::Auto,
+            config::Tracing::Walk => Tracing::Walk,
+            config::Tracing::Query => Tracing::RayQuery,
+        },
     }
 }
 
