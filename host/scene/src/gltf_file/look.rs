@@ -86,11 +86,14 @@ struct Reader<'a> {
     cancel: &'a Cancel,
     /// Decoded images.
     images: HashMap<usize, Picture>,
-    /// (glTF texture, sRGB) to index in `textures`.
-    known: HashMap<(usize, bool), u32>,
+    /// (glTF texture, sRGB, with heights) to index in `textures`.
+    known: HashMap<(usize, bool, bool), u32>,
     textures: Vec<Texture>,
     texels: u64,
 }
+
+/// The slot of the texture that tilts a surface.
+const NORMAL: &str = "normal";
 
 /// A texture reference of a material before its image is decoded.
 struct Use {
@@ -177,13 +180,16 @@ impl Reader<'_> {
     }
 
     fn reference(&mut self, u: &Use, warnings: &mut Vec<String>) -> Result<TextureRef, SceneError> {
-        let texture = match self.known.get(&(u.texture, u.srgb)) {
+        let image = self.image(u, warnings)?;
+        let heights = u.slot == NORMAL && self.images[&image].red_green_only;
+        let key = (u.texture, u.srgb, heights);
+        let texture = match self.known.get(&key) {
             Some(&known) => known,
             None => {
-                let made = self.texture(u, warnings)?;
+                let made = self.texture(u, image, heights, warnings)?;
                 self.textures.push(made);
                 let index = self.textures.len() as u32 - 1;
-                self.known.insert((u.texture, u.srgb), index);
+                self.known.insert(key, index);
                 index
             }
         };
@@ -195,15 +201,33 @@ impl Reader<'_> {
         })
     }
 
-    fn texture(&mut self, u: &Use, warnings: &mut Vec<String>) -> Result<Texture, SceneError> {
-        let json = &self.document.as_json().textures[u.texture];
-        let image = json.source.value();
+    /// The index of the image of a texture, which is decoded by then.
+    fn image(&mut self, u: &Use, warnings: &mut Vec<String>) -> Result<usize, SceneError> {
+        let image = self.document.as_json().textures[u.texture].source.value();
         if !self.images.contains_key(&image) {
             self.cancel.check(self.limits)?;
             let decoded = self.decode(image)?;
+            if decoded.cut_off {
+                warnings.push(format!(
+                    "{}: it holds numbers outside of 0 to 1, which a texture does not hold: they are cut off there",
+                    self.image_items[image].name
+                ));
+            }
             self.images.insert(image, decoded);
         }
-        let Picture { size: Size { width, height }, ref texels, srgb } = self.images[&image];
+        Ok(image)
+    }
+
+    /// A texture of a decoded image, with `heights` as normals that need their third number.
+    fn texture(
+        &mut self,
+        u: &Use,
+        image: usize,
+        heights: bool,
+        warnings: &mut Vec<String>,
+    ) -> Result<Texture, SceneError> {
+        let picture = &self.images[&image];
+        let (Size { width, height }, srgb) = (picture.size, picture.srgb);
         if srgb.is_some_and(|srgb| srgb != u.srgb) {
             let (said, used) =
                 if u.srgb { ("linear", "colours in sRGB") } else { ("sRGB", "linear numbers") };
@@ -229,7 +253,7 @@ impl Reader<'_> {
         Ok(Texture {
             width,
             height,
-            texels: texels.clone(),
+            texels: if heights { picture.with_heights() } else { picture.texels.clone() },
             srgb: u.srgb,
             wrap_u: sampler.as_ref().map_or(Wrap::Repeat, |s| wrap(s.wrap_s())),
             wrap_v: sampler.as_ref().map_or(Wrap::Repeat, |s| wrap(s.wrap_t())),
@@ -279,7 +303,7 @@ fn normal_use(normal: &gltf::material::NormalTexture, material: &Item) -> Result
         None => None,
     };
     let mut out = Use {
-        slot: "normal",
+        slot: NORMAL,
         texture: normal.texture().index(),
         uv_set: normal.tex_coord(),
         offset: [0.0; 2],

@@ -33,6 +33,22 @@ pub(super) struct Picture {
     pub texels: Vec<[u8; 4]>,
     /// Whether red, green and blue are encoded as sRGB, if the image says so in words that glTF makes binding.
     pub srgb: Option<bool>,
+    /// It stores red and green alone. As normals such a picture lacks their heights ([`Picture::with_heights`]).
+    pub red_green_only: bool,
+    /// Some of its numbers lay outside of 0 to 1 and were cut off there.
+    pub cut_off: bool,
+}
+
+impl Picture {
+    /// The texels with blue as normals of length 1 need it, which point away from the surface.
+    pub(super) fn with_heights(&self) -> Vec<[u8; 4]> {
+        let height = |[r, g, _, a]: [u8; 4]| {
+            let [x, y] = [r, g].map(|byte| f32::from(byte) / 127.5 - 1.0);
+            let z = (1.0 - x * x - y * y).max(0.0).sqrt();
+            [r, g, (z * 127.5 + 128.0) as u8, a]
+        };
+        self.texels.iter().copied().map(height).collect()
+    }
 }
 
 /// Decodes PNG, JPEG or KTX2. `texels_so_far` counts those of the scene's other textures.
@@ -76,7 +92,7 @@ pub(super) fn decode(
     bounded.limits(memory);
     let rgba = bounded.decode().map_err(failed)?.into_rgba8();
     let texels = rgba.as_raw().chunks_exact(4).map(|c| [c[0], c[1], c[2], c[3]]).collect();
-    Ok(Picture { size, texels, srgb: None })
+    Ok(Picture { size, texels, srgb: None, red_green_only: false, cut_off: false })
 }
 
 /// Refuses a picture without texels, or with more than the limits allow.

@@ -121,6 +121,52 @@ pub(crate) fn with_image(bytes: &[u8]) -> Glb {
         .set("/materials/0/pbrMetallicRoughness/baseColorTexture", json!({"index": 0}))
 }
 
+/// A file whose only texture has the extension, without an image for programs that do not know it.
+pub(crate) fn with_ktx2(bytes: &[u8]) -> Glb {
+    let name = "KHR_texture_basisu";
+    with_image(bytes)
+        .set("/images/0/mimeType", json!("image/ktx2"))
+        .set("/textures", json!([{"extensions": {name: {"source": 0}}}]))
+        .set("/extensionsUsed", json!([name]))
+        .set("/extensionsRequired", json!([name]))
+}
+
+/// A KTX2 file of one level with texels in sRGB of a format that Vulkan has a name for. `scheme` is its supercompression.
+pub(crate) fn ktx2(format: u32, width: u32, height: u32, scheme: u32, data: &[u8]) -> Vec<u8> {
+    let words = |w: &[u32]| w.iter().flat_map(|w| w.to_le_bytes()).collect::<Vec<u8>>();
+    let sample = [7 << 16, 0, 0, 255];
+    let descriptor = words(&[&[44, 0, 2 | 40 << 16, 1 | 1 << 8 | 2 << 16, 0, 4, 0][..], &sample].concat());
+    let head = words(&[
+        format,
+        1,
+        width,
+        height,
+        0,
+        0,
+        1,
+        1,
+        scheme,
+        104,
+        descriptor.len() as u32,
+        0,
+        0,
+        0,
+        0,
+        0,
+        0,
+    ]);
+    let at = 104 + descriptor.len() as u64;
+    let level = [at, data.len() as u64, data.len() as u64].map(u64::to_le_bytes).concat();
+    [&b"\xabKTX 20\xbb\r\n\x1a\n"[..], &head, &level, &descriptor, data].concat()
+}
+
+/// `bytes` with the word at `at` set to `value`.
+pub(crate) fn changed(bytes: &[u8], at: usize, value: u32) -> Vec<u8> {
+    let mut out = bytes.to_vec();
+    out[at..at + 4].copy_from_slice(&value.to_le_bytes());
+    out
+}
+
 /// Base64 with padding.
 pub(crate) fn base64(bytes: &[u8]) -> String {
     const ALPHABET: &[u8; 64] = b"ABCDEFGHIJKLMNOPQRSTUVWXYZabcdefghijklmnopqrstuvwxyz0123456789+/";

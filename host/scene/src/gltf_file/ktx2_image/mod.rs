@@ -1,18 +1,23 @@
 //! Decodes images in KTX2, the container of the extension KHR_texture_basisu, to texels of 8-bit RGBA.
 //!
 //! The extension allows what Basis Universal has compressed: ETC1S and UASTC ([`basis`]). Files by others also hold
-//! blocks as graphics cards take them ([`blocks`]) and plain texels ([`plain`]). Mipmaps are left out: level 0 is the
-//! picture, and the renderer averages by samples. Every size is checked before memory of that size is taken.
+//! blocks as graphics cards take them ([`blocks`], [`etc`]) and plain texels ([`plain`]). Mipmaps are left out: level 0
+//! is the picture, and the renderer averages by samples. Every size is checked before memory of that size is taken.
 
 mod basis;
 mod blocks;
 mod container;
+mod etc;
+mod numbers;
 mod plain;
 
 use std::borrow::Cow;
+use std::io::Read;
 
 use container::File;
+use flate2::bufread::ZlibDecoder;
 use ktx2::{ColorModel, Format, Header, SupercompressionScheme, TransferFunction};
+use numbers::Rounder;
 use ruzstd::decoding::FrameDecoder;
 use serde_json::{json, Value};
 
@@ -28,6 +33,9 @@ const REMEDY: &str = "encode it as ETC1S or UASTC, or export PNG or JPEG texture
 
 /// A stored byte of a Zstandard stream stands for at most so many: a block of 3 bytes and more makes up to 128 KiB.
 const MOST_FROM_A_BYTE: usize = 1 << 16;
+
+/// A stored byte of a ZLIB stream stands for at most so many: two bits repeat up to 258.
+const MOST_FROM_A_BYTE_OF_ZLIB: usize = 4 * 258;
 
 /// A Zstandard stream may ask for a window of so many bytes, whatever the size of its content. Every decoder has to
 /// allow that much by the format's own advice.
@@ -63,8 +71,8 @@ pub(super) fn is_ktx2(bytes: &[u8]) -> bool {
 /// The texels of level 0 of a KTX2 image. `texels_so_far` counts those of the scene's other textures.
 ///
 /// # Errors
-/// An image that contradicts its format, is beyond the limits, or holds something else than one flat picture of 8 bits
-/// with three or four channels. The text names `item` and what to do.
+/// An image that contradicts its format, is beyond the limits, or holds something else than one flat picture of a format
+/// that is known here. The text names `item` and what to do.
 pub(super) fn decode(
     item: &Item,
     bytes: &[u8],
@@ -79,33 +87,60 @@ pub(super) fn decode(
     check_size(item, size, texels_so_far, limits)?;
     check_meaning(item, &file)?;
     let content = Content { item, file: &file, size };
-    let mut texels = match (header.format, file.descriptor.model) {
-        (None, Some(ColorModel::ETC1S)) => basis::etc1s(&content)?,
-        (None, Some(ColorModel::UASTC)) => basis::uastc(&content)?,
+    let mut stored = match (header.format, file.descriptor.model) {
+        (None, Some(ColorModel::ETC1S)) => Stored::of_bytes(basis::etc1s(&content)?),
+        (None, Some(ColorModel::UASTC)) => Stored::of_bytes(basis::uastc(&content)?),
         (None, model) => return Err(content.unsupported(&format!("of the colour model {model:?}"))),
-        (Some(format), _) => stored_texels(&content, format)?,
+        (Some(format), _) => Stored::of(&content, format)?,
     };
-    swizzle(item, &file, &mut texels)?;
+    let order = file.note("KTXswizzle");
+    if let Some(order) = order.as_deref().filter(|order| *order != "rgba") {
+        swizzle(item, order, &mut stored.texels)?;
+    }
+    let as_stored = matches!(order.as_deref(), None | Some("rgba" | "rg01"));
     let srgb = match file.descriptor.transfer {
         Some(TransferFunction::SRGB) => Some(true),
         Some(TransferFunction::Linear) => Some(false),
         _ => None,
     };
-    Ok(Picture { size, texels, srgb })
+    Ok(Picture {
+        size,
+        texels: stored.texels,
+        srgb,
+        red_green_only: stored.channels == 2 && as_stored,
+        cut_off: stored.cut_off,
+    })
 }
 
-/// The texels of a format that Vulkan has a name for.
-fn stored_texels(content: &Content, format: Format) -> Result<Vec<[u8; 4]>, SceneError> {
-    if let Some(layout) = plain::Layout::of(format) {
-        return layout.texels(content);
+/// What an image stores, as texels.
+struct Stored {
+    texels: Vec<[u8; 4]>,
+    /// Channels, 1 to 4, beginning with red.
+    channels: usize,
+    /// Some numbers lie beyond those of a texture.
+    cut_off: bool,
+}
+
+impl Stored {
+    /// Texels of three or four channels that are bytes already.
+    fn of_bytes(texels: Vec<[u8; 4]>) -> Self {
+        Self { texels, channels: 4, cut_off: false }
     }
-    if let Some(block) = blocks::Block::of(format) {
-        return block.texels(content);
+
+    /// The texels of a format that Vulkan has a name for.
+    fn of(content: &Content, format: Format) -> Result<Self, SceneError> {
+        let mut rounder = Rounder::default();
+        let (texels, channels) = if let Some(layout) = plain::Layout::of(format) {
+            (layout.texels(content, &mut rounder)?, layout.channels)
+        } else if let Some(block) = blocks::Block::of(format) {
+            (block.texels(content, &mut rounder)?, block.channels)
+        } else if blocks::is_astc(format) {
+            (basis::astc(content, format)?, 4)
+        } else {
+            return Err(content.unsupported(&format!("in {format:?}")));
+        };
+        Ok(Self { texels, channels, cut_off: rounder.cut_off })
     }
-    if blocks::is_astc(format) {
-        return basis::astc(content, format);
-    }
-    Err(content.unsupported(&format!("in {format:?}")))
 }
 
 /// Refuses what is not one flat picture.
@@ -136,14 +171,13 @@ fn check_meaning(item: &Item, file: &File) -> Result<(), SceneError> {
 }
 
 /// Puts the channels where the image's KTXswizzle wants them. glTF forbids one, but encoders leave 'rrr1' at grey images.
-fn swizzle(item: &Item, file: &File, texels: &mut [[u8; 4]]) -> Result<(), SceneError> {
-    let Some(order) = file.note("KTXswizzle").filter(|order| order != "rgba") else { return Ok(()) };
+fn swizzle(item: &Item, order: &str, texels: &mut [[u8; 4]]) -> Result<(), SceneError> {
     // The channels of a texel, and behind them the constants.
     let sources: Option<Vec<usize>> = order.chars().map(|c| "rgba01".find(c)).collect();
     let Some(&[r, g, b, a]) = sources.as_deref().and_then(<[usize]>::as_array) else {
         return Err(item.error(format!(
             "says that its KTXswizzle is '{}', which is none: export it again",
-            shorten(&order)
+            shorten(order)
         )));
     };
     for texel in texels {
@@ -190,7 +224,28 @@ impl Content<'_> {
                 }
                 Ok(Cow::Owned(plain))
             }
+            Some(SupercompressionScheme::ZLIB) => {
+                if needed / MOST_FROM_A_BYTE_OF_ZLIB > data.len() {
+                    return Err(cut_off(data.len()));
+                }
+                self.inflated(data, needed).map(Cow::Owned)
+            }
             Some(other) => Err(self.unsupported(&format!("with supercompression {other:?}"))),
+        }
+    }
+
+    /// A ZLIB stream of `needed` bytes and no more.
+    fn inflated(&self, data: &[u8], needed: usize) -> Result<Vec<u8>, SceneError> {
+        let failed = |e: std::io::Error| self.item.error(format!("cannot be decompressed: {e}"));
+        let mut decoder = ZlibDecoder::new(data);
+        let mut plain = vec![0; needed];
+        decoder.read_exact(&mut plain).map_err(failed)?;
+        // Only the end of the stream tells whether its sum is right.
+        match decoder.read(&mut [0]).map_err(failed)? {
+            0 => Ok(plain),
+            _ => Err(self
+                .item
+                .error(format!("holds more than the {needed} bytes of texels of its size: export it again"))),
         }
     }
 }
