@@ -67,7 +67,8 @@ fn texels_are_those_that_other_programs_read() {
         assert_eq!((width, height), expected.dimensions(), "{name}");
         let pairs = texels.iter().flatten().zip(expected.as_raw());
         let greatest = pairs.map(|(a, b)| a.abs_diff(*b)).max().unwrap();
-        // Between two colours of BC1 lie thirds, which this program rounds and the other one cuts off; so it is with these.
+        // Between two colours of BC1 lie thirds, which this program rounds and the other one cuts off. So it is with all
+        // of these.
         let rounded =
             ["blocks_bc1", "blocks_bc3", "chance_bc4", "chance_bc5", "chance_eac_r", "chance_eac_rg"];
         let allowed = u8::from(rounded.contains(&name.as_str()));

@@ -71,8 +71,8 @@ pub(super) fn is_ktx2(bytes: &[u8]) -> bool {
 /// The texels of level 0 of a KTX2 image. `texels_so_far` counts those of the scene's other textures.
 ///
 /// # Errors
-/// An image that contradicts its format, is beyond the limits, or holds something else than one flat picture of a format
-/// that is known here. The text names `item` and what to do.
+/// An image that contradicts its format, is beyond the limits, or holds something else than one flat picture of a
+/// format that is known here. The text names `item` and what to do.
 pub(super) fn decode(
     item: &Item,
     bytes: &[u8],

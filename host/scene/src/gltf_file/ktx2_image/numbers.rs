@@ -45,7 +45,7 @@ impl Number {
 
 /// A number of -1 to 1 as one of 0 to 1, which is how glTF stores directions.
 ///
-/// Images with a sign hold directions: a colour has none. The least of their numbers stands for -1, as the one above it.
+/// Images with a sign hold directions: a colour has none. The least of their numbers stands for -1, as does the next.
 pub(super) fn raised(number: f32) -> f32 {
     number.max(-1.0) * 0.5 + 0.5
 }
