@@ -1,10 +1,8 @@
 //! A serial port that a client keeps open: it is opened beside the client, read without waiting, and opened again after an
 //! unplug. With it comes the pacing of the echoes that map a device's clock.
 
-use crate::stream::Stream;
+use crate::stream::{OnThread, Opener, Stream};
 use crate::time::HostTime;
-use crossbeam::channel::{Receiver, TryRecvError};
-use serialport::SerialPort;
 
 const MS: i64 = 1_000_000;
 /// Interval between attempts to open the port.
@@ -17,7 +15,7 @@ const ECHO_LOST_NS: i64 = 500 * MS;
 
 enum State {
     Idle { retry_at: HostTime },
-    Opening(Receiver<serialport::Result<Box<dyn SerialPort>>>),
+    Opening,
     Open(Box<dyn Stream>),
 }
 
@@ -35,16 +33,33 @@ pub(crate) enum Polled {
 /// A port that is kept open.
 pub(crate) struct Line {
     port: String,
-    baud: u32,
+    opener: Box<dyn Opener>,
     state: State,
     problem: Option<String>,
+}
+
+/// Opens `port` of the operating system.
+fn os_port(port: &str, baud: u32) -> Result<Box<dyn Stream>, String> {
+    match crate::tty::open(port, baud) {
+        Ok(port) => Ok(Box::new(port)),
+        Err(error) => {
+            let remedy = crate::tty::refusal(&error).remedy();
+            Err(format!("cannot open {port}: {error}; {remedy}"))
+        }
+    }
 }
 
 impl Line {
     /// A line to `port`, which the first poll begins to open.
     pub(crate) fn new(port: &str, baud: u32) -> Self {
+        let path = port.to_owned();
+        Self::through(port, Box::new(OnThread::new("serial-open", move || os_port(&path, baud))))
+    }
+
+    /// The same, but `opener` opens it; `port` is only its name.
+    pub(crate) fn through(port: &str, opener: Box<dyn Opener>) -> Self {
         let state = State::Idle { retry_at: HostTime(i64::MIN) };
-        Self { port: port.to_owned(), baud, state, problem: None }
+        Self { port: port.to_owned(), opener, state, problem: None }
     }
 
     /// Takes a port that is open already; if it is lost, the line opens its own.
@@ -60,37 +75,24 @@ impl Line {
     /// Opens the port if it is time to. Never waits.
     pub(crate) fn poll(&mut self, now: HostTime) -> Polled {
         match &self.state {
-            State::Idle { retry_at } if now >= *retry_at => self.state = self.start_opening(now),
+            State::Idle { retry_at } if now >= *retry_at => {
+                self.state = match self.opener.begin() {
+                    true => State::Opening,
+                    false => State::Idle { retry_at: now.plus_ns(RETRY_EVERY_NS) },
+                }
+            }
             State::Idle { .. } => {}
-            State::Opening(result) => match result.try_recv() {
-                Ok(Ok(port)) => {
-                    self.take_over(Box::new(port));
+            State::Opening => match self.opener.outcome() {
+                None => {}
+                Some(Ok(port)) => {
+                    self.take_over(port);
                     return Polled::Opened;
                 }
-                Ok(Err(error)) => {
-                    let remedy = crate::tty::refusal(&error).remedy();
-                    self.lose(now, format!("cannot open {}: {error}; {remedy}", self.port));
-                }
-                Err(TryRecvError::Empty) => {}
-                Err(TryRecvError::Disconnected) => self.lose(now, "the opening thread ended".into()),
+                Some(Err(why)) => self.lose(now, why),
             },
             State::Open(_) => return Polled::Open,
         }
         Polled::Closed
-    }
-
-    fn start_opening(&self, now: HostTime) -> State {
-        let (send, receive) = crossbeam::channel::bounded(1);
-        let (port, baud) = (self.port.clone(), self.baud);
-        // Opening a port can block in its driver, so a helper thread does it, one attempt at a time.
-        let spawned = std::thread::Builder::new().name("serial-open".into()).spawn(move || {
-            // If the client was dropped, nobody receives this, and the port closes again.
-            let _ = send.send(crate::tty::open(&port, baud));
-        });
-        match spawned {
-            Ok(_) => State::Opening(receive),
-            Err(_) => State::Idle { retry_at: now.plus_ns(RETRY_EVERY_NS) },
-        }
     }
 
     fn lose(&mut self, now: HostTime, why: String) {
@@ -222,6 +224,6 @@ mod tests {
         line.poll(HostTime(100 * MS));
         assert!(matches!(line.state, State::Idle { .. }));
         line.poll(HostTime(200 * MS));
-        assert!(matches!(line.state, State::Opening(_)));
+        assert!(matches!(line.state, State::Opening));
     }
 }

@@ -11,7 +11,7 @@ pub mod vrpn;
 pub use gate::{PacketCounters, SampleCounters, SampleGate, TrackerCounters};
 
 use crate::pose::Pose;
-pub use crate::stream::Stream;
+pub use crate::stream::{Opener, Stream};
 use crate::time::HostTime;
 
 /// Index of a tracked body in the order the rig file names them.

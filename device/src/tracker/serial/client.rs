@@ -6,6 +6,7 @@ use crate::clock_map::{ClockMap, ExchangeOutcome};
 use crate::cobs::Deframer;
 use crate::line::{EchoPace, Line, Polled};
 use crate::pose::Pose;
+use crate::stream::Opener;
 use crate::time::{DeviceTicks, HostClock, HostTime};
 use crate::tracker::{
     BodyIndex, BodyKey, SampleGate, Stream, Tracker, TrackerCounters, TrackerError, TrackerSample,
@@ -73,6 +74,19 @@ impl SerialTracker {
             opened_at: HostTime(i64::MIN),
             is_settled: false,
         })
+    }
+
+    /// A tracker whose port `opener` opens when it is polled, instead of the operating system.
+    ///
+    /// # Errors
+    /// As [`SerialTracker::open`].
+    pub fn open_through(
+        config: SerialTrackerConfig,
+        clock: Arc<dyn HostClock>,
+        opener: Box<dyn Opener>,
+    ) -> Result<Self, TrackerError> {
+        let line = Line::through(&config.port, opener);
+        Ok(Self { line, ..Self::open(config, clock)? })
     }
 
     /// A tracker whose port is open already: a conversation in memory, where a test writes the device's part. If it is

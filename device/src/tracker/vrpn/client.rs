@@ -3,14 +3,13 @@
 
 use super::wire::{self, system, type_name, Message, COOKIE, COOKIE_BYTES};
 use crate::clock_map::{ClockMap, ExchangeOutcome};
+use crate::stream::{OnThread, Opener};
 use crate::time::{DeviceTicks, HostClock, HostTime};
 use crate::tracker::{
     BodyIndex, BodyKey, SampleGate, Stream, Tracker, TrackerCounters, TrackerError, TrackerSample,
 };
-use crossbeam::channel::{Receiver, TryRecvError};
 use std::io::ErrorKind;
 use std::net::{SocketAddr, TcpStream, ToSocketAddrs};
-use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::Arc;
 use std::time::Duration;
 
@@ -20,7 +19,7 @@ const BUFFER_BYTES: usize = 64 * 1024;
 /// Interval between attempts to connect.
 const RETRY_EVERY_NS: i64 = 500 * MS;
 /// Timeout of an attempt to connect.
-const CONNECT_TIMEOUT: Duration = Duration::from_millis(1000);
+pub const CONNECT_TIMEOUT: Duration = Duration::from_millis(1000);
 /// The client disconnects from a server that sent nothing for this long, although it was pinged, and connects anew.
 const SILENCE_NS: i64 = 3_000 * MS;
 /// Pings: this many quickly, the rest slowly.
@@ -65,8 +64,8 @@ enum Kind {
 enum State {
     /// Waiting for the next attempt.
     Idle { retry_at: HostTime },
-    /// A helper thread connects.
-    Connecting(Receiver<std::io::Result<TcpStream>>),
+    /// An attempt to connect lasts.
+    Connecting,
     /// Connected; the cookie may still be missing.
     Open { stream: Box<dyn Stream>, greeted: bool, heard_at: HostTime },
 }
@@ -75,8 +74,8 @@ enum State {
 pub struct VrpnClient {
     config: VrpnConfig,
     clock: Arc<dyn HostClock>,
+    opener: Box<dyn Opener>,
     state: State,
-    abandoned: Arc<AtomicBool>,
     gate: SampleGate,
     senders: Vec<Sender>,
     kinds: Vec<Kind>,
@@ -122,6 +121,20 @@ impl OneWay {
 impl VrpnClient {
     /// A client that connects when polled. `clock` is the host's clock, the one `poll` is called with.
     pub fn open(config: VrpnConfig, clock: Arc<dyn HostClock>) -> Result<Self, TrackerError> {
+        let server = config.server.clone();
+        // Name look-up and connecting can block without bound, so a helper thread does them.
+        Self::open_through(config, clock, Box::new(OnThread::new("vrpn-connect", move || connect(&server))))
+    }
+
+    /// A client that `opener` connects when it is polled, instead of the operating system.
+    ///
+    /// # Errors
+    /// The configuration names no server.
+    pub fn open_through(
+        config: VrpnConfig,
+        clock: Arc<dyn HostClock>,
+        opener: Box<dyn Opener>,
+    ) -> Result<Self, TrackerError> {
         if config.server.is_empty() {
             return Err(TrackerError::Protocol("VRPN: the server's address is empty".into()));
         }
@@ -129,8 +142,8 @@ impl VrpnClient {
             gate: SampleGate::new(config.bodies.len()),
             config,
             clock,
+            opener,
             state: State::Idle { retry_at: HostTime(i64::MIN) },
-            abandoned: Arc::new(AtomicBool::new(false)),
             senders: vec![Sender::Unknown; MAX_NUMBERS],
             kinds: vec![Kind::Unknown; MAX_NUMBERS],
             names_seen: Vec::new(),
@@ -176,23 +189,6 @@ impl VrpnClient {
     /// The map of the server's clock, once a ping was answered.
     pub fn clock_map(&self) -> Option<&ClockMap> {
         self.map.is_ready().then_some(&self.map)
-    }
-
-    fn start_connecting(&self) -> State {
-        let (send, receive) = crossbeam::channel::bounded(1);
-        let server = self.config.server.clone();
-        let abandoned = self.abandoned.clone();
-        // Name look-up and connecting can block without bound, so a helper thread does them; one attempt at a time.
-        let spawned = std::thread::Builder::new().name("vrpn-connect".into()).spawn(move || {
-            let result = connect(&server);
-            if !abandoned.load(Ordering::Relaxed) {
-                let _ = send.send(result);
-            }
-        });
-        match spawned {
-            Ok(_) => State::Connecting(receive),
-            Err(_) => State::Idle { retry_at: self.clock.now().plus_ns(RETRY_EVERY_NS) },
-        }
     }
 
     fn begin(&mut self, mut stream: Box<dyn Stream>, now: HostTime) -> std::io::Result<()> {
@@ -465,7 +461,14 @@ fn without_waiting(stream: &TcpStream) -> std::io::Result<()> {
     stream.set_nodelay(true)
 }
 
-fn connect(server: &str) -> std::io::Result<TcpStream> {
+fn connect(server: &str) -> Result<Box<dyn Stream>, String> {
+    match connect_to_any(server).and_then(|stream| without_waiting(&stream).map(|()| stream)) {
+        Ok(stream) => Ok(Box::new(stream)),
+        Err(error) => Err(format!("cannot connect to {server}: {error}")),
+    }
+}
+
+fn connect_to_any(server: &str) -> std::io::Result<TcpStream> {
     let text = server.trim_start_matches("tcp://");
     let addresses: Vec<SocketAddr> = match text.to_socket_addrs() {
         Ok(found) => found.collect(),
@@ -484,20 +487,21 @@ fn connect(server: &str) -> std::io::Result<TcpStream> {
 impl Tracker for VrpnClient {
     fn poll(&mut self, now: HostTime, sink: &mut dyn FnMut(&TrackerSample)) -> Result<usize, TrackerError> {
         match &self.state {
-            State::Idle { retry_at } if now >= *retry_at => self.state = self.start_connecting(),
+            State::Idle { retry_at } if now >= *retry_at => {
+                self.state = match self.opener.begin() {
+                    true => State::Connecting,
+                    false => State::Idle { retry_at: now.plus_ns(RETRY_EVERY_NS) },
+                }
+            }
             State::Idle { .. } => {}
-            State::Connecting(result) => match result.try_recv() {
-                Ok(Ok(stream)) => {
-                    let begun = without_waiting(&stream).and_then(|()| self.begin(Box::new(stream), now));
-                    if let Err(error) = begun {
+            State::Connecting => match self.opener.outcome() {
+                None => {}
+                Some(Ok(stream)) => {
+                    if let Err(error) = self.begin(stream, now) {
                         self.lose(now, error.to_string());
                     }
                 }
-                Ok(Err(error)) => {
-                    self.lose(now, format!("cannot connect to {}: {error}", self.config.server))
-                }
-                Err(TryRecvError::Empty) => {}
-                Err(TryRecvError::Disconnected) => self.lose(now, "the connecting thread ended".into()),
+                Some(Err(why)) => self.lose(now, why),
             },
             State::Open { .. } => return Ok(self.converse(now, sink)),
         }
@@ -534,11 +538,5 @@ impl Tracker for VrpnClient {
         });
         text.push_str(&format!("; connections {}, pongs {}, {c}", self.connections, self.pongs));
         text
-    }
-}
-
-impl Drop for VrpnClient {
-    fn drop(&mut self) {
-        self.abandoned.store(true, Ordering::Relaxed);
     }
 }
