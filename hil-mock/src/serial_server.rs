@@ -1,7 +1,7 @@
 //! Sends true poses as the serial pose stream: the device's side as a state machine, and the same on a port or
 //! pseudo-terminal.
 
-use crate::faults::{FaultError, FaultKind};
+use crate::faults::{FaultError, FaultKind, FaultPlan};
 use crate::report_queue::ReportQueue;
 use crate::tracker::SampleSource;
 use dpm_device::cobs::Deframer;
@@ -40,9 +40,30 @@ pub const SERIAL_FAULTS: [FaultKind; 14] = [
 pub const TICKS_PER_SECOND: u32 = 1_000_000;
 const HELLO_EVERY_NS: i64 = 1_000_000_000;
 
+/// How a device differs from others of its kind.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct SerialDeviceKind {
+    /// Version that it announces.
+    pub version: u8,
+    /// Number of its first body.
+    pub first_body: u8,
+    /// Error of its clock, parts per billion.
+    pub skew_ppb: i32,
+}
+
+impl Default for SerialDeviceKind {
+    fn default() -> Self {
+        Self { version: VERSION, first_body: 0, skew_ppb: 0 }
+    }
+}
+
 /// The device without its port.
 pub struct SerialPoseDevice {
+    kind: SerialDeviceKind,
     source: SampleSource,
+    /// When its clock began, and the first sample that it has seen since.
+    began_at: HostTime,
+    first: u64,
     queue: ReportQueue,
     deframer: Deframer<[u8; MAX_PACKET]>,
     hello_due: HostTime,
@@ -55,12 +76,39 @@ impl SerialPoseDevice {
         source.config().faults.check_supported(&SERIAL_FAULTS, "the serial tracker")?;
         let hello_due = HostTime(i64::MIN);
         Ok(Self {
+            kind: SerialDeviceKind::default(),
+            began_at: source.config().start,
+            first: 0,
             source,
             queue: ReportQueue::new(),
             deframer: Deframer::new([0; MAX_PACKET]),
             hello_due,
             echoes: 0,
         })
+    }
+
+    /// The same device as one of this kind.
+    pub fn of_kind(self, kind: SerialDeviceKind) -> Self {
+        Self { kind, ..self }
+    }
+
+    /// From now on the device has these faults, with times relative to the source's start.
+    ///
+    /// # Errors
+    /// A fault that the device does not implement; the former faults remain.
+    pub fn set_faults(&mut self, faults: FaultPlan) -> Result<(), FaultError> {
+        faults.check_supported(&SERIAL_FAULTS, "the serial tracker")?;
+        self.source.set_faults(faults);
+        Ok(())
+    }
+
+    /// The device starts at `now`: its clock and its numbers begin anew, and what was captured before is never sent.
+    pub fn begin_at(&mut self, now: HostTime) {
+        self.queue = ReportQueue::new();
+        let _ = self.queue.take_due(&self.source, now);
+        self.first = self.queue.newest().map_or(0, |newest| newest + 1);
+        (self.began_at, self.hello_due) = (now, now);
+        self.deframer.reset();
     }
 
     /// The source of the poses.
@@ -79,7 +127,8 @@ impl SerialPoseDevice {
     }
 
     fn ticks_at(&self, now: HostTime) -> u64 {
-        (now.ns_since(self.source.config().start).max(0) / 1000) as u64
+        let t = i128::from(now.ns_since(self.began_at).max(0));
+        ((t + t * i128::from(self.kind.skew_ppb) / 1_000_000_000) / 1000) as u64
     }
 
     /// Handles bytes of the host and appends answers to `out`.
@@ -101,21 +150,21 @@ impl SerialPoseDevice {
         if now >= self.hello_due {
             self.hello_due = now.plus_ns(HELLO_EVERY_NS);
             let hello = SerialMessage::Hello {
-                version: VERSION,
+                version: self.kind.version,
                 bodies: bodies as u8,
                 ticks_per_second: TICKS_PER_SECOND,
             };
             hello.encode(out);
         }
         let due = self.queue.take_due(&self.source, now).to_vec();
-        for k in due {
+        for k in due.into_iter().filter(|k| *k >= self.first) {
             let start = out.len();
             for body in 0..bodies {
                 let Some(sample) = self.source.sample(BodyIndex(body as u16), k) else { continue };
                 let message = SerialMessage::Pose {
-                    body: body as u8,
+                    body: self.kind.first_body.wrapping_add(body as u8),
                     tracked: sample.tracked,
-                    sequence: sample.sequence,
+                    sequence: sample.sequence.wrapping_sub(self.first as u32),
                     captured: self.ticks_at(sample.captured_at),
                     position: sample.pose.position_m.map(|c| c as f32),
                     rotation_xyzw: sample.pose.rotation_xyzw.map(|c| c as f32),
@@ -214,4 +263,36 @@ fn run(
         std::thread::sleep(Duration::from_nanos(wait_ns as u64));
     }
     Ok(())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::motion::{Motion, MotionSpec};
+    use crate::tracker::MockTrackerConfig;
+    use dpm_device::pose::Pose;
+
+    #[test]
+    fn a_device_that_starts_again_counts_and_keeps_time_anew() {
+        let still = Motion::new(&MotionSpec::Still {}, Pose::IDENTITY).unwrap();
+        let source = SampleSource::new(MockTrackerConfig::default(), vec![still]).unwrap();
+        let kind = SerialDeviceKind { version: 7, first_body: 3, skew_ppb: 1_000_000 };
+        let mut device = SerialPoseDevice::new(source).unwrap().of_kind(kind);
+        device.report(HostTime(1_000_000_000), &mut Vec::new());
+        device.begin_at(HostTime(2_000_000_000));
+        let (mut out, mut messages) = (Vec::new(), Vec::new());
+        device.report(HostTime(2_010_000_000), &mut out);
+        Deframer::new([0; MAX_PACKET]).push(&out, &mut |packet| {
+            messages.push(SerialMessage::decode(packet).unwrap());
+        });
+        assert!(matches!(messages[0], SerialMessage::Hello { version: 7, .. }), "{messages:?}");
+        let SerialMessage::Pose { body: 3, sequence: 0, captured, .. } = messages[1] else {
+            panic!("{messages:?}");
+        };
+        // Samples come every 2 ms, and this clock is fast by a thousandth.
+        assert!((1_900..=2_002).contains(&captured), "{captured}");
+        assert!(messages.len() >= 4, "{messages:?}");
+        assert!(device.set_faults("unplug@1s+1s".parse().unwrap()).is_err());
+        assert!(device.set_faults("nan=1".parse().unwrap()).is_ok());
+    }
 }

@@ -1,7 +1,7 @@
 //! Sends true poses as VRPN messages: the server's side of one connection as a state machine, and the samples of all
 //! connections.
 
-use crate::faults::{FaultError, FaultKind};
+use crate::faults::{FaultError, FaultKind, FaultPlan};
 use crate::report_queue::ReportQueue;
 use crate::tracker::SampleSource;
 use dpm_device::time::HostTime;
@@ -172,6 +172,16 @@ impl VrpnReports {
     pub fn new(source: SampleSource) -> Result<Self, FaultError> {
         source.config().faults.check_supported(&VRPN_FAULTS, "the VRPN server")?;
         Ok(Self { source, queue: ReportQueue::new() })
+    }
+
+    /// From now on the server has these faults, with times relative to the source's start.
+    pub fn set_faults(&mut self, faults: FaultPlan) {
+        self.source.set_faults(faults);
+    }
+
+    /// The server begins at `now`: what was captured before is never sent.
+    pub fn begin_at(&mut self, now: HostTime) {
+        let _ = self.queue.take_due(&self.source, now);
     }
 
     /// The source of the poses.
