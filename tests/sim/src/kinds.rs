@@ -1,5 +1,7 @@
 //! The kinds of faults, and the states of the rig in which they strike.
 
+use crate::plan::TrackerKind;
+
 /// What the rig is doing, as an operator would say.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash)]
 #[repr(usize)]
@@ -221,6 +223,16 @@ kinds! {
     X10,
     /// The ends of a serial line run at different rates: every byte is another one.
     X11,
+    /// A VRPN server resets its connection, and refuses others for a while.
+    X12,
+    /// A VRPN connection is half-open: the server's machine was restarted and has forgotten it.
+    X13,
+    /// Nothing gets through between a VRPN server and the host, and later all of it.
+    X14,
+    /// A VRPN server hangs: it accepts and says nothing, or something else listens at its port.
+    X15,
+    /// The clock of a VRPN server is set while it runs.
+    X16,
 }
 
 const FILES: &str = "scenes are read only when the program starts, before any light";
@@ -228,7 +240,21 @@ const FILES: &str = "scenes are read only when the program starts, before any li
 impl Kind {
     /// It strikes the tracker or its network, and nothing else.
     pub fn is_of_tracker(self) -> bool {
-        (self as usize) <= Self::T18 as usize
+        (self as usize) <= Self::T18 as usize || self.needs_connection()
+    }
+
+    /// It strikes only where the tracker is a VRPN server.
+    pub fn needs_connection(self) -> bool {
+        matches!(self, Self::X12 | Self::X13 | Self::X14 | Self::X15 | Self::X16)
+    }
+
+    /// It can strike a life with a tracker of this kind: only NatNet has datagrams, which strangers can send, too.
+    pub fn strikes(self, tracker: TrackerKind) -> bool {
+        match self {
+            Self::T18 => tracker == TrackerKind::Serial,
+            Self::T16 | Self::N1 | Self::N2 | Self::N6 | Self::N7 => tracker == TrackerKind::NatNet,
+            _ => !self.needs_connection() || tracker == TrackerKind::Vrpn,
+        }
     }
 
     /// It strikes only where the projector follows tracks.
@@ -245,9 +271,6 @@ impl Kind {
     pub fn impossible(self, state: State) -> Option<&'static str> {
         use Kind as K;
         match self {
-            K::T18 => {
-                Some("the simulated tracker is on the network; serial trackers: device/src/tracker/serial")
-            }
             K::G3 => Some("no scene is loaded while the rig runs"),
             K::G9 => Some("the program keeps no cache of shaders"),
             K::F1 | K::F2 | K::F3 | K::F4 | K::F5 | K::F6 | K::F7 | K::F8 | K::F9 | K::F10 => {

@@ -1,7 +1,7 @@
 //! Runs one seed for a while, and shrinks it if a law was broken.
 
 use crate::laws::Broken;
-use crate::plan::{Episodes, Setup};
+use crate::plan::{Episodes, Setup, TrackerKind};
 use crate::table::Table;
 use crate::tracks::Placed;
 use crate::world::{World, S};
@@ -20,6 +20,8 @@ pub struct Order {
     pub follows: Option<bool>,
     /// Whether the projector hangs on a serial line, if not as the seed says.
     pub serial: Option<bool>,
+    /// What the tracker speaks, if not as the seed says.
+    pub tracker: Option<TrackerKind>,
     /// Faults that do not strike, by number.
     pub without: BTreeSet<u32>,
     /// Stop at this event.
@@ -62,7 +64,7 @@ pub struct Lived {
 /// # Errors
 /// The world cannot be made, which is a mistake in this program.
 pub fn live(order: &Order) -> Result<Lived, String> {
-    let setup = Setup::of(order.seed, order.rate_hz, order.follows, order.serial);
+    let setup = Setup::of(order.seed, order.rate_hz, order.follows, order.serial, order.tracker);
     let mut world = World::new(setup.clone())?;
     world.is_loud = order.is_loud;
     world.laws.is_loud = order.is_loud;

@@ -11,9 +11,9 @@ use std::io;
 use std::sync::{Arc, Mutex};
 
 /// What a driver takes from its program before it takes no more.
-const DRIVER_BYTES: usize = 4096;
+pub(crate) const DRIVER_BYTES: usize = 4096;
 /// Replies that a driver keeps for its program; further bytes are lost.
-const INPUT_BYTES: usize = 4095;
+pub(crate) const INPUT_BYTES: usize = 4095;
 /// Faults are given as shares of packets; most packets of such a line have about so many bytes.
 const PACKET_BYTES: f64 = 64.0;
 /// Bits of a byte: start, eight, stop.
@@ -46,18 +46,18 @@ pub enum Echo {
 
 /// Shares of bytes to which something happens.
 #[derive(Clone, Copy, Debug, Default)]
-struct Spoils {
-    flip: f64,
-    lose: f64,
-    twice: f64,
+pub(crate) struct Spoils {
+    pub(crate) flip: f64,
+    pub(crate) lose: f64,
+    pub(crate) twice: f64,
     /// Some bytes in a row are lost.
-    gap: f64,
+    pub(crate) gap: f64,
     /// Bytes that nobody sent.
-    stray: f64,
+    pub(crate) stray: f64,
     /// Every byte is another one.
-    all: bool,
+    pub(crate) all: bool,
     /// Nothing arrives.
-    silent: bool,
+    pub(crate) silent: bool,
 }
 
 impl Spoils {
@@ -68,15 +68,15 @@ impl Spoils {
 
 /// One direction.
 #[derive(Debug, Default)]
-struct Way {
+pub(crate) struct Way {
     /// What the sender's driver holds; the first byte is in transmission.
-    queue: VecDeque<u8>,
+    pub(crate) queue: VecDeque<u8>,
     /// When that byte is over; if there is none, when the last one was.
     over_at: i64,
     /// What has arrived of a piece whose zero byte has not.
-    begun: Vec<u8>,
+    pub(crate) begun: Vec<u8>,
     /// Pieces that arrive, and when.
-    landing: VecDeque<(i64, Vec<u8>)>,
+    pub(crate) landing: VecDeque<(i64, Vec<u8>)>,
     /// Bytes that are still to be lost of a gap.
     gap: u64,
     /// Bytes in the queue that a program left when it ended, and when the last of them arrives.
@@ -85,7 +85,7 @@ struct Way {
 }
 
 impl Way {
-    fn put(&mut self, bytes: &[u8], now: i64, byte_ns: i64) {
+    pub(crate) fn put(&mut self, bytes: &[u8], now: i64, byte_ns: i64) {
         if self.queue.is_empty() && !bytes.is_empty() {
             self.over_at = self.over_at.max(now) + byte_ns;
         }
@@ -93,7 +93,7 @@ impl Way {
     }
 
     /// Carries the bytes that are over by `now`. Pieces that are whole go to `heard`, too.
-    fn carry(
+    pub(crate) fn carry(
         &mut self,
         now: i64,
         byte_ns: i64,
@@ -165,10 +165,15 @@ impl Way {
     }
 
     /// When something happens that anybody notices.
-    fn due(&self, byte_ns: i64) -> i64 {
+    pub(crate) fn due(&self, byte_ns: i64) -> i64 {
         let landing = self.landing.front().map_or(i64::MAX, |(at, _)| *at);
+        landing.min(self.whole_at(byte_ns))
+    }
+
+    /// When the last byte of the next piece in the queue is over.
+    pub(crate) fn whole_at(&self, byte_ns: i64) -> i64 {
         let whole = self.queue.iter().position(|byte| *byte == 0);
-        landing.min(whole.map_or(i64::MAX, |before| self.over_at + before as i64 * byte_ns))
+        whole.map_or(i64::MAX, |before| self.over_at + before as i64 * byte_ns)
     }
 }
 

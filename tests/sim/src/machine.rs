@@ -3,8 +3,13 @@
 use crate::cable::lock;
 use crate::dice::Dice;
 use crate::net::{Net, SimSocket};
+use crate::plan::TrackerSetup;
+use crate::tracker_line::PortOpener;
+use crate::tracker_stream::{ServerOpener, TRACKER};
 use dpm_device::time::{DeviceTicks, HostClock, HostTime};
 use dpm_device::tracker::natnet::client::{NatNetClient, NatNetConfig};
+use dpm_device::tracker::serial::client::{SerialTracker, SerialTrackerConfig};
+use dpm_device::tracker::vrpn::client::{VrpnClient, VrpnConfig};
 use dpm_device::tracker::{BodyKey, Tracker};
 use dpm_render::gpu::{GpuError, MemoryPool};
 use dpm_rig::pipeline::stepped::{Machine, Part, Rendered, SentFrame, Takes};
@@ -181,6 +186,8 @@ pub struct SimMachine {
     pub beneath: Arc<Mutex<Beneath>>,
     /// The tracker's network.
     pub net: Arc<Mutex<Net>>,
+    /// What the tracker speaks.
+    pub tracker: TrackerSetup,
     /// Host's clock now.
     pub clock: Arc<AtomicI64>,
     /// True time minus the host's clock.
@@ -251,14 +258,23 @@ impl Machine for SimMachine {
 
     fn opens_tracker(&mut self, _: HostTime) -> Box<dyn Tracker> {
         lock(&self.net).new_socket();
-        let bodies = vec![BodyKey { name: "a".into(), id: Some(1) }];
-        let config = NatNetConfig {
-            local: Ipv4Addr::new(10, 0, 0, 1),
-            ..NatNetConfig::unicast(Ipv4Addr::new(10, 0, 0, 2), bodies)
-        };
         let clock = self.clock.clone();
         let clock: Arc<dyn HostClock> = Arc::new(move || HostTime(clock.load(Ordering::Relaxed)));
-        Box::new(NatNetClient::with_ports(config, clock, Box::new(SimSocket(self.net.clone())), None))
+        match self.tracker {
+            TrackerSetup::NatNet => self.natnet(clock),
+            TrackerSetup::Serial(line) => {
+                let (port, bodies) = ("/dev/tracker".into(), vec![BodyKey { name: "a".into(), id: None }]);
+                let config = SerialTrackerConfig { port, baud: line.baud, bodies };
+                let opener = Box::new(PortOpener(self.net.clone()));
+                Box::new(SerialTracker::open_through(config, clock, opener).expect("the port has a name"))
+            }
+            TrackerSetup::Vrpn(_) => {
+                let bodies = vec![BodyKey { name: "a".into(), id: None }];
+                let config = VrpnConfig { server: "10.0.0.2".into(), tracker: TRACKER.into(), bodies };
+                let opener = Box::new(ServerOpener(self.net.clone()));
+                Box::new(VrpnClient::open_through(config, clock, opener).expect("the server has a name"))
+            }
+        }
     }
 
     fn next_sample_at(&self, _: HostTime) -> HostTime {
@@ -287,5 +303,16 @@ impl Machine for SimMachine {
             ends: frame.swept_at,
             hash: hash(frame.planes),
         });
+    }
+}
+
+impl SimMachine {
+    fn natnet(&self, clock: Arc<dyn HostClock>) -> Box<dyn Tracker> {
+        let bodies = vec![BodyKey { name: "a".into(), id: Some(1) }];
+        let config = NatNetConfig {
+            local: Ipv4Addr::new(10, 0, 0, 1),
+            ..NatNetConfig::unicast(Ipv4Addr::new(10, 0, 0, 2), bodies)
+        };
+        Box::new(NatNetClient::with_ports(config, clock, Box::new(SimSocket(self.net.clone())), None))
     }
 }

@@ -1,6 +1,7 @@
 //! `dpm-sim`: hours of rig, with every fault, in minutes.
 
 use dpm_sim::life::{live, shrink, Lived, Order};
+use dpm_sim::plan::TrackerKind;
 use dpm_sim::table::Table;
 use dpm_sim::tracks::Placed;
 use std::collections::{BTreeMap, BTreeSet};
@@ -17,6 +18,8 @@ dpm-sim: a simulated world around the rig, with every fault in every state
   --tracks WHO    all or none: whose projector follows tracks; default: a third of the seeds'
   --serial WHO    all, none or some: whose projector hangs on a serial line; default: some, a fifth of the seeds'
                   (none of --tracks all)
+  --tracker WHAT  natnet, serial, vrpn or all: what the trackers speak; default: all, a fifth of the seeds' serial and
+                  a fifth VRPN
   --until EVENT   stop the (single) seed at this event and print what happened
   --without LIST  numbers of faults that do not strike, as a shrunk seed names them
   --minutes M     end after so many minutes of real time
@@ -34,6 +37,7 @@ struct Wish {
     life_s: f64,
     follows: Option<bool>,
     serial: Option<bool>,
+    tracker: Option<TrackerKind>,
     until: Option<u64>,
     without: BTreeSet<u32>,
     minutes: Option<f64>,
@@ -52,6 +56,7 @@ fn wish() -> Result<Wish, String> {
         life_s: 120.0,
         follows: None,
         serial: None,
+        tracker: None,
         until: None,
         without: BTreeSet::new(),
         minutes: None,
@@ -83,6 +88,7 @@ fn wish() -> Result<Wish, String> {
                 "some" => wish.serial = None,
                 other => return Err(format!("--serial {other:?}: give \"all\", \"none\" or \"some\"")),
             },
+            "--tracker" => wish.tracker = tracker_named(&value()?)?,
             "--until" => wish.until = Some(number(&value()?)?),
             "--without" => {
                 for word in value()?.split(',').filter(|word| !word.is_empty()) {
@@ -109,6 +115,17 @@ fn wish() -> Result<Wish, String> {
     Ok(wish)
 }
 
+/// What all trackers of a campaign speak; `None`: each what its seed says.
+fn tracker_named(word: &str) -> Result<Option<TrackerKind>, String> {
+    let kinds = [TrackerKind::NatNet, TrackerKind::Serial, TrackerKind::Vrpn];
+    match kinds.into_iter().find(|kind| kind.word() == word) {
+        None if word != "all" => {
+            Err(format!("--tracker {word:?}: give \"natnet\", \"serial\", \"vrpn\" or \"all\""))
+        }
+        found => Ok(found),
+    }
+}
+
 /// A seed that nobody has chosen.
 fn fresh() -> u64 {
     use std::hash::{BuildHasher, Hasher};
@@ -127,6 +144,8 @@ struct Sum {
     lives: u64,
     following: u64,
     on_lines: u64,
+    /// Lives whose tracker hangs on a serial line, and those whose tracker is a VRPN server.
+    other_trackers: [u64; 2],
     planes_moved: u64,
     placed: Placed,
 }
@@ -152,8 +171,9 @@ fn report(lived: &Lived, order: &Order, shrinks: bool) -> Result<String, String>
         Some(true) => " --serial all",
         Some(false) => " --serial none",
     };
+    let tracker = order.tracker.map_or(String::new(), |kind| format!(" --tracker {}", kind.word()));
     println!(
-        "  again: --seed {}{rate}{tracks}{serial} --life {:.0} --hours 0.0001 --loud --without {}",
+        "  again: --seed {}{rate}{tracks}{serial}{tracker} --life {:.0} --hours 0.0001 --loud --without {}",
         order.seed,
         (least.length_ns as f64 * 1e-9).ceil() + 1.0,
         if without.is_empty() { "\"\"".into() } else { without.join(",") }
@@ -177,6 +197,7 @@ fn run() -> Result<bool, String> {
             rate_hz: wish.rate,
             follows: wish.follows,
             serial: wish.serial,
+            tracker: wish.tracker,
             without: wish.without.clone(),
             until: wish.until,
             is_loud: wish.is_loud,
@@ -193,6 +214,8 @@ fn run() -> Result<bool, String> {
         sum.lives += 1;
         sum.following += u64::from(lived.setup.follows);
         sum.on_lines += u64::from(lived.setup.serial.is_some());
+        sum.other_trackers[0] += u64::from(lived.setup.tracker.kind() == TrackerKind::Serial);
+        sum.other_trackers[1] += u64::from(lived.setup.tracker.kind() == TrackerKind::Vrpn);
         sum.planes_moved += lived.planes_moved;
         sum.placed.add(&lived.placed);
         if lived.broken.is_some() {
@@ -228,10 +251,12 @@ fn run() -> Result<bool, String> {
     let hours = sum.length_ns as f64 / 3.6e12;
     let below = sum.table.cells_below(1000);
     println!(
-        "{hours:.2} h in {} lives ({} on serial lines), {} faults, {} laws broken; cells below 1000: {below}; oldest pose {:.0} % of what is \
+        "{hours:.2} h in {} lives ({} on serial lines; trackers: {} serial, {} VRPN), {} faults, {} laws broken; cells below 1000: {below}; oldest pose {:.0} % of what is \
          allowed; slowest return of light {:.2} s; {:.0} s of real time",
         sum.lives,
         sum.on_lines,
+        sum.other_trackers[0],
+        sum.other_trackers[1],
         sum.table.total(),
         sum.failures.len(),
         sum.worst_age_milli as f64 / 10.0,

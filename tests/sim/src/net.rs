@@ -2,10 +2,14 @@
 
 use crate::cable::lock;
 use crate::dice::Dice;
+use crate::plan::TrackerSetup;
+use crate::tracker_line::{LineFaults, TrackerLine};
+use crate::tracker_stream::{StreamFaults, TrackerStream};
 use dpm_device::pose::Pose;
 use dpm_device::time::{FrameRate, HostClock, HostTime};
 use dpm_device::tracker::natnet::wire::Version;
 use dpm_device::tracker::udp::{Arrival, Datagrams};
+use hil_mock::faults::FaultPlan;
 use hil_mock::motion::{Motion, MotionSpec};
 use hil_mock::natnet_server::{NatNetServer, NatNetServerConfig, Streaming, UnicastTo};
 use hil_mock::tracker::{MockTrackerConfig, SampleSource};
@@ -59,6 +63,20 @@ pub struct NetFaults {
     pub huge: bool,
     /// The host opens no sockets.
     pub no_sockets: bool,
+    /// Those of a serial line.
+    pub line: LineFaults,
+    /// Those of a VRPN server and the way to it.
+    pub stream: StreamFaults,
+}
+
+/// What speaks to the host.
+enum Server {
+    /// By datagrams.
+    NatNet(NatNetServer),
+    /// On a serial line.
+    Serial(TrackerLine),
+    /// By a connection.
+    Vrpn(TrackerStream),
 }
 
 /// The server, the network and the host's socket.
@@ -69,7 +87,7 @@ pub struct Net {
     pub host_lag: i64,
     /// The host's wall clock minus true time.
     pub wall_ahead: i64,
-    server: NatNetServer,
+    server: Server,
     kind: ServerKind,
     seed: u64,
     /// Faults of samples, and when each is over.
@@ -132,7 +150,7 @@ impl BodyMotion {
     }
 }
 
-fn server(kind: &ServerKind, seed: u64) -> Result<NatNetServer, String> {
+fn source(kind: &ServerKind, seed: u64) -> Result<SampleSource, String> {
     let config = MockTrackerConfig {
         seed,
         rate: FrameRate::new(kind.rate_hz, 1).ok_or("a rate of 0")?,
@@ -143,14 +161,29 @@ fn server(kind: &ServerKind, seed: u64) -> Result<NatNetServer, String> {
         ..Default::default()
     };
     let motion = kind.motion.of(if kind.millimetres { 1000.0 } else { 1.0 })?;
-    let source = SampleSource::new(config, vec![motion]).map_err(|e| e.to_string())?;
+    SampleSource::new(config, vec![motion]).map_err(|e| e.to_string())
+}
+
+fn natnet(kind: &ServerKind, seed: u64) -> Result<NatNetServer, String> {
     let config = NatNetServerConfig {
         bodies: vec![(kind.name.clone(), kind.number)],
         version: if kind.is_old { Version::V3_0 } else { Version::V4_1 },
         streaming: Streaming::Unicast(UnicastTo::CommandSocket),
         ..NatNetServerConfig::new(&["a"])
     };
-    NatNetServer::new(config, source).map_err(|e| e.to_string())
+    NatNetServer::new(config, source(kind, seed)?).map_err(|e| e.to_string())
+}
+
+fn server(kind: &ServerKind, seed: u64, tracker: TrackerSetup) -> Result<Server, String> {
+    Ok(match tracker {
+        TrackerSetup::NatNet => Server::NatNet(natnet(kind, seed)?),
+        TrackerSetup::Serial(setup) => {
+            Server::Serial(TrackerLine::new(seed, kind, source(kind, seed)?, setup)?)
+        }
+        TrackerSetup::Vrpn(setup) => {
+            Server::Vrpn(TrackerStream::new(seed, kind, source(kind, seed)?, setup)?)
+        }
+    })
 }
 
 impl Net {
@@ -158,12 +191,12 @@ impl Net {
     ///
     /// # Errors
     /// The server's settings are wrong, which is a mistake in this program.
-    pub fn new(seed: u64, kind: ServerKind) -> Result<Self, String> {
+    pub fn new(seed: u64, kind: ServerKind, tracker: TrackerSetup) -> Result<Self, String> {
         Ok(Self {
             now: 0,
             host_lag: 0,
             wall_ahead: 1_800_000_000_000_000_000,
-            server: server(&kind, seed)?,
+            server: server(&kind, seed, tracker)?,
             kind,
             seed,
             windows: Vec::new(),
@@ -200,8 +233,34 @@ impl Net {
         let texts: Vec<&str> =
             self.windows.iter().map(|(_, text)| text.as_str()).chain(self.restart.as_deref()).collect();
         let plan = texts.join(",");
-        let parsed = plan.parse().map_err(|e| format!("{plan}: {e}"))?;
-        self.server.set_faults(parsed).map_err(|e| e.to_string())
+        let parsed: FaultPlan = plan.parse().map_err(|e| format!("{plan}: {e}"))?;
+        match &mut self.server {
+            Server::NatNet(server) => server.set_faults(parsed).map_err(|e| e.to_string()),
+            Server::Serial(line) => line.set_faults(parsed),
+            Server::Vrpn(stream) => {
+                stream.set_faults(parsed);
+                Ok(())
+            }
+        }
+    }
+
+    /// Works on the serial line, if the tracker hangs on one; `now` and its faults are handed in.
+    pub(crate) fn on_line<R>(
+        &mut self,
+        work: impl FnOnce(&mut TrackerLine, i64, &LineFaults) -> R,
+    ) -> Option<R> {
+        let Self { server: Server::Serial(line), now, faults, .. } = self else { return None };
+        Some(work(line, *now, &LineFaults { held: faults.held, ..faults.line }))
+    }
+
+    /// The same for a VRPN server.
+    pub(crate) fn on_stream<R>(
+        &mut self,
+        work: impl FnOnce(&mut TrackerStream, i64, &StreamFaults) -> R,
+    ) -> Option<R> {
+        let Self { server: Server::Vrpn(stream), now, faults, .. } = self else { return None };
+        let is_cut = faults.held || faults.stream.cut;
+        Some(work(stream, *now, &StreamFaults { cut: is_cut, ..faults.stream }))
     }
 
     /// Another server takes the place of this one: restarted, renamed, of another version, with another rate. Its
@@ -210,16 +269,28 @@ impl Net {
     /// # Errors
     /// As [`Net::new`].
     pub fn replace(&mut self, kind: ServerKind) -> Result<(), String> {
-        self.server = server(&kind, self.seed)?;
-        self.restart = Some(format!("reset@{}ns", self.now));
-        self.server.begin_at(HostTime(self.now));
+        let now = self.now;
+        match &mut self.server {
+            Server::NatNet(server) => {
+                *server = natnet(&kind, self.seed)?;
+                self.restart = Some(format!("reset@{now}ns"));
+                server.begin_at(HostTime(now));
+            }
+            Server::Serial(line) => line.replace(&kind, source(&kind, self.seed)?, now)?,
+            Server::Vrpn(stream) => stream.replace(&kind, source(&kind, self.seed)?, now)?,
+        }
         self.kind = kind;
         self.plan()
     }
 
     /// When something happens here next.
     pub fn due(&self) -> i64 {
-        let server = if self.faults.away { i64::MAX } else { self.server.next_due().0 };
+        let server = match &self.server {
+            Server::NatNet(_) if self.faults.away => i64::MAX,
+            Server::NatNet(server) => server.next_due().0,
+            Server::Serial(line) => line.due(&LineFaults { held: self.faults.held, ..self.faults.line }),
+            Server::Vrpn(stream) => stream.due(&self.faults.stream),
+        };
         let flood = if self.faults.flood > 0 { self.flooded_at + 1_000_000 } else { i64::MAX };
         server.max(self.now).min(flood.max(self.now))
     }
@@ -227,30 +298,37 @@ impl Net {
     /// When the next datagram reaches the host.
     pub fn next_arrival(&self) -> i64 {
         let front = self.to_host.front().map_or(i64::MAX, |d| d.0);
-        if self.faults.away {
-            return front;
+        match &self.server {
+            Server::NatNet(_) if self.faults.away => front,
+            Server::NatNet(server) => front.min(server.next_due().0.max(self.now) + self.travel_ns),
+            Server::Serial(line) => line.next_arrival(self.now),
+            Server::Vrpn(stream) => stream.next_arrival(),
         }
-        front.min(self.server.next_due().0.max(self.now) + self.travel_ns)
     }
 
     /// Advances to `now`.
     pub fn advance(&mut self, now: i64) {
         self.now = now;
+        let _ = self.on_line(|line, now, faults| line.advance(now, faults));
+        let _ = self.on_stream(|stream, now, faults| stream.advance(now, faults));
         if !self.held.is_empty() && !self.faults.held {
             for bytes in std::mem::take(&mut self.held) {
                 self.deliver(bytes);
             }
         }
-        if !self.faults.away && self.server.next_due().0 <= now {
-            let mut sent = Vec::new();
-            let spare = &mut self.spare;
-            self.server.stream(HostTime(now), &mut |bytes, _| {
-                let mut copy: Vec<u8> = spare.pop().unwrap_or_default();
-                copy.extend_from_slice(bytes);
-                sent.push(copy);
-            });
-            sent.into_iter().for_each(|bytes| self.server_sends(bytes));
+        let Self { server, spare, .. } = self;
+        let mut sent = Vec::new();
+        match server {
+            Server::NatNet(server) if !self.faults.away && server.next_due().0 <= now => {
+                server.stream(HostTime(now), &mut |bytes, _| {
+                    let mut copy: Vec<u8> = spare.pop().unwrap_or_default();
+                    copy.extend_from_slice(bytes);
+                    sent.push(copy);
+                });
+            }
+            _ => {}
         }
+        sent.into_iter().for_each(|bytes| self.server_sends(bytes));
         if self.faults.flood > 0 && self.flooded_at + 1_000_000 <= now {
             self.flooded_at = now;
             for _ in 0..self.faults.flood {
@@ -334,11 +412,18 @@ impl Net {
         // The request arrives at once and its answers travel both ways' time.
         let mut answers = Vec::new();
         let now = HostTime(self.now + self.travel_ns);
-        self.server.on_datagram(bytes, CLIENT, now, &mut |answer, _| answers.push(answer.to_vec()));
+        if let Server::NatNet(server) = &mut self.server {
+            server.on_datagram(bytes, CLIENT, now, &mut |answer, _| answers.push(answer.to_vec()));
+        }
         for answer in answers {
             let at = self.now + 2 * self.travel_ns;
             self.push(at, SERVER, answer);
         }
+    }
+
+    /// The server is to be moved at every event, not only when something is due there.
+    pub fn is_wired(&self) -> bool {
+        !matches!(self.server, Server::NatNet(_))
     }
 
     /// The socket is new: nothing waits in it.

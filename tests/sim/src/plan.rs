@@ -4,11 +4,89 @@ use crate::dice::Dice;
 use crate::kinds::{Kind, State};
 use crate::line::SerialSetup;
 use crate::net::BodyMotion;
+use crate::tracker_line::{LineSetup, POSE_BYTES};
+use crate::tracker_stream::StreamSetup;
 use dpm_device::cobs::encoded_bytes;
 use dpm_device::link::{packet_bytes, COMMIT_BYTES};
 
 /// The rates at which rigs run, frames per second.
 pub const RATES: [u32; 6] = [24, 60, 120, 240, 947, 2000];
+
+/// What a tracker speaks.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum TrackerKind {
+    /// NatNet, by datagrams.
+    NatNet,
+    /// The serial pose stream.
+    Serial,
+    /// VRPN, by a connection.
+    Vrpn,
+}
+
+impl TrackerKind {
+    /// As given on the command line.
+    pub fn word(self) -> &'static str {
+        match self {
+            Self::NatNet => "natnet",
+            Self::Serial => "serial",
+            Self::Vrpn => "vrpn",
+        }
+    }
+}
+
+/// The tracker of one life.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum TrackerSetup {
+    /// See [`TrackerKind::NatNet`].
+    NatNet,
+    /// See [`TrackerKind::Serial`].
+    Serial(LineSetup),
+    /// See [`TrackerKind::Vrpn`].
+    Vrpn(StreamSetup),
+}
+
+impl TrackerSetup {
+    /// What it speaks.
+    pub fn kind(&self) -> TrackerKind {
+        match self {
+            Self::NatNet => TrackerKind::NatNet,
+            Self::Serial(_) => TrackerKind::Serial,
+            Self::Vrpn(_) => TrackerKind::Vrpn,
+        }
+    }
+}
+
+/// The shares of lives whose tracker hangs on a serial line, and of those whose tracker is a VRPN server.
+const OTHER_TRACKERS: f64 = 1.0 / 5.0;
+/// The bits per second at which trackers run.
+const TRACKER_BAUDS: [u32; 5] = [115_200, 230_400, 921_600, 921_600, 3_000_000];
+
+/// The tracker of `seed`, from a row of its own, so that a life with NatNet is what it was before there were others.
+fn tracker_of(seed: u64, tracker_hz: u32, kind: Option<TrackerKind>) -> TrackerSetup {
+    let mut dice = Dice::new(seed, 0x7ac3e);
+    let share = dice.unit();
+    let drawn = match share {
+        _ if share < OTHER_TRACKERS => TrackerKind::Serial,
+        _ if share < 2.0 * OTHER_TRACKERS => TrackerKind::Vrpn,
+        _ => TrackerKind::NatNet,
+    };
+    let skew_ppb = dice.between(-80_000, 80_000) as i32;
+    match kind.unwrap_or(drawn) {
+        TrackerKind::NatNet => TrackerSetup::NatNet,
+        TrackerKind::Serial => {
+            // With a quarter to spare for what else is told.
+            let needed = POSE_BYTES * 10 * i64::from(tracker_hz) * 5 / 4;
+            let first = TRACKER_BAUDS.iter().position(|baud| i64::from(*baud) >= needed).unwrap_or(2);
+            TrackerSetup::Serial(LineSetup {
+                baud: dice.one_of(&TRACKER_BAUDS[first..]),
+                timer_ns: dice.one_of(&[0, 0, 1_000_000, 1_000_000, 16_000_000]),
+                skew_ppb,
+                is_bus_powered: dice.happens(0.5),
+            })
+        }
+        TrackerKind::Vrpn => TrackerSetup::Vrpn(StreamSetup { skew_ppb, each_body: dice.happens(0.5) }),
+    }
+}
 
 /// The rig of one life.
 #[derive(Clone, Debug)]
@@ -21,6 +99,8 @@ pub struct Setup {
     pub planes: u32,
     /// Samples of the tracker per second.
     pub tracker_hz: u32,
+    /// What it speaks, over what.
+    pub tracker: TrackerSetup,
     /// `safety.predict_ms`, if the rig file sets it.
     pub predict_ms: Option<u32>,
     /// GPU time of a frame in thousandths of a slot.
@@ -94,9 +174,15 @@ impl OnALine {
 }
 
 impl Setup {
-    /// The rig that `seed` describes. Others may decide its rate, whether its projector follows tracks, and whether it hangs
-    /// on a serial line.
-    pub fn of(seed: u64, rate_hz: Option<u32>, follows: Option<bool>, serial: Option<bool>) -> Self {
+    /// The rig that `seed` describes. Others may decide its rate, whether its projector follows tracks, whether it hangs
+    /// on a serial line, and what its tracker speaks.
+    pub fn of(
+        seed: u64,
+        rate_hz: Option<u32>,
+        follows: Option<bool>,
+        serial: Option<bool>,
+        tracker: Option<TrackerKind>,
+    ) -> Self {
         let mut on_a_line = OnALine::drawn(seed, rate_hz, follows, serial);
         let rate_hz = on_a_line.as_ref().map_or(rate_hz, |line| Some(line.rate_hz));
         let mut dice = Dice::new(seed, 0x5e7);
@@ -110,6 +196,11 @@ impl Setup {
         let planes = if rate_hz > 947 || dice.happens(0.7) { 8 } else { 24 };
         let serial = on_a_line.as_mut().map(|line| line.line(planes));
         let raster = on_a_line.as_ref().map_or((16, 12), |line| line.raster);
+        let tracker = tracker_of(seed, tracker_hz, tracker);
+        let sample_ms = match tracker {
+            TrackerSetup::Serial(line) => line.pose_ns() / 1_000_000 + 1,
+            TrackerSetup::NatNet | TrackerSetup::Vrpn(_) => 0,
+        };
         let line_ms = serial.map_or(0, |line| {
             (frame_bytes(raster, planes) * 10_000 / u64::from(line.baud)) as i64
                 + line.reply_late_ns / 1_000_000
@@ -117,7 +208,8 @@ impl Setup {
         // What a frame needs from sample to light, twice; else the rig would be dark by its own file.
         let needed_ms = (2 * (3 + 2_000 / i64::from(tracker_hz)) + 8 * slot_us / 1000 + 20)
             + slot_us * render_milli / 1_000_000 * 4
-            + 2 * line_ms;
+            + 2 * line_ms
+            + 2 * sample_ms;
         let predict_ms = dice.happens(0.3).then(|| dice.between(needed_ms, 2 * needed_ms).min(1_000) as u32);
         // These have a row of their own, so that a life without tracks is what it was before there were any.
         let mut late = Dice::new(seed, 0x7ac);
@@ -139,6 +231,7 @@ impl Setup {
             rate_hz,
             planes,
             tracker_hz,
+            tracker,
             predict_ms,
             render_milli,
             clock_ppb: dice.between(-80_000, 80_000) as i32,
@@ -181,6 +274,7 @@ pub struct Episodes {
     dice: Dice,
     cells: Vec<(State, Kind)>,
     kinds: Vec<Kind>,
+    tracker: TrackerKind,
     /// Now and then a long rest comes before an episode, in which the laws of peace are judged.
     rests: Option<Dice>,
     next: u32,
@@ -194,22 +288,30 @@ const RESTING: f64 = 0.03;
 impl Episodes {
     /// The episodes of a life.
     pub fn new(setup: &Setup) -> Self {
+        let tracker = setup.tracker.kind();
         let all = Kind::ALL.iter().copied();
         let kinds = all
             .filter(|kind| setup.follows || !kind.needs_tracks())
             .filter(|kind| setup.serial.is_some() || !kind.needs_line())
+            .filter(|kind| tracker == TrackerKind::Vrpn || !kind.needs_connection())
             .collect();
         let dice = Dice::new(setup.seed, 0xe915);
         let rests = setup.follows.then(|| Dice::new(setup.seed, 0x4e57));
-        Self { dice, cells: Vec::new(), kinds, rests, next: 0 }
+        Self { dice, cells: Vec::new(), kinds, tracker, rests, next: 0 }
+    }
+
+    /// Whether a kind can strike this life in `state`.
+    fn can_strike(&self, kind: Kind, state: State) -> bool {
+        kind.impossible(state).is_none() && kind.strikes(self.tracker)
     }
 
     /// The next pair of state and kind: each comes once before any comes again.
     fn cell(&mut self) -> (State, Kind) {
         if self.cells.is_empty() {
             for state in State::ALL {
-                let possible = self.kinds.iter().filter(|kind| kind.impossible(state).is_none());
-                self.cells.extend(possible.map(|kind| (state, *kind)));
+                let possible = self.kinds.iter().filter(|kind| self.can_strike(**kind, state));
+                let possible: Vec<(State, Kind)> = possible.map(|kind| (state, *kind)).collect();
+                self.cells.extend(possible);
             }
             for i in (1..self.cells.len()).rev() {
                 let j = self.dice.bits() as usize % (i + 1);
@@ -235,7 +337,7 @@ impl Episodes {
             let mut kind = first;
             if i > 0 {
                 kind = self.dice.one_of(&self.kinds);
-                if kind.impossible(state).is_some() {
+                if !self.can_strike(kind, state) {
                     continue;
                 }
             }

@@ -85,7 +85,9 @@ impl World {
                 self.lasts(kind, dice.decades(2, 1_500) * MS, Undo::Cable);
             }
             K::X9 | K::X10 | K::X11 => self.strike_line(kind, &mut dice),
-            K::T18 | K::G3 | K::G9 => self.lasts(kind, MS, Undo::Nothing),
+            K::T18 => self.strike_tracker_line(&mut dice),
+            K::X12 | K::X13 | K::X14 | K::X15 | K::X16 => self.strike_connection(kind, &mut dice),
+            K::G3 | K::G9 => self.lasts(kind, MS, Undo::Nothing),
         }
     }
 
@@ -128,7 +130,7 @@ impl World {
         self.lasts(kind, lasts_us * 1000 + 40 * MS, Undo::Nothing);
     }
 
-    fn strike_sample(&mut self, text: &str, until: i64) {
+    pub(crate) fn strike_sample(&mut self, text: &str, until: i64) {
         let struck = lock(&self.net).strike(text, until);
         if let Err(e) = struck {
             self.laws.fail(self.t, format!("mistake of the simulator: {e}"));
@@ -426,6 +428,7 @@ impl World {
             K::H10 => {
                 lock(&self.cable).faults.denied = true;
                 self.lasts(kind, lasts_ns, Undo::Cable);
+                self.no_descriptors(kind, lasts_ns);
             }
             // The lock refuses it before it does anything.
             K::H11 => self.lasts(kind, MS, Undo::Nothing),
@@ -475,6 +478,7 @@ impl World {
         match undo {
             Undo::Nothing => {}
             Undo::Net => lock(&self.net).faults = NetFaults::default(),
+            Undo::TrackerPlug => self.plug_tracker_in(),
             Undo::Server => {
                 let own = server_kind(&self.setup);
                 self.replace_server(own);

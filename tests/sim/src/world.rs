@@ -7,7 +7,7 @@ use crate::laws::Laws;
 use crate::line::SerialLine;
 use crate::machine::{Beneath, SimMachine};
 use crate::net::{Net, ServerKind};
-use crate::plan::{Episode, Setup};
+use crate::plan::{Episode, Setup, TrackerSetup};
 use crate::process::{Exit, Process};
 use crate::table::Table;
 use crate::tracks::TrackLaws;
@@ -74,6 +74,8 @@ pub enum Undo {
     Nothing,
     /// The network is as it should be.
     Net,
+    /// The tracker's adapter is plugged in, and its line is as it should be.
+    TrackerPlug,
     /// The first server comes back.
     Server,
     /// The cable is as it should be.
@@ -177,8 +179,15 @@ fn rig_of(setup: &Setup, acknowledges: bool) -> Result<Rig, String> {
         Some(line) => format!("kind = \"serial\", port = \"/dev/simulated\", baud = {}", line.baud),
         None => "kind = \"usb\"".into(),
     };
+    let tracker = match setup.tracker {
+        TrackerSetup::NatNet => "kind = \"natnet\"\nserver = \"10.0.0.2\"\nlocal = \"10.0.0.1\"".into(),
+        TrackerSetup::Serial(line) => {
+            format!("kind = \"serial\"\nport = \"/dev/tracker\"\nbaud = {}", line.baud)
+        }
+        TrackerSetup::Vrpn(_) => "kind = \"vrpn\"\nserver = \"10.0.0.2\"".into(),
+    };
     let text = format!(
-        "[tracker]\nkind = \"natnet\"\nserver = \"10.0.0.2\"\nlocal = \"10.0.0.1\"\nrate_hz = {}\n\
+        "[tracker]\n{tracker}\nrate_hz = {}\n\
          [projector]\nwidth = {}\nheight = {}\nplanes = {}\nframe_rate = {}\nbackend = {{ {backend} }}\n{tracks}\
          [scene]\nfile = \"triangle.gltf\"\n[[scene.bodies]]\nname = \"a\"\n[safety]\nacknowledge_faults = {acknowledges}\n{predict}",
         setup.tracker_hz, setup.raster.0, setup.raster.1, setup.planes, setup.rate_hz
@@ -226,7 +235,7 @@ impl World {
             t: 0,
             far: setup.serial.map(|_| SerialEnd::new(&projector)),
             cable: Arc::new(Mutex::new(cable)),
-            net: Arc::new(Mutex::new(Net::new(seed, kind)?)),
+            net: Arc::new(Mutex::new(Net::new(seed, kind, setup.tracker)?)),
             beneath: Arc::new(Mutex::new(Beneath::new(seed, slot_ns * setup.render_milli / 1000))),
             disk: Arc::default(),
             clock: Arc::default(),
@@ -354,7 +363,7 @@ impl World {
         self.clock.store(host, Ordering::Relaxed);
         {
             let mut net = lock(&self.net);
-            if net.due() <= self.t {
+            if net.is_wired() || net.due() <= self.t {
                 net.advance(self.t);
             }
             net.now = self.t;
@@ -597,6 +606,7 @@ impl World {
         let machine = SimMachine {
             beneath: self.beneath.clone(),
             net: self.net.clone(),
+            tracker: self.setup.tracker,
             clock: self.clock.clone(),
             lag: self.lag.clone(),
         };

@@ -1,7 +1,7 @@
 //! Seeds that once broke a law, shrunk to what they need, and what a life has to be besides lawful: the same every time.
 
 use dpm_sim::life::{live, Lived, Order};
-use dpm_sim::plan::{Episodes, Setup};
+use dpm_sim::plan::{Episodes, Setup, TrackerKind};
 use dpm_sim::tracks::Placed;
 use std::collections::BTreeSet;
 
@@ -13,6 +13,7 @@ fn order(seed: u64, rate_hz: Option<u32>, seconds: i64) -> Order {
         rate_hz,
         follows: None,
         serial: None,
+        tracker: Some(TrackerKind::NatNet),
         without: BTreeSet::new(),
         until: None,
         is_loud: false,
@@ -124,14 +125,14 @@ fn what_once_broke_a_law_on_a_serial_line_keeps_them_all() {
 /// A fifth of the lives have a serial line, which carries every frame that its projector may be sent.
 #[test]
 fn serial_lines_carry_their_frames_and_are_struck_by_faults_of_their_own() {
-    let lives = (0..3_000).map(|seed| Setup::of(seed, None, None, None));
+    let lives = (0..3_000).map(|seed| Setup::of(seed, None, None, None, None));
     let on_lines: Vec<Setup> = lives.filter(|setup| setup.serial.is_some()).collect();
     assert!((500..700).contains(&on_lines.len()), "{} of 3000 lives", on_lines.len());
     let bauds: BTreeSet<u32> = on_lines.iter().filter_map(|setup| Some(setup.serial?.baud)).collect();
     assert!(bauds.contains(&115_200) && bauds.contains(&3_000_000), "{bauds:?}");
     assert!(on_lines.iter().all(|setup| !setup.follows && setup.rate_hz <= 240));
     let cells = |serial| {
-        let setup = Setup::of(5, None, Some(false), Some(serial));
+        let setup = Setup::of(5, None, Some(false), Some(serial), None);
         let mut episodes = Episodes::new(&setup);
         (0..2_000)
             .flat_map(|_| episodes.next_episode().faults)
@@ -140,7 +141,7 @@ fn serial_lines_carry_their_frames_and_are_struck_by_faults_of_their_own() {
     };
     assert!(cells(true) > 50 && cells(false) == 0);
     // Nobody sends tracks on such a line, so lives with tracks have none.
-    assert!((0..300).all(|seed| Setup::of(seed, None, Some(true), None).serial.is_none()));
+    assert!((0..300).all(|seed| Setup::of(seed, None, Some(true), None, None).serial.is_none()));
 }
 
 #[test]
@@ -160,7 +161,7 @@ fn the_same_seed_is_the_same_life_and_another_is_not() {
 /// A third of the lives have tracks, in which light is moved, and moved to where the body is.
 #[test]
 fn tracks_move_light_nearer_to_its_body() {
-    let following = (0..3_000).filter(|seed| Setup::of(*seed, None, None, Some(false)).follows).count();
+    let following = (0..3_000).filter(|seed| Setup::of(*seed, None, None, Some(false), None).follows).count();
     assert!((900..1_100).contains(&following), "{following} of 3000 lives have tracks");
     let mut sum = Placed::default();
     for seed in 400..408 {
