@@ -77,7 +77,7 @@ mod tests {
 
     #[test]
     fn an_attempt_has_one_outcome_even_if_its_thread_panics() {
-        let mut opener = OnThread::new("opens", || Ok(Box::new(std::io::Cursor::new(vec![1])) as _));
+        let mut opener = OnThread::new("opens", || Ok(Box::new(std::io::Cursor::new(vec![1u8])) as _));
         assert!(opener.outcome().is_none() && opener.begin());
         assert!(wait(&mut opener).is_ok() && opener.outcome().is_none());
         let mut refused = OnThread::new("refuses", || Err("no".into()));

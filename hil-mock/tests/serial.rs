@@ -1,13 +1,15 @@
 //! The serial tracker against the mock device through pseudo-terminals: the kernel's own tty layer in between.
 
+use dpm_device::cobs::Deframer;
 use dpm_device::pose::Pose;
 use dpm_device::time::{HostClock, HostTime};
 use dpm_device::tracker::serial::client::{SerialTracker, SerialTrackerConfig};
-use dpm_device::tracker::serial::wire::SerialMessage;
+use dpm_device::tracker::serial::wire::{SerialMessage, MAX_PACKET, VERSION};
 use dpm_device::tracker::{BodyIndex, BodyKey, Tracker, TrackerSample};
 use hil_mock::motion::{Motion, MotionSpec};
 use hil_mock::serial_server::{pseudo_terminal, SerialPoseDevice, SerialPoseHost};
 use hil_mock::tracker::{MockTrackerConfig, SampleSource};
+use serialport::SerialPort;
 use std::io::Write;
 use std::path::PathBuf;
 use std::sync::Arc;
@@ -109,7 +111,7 @@ fn pose(sequence: u32) -> Vec<u8> {
         body: 0,
         tracked: true,
         sequence,
-        captured: 0,
+        captured: u64::from(sequence),
         position: [0.1, 0.2, 0.3],
         rotation_xyzw: [0.0, 0.0, 0.0, 1.0],
         mean_error: 0.0,
@@ -118,27 +120,54 @@ fn pose(sequence: u32) -> Vec<u8> {
     out
 }
 
+/// The device's part until an echo came back quickly. Its clock shows 0.
+fn answer_an_echo(ours: &mut Box<dyn SerialPort>, tracker: &mut SerialTracker, clock: &Arc<dyn HostClock>) {
+    let mut deframer = Deframer::new([0; MAX_PACKET]);
+    let end = Instant::now() + Duration::from_secs(20);
+    let mut has_answered = false;
+    while !has_answered && Instant::now() < end {
+        run(tracker, clock, 1);
+        let (mut heard, mut said) = ([0; 256], Vec::new());
+        let n = ours.read(&mut heard).unwrap_or(0);
+        deframer.push(&heard[..n], &mut |packet| match SerialMessage::decode(packet) {
+            Ok(SerialMessage::HelloRequest) => {
+                SerialMessage::Hello { version: VERSION, bodies: 2, ticks_per_second: 1_000 }
+                    .encode(&mut said);
+            }
+            Ok(SerialMessage::EchoRequest { token }) => {
+                SerialMessage::EchoResponse { token, ticks: 0 }.encode(&mut said);
+            }
+            _ => {}
+        });
+        ours.write_all(&said).unwrap();
+        run(tracker, clock, 1);
+        has_answered = tracker.clock_map().is_some();
+    }
+    assert!(has_answered, "{}", tracker.status());
+}
+
 #[test]
 fn half_lines_and_other_baud_rates_do_no_harm() {
     let clock = clock();
     let (mut ours, path, _held) = pseudo_terminal().unwrap();
     let mut tracker = tracker(&path, &clock);
-    // Longer than a device is given to answer the first echo; this one never does.
     run(&mut tracker, &clock, 400);
     assert!(tracker.is_open() && tracker.status().contains("nothing has been heard"), "{}", tracker.status());
+    answer_an_echo(&mut ours, &mut tracker, &clock);
+    let before = tracker.counters().packets.malformed;
     // Joined in the middle of a packet: the rest of it is lost, the next one is not.
     ours.write_all(&pose(1)[20..]).unwrap();
     ours.write_all(&pose(2)).unwrap();
     let samples = run(&mut tracker, &clock, 60);
     assert_eq!(samples.iter().map(|s| s.sequence).collect::<Vec<_>>(), [2]);
-    assert_eq!(tracker.counters().packets.malformed, 1);
+    assert_eq!(tracker.counters().packets.malformed, before + 1);
     // A kilobyte without a zero (framing errors at the wrong rate), then a good packet.
     ours.write_all(&[0x55; 1024]).unwrap();
     ours.write_all(&[0]).unwrap();
     ours.write_all(&pose(3)).unwrap();
     let samples = run(&mut tracker, &clock, 60);
     assert_eq!(samples.iter().map(|s| s.sequence).collect::<Vec<_>>(), [3]);
-    assert_eq!(tracker.counters().packets.malformed, 2);
+    assert_eq!(tracker.counters().packets.malformed, before + 2);
 }
 
 #[test]

@@ -44,7 +44,8 @@ pub struct SampleCounters {
     pub duplicate: u64,
     /// Captured before a sample that was already passed on.
     pub late: u64,
-    /// Of unknown age, because they arrived before the first echo: bytes that had waited in a serial port.
+    /// Of unknown age: they had waited in a serial port before the first echo, or the sender's clock contradicts their
+    /// arrival, and no echo has told yet which of both is wrong.
     pub unknown_age: u64,
     /// With NaN or infinite numbers.
     pub not_finite: u64,

@@ -20,9 +20,13 @@ const ECHO_EVERY_NS: i64 = 200 * MS;
 /// Samples are passed on once an echo came back within this time. Bytes that had waited in the port when it was opened
 /// (the kernel keeps more than can be flushed) precede the answer to the first echo, and delay it.
 const SETTLED_ROUND_TRIP_NS: i64 = 50 * MS;
-/// If a device answers no echo, its samples are accepted this long after the port was opened, as soon as the port is
-/// empty.
+/// If a device answers no echo, its samples are accepted when it has been heard for this long and the port is empty ...
 const SETTLED_AFTER_NS: i64 = 300 * MS;
+/// ... without a pause of this length, after which what had been held back may arrive.
+const PAUSE_NS: i64 = 100 * MS;
+/// A pose that is older than this, or as far in the future, waited somewhere on its way, or the device's clock stepped.
+/// An echo tells which.
+const DOUBTED_NS: u64 = 1_000_000_000;
 
 /// Configuration of a serial tracker.
 #[derive(Clone, Debug)]
@@ -48,7 +52,12 @@ pub struct SerialTracker {
     ticks_per_second: u32,
     echo: EchoPace,
     opened: u64,
-    opened_at: HostTime,
+    /// When something was read last.
+    heard_at: Option<HostTime>,
+    /// When an echo was answered last.
+    answered_at: Option<HostTime>,
+    /// Since then the device has been heard without a pause, or the age of a pose has been in doubt.
+    unsettled_at: HostTime,
     /// No sample that waited in the port can arrive any more.
     is_settled: bool,
 }
@@ -71,7 +80,9 @@ impl SerialTracker {
             ticks_per_second: 0,
             echo: EchoPace::new(ECHO_EVERY_NS),
             opened: 0,
-            opened_at: HostTime(i64::MIN),
+            heard_at: None,
+            answered_at: None,
+            unsettled_at: HostTime(i64::MIN),
             is_settled: false,
         })
     }
@@ -123,12 +134,16 @@ impl SerialTracker {
         (self.map, self.ticks_per_second) = (None, 0);
         self.echo.begin(now);
         self.opened += 1;
-        (self.opened_at, self.is_settled) = (now, false);
+        (self.heard_at, self.answered_at) = (None, None);
+        (self.unsettled_at, self.is_settled) = (now, false);
     }
 
     fn listen(&mut self, now: HostTime, sink: &mut dyn FnMut(&TrackerSample)) -> usize {
         let Some(n) = self.line.read(now, &mut self.buffer) else { return 0 };
         let at = self.clock.now();
+        if n > 0 {
+            self.hear(at);
+        }
         let buffer = std::mem::take(&mut self.buffer);
         let mut deframer = self.deframer.clone();
         let before = deframer.counters();
@@ -144,9 +159,30 @@ impl SerialTracker {
         self.deframer = deframer;
         let is_empty = n < buffer.len();
         self.buffer = buffer;
-        self.is_settled |= is_empty && at.ns_since(self.opened_at) >= SETTLED_AFTER_NS;
+        if n > 0 && is_empty {
+            self.settle(at);
+        }
         self.ask_for_echo(at);
         delivered
+    }
+
+    /// Something was read. After a pause it may have been held back, and only a map of the device's clock tells.
+    fn hear(&mut self, at: HostTime) {
+        let paused = self.heard_at.replace(at).is_none_or(|before| at.ns_since(before) > PAUSE_NS);
+        if paused && self.clock_map().is_none() {
+            (self.unsettled_at, self.is_settled) = (at, false);
+        }
+    }
+
+    /// The port is empty: if no echo is answered, samples are accepted once the device has been heard for a while.
+    fn settle(&mut self, at: HostTime) {
+        if !self.is_settled && at.ns_since(self.unsettled_at) >= SETTLED_AFTER_NS {
+            self.is_settled = true;
+            if self.answered_at.is_none_or(|answered| answered < self.unsettled_at) {
+                // Whatever was known of the device's clock, it does not answer for it now.
+                self.map = None;
+            }
+        }
     }
 
     fn take_in(
@@ -225,6 +261,7 @@ impl SerialTracker {
 
     fn on_echo(&mut self, token: u64, ticks: u64, at: HostTime) -> Result<(), bool> {
         let Some(t1) = self.echo.answered(token) else { return Err(false) };
+        self.answered_at = Some(at);
         self.is_settled |= at.ns_since(t1) <= SETTLED_ROUND_TRIP_NS;
         if let Some(map) = &mut self.map {
             let ticks = DeviceTicks(ticks);
@@ -236,10 +273,14 @@ impl SerialTracker {
         Ok(())
     }
 
-    fn captured_at(&self, ticks: u64, at: HostTime) -> HostTime {
-        let mapped = self.clock_map().and_then(|m| m.to_host(DeviceTicks(ticks)));
-        // A transmission time of a second means that the clock stepped.
-        mapped.filter(|m| at.ns_since(m.at) < 1_000 * MS).map_or(at, |m| m.at.min(at))
+    fn captured_at(&mut self, ticks: u64, at: HostTime) -> HostTime {
+        let Some(mapped) = self.clock_map().and_then(|m| m.to_host(DeviceTicks(ticks))) else { return at };
+        if self.is_settled && at.ns_since(mapped.at).unsigned_abs() >= DOUBTED_NS {
+            // Poses are as old as those that had waited in a port that was just opened: of unknown age.
+            (self.unsettled_at, self.is_settled) = (at, false);
+            self.echo.begin(at);
+        }
+        mapped.at.min(at)
     }
 
     fn ask_for_echo(&mut self, now: HostTime) {
@@ -292,3 +333,7 @@ impl Tracker for SerialTracker {
         text
     }
 }
+
+#[cfg(test)]
+#[path = "client_tests.rs"]
+mod tests;

@@ -17,11 +17,21 @@ const MS: i64 = 1_000_000;
 /// Bytes read in one poll, and room for an incomplete message.
 const BUFFER_BYTES: usize = 64 * 1024;
 /// Interval between attempts to connect.
-const RETRY_EVERY_NS: i64 = 500 * MS;
-/// Timeout of an attempt to connect.
-pub const CONNECT_TIMEOUT: Duration = Duration::from_millis(1000);
-/// The client disconnects from a server that sent nothing for this long, although it was pinged, and connects anew.
-const SILENCE_NS: i64 = 3_000 * MS;
+const RETRY_EVERY_NS: i64 = 250 * MS;
+/// Timeout of an attempt to connect. The operating system would ask again only after a second; a new attempt comes sooner.
+pub const CONNECT_TIMEOUT: Duration = Duration::from_millis(400);
+/// The client disconnects from a server that sent nothing for this long, and connects anew: the server may have forgotten
+/// the connection, and TCP sends lost bytes again at ever longer intervals ...
+const SILENCE_NS: i64 = 1_000 * MS;
+/// ... but a server that has answered no ping may just have nothing to tell.
+const SILENCE_WITHOUT_PONGS_NS: i64 = 3_000 * MS;
+/// A pose that is older than this, or as far in the future, waited somewhere on its way, or the server's clock stepped. A
+/// pong tells which.
+const DOUBTED_NS: u64 = 1_000_000_000;
+/// It does if it came back within this time.
+const SETTLED_ROUND_TRIP_NS: i64 = 50 * MS;
+/// If no pong comes for this long, the map of the server's clock is forgotten.
+const UNSETTLED_NS: i64 = 300 * MS;
 /// Pings: this many quickly, the rest slowly.
 const QUICK_PINGS: u32 = 20;
 const QUICK_PING_EVERY_NS: i64 = 10 * MS;
@@ -91,6 +101,10 @@ pub struct VrpnClient {
     ping_due: HostTime,
     pings: u32,
     pongs: u64,
+    /// Pings of this connection have been answered.
+    has_ponged: bool,
+    /// Since then the server's clock contradicts the arrival of its poses, whose age is unknown.
+    doubted_since: Option<HostTime>,
     problem: Option<String>,
     connections: u64,
 }
@@ -157,6 +171,8 @@ impl VrpnClient {
             ping_due: HostTime(i64::MIN),
             pings: 0,
             pongs: 0,
+            has_ponged: false,
+            doubted_since: None,
             problem: None,
             connections: 0,
         })
@@ -200,6 +216,7 @@ impl VrpnClient {
         self.one_way = OneWay::EMPTY;
         self.ping_as = None;
         (self.ping_sent, self.ping_due, self.pings) = (None, now, 0);
+        (self.has_ponged, self.doubted_since) = (false, None);
         self.connections += 1;
         self.out.clear();
         self.out.extend_from_slice(&COOKIE);
@@ -358,6 +375,10 @@ impl VrpnClient {
             self.gate.count_unknown();
             return 0;
         };
+        if self.doubted_since.is_some() {
+            self.gate.count_unknown_age();
+            return 0;
+        }
         match self.gate.admit(&TrackerSample { body, ..sample }) {
             Some(sample) => {
                 sink(&sample);
@@ -401,16 +422,18 @@ impl VrpnClient {
     fn on_pong(&mut self, message: &Message<'_>, at: HostTime) {
         let Some(t1) = self.ping_sent.take() else { return };
         self.pongs += 1;
+        self.has_ponged = true;
         // The pongs of a server that does not stamp them cannot be used for timing.
         if message.stamp_us() == 0 {
             return;
         }
         let ticks = DeviceTicks(message.stamp_us());
-        if matches!(
-            self.map.add_exchange(t1, ticks, ticks, at),
-            ExchangeOutcome::Stepped | ExchangeOutcome::Contradicting
-        ) {
+        let outcome = self.map.add_exchange(t1, ticks, ticks, at);
+        if matches!(outcome, ExchangeOutcome::Stepped | ExchangeOutcome::Contradicting) {
             (self.pings, self.ping_due) = (0, at);
+        }
+        if outcome != ExchangeOutcome::Contradicting && at.ns_since(t1) <= SETTLED_ROUND_TRIP_NS {
+            self.doubted_since = None;
         }
     }
 
@@ -421,9 +444,10 @@ impl VrpnClient {
             return at;
         }
         if let Some(mapped) = self.map.to_host(DeviceTicks(stamp)) {
-            if at.ns_since(mapped.at) < 1_000 * MS {
-                return mapped.at.min(at);
+            if at.ns_since(mapped.at).unsigned_abs() >= DOUBTED_NS && self.doubted_since.is_none() {
+                (self.doubted_since, self.pings, self.ping_due) = (Some(at), 0, at);
             }
+            return mapped.at.min(at);
         }
         let device_ns = i64::try_from(stamp.saturating_mul(1000)).unwrap_or(i64::MAX);
         let offset = self.one_way.note(at, device_ns);
@@ -431,13 +455,18 @@ impl VrpnClient {
     }
 
     fn converse(&mut self, now: HostTime, sink: &mut dyn FnMut(&TrackerSample)) -> usize {
+        let alive = self.fill(now);
+        let silence_ns = if self.has_ponged { SILENCE_NS } else { SILENCE_WITHOUT_PONGS_NS };
         let State::Open { heard_at, .. } = &self.state else { return 0 };
-        if now.ns_since(*heard_at) > SILENCE_NS {
+        if now.ns_since(*heard_at) > silence_ns {
             self.lose(now, "the server fell silent".into());
             return 0;
         }
-        let alive = self.fill(now);
         let at = self.clock.now();
+        if self.doubted_since.take_if(|since| at.ns_since(*since) >= UNSETTLED_NS).is_some() {
+            self.map = ClockMap::new(1_000_000).expect("a microsecond clock");
+            self.one_way = OneWay::EMPTY;
+        }
         let delivered = match self.digest(at, sink) {
             Ok(n) => n,
             Err(error) => {
@@ -540,3 +569,7 @@ impl Tracker for VrpnClient {
         text
     }
 }
+
+#[cfg(test)]
+#[path = "client_tests.rs"]
+mod tests;
