@@ -10,8 +10,8 @@ pub trait Stream: Read + Write + Send {}
 
 impl<T: Read + Write + Send> Stream for T {}
 
-/// Opens a [`Stream`] for a client that must never wait. The clients bring one that asks the operating system on a helper
-/// thread; a simulator brings its own. There is one attempt at a time.
+/// Opens a [`Stream`] for a client that must never wait. The clients bring one that asks the operating system on a
+/// helper thread; a simulator brings its own. There is one attempt at a time.
 pub trait Opener: Send {
     /// Begins an attempt. Returns false if none can be made now.
     fn begin(&mut self) -> bool;

@@ -270,7 +270,7 @@ impl TrackerLine {
     fn read(&mut self, port: (u64, u64), into: &mut [u8]) -> io::Result<usize> {
         if !self.is_same(port) {
             // Drivers tell a hang-up in two ways.
-            return if self.plugs % 2 == 0 { Ok(0) } else { Err(ErrorKind::BrokenPipe.into()) };
+            return if self.plugs.is_multiple_of(2) { Ok(0) } else { Err(ErrorKind::BrokenPipe.into()) };
         }
         let mut n = 0;
         while let Some(bytes) = self.input.front_mut() {

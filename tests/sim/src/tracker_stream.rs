@@ -1,4 +1,5 @@
-//! A VRPN server at the end of a TCP connection: what arrives is whole and in order, but late, or the connection is gone.
+//! A VRPN server at the end of a TCP connection: what arrives is whole and in order, but late, or the connection is
+//! gone.
 
 use crate::cable::lock;
 use crate::dice::Dice;

@@ -144,6 +144,54 @@ fn serial_lines_carry_their_frames_and_are_struck_by_faults_of_their_own() {
     assert!((0..300).all(|seed| Setup::of(seed, None, Some(true), None, None).serial.is_none()));
 }
 
+/// The same for lives whose tracker hangs on a serial line or is a VRPN server.
+#[test]
+fn what_once_broke_a_law_with_another_tracker_keeps_them_all() {
+    use TrackerKind::{Serial, Vrpn};
+    let found = [
+        // A line held poses back for three seconds, and they were dated as new.
+        (34, Serial, 36),
+        // The same before the first echo.
+        (110_000_400, Serial, 30),
+        // A connection that was cut or forgotten took more than a second to come back.
+        (7, Vrpn, 33),
+        (46, Vrpn, 6),
+        (58, Vrpn, 6),
+    ];
+    for (seed, tracker, seconds) in found {
+        let lived = lived(&Order { serial: None, tracker: Some(tracker), ..order(seed, None, seconds) });
+        assert_eq!(lived.broken, None, "seed {seed}");
+        assert!(lived.table.total() > 0 && lived.setup.tracker.kind() == tracker, "seed {seed}");
+    }
+}
+
+/// A fifth of the lives each have a serial tracker and a VRPN server, which are struck by faults of their own.
+#[test]
+fn other_trackers_are_struck_by_faults_of_their_own() {
+    let kinds = (0..3_000).map(|seed| Setup::of(seed, None, None, None, None).tracker.kind());
+    let kinds: Vec<TrackerKind> = kinds.collect();
+    for kind in [TrackerKind::Serial, TrackerKind::Vrpn] {
+        let lives = kinds.iter().filter(|other| **other == kind).count();
+        assert!((500..700).contains(&lives), "{lives} of 3000 lives are {kind:?}");
+    }
+    for tracker in [TrackerKind::NatNet, TrackerKind::Serial, TrackerKind::Vrpn] {
+        let mut episodes = Episodes::new(&Setup::of(5, None, None, None, Some(tracker)));
+        let faults: Vec<_> = (0..2_000).flat_map(|_| episodes.next_episode().faults).collect();
+        assert!(faults.iter().all(|fault| fault.kind.strikes(tracker)));
+        let own = faults.iter().filter(|fault| {
+            let strikes = |other| fault.kind.strikes(other);
+            [TrackerKind::NatNet, TrackerKind::Serial, TrackerKind::Vrpn]
+                .map(strikes)
+                .iter()
+                .filter(|s| **s)
+                .count()
+                == 1
+        });
+        let own = own.count();
+        assert!(own > 30, "{own} faults that strike only {tracker:?}");
+    }
+}
+
 #[test]
 fn the_same_seed_is_the_same_life_and_another_is_not() {
     let (a, b) = (lived(&order(77, Some(120), 20)), lived(&order(77, Some(120), 20)));
@@ -153,6 +201,11 @@ fn the_same_seed_is_the_same_life_and_another_is_not() {
     let with_tracks = |seed| lived(&Order { follows: Some(true), ..order(seed, Some(60), 20) });
     let (a, b) = (with_tracks(77), with_tracks(77));
     assert_eq!((a.trace, a.events, a.planes_moved), (b.trace, b.events, b.planes_moved));
+    for tracker in [TrackerKind::Serial, TrackerKind::Vrpn] {
+        let with = |seed| lived(&Order { tracker: Some(tracker), ..order(seed, Some(60), 20) });
+        let (a, b) = (with(77), with(77));
+        assert_eq!((a.trace, a.events), (b.trace, b.events), "{tracker:?}");
+    }
     let on_a_line = |seed| lived(&Order { serial: Some(true), ..order(seed, Some(60), 20) });
     let (a, b) = (on_a_line(77), on_a_line(77));
     assert_eq!((a.trace, a.events), (b.trace, b.events));
@@ -191,6 +244,12 @@ fn a_life_without_faults_is_light() {
             let lived = lived(&quiet);
             let what = format!("{rate_hz}, tracks {follows:?}, serial line {serial:?}");
             assert_eq!((lived.broken, lived.table.total()), (None, 0), "{what}");
+        }
+        for tracker in [TrackerKind::Serial, TrackerKind::Vrpn] {
+            let without = (0..10_000).collect();
+            let quiet = Order { without, tracker: Some(tracker), ..order(3, Some(rate_hz), 10) };
+            let lived = lived(&quiet);
+            assert_eq!((lived.broken, lived.table.total()), (None, 0), "{rate_hz}, {tracker:?}");
         }
     }
 }

@@ -18,15 +18,16 @@ const MS: i64 = 1_000_000;
 const BUFFER_BYTES: usize = 64 * 1024;
 /// Interval between attempts to connect.
 const RETRY_EVERY_NS: i64 = 250 * MS;
-/// Timeout of an attempt to connect. The operating system would ask again only after a second; a new attempt comes sooner.
+/// Timeout of an attempt to connect. The operating system would ask again only after a second; a new attempt comes
+/// sooner.
 pub const CONNECT_TIMEOUT: Duration = Duration::from_millis(400);
-/// The client disconnects from a server that sent nothing for this long, and connects anew: the server may have forgotten
-/// the connection, and TCP sends lost bytes again at ever longer intervals ...
+/// The client disconnects from a server that sent nothing for this long, and connects anew: the server may have
+/// forgotten the connection, and TCP sends lost bytes again at ever longer intervals ...
 const SILENCE_NS: i64 = 1_000 * MS;
 /// ... but a server that has answered no ping may just have nothing to tell.
 const SILENCE_WITHOUT_PONGS_NS: i64 = 3_000 * MS;
-/// A pose that is older than this, or as far in the future, waited somewhere on its way, or the server's clock stepped. A
-/// pong tells which.
+/// A pose that is older than this, or as far in the future, waited somewhere on its way, or the server's clock stepped.
+/// A pong tells which.
 const DOUBTED_NS: u64 = 1_000_000_000;
 /// It does if it came back within this time.
 const SETTLED_ROUND_TRIP_NS: i64 = 50 * MS;
