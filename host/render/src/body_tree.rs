@@ -234,22 +234,22 @@ fn best_place(leaves: &[Leaf], bin: impl Fn(&Leaf) -> usize) -> Option<usize> {
 mod tests {
     use super::*;
     use bytemuck::Zeroable;
+    use dpm_device::rng::Sampler;
     use dpm_shaders::structs::INSTANCE_PROJECTED;
+    use std::time::Instant;
 
-    /// Numbers from 0 to 1 that look random.
-    fn random(state: &mut u64) -> f32 {
-        *state = state.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1_442_695_040_888_963_407);
-        (*state >> 40) as f32 / (1u64 << 24) as f32
+    /// A point of the unit cube.
+    fn point(random: &mut Sampler) -> Vec3 {
+        Vec3::from_array(std::array::from_fn(|_| random.uniform() as f32))
     }
 
-    fn boxes(count: usize, size: f32, state: &mut u64) -> Vec<Instance> {
-        let mut point = || Vec3::from_array(std::array::from_fn(|_| random(state)));
+    fn boxes(count: usize, size: f32, random: &mut Sampler) -> Vec<Instance> {
         (0..count)
             .map(|i| {
-                let lower = point() * 10.0;
+                let lower = point(random) * 10.0;
                 Instance {
                     bounds_min: lower.into(),
-                    bounds_max: (lower + point() * size).into(),
+                    bounds_max: (lower + point(random) * size).into(),
                     flags: if i % 3 == 0 { INSTANCE_PROJECTED } else { 0 },
                     body: i as u32,
                     ..Instance::zeroed()
@@ -298,15 +298,14 @@ mod tests {
     /// Whatever the bodies, a ray finds in the tree exactly those whose boxes it enters, with a mask and without.
     #[test]
     fn a_ray_finds_every_body_that_it_enters_and_no_other() {
-        let mut state = 7;
+        let mut random = Sampler::new(7, 0);
         for (count, size) in [(0, 1.0), (1, 1.0), (2, 9.0), (9, 3.0), (64, 0.5), (256, 0.2), (256, 12.0)] {
-            let instances = boxes(count, size, &mut state);
+            let instances = boxes(count, size, &mut random);
             let (nodes, per_octant) = written(&instances);
             assert_eq!(per_octant, (2 * count).saturating_sub(1));
             for k in 0..500 {
-                let mut point = || Vec3::from_array(std::array::from_fn(|_| random(&mut state)));
-                let origin = point() * 12.0 - 1.0;
-                let inverse = 1.0 / (point() - 0.5);
+                let origin = point(&mut random) * 12.0 - 1.0;
+                let inverse = 1.0 / (point(&mut random) - 0.5);
                 let mask = if k % 2 == 0 { 0 } else { INSTANCE_PROJECTED };
                 let is_entered = |i: &&Instance| {
                     (mask == 0 || i.flags & mask != 0)
@@ -353,31 +352,37 @@ mod tests {
         }
     }
 
-    /// Of many small bodies a ray asks a number that grows with the logarithm of theirs.
+    /// Of many small bodies a ray asks few. A ray through a cloud of n bodies passes about as many as the cube root of n, and goes down to each: of
+    /// 16 times as many bodies it asks less than six times as many nodes.
     #[test]
     fn few_nodes_are_asked_of_many_bodies() {
-        let mut state = 3;
+        let mut random = Sampler::new(3, 0);
         let mut asked_of = |count: usize| {
-            let instances = boxes(count, 0.3, &mut state);
+            let instances = boxes(count, 0.3, &mut random);
             let (nodes, per_octant) = written(&instances);
             let rays = 2000;
             let asked = (0..rays).map(|_| {
-                let mut point = || Vec3::from_array(std::array::from_fn(|_| random(&mut state)));
-                let (origin, inverse) = (point() * 10.0, 1.0 / (point() - 0.5));
+                let (origin, inverse) = (point(&mut random) * 10.0, 1.0 / (point(&mut random) - 0.5));
                 walk(&nodes, per_octant, origin, inverse, 0).1
             });
             asked.sum::<usize>() as f64 / f64::from(rays)
         };
         let [few, many] = [asked_of(16), asked_of(256)];
         println!("nodes asked: {few:.1} of 16 bodies, {many:.1} of 256");
-        assert!(few < 16.0 && many < 48.0 && many < 4.0 * few, "{few} {many}");
+        for count in [64, 256] {
+            let instances = boxes(count, 0.3, &mut random);
+            let started = Instant::now();
+            (0..100).for_each(|_| drop(written(&instances)));
+            println!("{count} bodies take the host {:?}", started.elapsed() / 100);
+        }
+        assert!(few < 16.0 && many < 48.0 && many < 6.0 * few, "{few} {many}");
     }
 
     /// Bodies at one place, boxes that are huge, and bodies without surfaces take no more nodes and are found.
     #[test]
     fn odd_bodies_have_a_tree_too() {
-        let mut state = 1;
-        let mut same = vec![boxes(1, 1.0, &mut state)[0]; 100];
+        let mut random = Sampler::new(1, 0);
+        let mut same = vec![boxes(1, 1.0, &mut random)[0]; 100];
         (0..100).for_each(|i| same[i].body = i as u32);
         let (nodes, count) = written(&same);
         assert_eq!(count, 199);
@@ -385,12 +390,12 @@ mod tests {
         let origin = centre - Vec3::X * 20.0;
         assert_eq!(walk(&nodes, count, origin, 1.0 / Vec3::new(1.0, 1e-9, 1e-9), 0).0.len(), 100);
         for far in [f32::MAX, f32::INFINITY] {
-            let mut huge = boxes(40, 1.0, &mut state);
+            let mut huge = boxes(40, 1.0, &mut random);
             huge[7].bounds_min = [-far; 3];
             huge[9].bounds_max = [far; 3];
             assert_eq!(written(&huge).1, 79);
         }
-        let mut some = boxes(10, 1.0, &mut state);
+        let mut some = boxes(10, 1.0, &mut random);
         some[4].flags = INSTANCE_EMPTY;
         let (nodes, count) = written(&some);
         assert_eq!(count, 17);

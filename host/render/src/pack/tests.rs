@@ -3,24 +3,12 @@
 use super::quantise::{quantise_scalar, ROUND};
 use super::*;
 use dpm_device::planes::{PlaneSchedule, Raster};
-
-/// A generator of reproducible bits (splitmix64).
-struct Bits(u64);
-
-impl Bits {
-    fn next(&mut self) -> u64 {
-        self.0 = self.0.wrapping_add(0x9e37_79b9_7f4a_7c15);
-        let mut z = self.0;
-        z = (z ^ (z >> 30)).wrapping_mul(0xbf58_476d_1ce4_e5b9);
-        z = (z ^ (z >> 27)).wrapping_mul(0x94d0_49bb_1331_11eb);
-        z ^ (z >> 31)
-    }
-}
+use dpm_device::rng::Sampler;
 
 fn random_codes(raster: Raster, seed: u64) -> Vec<u32> {
-    let mut bits = Bits(seed);
+    let mut bits = Sampler::new(seed, 0);
     // The top byte is garbage on purpose: it must not reach any plane.
-    (0..raster.pixel_count()).map(|_| bits.next() as u32).collect()
+    (0..raster.pixel_count()).map(|_| bits.next_u64() as u32).collect()
 }
 
 fn frame(width: u32, height: u32, schedule: PlaneSchedule) -> BitPlaneFrame {
@@ -206,13 +194,13 @@ fn what_no_level_stands_for_is_clamped_and_counted() {
 
 #[test]
 fn the_vector_code_is_the_plain_code_bit_for_bit() {
-    let mut bits = Bits(3);
+    let mut bits = Sampler::new(3, 0);
     // All bit patterns are equally likely: NaNs, infinities and subnormals among them.
     let wild: Vec<[f32; 4]> =
-        (0..4099).map(|_| std::array::from_fn(|_| f32::from_bits(bits.next() as u32))).collect();
+        (0..4099).map(|_| std::array::from_fn(|_| f32::from_bits(bits.next_u64() as u32))).collect();
     let tame: Vec<[f32; 4]> =
-        (0..4099).map(|_| std::array::from_fn(|_| (bits.next() >> 40) as f32 / 16e6)).collect();
-    let offsets: Vec<f32> = (0..4099).map(|_| (bits.next() >> 40) as f32 / (1 << 24) as f32).collect();
+        (0..4099).map(|_| std::array::from_fn(|_| (bits.next_u64() >> 40) as f32 / 16e6)).collect();
+    let offsets: Vec<f32> = (0..4099).map(|_| (bits.next_u64() >> 40) as f32 / (1 << 24) as f32).collect();
     for drive in [&wild, &tame] {
         for offsets in [None, Some(&offsets[..])] {
             for len in [0, 1, 7, 8, 9, if cfg!(miri) { 99 } else { 4099 }] {

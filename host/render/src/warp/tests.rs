@@ -2,18 +2,19 @@
 
 use super::*;
 use dpm_device::planes::Raster;
+use dpm_device::rng::Sampler;
 use dpm_shaders::structs::{Moved, Mover, OWNER_NONE, OWNER_STILL, WORD_ROUGH};
 
-/// A generator of reproducible numbers (splitmix64).
-struct Dice(u64);
+/// Random numbers of a seed, as pictures need them.
+struct Dice(Sampler);
 
 impl Dice {
+    fn of(seed: u64) -> Self {
+        Self(Sampler::new(seed, 0))
+    }
+
     fn next(&mut self) -> u64 {
-        self.0 = self.0.wrapping_add(0x9e37_79b9_7f4a_7c15);
-        let mut z = self.0;
-        z = (z ^ (z >> 30)).wrapping_mul(0xbf58_476d_1ce4_e5b9);
-        z = (z ^ (z >> 27)).wrapping_mul(0x94d0_49bb_1331_11eb);
-        z ^ (z >> 31)
+        self.0.next_u64()
     }
 
     /// A number from `low` up to and without `high`.
@@ -140,7 +141,7 @@ fn pixel(dice: &mut Dice, at: [i32; 2], movers: &[Mover], look: &Look, are_codes
 }
 
 fn picture(seed: u64) -> Picture {
-    let mut dice = Dice(seed);
+    let mut dice = Dice::of(seed);
     let width = dice.one_of(&[1, 7, 8, 15, 16, 17, 40, 64, 96, 131, 200]);
     let height = dice.one_of(&[1, 2, 9, 24, 47]);
     let raster = Raster::new(width as u32, height as u32).unwrap();
@@ -207,7 +208,7 @@ fn every_fraction_of_a_pixel_is_interpolated_alike() {
     for &kernel in Kernel::available() {
         let mut warper = Warper::new(kernel);
         for turn in 0..if cfg!(miri) { 1 } else { 64 } {
-            let mut dice = Dice(turn);
+            let mut dice = Dice::of(turn);
             let start = [turn as i32 * 5 % 64 - 32, 3 * (turn as i32 - 32)];
             let of = |dice: &mut Dice| dice.next() as u32 & 0xff_ffff;
             let owner = |i: usize| OWNER_STILL + if turn % 2 == 0 || i % 140 < 70 { 1 } else { 2 };
@@ -235,7 +236,7 @@ fn what_is_around_blocks_ends_at_any_column() {
         let mut warper = Warper::new(kernel);
         for edge in 96..if cfg!(miri) { 98 } else { 130 } {
             for (motion, beyond) in [([-800, 30], 0), ([-330, -90], 1), ([300, 0], 2), ([-300, 100], 2)] {
-                let mut dice = Dice(edge);
+                let mut dice = Dice::of(edge);
                 let pixels = (0..raster.pixel_count() as u64).map(|i| {
                     let is_beyond = i % 160 >= edge;
                     let owner = if is_beyond && beyond < 2 { beyond } else { OWNER_STILL + 1 };
@@ -261,7 +262,7 @@ fn a_body_comes_from_far_away() {
         for (fast, behind) in
             [[-4000, 0], [0, -3000], [-4000, 2500]].into_iter().zip([OWNER_STILL + 1, OWNER_STILL, 0])
         {
-            let mut dice = Dice(7);
+            let mut dice = Dice::of(7);
             let pixels = (0..raster.pixel_count() as i32).map(|i| {
                 let is_fast = i % 200 > 110 || i / 200 > 40;
                 let (owner, motion) = if is_fast { (OWNER_STILL + 2, fast) } else { (behind, [20, 10]) };
@@ -284,7 +285,7 @@ fn a_body_is_looked_for_no_farther_than_pixels_can_tell() {
     let raster = Raster::new(90, 20).unwrap();
     for &kernel in Kernel::available() {
         for [start, steep] in [[32000, 131_072], [-32000, -131_072]] {
-            let mut dice = Dice(11);
+            let mut dice = Dice::of(11);
             let pixels = (0..raster.pixel_count()).map(|_| {
                 let owner = OWNER_STILL + dice.from(0, 2) as u32;
                 let motion = motion_word([dice.from(-32767, 32768), dice.from(-3000, 3000)]);

@@ -103,6 +103,64 @@ macro_rules! instructions {
     )+};
 }
 
+/// Methods that differ between the CPUs in the names of their instructions only.
+macro_rules! registers {
+    ($splat:ident, $splat_four16:ident, $load:ident, $store:ident, $abs:ident, $shuffle:ident,
+     $truncated:ident, $divide:ident, $float:ident) => {
+        #[inline(always)]
+        fn splat(self, value: i32) -> Self::V {
+            // SAFETY: `self` is the proof that the CPU has the instruction.
+            unsafe { $splat(value) }
+        }
+
+        #[inline(always)]
+        fn splat_four16(self, four: u64) -> Self::V {
+            // SAFETY: `self` is the proof that the CPU has the instruction.
+            unsafe { $splat_four16(four as i64) }
+        }
+
+        #[inline(always)]
+        fn numbers(self) -> Self::V {
+            self.load(&NUMBERS)
+        }
+
+        #[inline(always)]
+        fn load(self, from: &[u32]) -> Self::V {
+            let from = &from[..Self::N];
+            // SAFETY: the slice has the numbers of a register, the load needs no alignment, and `self` is the proof that the CPU has
+            // the instruction.
+            unsafe { $load(from.as_ptr().cast()) }
+        }
+
+        #[inline(always)]
+        fn store(self, value: Self::V, to: &mut [u32]) {
+            let to = &mut to[..Self::N];
+            // SAFETY: the slice has the numbers of a register, the store needs no alignment, and `self` is the proof that the CPU has
+            // the instruction.
+            unsafe { $store(to.as_mut_ptr().cast(), value) }
+        }
+
+        #[inline(always)]
+        fn abs(self, a: Self::V) -> Self::V {
+            // SAFETY: `self` is the proof that the CPU has the instruction, which takes registers only.
+            unsafe { $abs(a) }
+        }
+
+        #[inline(always)]
+        fn quotient(self, a: Self::V, b: Self::V) -> Self::V {
+            // SAFETY: `self` is the proof that the CPU has the instructions, which take registers only.
+            unsafe { $truncated($divide($float(a), $float(b))) }
+        }
+
+        #[inline(always)]
+        fn spread<const HALF: u8>(self, a: Self::V) -> Self::V {
+            // SAFETY: no register has more than the 64 bytes that are loaded from, the load needs no alignment, and `self` is the proof
+            // that the CPU has the instructions.
+            unsafe { $shuffle(a, $load(SPREAD[HALF as usize].as_ptr().cast())) }
+        }
+    };
+}
+
 /// Shifts by a constant.
 macro_rules! shifts {
     ($($name:ident = $instruction:ident),+ $(,)?) => {$(
@@ -146,49 +204,17 @@ impl Lanes for Avx2 {
         shl = _mm256_sll_epi32, shr = _mm256_srl_epi32, sar = _mm256_sra_epi32,
         shr16 = _mm256_srl_epi16,
     }
-
-    #[inline(always)]
-    fn splat(self, value: i32) -> Self::V {
-        // SAFETY: `self` is the proof that the CPU has AVX2.
-        unsafe { _mm256_set1_epi32(value) }
-    }
-
-    #[inline(always)]
-    fn splat_four16(self, four: u64) -> Self::V {
-        // SAFETY: `self` is the proof that the CPU has AVX2.
-        unsafe { _mm256_set1_epi64x(four as i64) }
-    }
-
-    #[inline(always)]
-    fn numbers(self) -> Self::V {
-        self.load(&NUMBERS)
-    }
-
-    #[inline(always)]
-    fn load(self, from: &[u32]) -> Self::V {
-        let from = &from[..Self::N];
-        // SAFETY: the slice has eight numbers, the load needs no alignment, and the CPU has AVX2.
-        unsafe { _mm256_loadu_si256(from.as_ptr().cast()) }
-    }
-
-    #[inline(always)]
-    fn store(self, value: Self::V, to: &mut [u32]) {
-        let to = &mut to[..Self::N];
-        // SAFETY: the slice has eight numbers, the store needs no alignment, and the CPU has AVX2.
-        unsafe { _mm256_storeu_si256(to.as_mut_ptr().cast(), value) }
-    }
-
-    #[inline(always)]
-    fn abs(self, a: Self::V) -> Self::V {
-        // SAFETY: `self` is the proof that the CPU has AVX2.
-        unsafe { _mm256_abs_epi32(a) }
-    }
-
-    #[inline(always)]
-    fn quotient(self, a: Self::V, b: Self::V) -> Self::V {
-        // SAFETY: `self` is the proof that the CPU has AVX2.
-        unsafe { _mm256_cvttps_epi32(_mm256_div_ps(_mm256_cvtepi32_ps(a), _mm256_cvtepi32_ps(b))) }
-    }
+    registers!(
+        _mm256_set1_epi32,
+        _mm256_set1_epi64x,
+        _mm256_loadu_si256,
+        _mm256_storeu_si256,
+        _mm256_abs_epi32,
+        _mm256_shuffle_epi8,
+        _mm256_cvttps_epi32,
+        _mm256_div_ps,
+        _mm256_cvtepi32_ps
+    );
 
     #[inline(always)]
     fn except(self, a: Self::M, b: Self::M) -> Self::M {
@@ -212,12 +238,6 @@ impl Lanes for Avx2 {
     fn merge(self, mask: Self::V, yes: Self::V, no: Self::V) -> Self::V {
         self.or(self.and(mask, yes), self.except(no, mask))
     }
-
-    #[inline(always)]
-    fn spread<const HALF: u8>(self, a: Self::V) -> Self::V {
-        // SAFETY: the load is of 32 of 64 bytes and needs no alignment, and the CPU has AVX2.
-        unsafe { _mm256_shuffle_epi8(a, _mm256_loadu_si256(SPREAD[HALF as usize].as_ptr().cast())) }
-    }
 }
 
 impl Lanes for Avx512 {
@@ -236,43 +256,17 @@ impl Lanes for Avx512 {
         shl = _mm512_sll_epi32, shr = _mm512_srl_epi32, sar = _mm512_sra_epi32,
         shr16 = _mm512_srl_epi16,
     }
-
-    #[inline(always)]
-    fn splat(self, value: i32) -> Self::V {
-        // SAFETY: `self` is the proof that the CPU has AVX-512.
-        unsafe { _mm512_set1_epi32(value) }
-    }
-
-    #[inline(always)]
-    fn splat_four16(self, four: u64) -> Self::V {
-        // SAFETY: `self` is the proof that the CPU has AVX-512.
-        unsafe { _mm512_set1_epi64(four as i64) }
-    }
-
-    #[inline(always)]
-    fn numbers(self) -> Self::V {
-        self.load(&NUMBERS)
-    }
-
-    #[inline(always)]
-    fn load(self, from: &[u32]) -> Self::V {
-        let from = &from[..Self::N];
-        // SAFETY: the slice has sixteen numbers, the load needs no alignment, and the CPU has AVX-512.
-        unsafe { _mm512_loadu_si512(from.as_ptr().cast()) }
-    }
-
-    #[inline(always)]
-    fn store(self, value: Self::V, to: &mut [u32]) {
-        let to = &mut to[..Self::N];
-        // SAFETY: the slice has sixteen numbers, the store needs no alignment, and the CPU has AVX-512.
-        unsafe { _mm512_storeu_si512(to.as_mut_ptr().cast(), value) }
-    }
-
-    #[inline(always)]
-    fn abs(self, a: Self::V) -> Self::V {
-        // SAFETY: `self` is the proof that the CPU has AVX-512.
-        unsafe { _mm512_abs_epi32(a) }
-    }
+    registers!(
+        _mm512_set1_epi32,
+        _mm512_set1_epi64,
+        _mm512_loadu_si512,
+        _mm512_storeu_si512,
+        _mm512_abs_epi32,
+        _mm512_shuffle_epi8,
+        _mm512_cvttps_epi32,
+        _mm512_div_ps,
+        _mm512_cvtepi32_ps
+    );
 
     #[inline(always)]
     fn equal(self, a: Self::V, b: Self::V) -> Self::M {
@@ -284,12 +278,6 @@ impl Lanes for Avx512 {
     fn greater(self, a: Self::V, b: Self::V) -> Self::M {
         // SAFETY: `self` is the proof that the CPU has AVX-512.
         unsafe { _mm512_cmpgt_epi32_mask(a, b) }
-    }
-
-    #[inline(always)]
-    fn quotient(self, a: Self::V, b: Self::V) -> Self::V {
-        // SAFETY: `self` is the proof that the CPU has AVX-512.
-        unsafe { _mm512_cvttps_epi32(_mm512_div_ps(_mm512_cvtepi32_ps(a), _mm512_cvtepi32_ps(b))) }
     }
 
     #[inline(always)]
@@ -322,11 +310,5 @@ impl Lanes for Avx512 {
     fn merge(self, mask: Self::V, yes: Self::V, no: Self::V) -> Self::V {
         // SAFETY: `self` is the proof that the CPU has AVX-512.
         unsafe { _mm512_ternarylogic_epi32::<0xca>(mask, yes, no) }
-    }
-
-    #[inline(always)]
-    fn spread<const HALF: u8>(self, a: Self::V) -> Self::V {
-        // SAFETY: the load is of 64 bytes and needs no alignment, and the CPU has AVX-512.
-        unsafe { _mm512_shuffle_epi8(a, _mm512_loadu_si512(SPREAD[HALF as usize].as_ptr().cast())) }
     }
 }

@@ -3,7 +3,7 @@
 use super::lanes::Lanes;
 use super::pure::turns;
 use super::rows::{Rows, MOTION, OWNER_AND_DEPTH, WORD};
-use super::{columns_and_rows, keys, motions, offset, unmarked, Block, Body, Group, Plan, MOST_LANES};
+use super::{all_of, motions, offset, unmarked, Block, Body, Group, Offsets, Plan, MOST_LANES};
 use dpm_shaders::structs::{Moved, OWNER_NONE, OWNER_STILL, WORD_ROUGH};
 
 /// A block, and the pixels that it has itself.
@@ -109,28 +109,21 @@ impl<L: Lanes> Own<'_, L> {
         let within = body.within(l, l.add(self.x, off[0]), l.add(self.y, off[1]));
         let wanted = l.both(wanted, within);
         let mut out = [l.splat(0); K];
-        let mut bits = l.bits(wanted);
-        let keys = keys(l, off);
-        let mut list = [0; MOST_LANES];
-        l.store(keys, &mut list);
-        while bits != 0 {
-            let first = bits.trailing_zeros();
-            let off = columns_and_rows(list[first as usize] as i32);
+        let mut offsets = Offsets::of(l, off, l.bits(wanted));
+        while let Some((first, off)) = offsets.next() {
             let at = [self.block.at[0] + off[0], self.block.at[1] + off[1]];
             if self.rows.keeps(off) {
-                let same = l.equal(keys, l.splat(list[first as usize] as i32));
+                let same = offsets.alike(l, first);
                 let index = self.rows.index(at);
                 for (out, field) in out.iter_mut().zip(fields) {
                     *out = l.choose(same, self.rows.load(l, field, index), *out);
                 }
-                bits &= !l.bits(same);
             } else {
-                let here = l.equal(l.numbers(), l.splat(first as i32));
+                let here = offsets.alone(l, first);
                 let far = self.far([at[0] + first as i32, at[1]]);
                 for (out, field) in out.iter_mut().zip(fields) {
                     *out = l.choose(here, l.splat(far[field] as i32), *out);
                 }
-                bits &= bits - 1;
             }
         }
         (wanted, out)
@@ -151,25 +144,19 @@ impl<L: Lanes> Own<'_, L> {
         for (neighbour, is_there) in four.iter_mut().zip(is_there) {
             neighbour.is_there = is_there;
         }
-        let keys = keys(l, off);
-        let mut list = [0; MOST_LANES];
-        l.store(keys, &mut list);
-        let mut bits = l.bits(wanted);
-        while bits != 0 {
-            let first = bits.trailing_zeros();
-            let off = columns_and_rows(list[first as usize] as i32);
+        let mut offsets = Offsets::of(l, off, l.bits(wanted));
+        while let Some((first, off)) = offsets.next() {
             let at = [self.block.at[0] + off[0], self.block.at[1] + off[1]];
             if self.rows.keeps(off) {
-                let same = l.equal(keys, l.splat(list[first as usize] as i32));
+                let same = offsets.alike(l, first);
                 let (above, below) = (self.rows.index(at), self.rows.index([at[0], at[1] + 1]));
                 for (neighbour, index) in four.iter_mut().zip([above, above + 1, below, below + 1]) {
                     neighbour.word = l.choose(same, self.rows.load(l, WORD, index), neighbour.word);
                     let owner_and_depth = self.rows.load(l, OWNER_AND_DEPTH, index);
                     neighbour.owner_and_depth = l.choose(same, owner_and_depth, neighbour.owner_and_depth);
                 }
-                bits &= !l.bits(same);
             } else {
-                let here = l.equal(l.numbers(), l.splat(first as i32));
+                let here = offsets.alone(l, first);
                 for (i, neighbour) in four.iter_mut().enumerate() {
                     if l.bits(neighbour.is_there) >> first & 1 == 1 {
                         let [word, _, owner_and_depth] =
@@ -180,7 +167,6 @@ impl<L: Lanes> Own<'_, L> {
                             l.choose(here, owner_and_depth, neighbour.owner_and_depth);
                     }
                 }
-                bits &= bits - 1;
             }
         }
         four
@@ -319,7 +305,7 @@ fn nearest<L: Lanes>(l: L, at: [L::V; 2]) -> [L::V; 2] {
 fn mean<L: Lanes>(l: L, weights: L::V, sums: [L::V; 3]) -> L::V {
     let half = l.shr::<1>(weights);
     let all = l.splat(4096);
-    let is_full = l.bits(l.equal(weights, all)) == u32::MAX >> (32 - L::N);
+    let is_full = l.bits(l.equal(weights, all)) == all_of::<L>();
     let divisor = l.max(weights, l.splat(1));
     let mut codes = sums;
     for code in &mut codes {

@@ -405,14 +405,54 @@ fn motions<L: Lanes>(l: L, motion: L::V) -> [L::V; 2] {
     [l.sar::<16>(l.shl::<16>(motion)), l.sar::<16>(motion)]
 }
 
-/// Whole pixels of places, and one number for both: rows in the upper half, columns in the lower.
-#[inline(always)]
-fn keys<L: Lanes>(l: L, whole: [L::V; 2]) -> L::V {
-    l.or(l.shl::<16>(whole[1]), l.and(whole[0], l.splat(0xffff)))
+/// Bits of all mirrors of a block.
+const fn all_of<L: Lanes>() -> u32 {
+    u32::MAX >> (32 - L::N)
 }
 
-/// The columns and rows of a key.
-#[inline(always)]
-fn columns_and_rows(key: i32) -> [i32; 2] {
-    [key << 16 >> 16, key >> 16]
+/// By how many whole pixels the places that mirrors of a block show are off. Those of mirrors that are off by as many are
+/// neighbours like the mirrors, so that one load serves all of them.
+struct Offsets<L: Lanes> {
+    /// One number for both directions: rows in the upper half, columns in the lower.
+    keys: L::V,
+    list: [u32; MOST_LANES],
+    /// Bits of the mirrors that are not served yet.
+    left: u32,
+}
+
+impl<L: Lanes> Offsets<L> {
+    /// Those of `mirrors`, given as bits, whose places are off by `whole` pixels.
+    #[inline(always)]
+    fn of(l: L, whole: [L::V; 2], mirrors: u32) -> Self {
+        let keys = l.or(l.shl::<16>(whole[1]), l.and(whole[0], l.splat(0xffff)));
+        let mut list = [0; MOST_LANES];
+        l.store(keys, &mut list);
+        Self { keys, list, left: mirrors }
+    }
+
+    /// A mirror that is not served yet, and by how many columns and rows its place is off.
+    #[inline(always)]
+    fn next(&self) -> Option<(u32, [i32; 2])> {
+        if self.left == 0 {
+            return None;
+        }
+        let mirror = self.left.trailing_zeros();
+        let key = self.list[mirror as usize] as i32;
+        Some((mirror, [key << 16 >> 16, key >> 16]))
+    }
+
+    /// All mirrors whose places are off by as much as that of `mirror`. They are served now.
+    #[inline(always)]
+    fn alike(&mut self, l: L, mirror: u32) -> L::M {
+        let same = l.equal(self.keys, l.splat(self.list[mirror as usize] as i32));
+        self.left &= !l.bits(same);
+        same
+    }
+
+    /// This mirror alone, which is the one of [`Offsets::next`]. It is served now.
+    #[inline(always)]
+    fn alone(&mut self, l: L, mirror: u32) -> L::M {
+        self.left &= self.left - 1;
+        l.equal(l.numbers(), l.splat(mirror as i32))
+    }
 }

@@ -3,7 +3,7 @@
 
 use super::lanes::Lanes;
 use super::rows::{Rows, MOTION, WORD};
-use super::{columns_and_rows, keys, motions, offset, unmarked, Block, Body, Group, Plan, MOST_LANES};
+use super::{all_of, motions, offset, unmarked, Block, Body, Group, Offsets, Plan, MOST_LANES};
 use dpm_shaders::structs::WORD_ROUGH;
 
 /// Bits of code values.
@@ -84,7 +84,7 @@ pub(super) fn warp<L: Lanes>(
     let mut first = [0; MOST_LANES];
     l.store(motion, &mut first);
     let first = first[0] as i32;
-    let is_even = l.bits(l.equal(motion, l.splat(first))) == u32::MAX >> (32 - L::N);
+    let is_even = l.bits(l.equal(motion, l.splat(first))) == all_of::<L>();
     let own = unmarked(l, plan, rows.load(l, WORD, block.index));
     Some(match (plan.drawn.are_codes, is_even) {
         (true, true) if !rough => {
@@ -158,13 +158,11 @@ fn even_words<L: Lanes>(
     word
 }
 
-/// Whole pixels and parts of places, and their keys in a list.
+/// Whole pixels of places, and the parts that are left of them.
 #[inline(always)]
-fn parted<L: Lanes>(l: L, at: [L::V; 2]) -> (L::V, [u32; MOST_LANES], [L::V; 2]) {
-    let keys = keys(l, [l.sar::<6>(at[0]), l.sar::<6>(at[1])]);
-    let mut list = [0; MOST_LANES];
-    l.store(keys, &mut list);
-    (keys, list, [l.and(at[0], l.splat(63)), l.and(at[1], l.splat(63))])
+fn parted<L: Lanes>(l: L, at: [L::V; 2]) -> (Offsets<L>, [L::V; 2]) {
+    let whole = [l.sar::<6>(at[0]), l.sar::<6>(at[1])];
+    (Offsets::of(l, whole, all_of::<L>()), [l.and(at[0], l.splat(63)), l.and(at[1], l.splat(63))])
 }
 
 /// Code values of any block.
@@ -182,22 +180,17 @@ fn codes<L: Lanes>(
     let mut word = own;
     for group in plan.groups {
         let at = offset(l, body, motion, group.instant);
-        let (keys, list, part) = parted(l, at);
+        let (mut offsets, part) = parted(l, at);
         let weights = Weights::of(l, part);
-        let mut bits = u32::MAX >> (32 - L::N);
         let mut found = l.splat(0);
-        while bits != 0 {
-            let key = list[bits.trailing_zeros() as usize] as i32;
-            let [right, down] = columns_and_rows(key);
+        while let Some((mirror, [right, down])) = offsets.next() {
             let four = four(l, rows, [block.at[0] + right, block.at[1] + down]);
             let mut code = l.and(weights.interpolate(l, four), l.splat(CODE));
             if rough && !group.whole {
                 let one = one_of(l, four, part, turns(body, group));
                 code = l.choose(is_rough(l, four, part), one, code);
             }
-            let same = l.equal(keys, l.splat(key));
-            found = l.choose(same, code, found);
-            bits &= !l.bits(same);
+            found = l.choose(offsets.alike(l, mirror), code, found);
         }
         word = l.merge(l.splat(group.mask), found, word);
     }
@@ -218,16 +211,11 @@ fn words<L: Lanes>(
     let mut word = own;
     for group in plan.groups {
         let [x, y] = offset(l, body, motion, group.instant);
-        let (keys, list, _) = parted(l, [l.add(x, l.splat(32)), l.add(y, l.splat(32))]);
-        let mut bits = u32::MAX >> (32 - L::N);
+        let (mut offsets, _) = parted(l, [l.add(x, l.splat(32)), l.add(y, l.splat(32))]);
         let mut found = l.splat(0);
-        while bits != 0 {
-            let key = list[bits.trailing_zeros() as usize] as i32;
-            let [right, down] = columns_and_rows(key);
+        while let Some((mirror, [right, down])) = offsets.next() {
             let there = rows.load(l, WORD, rows.index([block.at[0] + right, block.at[1] + down]));
-            let same = l.equal(keys, l.splat(key));
-            found = l.choose(same, there, found);
-            bits &= !l.bits(same);
+            found = l.choose(offsets.alike(l, mirror), there, found);
         }
         word = l.merge(l.splat(group.mask), found, word);
     }
