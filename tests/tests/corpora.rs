@@ -232,7 +232,7 @@ fn files() -> Vec<(&'static str, &'static str, Vec<u8>)> {
         let text = serde_json::to_vec(&file.json).unwrap();
         seeds.push(("gltf_parts", name, [&text[..], &[0], &file.bin].concat()));
     }
-    for name in ["alpha_etc1s", "alpha_uastc"] {
+    for name in ["alpha_etc1s", "alpha_uastc", "chance_bc5", "chance_etc2_a8"] {
         let path = concat!(env!("CARGO_MANIFEST_DIR"), "/assets/ktx2");
         let image = std::fs::read(PathBuf::from(path).join(name).with_extension("ktx2")).unwrap();
         let file = with_image(&image);
