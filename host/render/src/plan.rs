@@ -126,8 +126,7 @@ impl RendererPlan {
     ///
     /// # Errors
     /// The GPU's own.
-    pub(super) fn pipelines(&self, gpu: &Arc<Gpu>) -> Result<Pipelines, GpuError> {
-        let reading = self.reading(gpu.summary())?;
+    pub(super) fn pipelines(&self, gpu: &Arc<Gpu>, reading: Reading) -> Result<Pipelines, GpuError> {
         let table = BindingTable::new(gpu, &shared_bindings(reading))?;
         let compiled = |p: Program| ComputePipeline::new(&table, p.shader, &p.constants);
         let wanted = self.wanted(reading, trace_groups(gpu.summary()));

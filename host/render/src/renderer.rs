@@ -107,7 +107,7 @@ impl Renderer {
         let reading = plan.reading(gpu.summary())?;
         let scene_gpu = SceneGpu::new(gpu, &data, reading)?;
         let optics = OpticsLayout::new(&settings);
-        let Pipelines { table, each: pipelines } = plan.pipelines(gpu)?;
+        let Pipelines { table, each: pipelines } = plan.pipelines(gpu, reading)?;
         let decides_rates =
             TABLE.iter().zip(&pipelines).any(|(pass, p)| pass.grid == Grid::Rates && p.is_some());
         let overlaps = match settings.overlap {
