@@ -113,6 +113,20 @@ pub(crate) fn start_with(rig: &Arc<Rig>, frames: u64, prepare: impl FnOnce(&RunM
 }
 
 impl Running {
+    /// Waits until `done`, at most 20 s, and no longer than the run goes on.
+    pub(crate) fn until(&self, what: &str, mut done: impl FnMut(&RunMonitor) -> bool) {
+        let begin = Instant::now();
+        while !done(&self.monitor) {
+            let is_over = self.thread.as_ref().is_none_or(JoinHandle::is_finished);
+            let counts = self.monitor.counts();
+            assert!(
+                !is_over && begin.elapsed() < Duration::from_secs(20),
+                "{what}: run over: {is_over}; {counts:?}"
+            );
+            std::thread::sleep(Duration::from_millis(1));
+        }
+    }
+
     /// Waits for the end.
     pub(crate) fn end(mut self) -> Result<RunOutcome, PipelineError> {
         self.thread.take().expect("taken once").join().expect("no panic")
@@ -127,9 +141,17 @@ impl Running {
 
 impl Drop for Running {
     fn drop(&mut self) {
+        let was_over = self.thread.as_ref().is_some_and(JoinHandle::is_finished);
         self.monitor.request_stop();
-        if let Some(thread) = self.thread.take() {
-            let _ = thread.join();
+        let Some(thread) = self.thread.take() else { return };
+        let outcome = thread.join();
+        // A test that waits in vain for what the run should do: this is why.
+        if was_over && std::thread::panicking() {
+            match outcome {
+                Ok(Ok(outcome)) => eprintln!("the run had ended well: {:?}", outcome.report),
+                Ok(Err(error)) => eprintln!("the run had ended: {error}"),
+                Err(_) => eprintln!("the run had panicked"),
+            }
         }
     }
 }
