@@ -2,14 +2,18 @@
 //!
 //! The write of the serialport crate waits for room and then writes to a blocking descriptor. The kernel then blocks
 //! the caller until the last byte has found room: for the whole time of a frame on a slow line, and for ever on a line
-//! that nobody reads.
+//! that nobody reads. And where it asks for room with poll(2), Linux first waits until a worker of the kernel has handed
+//! on what had arrived (`n_tty_poll`). That worker has the priority of any program: on a busy machine it took more than
+//! 100 ms, and the link's thread counted as hung.
 #![allow(unsafe_code)]
 
 use std::io;
 use std::os::fd::AsRawFd;
 use std::time::Duration;
 
-use serialport::{SerialPort, TTYPort};
+use serialport::{
+    ClearBuffer, DataBits, FlowControl, Parity, Result as PortResult, SerialPort, StopBits, TTYPort,
+};
 
 /// Opens the port at `path` exclusively, with 8 data bits, no parity and one stop bit. Discards the bytes that had
 /// waited in it: their age is unknown, and they answer no request.
@@ -102,9 +106,88 @@ pub fn never_wait(mut port: TTYPort) -> io::Result<Box<dyn SerialPort>> {
             && libc::fcntl(descriptor, libc::F_SETFD, libc::FD_CLOEXEC) >= 0
     };
     if set {
-        Ok(Box::new(port))
+        Ok(Box::new(NeverWaiting(port)))
     } else {
         Err(io::Error::last_os_error())
+    }
+}
+
+/// A port whose descriptor does not block, and which is never asked with poll(2) whether it is ready. Another handle on it
+/// waits as the library's do.
+struct NeverWaiting(TTYPort);
+
+/// The number of bytes that a call of the system transferred.
+fn transferred(result: isize) -> io::Result<usize> {
+    usize::try_from(result).map_err(|_| io::Error::last_os_error())
+}
+
+impl io::Read for NeverWaiting {
+    fn read(&mut self, into: &mut [u8]) -> io::Result<usize> {
+        // SAFETY: the descriptor is open as long as the port, and the system writes at most `len` bytes to `into`.
+        transferred(unsafe { libc::read(self.0.as_raw_fd(), into.as_mut_ptr().cast(), into.len()) })
+    }
+}
+
+impl io::Write for NeverWaiting {
+    fn write(&mut self, bytes: &[u8]) -> io::Result<usize> {
+        // SAFETY: the descriptor is open as long as the port, and the system reads at most `len` bytes of `bytes`.
+        transferred(unsafe { libc::write(self.0.as_raw_fd(), bytes.as_ptr().cast(), bytes.len()) })
+    }
+
+    fn flush(&mut self) -> io::Result<()> {
+        self.0.flush()
+    }
+}
+
+/// Methods that are those of the port within.
+macro_rules! passed_on {
+    ($(fn $name:ident(&self $(, $argument:ident: $kind:ty)*) -> $result:ty;)*
+     ; $(fn $set:ident(&mut self, $value:ident: $value_kind:ty) -> $set_result:ty;)*) => {
+        $(fn $name(&self $(, $argument: $kind)*) -> $result { self.0.$name($($argument),*) })*
+        $(fn $set(&mut self, $value: $value_kind) -> $set_result { self.0.$set($value) })*
+    };
+}
+
+impl SerialPort for NeverWaiting {
+    passed_on! {
+        fn name(&self) -> Option<String>;
+        fn baud_rate(&self) -> PortResult<u32>;
+        fn data_bits(&self) -> PortResult<DataBits>;
+        fn flow_control(&self) -> PortResult<FlowControl>;
+        fn parity(&self) -> PortResult<Parity>;
+        fn stop_bits(&self) -> PortResult<StopBits>;
+        fn timeout(&self) -> Duration;
+        fn bytes_to_read(&self) -> PortResult<u32>;
+        fn bytes_to_write(&self) -> PortResult<u32>;
+        fn clear(&self, buffer: ClearBuffer) -> PortResult<()>;
+        fn try_clone(&self) -> PortResult<Box<dyn SerialPort>>;
+        fn set_break(&self) -> PortResult<()>;
+        fn clear_break(&self) -> PortResult<()>;
+        ;
+        fn set_baud_rate(&mut self, rate: u32) -> PortResult<()>;
+        fn set_data_bits(&mut self, bits: DataBits) -> PortResult<()>;
+        fn set_flow_control(&mut self, control: FlowControl) -> PortResult<()>;
+        fn set_parity(&mut self, parity: Parity) -> PortResult<()>;
+        fn set_stop_bits(&mut self, bits: StopBits) -> PortResult<()>;
+        fn set_timeout(&mut self, timeout: Duration) -> PortResult<()>;
+        fn write_request_to_send(&mut self, level: bool) -> PortResult<()>;
+        fn write_data_terminal_ready(&mut self, level: bool) -> PortResult<()>;
+    }
+
+    fn read_clear_to_send(&mut self) -> PortResult<bool> {
+        self.0.read_clear_to_send()
+    }
+
+    fn read_data_set_ready(&mut self) -> PortResult<bool> {
+        self.0.read_data_set_ready()
+    }
+
+    fn read_ring_indicator(&mut self) -> PortResult<bool> {
+        self.0.read_ring_indicator()
+    }
+
+    fn read_carrier_detect(&mut self) -> PortResult<bool> {
+        self.0.read_carrier_detect()
     }
 }
 
