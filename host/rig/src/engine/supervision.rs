@@ -22,6 +22,8 @@ const MADE_WITHIN_NS: i64 = 180_000_000_000;
 /// The operator is informed that a frame stays on the GPU after this time, nanoseconds. A GPU that is still warming up
 /// is given up later than that.
 const STAYS_AFTER_NS: i64 = 1_000_000_000;
+/// A frame that has been on the GPU for so long is what keeps the light away, nanoseconds.
+const HOLDS_UP_NS: i64 = 100_000_000;
 /// The operator is informed that frames are made and none is lit after [`STAYS_AFTER_NS`] and so many frames: a slow renderer
 /// has fewer on the way.
 const UNLIT_FRAMES: u64 = 8;
@@ -128,6 +130,8 @@ pub(crate) struct Supervision {
     /// Since when the GPU has had the frame of which the operator was last informed.
     told_of_ns: i64,
     unlit: Unlit,
+    /// The last light after which the operator was informed that frames on the GPU hold it up.
+    told_after: Option<HostTime>,
 }
 
 /// Frames are made, and none reaches the light: a cable that damages all of them looks like a link that is up.
@@ -137,7 +141,9 @@ struct Unlit {
     /// count them: a collector that has fallen silent is another trouble. And frames planned then.
     results: u64,
     planned: u64,
-    /// When that was, or later: when no frame had been planned since.
+    /// When that was; `None`: nothing has been looked at.
+    ended_at: Option<HostTime>,
+    /// The same, or later: when no frame had been planned since.
     at: HostTime,
     is_told: bool,
 }
@@ -147,10 +153,10 @@ impl Unlit {
     /// no frame is lit; `Some(false)`, they are lit again.
     fn observe(&mut self, counts: &RunCounts, lit: u64, is_up: bool, now: HostTime) -> Option<bool> {
         let results = counts.frames_lit + counts.frames_dark + counts.frames_withheld + lit;
-        if !is_up || results != self.results {
+        if !is_up || results != self.results || self.ended_at.is_none() {
             let are_lit_again = self.is_told && results != self.results;
             let is_told = self.is_told && !are_lit_again;
-            *self = Self { results, planned: counts.frames_planned, at: now, is_told };
+            *self = Self { results, planned: counts.frames_planned, ended_at: Some(now), at: now, is_told };
             return are_lit_again.then_some(false);
         }
         if counts.frames_planned <= self.planned {
@@ -162,6 +168,31 @@ impl Unlit {
         }
         self.is_told = true;
         Some(true)
+    }
+
+    /// True if nothing has been lit for a second.
+    fn is_long(&self, now: HostTime) -> bool {
+        self.ended_at.is_some_and(|at| now.ns_since(at) >= STAYS_AFTER_NS)
+    }
+}
+
+/// Why the operator is told of the frame that the GPU works on.
+#[derive(Debug, PartialEq, Eq)]
+enum OnGpu {
+    /// It has worked on this frame for a second.
+    Stays,
+    /// No frame has been lit for a second, and each of several took long, though less than that.
+    HoldsUp,
+}
+
+impl OnGpu {
+    /// For a frame that has been on the GPU for `held_ns`.
+    fn told(held_ns: i64, unlit: &Unlit, now: HostTime) -> Option<Self> {
+        match held_ns {
+            STAYS_AFTER_NS.. => Some(Self::Stays),
+            HOLDS_UP_NS.. if unlit.is_long(now) => Some(Self::HoldsUp),
+            _ => None,
+        }
     }
 }
 
@@ -178,6 +209,7 @@ impl Supervision {
             slowness: Slowness::default(),
             told_of_ns: i64::MAX,
             unlit: Unlit::default(),
+            told_after: None,
         }
     }
 
@@ -191,8 +223,8 @@ impl Supervision {
         step_ns: i64,
     ) -> Option<Irreplaceable> {
         self.tell_if_slow(now);
-        self.tell_if_gpu_stays(now);
         self.tell_if_nothing_is_lit(now);
+        self.tell_if_gpu_stays(now);
         if self.link.observe(link, now, step_ns, self.ask) {
             self.facts.fail(PipelineError::Hung { stage: link.name() });
             return Some(Irreplaceable::Link);
@@ -253,18 +285,33 @@ impl Supervision {
         false
     }
 
-    /// Informs the operator, once for each frame, that the GPU has had a frame for long.
+    /// Informs the operator that the GPU has had a frame for long: once for each frame, and of frames that are shorter
+    /// once until one is lit.
     fn tell_if_gpu_stays(&mut self, now: HostTime) {
         let since_ns = self.facts.gpu_since_ns.load(Ordering::Relaxed);
-        if since_ns == self.told_of_ns || now.0.saturating_sub(since_ns) < STAYS_AFTER_NS {
+        let held_ns = now.0.saturating_sub(since_ns);
+        let Some(why) = OnGpu::told(held_ns, &self.unlit, now) else { return };
+        let is_told = match why {
+            OnGpu::Stays => std::mem::replace(&mut self.told_of_ns, since_ns) == since_ns,
+            OnGpu::HoldsUp => {
+                let after = self.unlit.ended_at;
+                std::mem::replace(&mut self.told_after, after) == after
+            }
+        };
+        if is_told {
             return;
         }
-        self.told_of_ns = since_ns;
-        self.facts.monitor.note(
-            "the GPU has worked on one frame for a second, and nothing new is lit meanwhile; after two seconds it is \
-             given up and opened again"
-                .into(),
-        );
+        self.facts.monitor.note(match why {
+            OnGpu::Stays => {
+                "the GPU has worked on one frame for a second, and nothing new is lit meanwhile; after two seconds it \
+                 is given up and opened again"
+                    .into()
+            }
+            OnGpu::HoldsUp => format!(
+                "no frame has been lit for a second, because the GPU takes long: it has worked on this one for {} ms",
+                held_ns / 1_000_000
+            ),
+        });
     }
 
     /// Informs the operator once when frames are made and none is lit for a second, and when they are lit again.
@@ -320,5 +367,25 @@ mod tests {
         // Few frames, or a projector that is dark by order, are no reason.
         assert_eq!((look(55_000, 99, 14, true), look(56_000, 200, 14, false)), (None, None));
         assert_eq!((look(56_900, 230, 14, true), look(57_000, 230, 14, true)), (None, Some(true)));
+    }
+
+    #[test]
+    fn frames_that_take_long_one_behind_the_other_are_told_though_none_takes_a_second() {
+        let mut unlit = Unlit::default();
+        let at = |ms: i64| HostTime(ms * 1_000_000);
+        let counts = |planned: u64| RunCounts { frames_planned: planned, ..RunCounts::default() };
+        let mut look = |ms: i64, planned: u64, lit: u64, held_ms: i64| {
+            unlit.observe(&counts(planned), lit, true, at(ms));
+            OnGpu::told(held_ms * 1_000_000, &unlit, at(ms))
+        };
+        // The last light is at 50 s. One frame takes 0.8 s, the next one as long.
+        assert_eq!(
+            (look(50_000, 9, 9, 2), look(50_800, 11, 9, 800), look(50_900, 12, 9, 99)),
+            (None, None, None)
+        );
+        assert_eq!((look(50_999, 12, 9, 198), look(51_000, 12, 9, 199)), (None, Some(OnGpu::HoldsUp)));
+        // A GPU that is quick is not the reason, and neither is one whose frames are lit.
+        assert_eq!((look(51_100, 13, 9, 20), look(51_200, 14, 10, 300)), (None, None));
+        assert_eq!(look(51_300, 14, 10, 1_000), Some(OnGpu::Stays));
     }
 }
