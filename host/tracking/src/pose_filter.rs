@@ -33,6 +33,8 @@ const LEAST_INTERVALS: usize = 3;
 const LONGEST_PERIOD_NS: i64 = 100_000_000;
 /// A track survives a gap of this many half periods: two samples in a row may be missing, and the third may be late.
 const HALF_PERIODS_CARRIED: i64 = 7;
+/// A track survives a gap of this length in any case, ns.
+const CARRIED_NS: i64 = 20_000_000;
 /// The part of [`PoseFilterConfig::tracked_for_ns`] for the rig's own latency, ns; a missing sample or two come on top.
 const OWN_LATENCY_NS: i64 = 6_000_000;
 
@@ -71,8 +73,8 @@ pub struct PoseFilterConfig {
     /// Horizons up to this count as [`super::state::Freshness::Tracked`]: the rig's own latency and a missing sample or
     /// two, ns. With a tracker below 500 Hz it is that latency and two periods, at most `lost_after_ns`.
     pub tracked_for_ns: i64,
-    /// Longest time for which motion is extrapolated without samples, ns; then the body is lost. A track may be older:
-    /// it continues with the next sample if no more than two are missing, at the measured rate.
+    /// Longest time for which motion is extrapolated without samples, ns; then the body is lost. A track may be older
+    /// or younger: it continues with the next sample if no more than two are missing, at the measured rate, or within 20 ms.
     pub lost_after_ns: i64,
     /// A body that moved and then delivers this many identical poses is reported as stuck.
     pub stuck_after: u32,
@@ -309,9 +311,10 @@ impl PoseFilter {
         }
     }
 
-    /// Longest gap between two samples that a track survives, ns.
+    /// Longest gap between two samples that a track survives, ns. However long poses may be predicted, what was seen of an
+    /// acceleration before a longer one says nothing of the motion now: the first sample would throw the light ahead.
     fn carried_for_ns(&self) -> i64 {
-        self.config.lost_after_ns.max(HALF_PERIODS_CARRIED * self.rate.period_ns() / 2)
+        CARRIED_NS.max(HALF_PERIODS_CARRIED * self.rate.period_ns() / 2)
     }
 
     fn tracked_for_ns(&self) -> i64 {
@@ -444,7 +447,7 @@ impl PoseFilter {
             if gap_ns < 0 {
                 return Verdict::OutOfOrder;
             }
-            if gap_ns > self.carried_for_ns() || !self.agrees(z, rp) {
+            if gap_ns > c.lost_after_ns.max(self.carried_for_ns()) || !self.agrees(z, rp) {
                 self.candidates = [None; ACQUIRE_SAMPLES];
             }
         }

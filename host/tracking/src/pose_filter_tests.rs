@@ -580,3 +580,47 @@ fn noise_that_looks_like_an_acceleration_does_not_carry_a_body_away() {
         assert!(worst < 0.025, "seed {seed}: {:.1} mm", worst * 1e3);
     }
 }
+
+/// A turn was seen before a gap in which poses may still be predicted. The acceleration must not go on through the gap: the
+/// first sample after it would seem to say that the body is a metre from where it should be, and throw its light ahead. The old
+/// track, whose accelerations end after 12 ms, holds until three samples agree.
+#[test]
+fn an_acceleration_does_not_outlive_a_gap() {
+    let speed = 0.28;
+    let turn_s = 2.0 * speed / 40.0;
+    let x = |t: f64| match t - 1.0 {
+        late if late <= 0.0 => speed * late,
+        late if late <= turn_s => speed * late - 20.0 * late * late,
+        late => -speed * (late - turn_s),
+    };
+    for (gap_ms, hz) in [(60, 60), (233, 60), (233, 240), (400, 120)] {
+        let period_ns = 1_000_000_000 / hz;
+        let config =
+            PoseFilterConfig { lost_after_ns: 500 * MS, tracked_for_ns: 250 * MS, ..Default::default() };
+        let mut filter = PoseFilter::new(config);
+        let mut gauss = Gauss::new(5);
+        let mut at = |t_ns: i64| {
+            let place = DVec3::new(x(t_ns as f64 * 1e-9), 0.0, 0.0) + gauss.vector(1e-4);
+            sample(t_ns, place, DQuat::IDENTITY)
+        };
+        let mut t_ns = 0;
+        // The last sample before the gap has seen the turn begin.
+        while t_ns < 1008 * MS {
+            filter.update(&at(t_ns));
+            t_ns += period_ns;
+        }
+        let (last, first) = (t_ns - period_ns, t_ns - period_ns + gap_ms * MS);
+        for k in 0..5 {
+            let now = first + k * period_ns;
+            let verdict = filter.update(&at(now));
+            assert_eq!(matches!(verdict, Verdict::Acquired | Verdict::Accepted), k >= 2, "{verdict:?}");
+            let ahead = now + 20 * MS;
+            let seen = filter.predict(HostTime(ahead)).expect("it is tracked");
+            let off = position(&seen).x - x(ahead as f64 * 1e-9);
+            // The old track may be wrong by twice the speed and by 12 ms of the acceleration; the new one is exact soon.
+            let stale_s = (ahead - last) as f64 * 1e-9;
+            let bound = if k < 2 { (2.0 * speed + 0.012 * 40.0) * stale_s } else { 2.0 * speed * 0.02 };
+            assert!(off.abs() < bound, "{gap_ms} ms at {hz} Hz, sample {k}: {off} m off");
+        }
+    }
+}
