@@ -29,10 +29,16 @@ const SILENCE_WITHOUT_PONGS_NS: i64 = 3_000 * MS;
 /// A pose that is older than this, or as far in the future, waited somewhere on its way, or the server's clock stepped.
 /// A pong tells which.
 const DOUBTED_NS: u64 = 1_000_000_000;
-/// It does if it came back within this time.
-const SETTLED_ROUND_TRIP_NS: i64 = 50 * MS;
-/// If no pong comes for this long, the map of the server's clock is forgotten.
+/// It does if it came back within this time: a map that is made of it is wrong by half of that at most ...
+const SETTLED_ROUND_TRIP_NS: i64 = 10 * MS;
+/// ... or so many pongs do that came back within this time, of which the map takes the quickest.
+const SETTLED_PONGS: u32 = 5;
+const SETTLED_ROUND_TRIPS_NS: i64 = 50 * MS;
+/// If no pong comes for this long, the map of the server's clock is forgotten, and poses are dated by their arrival.
 const UNSETTLED_NS: i64 = 300 * MS;
+/// From a server that has not been heard for this long something is asked for. A machine that has forgotten the connection
+/// says so then, and not before.
+const PROBE_AFTER_NS: i64 = 200 * MS;
 /// Pings: this many quickly, the rest slowly.
 const QUICK_PINGS: u32 = 20;
 const QUICK_PING_EVERY_NS: i64 = 10 * MS;
@@ -100,12 +106,15 @@ pub struct VrpnClient {
     ping_as: Option<i32>,
     ping_sent: Option<HostTime>,
     ping_due: HostTime,
+    probe_due: HostTime,
     pings: u32,
     pongs: u64,
     /// Pings of this connection have been answered.
     has_ponged: bool,
-    /// Since then the server's clock contradicts the arrival of its poses, whose age is unknown.
+    /// Since then the age of poses is unknown: the connection is new, or the server's clock contradicts their arrival.
     doubted_since: Option<HostTime>,
+    /// Pongs since then that bear the server's clock out.
+    agreeing: u32,
     problem: Option<String>,
     connections: u64,
 }
@@ -170,10 +179,12 @@ impl VrpnClient {
             ping_as: None,
             ping_sent: None,
             ping_due: HostTime(i64::MIN),
+            probe_due: HostTime(i64::MIN),
             pings: 0,
             pongs: 0,
             has_ponged: false,
             doubted_since: None,
+            agreeing: 0,
             problem: None,
             connections: 0,
         })
@@ -259,6 +270,18 @@ impl VrpnClient {
         stream.write_all(&self.out)
     }
 
+    /// Sends something that needs no answer to a server that is silent. One ping waits for its pong as long as a second.
+    fn probe(&mut self, now: HostTime) -> std::io::Result<()> {
+        let State::Open { stream, heard_at, .. } = &mut self.state else { return Ok(()) };
+        if now.ns_since(*heard_at) < PROBE_AFTER_NS || now < self.probe_due {
+            return Ok(());
+        }
+        self.probe_due = now.plus_ns(PROBE_AFTER_NS);
+        self.out.clear();
+        wire::put_description(&mut self.out, system::TYPE, 0, type_name::PING);
+        stream.write_all(&self.out)
+    }
+
     /// Reads the available input, at most one buffer full; returns whether the other side is still connected.
     fn fill(&mut self, now: HostTime) -> std::io::Result<bool> {
         let State::Open { stream, heard_at, .. } = &mut self.state else { return Ok(true) };
@@ -288,6 +311,8 @@ impl VrpnClient {
             let Some(cookie) = self.buffer[..self.filled].first_chunk::<COOKIE_BYTES>() else { return Ok(0) };
             wire::check_cookie(cookie)?;
             *greeted = true;
+            // The first poses would be dated by their arrival and the next ones by a pong, and a body would seem to leap.
+            (self.doubted_since, self.agreeing) = (Some(at), 0);
             self.problem = None;
             start = COOKIE_BYTES;
         }
@@ -433,8 +458,12 @@ impl VrpnClient {
         if matches!(outcome, ExchangeOutcome::Stepped | ExchangeOutcome::Contradicting) {
             (self.pings, self.ping_due) = (0, at);
         }
-        if outcome != ExchangeOutcome::Contradicting && at.ns_since(t1) <= SETTLED_ROUND_TRIP_NS {
-            self.doubted_since = None;
+        let round_trip_ns = at.ns_since(t1);
+        if outcome != ExchangeOutcome::Contradicting && round_trip_ns <= SETTLED_ROUND_TRIPS_NS {
+            self.agreeing += 1;
+            if round_trip_ns <= SETTLED_ROUND_TRIP_NS || self.agreeing >= SETTLED_PONGS {
+                self.doubted_since = None;
+            }
         }
     }
 
@@ -446,10 +475,15 @@ impl VrpnClient {
         }
         if let Some(mapped) = self.map.to_host(DeviceTicks(stamp)) {
             if at.ns_since(mapped.at).unsigned_abs() >= DOUBTED_NS && self.doubted_since.is_none() {
-                (self.doubted_since, self.pings, self.ping_due) = (Some(at), 0, at);
+                (self.doubted_since, self.agreeing) = (Some(at), 0);
+                (self.pings, self.ping_due) = (0, at);
+                self.one_way = OneWay::EMPTY;
             }
-            return mapped.at.min(at);
+            if self.doubted_since.is_none() {
+                return mapped.at.min(at);
+            }
         }
+        // In doubt, the shortest delay is learned, for the case that no pong settles it.
         let device_ns = i64::try_from(stamp.saturating_mul(1000)).unwrap_or(i64::MAX);
         let offset = self.one_way.note(at, device_ns);
         HostTime(device_ns.saturating_add(offset)).min(at)
@@ -466,7 +500,6 @@ impl VrpnClient {
         let at = self.clock.now();
         if self.doubted_since.take_if(|since| at.ns_since(*since) >= UNSETTLED_NS).is_some() {
             self.map = ClockMap::new(1_000_000).expect("a microsecond clock");
-            self.one_way = OneWay::EMPTY;
         }
         let delivered = match self.digest(at, sink) {
             Ok(n) => n,
@@ -475,7 +508,7 @@ impl VrpnClient {
                 return 0;
             }
         };
-        let pinged = self.ping(at);
+        let pinged = self.ping(at).and_then(|()| self.probe(now));
         match alive.and_then(|alive| pinged.map(|()| alive)) {
             Ok(true) => {}
             Ok(false) => self.lose(now, "the server closed the connection".into()),

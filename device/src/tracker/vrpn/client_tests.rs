@@ -72,6 +72,8 @@ enum Does {
     IsHeld,
     /// Nothing arrives, and it answers no more.
     IsMute,
+    /// It answers no pings.
+    IgnoresPings,
 }
 
 struct Bench {
@@ -83,6 +85,8 @@ struct Bench {
     held: Vec<u8>,
     /// The program that polls is stopped.
     is_stopped: bool,
+    /// When the client sent something, milliseconds.
+    sent_at: Vec<i64>,
 }
 
 impl Bench {
@@ -94,7 +98,15 @@ impl Bench {
         let config = VrpnConfig { server: "memory".into(), tracker: "Tracker0".into(), bodies };
         let network = Network::default();
         let client = VrpnClient::open_through(config, clock, Box::new(network.clone())).unwrap();
-        Self { now, network, client, clock_us: 1_700_000_000_000_000, held: Vec::new(), is_stopped: false }
+        Self {
+            now,
+            network,
+            client,
+            clock_us: 1_700_000_000_000_000,
+            held: Vec::new(),
+            is_stopped: false,
+            sent_at: Vec::new(),
+        }
     }
 
     fn message(&self, now: i64, kind: i32, payload: &[u8]) -> Vec<u8> {
@@ -111,11 +123,14 @@ impl Bench {
         for _ in 0..ms {
             let now = self.now.fetch_add(MS, Ordering::Relaxed) + MS;
             let asked = std::mem::take(&mut self.network.0.lock().unwrap().to_server);
+            if !asked.is_empty() {
+                self.sent_at.push(now / MS);
+            }
             let mut said = std::mem::take(&mut self.held);
             // The client's type 0 is the ping; descriptions have negative ones.
             let ping = |m: &[u8]| m.len() == 24 && m[16..20] == [0; 4];
             if does != Does::IsMute {
-                if asked.chunks(24).any(ping) && asked.len() == 24 {
+                if does != Does::IgnoresPings && asked.chunks(24).any(ping) && asked.len() == 24 {
                     said.extend(self.message(now, 2, &[]));
                 }
                 if now / MS % 10 == 0 {
@@ -197,5 +212,36 @@ fn what_a_network_held_back_for_a_moment_keeps_its_age() {
     bench.run(600, Does::IsHeld);
     let after = bench.run(300, Does::Speaks);
     assert!(after.len() > 80 && are_true(&after), "{after:?}");
+    assert_eq!(bench.connections(), 1);
+}
+
+/// The simulator found light 22 mm beside a body: the first pose of a connection was dated by its arrival, 3.5 ms late, and the
+/// second by a pong, so that the body seemed to leap.
+#[test]
+fn poses_of_a_new_connection_wait_for_a_pong_and_not_for_long() {
+    let mut bench = Bench::new();
+    // What the server says first is late.
+    bench.run(40, Does::IsHeld);
+    let early = bench.run(200, Does::Speaks);
+    assert!(are_true(&early) && early.len() > 15, "{early:?}");
+    assert!(bench.client.counters().samples.unknown_age > 0, "{:?}", bench.client.counters());
+    let mut without = Bench::new();
+    without.run(40, Does::IsHeld);
+    let late = without.run(600, Does::IgnoresPings);
+    assert!((300..420).contains(&late[0].1), "{late:?}");
+    assert!(are_true(&late) && late.len() > 20, "{late:?}");
+}
+
+/// A machine that has forgotten a connection says so when something is sent to it. While a ping waits for its pong, no other
+/// follows for a second.
+#[test]
+fn a_silent_server_is_asked_for_five_times_a_second() {
+    let mut bench = Bench::new();
+    bench.run(1_000, Does::Speaks);
+    bench.sent_at.clear();
+    bench.run(900, Does::IsMute);
+    let since: Vec<i64> = bench.sent_at.iter().map(|at| at - 1_000).collect();
+    assert!(since.len() >= 4, "{since:?}");
+    assert!(since.windows(2).all(|pair| pair[1] - pair[0] <= 205) && since[0] <= 405, "{since:?}");
     assert_eq!(bench.connections(), 1);
 }
