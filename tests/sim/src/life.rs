@@ -1,5 +1,6 @@
 //! Runs one seed for a while, and shrinks it if a law was broken.
 
+use crate::kinds::Kind;
 use crate::laws::Broken;
 use crate::plan::{Episodes, Setup, TrackerKind};
 use crate::table::Table;
@@ -22,6 +23,8 @@ pub struct Order {
     pub serial: Option<bool>,
     /// What the tracker speaks, if not as the seed says.
     pub tracker: Option<TrackerKind>,
+    /// The kinds of which one strikes first in every episode; empty: all in turn.
+    pub first: Vec<Kind>,
     /// Faults that do not strike, by number.
     pub without: BTreeSet<u32>,
     /// Stop at this event.
@@ -71,7 +74,7 @@ pub fn live(order: &Order) -> Result<Lived, String> {
     if let Some(tracks) = &mut world.tracks {
         tracks.is_loud = order.is_loud;
     }
-    let mut episodes = Episodes::new(&world.setup);
+    let mut episodes = Episodes::new(&world.setup, &order.first);
     let mut faults = Vec::new();
     let mut next = episodes.next_episode();
     let mut ready_since = None;

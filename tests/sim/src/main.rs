@@ -1,5 +1,6 @@
 //! `dpm-sim`: hours of rig, with every fault, in minutes.
 
+use dpm_sim::kinds::Kind;
 use dpm_sim::life::{live, shrink, Lived, Order};
 use dpm_sim::plan::TrackerKind;
 use dpm_sim::table::Table;
@@ -20,6 +21,8 @@ dpm-sim: a simulated world around the rig, with every fault in every state
                   (none of --tracks all)
   --tracker WHAT  natnet, serial, vrpn or all: what the trackers speak; default: all, a fifth of the seeds' serial and
                   a fifth VRPN
+  --kinds LIST    kinds of faults, as T18,X9; every episode begins with one of them in lives that they can strike;
+                  default: all in turn
   --until EVENT   stop the (single) seed at this event and print what happened
   --without LIST  numbers of faults that do not strike, as a shrunk seed names them
   --minutes M     end after so many minutes of real time
@@ -38,6 +41,7 @@ struct Wish {
     follows: Option<bool>,
     serial: Option<bool>,
     tracker: Option<TrackerKind>,
+    first: Vec<Kind>,
     until: Option<u64>,
     without: BTreeSet<u32>,
     minutes: Option<f64>,
@@ -57,6 +61,7 @@ fn wish() -> Result<Wish, String> {
         follows: None,
         serial: None,
         tracker: None,
+        first: Vec::new(),
         until: None,
         without: BTreeSet::new(),
         minutes: None,
@@ -89,6 +94,7 @@ fn wish() -> Result<Wish, String> {
                 other => return Err(format!("--serial {other:?}: give \"all\", \"none\" or \"some\"")),
             },
             "--tracker" => wish.tracker = tracker_named(&value()?)?,
+            "--kinds" => wish.first = kinds_named(&value()?)?,
             "--until" => wish.until = Some(number(&value()?)?),
             "--without" => {
                 for word in value()?.split(',').filter(|word| !word.is_empty()) {
@@ -124,6 +130,15 @@ fn tracker_named(word: &str) -> Result<Option<TrackerKind>, String> {
         }
         found => Ok(found),
     }
+}
+
+/// The kinds that a list names.
+fn kinds_named(list: &str) -> Result<Vec<Kind>, String> {
+    let named = |word: &str| {
+        let found = Kind::ALL.iter().copied().find(|kind| format!("{kind:?}") == word);
+        found.ok_or_else(|| format!("--kinds {word:?}: no such kind; docs/FAILURES.md has them"))
+    };
+    list.split(',').filter(|word| !word.is_empty()).map(named).collect()
 }
 
 /// A seed that nobody has chosen.
@@ -172,8 +187,10 @@ fn report(lived: &Lived, order: &Order, shrinks: bool) -> Result<String, String>
         Some(false) => " --serial none",
     };
     let tracker = order.tracker.map_or(String::new(), |kind| format!(" --tracker {}", kind.word()));
+    let kinds: Vec<String> = order.first.iter().map(|kind| format!("{kind:?}")).collect();
+    let kinds = if kinds.is_empty() { String::new() } else { format!(" --kinds {}", kinds.join(",")) };
     println!(
-        "  again: --seed {}{rate}{tracks}{serial}{tracker} --life {:.0} --hours 0.0001 --loud --without {}",
+        "  again: --seed {}{rate}{tracks}{serial}{tracker}{kinds} --life {:.0} --hours 0.0001 --loud --without {}",
         order.seed,
         (least.length_ns as f64 * 1e-9).ceil() + 1.0,
         if without.is_empty() { "\"\"".into() } else { without.join(",") }
@@ -198,6 +215,7 @@ fn run() -> Result<bool, String> {
             follows: wish.follows,
             serial: wish.serial,
             tracker: wish.tracker,
+            first: wish.first.clone(),
             without: wish.without.clone(),
             until: wish.until,
             is_loud: wish.is_loud,

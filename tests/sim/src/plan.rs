@@ -274,6 +274,8 @@ pub struct Episodes {
     dice: Dice,
     cells: Vec<(State, Kind)>,
     kinds: Vec<Kind>,
+    /// Those that strike first in an episode.
+    first: Vec<Kind>,
     tracker: TrackerKind,
     /// Now and then a long rest comes before an episode, in which the laws of peace are judged.
     rests: Option<Dice>,
@@ -286,18 +288,24 @@ const REST_NS: i64 = 6_000_000_000;
 const RESTING: f64 = 0.03;
 
 impl Episodes {
-    /// The episodes of a life.
-    pub fn new(setup: &Setup) -> Self {
+    /// The episodes of a life. Each begins with one of the kinds `first`, of which those count that can strike this life;
+    /// if none can, with one of all kinds.
+    pub fn new(setup: &Setup, first: &[Kind]) -> Self {
         let tracker = setup.tracker.kind();
         let all = Kind::ALL.iter().copied();
         let kinds = all
             .filter(|kind| setup.follows || !kind.needs_tracks())
             .filter(|kind| setup.serial.is_some() || !kind.needs_line())
             .filter(|kind| tracker == TrackerKind::Vrpn || !kind.needs_connection())
-            .collect();
+            .collect::<Vec<_>>();
+        let wanted = |kind: &Kind| first.contains(kind) && kind.strikes(tracker);
+        let mut first: Vec<Kind> = kinds.iter().copied().filter(wanted).collect();
+        if first.is_empty() {
+            first.clone_from(&kinds);
+        }
         let dice = Dice::new(setup.seed, 0xe915);
         let rests = setup.follows.then(|| Dice::new(setup.seed, 0x4e57));
-        Self { dice, cells: Vec::new(), kinds, tracker, rests, next: 0 }
+        Self { dice, cells: Vec::new(), kinds, first, tracker, rests, next: 0 }
     }
 
     /// Whether a kind can strike this life in `state`.
@@ -309,7 +317,7 @@ impl Episodes {
     fn cell(&mut self) -> (State, Kind) {
         if self.cells.is_empty() {
             for state in State::ALL {
-                let possible = self.kinds.iter().filter(|kind| self.can_strike(**kind, state));
+                let possible = self.first.iter().filter(|kind| self.can_strike(**kind, state));
                 let possible: Vec<(State, Kind)> = possible.map(|kind| (state, *kind)).collect();
                 self.cells.extend(possible);
             }
