@@ -61,7 +61,7 @@ fn frame(gpu: &Arc<Gpu>, rig: &Rig) -> Vec<Lit> {
     let mut renderer = Renderer::keeping(gpu, &rig.scene, settings, Keep::default()).unwrap();
     let mut slot = renderer.create_slot(true).unwrap();
     let mut poses = Vec::new();
-    rig.scene_poses(&rig.true_poses(0).unwrap(), &mut poses);
+    rig.scene_poses(&rig.true_poses(0).unwrap(), 0, &mut poses);
     let still = FrameInputs::new(&rig.camera, rig.observer.eye_and_gaze(&poses), &poses);
     let inputs = FrameInputs { spp: 2, budget_spp: 2.0, ..still };
     renderer.submit(&mut slot, &inputs).unwrap();

@@ -7,7 +7,7 @@
 #[path = "../../host/scene/tests/common/mod.rs"]
 mod common;
 
-use common::{png, tetrahedra, with_image};
+use common::{png, tetrahedra, with_image, Glb};
 use dpm_device::cobs::{encode, encoded_bytes};
 use dpm_device::dlpc900::command::{Command, Opcode};
 use dpm_device::dlpc900::image::{self, Compression, PlaneOrder};
@@ -25,6 +25,7 @@ use dpm_device::tracker::serial::wire::SerialMessage;
 use dpm_device::tracker::vrpn::wire as vrpn;
 use dpm_tests::decoders::ALL;
 use hil_mock::usbip::wire as usbip;
+use serde_json::json;
 use std::path::PathBuf;
 
 fn folder(target: &str) -> PathBuf {
@@ -223,6 +224,29 @@ fn words() -> Vec<(&'static str, &'static str, Vec<u8>)> {
     seeds
 }
 
+/// A node that turns on a node that slides by splines.
+fn animated() -> Glb {
+    let floats = |values: &[f32]| values.iter().flat_map(|x| x.to_le_bytes()).collect::<Vec<u8>>();
+    let mut file = tetrahedra().set("/nodes/0/children", json!([2])).set("/nodes/2", json!({"mesh": 0}));
+    let mut accessors = file.json["accessors"].as_array().unwrap().clone();
+    let (zero, ahead) = ([0.0; 3], [0.1, 0.0, 0.0]);
+    for (kind, components, values) in [
+        ("SCALAR", 1, vec![0.0, 1.0]),
+        ("VEC3", 3, [zero, zero, ahead, ahead, ahead, zero].concat()),
+        ("VEC4", 4, vec![0.0, 0.0, 0.0, 1.0, 0.0, 1.0, 0.0, 0.0]),
+    ] {
+        let view = file.push_view(&floats(&values));
+        let count = values.len() / components;
+        accessors.push(json!({"bufferView": view, "componentType": 5126, "type": kind, "count": count}));
+    }
+    file.set("/accessors", accessors.into()).set(
+        "/animations",
+        json!([{"name": "a", "channels": [{"sampler": 0, "target": {"node": 1, "path": "translation"}},
+            {"sampler": 1, "target": {"node": 2, "path": "rotation"}}],
+            "samplers": [{"input": 3, "output": 4, "interpolation": "CUBICSPLINE"}, {"input": 3, "output": 5}]}]),
+    )
+}
+
 /// A scene with a texture and an environment of each format, as small as they get.
 fn files() -> Vec<(&'static str, &'static str, Vec<u8>)> {
     let mut seeds = Vec::new();
@@ -232,6 +256,9 @@ fn files() -> Vec<(&'static str, &'static str, Vec<u8>)> {
         let text = serde_json::to_vec(&file.json).unwrap();
         seeds.push(("gltf_parts", name, [&text[..], &[0], &file.bin].concat()));
     }
+    let moving = animated();
+    let text = serde_json::to_vec(&moving.json).unwrap();
+    seeds.push(("gltf_parts", "animated", [&text[..], &[0], &moving.bin].concat()));
     for name in ["alpha_etc1s", "alpha_uastc", "chance_bc5", "chance_etc2_a8"] {
         let path = concat!(env!("CARGO_MANIFEST_DIR"), "/assets/ktx2");
         let image = std::fs::read(PathBuf::from(path).join(name).with_extension("ktx2")).unwrap();

@@ -41,7 +41,7 @@ fn the_light_is_the_rendered_picture_in_all_24_planes() {
         let (mut lit_pixels, mut levels) = (0, [[false; 256]; 3]);
         for (light, record) in outcome.light.iter().zip(&outcome.recent) {
             assert_eq!(light.frame, record.id.0 as u32);
-            rig.scene_poses(&record.tracked_poses, &mut poses);
+            rig.scene_poses(&record.tracked_poses, 0, &mut poses);
             assert_eq!(rig.observer.eye_and_gaze(&record.tracked_poses).0, record.eye);
             let spp = rig.config.render.spp;
             draw(&rig, &mut renderer, &mut slot, &poses, light.frame, spp as f32).unwrap();

@@ -31,7 +31,7 @@ fn wider_zones_are_the_zones_of_a_rig_file_with_wider_angles() {
             let mut slot = renderer.create_slot(false).unwrap();
             let tracked: Vec<_> = rig.bodies.iter().map(|b| dpm_rig::rig::affine(&b.rest)).collect();
             let mut poses = Vec::new();
-            rig.scene_poses(&tracked, &mut poses);
+            rig.scene_poses(&tracked, 0, &mut poses);
             let still = FrameInputs::new(&rig.camera, rig.observer.eye_and_gaze(&tracked), &poses);
             let inputs = FrameInputs { widen_deg, ..still };
             renderer.submit(&mut slot, &inputs).unwrap();

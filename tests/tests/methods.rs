@@ -161,7 +161,7 @@ fn what_a_frame_shows_does_not_depend_on_the_slot_that_draws_it() {
             // Back and forth by about four tiles, at rest for three frames at a time.
             let x = 0.16 * ((k / 3) as f64 * 1.9).sin();
             let moved: Vec<_> = rest.iter().map(|m| DAffine3::from_translation(DVec3::X * x) * *m).collect();
-            rig.scene_poses(&moved, &mut poses);
+            rig.scene_poses(&moved, 0, &mut poses);
             let still = FrameInputs::new(&camera, rig.observer.eye_and_gaze(&moved), &poses);
             let inputs = FrameInputs { frame: k as u32, spp: 2, budget_spp: 2.0, ..still };
             let slot = &mut slots[order(k)];

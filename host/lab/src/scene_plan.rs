@@ -192,7 +192,7 @@ pub(crate) fn method_entries(method: &Method, full: &Method, word: &str) -> Vec<
 
 fn rig_entries(rig: &Rig) -> Vec<PlanEntry> {
     let config = &rig.config;
-    let resting = rig.scene.bodies.iter().filter(|b| b.tracked.is_none()).count();
+    let resting = rig.scene.bodies.iter().filter(|b| b.tracked.is_none() && b.motion.is_none()).count();
     let planes = rig.schedule.len();
     let mono = rig.schedule.planes().iter().all(|plane| plane.channel == Channel::White);
     let depth = config.render.depth;
@@ -241,7 +241,8 @@ fn planes_that_follow(rig: &Rig) -> PlanEntry {
     let groups = renderer_settings(rig).plane_groups;
     let reach = groups.iter().map(|g| g.instant.unsigned_abs()).max().unwrap_or(0);
     let seconds = f64::from(reach) / 65536.0 * rig.rate().slot_len_ns(0) as f64 * 1e-9;
-    let tracked = rig.scene.bodies.iter().filter(|b| b.tracked.is_some() && b.projected);
+    let tracked =
+        rig.scene.bodies.iter().filter(|b| b.tracked.is_some() && b.motion.is_none() && b.projected);
     let to_body = |b: &Body| b.world_from_body_rest.translation.distance(rig.camera.position());
     let nearest = tracked.map(to_body).fold(f64::INFINITY, f64::min);
     // Pixels that the nearest body moves at 1 m/s between the frame's instant and that of the farthest group.

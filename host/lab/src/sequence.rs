@@ -92,7 +92,7 @@ pub fn poses_at(rig: &Rig, slot: u64) -> Vec<DAffine3> {
         .true_poses(t)
         .unwrap_or_else(|| rig.bodies.iter().map(|b| dpm_rig::rig::affine(&b.rest)).collect());
     let mut out = Vec::new();
-    rig.scene_poses(&tracked, &mut out);
+    rig.scene_poses(&tracked, t, &mut out);
     out
 }
 

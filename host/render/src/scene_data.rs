@@ -136,11 +136,14 @@ pub struct Keep {
 #[derive(Debug, thiserror::Error)]
 pub enum SceneDataError {
     /// There are too many bodies.
-    #[error("the scene has {tracked} tracked bodies and {fixed} that never move (what no body claims, lamps); all together may be {MAX_BODIES}. \
-             Name fewer in scene.bodies: what is not named is one body that never moves")]
+    #[error("the scene has {tracked} tracked bodies, {parts} parts that an animation moves, and {fixed} bodies that never move (what no body \
+             claims, lamps); all together may be {MAX_BODIES}. Name fewer in scene.bodies: what is not named is one body that never \
+             moves. scene.animation = \"none\" moves no part")]
     TooManyBodies {
         /// Bodies that the rig file names.
         tracked: usize,
+        /// Parts that move by themselves.
+        parts: usize,
         /// The others.
         fixed: usize,
     },
@@ -194,8 +197,10 @@ impl SceneData {
     pub fn build(scene: &Scene) -> Result<Self, SceneDataError> {
         let mut data = Self::default();
         if scene.bodies.len() > MAX_BODIES {
-            let tracked = scene.bodies.iter().filter(|b| b.tracked.is_some()).count();
-            return Err(SceneDataError::TooManyBodies { tracked, fixed: scene.bodies.len() - tracked });
+            let parts = scene.bodies.iter().filter(|b| b.motion.is_some()).count();
+            let tracked = scene.bodies.iter().filter(|b| b.tracked.is_some() && b.motion.is_none()).count();
+            let fixed = scene.bodies.len() - tracked - parts;
+            return Err(SceneDataError::TooManyBodies { tracked, parts, fixed });
         }
         data.add_textures(scene);
         data.add_materials(scene);

@@ -8,7 +8,7 @@
 use crate::light::recorder::LightFrame;
 use crate::light::FrameRecord;
 use crate::pipeline::renderer_settings;
-use crate::plan::light_centre::true_poses_at_centre;
+use crate::plan::light_centre::{light_centre_at, true_poses_at_centre};
 use crate::rig::Rig;
 use dpm_device::planes::Raster;
 use dpm_render::drive::Drive;
@@ -29,9 +29,11 @@ pub struct Pictures {
     pub viewer: Result<Vec<Vec3>, &'static str>,
 }
 
-/// Frames of light with the poses of the tracked bodies at the centre of each frame's light.
+/// Frames of light with the poses of the scene's bodies at the centre of each frame's light.
 struct Window<'a> {
     frames: Vec<(&'a LightFrame, Vec<DAffine3>)>,
+    /// Poses of the tracked bodies at the centre of the last frame's light; empty without any frame.
+    tracked: Vec<DAffine3>,
 }
 
 /// The frames of `light` whose poses are known. With the mock tracker they are the true poses. With a real tracker
@@ -42,7 +44,15 @@ fn window<'a>(rig: &Rig, light: &'a [LightFrame], records: &[FrameRecord]) -> Wi
         Some(record.tracked_poses.clone())
     };
     let poses = |f: &LightFrame| true_poses_at_centre(rig, f.first_photon_at).or_else(|| drawn_for(f));
-    Window { frames: light.iter().filter_map(|f| Some((f, poses(f)?))).collect() }
+    let mut window = Window { frames: Vec::new(), tracked: Vec::new() };
+    for frame in light {
+        let Some(tracked) = poses(frame) else { continue };
+        let mut all = Vec::new();
+        rig.scene_poses(&tracked, light_centre_at(rig, frame.first_photon_at).0, &mut all);
+        window.frames.push((frame, all));
+        window.tracked = tracked;
+    }
+    window
 }
 
 /// Mean of the frames for each pixel, 0 to 1.
@@ -79,7 +89,7 @@ pub fn pictures(
         return Ok(Pictures { light: mean(light), viewer: Err(why) });
     }
     let now = &window.frames[window.frames.len() - 1].1;
-    let (eye, _) = rig.observer.eye_and_gaze(now);
+    let (eye, _) = rig.observer.eye_and_gaze(&window.tracked);
     // The pictures need only the surfaces, so the simplest method is enough.
     let settings = |lens| RendererSettings {
         method: Method::full(1),
@@ -114,11 +124,9 @@ pub fn pictures(
 }
 
 /// A camera at the eye whose frame encloses what the projector lights.
-fn viewer_camera(rig: &Rig, eye: DVec3, tracked: &[DAffine3]) -> Option<ProjectorCamera> {
-    let mut poses = Vec::new();
-    rig.scene_poses(tracked, &mut poses);
+fn viewer_camera(rig: &Rig, eye: DVec3, poses: &[DAffine3]) -> Option<ProjectorCamera> {
     let (mut lower, mut upper) = (DVec3::INFINITY, DVec3::NEG_INFINITY);
-    for (body, pose) in rig.scene.bodies.iter().zip(&poses).filter(|(b, _)| b.projected) {
+    for (body, pose) in rig.scene.bodies.iter().zip(poses).filter(|(b, _)| b.projected) {
         for p in &body.mesh.positions {
             let p = pose.transform_point3(p.as_dvec3());
             lower = lower.min(p);
@@ -153,25 +161,17 @@ fn integrate(
     renderer: &mut Renderer,
     camera: &ProjectorCamera,
     other: DVec3,
-    tracked: &[DAffine3],
+    poses: &[DAffine3],
     window: &Window<'_>,
     shade: impl Fn(&Seen, Vec3) -> Vec3,
 ) -> Result<Vec<Vec3>, GpuError> {
-    let mut poses = Vec::new();
-    rig.scene_poses(tracked, &mut poses);
     let mut slot = renderer.create_slot(true)?;
-    let inputs = FrameInputs::new(camera, (other, other), &poses);
+    let inputs = FrameInputs::new(camera, (other, other), poses);
     renderer.submit(&mut slot, &inputs)?;
     slot.wait(60_000_000_000)?;
     let surfaces = slot.surfaces().unwrap_or(&[]);
     let width = camera.raster.width();
     let mut out = vec![Vec3::ZERO; surfaces.len()];
-    let mut window_poses: Vec<Vec<DAffine3>> = Vec::new();
-    for (_, tracked) in &window.frames {
-        let mut all = Vec::new();
-        rig.scene_poses(tracked, &mut all);
-        window_poses.push(all);
-    }
     for (i, surface) in surfaces.iter().enumerate() {
         if surface.id == NO_HIT || surface.distance <= 0.0 {
             continue;
@@ -185,7 +185,7 @@ fn integrate(
             poses[body].transform_vector3(renderer.shading_normal(surface).as_dvec3()).normalize_or_zero();
         let seen = Seen { body, position, normal, uv: renderer.texture_coordinates(surface) };
         let mut sum = Vec3::ZERO;
-        for ((frame, _), all) in window.frames.iter().zip(&window_poses) {
+        for (frame, all) in &window.frames {
             if let Some(p) = rig.camera.project(all[body].transform_point3(in_body)) {
                 sum += sample(&rig.drive, frame, rig.camera.raster, p);
             }

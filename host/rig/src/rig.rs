@@ -12,7 +12,9 @@ use dpm_device::pose::Pose;
 use dpm_device::time::FrameRate;
 use dpm_render::drive::Drive;
 use dpm_scene::geometry::projector::{ProjectorCamera, ProjectorError};
-use dpm_scene::{BodySelector, Environment, LoadOptions, Scene, SceneError, SceneFeatures, UpAxis};
+use dpm_scene::{
+    AnimationChoice, BodySelector, Environment, LoadOptions, Scene, SceneError, SceneFeatures, UpAxis,
+};
 use glam::{DAffine3, DQuat, DVec3, Vec3};
 
 /// Why a rig cannot be built from a configuration that passed its own checks.
@@ -264,12 +266,20 @@ impl Rig {
         config.projector.tracks == TracksUse::Auto && config.prediction.on && carries
     }
 
-    /// Writes the pose of every body of the scene to `out`, taking `tracked` for the tracked bodies and the rest pose
-    /// for the others. Allocates nothing if `out` has enough capacity.
-    pub fn scene_poses(&self, tracked: &[DAffine3], out: &mut Vec<DAffine3>) {
+    /// Writes the pose of every body of the scene at `t_ns` on the host's clock to `out`: `tracked` for the tracked bodies,
+    /// the rest pose for those that never move, and for parts that move by themselves their place in their carrier at that
+    /// time. Allocates nothing if `out` has enough capacity.
+    pub fn scene_poses(&self, tracked: &[DAffine3], t_ns: i64, out: &mut Vec<DAffine3>) {
         out.clear();
         out.extend(self.scene.bodies.iter().map(|b| {
-            b.tracked.and_then(|i| tracked.get(usize::from(i))).copied().unwrap_or(b.world_from_body_rest)
+            let carrier = b.tracked.and_then(|i| tracked.get(usize::from(i))).copied();
+            match (&b.motion, b.tracked) {
+                (Some(motion), None) => motion.at(t_ns),
+                (Some(motion), Some(_)) => {
+                    carrier.map_or(b.world_from_body_rest, |carrier| carrier * motion.at(t_ns))
+                }
+                (None, _) => carrier.unwrap_or(b.world_from_body_rest),
+            }
         }));
     }
 }
@@ -294,6 +304,12 @@ fn load_scene(config: &RigConfig) -> Result<Scene, SceneError> {
             FileAxis::Y => UpAxis::Y,
             FileAxis::Z => UpAxis::Z,
         }),
+        animation: match c.animation.as_str() {
+            "first" => AnimationChoice::First,
+            "none" => AnimationChoice::Off,
+            name => AnimationChoice::Named(name.to_owned()),
+        },
+        animation_speed: Some(c.animation_speed),
         ..LoadOptions::default()
     };
     dpm_scene::load(file, &options)

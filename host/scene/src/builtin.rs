@@ -86,6 +86,7 @@ fn hare_body() -> Body {
         tracked: Some(0),
         projected: true,
         world_from_body_rest: DAffine3::from_translation(DVec3::new(-0.10, 0.0, 0.0)),
+        motion: None,
         mesh: textured_mesh(surface, 0.17, |_| GLAZE),
     }
 }
@@ -97,6 +98,7 @@ fn bust_body() -> Body {
         tracked: Some(1),
         projected: true,
         world_from_body_rest: DAffine3::from_translation(DVec3::new(0.13, 0.03, -0.18)),
+        motion: None,
         mesh: textured_mesh(surface, 0.2, |p| if p.y < PLINTH_TOP_M + 0.0015 { PLINTH } else { BRONZE }),
     }
 }
@@ -130,6 +132,7 @@ fn lamp() -> Body {
         tracked: None,
         projected: false,
         world_from_body_rest: DAffine3::from_translation(centre.as_dvec3()),
+        motion: None,
         mesh,
     }
 }

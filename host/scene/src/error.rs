@@ -46,6 +46,14 @@ pub enum SceneError {
         /// Names to choose from.
         known: String,
     },
+    /// The rig file names an animation that does not exist.
+    #[error("scene.animation is '{name}', and the file has no animation of this name (it has: {known}). \"first\" plays the first one, \"none\" none")]
+    Animation {
+        /// The name.
+        name: String,
+        /// Names to choose from.
+        known: String,
+    },
     /// It took longer than [`super::Limits::time`].
     #[error("loading took longer than {0:?} and was stopped: simplify the file or raise the limit")]
     TimedOut(Duration),

@@ -30,6 +30,7 @@ mod linear_picture;
 mod load;
 pub mod mesh;
 mod mesh_file;
+mod part_motion;
 mod polygonise;
 mod procedural;
 pub mod shapes;
@@ -46,11 +47,12 @@ pub use environment::load_environment;
 pub use error::SceneError;
 pub use limits::Limits;
 pub use linear_picture::{load_linear_picture, LinearPicture};
-pub use load::{load, load_bytes, BodySelector, LoadOptions, UpAxis};
+pub use load::{load, load_bytes, AnimationChoice, BodySelector, LoadOptions, UpAxis};
 #[doc(hidden)]
 pub use load::{load_bytes_here, load_mesh_here};
 #[doc(hidden)]
 pub use mesh_file::MeshFormat;
+pub use part_motion::PartMotion;
 pub use stats::SceneFeatures;
 pub use studio::studio;
 
@@ -77,13 +79,16 @@ pub struct Body {
     /// Name of the rigid body (without a rig file, of the glTF node); "static" and "virtual" for everything that no
     /// body claims.
     pub name: String,
-    /// Index into the rig file's tracked bodies; `None` for static geometry.
+    /// Index into the rig file's tracked bodies; `None` for static geometry. Several bodies may have the same: the first of them
+    /// lies as the tracker says, the others are parts of it that move by themselves.
     pub tracked: Option<u16>,
     /// False for geometry that exists only in the virtual world (lamps, surroundings): light from the projector never falls on it,
     /// but reflections and shadows see it.
     pub projected: bool,
-    /// Pose at rest: world-from-body. A tracker pose replaces it.
+    /// Pose at rest: world-from-body. A tracker pose replaces it. That of a part is its pose at time 0.
     pub world_from_body_rest: DAffine3,
+    /// How it moves in the space of its carrier, the tracked body or the world. `None`: it lies in it as the identity.
+    pub motion: Option<PartMotion>,
     /// Geometry in body space.
     pub mesh: TriangleMesh,
 }

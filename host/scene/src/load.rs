@@ -64,8 +64,24 @@ pub struct LoadOptions {
     pub scale: Option<f64>,
     /// The axis of the file that points up. `None`: Y for glTF, a guess that a warning tells for other formats.
     pub up: Option<UpAxis>,
+    /// Which animation of the file plays.
+    pub animation: AnimationChoice,
+    /// How fast it plays, above 0. `None`: as the file says, 1.
+    pub animation_speed: Option<f64>,
     /// Limits on size and time.
     pub limits: Limits,
+}
+
+/// Which animation of a file plays.
+#[derive(Clone, Debug, Default, PartialEq, Eq)]
+pub enum AnimationChoice {
+    /// The first one, if there is any.
+    #[default]
+    First,
+    /// The one of this name.
+    Named(String),
+    /// None: everything is shown at rest.
+    Off,
 }
 
 /// Reads a `.glb`, `.gltf`, `.obj`, `.ply` or `.stl` file. The bodies of formats without nodes are their objects; a file

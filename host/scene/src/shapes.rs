@@ -26,6 +26,7 @@ pub fn add(scene: &mut Scene, mut mesh: TriangleMesh, material: Material) -> usi
         tracked: None,
         projected: true,
         world_from_body_rest: DAffine3::IDENTITY,
+        motion: None,
         mesh,
     });
     scene.bodies.len() - 1

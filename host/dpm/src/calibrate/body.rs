@@ -49,14 +49,14 @@ pub(super) fn index_of(config: &RigConfig, name: &str) -> Result<usize, Failure>
     })
 }
 
-/// The bodies of a scene that the tracked body `name` carries.
+/// The bodies of a scene that the tracked body `name` carries, without the parts that move by themselves.
 pub(super) fn carried<'a>(
     config: &RigConfig,
     scene: &'a Scene,
     name: &str,
 ) -> Result<Vec<&'a Body>, Failure> {
     let index = index_of(config, name)?;
-    Ok(scene.bodies.iter().filter(|b| b.tracked == Some(index as u16)).collect())
+    Ok(scene.bodies.iter().filter(|b| b.tracked == Some(index as u16) && b.motion.is_none()).collect())
 }
 
 /// The triangles of bodies.

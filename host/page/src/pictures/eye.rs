@@ -88,9 +88,9 @@ impl Eye {
         Some(Linear { raster: small, pixels })
     }
 
-    /// What the observer sees, radiance in scene units, in `light`, which falls on tracked bodies at `poses`. `None` while
-    /// nothing can be seen.
-    pub(super) fn viewer(&mut self, light: &Linear, poses: &[DAffine3]) -> Option<Linear> {
+    /// What the observer sees, radiance in scene units, in `light`, which falls on tracked bodies at `poses` at `t_ns` on the
+    /// host's clock. `None` while nothing can be seen.
+    pub(super) fn viewer(&mut self, light: &Linear, poses: &[DAffine3], t_ns: i64) -> Option<Linear> {
         if poses.len() != self.rig.bodies.len() {
             return None;
         }
@@ -98,7 +98,7 @@ impl Eye {
         let intensity = Vec3::from_array(self.rig.config.projector.max_intensity.0.map(|v| v as f32));
         let ambient = Vec3::from_array(self.rig.config.scene.ambient.map(|v| v as f32));
         let (eye, _) = self.rig.observer.eye_and_gaze(poses);
-        self.rig.scene_poses(poses, &mut self.poses);
+        self.rig.scene_poses(poses, t_ns, &mut self.poses);
         let camera = self.camera(eye)?;
         let bodies: Vec<(&CoarseMesh, DAffine3)> =
             self.meshes.iter().map(|(i, mesh)| (mesh, self.poses[*i])).collect();

@@ -209,7 +209,7 @@ impl Maker {
             return Newest { told, ..Newest::default() };
         };
         let poses = live.poses_of(&self.light);
-        let viewer = poses.and_then(|poses| self.eye.viewer(&light, &poses));
+        let viewer = poses.and_then(|(poses, t_ns)| self.eye.viewer(&light, &poses, t_ns));
         let told = viewer.is_none().then(|| match self.light.is_moved {
             true => {
                 "Tracks moved the light, and where the bodies were then is known with a mock tracker only."

@@ -262,6 +262,12 @@ section! {
         /// The axis of `file` that points up. If left out, it is `y` for glTF, OBJ and PLY, and `z` for STL; the program
         /// says so for formats that name none.
         up: Option<FileAxis> = None, "", Any;
+        /// Which animation of a glTF file plays, over and over: `first`, `none`, or its name. It moves nodes; each that has
+        /// surfaces is a body of its own, at most 128. Its time is that of the light. Sizes, skins and morph targets are
+        /// shown at rest.
+        animation: String = "first".into(), "", NotEmpty;
+        /// How fast it plays; 1 is the file's own time.
+        animation_speed: f64 = 1.0, "", Within(0.001, 1000.0);
         /// A scene that the program generates.
         builtin: BuiltinScene = BuiltinScene::Demo, "", Any;
         /// Light from the surroundings.

@@ -14,6 +14,7 @@ use dpm_device::time::{DeviceTicks, HostTime};
 use dpm_device::transport::Transport;
 use dpm_handoff::latest::Reader;
 use dpm_scene::geometry::projector::ProjectorCamera;
+use dpm_scene::Body;
 use dpm_tracking::{Freshness, TrackState};
 use glam::{DAffine3, DVec2, DVec3};
 use std::sync::Arc;
@@ -45,22 +46,38 @@ struct Shape {
 impl Shape {
     /// The tracked body `tracked` of `rig`; `None` if no light falls on it.
     fn of(rig: &Rig, tracked: usize) -> Option<Self> {
-        let bodies = rig.scene.bodies.iter().filter(|b| b.tracked == Some(tracked as u16) && b.projected);
-        let all: Vec<DVec3> = bodies.flat_map(|b| b.mesh.positions.iter().map(|p| p.as_dvec3())).collect();
+        let carried = |b: &&Body| b.tracked == Some(tracked as u16) && b.projected;
+        let all: Vec<DVec3> = rig.scene.bodies.iter().filter(carried).flat_map(points_of).collect();
         let first = *all.first()?;
         let (lower, upper) =
             all.iter().fold((first, first), |(lower, upper), p| (lower.min(*p), upper.max(*p)));
         let n = all.len().min(POINTS);
-        let end = |high: bool, a: f64, b: f64| if high { b } else { a };
-        let corners = std::array::from_fn(|i| {
-            DVec3::new(
-                end(i & 1 != 0, lower.x, upper.x),
-                end(i & 2 != 0, lower.y, upper.y),
-                end(i & 4 != 0, lower.z, upper.z),
-            )
-        });
+        let corners = corners_of(lower, upper);
         Some(Self { points: (0..n).map(|i| all[i * all.len() / n]).collect(), corners })
     }
+}
+
+/// The vertices of a body in the space of its carrier; of a part that moves by itself the corners of the box around it,
+/// wherever it goes.
+fn points_of(body: &Body) -> Vec<DVec3> {
+    let vertices = body.mesh.positions.iter().map(|p| p.as_dvec3());
+    let Some(motion) = &body.motion else { return vertices.collect() };
+    let (lower, upper) = vertices
+        .fold((DVec3::INFINITY, DVec3::NEG_INFINITY), |(lower, upper), p| (lower.min(p), upper.max(p)));
+    let places = motion.instants().into_iter().map(|t| motion.at(t));
+    places.flat_map(|place| corners_of(lower, upper).map(|corner| place.transform_point3(corner))).collect()
+}
+
+/// The corners of a box.
+fn corners_of(lower: DVec3, upper: DVec3) -> [DVec3; 8] {
+    let end = |high: bool, a: f64, b: f64| if high { b } else { a };
+    std::array::from_fn(|i| {
+        DVec3::new(
+            end(i & 1 != 0, lower.x, upper.x),
+            end(i & 2 != 0, lower.y, upper.y),
+            end(i & 4 != 0, lower.z, upper.z),
+        )
+    })
 }
 
 /// What a sent frame was drawn for.

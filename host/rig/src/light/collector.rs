@@ -384,6 +384,7 @@ impl Collector {
                 id: job.plan.id,
                 slot: job.plan.slot,
                 timeline: job.timeline,
+                drawn_for: job.plan.centre_at,
                 tracked_poses: job.plan.tracked_poses.clone(),
                 swept_poses: job.plan.swept_poses.clone(),
                 sampled_poses: job.plan.sampled_poses.clone(),

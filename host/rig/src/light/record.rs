@@ -3,6 +3,7 @@
 use crate::frame::FrameTimeline;
 use crate::plan::dark::DarkCause;
 use crate::plan::frame::FrameId;
+use dpm_device::time::HostTime;
 use dpm_render::PASSES;
 use glam::{DAffine3, DVec3};
 
@@ -15,6 +16,8 @@ pub struct FrameRecord {
     pub slot: u64,
     /// Its stamps.
     pub timeline: FrameTimeline,
+    /// The instant for which it was drawn: the planned centre of its light.
+    pub drawn_for: HostTime,
     /// world-from-body of the tracked bodies for which it was drawn.
     pub tracked_poses: Vec<DAffine3>,
     /// The same at the first photon and at the last; empty if all planes were drawn for one instant.

@@ -161,7 +161,7 @@ impl FramePlan {
         let exposure_ns = slots.host_of_slot(slot + 1).ns_since(self.due_at);
         let centre = self.due_at.plus_ns(light_centre_ns(rig, exposure_ns) + late_ns);
         self.place_bodies(rig, snapshot, inputs, centre);
-        rig.scene_poses(&self.tracked_poses, &mut self.scene_poses);
+        rig.scene_poses(&self.tracked_poses, centre.0, &mut self.scene_poses);
         let first = self.due_at.plus_ns(late_ns);
         (self.centre_at, self.swept_at) = (centre, [first, first.plus_ns(exposure_ns)]);
         self.sweep_bodies(rig, snapshot, inputs.applied);
@@ -264,7 +264,7 @@ impl FramePlan {
                     None => affine(&body.rest),
                 });
             }
-            rig.scene_poses(swept, scene);
+            rig.scene_poses(swept, end.0, scene);
         }
     }
 

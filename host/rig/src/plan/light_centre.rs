@@ -22,11 +22,15 @@ pub(crate) fn light_centre_ns(rig: &Rig, exposure_ns: i64) -> i64 {
     Lights::of(rig).centre_ns(exposure_ns)
 }
 
+/// The centre of the light of a whole frame of `rig` whose first photon left at `first_photon_at`.
+pub(crate) fn light_centre_at(rig: &Rig, first_photon_at: HostTime) -> HostTime {
+    first_photon_at.plus_ns(light_centre_ns(rig, rig.rate().slot_len_ns(0)))
+}
+
 /// The true world-from-mesh transform of every tracked body at the centre of the light of a whole frame of `rig` whose first
 /// photon left at `first_photon_at`; `None` unless the tracker is the mock.
 pub(crate) fn true_poses_at_centre(rig: &Rig, first_photon_at: HostTime) -> Option<Vec<DAffine3>> {
-    let to_centre = light_centre_ns(rig, rig.rate().slot_len_ns(0));
-    rig.true_poses(first_photon_at.plus_ns(to_centre).0)
+    rig.true_poses(light_centre_at(rig, first_photon_at).0)
 }
 
 /// The light of each plane of a frame of `rig`: the time from the first photon to the middle of the plane in nanoseconds,

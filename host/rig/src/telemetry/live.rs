@@ -8,7 +8,7 @@ use super::histogram_steps::Steps;
 use super::miss_log::MissRun;
 use super::report::Report;
 use crate::plan::dark::DarkCause;
-use crate::plan::light_centre::true_poses_at_centre;
+use crate::plan::light_centre::{light_centre_at, true_poses_at_centre};
 use crate::rig::Rig;
 use dpm_common::unix::monotonic_ns;
 use dpm_device::time::HostTime;
@@ -196,13 +196,17 @@ impl Live {
         drawn.iter().rev().find(|d| Some(d.frame) == frame).or_else(|| drawn.back()).cloned()
     }
 
-    /// Per tracked body: world-from-mesh where `light` fell. That is what its frame was drawn for; light that tracks moved
-    /// fell where the bodies were by then, which is `None` unless the tracker is the mock.
-    pub fn poses_of(&self, light: &SeenLight) -> Option<Vec<DAffine3>> {
-        if light.is_moved {
-            return true_poses_at_centre(self.rig()?, light.first_photon_at);
-        }
-        self.drawn(light.frame).map(|drawn| drawn.poses)
+    /// Per tracked body: world-from-mesh where `light` fell, and when that was, nanoseconds on the host's clock. It is what its
+    /// frame was drawn for; light that tracks moved fell where the bodies were by then, which is `None` unless the tracker is the
+    /// mock.
+    pub fn poses_of(&self, light: &SeenLight) -> Option<(Vec<DAffine3>, i64)> {
+        let rig = self.rig()?;
+        let poses = if light.is_moved {
+            true_poses_at_centre(rig, light.first_photon_at)?
+        } else {
+            self.drawn(light.frame)?.poses
+        };
+        Some((poses, light_centre_at(rig, light.first_photon_at).0))
     }
 
     /// Asks the mock projector for its light; [`Live::take_light`] has it a moment later.

@@ -82,10 +82,8 @@ pub(super) fn check(root: &Item, data: &Data, limits: &Limits) -> Result<Checked
     for mesh in &meshes {
         triangles.push(check_mesh(mesh, data, &counts, quantized, limits, &mut warnings)?);
     }
-    for (key, what) in [("animations", "animations"), ("skins", "skins (the rest pose is shown)")] {
-        if !list(key, key)?.is_empty() {
-            warnings.push(format!("{what} are ignored: motion comes from the tracker"));
-        }
+    if !list("skins", "skins")?.is_empty() {
+        warnings.push("skins are ignored: their meshes are shown at rest".into());
     }
     let instances = read_instances(&nodes, data, limits)?;
     check_nodes(root, &nodes, &counts, &triangles, &instances, limits)?;

@@ -1,5 +1,5 @@
 //! Flattens the node tree into rigid bodies: nodes that a body of the rig file claims move with it, all others are
-//! static.
+//! static. What an animation moves is a part, a body of its own with the same carrier.
 
 use std::collections::{BTreeMap, HashMap, HashSet};
 
@@ -7,10 +7,12 @@ use glam::{DAffine3, DMat3, DMat4, DVec3, Vec3};
 
 use super::super::limits::Cancel;
 use super::super::mesh::Dropped;
+use super::super::part_motion::{Link, NodeMotion, PartMotion, Track};
 use super::super::{
     Body, BodySelector, Limits, LoadOptions, PunctualKind, PunctualLight, SceneError, TriangleMesh,
 };
 use super::accessor::Data;
+use super::animation::{Animation, Channels};
 use super::instancing::Instances;
 use super::look::Look;
 use super::primitive::read_primitive;
@@ -19,15 +21,35 @@ use super::vertex_paint::Paint;
 /// Bodies that [`choose_bodies`] makes movable when the rig file names none.
 const AUTO_BODIES: usize = 2;
 
-/// The body that a node belongs to: (index of the selector or none, exists only in the virtual world).
-type Group = (Option<usize>, bool);
+/// Most parts that an animation may move.
+const MAX_PARTS: usize = 128;
 
-/// Part of the tree still to be walked.
+/// The body that a node belongs to.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
+struct Group {
+    /// Index of the selector, if one claims it.
+    claim: Option<usize>,
+    /// It exists only in the virtual world.
+    is_virtual: bool,
+    /// Index of the part, if an animation moves it.
+    part: Option<usize>,
+}
+
+/// A subtree still to be walked.
 struct Step {
     node: usize,
+    /// World-from-parent at rest.
     world: DAffine3,
-    claim: Option<usize>,
-    is_virtual: bool,
+    /// Part-from-parent, if the parent belongs to a part.
+    place: DAffine3,
+    group: Group,
+}
+
+/// Nodes that an animation moves with all below them, up to the next such node.
+struct Part {
+    name: String,
+    /// From the carrier to the part.
+    links: Vec<Link>,
 }
 
 /// The result of [`flatten`].
@@ -207,6 +229,8 @@ pub(super) struct Source<'a> {
     pub look: &'a Look,
     /// The places of the meshes of instanced nodes.
     pub instances: &'a Instances,
+    /// How nodes move.
+    pub animation: &'a Animation,
     /// The world's unit and axes from those of the file.
     pub world: DAffine3,
 }
@@ -225,18 +249,27 @@ pub(super) fn flatten(
     cancel: &Cancel,
     warnings: &mut Vec<String>,
 ) -> Result<(Flat, Paint), SceneError> {
-    let mut gatherer = Gatherer {
-        source,
-        claims,
-        limits,
-        cancel,
-        rest: vec![DAffine3::IDENTITY; claims.bodies.len()],
-        meshes: BTreeMap::new(),
-        lights: vec![],
-        dropped: Dropped::default(),
-        paint: Paint::new(source.look, limits),
-    };
+    let told = warnings.len();
+    let still = Animation::default();
+    let unmoved = Source { animation: &still, ..*source };
+    let mut gatherer = Gatherer::new(source, claims, limits, cancel);
     gatherer.walk(warnings)?;
+    let parts = gatherer.moving_parts();
+    if parts > MAX_PARTS {
+        warnings.truncate(told);
+        warnings.push(format!(
+            "{} moves {parts} parts, and at most {MAX_PARTS} can move: all are shown at rest",
+            source.animation.name
+        ));
+        gatherer = Gatherer::new(&unmoved, claims, limits, cancel);
+        gatherer.walk(warnings)?;
+    } else if parts > 0 {
+        warnings.push(format!(
+            "{} plays over and over, {:.2} s a round: {parts} parts of the scene move",
+            source.animation.name,
+            source.animation.period_ns as f64 * 1e-9
+        ));
+    }
     let paint = std::mem::take(&mut gatherer.paint);
     paint.warn(warnings);
     Ok((gatherer.into_flat(warnings)?, paint))
@@ -250,59 +283,136 @@ struct Gatherer<'a> {
     cancel: &'a Cancel,
     /// By claim: world-from-body at rest.
     rest: Vec<DAffine3>,
+    parts: Vec<Part>,
     meshes: BTreeMap<Group, TriangleMesh>,
-    lights: Vec<(Option<usize>, PunctualLight)>,
+    lights: Vec<(Group, PunctualLight)>,
     dropped: Dropped,
     paint: Paint,
 }
 
-impl Gatherer<'_> {
+impl<'a> Gatherer<'a> {
+    fn new(source: &'a Source<'a>, claims: &'a Claims, limits: &'a Limits, cancel: &'a Cancel) -> Self {
+        Self {
+            source,
+            claims,
+            limits,
+            cancel,
+            rest: vec![DAffine3::IDENTITY; claims.bodies.len()],
+            parts: vec![],
+            meshes: BTreeMap::new(),
+            lights: vec![],
+            dropped: Dropped::default(),
+            paint: Paint::new(source.look, limits),
+        }
+    }
+
+    /// Parts that hold triangles.
+    fn moving_parts(&self) -> usize {
+        self.meshes.iter().filter(|(group, mesh)| group.part.is_some() && !mesh.triangles.is_empty()).count()
+    }
+
     fn walk(&mut self, warnings: &mut Vec<String>) -> Result<(), SceneError> {
         let claims = self.claims;
         let claim_of: HashMap<usize, usize> =
             claims.bodies.iter().enumerate().map(|(c, b)| (b.node, c)).collect();
         let document = self.source.document;
-        let mut walk: Vec<Step> = roots(document)
-            .into_iter()
-            .rev()
-            .map(|node| Step { node, world: self.source.world, claim: None, is_virtual: false })
-            .collect();
-        while let Some(step) = walk.pop() {
+        let world = self.source.world;
+        let group = Group { claim: None, is_virtual: false, part: None };
+        let mut walk: Vec<Step> =
+            roots(document).into_iter().rev().map(|node| Step { node, world, place: world, group }).collect();
+        while let Some(Step { node: index, world, place, mut group }) = walk.pop() {
             self.cancel.check(self.limits)?;
-            let Some(node) = document.nodes().nth(step.node) else { continue };
-            let world = step.world * local_transform(&node);
-            let claimed_here = claim_of.get(&step.node).copied();
-            let claim = claimed_here.or(step.claim);
-            let is_virtual = match claimed_here {
-                Some(c) => !claims.bodies[c].projected,
-                None => step.is_virtual,
-            } || claims.virtual_nodes.binary_search(&step.node).is_ok();
-            if let Some(c) = claimed_here {
-                // The body's own axes are turned with the file's: without its node's transform the body lies as the world does.
-                let turned = world * self.source.world.inverse();
-                self.rest[c] = rigid_part(&turned).ok_or_else(|| {
-                    SceneError::broken(
-                        format!("body '{}'", claims.bodies[c].name),
-                        "its node has a scale of zero or a position beyond any room",
-                    )
-                })?;
+            let Some(node) = document.nodes().nth(index) else { continue };
+            let channels = self.source.animation.nodes.get(&index);
+            let local = local_transform(&node, channels);
+            let above = self.place_at(group, &world, &place);
+            let world = world * local;
+            let mut place = place * local;
+            if let Some(&c) = claim_of.get(&index) {
+                group = Group { claim: Some(c), is_virtual: !claims.bodies[c].projected, part: None };
+                self.rest[c] = self.rest_of(c, &world)?;
+                if channels.is_some_and(Channels::moves) {
+                    warnings.push(format!(
+                        "node {index} '{}': its own motion is not played: the tracker moves body '{}'",
+                        node.name().unwrap_or(""),
+                        claims.bodies[c].name
+                    ));
+                }
+            } else if let Some(channels) = channels.filter(|channels| channels.moves()) {
+                match self.part(&node, channels, &above, group) {
+                    Some((part, scale)) => (group.part, place) = (Some(part), scale),
+                    None => warnings.push(format!(
+                        "node {index} '{}': its motion is not played, because a node above it is scaled unevenly",
+                        node.name().unwrap_or("")
+                    )),
+                }
             }
-            let body_from_node = claim.map_or(world, |c| self.rest[c].inverse() * world);
+            let place = self.place_at(group, &world, &place);
+            group.is_virtual |= claims.virtual_nodes.binary_search(&index).is_ok();
             if let Some(mesh) = node.mesh() {
-                if is_invertible(&body_from_node) {
-                    self.add_mesh(mesh.index(), step.node, (claim, is_virtual), &body_from_node)?;
+                if is_invertible(&place) {
+                    self.add_mesh(mesh.index(), index, group, &place)?;
                 } else {
                     let name = node.name().unwrap_or("");
-                    warnings
-                        .push(format!("node {} '{name}' is scaled to nothing and is left out", step.node));
+                    warnings.push(format!("node {index} '{name}' is scaled to nothing and is left out"));
                 }
             }
             if let Some(light) = node.light() {
-                self.lights.extend(place_light(&light, &body_from_node).map(|l| (claim, l)));
+                self.lights.extend(place_light(&light, &place).map(|l| (group, l)));
             }
-            walk.extend(node.children().map(|c| Step { node: c.index(), world, claim, is_virtual }));
+            walk.extend(node.children().map(|c| Step { node: c.index(), world, place, group }));
         }
         Ok(())
+    }
+
+    /// The place of a node in the space of its body or part. `world` is its place at rest, `in_part` that in its part.
+    fn place_at(&self, group: Group, world: &DAffine3, in_part: &DAffine3) -> DAffine3 {
+        match group {
+            Group { part: Some(_), .. } => *in_part,
+            Group { claim: Some(c), .. } => self.rest[c].inverse() * *world,
+            Group { claim: None, .. } => *world,
+        }
+    }
+
+    /// World-from-body at rest of claim `c`, whose node is at `world`.
+    fn rest_of(&self, c: usize, world: &DAffine3) -> Result<DAffine3, SceneError> {
+        // The body's own axes are turned with the file's: without its node's transform the body lies as the world does.
+        let turned = *world * self.source.world.inverse();
+        rigid_part(&turned).ok_or_else(|| {
+            SceneError::broken(
+                format!("body '{}'", self.claims.bodies[c].name),
+                "its node has a scale of zero or a position beyond any room",
+            )
+        })
+    }
+
+    /// A part for a node that moves, and the place of the node in it, which is its scale. `parent`: the place of its parent
+    /// in the body or part above. `None`: what is above it does not keep angles, so that the part would not be rigid.
+    fn part(
+        &mut self,
+        node: &gltf::Node,
+        channels: &Channels,
+        parent: &DAffine3,
+        above: Group,
+    ) -> Option<(usize, DAffine3)> {
+        let (rigid, scale) = even_part(parent)?;
+        let (translation, rotation, own_scale) = decomposed(node)?;
+        let mut links = above.part.map_or_else(Vec::new, |p| self.parts[p].links.clone());
+        if rigid != DAffine3::IDENTITY {
+            links.push(Link::Fixed(rigid));
+        }
+        let mut motion = NodeMotion {
+            translation: channels.translation.clone().unwrap_or(Track::Constant(translation)),
+            rotation: channels.rotation.clone().unwrap_or(Track::Constant(rotation)),
+        };
+        match &mut motion.translation {
+            Track::Constant(at) => *at *= scale,
+            Track::Keys(keys) => keys.values.iter_mut().for_each(|at| *at *= scale),
+        }
+        links.push(Link::Node(motion));
+        let name = node.name().map_or_else(|| format!("node {}", node.index()), str::to_owned);
+        self.parts.push(Part { name, links });
+        Some((self.parts.len() - 1, DAffine3::from_scale(own_scale * scale)))
     }
 
     /// All primitives of a mesh, at each place of the node's instances.
@@ -339,57 +449,142 @@ impl Gatherer<'_> {
     /// Bodies of what was gathered.
     fn into_flat(mut self, warnings: &mut Vec<String>) -> Result<Flat, SceneError> {
         let claims = self.claims;
-        let mut bodies = vec![];
-        let mut body_of_claim = vec![None; claims.bodies.len()];
-        // The map sorts None first; static things must come last, after the bodies in the order of the rig file.
+        let mut bodies: Vec<Body> = vec![];
+        let mut body_of = BTreeMap::new();
+        let mut has_surface = vec![false; claims.bodies.len()];
+        self.add_carriers();
+        // None comes first; static things must come last, after the bodies in the order of the rig file.
         let (fixed, moving): (Vec<_>, Vec<_>) =
-            self.meshes.into_iter().partition(|((claim, _), _)| claim.is_none());
-        for ((claim, is_virtual), mut mesh) in moving.into_iter().chain(fixed) {
+            std::mem::take(&mut self.meshes).into_iter().partition(|(group, _)| group.claim.is_none());
+        for (group, mut mesh) in moving.into_iter().chain(fixed) {
             self.dropped.add(mesh.drop_unusable());
-            if mesh.triangles.is_empty() {
+            let is_carrier = group.claim.is_some() && group.part.is_none();
+            if mesh.triangles.is_empty() && !is_carrier {
                 continue;
             }
-            let name = match (claim, is_virtual) {
-                (Some(c), _) => claims.bodies[c].name.clone(),
-                (None, false) => "static".into(),
-                (None, true) => "virtual".into(),
-            };
-            if let Some(c) = claim {
-                body_of_claim[c].get_or_insert(bodies.len() as u32);
+            if let Some(c) = group.claim {
+                has_surface[c] |= !mesh.triangles.is_empty();
             }
-            bodies.push(Body {
-                name,
-                tracked: claim.map(|c| c as u16),
-                projected: !is_virtual,
-                world_from_body_rest: claim.map_or(DAffine3::IDENTITY, |c| self.rest[c]),
-                mesh,
-            });
+            body_of.insert(group, bodies.len() as u32);
+            bodies.push(self.body(group, mesh));
         }
         self.dropped.warn(warnings);
-        if bodies.is_empty() {
+        if bodies.iter().all(|b| b.mesh.triangles.is_empty()) {
             return Err(SceneError::broken("scene", "holds no usable triangle"));
         }
-        if let Some((claim, _)) = claims.bodies.iter().zip(&body_of_claim).find(|(_, b)| b.is_none()) {
+        if let Some((claim, _)) = claims.bodies.iter().zip(&has_surface).find(|(_, has)| !**has) {
             let name = format!("body '{}'", claim.name);
             return Err(SceneError::broken(name, "its node holds no usable triangle"));
         }
-        let of_body = |claim: Option<usize>| claim.and_then(|c| body_of_claim[c]);
-        let lights = self.lights.into_iter().map(|(claim, l)| PunctualLight { body: of_body(claim), ..l });
-        Ok(Flat { bodies, lights: lights.collect() })
+        let lights = std::mem::take(&mut self.lights);
+        let lights =
+            lights.into_iter().map(|(group, l)| self.carried(group, l, &body_of, warnings)).collect();
+        Ok(Flat { bodies, lights })
+    }
+
+    /// A body for every claim that has parts: its pose at rest is that of the claim, even if all its surfaces move.
+    fn add_carriers(&mut self) {
+        let with_parts = self.meshes.keys().filter(|group| group.claim.is_some() && group.part.is_some());
+        let carriers: Vec<Group> = with_parts
+            .map(|group| Group {
+                is_virtual: group.claim.is_some_and(|c| !self.claims.bodies[c].projected),
+                part: None,
+                ..*group
+            })
+            .collect();
+        for carrier in carriers {
+            self.meshes.entry(carrier).or_default();
+        }
+    }
+
+    fn body(&self, group: Group, mesh: TriangleMesh) -> Body {
+        let carrier = match (group.claim, group.is_virtual) {
+            (Some(c), _) => self.claims.bodies[c].name.as_str(),
+            (None, false) => "static",
+            (None, true) => "virtual",
+        };
+        let rest = group.claim.map_or(DAffine3::IDENTITY, |c| self.rest[c]);
+        let motion = self.motion(group);
+        Body {
+            name: match group.part {
+                Some(part) => format!("{carrier}/{}", self.parts[part].name),
+                None => carrier.to_owned(),
+            },
+            tracked: group.claim.map(|c| c as u16),
+            projected: !group.is_virtual,
+            world_from_body_rest: motion.as_ref().map_or(rest, |motion| rest * motion.at(0)),
+            motion,
+            mesh,
+        }
+    }
+
+    fn motion(&self, group: Group) -> Option<PartMotion> {
+        let Animation { length_s, period_ns, .. } = *self.source.animation;
+        group.part.map(|part| PartMotion::new(self.parts[part].links.clone(), length_s, period_ns))
+    }
+
+    /// A light with the body that carries it: that of its group, or of its claim if the part that carries it has no surface.
+    fn carried(
+        &self,
+        group: Group,
+        light: PunctualLight,
+        body_of: &BTreeMap<Group, u32>,
+        warnings: &mut Vec<String>,
+    ) -> PunctualLight {
+        let find = |part| {
+            let same = |g: &&Group| g.claim == group.claim && g.part == part;
+            body_of.keys().find(same).map(|g| body_of[g])
+        };
+        let Some(motion) = self.motion(group) else {
+            return PunctualLight { body: group.claim.and_then(|_| find(None)), ..light };
+        };
+        if let Some(body) = find(group.part) {
+            return PunctualLight { body: Some(body), ..light };
+        }
+        warnings.push("a light that an animation moves stands still: nothing else moves with it".into());
+        let place = motion.at(0);
+        PunctualLight {
+            body: group.claim.and_then(|_| find(None)),
+            position: place.transform_point3(light.position.as_dvec3()).as_vec3(),
+            direction: place.transform_vector3(light.direction.as_dvec3()).as_vec3(),
+            ..light
+        }
     }
 }
 
-fn local_transform(node: &gltf::Node) -> DAffine3 {
+/// Translation, rotation and scale of a node; `None` if it has a matrix that is more than these.
+fn decomposed(node: &gltf::Node) -> Option<(DVec3, glam::DQuat, DVec3)> {
+    let vector = |v: [f32; 3]| DVec3::from_array(v.map(f64::from));
     match node.transform() {
-        gltf::scene::Transform::Matrix { matrix } => {
-            DAffine3::from_mat4(DMat4::from_cols_array_2d(&matrix.map(|c| c.map(f64::from))))
-        }
+        gltf::scene::Transform::Matrix { .. } => None,
         gltf::scene::Transform::Decomposed { translation, rotation, scale } => {
-            let vector = |v: [f32; 3]| DVec3::from_array(v.map(f64::from));
             let rotation = glam::DQuat::from_array(rotation.map(f64::from)).normalize();
-            DAffine3::from_scale_rotation_translation(vector(scale), rotation, vector(translation))
+            Some((vector(translation), rotation, vector(scale)))
         }
     }
+}
+
+/// Parent-from-node: as `channels` say where these never change, elsewhere at rest.
+fn local_transform(node: &gltf::Node, channels: Option<&Channels>) -> DAffine3 {
+    let Some((mut translation, mut rotation, scale)) = decomposed(node) else {
+        let matrix = node.transform().matrix().map(|c| c.map(f64::from));
+        return DAffine3::from_mat4(DMat4::from_cols_array_2d(&matrix));
+    };
+    if let Some(Track::Constant(at)) = channels.and_then(|c| c.translation.as_ref()) {
+        translation = *at;
+    }
+    if let Some(Track::Constant(turn)) = channels.and_then(|c| c.rotation.as_ref()) {
+        rotation = *turn;
+    }
+    DAffine3::from_scale_rotation_translation(scale, rotation, translation)
+}
+
+/// The rigid map and the factor of which a map is the product; `None` if it does not keep angles, or mirrors.
+fn even_part(map: &DAffine3) -> Option<(DAffine3, f64)> {
+    let rigid = rigid_part(map)?;
+    let scale = map.matrix3.x_axis.length();
+    let even = DAffine3 { matrix3: rigid.matrix3 * DMat3::from_diagonal(DVec3::splat(scale)), ..rigid };
+    even.abs_diff_eq(*map, 1e-4 * scale).then_some((rigid, scale))
 }
 
 fn is_invertible(map: &DAffine3) -> bool {

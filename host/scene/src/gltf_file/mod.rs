@@ -2,6 +2,7 @@
 //! `gltf` crate's typed view of the checked document, look and geometry.
 
 mod accessor;
+mod animation;
 mod check;
 mod check_look;
 mod compressed;
@@ -54,6 +55,8 @@ pub(super) fn read(
     let limits = &limits.of_file(all_bytes as u64);
     let data = accessor::Data::new(&root, buffers, limits)?;
     let check::Checked { mut warnings, instances } = check::check(&root, &data, limits)?;
+    let nodes = root.list("nodes", "node", limits.objects)?;
+    let animation = animation::read(&root, &data, &nodes, options, &mut warnings)?;
     cancel.check(limits)?;
 
     let typed: gltf::json::Root =
@@ -62,8 +65,14 @@ pub(super) fn read(
     let claims = flatten::choose_bodies(&document, options, &mut warnings)?;
     let mut look = look::read_look(&document, &root, &data, folder.as_ref(), limits, cancel, &mut warnings)?;
     let world = flatten::world_from_file(options);
-    let source =
-        flatten::Source { document: &document, data: &data, look: &look, instances: &instances, world };
+    let source = flatten::Source {
+        document: &document,
+        data: &data,
+        look: &look,
+        instances: &instances,
+        animation: &animation,
+        world,
+    };
     let (flat, paint) = flatten::flatten(&source, &claims, limits, cancel, &mut warnings)?;
     paint.add_to(&mut look);
     let mut warnings = grouped(warnings);

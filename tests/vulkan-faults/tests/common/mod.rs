@@ -81,7 +81,7 @@ pub(crate) fn submit(renderer: &mut Renderer, slot: &mut FrameSlot, frame: u32) 
     let along = DAffine3::from_translation(DVec3::X * 5e-4 * f64::from(frame));
     let tracked: Vec<_> = rig.bodies.iter().map(|b| along * affine(&b.rest)).collect();
     let mut poses = Vec::new();
-    rig.scene_poses(&tracked, &mut poses);
+    rig.scene_poses(&tracked, 0, &mut poses);
     let still = FrameInputs::new(&rig.camera, rig.observer.eye_and_gaze(&tracked), &poses);
     renderer.submit(slot, &FrameInputs { frame, spp: 2, budget_spp: 2.0, ..still })
 }

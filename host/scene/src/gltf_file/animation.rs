@@ -1,0 +1,256 @@
+//! The animation of a file that is played: which nodes move, and how.
+//!
+//! An animation that is broken is no reason to refuse a scene: what of it cannot be used is left out and told.
+
+use std::collections::HashMap;
+
+use glam::{DQuat, DVec3};
+
+use super::super::part_motion::{Interpolation, Keyed, Keys, Track};
+use super::super::{AnimationChoice, LoadOptions, SceneError};
+use super::accessor::{Accessor, Component, Data};
+use super::json::{shorten, Item};
+
+/// Longest animation, seconds of the file's time.
+const LONGEST_S: f64 = 1e6;
+/// What an animation that never ends counts as: all its values are at one instant.
+const SHORTEST_S: f64 = 1e-3;
+
+/// What a file says of the motion of its nodes.
+#[derive(Debug, Default)]
+pub(crate) struct Animation {
+    /// For the operator, as `animation 0 'walk'`; empty if none is played.
+    pub name: String,
+    /// Seconds of the file's time in a round.
+    pub length_s: f64,
+    /// Nanoseconds that a round lasts.
+    pub period_ns: i64,
+    /// The nodes that it names.
+    pub nodes: HashMap<usize, Channels>,
+}
+
+/// What an animation says of a node; `None`: nothing.
+#[derive(Clone, Debug, Default)]
+pub(crate) struct Channels {
+    /// Metres, or units of the parent.
+    pub translation: Option<Track<DVec3>>,
+    /// Unit quaternions.
+    pub rotation: Option<Track<DQuat>>,
+}
+
+impl Channels {
+    /// True if something about the node changes with time.
+    pub(crate) fn moves(&self) -> bool {
+        matches!(self.translation, Some(Track::Keys(_))) || matches!(self.rotation, Some(Track::Keys(_)))
+    }
+}
+
+/// Reads the animation of `root` that the options choose.
+///
+/// # Errors
+/// The options name one that the file does not have, or the file has too many.
+pub(super) fn read(
+    root: &Item,
+    data: &Data,
+    nodes: &[Item],
+    options: &LoadOptions,
+    warnings: &mut Vec<String>,
+) -> Result<Animation, SceneError> {
+    let all = root.list("animations", "animation", options.limits.objects)?;
+    let item = match &options.animation {
+        AnimationChoice::Off => None,
+        AnimationChoice::First => all.first(),
+        AnimationChoice::Named(name) => {
+            let is_it = |a: &&Item| a.get("name").and_then(serde_json::Value::as_str) == Some(name);
+            Some(all.iter().find(is_it).ok_or_else(|| unknown(name, &all))?)
+        }
+    };
+    let Some(item) = item else {
+        if !all.is_empty() {
+            warnings.push("animations are not played: scene.animation = \"none\"".into());
+        }
+        return Ok(Animation::default());
+    };
+    if all.len() > 1 {
+        let played = match &options.animation {
+            AnimationChoice::Named(_) => "the one that scene.animation names",
+            _ => "the first one; scene.animation names another",
+        };
+        warnings.push(format!("of {} animations one is played: {played}", all.len()));
+    }
+    let mut reader = Reader { item, data, nodes, lost: Vec::new() };
+    let mut animation = reader.animation(options);
+    let lost = reader.lost;
+    if let Some((first, more)) = lost.split_first() {
+        let rest = if more.is_empty() { String::new() } else { format!(", and {} more such", more.len()) };
+        warnings.push(format!("{}: {first}{rest}", item.name));
+    }
+    animation.nodes.retain(|_, channels| channels.translation.is_some() || channels.rotation.is_some());
+    Ok(animation)
+}
+
+fn unknown(name: &str, all: &[Item]) -> SceneError {
+    let names: Vec<String> =
+        all.iter().filter_map(|a| a.text("name").ok().flatten()).take(30).map(shorten).collect();
+    SceneError::Animation {
+        name: name.to_owned(),
+        known: if names.is_empty() { "none".into() } else { names.join(", ") },
+    }
+}
+
+struct Reader<'a> {
+    item: &'a Item<'a>,
+    data: &'a Data,
+    nodes: &'a [Item<'a>],
+    /// What cannot be shown.
+    lost: Vec<String>,
+}
+
+impl Reader<'_> {
+    fn animation(&mut self, options: &LoadOptions) -> Animation {
+        let limit = options.limits.objects;
+        let lists = self.item.list("channels", "channel", limit);
+        let lists = lists.and_then(|c| Ok((c, self.item.list("samplers", "sampler", limit)?)));
+        let (channels, samplers) = lists.unwrap_or_else(|e| {
+            self.lost.push(e.to_string());
+            (Vec::new(), Vec::new())
+        });
+        let mut animation = Animation { name: self.item.name.clone(), ..Animation::default() };
+        for channel in &channels {
+            if let Err(problem) = self.channel(channel, &samplers, &mut animation) {
+                self.lost.push(format!("{}: {problem}", channel.name));
+            }
+        }
+        animation.length_s = animation.length_s.max(SHORTEST_S);
+        let speed = options.animation_speed.unwrap_or(1.0);
+        animation.period_ns = ((animation.length_s / speed * 1e9).round() as i64).max(1);
+        animation
+    }
+
+    /// Adds a channel to the animation, or says why not.
+    fn channel(
+        &mut self,
+        channel: &Item,
+        samplers: &[Item],
+        animation: &mut Animation,
+    ) -> Result<(), String> {
+        let text = |e: SceneError| e.to_string();
+        let target = channel.object("target").map_err(text)?.ok_or("it has no target")?;
+        // Extensions name other targets, without a node.
+        let Some(node) = target.index("node", self.nodes.len(), "node").map_err(text)? else { return Ok(()) };
+        let sampler = channel.index("sampler", samplers.len(), "sampler").map_err(text)?;
+        let sampler = &samplers[sampler.ok_or("it has no sampler")?];
+        let path = target.text("path").map_err(text)?.unwrap_or("missing");
+        let times = self.times(sampler)?;
+        animation.length_s = animation.length_s.max(times.last().copied().unwrap_or(0.0));
+        let name = || format!("of {}", self.nodes[node].name);
+        match path {
+            "translation" => {
+                let keys = self.keys::<3, DVec3>(sampler, times, |v| {
+                    let v = DVec3::from_array(v.map(f64::from));
+                    v.is_finite().then_some(v)
+                })?;
+                animation.nodes.entry(node).or_default().translation = Some(track(keys));
+            }
+            "rotation" => {
+                let mut keys = self.keys::<4, DQuat>(sampler, times, |v| {
+                    let q = DQuat::from_array(v.map(f64::from));
+                    q.is_finite().then_some(q)
+                })?;
+                normalise(&mut keys)?;
+                animation.nodes.entry(node).or_default().rotation = Some(track(keys));
+            }
+            "scale" => {
+                let keys =
+                    self.keys::<3, DVec3>(sampler, times, |v| Some(DVec3::from_array(v.map(f64::from))))?;
+                let rest = self.nodes[node].numbers::<3>("scale").ok().flatten().unwrap_or([1.0; 3]);
+                let rest = DVec3::from_array(rest.map(f64::from));
+                if !keys.constant().is_some_and(|scale| scale.distance(rest) < 1e-4 * rest.length()) {
+                    return Err(format!("the size {} changes, and its rest size is shown", name()));
+                }
+            }
+            "weights" => {
+                return Err(format!(
+                    "the shape {} changes (morph targets), and its rest shape is shown",
+                    name()
+                ))
+            }
+            other => return Err(format!("'path' is {}", shorten(other))),
+        }
+        Ok(())
+    }
+
+    fn accessor(&self, sampler: &Item, key: &str) -> Result<&Accessor, String> {
+        let index = sampler.index(key, self.data.accessors.len(), "accessor").map_err(|e| e.to_string())?;
+        Ok(&self.data.accessors[index.ok_or_else(|| format!("{} has no '{key}'", sampler.name))?])
+    }
+
+    /// The rising times of a sampler.
+    fn times(&self, sampler: &Item) -> Result<Vec<f64>, String> {
+        let input = self.accessor(sampler, "input")?;
+        if input.dimensions != 1 || input.component != Component::F32 {
+            return Err(format!("{} serves as times: it must be SCALAR of 32-bit float", input.name));
+        }
+        let times: Vec<f64> =
+            (0..input.count).map(|k| f64::from(self.data.floats::<1>(input, k)[0])).collect();
+        let is_time = |t: &f64| (0.0..=LONGEST_S).contains(t);
+        if !times.iter().all(is_time) || !times.windows(2).all(|pair| pair[0] < pair[1]) {
+            return Err(format!(
+                "{} serves as times: they must rise from one to the next, from 0",
+                input.name
+            ));
+        }
+        Ok(times)
+    }
+
+    /// The key frames of a sampler; `value` refuses numbers that are none.
+    fn keys<const N: usize, T: Keyed>(
+        &self,
+        sampler: &Item,
+        times: Vec<f64>,
+        value: impl Fn([f32; N]) -> Option<T>,
+    ) -> Result<Keys<T>, String> {
+        let interpolation = match sampler.text("interpolation").map_err(|e| e.to_string())? {
+            None | Some("LINEAR") => Interpolation::Linear,
+            Some("STEP") => Interpolation::Step,
+            Some("CUBICSPLINE") => Interpolation::CubicSpline,
+            Some(other) => return Err(format!("'interpolation' is {}", shorten(other))),
+        };
+        let output = self.accessor(sampler, "output")?;
+        let small = N == 4
+            && output.normalized
+            && matches!(output.component, Component::I8 | Component::U8 | Component::I16 | Component::U16);
+        if output.dimensions != N as u64 || !(output.component == Component::F32 || small) {
+            return Err(format!("{} has numbers of another type than its channel needs", output.name));
+        }
+        let needed = (times.len() * interpolation.values_of_key()) as u64;
+        if output.count != needed {
+            return Err(format!("{} has {} elements, and {needed} are needed", output.name, output.count));
+        }
+        let values: Option<Vec<T>> =
+            (0..output.count).map(|k| value(self.data.floats::<N>(output, k))).collect();
+        let values = values.ok_or_else(|| format!("{} holds what is no number", output.name))?;
+        Ok(Keys { times, values, interpolation })
+    }
+}
+
+/// Makes the rotations of keys, but not their tangents, unit quaternions.
+fn normalise(keys: &mut Keys<DQuat>) -> Result<(), String> {
+    let per_key = keys.interpolation.values_of_key();
+    for value in keys.values.iter_mut().skip(per_key / 2).step_by(per_key) {
+        let length = value.length();
+        if length.is_nan() || length < 1e-6 {
+            return Err("a rotation has the length zero".into());
+        }
+        *value = *value * length.recip();
+    }
+    Ok(())
+}
+
+/// Exporters write keys for nodes that never move, too.
+fn track<T: Keyed>(keys: Keys<T>) -> Track<T> {
+    match keys.constant() {
+        Some(value) => Track::Constant(value),
+        None => Track::Keys(keys),
+    }
+}
