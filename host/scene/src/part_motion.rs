@@ -3,13 +3,15 @@
 //! A part is rigid. What carries it is a tracked body or the world. Its place in the space of its carrier is a product of
 //! the nodes between them, of which each stands still or follows its key frames [glTF 2.0, section 3.11 and appendix C].
 
+use std::sync::Arc;
+
 use glam::{DAffine3, DQuat, DVec3};
 
 /// The motion of a part in the space of its carrier, which repeats for ever.
 #[derive(Clone, Debug, PartialEq)]
 pub struct PartMotion {
-    /// From the carrier to the part.
-    links: Vec<Link>,
+    /// From the carrier to the part; parts on parts share them.
+    links: Vec<Arc<Link>>,
     /// Seconds of the file's time in a round.
     length_s: f64,
     /// Nanoseconds that a round lasts, above 0.
@@ -191,7 +193,7 @@ const BETWEEN_KEYS: usize = 8;
 
 impl PartMotion {
     /// The product of `links`, of whose key frames a round has `length_s` seconds and lasts `period_ns`.
-    pub(crate) fn new(links: Vec<Link>, length_s: f64, period_ns: i64) -> Self {
+    pub(crate) fn new(links: Vec<Arc<Link>>, length_s: f64, period_ns: i64) -> Self {
         Self { links, length_s, period_ns: period_ns.max(1) }
     }
 
@@ -201,7 +203,7 @@ impl PartMotion {
         let t = round * self.length_s;
         self.links.iter().fold(DAffine3::IDENTITY, |place, link| {
             place
-                * match link {
+                * match &**link {
                     Link::Fixed(map) => *map,
                     Link::Node(node) => {
                         DAffine3::from_rotation_translation(node.rotation.at(t), node.translation.at(t))
@@ -217,7 +219,7 @@ impl PartMotion {
 
     /// Instants of a round that show where the part goes: its key frames and some between them, at most 4,097.
     pub fn instants(&self) -> Vec<i64> {
-        let nodes = self.links.iter().filter_map(|link| match link {
+        let nodes = self.links.iter().filter_map(|link| match &**link {
             Link::Fixed(_) => None,
             Link::Node(node) => Some(node),
         });
@@ -324,7 +326,7 @@ mod tests {
             rotation: turn(&[0.0, 2.0], &[0.0, -0.5 * PI]),
         };
         let above = DAffine3::from_translation(DVec3::new(0.0, 0.0, 5.0));
-        let links = vec![Link::Fixed(above), Link::Node(arm), Link::Node(wheel)];
+        let links = [Link::Fixed(above), Link::Node(arm), Link::Node(wheel)].map(Arc::new).to_vec();
         // Played at twice the file's speed.
         let motion = PartMotion::new(links, 2.0, 1_000_000_000);
         let place = motion.at(500_000_000);
@@ -349,7 +351,7 @@ mod tests {
             translation: Track::Keys(keys(&times, values, Interpolation::Linear)),
             rotation: Track::Constant(DQuat::IDENTITY),
         };
-        let motion = PartMotion::new(vec![Link::Node(node)], 99_999.0, 99_999_000_000_000);
+        let motion = PartMotion::new(vec![Arc::new(Link::Node(node))], 99_999.0, 99_999_000_000_000);
         let n = motion.instants().len();
         assert!((2_000..=MOST_INSTANTS + BETWEEN_KEYS + 1).contains(&n), "{n}");
     }

@@ -340,3 +340,44 @@ fn lights_ride_on_parts_and_bodies_may_be_all_parts() {
     assert!(scene.warnings.iter().any(|w| w.contains("stands still")), "{:?}", scene.warnings);
     assert_eq!(scene.lights[0].body, Some(0));
 }
+
+/// Many channels that read the same long accessor, and a long row of nodes on nodes: a small file must not become gigabytes.
+#[test]
+fn shared_key_frames_and_deep_rows_are_bounded() {
+    let count = 100_000;
+    let times: Vec<f32> = (0..count).map(|k| k as f32 * 1e-3).collect();
+    let values: Vec<f32> = (0..count).flat_map(|k| [(k % 7) as f32, 0.0, 0.0]).collect();
+    let mut glb = tetrahedra();
+    for k in 0..60 {
+        glb = glb.set(&format!("/nodes/{}", k + 2), json!({"mesh": 0, "children": [k + 3]}));
+    }
+    let mut glb = glb.set("/nodes/62", json!({"mesh": 0})).set("/nodes/1/children", json!([2]));
+    let (input, output) = (numbers(&mut glb, "SCALAR", 1, &times), numbers(&mut glb, "VEC3", 3, &values));
+    let channels: Vec<Value> =
+        (2..63).map(|node| json!({"sampler": 0, "target": {"node": node, "path": "translation"}})).collect();
+    let shared = glb.set(
+        "/animations",
+        json!([{"name": "a", "channels": channels, "samplers": [{"input": input, "output": output}]}]),
+    );
+    let scene = load(&shared, &options(&["left"]));
+    // 13 channels of 300,000 values.
+    assert_eq!(scene.bodies.iter().filter(|b| b.motion.is_some()).count(), 13);
+    assert!(scene.warnings.iter().any(|w| w.contains("more than 4000000 values")), "{:?}", scene.warnings);
+    let slide = [[0.0; 3], [1.0, 0.0, 0.0]].concat();
+    let mut deep = tetrahedra();
+    for k in 0..60 {
+        let place = json!({"mesh": 0, "children": [k + 3], "rotation": [0.0, 0.6, 0.0, 0.8]});
+        deep = deep.set(&format!("/nodes/{}", k + 2), place);
+    }
+    let deep = deep.set("/nodes/62", json!({"mesh": 0})).set("/nodes/1/children", json!([2]));
+    let channels: Vec<Channel> =
+        (2..63).map(|node| linear(node, "translation", &[0.0, 1.0], &slide)).collect();
+    let scene = load(&animate(deep, "a", &channels), &options(&["left"]));
+    let moving = scene.bodies.iter().filter(|b| b.motion.is_some()).count();
+    assert!((40..48).contains(&moving), "{moving}");
+    assert!(
+        scene.warnings.iter().any(|w| w.contains("too many nodes above it move")),
+        "{:?}",
+        scene.warnings
+    );
+}

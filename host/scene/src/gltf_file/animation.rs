@@ -13,6 +13,8 @@ use super::json::{shorten, Item};
 
 /// Longest animation, seconds of the file's time.
 const LONGEST_S: f64 = 1e6;
+/// Most values of all key frames together: channels may share what they read, so the size of a file is no bound.
+const MOST_VALUES: u64 = 4_000_000;
 /// What an animation that never ends counts as: all its values are at one instant.
 const SHORTEST_S: f64 = 1e-3;
 
@@ -78,7 +80,7 @@ pub(super) fn read(
         };
         warnings.push(format!("of {} animations one is played: {played}", all.len()));
     }
-    let mut reader = Reader { item, data, nodes, lost: Vec::new() };
+    let mut reader = Reader { item, data, nodes, lost: Vec::new(), values_left: MOST_VALUES };
     let mut animation = reader.animation(options);
     let lost = reader.lost;
     if let Some((first, more)) = lost.split_first() {
@@ -104,6 +106,8 @@ struct Reader<'a> {
     nodes: &'a [Item<'a>],
     /// What cannot be shown.
     lost: Vec<String>,
+    /// Values that may still be read.
+    values_left: u64,
 }
 
 impl Reader<'_> {
@@ -186,7 +190,13 @@ impl Reader<'_> {
     }
 
     /// The rising times of a sampler.
-    fn times(&self, sampler: &Item) -> Result<Vec<f64>, String> {
+    fn times(&mut self, sampler: &Item) -> Result<Vec<f64>, String> {
+        // A key frame has three values at most.
+        let needed = self.accessor(sampler, "input")?.count.saturating_mul(3);
+        self.values_left = self
+            .values_left
+            .checked_sub(needed)
+            .ok_or_else(|| format!("the key frames of the animation have more than {MOST_VALUES} values"))?;
         let input = self.accessor(sampler, "input")?;
         if input.dimensions != 1 || input.component != Component::F32 {
             return Err(format!("{} serves as times: it must be SCALAR of 32-bit float", input.name));
@@ -242,7 +252,7 @@ fn normalise(keys: &mut Keys<DQuat>) -> Result<(), String> {
         if length.is_nan() || length < 1e-6 {
             return Err("a rotation has the length zero".into());
         }
-        *value = *value * length.recip();
+        *value *= length.recip();
     }
     Ok(())
 }

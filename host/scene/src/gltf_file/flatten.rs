@@ -2,6 +2,7 @@
 //! static. What an animation moves is a part, a body of its own with the same carrier.
 
 use std::collections::{BTreeMap, HashMap, HashSet};
+use std::sync::Arc;
 
 use glam::{DAffine3, DMat3, DMat4, DVec3, Vec3};
 
@@ -23,6 +24,8 @@ const AUTO_BODIES: usize = 2;
 
 /// Most parts that an animation may move.
 const MAX_PARTS: usize = 128;
+/// Most places of which that of a part may be the product: it is worked out three times for every frame.
+const MAX_LINKS: usize = 48;
 
 /// The body that a node belongs to.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
@@ -49,7 +52,7 @@ struct Step {
 struct Part {
     name: String,
     /// From the carrier to the part.
-    links: Vec<Link>,
+    links: Vec<Arc<Link>>,
 }
 
 /// The result of [`flatten`].
@@ -340,9 +343,9 @@ impl<'a> Gatherer<'a> {
                 }
             } else if let Some(channels) = channels.filter(|channels| channels.moves()) {
                 match self.part(&node, channels, &above, group) {
-                    Some((part, scale)) => (group.part, place) = (Some(part), scale),
-                    None => warnings.push(format!(
-                        "node {index} '{}': its motion is not played, because a node above it is scaled unevenly",
+                    Ok((part, scale)) => (group.part, place) = (Some(part), scale),
+                    Err(why) => warnings.push(format!(
+                        "node {index} '{}': its motion is not played, because {why}",
                         node.name().unwrap_or("")
                     )),
                 }
@@ -387,19 +390,25 @@ impl<'a> Gatherer<'a> {
     }
 
     /// A part for a node that moves, and the place of the node in it, which is its scale. `parent`: the place of its parent
-    /// in the body or part above. `None`: what is above it does not keep angles, so that the part would not be rigid.
+    /// in the body or part above.
+    ///
+    /// # Errors
+    /// Why it does not move: what is above it does not keep angles, so that it would not be rigid, or too much is above it.
     fn part(
         &mut self,
         node: &gltf::Node,
         channels: &Channels,
         parent: &DAffine3,
         above: Group,
-    ) -> Option<(usize, DAffine3)> {
-        let (rigid, scale) = even_part(parent)?;
-        let (translation, rotation, own_scale) = decomposed(node)?;
+    ) -> Result<(usize, DAffine3), &'static str> {
+        let (rigid, scale) = even_part(parent).ok_or("a node above it is scaled unevenly")?;
+        let (translation, rotation, own_scale) = decomposed(node).ok_or("it has a matrix")?;
         let mut links = above.part.map_or_else(Vec::new, |p| self.parts[p].links.clone());
+        if links.len() + 2 > MAX_LINKS {
+            return Err("too many nodes above it move");
+        }
         if rigid != DAffine3::IDENTITY {
-            links.push(Link::Fixed(rigid));
+            links.push(Arc::new(Link::Fixed(rigid)));
         }
         let mut motion = NodeMotion {
             translation: channels.translation.clone().unwrap_or(Track::Constant(translation)),
@@ -409,10 +418,10 @@ impl<'a> Gatherer<'a> {
             Track::Constant(at) => *at *= scale,
             Track::Keys(keys) => keys.values.iter_mut().for_each(|at| *at *= scale),
         }
-        links.push(Link::Node(motion));
+        links.push(Arc::new(Link::Node(motion)));
         let name = node.name().map_or_else(|| format!("node {}", node.index()), str::to_owned);
         self.parts.push(Part { name, links });
-        Some((self.parts.len() - 1, DAffine3::from_scale(own_scale * scale)))
+        Ok((self.parts.len() - 1, DAffine3::from_scale(own_scale * scale)))
     }
 
     /// All primitives of a mesh, at each place of the node's instances.
