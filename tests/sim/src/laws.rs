@@ -470,7 +470,8 @@ impl Laws {
 
     /// A frame is shown again.
     fn held_too_long(&mut self, at: i64, lag: i64) {
-        if at < self.slow_disk_until {
+        // Where the disk refuses to forget FREEZE, a person orders ARM again, which takes a moment.
+        if at < self.slow_disk_until + S {
             return;
         }
         let Some(sent) = &self.showing else { return };

@@ -358,6 +358,8 @@ impl World {
                 lock(&self.net).wall_ahead += dice.between(-3_600, 3_600) * S;
                 return self.lasts(kind, MS, Undo::Nothing);
             }
+            // A machine that is suspended cannot be suspended once more: its clock would lag by both times.
+            K::H3 if self.t < self.frozen_until => return self.lasts(kind, MS, Undo::Nothing),
             K::H3 => {
                 let ns = dice.decades(50, 3_000) * MS;
                 self.frozen_until = self.t + ns;
