@@ -157,11 +157,6 @@ impl EchoPace {
         now >= self.due && self.sent.is_none_or(|t| now.ns_since(t) >= ECHO_LOST_NS)
     }
 
-    /// Asks for nothing until the usual interval has passed.
-    pub(crate) fn put_off(&mut self, now: HostTime) {
-        self.due = now.plus_ns(self.every_ns);
-    }
-
     /// An echo is about to be asked for: sets when the next one is due.
     pub(crate) fn ask(&mut self, now: HostTime) {
         let quick = self.count < QUICK_ECHOES;

@@ -289,8 +289,9 @@ impl SerialTracker {
         }
         self.out.clear();
         if self.map.is_none() {
-            // The rate of the device's clock must be known first. If the request is lost, the next one follows soon.
-            self.echo.put_off(now);
+            // The rate of the device's clock must be known first. If the request or its answer is lost, the next one follows
+            // soon: after 0.3 s samples would be dated by their arrival.
+            self.echo.ask(now);
             SerialMessage::HelloRequest.encode(&mut self.out);
             self.line.write(&self.out);
             return;
