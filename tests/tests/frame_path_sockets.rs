@@ -21,9 +21,9 @@ use std::path::Path;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
-/// What the link may do on a serial line: ask how much of the backlog has left, wait for room (the library of serial
-/// ports asks with a limit of 0), and write.
-const LINK: [&str; 4] = ["ioctl", "ppoll", "poll", "write"];
+/// What the link may do on a serial line: ask how much of the backlog has left, and write. It does not ask with poll(2)
+/// whether there is room: that may wait for a worker of the kernel.
+const LINK: [&str; 2] = ["ioctl", "write"];
 /// What tracking may do with sockets: read a datagram, and answer the server.
 const TRACKING: [&str; 2] = ["recvmsg", "sendto"];
 
