@@ -106,7 +106,7 @@ impl Keyed for DQuat {
         a.slerp(b, s)
     }
 
-    /// Not a unit quaternion any more: the specification has the sum normalised, and it may be nothing.
+    /// A rotation: the specification has the sum normalised. Where it is nothing, the first value holds.
     fn weighted(of: [(Self, f64); 4]) -> Self {
         let sum = of.iter().fold(DQuat::from_array([0.0; 4]), |sum, (value, weight)| sum + *value * *weight);
         let length = sum.length();
@@ -197,7 +197,7 @@ impl PartMotion {
         Self { links, length_s, period_ns: period_ns.max(1) }
     }
 
-    /// Carrier-from-part, a rigid map, at `t_ns` nanoseconds. It is that of `t_ns` modulo [`PartMotion::period_ns`].
+    /// Carrier-from-part, a rigid map, at `t_ns` nanoseconds. It repeats after every round.
     pub fn at(&self, t_ns: i64) -> DAffine3 {
         let round = t_ns.rem_euclid(self.period_ns) as f64 / self.period_ns as f64;
         let t = round * self.length_s;
@@ -210,11 +210,6 @@ impl PartMotion {
                     }
                 }
         })
-    }
-
-    /// Nanoseconds after which the motion repeats.
-    pub fn period_ns(&self) -> i64 {
-        self.period_ns
     }
 
     /// Instants of a round that show where the part goes: its key frames and some between them, at most 4,097.

@@ -29,8 +29,9 @@ const WORSE: f64 = 2.0;
 const FRESH_S: f64 = 0.03;
 /// What is foretold from older ones may err by this many metres a second: a body that has turned goes the other way.
 const WORSE_M_S: f64 = 0.6;
-/// Moved planes from which on their light must be nearer to the body than it would be without tracks. Of 551 it was farther in one
-/// life, in whose first five minutes 15,352 were nearer: a tracker of 60 Hz sees turns that are over before the next sample.
+/// Moved planes from which on their light must be nearer to the body than it would be without tracks. In one life the light of
+/// the first 551 was farther, and that of 15,352 in five minutes nearer: a tracker of 60 Hz sees turns that are over before
+/// its next sample.
 const MANY: u64 = 2_000;
 /// How far the host's idea of the projector's clock may be wrong in peace, nanoseconds.
 const CLOCK_NS: i64 = MS;

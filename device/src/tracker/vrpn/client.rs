@@ -34,10 +34,10 @@ const SETTLED_ROUND_TRIP_NS: i64 = 10 * MS;
 /// ... or so many pongs do that came back within this time, of which the map takes the quickest.
 const SETTLED_PONGS: u32 = 5;
 const SETTLED_ROUND_TRIPS_NS: i64 = 50 * MS;
-/// If no pong comes for this long, the map of the server's clock is forgotten, and poses are dated by their arrival.
+/// If no pong tells for this long, the map of the server's clock is forgotten, and poses are dated by the shortest delay.
 const UNSETTLED_NS: i64 = 300 * MS;
-/// From a server that has not been heard for this long something is asked for. A machine that has forgotten the connection
-/// says so then, and not before.
+/// A server that has not been heard for this long is sent something. A machine that has forgotten the connection says so
+/// then, and not before.
 const PROBE_AFTER_NS: i64 = 200 * MS;
 /// Pings: this many quickly, the rest slowly.
 const QUICK_PINGS: u32 = 20;
@@ -106,6 +106,7 @@ pub struct VrpnClient {
     ping_as: Option<i32>,
     ping_sent: Option<HostTime>,
     ping_due: HostTime,
+    /// Not before then a silent server is sent something again.
     probe_due: HostTime,
     pings: u32,
     pongs: u64,

@@ -47,12 +47,21 @@ impl Shape {
     /// The tracked body `tracked` of `rig`; `None` if no light falls on it.
     fn of(rig: &Rig, tracked: usize) -> Option<Self> {
         let carried = |b: &&Body| b.tracked == Some(tracked as u16) && b.projected;
-        let all: Vec<DVec3> = rig.scene.bodies.iter().filter(carried).flat_map(points_of).collect();
-        let first = *all.first()?;
-        let (lower, upper) =
-            all.iter().fold((first, first), |(lower, upper), p| (lower.min(*p), upper.max(*p)));
-        let n = all.len().min(POINTS);
+        let (parts, rigid): (Vec<&Body>, Vec<&Body>) =
+            rig.scene.bodies.iter().filter(carried).partition(|b| b.motion.is_some());
+        let of = |bodies: &[&Body]| bodies.iter().flat_map(|b| points_of(b)).collect::<Vec<DVec3>>();
+        let (mut all, moving) = (of(&rigid), of(&parts));
+        let first = *all.first().or(moving.first())?;
+        let (lower, upper) = all
+            .iter()
+            .chain(&moving)
+            .fold((first, first), |(lower, upper), p| (lower.min(*p), upper.max(*p)));
         let corners = corners_of(lower, upper);
+        if all.is_empty() {
+            // All surfaces move by themselves.
+            all = moving;
+        }
+        let n = all.len().min(POINTS);
         Some(Self { points: (0..n).map(|i| all[i * all.len() / n]).collect(), corners })
     }
 }

@@ -15,7 +15,7 @@ use super::json::{shorten, Item};
 const LONGEST_S: f64 = 1e6;
 /// Most values of all key frames together: channels may share what they read, so the size of a file is no bound.
 const MOST_VALUES: u64 = 4_000_000;
-/// What an animation that never ends counts as: all its values are at one instant.
+/// Length of a round whose key frames all lie at the beginning, seconds.
 const SHORTEST_S: f64 = 1e-3;
 
 /// What a file says of the motion of its nodes.
@@ -184,20 +184,14 @@ impl Reader<'_> {
         Ok(())
     }
 
-    fn accessor(&self, sampler: &Item, key: &str) -> Result<&Accessor, String> {
-        let index = sampler.index(key, self.data.accessors.len(), "accessor").map_err(|e| e.to_string())?;
-        Ok(&self.data.accessors[index.ok_or_else(|| format!("{} has no '{key}'", sampler.name))?])
-    }
-
     /// The rising times of a sampler.
     fn times(&mut self, sampler: &Item) -> Result<Vec<f64>, String> {
+        let input = accessor(self.data, sampler, "input")?;
         // A key frame has three values at most.
-        let needed = self.accessor(sampler, "input")?.count.saturating_mul(3);
         self.values_left = self
             .values_left
-            .checked_sub(needed)
+            .checked_sub(input.count.saturating_mul(3))
             .ok_or_else(|| format!("the key frames of the animation have more than {MOST_VALUES} values"))?;
-        let input = self.accessor(sampler, "input")?;
         if input.dimensions != 1 || input.component != Component::F32 {
             return Err(format!("{} serves as times: it must be SCALAR of 32-bit float", input.name));
         }
@@ -226,7 +220,7 @@ impl Reader<'_> {
             Some("CUBICSPLINE") => Interpolation::CubicSpline,
             Some(other) => return Err(format!("'interpolation' is {}", shorten(other))),
         };
-        let output = self.accessor(sampler, "output")?;
+        let output = accessor(self.data, sampler, "output")?;
         let small = N == 4
             && output.normalized
             && matches!(output.component, Component::I8 | Component::U8 | Component::I16 | Component::U16);
@@ -242,6 +236,12 @@ impl Reader<'_> {
         let values = values.ok_or_else(|| format!("{} holds what is no number", output.name))?;
         Ok(Keys { times, values, interpolation })
     }
+}
+
+/// The accessor that a sampler names by `key`.
+fn accessor<'a>(data: &'a Data, sampler: &Item, key: &str) -> Result<&'a Accessor, String> {
+    let index = sampler.index(key, data.accessors.len(), "accessor").map_err(|e| e.to_string())?;
+    Ok(&data.accessors[index.ok_or_else(|| format!("{} has no '{key}'", sampler.name))?])
 }
 
 /// Makes the rotations of keys, but not their tangents, unit quaternions.
