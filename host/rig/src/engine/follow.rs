@@ -343,3 +343,73 @@ fn fixed(value: f64) -> Option<i16> {
     let scaled = (value * 256.0).round();
     (scaled.abs() <= f64::from(i16::MAX)).then_some(scaled as i16)
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::config::{Overrides, RigConfig};
+
+    /// A box of 12 cm, on which another one slides by 30 cm to the left and to the right, 12 cm above it.
+    fn rig_with_a_slide() -> Rig {
+        let folder = std::env::temp_dir().join(format!("dpm-follow-{}", std::process::id()));
+        std::fs::create_dir_all(&folder).unwrap();
+        let corner =
+            |i: u32| [i & 1, i >> 1 & 1, i >> 2 & 1].map(|high| if high == 1 { 0.06f32 } else { -0.06 });
+        let mut bytes: Vec<u8> = (0..8).flat_map(corner).flat_map(f32::to_le_bytes).collect();
+        let faces: [[u16; 4]; 6] =
+            [[0, 4, 6, 2], [1, 3, 7, 5], [0, 1, 5, 4], [2, 6, 7, 3], [0, 2, 3, 1], [4, 5, 7, 6]];
+        let indices = faces.iter().flat_map(|[a, b, c, d]| [*a, *b, *c, *a, *c, *d]);
+        bytes.extend(indices.flat_map(u16::to_le_bytes));
+        let keys = [0.0f32, 1.0, -0.3, 0.12, 0.0, 0.3, 0.12, 0.0];
+        bytes.extend(keys.into_iter().flat_map(f32::to_le_bytes));
+        std::fs::write(folder.join("slide.bin"), &bytes).unwrap();
+        let view =
+            |at: usize, length: usize| format!(r#"{{"buffer":0,"byteOffset":{at},"byteLength":{length}}}"#);
+        let views = [view(0, 96), view(96, 72), view(168, 8), view(176, 24)].join(",");
+        let accessor = |view: u32, component: u32, kind: &str, count: u32| {
+            format!(r#"{{"bufferView":{view},"componentType":{component},"type":"{kind}","count":{count}}}"#)
+        };
+        let accessors = [
+            accessor(0, 5126, "VEC3", 8),
+            accessor(1, 5123, "SCALAR", 36),
+            accessor(2, 5126, "SCALAR", 2),
+            accessor(3, 5126, "VEC3", 2),
+        ];
+        let text = format!(
+            r#"{{"asset":{{"version":"2.0"}},"scenes":[{{"nodes":[0]}}],
+            "nodes":[{{"name":"base","mesh":0,"children":[1]}},{{"name":"slide","mesh":0}}],
+            "meshes":[{{"primitives":[{{"attributes":{{"POSITION":0}},"indices":1}}]}}],
+            "animations":[{{"channels":[{{"sampler":0,"target":{{"node":1,"path":"translation"}}}}],
+            "samplers":[{{"input":2,"output":3}}]}}],
+            "accessors":[{}],"bufferViews":[{views}],"buffers":[{{"byteLength":{},"uri":"slide.bin"}}]}}"#,
+            accessors.join(","),
+            bytes.len()
+        );
+        std::fs::write(folder.join("slide.gltf"), text).unwrap();
+        let file = format!("scene.file={:?}", folder.join("slide.gltf").display().to_string());
+        let flags = vec![file, "scene.bodies=[{ name = \"base\" }]".into()];
+        let config =
+            RigConfig::demo(&Overrides { variables: vec![], flags }).unwrap_or_else(|e| panic!("{e}"));
+        let rig = Rig::build(&config, None).unwrap_or_else(|e| panic!("{e}"));
+        std::fs::remove_dir_all(&folder).unwrap();
+        rig
+    }
+
+    /// The region holds a part wherever it goes; how far a body is from its light is taken where it does not move by itself.
+    #[test]
+    fn a_region_holds_the_parts_of_its_body() {
+        let shape = Shape::of(&rig_with_a_slide(), 0).expect("light falls on it");
+        let close = |a: f64, b: f64| (a - b).abs() < 1e-6;
+        let ends = |c: usize| {
+            let all = shape.corners.map(|corner| corner[c]);
+            (
+                all.iter().copied().fold(f64::INFINITY, f64::min),
+                all.iter().copied().fold(f64::NEG_INFINITY, f64::max),
+            )
+        };
+        assert!(close(ends(0).0, -0.36) && close(ends(0).1, 0.36), "{:?}", ends(0));
+        assert!(close(ends(1).0, -0.06) && close(ends(1).1, 0.18), "{:?}", ends(1));
+        assert_eq!(shape.points.len(), POINTS);
+        assert!(shape.points.iter().all(|p| p.abs().max_element() < 0.061), "{:?}", shape.points);
+    }
+}
