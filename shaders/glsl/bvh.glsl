@@ -143,15 +143,20 @@ bool enters_bounds(vec3 origin, vec3 inverse, vec3 lower, vec3 upper, float t_ma
     return enter <= leave;
 }
 
-// The next body from `first` on that has any of the bits of `mask` (0: all) and whose bounds the ray enters before `t_max`. The number of bodies if
-// there is none.
-uint next_body(uint first, vec3 origin, vec3 inverse, uint mask, float t_max) {
+// Up to two bodies that a ray surely does not meet, ten bits each (NO_BODY: none). NONE_LEFT: it may meet all.
+const uint NO_BODY = 1023u;
+const uint NONE_LEFT = NO_BODY << 10u | NO_BODY;
+bool has_left(uint left, uint body) { return body == (left & 1023u) || body == (left >> 10u & 1023u); }
+
+// The next body from `first` on that has any of the bits of `mask` (0: all), is none of those that the ray has left, and whose bounds it enters
+// before `t_max`. The number of bodies if there is none.
+uint next_body(uint first, vec3 origin, vec3 inverse, uint mask, uint left, float t_max) {
     uint i = first;
     bool enters = false;
     do {
         if (i < frame.instance_count) {
             uint flags = instance_at(i).flags;
-            enters = (flags & INSTANCE_EMPTY) == 0u && (mask == 0u || (flags & mask) != 0u)
+            enters = (flags & INSTANCE_EMPTY) == 0u && !has_left(left, i) && (mask == 0u || (flags & mask) != 0u)
                   && enters_bounds(origin, inverse, instance_at(i).bounds_min, instance_at(i).bounds_max, t_max);
             i += enters ? 0u : 1u;
         }
@@ -161,13 +166,14 @@ uint next_body(uint first, vec3 origin, vec3 inverse, uint mask, float t_max) {
 
 // The next body in the tree from its node `at` on, and `at` moves behind it. NO_INSTANCE: there is none. Otherwise as above. Bodies come about in
 // the order in which the ray meets them, because the nodes of each octant of directions stand in that order.
-uint next_in_tree(inout uint at, vec3 origin, vec3 inverse, uint mask, float t_max) {
+uint next_in_tree(inout uint at, vec3 origin, vec3 inverse, uint mask, uint left, float t_max) {
     uint first = ((inverse.x < 0.0 ? 1u : 0u) | (inverse.y < 0.0 ? 2u : 0u) | (inverse.z < 0.0 ? 4u : 0u)) * frame.body_nodes;
     uint body = BODY_NODE_INNER;
     do {
         if (at < frame.body_nodes) {
             BodyNode node = body_node_at(first + at);
-            bool enters = (mask == 0u || ((node.body >> 8u) & mask) != 0u) && enters_bounds(origin, inverse, node.lower, node.upper, t_max);
+            bool gone = (node.body & BODY_NODE_INNER) == 0u && has_left(left, node.body & 255u);
+            bool enters = !gone && (mask == 0u || ((node.body >> 8u) & mask) != 0u) && enters_bounds(origin, inverse, node.lower, node.upper, t_max);
             body = enters ? node.body : BODY_NODE_INNER;
             at = enters ? at + 1u : node.after;
         }
@@ -177,6 +183,14 @@ uint next_in_tree(inout uint at, vec3 origin, vec3 inverse, uint mask, float t_m
 
 // Where a walk has been at all bodies.
 uint end_of_bodies() { return HAS_BODY_TREE ? frame.body_nodes : frame.instance_count; }
+
+// Whether a ray enters the bounds of any body that it has not left.
+bool enters_any(vec3 origin, vec3 direction, uint left, float t_max) {
+    vec3 inverse = 1.0 / safe_direction(direction);
+    uint at = 0u;
+    if (HAS_BODY_TREE) return next_in_tree(at, origin, inverse, 0u, left, t_max) != NO_INSTANCE;
+    return next_body(0u, origin, inverse, 0u, left, t_max) < frame.instance_count;
+}
 
 #ifdef TEXEL_TABLES
 #include "walk_software.glsl"

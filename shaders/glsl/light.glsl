@@ -10,6 +10,7 @@ struct LightSample {
     float pdf;      // Over solid angle; 0 for lights that no ray can hit.
     bool valid;
     bool finite_distance;
+    uint left;      // A body that the way from the light to the point does not meet, or NO_INSTANCE.
 };
 
 vec2 environment_position(vec3 d) {
@@ -48,6 +49,7 @@ LightSample sample_environment(vec3 n, vec2 u) {
     LightSample r;
     r.valid = false;
     r.finite_distance = false;
+    r.left = NO_INSTANCE;
     r.pdf = 0.0;
     r.radiance = vec3(0.0);
     r.to_light = n;
@@ -95,6 +97,7 @@ LightSample sample_light(vec3 p, vec3 n, float u_pick, vec2 u) {
     LightSample r;
     r.valid = false;
     r.finite_distance = true;
+    r.left = NO_INSTANCE;
     r.pdf = 0.0;
     r.radiance = vec3(0.0);
     r.to_light = n;
@@ -127,6 +130,7 @@ LightSample sample_light(vec3 p, vec3 n, float u_pick, vec2 u) {
         vec3 d = q - p;
         float d2 = dot(d, d);
         float cosine = -dot(normal, d) * inversesqrt(max(d2, 1e-30));
+        if (cosine > 0.0 && leaves_body(carrier, row, normal, -d)) r.left = carrier;
         TriangleRef ref = triangle_ref_at(instance_at(carrier).triangle_offset + lights[index].triangle);
         bool both = (material_at(ref.material).flags & MATERIAL_DOUBLE_SIDED) != 0u;
         if (both) {

@@ -29,34 +29,55 @@ struct Path {
     uint vertex;     // Number of that vertex; 1 is the first surface point.
     vec3 throughput;
     vec3 radiance;
-    bool exact;      // No random choice was made yet, so every sample of the pixel is equal to this one.
+    uint exact;      // 1: no random choice was made yet, so every sample of the pixel is equal to this one.
 };
 
-Path begin_path(Point first) { return Path(first, 1u, vec3(1.0), first.emitted, true); }
+Path begin_path(Point first) { return Path(first, 1u, vec3(1.0), first.emitted, 1u); }
 
 // Pdf over solid angle with which a sample of the lights would have found the sky in this direction.
 float sky_pdf(BsdfSample next, vec3 n) {
     return ENVIRONMENT_KIND == ENVIRONMENT_NONE || next.delta ? 0.0 : environment_pdf(next.direction, n) * frame.environment_select;
 }
 
-bool is_blocked(vec3 origin, vec3 direction, float t_max, inout uint rays) {
-    Hit blocker;
-    blocker.t = t_max;
-    rays++;
-    return trace_ray(origin, direction, 0u, true, blocker);
+// Bits of what a path waits for at its newest vertex: for the ray to a light, whose light arrives if nothing is in its way; for its next ray; or, once
+// the former is traced, for the light of the sky, because its next ray surely meets nothing. (Words, because each bool would take a scalar register.)
+const uint WAITS_FOR_LIGHT = 1u, WAITS_ONWARD = 2u, WAITS_FOR_SKY = 4u;
+
+// The rays from a path's newest vertex that are yet to be traced, and what they need.
+struct Branches {
+    uint waits;           // WAITS_FOR_LIGHT, WAITS_ONWARD, WAITS_FOR_SKY.
+    vec3 light_origin;
+    vec3 light_direction;
+    float light_t;
+    vec3 light;
+    BsdfSample next;
+    vec3 origin;          // Where the next ray starts.
+    float sky;            // Pdf with which a sample of the lights would have found the sky there.
+    uint left;            // Bodies that these rays do not meet: two of the ray to the light, and in the upper bits one of the next ray.
+};
+
+uint left_onward(Branches b) { return NO_BODY << 10u | b.left >> 20u; }
+
+void add_sky(inout Path path, BsdfSample next, float sky) {
+    if (ENVIRONMENT_KIND == ENVIRONMENT_NONE) return;
+    float weight = next.delta ? 1.0 : balance(next.pdf, sky);
+    path.radiance += limit_indirect(path.throughput * environment_radiance(next.direction) * weight, path.vertex);
 }
 
-// Adds the light that reaches the newest vertex and continues to the next one. False: the path has ended, and its radiance is complete.
-bool advance_path(inout Path path, Sampler rng, inout uint rays) {
+// Chooses the rays from the newest vertex, and adds the light of those that surely meet nothing. False: no ray is left to be traced, and the path's
+// radiance is complete.
+bool branch(inout Path path, Sampler rng, inout uint rays, out Branches b) {
     Point s = path.at;
     uint vertex = path.vertex;
+    b.waits = 0u;
+    b.left = NONE_LEFT;
     // A single-sided opaque surface seen from behind is black.
     bool black = !s.front && (s.flags & (MATERIAL_DOUBLE_SIDED | MATERIAL_TRANSMISSIVE)) == 0u;
     if (vertex >= frame.depth || black) return false;
     Lobes lobes = lobes_of(s);
     bool only_delta = mirror_like(s) && lobes.diffuse <= 0.0;
     // There is only one way to continue, and no Russian roulette yet.
-    path.exact = path.exact && only_delta && lobes.transmit <= 0.0 && vertex < 3u;
+    path.exact = only_delta && lobes.transmit <= 0.0 && vertex < 3u ? path.exact : 0u;
     // The point on the light and the next direction matter most, so they share a group of four dimensions. Its first two dimensions are the most
     // evenly distributed. Without light samples the next direction takes these, and the choice of its lobe takes the third.
     vec4 u_direction = sample_4d(rng, vertex * 2u - 2u);
@@ -64,12 +85,6 @@ bool advance_path(inout Path path, Sampler rng, inout uint rays) {
     bool no_light = frame.environment_select == 0.0 && frame.light_count == 0u;
     vec2 u_light = u_direction.xy, u_bsdf = no_light ? u_direction.xy : u_direction.zw;
     float u_pick = u_choice.x, u_lobe = no_light ? u_direction.z : u_choice.y, u_roulette = u_choice.z;
-    // On a GPU the ray to the light and the next ray are both chosen before either is traced, and one walk traces them in turn. So the walk's code
-    // stands once, and while it runs nothing of the vertex is kept but what these rays need. On software Vulkan, where registers are plentiful, two
-    // walks are faster by a sixth.
-    bool shadow = false;
-    vec3 shadow_origin = vec3(0.0), shadow_direction = vec3(0.0), shadow_light = vec3(0.0);
-    float shadow_t = 0.0;
     if (!only_delta) {
         LightSample light = sample_light(s.p, s.n, u_pick, u_light);
         if (light.valid) {
@@ -79,61 +94,85 @@ bool advance_path(inout Path path, Sampler rng, inout uint rays) {
             evaluate(s, lobes, direction, value, pdf);
             if (luminance(value) > 0.0) {
                 float side = dot(direction, s.g) > 0.0 ? 1.0 : -1.0;
-                shadow = true;
-                shadow_origin = s.p + s.g * (side * s.offset);
-                shadow_direction = light.finite_distance ? light.to_light - s.g * (side * s.offset) : direction;
-                shadow_t = light.finite_distance ? 1.0 : INFINITY;
+                b.light_origin = s.p + s.g * (side * s.offset);
+                b.light_direction = light.finite_distance ? light.to_light - s.g * (side * s.offset) : direction;
+                b.light_t = light.finite_distance ? 1.0 : INFINITY;
                 float weight = light.pdf > 0.0 ? balance(light.pdf, pdf) : 1.0;
-                shadow_light = path.throughput * value * light.radiance * weight;
-#ifdef TEXEL_TABLES
-                if (!is_blocked(shadow_origin, shadow_direction, shadow_t, rays)) path.radiance += limit_indirect(shadow_light, vertex);
-#endif
+                b.light = path.throughput * value * light.radiance * weight;
+                b.left = light.left;
+                b.waits = WAITS_FOR_LIGHT;
+                rays++;
             }
         }
     }
-    BsdfSample next = sample_bsdf(s, lobes, u_lobe, u_bsdf);
-    bool continues = next.valid;
-    path.throughput *= next.weight;
+    b.next = sample_bsdf(s, lobes, u_lobe, u_bsdf);
+    bool continues = b.next.valid;
+    path.throughput *= b.next.weight;
     if (vertex >= 3u) {
         float survival = min(0.95, max(path.throughput.x, max(path.throughput.y, path.throughput.z)));
         continues = continues && u_roulette < survival;
         path.throughput /= survival;
     }
-    vec3 origin = s.p + s.g * (next.below ? -s.offset : s.offset);
-    vec3 from = s.p;
-    Hit hit;
-#ifdef TEXEL_TABLES
-    if (!continues) return false;
-    hit.t = INFINITY;
-    rays++;
-    bool met = trace_ray(origin, next.direction, 0u, false, hit);
-    float sky = met ? 0.0 : sky_pdf(next, s.n);
-#else
-    float sky = sky_pdf(next, s.n);
-    bool met = false;
-    for (uint ray = shadow ? 0u : 1u; ray < (continues ? 2u : 1u); ray++) {
-        bool to_light = ray == 0u;
-        hit.t = to_light ? shadow_t : INFINITY;
-        rays++;
-        met = trace_ray(to_light ? shadow_origin : origin, to_light ? shadow_direction : next.direction, 0u, to_light, hit);
-        if (to_light && !met) path.radiance += limit_indirect(shadow_light, vertex);
-    }
-    if (!continues) return false;
-#endif
-    if (!met) {
-        if (ENVIRONMENT_KIND != ENVIRONMENT_NONE) {
-            float weight = next.delta ? 1.0 : balance(next.pdf, sky);
-            path.radiance += limit_indirect(path.throughput * environment_radiance(next.direction) * weight, vertex);
+    b.origin = s.p + s.g * (b.next.below ? -s.offset : s.offset);
+    b.sky = continues ? sky_pdf(b.next, s.n) : 0.0;
+    // Rays that leave their body and enter the bounds of no other meet nothing.
+    if (b.waits != 0u) {
+        bool leaves = s.front && leaves_body(s.body, s.row, s.g, b.light_direction);
+        b.left = (b.left & NO_BODY) << 10u | (leaves ? s.body : NO_BODY);
+        if (leaves && !enters_any(b.light_origin, b.light_direction, b.left, b.light_t)) {
+            path.radiance += limit_indirect(b.light, vertex);
+            b.waits = 0u;
         }
-        return false;
     }
-    s = shading_point(hit, -normalize(next.direction));
+    if (continues) {
+        rays++;
+        bool leaves = s.front && leaves_body(s.body, s.row, s.g, b.next.direction);
+        b.left |= (leaves ? s.body : NO_BODY) << 20u;
+        bool onward = !leaves || enters_any(b.origin, b.next.direction, left_onward(b), INFINITY);
+        // Light is added in one order, whichever rays have to be traced.
+        if (!onward && (b.waits & WAITS_FOR_LIGHT) == 0u) add_sky(path, b.next, b.sky);
+        else b.waits |= onward ? WAITS_ONWARD : WAITS_FOR_SKY;
+    }
+    return b.waits != 0u;
+}
+
+// Traces the rays that `branch` left, and adds their light. False: the path has ended, and its radiance is complete. True: it goes on at `hit`.
+bool follow(inout Path path, Branches b, out Hit hit) {
+    bool met = false;
+#ifdef TEXEL_TABLES
+    // On software Vulkan, where registers are plentiful, two walks are faster by a sixth than one in a loop.
+    if ((b.waits & WAITS_FOR_LIGHT) != 0u) {
+        hit.t = b.light_t;
+        if (!trace_ray(b.light_origin, b.light_direction, 0u, b.left, true, hit)) path.radiance += limit_indirect(b.light, path.vertex);
+    }
+    if ((b.waits & WAITS_ONWARD) != 0u) {
+        hit.t = INFINITY;
+        met = trace_ray(b.origin, b.next.direction, 0u, left_onward(b), false, hit);
+    }
+#else
+    // On a GPU one walk traces both rays in turn. So the walk's code stands once, and while it runs nothing of the vertex is kept but what these rays
+    // need.
+    for (uint ray = (b.waits & WAITS_FOR_LIGHT) != 0u ? 0u : 1u; ray < ((b.waits & WAITS_ONWARD) != 0u ? 2u : 1u); ray++) {
+        bool to_light = ray == 0u;
+        hit.t = to_light ? b.light_t : INFINITY;
+        met = trace_ray(to_light ? b.light_origin : b.origin, to_light ? b.light_direction : b.next.direction, 0u,
+                        to_light ? b.left : left_onward(b), to_light, hit);
+        if (to_light && !met) path.radiance += limit_indirect(b.light, path.vertex);
+    }
+#endif
+    bool onward = (b.waits & WAITS_ONWARD) != 0u;
+    if (onward ? !met : (b.waits & WAITS_FOR_SKY) != 0u) add_sky(path, b.next, b.sky);
+    return onward && met;
+}
+
+// The path's next vertex, at which the ray of `b` arrives. False: the path ends there, and its radiance is complete.
+bool arrive(inout Path path, Branches b, Hit hit, Point s) {
     path.at = s;
     path.vertex++;
     if (HAS_EMISSIVE && s.light != NO_LIGHT && luminance(s.emitted) > 0.0) {
-        float light_pdf = next.delta ? 0.0 : emissive_pdf(s.light, instance_of(hit.id), triangle_of(hit.id), from, s.p, s.g);
-        float weight = next.delta ? 1.0 : balance(next.pdf, light_pdf);
-        path.radiance += limit_indirect(path.throughput * s.emitted * weight, vertex);
+        float light_pdf = b.next.delta ? 0.0 : emissive_pdf(s.light, instance_of(hit.id), triangle_of(hit.id), b.origin, s.p, s.g);
+        float weight = b.next.delta ? 1.0 : balance(b.next.pdf, light_pdf);
+        path.radiance += limit_indirect(path.throughput * s.emitted * weight, path.vertex);
     }
     return path.vertex < frame.depth;
 }

@@ -1,6 +1,9 @@
 // Pixels into surfaces and guides: what the projector's ray of each pixel meets, whether the eye sees that point, how it moves and how large it looks.
 #version 460
 #extension GL_GOOGLE_include_directive : require
+#ifdef RAY_QUERY
+#define FRAME_WHERE_USED
+#endif
 #include "scene.glsl"
 #define ALPHA_TEST
 #include "bvh.glsl"
@@ -72,7 +75,7 @@ void main() {
     Hit hit;
     hit.t = INFINITY;
     uint closest = still_dark(pixel) ? 0u : 1u, shadow = 0u;
-    if (closest > 0u && trace_ray(frame.projector_position, direction, mask, false, hit)) {
+    if (closest > 0u && trace_ray(frame.projector_position, direction, mask, NONE_LEFT, false, hit)) {
         uint instance = instance_of(hit.id), triangle = triangle_of(hit.id);
         surface.id = hit.id;
         surface.barycentric = hit.barycentric;
@@ -91,7 +94,7 @@ void main() {
                 Hit blocker;
                 blocker.t = 1.0;
                 shadow = 1u;
-                lit = !trace_ray(p + offset, to_eye - offset, INSTANCE_PROJECTED, true, blocker);
+                lit = !trace_ray(p + offset, to_eye - offset, INSTANCE_PROJECTED, NONE_LEFT, true, blocker);
             }
             if (!lit) surface.distance = -hit.t;
             if (HAS_GUIDES) {

@@ -8,8 +8,9 @@
 
 // A storage block, although it is small. Mesa's software Vulkan compiles a shader again for every value of a uniform block that a branch or loop
 // reads, which took 15 ms of every frame. The block is read once, where every lane is active, because elsewhere software Vulkan reads lane by lane.
-// With ray queries it is read where it is used: held from the start to the end it would fill the scalar registers of AMD's GPUs, which queries need.
-#ifdef RAY_QUERY
+// With FRAME_WHERE_USED it is read where it is used: held from the start to the end it would fill the scalar registers of AMD's GPUs, which the pass
+// `trace` and queries need.
+#ifdef FRAME_WHERE_USED
 layout(set = 0, binding = B_FRAME, scalar) readonly buffer FrameBlock { Frame frame; };
 #else
 layout(set = 0, binding = B_FRAME, scalar) readonly buffer FrameBlock { Frame frame_block; };

@@ -19,6 +19,8 @@ struct Point {
     uint table;
     uint light;     // Index in the light table.
     float offset;   // Distance from the surface at which a new ray starts.
+    uint body;
+    uint row;       // The first of its triangle's rows.
 };
 
 uint wrap_texel(int x, uint size, uint mode) {
@@ -109,6 +111,21 @@ float average_albedo(uint table, float alpha) {
     return mix(e.x, e.y, above);
 }
 
+// Whether a ray that starts on the outside of a triangle surely does not meet the triangle's body again: it is above the horizon that `horizons` of the
+// host found. `row` is the first of the triangle's rows, and `normal` is of unit length.
+bool leaves_body(uint body, uint row, vec3 normal, vec3 direction) {
+#ifdef TEXEL_TABLES
+    // Horizons are not worked out for software Vulkan.
+    return false;
+#else
+    vec3 d = transform_vector(instance_at(body).object_from_world, direction), a = abs(d);
+    uint largest = a.x >= a.y && a.x >= a.z ? 0u : a.y >= a.z ? 1u : 2u;
+    uint octant = (d.x < 0.0 ? 1u : 0u) | (d.y < 0.0 ? 2u : 0u) | (d.z < 0.0 ? 4u : 0u);
+    uint steps = (floatBitsToUint(TRI(row + largest).w) >> (4u * octant)) & 15u;
+    return steps < HORIZON_STEPS && dot(direction, normal) * float(HORIZON_STEPS) > float(steps) * length(direction);
+#endif
+}
+
 Point shading_point(Hit hit, vec3 v) {
     Point s;
     uint instance = instance_of(hit.id), triangle = triangle_of(hit.id);
@@ -123,6 +140,8 @@ Point shading_point(Hit hit, vec3 v) {
     s.light = ref.light;
     s.offset = surface_offset(s.p, instance);
     s.front = dot(s.g, v) > 0.0;
+    s.body = instance;
+    s.row = (instance_at(instance).triangle_offset + triangle) * 3u;
     vec3 n = vertex_at(ref.vertices.x).normal * (1.0 - b.x - b.y) + vertex_at(ref.vertices.y).normal * b.x + vertex_at(ref.vertices.z).normal * b.y;
     n = dot(n, n) > 1e-12 ? transform_normal(instance_at(instance).world_from_object, n) : s.g;
     vec2 uv = HAS_TEXTURES ? interpolate_uv(ref, b) : vec2(0.0);

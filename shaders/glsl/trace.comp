@@ -1,6 +1,9 @@
 // Work items into radiance toward the eye: paths from the surface point of each listed pixel.
 #version 460
 #extension GL_GOOGLE_include_directive : require
+#ifndef TEXEL_TABLES
+#define FRAME_WHERE_USED
+#endif
 #include "path.glsl"
 #include "moments.glsl"
 
@@ -50,13 +53,15 @@ Sampler begin_sampler(uint at, uint spp) {
     return rng;
 }
 
-// The first vertex of the paths of a pixel.
-Point first_point(Surface surface) {
-    Hit hit = Hit(surface.id, surface.barycentric, abs(surface.distance));
-    uint instance = instance_of(hit.id);
-    vec3 p = transform_point(instance_at(instance).world_from_object, object_position(instance, triangle_of(hit.id), hit.barycentric));
+// Where the paths of a pixel begin.
+Hit first_hit(Surface surface) { return Hit(surface.id, surface.barycentric, abs(surface.distance)); }
+
+// Unit direction from there to the eye.
+vec3 toward_eye(Hit first) {
+    uint instance = instance_of(first.id);
+    vec3 p = transform_point(instance_at(instance).world_from_object, object_position(instance, triangle_of(first.id), first.barycentric));
     bool camera_is_eye = (frame.flags & FRAME_CAMERA_IS_EYE) != 0u;
-    return shading_point(hit, normalize((camera_is_eye ? frame.projector_position : frame.eye_position) - p));
+    return normalize((camera_is_eye ? frame.projector_position : frame.eye_position) - p);
 }
 
 // What only an ordinary camera traces: the background.

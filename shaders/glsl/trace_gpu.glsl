@@ -88,42 +88,53 @@ void keep_light(uint slot, vec3 light, bool exact) {
     if (exact) atomicOr(exact_slots[slot / 32u], 1u << (slot % 32u));
 }
 
-// The path of a slot's sample, whose random numbers are then told by the slot. That of the background has ended already, and so has that of a sample
-// that waits for another lane.
-void begin_slot(uint slot, bool is_left_out, inout Path path) {
+// Where the path of a slot's sample begins. Its random numbers are then told by the slot. False: it has no path, because it is the background.
+bool begin_slot(uint slot, out Hit hit) {
     uint at = slots[slot];
     Surface surface = surface_at(at);
-    if (is_left_out || surface.id == NO_HIT) {
-        path.vertex = frame.depth;
-        path.radiance = background(at);
-        return;
-    }
+    hit = first_hit(surface);
+    if (surface.id == NO_HIT) return false;
     Sampler rng = begin_sampler(at, slots[slot + 2u * TRACE_SLOTS]);
     slots[slot + 2u * TRACE_SLOTS] = rng.seed;
     slots[slot + TRACE_SLOTS] += rng.index;
-    path = begin_path(first_point(surface));
+    return true;
 }
 
 Sampler sampler_of(uint slot) { return Sampler(slots[slot + 2u * TRACE_SLOTS], slots[slot + TRACE_SLOTS], pixel_of(slots[slot])); }
 
 // The light of every slot. A lane whose path ends takes the next slot at once, while the paths of its neighbours continue.
 void trace_slots(uint base) {
-    bool dpm = (frame.flags & FRAME_DPM) != 0u;
     uint rays = 0u;
     Path path;
-    bool begins = true;
-    // Whether this lane has traced the sample before the slot's.
-    bool follows = false;
+    Branches branches;
+    Hit hit;
+    // What the lane is about, in one word, because each bool would take a scalar register: the path of its slot is yet to begin, and it has traced the
+    // sample before the slot's.
+    const uint BEGINS = 1u, FOLLOWS = 2u;
+    uint state = BEGINS;
     uint count = min(range.end - base, TRACE_SLOTS);
     uint slot = atomicAdd(next_slot, 1u);
     while (slot < count) {
-        if (begins) begin_slot(slot, waits(slot) && !follows, path);
-        begins = !advance_path(path, sampler_of(slot), rays);
-        if (begins) {
-            bool is_left_out = waits(slot) && !follows, exact = dpm && path.exact;
+        bool begins = (state & BEGINS) != 0u;
+        bool is_left_out = state == BEGINS && waits(slot);
+        bool ended = is_left_out || begins && !begin_slot(slot, hit);
+        if (ended) {
+            path.radiance = background(slots[slot]);
+            path.exact = 0u;
+        } else {
+            // The code that shades is large, and stands once for all vertices.
+            Point s = shading_point(hit, begins ? toward_eye(hit) : -normalize(branches.next.direction));
+            if (begins) path = begin_path(s);
+            else ended = !arrive(path, branches, hit, s);
+            ended = ended || !branch(path, sampler_of(slot), rays, branches) || !follow(path, branches, hit);
+        }
+        state &= FOLLOWS;
+        if (ended) {
+            bool exact = (frame.flags & FRAME_DPM) != 0u && path.exact != 0u;
             if (!is_left_out) keep_light(slot, path.radiance, exact);
-            follows = !is_left_out && !exact && slot + 1u < count && waits(slot + 1u);
+            bool follows = !is_left_out && !exact && slot + 1u < count && waits(slot + 1u);
             slot = follows ? slot + 1u : atomicAdd(next_slot, 1u);
+            state = follows ? BEGINS | FOLLOWS : BEGINS;
         }
     }
     COUNT(rays, rays)

@@ -12,7 +12,7 @@ void main() {
         radiance_out[at] = vec4(background(at), 1.0);
         return;
     }
-    Point first = first_point(surface);
+    Point first = shading_point(first_hit(surface), toward_eye(first_hit(surface)));
     Sampler rng = begin_sampler(at, spp);
     bool dpm = (frame.flags & FRAME_DPM) != 0u;
     Sums sums = NO_SAMPLES;
@@ -22,9 +22,12 @@ void main() {
     bool begins = true;
     do {
         if (begins) path = begin_path(first);
-        begins = !advance_path(path, rng, rays);
+        Branches branches;
+        Hit hit;
+        begins = !branch(path, rng, rays, branches) || !follow(path, branches, hit)
+              || !arrive(path, branches, hit, shading_point(hit, -normalize(branches.next.direction)));
         if (begins) {
-            if (!add_sample(sums, path.radiance, dpm && path.exact)) invalid++;
+            if (!add_sample(sums, path.radiance, dpm && path.exact != 0u)) invalid++;
             rng.index++;
             traced++;
         }

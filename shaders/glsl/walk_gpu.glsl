@@ -35,6 +35,7 @@ struct Traversal {
     vec3 inverse;
     Hit hit;        // The nearest hit so far. Its `t` limits the ray.
     uint body;      // The body that is being traversed.
+    uint left;      // Bodies that the ray does not meet.
     uint next;      // The body after it, or where to look for it in the tree; `end_of_bodies()`: there is none.
     uint node_base;
     uint triangle_base;
@@ -44,25 +45,26 @@ struct Traversal {
     uint depth;     // Groups that wait.
 };
 
-void begin_ray(inout Traversal t, vec3 origin, vec3 direction, uint mask, float t_max) {
+void begin_ray(inout Traversal t, vec3 origin, vec3 direction, uint mask, uint left, float t_max) {
     set_world_ray(origin, direction);
+    t.left = left;
     t.hit.id = NO_HIT;
     t.hit.t = t_max;
     t.group = 0u;
     t.triangles = uvec2(0u);
     t.depth = 0u;
-    t.next = HAS_BODY_TREE ? 0u : next_body(0u, origin, 1.0 / safe_direction(direction), mask, t_max);
+    t.next = HAS_BODY_TREE ? 0u : next_body(0u, origin, 1.0 / safe_direction(direction), mask, left, t_max);
 }
 
 // Continues with the next body. In a list there must be one; in the tree there may be none.
 void enter_next_body(inout Traversal t, uint mask) {
     vec3 origin = world_origin(), direction = world_direction(), inverse = 1.0 / safe_direction(direction);
     if (HAS_BODY_TREE) {
-        t.body = next_in_tree(t.next, origin, inverse, mask, t.hit.t);
+        t.body = next_in_tree(t.next, origin, inverse, mask, t.left, t.hit.t);
         if (t.body == NO_INSTANCE) return;
     } else {
         t.body = min(t.next, max(frame.instance_count, 1u) - 1u);
-        t.next = next_body(t.body + 1u, origin, inverse, mask, t.hit.t);
+        t.next = next_body(t.body + 1u, origin, inverse, mask, t.left, t.hit.t);
     }
     t.origin = transform_point(instance_at(t.body).object_from_world, origin);
     t.direction = transform_vector(instance_at(t.body).object_from_world, direction);
@@ -120,9 +122,9 @@ bool at_end(Traversal t) { return t.group == 0u && t.triangles.y == 0u && t.dept
 
 // Traces one ray through all bodies that have any of the bits of `mask` (0: all). With `any_hit` it stops at the first surface. On entry `hit.t` is
 // the largest distance. Returns whether there is a hit.
-bool trace_ray(vec3 origin, vec3 direction, uint mask, bool any_hit, inout Hit hit) {
+bool trace_ray(vec3 origin, vec3 direction, uint mask, uint left, bool any_hit, inout Hit hit) {
     Traversal t;
-    begin_ray(t, origin, direction, mask, hit.t);
+    begin_ray(t, origin, direction, mask, left, hit.t);
     while (!at_end(t)) {
         if (t.group == 0u) {
             if (t.depth > 0u) {

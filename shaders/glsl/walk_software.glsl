@@ -13,6 +13,7 @@ struct Traversal {
     bool any_hit;   // The ray stops at the first surface.
     Hit hit;        // The nearest hit so far. Its `t` limits the ray.
     uint body;      // The body that is being traversed.
+    uint left;      // Bodies that the ray does not meet.
     uint next;      // The body after it, or where to look for it in the tree; `end_of_bodies()`: there is none.
     LocalRay local;
     uint node_base;
@@ -28,26 +29,27 @@ struct Traversal {
 
 uint traversal_stack[STACK_SIZE];
 
-void begin_ray(inout Traversal t, vec3 origin, vec3 direction, uint mask, bool any_hit, float t_max) {
+void begin_ray(inout Traversal t, vec3 origin, vec3 direction, uint mask, uint left, bool any_hit, float t_max) {
     t.origin = origin;
     t.direction = direction;
     t.inverse = 1.0 / safe_direction(direction);
     t.mask = mask;
     t.any_hit = any_hit;
+    t.left = left;
     t.hit.id = NO_HIT;
     t.hit.t = t_max;
     t.group = 0u;
     t.triangles = uvec2(0u);
     t.displaced = 0u;
     t.depth = 0u;
-    t.next = HAS_BODY_TREE ? 0u : next_body(0u, origin, t.inverse, mask, t_max);
+    t.next = HAS_BODY_TREE ? 0u : next_body(0u, origin, t.inverse, mask, left, t_max);
 }
 
 // Continues with the next body. In a list there must be one; in the tree there may be none, and then no node is opened.
 void enter_next_body(inout Traversal t) {
-    uint body = HAS_BODY_TREE ? next_in_tree(t.next, t.origin, t.inverse, t.mask, t.hit.t) : t.next;
+    uint body = HAS_BODY_TREE ? next_in_tree(t.next, t.origin, t.inverse, t.mask, t.left, t.hit.t) : t.next;
     t.body = min(body, max(frame.instance_count, 1u) - 1u);
-    if (!HAS_BODY_TREE) t.next = next_body(t.body + 1u, t.origin, t.inverse, t.mask, t.hit.t);
+    if (!HAS_BODY_TREE) t.next = next_body(t.body + 1u, t.origin, t.inverse, t.mask, t.left, t.hit.t);
     t.local = local_ray(transform_point(instance_at(t.body).object_from_world, t.origin),
                         transform_vector(instance_at(t.body).object_from_world, t.direction));
     t.node_base = instance_at(t.body).node_offset;
@@ -123,9 +125,9 @@ void test_triangle(inout Traversal t) {
 // the largest distance. Returns whether there is a hit.
 //
 // Every loop tests at its end, because software Vulkan runs the body of a loop that tests at its start once more with no lane active.
-bool trace_ray(vec3 origin, vec3 direction, uint mask, bool any_hit, inout Hit hit) {
+bool trace_ray(vec3 origin, vec3 direction, uint mask, uint left, bool any_hit, inout Hit hit) {
     Traversal t;
-    begin_ray(t, origin, direction, mask, any_hit, hit.t);
+    begin_ray(t, origin, direction, mask, left, any_hit, hit.t);
     do {
         go_on(t);
         do {

@@ -460,6 +460,7 @@ pub const CONSTANTS: &[(&str, u32)] = &[
     ("INSTANCE_PROJECTED", INSTANCE_PROJECTED),
     ("INSTANCE_EMPTY", INSTANCE_EMPTY),
     ("BODY_NODE_INNER", BODY_NODE_INNER),
+    ("HORIZON_STEPS", HORIZON_STEPS),
     ("MATERIAL_DOUBLE_SIDED", MATERIAL_DOUBLE_SIDED),
     ("MATERIAL_THIN", MATERIAL_THIN),
     ("MATERIAL_TRANSMISSIVE", MATERIAL_TRANSMISSIVE),
@@ -521,6 +522,8 @@ pub const NO_INSTANCE: u32 = u32::MAX;
 pub const INSTANCE_PROJECTED: u32 = 1;
 /// It has no triangles.
 pub const INSTANCE_EMPTY: u32 = 2;
+/// Steps of a horizon: the sine of an elevation in each octant of directions.
+pub const HORIZON_STEPS: u32 = 15;
 /// Back faces are shaded.
 pub const MATERIAL_DOUBLE_SIDED: u32 = 1;
 /// Transmission goes straight.

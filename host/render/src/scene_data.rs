@@ -6,12 +6,14 @@ use crate::gpu::BodyTriangles;
 use bytemuck::Zeroable;
 use dpm_scene::albedo_table::{tabulated, AlbedoTable, ALBEDO_NODES};
 use dpm_scene::bvh::BodyBvh;
+use dpm_scene::horizon::{horizons, Horizon, CLOSED};
 use dpm_scene::mesh::MAX_COORDINATE_M;
 use dpm_scene::{Environment, PunctualKind, Scene, TextureRef, TriangleMesh, Wrap};
 use dpm_shaders::structs::{
     self as gpu, AlbedoCell, Light, Material, TextureInfo, TextureUse, TriangleRef, Vertex,
 };
 use glam::{DAffine3, Vec3};
+use std::sync::OnceLock;
 
 /// Most bodies that a scene may have, those that never move included. The number of a body has 8 bits of a word that it shares with the triangle.
 pub const MAX_BODIES: usize = 256;
@@ -82,8 +84,10 @@ pub struct SceneData {
     pub bodies: Vec<BodyData>,
     /// BVH nodes, five words each.
     pub nodes: Vec<[u32; 4]>,
-    /// Three rows of f32 bits per triangle in BVH order: the corners.
+    /// Three rows per triangle in BVH order: each is a corner as f32 bits, and a word of a horizon that tells nothing.
     pub triangles: Vec<[u32; 4]>,
+    /// The horizons of the triangles, once they were asked for.
+    horizons: OnceLock<Vec<Horizon>>,
     /// Indices and material per triangle in BVH order.
     pub refs: Vec<TriangleRef>,
     /// All vertices.
@@ -373,7 +377,9 @@ impl SceneData {
         for (place, &t) in bvh.order.iter().enumerate() {
             let corners = mesh.triangles[t as usize];
             let p = corners.map(|v| mesh.positions[v as usize]);
-            self.triangles.extend(p.map(|p| [p.x.to_bits(), p.y.to_bits(), p.z.to_bits(), 0]));
+            let rows = p.iter().zip(CLOSED);
+            self.triangles
+                .extend(rows.map(|(p, closed)| [p.x.to_bits(), p.y.to_bits(), p.z.to_bits(), closed]));
             let material = mesh.materials[t as usize];
             let m = &scene.materials[material as usize];
             let mut light = gpu::NO_LIGHT;
@@ -531,6 +537,25 @@ impl SceneData {
 }
 
 impl SceneData {
+    /// [`Self::triangles`] with their horizons, which take a fiftieth of a millisecond of a core for each triangle when they are first asked for.
+    pub fn triangles_with_horizons(&self) -> Vec<[u32; 4]> {
+        let corner = |row: &[u32; 4]| Vec3::from_array([row[0], row[1], row[2]].map(f32::from_bits));
+        let horizons = self.horizons.get_or_init(|| {
+            let of_body = |body: BodyTriangles| {
+                let rows = &self.triangles[3 * body.range.start as usize..3 * body.range.end as usize];
+                horizons(
+                    &rows
+                        .chunks_exact(3)
+                        .map(|t| [corner(&t[0]), corner(&t[1]), corner(&t[2])])
+                        .collect::<Vec<_>>(),
+                )
+            };
+            self.triangles_of_bodies().into_iter().flat_map(of_body).collect()
+        });
+        let words = horizons.iter().flatten();
+        self.triangles.iter().zip(words).map(|(row, &word)| [row[0], row[1], row[2], word]).collect()
+    }
+
     /// The triangles of each body, and whether shaders must look for holes in them.
     pub(crate) fn triangles_of_bodies(&self) -> Vec<BodyTriangles> {
         let ends = self.bodies.iter().skip(1).map(|next| next.triangle_offset);

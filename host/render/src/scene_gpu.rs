@@ -32,7 +32,9 @@ impl SceneGpu {
         // Buffers cannot be empty; one element of padding is never read.
         let empty = [[0u32; 4]; 5];
         let nodes = if data.nodes.is_empty() || query { &empty[..] } else { &data.nodes };
-        let triangles = if data.triangles.is_empty() { &empty[..] } else { &data.triangles };
+        // On software Vulkan a run is too short, and its rays too few, to be worth the time that horizons take.
+        let triangles = if texel { data.triangles.clone() } else { data.triangles_with_horizons() };
+        let triangles = if triangles.is_empty() { &empty[..] } else { &triangles };
         let rows = |what, words: &[[u32; 4]], float| {
             if texel {
                 Buffer::texels(gpu, what, words, float)

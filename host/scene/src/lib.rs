@@ -25,6 +25,7 @@ mod environment;
 mod error;
 pub mod geometry;
 mod gltf_file;
+pub mod horizon;
 mod limits;
 mod linear_picture;
 mod load;

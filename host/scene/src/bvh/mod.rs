@@ -113,6 +113,11 @@ impl From<CwBvh> for BodyBvh {
     }
 }
 
+/// A binary tree over boxes, for what is worked out once from a body's shape.
+pub(crate) fn tree_of(boxes: &[Aabb]) -> Bvh2 {
+    clustered(boxes)
+}
+
 /// The boxes of a mesh's triangles, in their order.
 pub(crate) fn boxes_of(mesh: &TriangleMesh) -> Vec<Aabb> {
     let corner = |i: u32| Vec3A::from(mesh.positions[i as usize]);
