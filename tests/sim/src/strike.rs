@@ -316,8 +316,10 @@ impl World {
             K::G6 => {
                 let ns = dice.between(300, 1_500) * MS;
                 beneath.gpu_traps.push_back(GpuTrap::Late(ns));
-                lasts_ns += ns;
-                self.laws.hidden_until(self.t + lasts_ns);
+                // A frame that comes late after another that is stuck is late from then on.
+                self.gpu_hangs_until = self.gpu_hangs_until.max(self.t) + ns + lasts_ns;
+                lasts_ns = self.gpu_hangs_until - self.t;
+                self.laws.hidden_until(self.gpu_hangs_until);
             }
             K::G7 => beneath.gpu_traps.push_back(GpuTrap::Late(slot_ns * dice.between(1, 4))),
             _ => {}

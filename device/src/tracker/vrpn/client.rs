@@ -24,7 +24,7 @@ pub const CONNECT_TIMEOUT: Duration = Duration::from_millis(400);
 /// The client disconnects from a server that sent nothing for this long, and connects anew: the server may have
 /// forgotten the connection, and TCP sends lost bytes again at ever longer intervals ...
 const SILENCE_NS: i64 = 1_000 * MS;
-/// ... but a server that has answered no ping may just have nothing to tell.
+/// ... but a server that has greeted and answered no ping may just have nothing to tell.
 const SILENCE_WITHOUT_PONGS_NS: i64 = 3_000 * MS;
 /// A pose that is older than this, or as far in the future, waited somewhere on its way, or the server's clock stepped.
 /// A pong tells which.
@@ -492,8 +492,9 @@ impl VrpnClient {
 
     fn converse(&mut self, now: HostTime, sink: &mut dyn FnMut(&TrackerSample)) -> usize {
         let alive = self.fill(now);
-        let silence_ns = if self.has_ponged { SILENCE_NS } else { SILENCE_WITHOUT_PONGS_NS };
-        let State::Open { heard_at, .. } = &self.state else { return 0 };
+        let State::Open { heard_at, greeted, .. } = &self.state else { return 0 };
+        // Servers greet at once. One that has not was restarted while it accepted, or what it said was lost.
+        let silence_ns = if self.has_ponged || !greeted { SILENCE_NS } else { SILENCE_WITHOUT_PONGS_NS };
         if now.ns_since(*heard_at) > silence_ns {
             self.lose(now, "the server fell silent".into());
             return 0;

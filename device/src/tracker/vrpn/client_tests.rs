@@ -12,6 +12,8 @@ struct Wire {
     to_server: Vec<u8>,
     connections: u32,
     is_away: bool,
+    /// It accepts connections and says nothing.
+    is_dumb: bool,
 }
 
 #[derive(Clone, Default)]
@@ -30,6 +32,9 @@ impl Opener for Network {
         wire.connections += 1;
         wire.to_server.clear();
         wire.to_host.clear();
+        if wire.is_dumb {
+            return Some(Ok(Box::new(Socket(self.clone(), wire.connections))));
+        }
         wire.to_host.extend(COOKIE);
         let mut names = Vec::new();
         wire::put_description(&mut names, system::TYPE, 0, type_name::POS_QUAT);
@@ -203,6 +208,19 @@ fn a_connection_that_nobody_answers_is_given_up_after_a_second() {
     bench.network.0.lock().unwrap().is_away = false;
     let after = bench.run(400, Does::Speaks);
     assert!(after.len() > 10, "{}", bench.client.status());
+}
+
+#[test]
+fn a_connection_that_is_not_greeted_is_given_up_after_a_second() {
+    let mut bench = Bench::new();
+    bench.network.0.lock().unwrap().is_dumb = true;
+    bench.run(900, Does::IsMute);
+    assert_eq!(bench.connections(), 1, "{}", bench.client.status());
+    assert!(bench.client.status().contains("did not greet"), "{}", bench.client.status());
+    bench.network.0.lock().unwrap().is_dumb = false;
+    bench.run(400, Does::IsMute);
+    assert_eq!(bench.connections(), 2, "{}", bench.client.status());
+    assert!(bench.run(500, Does::Speaks).len() > 20, "{}", bench.client.status());
 }
 
 #[test]
