@@ -168,11 +168,11 @@ bool follow(inout Path path, Branches b, out Hit hit) {
 // The path's next vertex, at which the ray of `b` arrives. False: the path ends there, and its radiance is complete.
 bool arrive(inout Path path, Branches b, Hit hit, Point s) {
     path.at = s;
-    path.vertex++;
     if (HAS_EMISSIVE && s.light != NO_LIGHT && luminance(s.emitted) > 0.0) {
         float light_pdf = b.next.delta ? 0.0 : emissive_pdf(s.light, instance_of(hit.id), triangle_of(hit.id), b.origin, s.p, s.g);
         float weight = b.next.delta ? 1.0 : balance(b.next.pdf, light_pdf);
         path.radiance += limit_indirect(path.throughput * s.emitted * weight, path.vertex);
     }
+    path.vertex++;
     return path.vertex < frame.depth;
 }
