@@ -27,7 +27,7 @@ bool present_anew(vec3 origin, vec3 direction, uint body, uint triangle, float t
 }
 
 // Traces one ray through all bodies that have any of the bits of `mask` (0: all). With `any_hit` it stops at the first surface, and tells nothing of
-// it. On entry `hit.t` is the largest distance. Returns whether there is a hit.
+// it. On entry `hit.t` is the largest distance. Returns whether there is a hit. Bodies that the ray has left stand in the device's tree all the same.
 bool trace_ray(vec3 origin, vec3 direction, uint mask, uint left, bool any_hit, inout Hit hit) {
     hit.id = NO_HIT;
     // A device may do anything with such a ray.

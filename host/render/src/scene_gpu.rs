@@ -33,8 +33,9 @@ impl SceneGpu {
         let empty = [[0u32; 4]; 5];
         let nodes = if data.nodes.is_empty() || query { &empty[..] } else { &data.nodes };
         // On software Vulkan a run is too short, and its rays too few, to be worth the time that horizons take.
-        let triangles = if texel { data.triangles.clone() } else { data.triangles_with_horizons() };
-        let triangles = if triangles.is_empty() { &empty[..] } else { &triangles };
+        let with_horizons = if texel { vec![] } else { data.triangles_with_horizons() };
+        let triangles = if texel { &data.triangles } else { &with_horizons };
+        let triangles = if triangles.is_empty() { &empty[..] } else { triangles };
         let rows = |what, words: &[[u32; 4]], float| {
             if texel {
                 Buffer::texels(gpu, what, words, float)

@@ -1,8 +1,8 @@
 //! How far a body rises around each of its triangles: which rays from a triangle surely leave the body for good.
 //!
 //! Most rays that start on a body never meet it again. Which ones, its shape alone decides, so it is worked out once: for each triangle and
-//! each octant of directions in body space the elevation above the triangle's plane beyond which nothing of the body is seen from any of its
-//! points (\[Max88\] calls that the horizon). A renderer need not look for what such a ray meets in its own body.
+//! each of 24 cells of directions in body space the elevation above the triangle's plane beyond which nothing of the body is seen from any of
+//! its points (\[Max88\] calls that the horizon). A renderer need not look for what such a ray meets in its own body.
 //!
 //! The bound is safe and not sharp: rays that are told to leave do leave, and some that leave are not told so.
 
@@ -12,7 +12,7 @@ use obvhs::aabb::Aabb;
 use obvhs::bvh2::Bvh2;
 use obvhs::triangle::Triangle;
 
-/// Steps of the sine of an elevation, 0 to 1. A horizon at the last step is that of an octant no ray of which surely leaves.
+/// Steps of the sine of an elevation, 0 to 1. A horizon at the last step is that of a cell no ray of which surely leaves.
 pub const STEPS: u32 = 15;
 
 /// The horizon of a triangle. Word a is for directions whose component a, of x, y and z, is the largest. Its bits 4 o to 4 o + 3 are the sine of the
@@ -39,7 +39,8 @@ const LOOKS: usize = 120_000_000;
 /// With fewer looks a triangle, nothing useful would be found.
 const FEWEST_LOOKS: usize = 64;
 
-/// The horizons of a body's triangles, in their order, seen from outside. Coordinates are finite. They do not depend on the number of threads that work on them.
+/// The horizons of a body's triangles, in their order, seen from outside. Coordinates are finite. The number of threads that work on them changes
+/// no horizon.
 pub fn horizons(triangles: &[[Vec3; 3]]) -> Vec<Horizon> {
     let count = triangles.len();
     let looks = LOOKS / count.max(1);
@@ -180,7 +181,7 @@ impl Body {
                 continue;
             }
             let size = high - low;
-            // A ray near the border of two octants may count as one of either.
+            // A ray near the border of two cells may count as one of either.
             let blur = Vec3A::splat(1e-3 * (size + seat.high - seat.low).max_element() + self.slack);
             let cells = cells_between(low - seat.high - blur, high - seat.low + blur);
             let needs = steps_of(if distance > height { height / distance } else { 1.0 });
@@ -370,6 +371,23 @@ mod tests {
             let [told, left] = shares(&triangles, 4000);
             println!("{name}: {told:.3} of the rays are told to leave, {left:.3} leave");
             assert!(told >= least, "{name}: {told}");
+        }
+    }
+
+    #[test]
+    #[ignore = "it prints figures of docs/RENDERING.md"]
+    fn shares_of_the_demo() {
+        for body in crate::builtin().bodies.iter().filter(|body| body.tracked.is_some()) {
+            let triangles = corners(&body.mesh);
+            let begin = std::time::Instant::now();
+            let count = horizons(&triangles).len();
+            let ms = begin.elapsed().as_secs_f64() * 1e3;
+            let [told, left] = shares(&triangles, 2000);
+            println!(
+                "{}: {count} triangles, {:.3} ms each; {told:.3} of the rays are told to leave, {left:.3} leave",
+                body.name,
+                ms / count as f64
+            );
         }
     }
 
