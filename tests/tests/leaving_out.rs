@@ -41,6 +41,13 @@ fn scenes() -> Vec<(&'static str, Scene)> {
         ),
         ("emissive", room(emitter(Vec3::splat(2.0)))),
     ];
+    // The lamp shines down, and a part of its own body stands in the way.
+    let mut shaded = room(diffuse(Vec3::splat(0.5)));
+    let [lamp, shade] = [(1.4, 0.4), (1.2, 0.2)]
+        .map(|(y, side)| quad(Vec3::new(-0.2, y, 0.4), Vec3::X * side, Vec3::Z * side));
+    add(&mut shaded, join([lamp, shade]), emitter(Vec3::splat(6.0)));
+    shaded.bodies.last_mut().expect("the lamp").mesh.materials[2..].fill(0);
+    out.push(("a lamp with a shade", shaded));
     let mut metal_only =
         scene_of(sphere(Vec3::ZERO, 0.5, 2, true), Material { roughness: 0.5, ..Material::default() });
     metal_only.environment = image_sky(1.0);
