@@ -118,7 +118,8 @@ impl Connecting {
                 let held = echo.device_sent_at.0.saturating_sub(echo.device_received_at.0);
                 let there = DeviceTicks(echo.device_received_at.0.saturating_add(held / 2));
                 let middle = echo.host_sent_at.plus_ns(round_trip / 2);
-                return Ok(Some(LinkTime { clock, first: 0, anchor: (there, middle) }));
+                let bound_ns = round_trip - round_trip / 2;
+                return Ok(Some(LinkTime { clock, first: 0, anchor: (there, middle), bound_ns }));
             }
         }
         if now.ns_since(self.begin) > LIMIT_NS {

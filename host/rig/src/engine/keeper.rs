@@ -296,9 +296,10 @@ impl LinkKeeper {
             if let Some(reports) = self.reports.as_mut().filter(|_| stepped_ns > STEP_NS) {
                 reports.clock_was_wrong();
             }
-            self.time.anchor = (ticks, mapped.at);
+            (self.time.anchor, self.time.bound_ns) = ((ticks, mapped.at), mapped.uncertainty_ns);
         } else {
-            let mut time = LinkTime { clock, first: 0, anchor: (ticks, mapped.at) };
+            let (anchor, bound_ns) = ((ticks, mapped.at), mapped.uncertainty_ns);
+            let mut time = LinkTime { clock, first: 0, anchor, bound_ns };
             // The run continues to count its slots.
             time.first = self.time.slot_after(time.host_of_slot(0));
             (self.time, self.is_timed) = (time, true);

@@ -175,7 +175,9 @@ impl<P: Pace> LinkStage<P> {
             self.credit_until = now;
         }
         self.waited_ns = Some(now.ns_since(ready_at) + queued_ns);
-        if is_too_old(note, self.lit_at(note, now), self.slot_ns) {
+        // Where the projector's clock is not well known, light may come later than it seems.
+        let latest = self.lit_at(note, now).plus_ns(self.keeper.time().bound_ns);
+        if is_too_old(note, latest, self.slot_ns) {
             // The lead learns from this frame too: the next one should begin earlier.
             note.fate = Fate::TooOld;
             return Offer::Settled;
@@ -277,7 +279,7 @@ impl<P: Pace> LinkStage<P> {
     }
 }
 
-/// True when the poses of a frame that is lit at `lit_at` will be older than the prediction time plus one slot.
+/// True when the poses of a frame that is lit at `lit_at` at the latest may be older than the prediction time plus one slot.
 fn is_too_old(note: &FrameNote, lit_at: HostTime, slot_ns: i64) -> bool {
     let oldest = note.plan.oldest_captured_at();
     oldest.is_some_and(|captured| lit_at.ns_since(captured) > note.plan.predict_ns + slot_ns)

@@ -205,7 +205,7 @@ mod tests {
     fn time() -> LinkTime {
         let rate = FrameRate::new(1000, 1).unwrap();
         let clock = SlotClock::new(DeviceTicks(0), 1_000_000, rate).unwrap();
-        LinkTime { clock, first: 100, anchor: (DeviceTicks(0), HostTime(0)) }
+        LinkTime { clock, first: 100, anchor: (DeviceTicks(0), HostTime(0)), bound_ns: 0 }
     }
 
     fn status(now: u64, [lit, repeated, blank]: [u32; 3], last: (u32, u64)) -> Status {

@@ -13,6 +13,9 @@ pub struct LinkTime {
     pub first: u64,
     /// An instant of the device's clock, and the host's reading at that instant.
     pub anchor: (DeviceTicks, HostTime),
+    /// The host's reading may be wrong by plus or minus this, nanoseconds: half of the round trip that found it, because
+    /// nobody knows which way took longer.
+    pub bound_ns: i64,
 }
 
 impl LinkTime {
