@@ -505,9 +505,10 @@ impl Laws {
         // The clocks are known to a fraction of a millisecond only.
         let mut allowed = predict_ns + self.slot_ns + MS;
         // The host knows how long frames took on a line, not how long the next one takes: the line may stall, or the last ones
-        // were smaller. It does not trust the port's rate either, which many adapters ignore. `dark from` bounds the light.
+        // were smaller. It does not trust the port's rate either, which many adapters ignore. `dark from` bounds the light: for
+        // three slots after its own a frame may be lit, whatever its age. The clock is known to a few milliseconds only.
         if self.is_line {
-            allowed += 4 * self.stride_ns + self.slot_ns + 4 * MS;
+            allowed = allowed.max(sent.due_at + self.stride_ns + 3 * self.slot_ns + 4 * MS - captured_at);
         }
         self.worst_age_milli = self.worst_age_milli.max(age * 1000 / allowed);
         if age > allowed {

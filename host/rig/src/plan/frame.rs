@@ -156,11 +156,11 @@ impl FramePlan {
         self.target_at = slots.start(slot);
         // Light falls later than the projector's clock says by this much.
         let late_ns = rig.config.projector.light_delay_ns();
-        self.dark_from = slots.dark_from(slot, stride, predict_ns - late_ns);
         self.due_at = slots.host_of_slot(slot);
         let exposure_ns = slots.host_of_slot(slot + 1).ns_since(self.due_at);
         let centre = self.due_at.plus_ns(light_centre_ns(rig, exposure_ns) + late_ns);
         self.place_bodies(rig, snapshot, inputs, centre);
+        self.dark_from = slots.dark_from(slot, stride, predict_ns - late_ns, self.oldest_captured_at());
         rig.scene_poses(&self.tracked_poses, centre.0, &mut self.scene_poses);
         let first = self.due_at.plus_ns(late_ns);
         (self.centre_at, self.swept_at) = (centre, [first, first.plus_ns(exposure_ns)]);

@@ -29,11 +29,25 @@ impl LinkTime {
         self.clock.slot_at(ticks).map(|k| self.first.saturating_add(k))
     }
 
-    /// When the light of a frame must be off that is planned for `stride` slots from `slot` on, and whose poses may
-    /// be predicted for `predict_ns`: the end of those slots plus the longer of `predict_ns` and three slots.
-    pub(crate) fn dark_from(&self, slot: u64, stride: u64, predict_ns: i64) -> DeviceTicks {
-        let last = slot.saturating_sub(self.first).saturating_add(stride.max(1) - 1);
-        self.clock.dark_from(last, predict_ns.max(0) as u64)
+    /// When the light of a frame must be off that is planned for `stride` slots from `slot` on, and whose oldest pose was
+    /// captured at `captured_at`: when this pose may be older than `predict_ns` and a slot, but not before three slots
+    /// after the frame's own. If no tracked body is lit (`None`): `predict_ns` after them. Either way, a frame that
+    /// arrives late and a frame that is shown once more end alike.
+    pub(crate) fn dark_from(
+        &self,
+        slot: u64,
+        stride: u64,
+        predict_ns: i64,
+        captured_at: Option<HostTime>,
+    ) -> DeviceTicks {
+        let after = slot.saturating_add(stride.max(1));
+        let keep_ns = captured_at.map_or(predict_ns, |captured_at| {
+            let end = self.host_of_slot(after);
+            let slot_ns = end.ns_since(self.host_of_slot(after - 1));
+            let age_ns = end.ns_since(captured_at).saturating_add(self.bound_ns);
+            predict_ns.saturating_add(slot_ns).saturating_sub(age_ns).min(predict_ns)
+        });
+        self.clock.dark_from(after.saturating_sub(self.first).max(1) - 1, keep_ns.max(0) as u64)
     }
 
     /// Start of a slot on the host's clock.
@@ -66,5 +80,46 @@ impl LinkTime {
             slot += 1;
         }
         slot
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use dpm_device::time::FrameRate;
+
+    const MS: i64 = 1_000_000;
+
+    /// Light ends when its oldest pose may be older than the prediction time and a slot, whenever the frame arrived. The
+    /// three slots after its own, which bridge a frame that is lost, are always left to it.
+    #[test]
+    fn light_ends_when_its_oldest_pose_may_be_too_old() {
+        for (hz, stride, age_ms, predict_ms, bound_ms, kept_ms) in [
+            // 10 ms old when its slot of 1 ms begins: 11 ms at its end, so that 20 ms are left of 30 and 1.
+            (1000, 1, 10, 30, 0, 20),
+            // An unsure clock takes its share, and so do slots that the frame is shown for.
+            (1000, 1, 10, 30, 7, 13),
+            (1000, 4, 10, 30, 0, 17),
+            // Never less than three slots ...
+            (1000, 1, 29, 30, 0, 3),
+            (50, 1, 10, 30, 0, 60),
+            // ... and never more than the prediction time, though the pose is of the slot itself.
+            (1000, 1, 0, 30, 0, 30),
+            (1000, 1, -20, 30, 0, 30),
+        ] {
+            let clock =
+                SlotClock::new(DeviceTicks(5_000), 1_000_000, FrameRate::new(hz, 1).unwrap()).unwrap();
+            let anchor = (DeviceTicks(7_000), HostTime(90 * MS));
+            let slots = LinkTime { clock, first: 100, anchor, bound_ns: bound_ms * MS };
+            let begin = slots.host_of_slot(140);
+            let dark = |captured_at| {
+                let dark = slots.dark_from(140, stride, predict_ms * MS, captured_at);
+                slots.host_of(dark).ns_since(slots.host_of_slot(140 + stride))
+            };
+            let kept = dark(Some(begin.plus_ns(-age_ms * MS)));
+            assert_eq!(kept, kept_ms * MS, "{hz} frames/s, {age_ms} ms old");
+            let three = 3 * 1_000_000_000 / i64::from(hz);
+            assert_eq!(dark(None), three.max(predict_ms * MS), "no pose that could be old");
+        }
     }
 }
