@@ -33,8 +33,10 @@ const WORSE_M_S: f64 = 0.6;
 /// the first 551 was farther, and that of 15,352 in five minutes nearer: a tracker of 60 Hz sees turns that are over before
 /// its next sample.
 const MANY: u64 = 2_000;
-/// So many planes that follow tracks in a second tell how old tracks usually are. Even 24 frames of 8 planes are twice as many.
-const FEW: u64 = 96;
+/// So many slots, and planes that follow tracks, in a second tell how tracks usually are. Even 24 frames of 8 planes are twice
+/// as many; less is left of a second whose first part is not judged.
+const FEW_SLOTS: u64 = 12;
+const FEW: u64 = 8 * FEW_SLOTS;
 /// How far the host's idea of the projector's clock may be wrong in peace, nanoseconds.
 const CLOCK_NS: i64 = MS;
 
@@ -414,12 +416,11 @@ impl TrackLaws {
         let slots = self.now.slots - before.slots;
         let in_the_end = self.now.in_the_end - before.in_the_end;
         let (followed, old) = (self.now.followed - before.followed, self.now.old - before.old);
-        if in_the_end * 10 < slots * 8 {
+        if slots >= FEW_SLOTS && in_the_end * 10 < slots * 8 {
             return Err(format!(
                 "{in_the_end} of {slots} slots follow tracks in the end in a second of peace"
             ));
         }
-        // Less is followed where the second before had nothing to be judged.
         if followed >= FEW && old * 10 > followed {
             return Err(format!(
                 "tracks of {old} of {followed} planes are older than {:.2} ms in a second of peace",
