@@ -89,6 +89,8 @@ fn what_once_broke_a_law_of_tracks_keeps_them_all() {
         // A collector that hangs may be found after five seconds, amid the peace in which all frames are due: the simulator's
         // own mistake.
         (92_000_024, 60),
+        // Tracks after a turn that a tracker of 60 Hz did not see: a bound that was too narrow.
+        (450_004_609, 10),
     ];
     for (seed, seconds) in found {
         let lived = lived(&Order { follows: Some(true), ..order(seed, None, seconds) });
