@@ -1,5 +1,6 @@
 //! Checks the structure of the sources: every file belongs to a module, only one file of the rig names the mocks, and
-//! no folders of a crate import each other in a circle. Cargo checks the dependencies between crates.
+//! no folders of a crate import each other in a circle, and the lanes of tests name programs that exist. Cargo checks
+//! the dependencies between crates.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
@@ -245,4 +246,33 @@ fn a_circle_is_found_and_a_diamond_is_none() {
     assert_eq!(circle(&of(&[("a", &["b", "c"]), ("b", &["d"]), ("c", &["d"]), ("d", &[])])), None);
     let found = circle(&of(&[("a", &["b"]), ("b", &["c"]), ("c", &["b"])]));
     assert_eq!(found, Some(vec!["b".into(), "c".into()]));
+}
+
+/// A program that has another name now would run alone, and nobody would see why the tests take longer.
+#[test]
+fn lanes_name_programs_that_exist() {
+    let lanes = std::fs::read_to_string(root().join("tests/lanes")).unwrap();
+    let notes = std::fs::read_to_string(root().join("x")).unwrap();
+    let manifest = std::fs::read_to_string(root().join("Cargo.toml")).unwrap();
+    let members: Vec<&str> =
+        manifest.split('"').filter(|word| root().join(word).join("Cargo.toml").is_file()).collect();
+    let mut seen = BTreeSet::new();
+    for lane in ["quiet", "waiting", "working"] {
+        let (_, after) =
+            lanes.split_once(&format!("\n{lane}=\"")).unwrap_or_else(|| panic!("no lane {lane}"));
+        for name in after.split('"').next().unwrap_or_default().split_whitespace() {
+            assert!(seen.insert(name), "{name} stands in two places");
+            let is_program = members.iter().any(|member| {
+                let manifest = std::fs::read_to_string(root().join(member).join("Cargo.toml")).unwrap();
+                let is_library =
+                    manifest.lines().any(|line| line.replace('-', "_") == format!("name = \"{name}\""));
+                is_library || root().join(member).join(format!("tests/{name}.rs")).is_file()
+            });
+            assert!(
+                is_program || notes.contains(&format!("note-as {name} ")),
+                "{lane}: there is no program {name}"
+            );
+        }
+    }
+    assert!(seen.len() > 50, "{seen:?}");
 }

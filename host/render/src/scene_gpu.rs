@@ -4,6 +4,7 @@ use super::scene_data::SceneData;
 use crate::gpu::{triangle_buffer, BodyTrees, Buffer, Gpu, GpuError, MemoryKind};
 use bytemuck::cast_slice;
 use dpm_shaders::Reading;
+use std::borrow::Cow;
 use std::sync::Arc;
 
 /// The buffers of one scene; immutable after creation.
@@ -33,9 +34,9 @@ impl SceneGpu {
         let empty = [[0u32; 4]; 5];
         let nodes = if data.nodes.is_empty() || query { &empty[..] } else { &data.nodes };
         // On software Vulkan a run is too short, and its rays too few, to be worth the time that horizons take.
-        let with_horizons = if texel { vec![] } else { data.triangles_with_horizons() };
-        let triangles = if texel { &data.triangles } else { &with_horizons };
-        let triangles = if triangles.is_empty() { &empty[..] } else { triangles };
+        let triangles =
+            if texel { Cow::from(&data.triangles) } else { Cow::from(data.triangles_with_horizons()) };
+        let triangles = if triangles.is_empty() { &empty[..] } else { &triangles };
         let rows = |what, words: &[[u32; 4]], float| {
             if texel {
                 Buffer::texels(gpu, what, words, float)

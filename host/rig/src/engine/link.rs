@@ -279,10 +279,10 @@ impl<P: Pace> LinkStage<P> {
     }
 }
 
-/// True when the poses of a frame that is lit at `lit_at` at the latest may be older than the prediction time plus one slot.
-fn is_too_old(note: &FrameNote, lit_at: HostTime, slot_ns: i64) -> bool {
+/// True when the poses of a frame may be older than the prediction time plus one slot when it is lit, at `latest` or before.
+fn is_too_old(note: &FrameNote, latest: HostTime, slot_ns: i64) -> bool {
     let oldest = note.plan.oldest_captured_at();
-    oldest.is_some_and(|captured| lit_at.ns_since(captured) > note.plan.predict_ns + slot_ns)
+    oldest.is_some_and(|captured| latest.ns_since(captured) > note.plan.predict_ns + slot_ns)
 }
 
 #[cfg(test)]

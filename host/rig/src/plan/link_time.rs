@@ -31,8 +31,8 @@ impl LinkTime {
 
     /// When the light of a frame must be off that is planned for `stride` slots from `slot` on, and whose oldest pose was
     /// captured at `captured_at`: when this pose may be older than `predict_ns` and a slot, but not before three slots
-    /// after the frame's own. If no tracked body is lit (`None`): `predict_ns` after them. Either way, a frame that
-    /// arrives late and a frame that is shown once more end alike.
+    /// after the frame's own. If no tracked body is lit (`None`), nothing ages: `predict_ns` after its own slots, and not
+    /// before three. A frame that arrives late and a frame that is shown once more end alike.
     pub(crate) fn dark_from(
         &self,
         slot: u64,
