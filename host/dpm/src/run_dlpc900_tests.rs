@@ -8,6 +8,7 @@ use dpm_render::pack::unpack;
 use dpm_rig::interlock::{Contact, Interlock};
 use dpm_rig::pack::prepared::PreparedFrames;
 use hil_mock::dlpc900::{Dlpc900Model, Options, Sequencer, VirtualHid};
+use std::sync::atomic::AtomicBool;
 use std::sync::{Arc, Mutex};
 
 const DMD: Dmd = Dmd::Dlp5500;
