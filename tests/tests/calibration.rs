@@ -94,10 +94,10 @@ fn a_wand_with_a_sensor_finds_lens_pose_tip_and_latency() {
     let mock =
         Mock::start(&["--raster", "128x96", "--focal", "225", "--command-port", "15710", "--seed", "7"]);
     let folder = Folder::new("sensor");
-    folder.write("rig.toml", &mock.rig([128, 96], 48, 15710));
+    folder.write("rig.toml", &mock.rig([128, 96], 72, 15710));
     folder.done(&["calibrate", "wand", "rig.toml", "--tip", "11,-4,119"]);
     let told =
-        folder.done(&["calibrate", "projector", "rig.toml", "--sensor", &mock.sensor, "--seconds", "20"]);
+        folder.done(&["calibrate", "projector", "rig.toml", "--sensor", &mock.sensor, "--seconds", "14"]);
     println!("{told}");
     let file = folder.calibration();
     let errors = errors_in_the_beam(&file, &truth(128, 96, 225.0));
@@ -130,7 +130,7 @@ fn frames_and_their_inverse_do_the_same_on_a_projector_of_binary_planes() {
     let too_bright = folder.dpm(&[&frames[..], &["--seconds", "6"]].concat());
     assert_eq!(too_bright.status.code(), Some(2), "{}", text(&too_bright));
     assert!(text(&too_bright).contains("choose a lower --gain"), "{}", text(&too_bright));
-    let told = folder.done(&[&frames[..], &["--gain", "6", "--seconds", "60"]].concat());
+    let told = folder.done(&[&frames[..], &["--gain", "6", "--seconds", "42"]].concat());
     let file = folder.calibration();
     let errors = errors_in_the_beam(&file, &truth(128, 96, 225.0));
     let predicted = file.projector.as_ref().unwrap().predicted_p99_px;

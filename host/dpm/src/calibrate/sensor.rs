@@ -64,9 +64,9 @@ const FRAMES: f64 = 1200.0;
 /// A sweep lasts at least so many frames: the solvers need 500 with light, and some are without.
 const LEAST_FRAMES: f64 = 700.0;
 
-/// A pair needs two pictures in a row. Where fewer of them than this share came in time, a round of pairs may take longer
-/// than the wand rests, and a slower rate helps.
-const CARRIED_FOR_PAIRS: f64 = 0.8;
+/// A pair needs two pictures in a row. Where the wand was held still at enough places, and fewer pictures than this share
+/// came in time, the late ones may be why places were not seen, and a slower rate helps.
+const CARRIED_FOR_PAIRS: f64 = 0.95;
 
 /// What was recorded, ready for a solver.
 struct Sweep {
@@ -100,7 +100,37 @@ impl Clipped {
 /// A code, and what the sensor saw of it.
 enum SeenCode {
     Planes(Box<Code>, Decoded),
-    Frames(InverseCode, DecodedPairs),
+    Frames(InverseCode, DecodedPairs, Rests),
+}
+
+/// How the wand was held still.
+#[derive(Clone, Copy)]
+struct Rests {
+    /// At how many places it was still for a round of the code.
+    places: usize,
+}
+
+impl Rests {
+    /// Frames a second that were carried, if their number may be why too few places were seen.
+    fn carried_too_few(self, error: &SensorError, carried: f64, rate_hz: f64) -> Option<f64> {
+        let &SensorError::TooFewPlaces { need, .. } = error else { return None };
+        (self.places >= need && carried < CARRIED_FOR_PAIRS).then_some(carried * rate_hz)
+    }
+
+    /// What was seen, beside the reason why it was too little.
+    fn told(self, error: &SensorError, decoded: &DecodedPairs) -> String {
+        let Self { places } = self;
+        let lit = decoded.pairs.len();
+        let share = 100.0 * lit as f64 / (lit + decoded.dropped).max(1) as f64;
+        match error {
+            SensorError::TooFewPlaces { .. } => format!(
+                "{error} (by the tracker it was held still at {places} places; {:.0} % of the pictures came in time, and \
+                 the sensor was in the light during {share:.0} % of these)",
+                100.0 * decoded.carried
+            ),
+            _ => error.to_string(),
+        }
+    }
 }
 
 /// Shows the code, records, and solves. `tip` comes from `dpm calibrate wand`.
@@ -119,21 +149,18 @@ pub fn calibrate(
     };
     let solved = match &swept.seen {
         SeenCode::Planes(code, decoded) => solve(code, decoded, &swept.path, &swept.settings),
-        SeenCode::Frames(code, decoded) => solve_pairs(code, decoded, &swept.path, &swept.settings),
+        SeenCode::Frames(code, decoded, _) => solve_pairs(code, decoded, &swept.path, &swept.settings),
     };
-    if let (Err(error), SeenCode::Frames(_, decoded)) = (&solved, &swept.seen) {
-        if let Some(carried_hz) = carried_too_few(error, decoded.carried, config.projector.frame_rate.hz()) {
-            return Ok(Paced::TooFast { carried_hz });
+    match (solved, &swept.seen) {
+        (Ok(solution), _) => Ok(Paced::Done(solution)),
+        (Err(error), SeenCode::Planes(..)) => Err(swept.clipped.refused(error)),
+        (Err(error), SeenCode::Frames(_, decoded, rests)) => {
+            match rests.carried_too_few(&error, decoded.carried, config.projector.frame_rate.hz()) {
+                Some(carried_hz) => Ok(Paced::TooFast { carried_hz }),
+                None => Err(swept.clipped.refused(rests.told(&error, decoded))),
+            }
         }
     }
-    solved.map(Paced::Done).map_err(|e| swept.clipped.refused(e))
-}
-
-/// Frames a second that were carried, if their number is why too few places were seen: the wand may have rested long
-/// enough, and the pictures not have come. `carried` is the share of the slots with a picture of its own.
-fn carried_too_few(error: &SensorError, carried: f64, rate_hz: f64) -> Option<f64> {
-    let is_short_of_places = matches!(error, SensorError::TooFewPlaces { .. });
-    (is_short_of_places && carried < CARRIED_FOR_PAIRS).then_some(carried * rate_hz)
 }
 
 /// Shows the code, records, and finds the latency of the projector `model`, which is known.
@@ -150,7 +177,7 @@ pub fn latency(
     sweep(config, setup, tip, monitor)?.and_then(|s| {
         let solved = match &s.seen {
             SeenCode::Planes(code, decoded) => solve_latency(code, decoded, &s.path, &s.settings, model),
-            SeenCode::Frames(code, decoded) => {
+            SeenCode::Frames(code, decoded, _) => {
                 solve_latency_of_pairs(code, decoded, &s.path, &s.settings, model)
             }
         };
@@ -191,7 +218,8 @@ fn sweep(
     };
     if setup.is_held {
         let code = InverseCode::new(raster);
-        let guide = Guide::Rests { hold_s: code.hold_s(1e9 / config.projector.frame_rate.hz()), tip };
+        let hold_s = code.hold_s(1e9 / config.projector.frame_rate.hz());
+        let guide = Guide::Rests { hold_s, tip };
         let source = Arc::new(InverseSource::new(code.clone()));
         return record(config, setup, (source, guide), monitor)?.and_then(|(recording, showing)| {
             let clipped = recording.clipped;
@@ -204,7 +232,8 @@ fn sweep(
             let decoded = decode_pairs(&code, (&showing.timing, light), &mapped, &shown)
                 .map_err(|e| clipped.refused(e))?;
             let settings = settings(showing.timing, &recording.poses)?;
-            let seen = SeenCode::Frames(code.clone(), decoded);
+            let rests = Rests { places: places_rested(&recording.poses, tip, hold_s) };
+            let seen = SeenCode::Frames(code.clone(), decoded, rests);
             Ok(Sweep { seen, path: Trajectory::new(&recording.poses), settings, clipped })
         });
     }
@@ -443,9 +472,12 @@ mod tests {
     #[test]
     fn a_slower_rate_is_tried_where_late_pictures_are_why_places_were_not_seen() {
         let short = SensorError::TooFewPlaces { places: 6, need: FEWEST_PLACES };
-        assert_eq!(carried_too_few(&short, 0.5, 120.0), Some(60.0));
-        assert_eq!(carried_too_few(&short, 0.95, 120.0), None, "the wand did not rest");
+        let rests = Rests { places: FEWEST_PLACES };
+        assert_eq!(rests.carried_too_few(&short, 0.5, 120.0), Some(60.0));
+        assert_eq!(rests.carried_too_few(&short, 0.99, 120.0), None, "the pictures came");
+        let moved = Rests { places: FEWEST_PLACES - 1 };
+        assert_eq!(moved.carried_too_few(&short, 0.5, 120.0), None, "the wand did not rest");
         let other = SensorError::LatencyUncertain { us: 2000.0 };
-        assert_eq!(carried_too_few(&other, 0.5, 120.0), None);
+        assert_eq!(rests.carried_too_few(&other, 0.5, 120.0), None);
     }
 }
