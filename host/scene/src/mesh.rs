@@ -298,7 +298,7 @@ fn face_normal_of_tiny(mesh: &TriangleMesh, t: [u32; 3]) -> Vec3 {
 
 /// The cofactor matrix: it transforms area vectors, and so normals, by `m`, and unlike the inverse transpose it exists
 /// for every `m`.
-fn cofactor(m: DMat3) -> DMat3 {
+pub(crate) fn cofactor(m: DMat3) -> DMat3 {
     DMat3::from_cols(m.y_axis.cross(m.z_axis), m.z_axis.cross(m.x_axis), m.x_axis.cross(m.y_axis))
 }
 

@@ -9,17 +9,6 @@ use serde_json::{json, Value};
 
 const S: i64 = 1_000_000_000;
 
-/// Appends numbers as an accessor and returns its index.
-fn numbers(glb: &mut Glb, kind: &str, components: usize, values: &[f32]) -> usize {
-    let bytes: Vec<u8> = values.iter().flat_map(|x| x.to_le_bytes()).collect();
-    let view = glb.push_view(&bytes);
-    let accessors = glb.json["accessors"].as_array_mut().unwrap();
-    accessors.push(
-        json!({"bufferView": view, "componentType": 5126, "type": kind, "count": values.len() / components}),
-    );
-    accessors.len() - 1
-}
-
 /// One channel of an animation.
 struct Channel<'a> {
     node: usize,
@@ -38,13 +27,13 @@ fn linear<'a>(node: usize, path: &'a str, times: &'a [f32], values: &'a [f32]) -
 fn animate(mut glb: Glb, name: &str, channels: &[Channel]) -> Glb {
     let (mut list, mut samplers) = (vec![], vec![]);
     for c in channels {
-        let (kind, components) = match c.path {
-            "rotation" => ("VEC4", 4),
-            "weights" => ("SCALAR", 1),
-            _ => ("VEC3", 3),
+        let kind = match c.path {
+            "rotation" => "VEC4",
+            "weights" => "SCALAR",
+            _ => "VEC3",
         };
-        let input = numbers(&mut glb, "SCALAR", 1, c.times);
-        let output = numbers(&mut glb, kind, components, c.values);
+        let input = glb.push_numbers("SCALAR", c.times);
+        let output = glb.push_numbers(kind, c.values);
         list.push(json!({"sampler": samplers.len(), "target": {"node": c.node, "path": c.path}}));
         samplers.push(json!({"input": input, "output": output, "interpolation": c.interpolation}));
     }
@@ -352,7 +341,7 @@ fn shared_key_frames_and_deep_rows_are_bounded() {
         glb = glb.set(&format!("/nodes/{}", k + 2), json!({"mesh": 0, "children": [k + 3]}));
     }
     let mut glb = glb.set("/nodes/62", json!({"mesh": 0})).set("/nodes/1/children", json!([2]));
-    let (input, output) = (numbers(&mut glb, "SCALAR", 1, &times), numbers(&mut glb, "VEC3", 3, &values));
+    let (input, output) = (glb.push_numbers("SCALAR", &times), glb.push_numbers("VEC3", &values));
     let channels: Vec<Value> =
         (2..63).map(|node| json!({"sampler": 0, "target": {"node": node, "path": "translation"}})).collect();
     let shared = glb.set(

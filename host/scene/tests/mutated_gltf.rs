@@ -13,6 +13,18 @@ fn rich() -> Glb {
     let mut file = with_image(&png(3, 3, &[[200, 100, 50, 255]; 9]));
     let sparse_index = file.push_view(&[1, 3]);
     let sparse_value = file.push_view(&[0.1f32, 0.0, 0.0, 0.0, 0.0, 0.1].map(f32::to_le_bytes).concat());
+    let joints = file.push_bytes("VEC4", &[0, 1, 0, 0].repeat(4));
+    let shares = file.push_numbers("VEC4", &[0.75, 0.25, 0.0, 0.0].repeat(4));
+    let bind = file.push_numbers("MAT4", &glam::Mat4::IDENTITY.to_cols_array().repeat(2));
+    let target = file.push_numbers("VEC3", &[0.01; 12]);
+    let primitive = "/meshes/0/primitives/0";
+    let file = file
+        .set(&format!("{primitive}/attributes/JOINTS_0"), json!(joints))
+        .set(&format!("{primitive}/attributes/WEIGHTS_0"), json!(shares))
+        .set(&format!("{primitive}/targets"), json!([{"POSITION": target, "NORMAL": target}]))
+        .set("/meshes/0/weights", json!([0.5]))
+        .set("/nodes/1/skin", json!(0))
+        .set("/skins", json!([{"joints": [2, 1], "inverseBindMatrices": bind}]));
     file.set(
         "/accessors/0/sparse",
         json!({"count": 2, "indices": {"bufferView": sparse_index, "componentType": 5121}, "values": {"bufferView": sparse_value}}),

@@ -82,9 +82,6 @@ pub(super) fn check(root: &Item, data: &Data, limits: &Limits) -> Result<Checked
     for mesh in &meshes {
         triangles.push(check_mesh(mesh, data, &counts, quantized, limits, &mut warnings)?);
     }
-    if !list("skins", "skins")?.is_empty() {
-        warnings.push("skins are ignored: their meshes are shown at rest".into());
-    }
     let instances = read_instances(&nodes, data, limits)?;
     check_nodes(root, &nodes, &counts, &triangles, &instances, limits)?;
     let lost: Vec<String> = list_of_strings(root, "extensionsUsed")?
@@ -154,9 +151,6 @@ fn check_mesh(
     for mut primitive in primitives {
         primitive.name = format!("{}, {}", mesh.name, primitive.name);
         primitive.index("material", counts.materials, "material")?;
-        if primitive.get("targets").is_some() {
-            warnings.push(format!("{}: morph targets are ignored, the rest shape is shown", primitive.name));
-        }
         let mode = primitive.whole("mode")?.unwrap_or(4);
         if mode > 6 {
             return Err(primitive.error(format!("'mode' is {mode}; it must be 0 to 6")));
@@ -215,7 +209,8 @@ fn check_attributes(
             "COLOR_0" if a.dimensions == 4 => 4,
             "COLOR_0" => 3,
             _ if texture_set => 2,
-            _ => continue, // joints, weights and private attributes are not read
+            // Joints and weights are checked with the skins.
+            _ => continue,
         };
         let plain = a.component == Component::F32;
         let normalized_uv = (texture_set || key == "COLOR_0")

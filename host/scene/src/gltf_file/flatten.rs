@@ -1,7 +1,7 @@
 //! Flattens the node tree into rigid bodies: nodes that a body of the rig file claims move with it, all others are
 //! static. What an animation moves is a part, a body of its own with the same carrier.
 
-use std::collections::{BTreeMap, HashMap, HashSet};
+use std::collections::{BTreeMap, BTreeSet, HashMap, HashSet};
 use std::sync::Arc;
 
 use glam::{DAffine3, DMat3, DMat4, DVec3, Vec3};
@@ -14,6 +14,7 @@ use super::super::{
 };
 use super::accessor::Data;
 use super::animation::{Animation, Channels};
+use super::deform::{Deformations, Pose, Skin};
 use super::instancing::Instances;
 use super::look::Look;
 use super::primitive::read_primitive;
@@ -234,6 +235,8 @@ pub(super) struct Source<'a> {
     pub instances: &'a Instances,
     /// How nodes move.
     pub animation: &'a Animation,
+    /// Morph targets and skins.
+    pub deformations: &'a Deformations,
     /// The world's unit and axes from those of the file.
     pub world: DAffine3,
 }
@@ -284,6 +287,11 @@ struct Gatherer<'a> {
     claims: &'a Claims,
     limits: &'a Limits,
     cancel: &'a Cancel,
+    at_rest: AtRest,
+    /// Of each node: the body that it belongs to, and its place there. Only of files with skins.
+    places: HashMap<usize, (Group, DAffine3)>,
+    /// Nodes that show a skin, whose joints may be anywhere.
+    skinned: Vec<(usize, Group)>,
     /// By claim: world-from-body at rest.
     rest: Vec<DAffine3>,
     parts: Vec<Part>,
@@ -300,6 +308,9 @@ impl<'a> Gatherer<'a> {
             claims,
             limits,
             cancel,
+            at_rest: AtRest::default(),
+            places: HashMap::new(),
+            skinned: vec![],
             rest: vec![DAffine3::IDENTITY; claims.bodies.len()],
             parts: vec![],
             meshes: BTreeMap::new(),
@@ -319,6 +330,9 @@ impl<'a> Gatherer<'a> {
         let claim_of: HashMap<usize, usize> =
             claims.bodies.iter().enumerate().map(|(c, b)| (b.node, c)).collect();
         let document = self.source.document;
+        if self.source.deformations.has_skins() {
+            self.at_rest = AtRest::of(self.source, &claim_of);
+        }
         let world = self.source.world;
         let group = Group { claim: None, is_virtual: false, part: None };
         let mut walk: Vec<Step> =
@@ -353,19 +367,24 @@ impl<'a> Gatherer<'a> {
             let place = self.place_at(group, &world, &place);
             group.is_virtual |= claims.virtual_nodes.binary_search(&index).is_ok();
             if let Some(mesh) = node.mesh() {
-                if is_invertible(&place) {
-                    self.add_mesh(mesh.index(), index, group, &place)?;
+                if self.source.deformations.skin(index, mesh.index()).is_some() {
+                    self.skinned.push((index, group));
+                } else if is_invertible(&place) {
+                    self.add_mesh((mesh.index(), index), group, &place, None)?;
                 } else {
                     let name = node.name().unwrap_or("");
                     warnings.push(format!("node {index} '{name}' is scaled to nothing and is left out"));
                 }
+            }
+            if self.source.deformations.has_skins() {
+                self.places.insert(index, (group, place));
             }
             if let Some(light) = node.light() {
                 self.lights.extend(place_light(&light, &place).map(|l| (group, l)));
             }
             walk.extend(node.children().map(|c| Step { node: c.index(), world, place, group }));
         }
-        Ok(())
+        self.add_skinned_meshes(warnings)
     }
 
     /// The place of a node in the space of its body or part. `world` is its place at rest, `in_part` that in its part.
@@ -424,23 +443,76 @@ impl<'a> Gatherer<'a> {
         Ok((self.parts.len() - 1, DAffine3::from_scale(own_scale * scale)))
     }
 
-    /// All primitives of a mesh, at each place of the node's instances.
+    /// The meshes with skins, where the joints are. These and not the nodes say where a mesh is.
+    fn add_skinned_meshes(&mut self, warnings: &mut Vec<String>) -> Result<(), SceneError> {
+        let Source { document, data, deformations, .. } = *self.source;
+        for (index, group) in std::mem::take(&mut self.skinned) {
+            let Some(node) = document.nodes().nth(index) else { continue };
+            let Some(mesh) = node.mesh().map(|mesh| mesh.index()) else { continue };
+            let Some(skin) = deformations.skin(index, mesh) else { continue };
+            if skin.joints.iter().any(|joint| self.at_rest.moves[*joint]) {
+                let of_file = &document.as_json().meshes[mesh].primitives;
+                self.cancel.check(self.limits)?;
+                let pieces = deformations.rigid_joints(mesh, of_file, data, MAX_PARTS)?;
+                if self.add_pieces((mesh, index), group, skin, pieces.as_ref())? {
+                    continue;
+                }
+                warnings.push(format!(
+                    "node {index} '{}': its skin is shown as its joints lie at rest: only rigid pieces play, on joints of the same body",
+                    node.name().unwrap_or("")
+                ));
+            }
+            let group = Group { part: None, ..group };
+            let body_from_world = group.claim.map_or(DAffine3::IDENTITY, |c| self.rest[c].inverse());
+            let pose = skin.pose(&body_from_world, &self.at_rest.world_from_node);
+            self.add_mesh((mesh, index), group, &DAffine3::IDENTITY, Some(Pose::All(&pose)))?;
+        }
+        Ok(())
+    }
+
+    /// The rigid pieces of a skin, each in the part that its joint moves with. False if there are none, or if a piece belongs to
+    /// another body than the node that shows the skin.
+    fn add_pieces(
+        &mut self,
+        (mesh, node): (usize, usize),
+        group: Group,
+        skin: &Skin,
+        joints: Option<&BTreeSet<usize>>,
+    ) -> Result<bool, SceneError> {
+        let place = |joint: &usize| {
+            let (of_joint, place) = self.places.get(skin.joints.get(*joint)?)?;
+            let piece = Group { part: of_joint.part, ..group };
+            (of_joint.claim == group.claim).then(|| (piece, *joint, *place * skin.bind[*joint]))
+        };
+        let places: Option<Vec<_>> = joints.and_then(|joints| joints.iter().map(place).collect());
+        let Some(places) = places else { return Ok(false) };
+        for (piece, joint, map) in places {
+            self.add_mesh((mesh, node), piece, &DAffine3::IDENTITY, Some(Pose::One(joint, map)))?;
+        }
+        Ok(true)
+    }
+
+    /// All primitives of a mesh of a node, at each place of the node's instances. `pose` is that of its skin.
     fn add_mesh(
         &mut self,
-        mesh: usize,
-        node: usize,
+        (mesh, node): (usize, usize),
         group: Group,
         body_from_node: &DAffine3,
+        pose: Option<Pose<'_>>,
     ) -> Result<(), SceneError> {
-        let Source { document, data, look, instances, .. } = *self.source;
+        let Source { document, data, look, instances, deformations, .. } = *self.source;
         let into = self.meshes.entry(group).or_default();
         let here = [DAffine3::IDENTITY];
         let places = instances.get(&node).map_or(&here[..], Vec::as_slice);
-        for primitive in &document.as_json().meshes[mesh].primitives {
+        for (number, primitive) in document.as_json().meshes[mesh].primitives.iter().enumerate() {
             self.cancel.check(self.limits)?;
             let material = primitive.material.map_or(look.materials.len() - 1, |m| m.value());
             let uv_set = look.uv_sets[material];
-            let read = read_primitive(primitive, data, material as u32, uv_set, &mut self.paint)?;
+            let deformation = deformations.of((node, mesh, number), pose);
+            let stop = (self.cancel, self.limits);
+            let painted = &mut self.paint;
+            let read =
+                read_primitive(primitive, data, (material as u32, uv_set), &deformation, painted, stop)?;
             let Some((part, lost)) = read else { continue };
             for place in places {
                 self.cancel.check(self.limits)?;
@@ -558,6 +630,35 @@ impl<'a> Gatherer<'a> {
             direction: place.transform_vector3(light.direction.as_dvec3()).as_vec3(),
             ..light
         }
+    }
+}
+
+/// All nodes while nothing plays.
+#[derive(Default)]
+struct AtRest {
+    world_from_node: Vec<DAffine3>,
+    /// Whether an animation moves it in the space of its body.
+    moves: Vec<bool>,
+}
+
+impl AtRest {
+    fn of(source: &Source<'_>, claim_of: &HashMap<usize, usize>) -> Self {
+        let nodes: Vec<gltf::Node> = source.document.nodes().collect();
+        let mut is_child = vec![false; nodes.len()];
+        nodes.iter().flat_map(gltf::Node::children).for_each(|child| is_child[child.index()] = true);
+        let mut all =
+            Self { world_from_node: vec![source.world; nodes.len()], moves: vec![false; nodes.len()] };
+        let mut walk: Vec<(usize, DAffine3, bool)> =
+            (0..nodes.len()).filter(|i| !is_child[*i]).map(|i| (i, source.world, false)).collect();
+        while let Some((i, above, above_moves)) = walk.pop() {
+            let channels = source.animation.nodes.get(&i);
+            let world = above * local_transform(&nodes[i], channels);
+            // The tracker moves a body, and what is above it does not.
+            let moves = !claim_of.contains_key(&i) && (above_moves || channels.is_some_and(Channels::moves));
+            (all.world_from_node[i], all.moves[i]) = (world, moves);
+            walk.extend(nodes[i].children().map(|child| (child.index(), world, moves)));
+        }
+        all
     }
 }
 

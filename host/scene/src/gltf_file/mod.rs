@@ -7,6 +7,7 @@ mod check;
 mod check_look;
 mod compressed;
 mod container;
+mod deform;
 mod flatten;
 mod instancing;
 mod json;
@@ -57,6 +58,7 @@ pub(super) fn read(
     let check::Checked { mut warnings, instances } = check::check(&root, &data, limits)?;
     let nodes = root.list("nodes", "node", limits.objects)?;
     let animation = animation::read(&root, &data, &nodes, options, &mut warnings)?;
+    let deformations = deform::Deformations::read(&root, &data, &nodes, limits, &mut warnings)?;
     cancel.check(limits)?;
 
     let typed: gltf::json::Root =
@@ -71,6 +73,7 @@ pub(super) fn read(
         look: &look,
         instances: &instances,
         animation: &animation,
+        deformations: &deformations,
         world,
     };
     let (flat, paint) = flatten::flatten(&source, &claims, limits, cancel, &mut warnings)?;

@@ -1,4 +1,4 @@
-//! Reads one checked primitive of a mesh as a [`TriangleMesh`] in the mesh's own space.
+//! Reads one checked primitive of a mesh as a [`TriangleMesh`] in the mesh's own space, or with a skin in that of its body.
 
 use std::collections::HashMap;
 
@@ -6,9 +6,11 @@ use glam::{Vec2, Vec3, Vec4};
 use gltf::json::mesh::{Mode, Primitive, Semantic};
 use gltf::json::validation::Checked;
 
+use super::super::limits::Cancel;
 use super::super::mesh::Dropped;
-use super::super::{SceneError, TriangleMesh};
+use super::super::{Limits, SceneError, TriangleMesh};
 use super::accessor::{Accessor, Data};
+use super::deform::Deformation;
 use super::vertex_paint::Paint;
 
 /// Reads a primitive's triangles with their material; decodes only vertices that a triangle uses. `None` if there is
@@ -16,29 +18,15 @@ use super::vertex_paint::Paint;
 pub(crate) fn read_primitive(
     primitive: &Primitive,
     data: &Data,
-    material: u32,
-    uv_set: u32,
+    (material, uv_set): (u32, u32),
+    deformation: &Deformation,
     paint: &mut Paint,
+    stop: (&Cancel, &Limits),
 ) -> Result<Option<(TriangleMesh, Dropped)>, SceneError> {
-    let attribute = |semantic: Semantic| {
-        primitive.attributes.get(&Checked::Valid(semantic)).map(|i| &data.accessors[i.value()])
-    };
+    let attribute = |semantic: Semantic| accessor_of(primitive, data, semantic);
     let Some(positions) = attribute(Semantic::Positions) else { return Ok(None) };
-    let corners = corners(primitive, data, positions.count)?;
-    let faces: Vec<[u64; 3]> = match primitive.mode {
-        Checked::Valid(Mode::Triangles) => corners.chunks_exact(3).map(|c| [c[0], c[1], c[2]]).collect(),
-        Checked::Valid(Mode::TriangleStrip) => {
-            // Every second face of a strip is flipped, so that all face the same way.
-            let face =
-                |(i, c): (usize, &[u64])| if i % 2 == 0 { [c[0], c[1], c[2]] } else { [c[1], c[0], c[2]] };
-            corners.windows(3).enumerate().map(face).collect()
-        }
-        Checked::Valid(Mode::TriangleFan) => {
-            corners[1..].windows(2).map(|c| [c[0], c[1], corners[0]]).collect()
-        }
-        _ => return Ok(None),
-    };
-
+    let Some(mut faces) = faces(primitive, data)? else { return Ok(None) };
+    faces.retain(|face| deformation.shows(data, face));
     let colours = attribute(Semantic::Colors(0));
     let painted = match colours {
         Some(a) => paint.faces(&faces, material, |i| Vec3::from(data.floats::<3>(a, i)))?,
@@ -73,6 +61,7 @@ pub(crate) fn read_primitive(
         materials: vec![material; triangles.len()],
         triangles,
     };
+    deformation.apply(data, &used, &mut mesh, stop)?;
     let dropped = mesh.drop_unusable();
     if has_normals {
         mesh.repair_normals();
@@ -85,6 +74,32 @@ pub(crate) fn read_primitive(
         mesh.repair_tangents();
     }
     Ok(Some((mesh, dropped)))
+}
+
+fn accessor_of<'a>(primitive: &Primitive, data: &'a Data, semantic: Semantic) -> Option<&'a Accessor> {
+    primitive.attributes.get(&Checked::Valid(semantic)).map(|i| &data.accessors[i.value()])
+}
+
+/// The corners of a primitive's triangles, as numbers of its vertices; `None` if there is nothing to see.
+///
+/// # Errors
+/// An index points at a vertex that is not there.
+pub(super) fn faces(primitive: &Primitive, data: &Data) -> Result<Option<Vec<[u64; 3]>>, SceneError> {
+    let Some(positions) = accessor_of(primitive, data, Semantic::Positions) else { return Ok(None) };
+    let corners = corners(primitive, data, positions.count)?;
+    Ok(Some(match primitive.mode {
+        Checked::Valid(Mode::Triangles) => corners.chunks_exact(3).map(|c| [c[0], c[1], c[2]]).collect(),
+        Checked::Valid(Mode::TriangleStrip) => {
+            // Every second face of a strip is flipped, so that all face the same way.
+            let face =
+                |(i, c): (usize, &[u64])| if i % 2 == 0 { [c[0], c[1], c[2]] } else { [c[1], c[0], c[2]] };
+            corners.windows(3).enumerate().map(face).collect()
+        }
+        Checked::Valid(Mode::TriangleFan) => {
+            corners[1..].windows(2).map(|c| [c[0], c[1], corners[0]]).collect()
+        }
+        _ => return Ok(None),
+    }))
 }
 
 /// The vertices that triangles use, each once, and the triangles in their numbers.

@@ -83,6 +83,33 @@ impl Glb {
         views.push(json!({"buffer": 0, "byteOffset": start, "byteLength": bytes.len()}));
         views.len() - 1
     }
+
+    /// Appends floats as an accessor and returns its index.
+    pub(crate) fn push_numbers(&mut self, kind: &str, values: &[f32]) -> usize {
+        let bytes: Vec<u8> = values.iter().flat_map(|x| x.to_le_bytes()).collect();
+        self.push_elements(kind, 5126, &bytes, values.len())
+    }
+
+    /// Appends small integers as an accessor and returns its index.
+    pub(crate) fn push_bytes(&mut self, kind: &str, values: &[u8]) -> usize {
+        self.push_elements(kind, 5121, values, values.len())
+    }
+
+    fn push_elements(&mut self, kind: &str, component: u32, bytes: &[u8], values: usize) -> usize {
+        let view = self.push_view(bytes);
+        let components = match kind {
+            "SCALAR" => 1,
+            "VEC3" => 3,
+            "VEC4" => 4,
+            "MAT4" => 16,
+            other => panic!("{other}"),
+        };
+        let accessors = self.json["accessors"].as_array_mut().unwrap();
+        accessors.push(
+            json!({"bufferView": view, "componentType": component, "type": kind, "count": values / components}),
+        );
+        accessors.len() - 1
+    }
 }
 
 /// Wraps JSON text and a binary part without looking at them.
