@@ -226,25 +226,33 @@ fn words() -> Vec<(&'static str, &'static str, Vec<u8>)> {
 
 /// A node that turns on a node that slides by splines.
 fn animated() -> Glb {
-    let floats = |values: &[f32]| values.iter().flat_map(|x| x.to_le_bytes()).collect::<Vec<u8>>();
     let mut file = tetrahedra().set("/nodes/0/children", json!([2])).set("/nodes/2", json!({"mesh": 0}));
-    let mut accessors = file.json["accessors"].as_array().unwrap().clone();
     let (zero, ahead) = ([0.0; 3], [0.1, 0.0, 0.0]);
-    for (kind, components, values) in [
-        ("SCALAR", 1, vec![0.0, 1.0]),
-        ("VEC3", 3, [zero, zero, ahead, ahead, ahead, zero].concat()),
-        ("VEC4", 4, vec![0.0, 0.0, 0.0, 1.0, 0.0, 1.0, 0.0, 0.0]),
-    ] {
-        let view = file.push_view(&floats(&values));
-        let count = values.len() / components;
-        accessors.push(json!({"bufferView": view, "componentType": 5126, "type": kind, "count": count}));
-    }
-    file.set("/accessors", accessors.into()).set(
+    let times = file.push_numbers("SCALAR", &[0.0, 1.0]);
+    let slide = file.push_numbers("VEC3", &[zero, zero, ahead, ahead, ahead, zero].concat());
+    let turn = file.push_numbers("VEC4", &[0.0, 0.0, 0.0, 1.0, 0.0, 1.0, 0.0, 0.0]);
+    file.set(
         "/animations",
         json!([{"name": "a", "channels": [{"sampler": 0, "target": {"node": 1, "path": "translation"}},
             {"sampler": 1, "target": {"node": 2, "path": "rotation"}}],
-            "samplers": [{"input": 3, "output": 4, "interpolation": "CUBICSPLINE"}, {"input": 3, "output": 5}]}]),
+            "samplers": [{"input": times, "output": slide, "interpolation": "CUBICSPLINE"}, {"input": times, "output": turn}]}]),
     )
+}
+
+/// The same with a skin on both nodes, of one piece each or bending, and a morph target.
+fn skinned(is_rigid: bool) -> Glb {
+    let mut file = animated();
+    let joints = file.push_bytes("VEC4", &[0, 1, 0, 0].repeat(4));
+    let shares = if is_rigid { [1.0, 0.0, 0.0, 0.0] } else { [0.75, 0.25, 0.0, 0.0] };
+    let shares = file.push_numbers("VEC4", &shares.repeat(4));
+    let target = file.push_numbers("VEC3", &[0.01; 12]);
+    let primitive = "/meshes/0/primitives/0";
+    file.set(&format!("{primitive}/attributes/JOINTS_0"), json!(joints))
+        .set(&format!("{primitive}/attributes/WEIGHTS_0"), json!(shares))
+        .set(&format!("{primitive}/targets"), json!([{"POSITION": target}]))
+        .set("/meshes/0/weights", json!([0.5]))
+        .set("/nodes/1/skin", json!(0))
+        .set("/skins", json!([{"joints": [2, 1]}]))
 }
 
 /// A scene with a texture and an environment of each format, as small as they get.
@@ -256,9 +264,12 @@ fn files() -> Vec<(&'static str, &'static str, Vec<u8>)> {
         let text = serde_json::to_vec(&file.json).unwrap();
         seeds.push(("gltf_parts", name, [&text[..], &[0], &file.bin].concat()));
     }
-    let moving = animated();
-    let text = serde_json::to_vec(&moving.json).unwrap();
-    seeds.push(("gltf_parts", "animated", [&text[..], &[0], &moving.bin].concat()));
+    for (name, file) in
+        [("animated", animated()), ("skinned", skinned(false)), ("skinned_rigid", skinned(true))]
+    {
+        let text = serde_json::to_vec(&file.json).unwrap();
+        seeds.push(("gltf_parts", name, [&text[..], &[0], &file.bin].concat()));
+    }
     for name in ["alpha_etc1s", "alpha_uastc", "chance_bc5", "chance_etc2_a8"] {
         let path = concat!(env!("CARGO_MANIFEST_DIR"), "/assets/ktx2");
         let image = std::fs::read(PathBuf::from(path).join(name).with_extension("ktx2")).unwrap();
