@@ -33,7 +33,7 @@ pub use projector::*;
 pub use run::*;
 pub use safety::{
     InterlockConfig, InterlockSignal, KeyInterlockConfig, LimitsConfig, LineInterlockConfig,
-    NoInterlockConfig, ProcessInterlockConfig,
+    NoInterlockConfig, ProcessInterlockConfig, SafetyConfig,
 };
 pub use values::{Axes, BitOrder, PerChannel};
 pub use world::*;

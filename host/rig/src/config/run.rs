@@ -1,6 +1,5 @@
-//! `[render]`, `[real_time]`, `[run]`, `[output]` and `[safety]`: how the picture is made and how the program behaves.
+//! `[render]`, `[real_time]`, `[run]` and `[output]`: how the picture is made and how the program behaves.
 
-use super::safety::{InterlockConfig, LimitsConfig};
 use dpm_common::keys::read::{Any, NotEmpty, Within};
 use dpm_common::{section, words};
 use dpm_device::planes::Raster;
@@ -269,32 +268,5 @@ impl OutputConfig {
     /// How often progress is written without a terminal; `None` for never.
     pub fn log_every(&self) -> Option<Duration> {
         (self.log_every_s > 0.0).then(|| Duration::from_secs_f64(self.log_every_s))
-    }
-}
-
-section! {
-    /// What happens when something fails.
-    pub struct SafetyConfig {
-        /// The projector goes dark by itself if it receives nothing for this long, at least two frames. If left out,
-        /// it is 50 ms or three frames, whichever is longer.
-        watchdog_ms: Option<u32> = None, "ms", Within(1, 10_000);
-        /// Prediction extends a body's track for at most this long, from the tracker's newest sample to the middle of
-        /// the light; then its light goes off. A frame that would be lit later than that plus one slot is not sent,
-        /// and one that is late on its way or shown again goes dark at that age, but not within three slots of its own.
-        /// If left out, the value follows the rig: the sum of the tracker's latency, two of its samples, the time
-        /// from latch to light and two slots, and at least 20 ms. A value in the file is binding: a rig whose frames
-        /// take longer stays dark and reports it.
-        predict_ms: Option<u32> = None, "ms", Within(0, 1_000);
-        /// Permitted general flashes of the whole picture per second; beyond this the projector rests in the dark for
-        /// two seconds. WCAG 2.3.1 allows 3; 0 is off.
-        flashes_per_second: u32 = 3, "1/s", Within(0, 1_000);
-        /// If set, the start of a run also acknowledges latched faults of heat, lamp, emergency stop and flashes.
-        /// Otherwise the run refuses to start and names them. Set it once, on the command line, when the cause is
-        /// gone.
-        acknowledge_faults: bool = false, "", Any;
-        /// How much light is permitted; docs/SAFETY.md says what that does for people and what it does not.
-        limits: LimitsConfig = LimitsConfig::default(), "", Any;
-        /// What else must permit light.
-        interlock: InterlockConfig = InterlockConfig::default(), "", Any;
     }
 }

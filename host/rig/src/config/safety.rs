@@ -1,4 +1,5 @@
-//! `[safety.limits]` and `[safety.interlock]`: how much light is permitted, and what else must permit it.
+//! `[safety]` with its limits and interlock: what happens when something fails, how much light is permitted, and what else
+//! must permit it.
 
 use super::{Origin, ProjectorBackend, RigConfig};
 use dpm_common::keys::read::{Any, NotEmpty, Reader, Within};
@@ -9,6 +10,33 @@ use std::path::{Path, PathBuf};
 
 const SHORTEST_S: f64 = MIN_LIMIT_MS as f64 / 1e3;
 const LONGEST_S: f64 = MAX_LIMIT_MS as f64 / 1e3;
+
+section! {
+    /// What happens when something fails.
+    pub struct SafetyConfig {
+        /// The projector goes dark by itself if it receives nothing for this long, at least two frames. If left out,
+        /// it is 50 ms or three frames, whichever is longer.
+        watchdog_ms: Option<u32> = None, "ms", Within(1, 10_000);
+        /// Prediction extends a body's track for at most this long, from the tracker's newest sample to the middle of
+        /// the light; then its light goes off. A frame that would be lit later than that plus one slot is not sent,
+        /// and one that is late on its way or shown again goes dark at that age, but not within three slots of its own.
+        /// If left out, the value follows the rig: the sum of the tracker's latency, two of its samples, the time
+        /// from latch to light and two slots, and at least 20 ms. A value in the file is binding: a rig whose frames
+        /// take longer stays dark and reports it.
+        predict_ms: Option<u32> = None, "ms", Within(0, 1_000);
+        /// Permitted general flashes of the whole picture per second; beyond this the projector rests in the dark for
+        /// two seconds. WCAG 2.3.1 allows 3; 0 is off.
+        flashes_per_second: u32 = 3, "1/s", Within(0, 1_000);
+        /// If set, the start of a run also acknowledges latched faults of heat, lamp, emergency stop and flashes.
+        /// Otherwise the run refuses to start and names them. Set it once, on the command line, when the cause is
+        /// gone.
+        acknowledge_faults: bool = false, "", Any;
+        /// How much light is permitted; docs/SAFETY.md says what that does for people and what it does not.
+        limits: LimitsConfig = LimitsConfig::default(), "", Any;
+        /// What else must permit light.
+        interlock: InterlockConfig = InterlockConfig::default(), "", Any;
+    }
+}
 
 section! {
     /// Limits on light. The host goes dark before a limit is exceeded, and the projector enforces the same limits by

@@ -53,7 +53,7 @@ pub(super) const WAIT_NS: i64 = 20_000_000;
 /// Time that a step of a stage may take besides its waits, nanoseconds.
 pub(super) const STEP_NS: i64 = 20_000_000;
 /// Time that a poll of a tracker may take, nanoseconds: some trackers must be reopened or reconnected.
-pub(super) const POLL_NS: i64 = 200_000_000;
+pub(super) const POLL_WITHIN_NS: i64 = 200_000_000;
 /// Time between two polls of a tracker.
 const POLL_REST: Duration = Duration::from_micros(200);
 /// At the end, how long to wait for frames that the GPU still works on, nanoseconds.
@@ -122,7 +122,7 @@ pub(super) fn tracking_thread(
             may_stall(facts, StallIn::Tracking, planned);
         }
         let now = clock.now();
-        pulse.beat(now, POLL_NS);
+        pulse.beat(now, POLL_WITHIN_NS);
         steps = steps.saturating_add(1);
         enter_frame_path(steps >= WARM_UP_STEPS);
         read_tracker(facts, &mut stage, &mut latest, now);

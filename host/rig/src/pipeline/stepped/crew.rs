@@ -12,7 +12,7 @@ use crate::engine::supervision::Trouble;
 use crate::frame::job::{FrameJob, FrameMemory};
 use crate::pack::prepared::PreparedFrames;
 use crate::pipeline::parts::CrewParts;
-use crate::pipeline::threads::{POLL_NS, STEP_NS, WAIT_NS};
+use crate::pipeline::threads::{POLL_WITHIN_NS, STEP_NS, WAIT_NS};
 use crate::plan::link_time::LinkTime;
 use crate::render::WarmUp;
 use crate::rig::Rig;
@@ -279,7 +279,7 @@ impl Crew {
     }
 
     fn track<M: Machine>(&mut self, now: HostTime, facts: &Arc<Facts>, machine: &mut M) {
-        self.pulses[0].beat(now, POLL_NS);
+        self.pulses[0].beat(now, POLL_WITHIN_NS);
         match machine.takes(Part::Tracking, facts.next_frame.load(Ordering::Relaxed), now) {
             Takes::Ns(ns) => {
                 let read_at = now.plus_ns(ns);
