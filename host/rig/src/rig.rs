@@ -9,13 +9,15 @@ use crate::drive::{albedo_of, drive, DriveError};
 use crate::mock::{Motion, MotionError, MotionSpec};
 use dpm_device::planes::{PlaneSchedule, Raster};
 use dpm_device::pose::Pose;
+use dpm_device::regular_file;
 use dpm_device::time::FrameRate;
 use dpm_render::drive::Drive;
 use dpm_scene::geometry::projector::{ProjectorCamera, ProjectorError};
 use dpm_scene::{
-    AnimationChoice, BodySelector, Environment, LoadOptions, Scene, SceneError, SceneFeatures, UpAxis,
+    AnimationChoice, BodySelector, Environment, Limits, LoadOptions, Scene, SceneError, SceneFeatures, UpAxis,
 };
 use glam::{DAffine3, DQuat, DVec3, Vec3};
+use std::path::PathBuf;
 
 /// Why a rig cannot be built from a configuration that passed its own checks.
 #[derive(Debug, thiserror::Error)]
@@ -26,6 +28,16 @@ pub enum RigError {
     /// The projector's pose or lens is invalid.
     #[error(transparent)]
     Projector(#[from] ProjectorError),
+    /// A picture cannot be shown on a body.
+    #[error("scene.bodies[].texture: body \"{name}\": {}: {message}", file.display())]
+    Picture {
+        /// The body's name.
+        name: String,
+        /// The picture.
+        file: PathBuf,
+        /// What is wrong.
+        message: String,
+    },
     /// A body's motion is invalid.
     #[error("scene.bodies[{index}] \"{name}\": motion: {source}")]
     Motion {
@@ -179,6 +191,7 @@ impl Rig {
     /// A part cannot be built. The error names its key.
     pub fn build(config: &RigConfig, raster: Option<Raster>) -> Result<Self, RigError> {
         let mut scene = load_scene(config)?;
+        show_pictures(config, &mut scene)?;
         let features = SceneFeatures::of(&scene);
         let has_lights = features.lamp_triangles + features.punctual_lights > 0;
         let (fitted, told) = environment(config, has_lights)?.unwrap_or(scene.environment).fitted();
@@ -315,6 +328,19 @@ fn load_scene(config: &RigConfig) -> Result<Scene, SceneError> {
     dpm_scene::load(file, &options)
 }
 
+/// Shows the pictures that the rig file names on its bodies.
+fn show_pictures(config: &RigConfig, scene: &mut Scene) -> Result<(), RigError> {
+    let limits = Limits::default();
+    for (index, body) in config.scene.bodies.iter().enumerate() {
+        let Some(file) = &body.texture else { continue };
+        let wrong =
+            |message: String| RigError::Picture { name: body.name.clone(), file: file.clone(), message };
+        let bytes = regular_file::read(file, limits.bytes).map_err(|e| wrong(e.to_string()))?;
+        scene.show_picture(index as u16, bytes, &limits).map_err(|e| wrong(e.to_string()))?;
+    }
+    Ok(())
+}
+
 /// Radiance of the uniform environment for scene files that contain lights; such files have no environment of their
 /// own.
 const FILE_SCENE_RADIANCE: f32 = 0.25;
@@ -445,6 +471,31 @@ mod tests {
         let flags = settings.iter().map(|s| (*s).to_owned()).collect();
         let config = RigConfig::demo(&Overrides { variables: vec![], flags }).unwrap();
         Rig::build(&config, Raster::new(8, 8)).unwrap().observer
+    }
+
+    /// Only the body that the rig file names shows its picture; what is wrong with it is told with body and file.
+    #[test]
+    fn a_picture_is_shown_on_its_body_and_named_where_it_is_wrong() {
+        let file = std::env::temp_dir().join(format!("dpm-texture-{}.png", std::process::id()));
+        std::fs::write(&file, b"no picture").unwrap();
+        let flags = vec![format!("scene.bodies.1.texture=\"{}\"", file.display())];
+        let config = RigConfig::demo(&Overrides { variables: vec![], flags }).unwrap();
+        let build = || Rig::build(&config, Raster::new(8, 8));
+        let told = build().err().unwrap().to_string();
+        assert!(told.contains("body \"venus\"") && told.contains(&*file.to_string_lossy()), "{told}");
+        image::RgbImage::from_pixel(3, 2, image::Rgb([7, 8, 9])).save(&file).unwrap();
+        let scene = build().unwrap().scene;
+        let picture = scene.textures.len() as u32 - 1;
+        let shows = |name: &str| {
+            let body = scene.bodies.iter().find(|b| b.name == name).unwrap();
+            let of = |m: &u32| scene.materials[*m as usize].base_color_texture.map(|t| t.texture);
+            body.mesh.materials.iter().all(|m| of(m) == Some(picture))
+        };
+        assert_eq!(
+            (scene.textures[picture as usize].width, shows("venus"), shows("bunny")),
+            (3, true, false)
+        );
+        std::fs::remove_file(&file).unwrap();
     }
 
     #[test]

@@ -18,6 +18,7 @@
 //! ```
 
 pub mod albedo_table;
+mod body_picture;
 pub mod builtin;
 pub mod bvh;
 pub mod camera_files;

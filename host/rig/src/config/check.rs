@@ -335,6 +335,9 @@ pub(super) fn resolve_files(rig: &mut RigConfig, base: &Path, purpose: Purpose, 
         input(&mut table.file, "projector.response.file", false);
     }
     for (i, body) in rig.scene.bodies.iter_mut().enumerate() {
+        if let Some(file) = &mut body.texture {
+            input(file, &format!("scene.bodies.{i}.texture"), false);
+        }
         if let Some(file) = &mut body.albedo_map {
             input(file, &format!("scene.bodies.{i}.albedo_map"), false);
         }

@@ -4,15 +4,13 @@ use super::{srgb_light, DriveError, MAX_PICTURE_BYTES};
 use crate::config::{AlbedoEncoding, BodyConfig, RigConfig};
 use dpm_device::regular_file;
 use dpm_render::albedo_map::AlbedoMap;
-use dpm_scene::{LinearPicture, Scene, TriangleMesh};
+use dpm_scene::{LinearPicture, Scene};
 use std::path::Path;
 use std::sync::Arc;
 
 /// Most texels of all albedo maps together. As numbers of four bytes they fill three quarters of the smallest storage buffer that Vulkan allows, and the
 /// rest is for what differs from pixel to pixel.
 const MAX_TEXELS: usize = 8 << 20;
-/// Share of a body's surface that may lack texture coordinates: a few triangles that nobody sees.
-const MOST_WITHOUT_UVS: f64 = 0.01;
 
 /// Albedo of the real surface of a body of the scene, by the tracked body that carries it. Where the body has an albedo map it is that of the map.
 pub(crate) fn albedo_of(config: &RigConfig, tracked: Option<u16>) -> [f64; 3] {
@@ -45,25 +43,14 @@ pub(crate) fn albedo_maps(
             key: "scene.bodies[].albedo_map",
             message: format!("body \"{}\": {message}", section.name),
         };
-        check_coordinates(&body.mesh).map_err(wrong)?;
+        let instead = |e: String| wrong(format!("{e}, or give one `albedo` in place of the picture"));
+        scene.check_coordinates(body).map_err(instead)?;
         let map = albedo_map(file, section, left)
             .map_err(|message| wrong(format!("{}: {message}", file.display())))?;
         left -= map.texels().len();
         Ok(Some(Arc::new(map)))
     });
     bodies.collect()
-}
-
-fn check_coordinates(mesh: &TriangleMesh) -> Result<(), String> {
-    let bare = mesh.share_without_uvs();
-    if bare <= MOST_WITHOUT_UVS {
-        return Ok(());
-    }
-    Err(format!(
-        "{:.0} % of its surface has no texture coordinates, so the picture has no place there; export the mesh with them \
-         (TEXCOORD_0), or give one `albedo` in place of the picture",
-        100.0 * bare
-    ))
 }
 
 /// The albedo in a picture of at most `left` texels.

@@ -22,7 +22,7 @@ use std::path::Path;
 use serde_json::Value;
 
 use super::limits::Cancel;
-use super::{Environment, LoadOptions, Scene, SceneError};
+use super::{Environment, Limits, LoadOptions, Scene, SceneError, Texture, Wrap};
 use container::Folder;
 use json::Item;
 
@@ -31,6 +31,26 @@ pub(super) use container::read_file;
 /// The content of a URI: inline, or a file in the folder of `beside`.
 pub(super) fn fetch_beside(uri: &str, beside: Option<&Path>, limit: u64) -> Result<Vec<u8>, SceneError> {
     container::fetch(uri, beside.map(Folder::of).transpose()?.as_ref(), limit)
+}
+
+/// A picture of colours that is not part of a file, PNG, JPEG or KTX2; it repeats. `texels_so_far` counts those of the scene.
+pub(super) fn decode_picture(
+    bytes: &[u8],
+    texels_so_far: u64,
+    limits: &Limits,
+) -> Result<Texture, SceneError> {
+    let nothing = Value::Object(serde_json::Map::new());
+    let picture = picture::decode(&Item::new(&nothing, "picture".into())?, bytes, texels_so_far, limits)?;
+    let picture::Size { width, height } = picture.size;
+    Ok(Texture {
+        width,
+        height,
+        srgb: picture.srgb.unwrap_or(true),
+        texels: picture.texels,
+        wrap_u: Wrap::Repeat,
+        wrap_v: Wrap::Repeat,
+        nearest: false,
+    })
 }
 
 /// Maximum number of warnings of one kind from a hostile file.
