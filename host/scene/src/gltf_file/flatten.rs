@@ -1,7 +1,9 @@
 //! Flattens the node tree into rigid bodies: nodes that a body of the rig file claims move with it, all others are
 //! static. What an animation moves is a part, a body of its own with the same carrier.
 
-use std::collections::{BTreeMap, BTreeSet, HashMap, HashSet};
+mod skinned;
+
+use std::collections::{BTreeMap, HashMap, HashSet};
 use std::sync::Arc;
 
 use glam::{DAffine3, DMat3, DMat4, DVec3, Vec3};
@@ -14,11 +16,12 @@ use super::super::{
 };
 use super::accessor::Data;
 use super::animation::{Animation, Channels};
-use super::deform::{Deformations, Pose, Skin};
+use super::deform::{Deformations, Pose};
 use super::instancing::Instances;
 use super::look::Look;
 use super::primitive::read_primitive;
 use super::vertex_paint::Paint;
+use skinned::AtRest;
 
 /// Bodies that [`choose_bodies`] makes movable when the rig file names none.
 const AUTO_BODIES: usize = 2;
@@ -443,55 +446,6 @@ impl<'a> Gatherer<'a> {
         Ok((self.parts.len() - 1, DAffine3::from_scale(own_scale * scale)))
     }
 
-    /// The meshes with skins, where the joints are. These and not the nodes say where a mesh is.
-    fn add_skinned_meshes(&mut self, warnings: &mut Vec<String>) -> Result<(), SceneError> {
-        let Source { document, data, deformations, .. } = *self.source;
-        for (index, group) in std::mem::take(&mut self.skinned) {
-            let Some(node) = document.nodes().nth(index) else { continue };
-            let Some(mesh) = node.mesh().map(|mesh| mesh.index()) else { continue };
-            let Some(skin) = deformations.skin(index, mesh) else { continue };
-            if skin.joints.iter().any(|joint| self.at_rest.moves[*joint]) {
-                let of_file = &document.as_json().meshes[mesh].primitives;
-                self.cancel.check(self.limits)?;
-                let pieces = deformations.rigid_joints(mesh, of_file, data, MAX_PARTS)?;
-                if self.add_pieces((mesh, index), group, skin, pieces.as_ref())? {
-                    continue;
-                }
-                warnings.push(format!(
-                    "node {index} '{}': its skin is shown as its joints lie at rest: only rigid pieces play, on joints of the same body",
-                    node.name().unwrap_or("")
-                ));
-            }
-            let group = Group { part: None, ..group };
-            let body_from_world = group.claim.map_or(DAffine3::IDENTITY, |c| self.rest[c].inverse());
-            let pose = skin.pose(&body_from_world, &self.at_rest.world_from_node);
-            self.add_mesh((mesh, index), group, &DAffine3::IDENTITY, Some(Pose::All(&pose)))?;
-        }
-        Ok(())
-    }
-
-    /// The rigid pieces of a skin, each in the part that its joint moves with. False if there are none, or if a piece belongs to
-    /// another body than the node that shows the skin.
-    fn add_pieces(
-        &mut self,
-        (mesh, node): (usize, usize),
-        group: Group,
-        skin: &Skin,
-        joints: Option<&BTreeSet<usize>>,
-    ) -> Result<bool, SceneError> {
-        let place = |joint: &usize| {
-            let (of_joint, place) = self.places.get(skin.joints.get(*joint)?)?;
-            let piece = Group { part: of_joint.part, ..group };
-            (of_joint.claim == group.claim).then(|| (piece, *joint, *place * skin.bind[*joint]))
-        };
-        let places: Option<Vec<_>> = joints.and_then(|joints| joints.iter().map(place).collect());
-        let Some(places) = places else { return Ok(false) };
-        for (piece, joint, map) in places {
-            self.add_mesh((mesh, node), piece, &DAffine3::IDENTITY, Some(Pose::One(joint, map)))?;
-        }
-        Ok(true)
-    }
-
     /// All primitives of a mesh of a node, at each place of the node's instances. `pose` is that of its skin.
     fn add_mesh(
         &mut self,
@@ -630,35 +584,6 @@ impl<'a> Gatherer<'a> {
             direction: place.transform_vector3(light.direction.as_dvec3()).as_vec3(),
             ..light
         }
-    }
-}
-
-/// All nodes while nothing plays.
-#[derive(Default)]
-struct AtRest {
-    world_from_node: Vec<DAffine3>,
-    /// Whether an animation moves it in the space of its body.
-    moves: Vec<bool>,
-}
-
-impl AtRest {
-    fn of(source: &Source<'_>, claim_of: &HashMap<usize, usize>) -> Self {
-        let nodes: Vec<gltf::Node> = source.document.nodes().collect();
-        let mut is_child = vec![false; nodes.len()];
-        nodes.iter().flat_map(gltf::Node::children).for_each(|child| is_child[child.index()] = true);
-        let mut all =
-            Self { world_from_node: vec![source.world; nodes.len()], moves: vec![false; nodes.len()] };
-        let mut walk: Vec<(usize, DAffine3, bool)> =
-            (0..nodes.len()).filter(|i| !is_child[*i]).map(|i| (i, source.world, false)).collect();
-        while let Some((i, above, above_moves)) = walk.pop() {
-            let channels = source.animation.nodes.get(&i);
-            let world = above * local_transform(&nodes[i], channels);
-            // The tracker moves a body, and what is above it does not.
-            let moves = !claim_of.contains_key(&i) && (above_moves || channels.is_some_and(Channels::moves));
-            (all.world_from_node[i], all.moves[i]) = (world, moves);
-            walk.extend(nodes[i].children().map(|child| (child.index(), world, moves)));
-        }
-        all
     }
 }
 

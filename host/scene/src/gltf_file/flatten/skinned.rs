@@ -1,0 +1,90 @@
+//! Meshes with skins: where their joints are at rest, or as rigid pieces in the parts that move with the joints.
+
+use std::collections::{BTreeSet, HashMap};
+
+use glam::DAffine3;
+
+use super::super::super::SceneError;
+use super::super::animation::Channels;
+use super::super::deform::{Pose, Skin};
+use super::{local_transform, Gatherer, Group, Source, MAX_PARTS};
+
+/// All nodes while nothing plays.
+#[derive(Default)]
+pub(super) struct AtRest {
+    world_from_node: Vec<DAffine3>,
+    /// Whether an animation moves it in the space of its body.
+    moves: Vec<bool>,
+}
+
+impl AtRest {
+    pub(super) fn of(source: &Source<'_>, claim_of: &HashMap<usize, usize>) -> Self {
+        let nodes: Vec<gltf::Node> = source.document.nodes().collect();
+        let mut is_child = vec![false; nodes.len()];
+        nodes.iter().flat_map(gltf::Node::children).for_each(|child| is_child[child.index()] = true);
+        let mut all =
+            Self { world_from_node: vec![source.world; nodes.len()], moves: vec![false; nodes.len()] };
+        let mut walk: Vec<(usize, DAffine3, bool)> =
+            (0..nodes.len()).filter(|i| !is_child[*i]).map(|i| (i, source.world, false)).collect();
+        while let Some((i, above, above_moves)) = walk.pop() {
+            let channels = source.animation.nodes.get(&i);
+            let world = above * local_transform(&nodes[i], channels);
+            // The tracker moves a body, and what is above it does not.
+            let moves = !claim_of.contains_key(&i) && (above_moves || channels.is_some_and(Channels::moves));
+            (all.world_from_node[i], all.moves[i]) = (world, moves);
+            walk.extend(nodes[i].children().map(|child| (child.index(), world, moves)));
+        }
+        all
+    }
+}
+
+impl Gatherer<'_> {
+    /// The meshes with skins, where the joints are. These and not the nodes say where a mesh is.
+    pub(super) fn add_skinned_meshes(&mut self, warnings: &mut Vec<String>) -> Result<(), SceneError> {
+        let Source { document, data, deformations, .. } = *self.source;
+        for (index, group) in std::mem::take(&mut self.skinned) {
+            let Some(node) = document.nodes().nth(index) else { continue };
+            let Some(mesh) = node.mesh().map(|mesh| mesh.index()) else { continue };
+            let Some(skin) = deformations.skin(index, mesh) else { continue };
+            if skin.joints.iter().any(|joint| self.at_rest.moves[*joint]) {
+                let of_file = &document.as_json().meshes[mesh].primitives;
+                self.cancel.check(self.limits)?;
+                let pieces = deformations.rigid_joints(mesh, of_file, data, MAX_PARTS)?;
+                if self.add_pieces((mesh, index), group, skin, pieces.as_ref())? {
+                    continue;
+                }
+                warnings.push(format!(
+                    "node {index} '{}': its skin is shown as its joints lie at rest: only rigid pieces play, on joints of the same body",
+                    node.name().unwrap_or("")
+                ));
+            }
+            let group = Group { part: None, ..group };
+            let body_from_world = group.claim.map_or(DAffine3::IDENTITY, |c| self.rest[c].inverse());
+            let pose = skin.pose(&body_from_world, &self.at_rest.world_from_node);
+            self.add_mesh((mesh, index), group, &DAffine3::IDENTITY, Some(Pose::All(&pose)))?;
+        }
+        Ok(())
+    }
+
+    /// The rigid pieces of a skin, each in the part that its joint moves with. False if there are none, or if a piece belongs to
+    /// another body than the node that shows the skin.
+    fn add_pieces(
+        &mut self,
+        (mesh, node): (usize, usize),
+        group: Group,
+        skin: &Skin,
+        joints: Option<&BTreeSet<usize>>,
+    ) -> Result<bool, SceneError> {
+        let place = |joint: &usize| {
+            let (of_joint, place) = self.places.get(skin.joints.get(*joint)?)?;
+            let piece = Group { part: of_joint.part, ..group };
+            (of_joint.claim == group.claim).then(|| (piece, *joint, *place * skin.bind[*joint]))
+        };
+        let places: Option<Vec<_>> = joints.and_then(|joints| joints.iter().map(place).collect());
+        let Some(places) = places else { return Ok(false) };
+        for (piece, joint, map) in places {
+            self.add_mesh((mesh, node), piece, &DAffine3::IDENTITY, Some(Pose::One(joint, map)))?;
+        }
+        Ok(true)
+    }
+}
