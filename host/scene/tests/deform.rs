@@ -36,7 +36,7 @@ fn volume(scene: &Scene, name: &str) -> f64 {
     for t in &mesh.triangles {
         let [a, b, c] = t.map(at);
         let face = (b - a).cross(c - a).normalize();
-        assert!(t.iter().all(|i| mesh.normals[*i as usize].as_dvec3().dot(face) > 0.9));
+        assert!(t.iter().all(|i| mesh.normals[*i as usize].as_dvec3().dot(face) > 0.999));
     }
     mesh.triangles.iter().map(|t| at(t[0]).dot(at(t[1]).cross(at(t[2])))).sum()
 }
@@ -146,6 +146,29 @@ fn a_skin_on_mirrored_joints_keeps_its_faces_outside() {
     let scene = load(&glb);
     assert!(off(&scene, "static", &truth) < 1e-6, "{}", told(&scene));
     assert!(volume(&scene, "static") > 0.0);
+}
+
+/// Normals of the file turn with the joints, also where these mirror and stretch.
+#[test]
+fn normals_turn_with_the_skin() {
+    let (points, indices) = TETRAHEDRON;
+    let corners: Vec<[f32; 3]> = indices.iter().map(|i| points[*i as usize]).collect();
+    let normal = |face: &[[f32; 3]]| {
+        let [a, b, c] = [face[0], face[1], face[2]].map(glam::Vec3::from_array);
+        (b - a).cross(c - a).normalize().to_array()
+    };
+    let normals: Vec<[f32; 3]> = corners.chunks_exact(3).flat_map(|face| [normal(face); 3]).collect();
+    for scale in [[1.0; 3], [1.0, 3.0, 1.0], [-1.0, 3.0, 1.0]] {
+        let (mut glb, _) = with_skin(scale);
+        let positions = glb.push_numbers("VEC3", corners.as_flattened());
+        let normals = glb.push_numbers("VEC3", normals.as_flattened());
+        let joints = glb.push_bytes("VEC4", &[0; 48]);
+        let shares = glb.push_numbers("VEC4", &[1.0, 0.0, 0.0, 0.0].repeat(12));
+        let attributes =
+            json!({"POSITION": positions, "NORMAL": normals, "JOINTS_0": joints, "WEIGHTS_0": shares});
+        let scene = load(&glb.set("/meshes/1/primitives/0", json!({"attributes": attributes})));
+        assert!(volume(&scene, "static") > 0.0, "{scale:?}");
+    }
 }
 
 /// A skin on a tracked body lies in its space, wherever the joints are in the tree.
@@ -337,8 +360,16 @@ fn a_skin_that_bends_or_spans_bodies_is_at_rest() {
     let mut bent = of_pieces();
     let joints = bent.push_bytes("VEC4", &[[0u8; 4].repeat(3), [1, 0, 0, 0].repeat(5)].concat());
     let bent = bent.set("/meshes/1/primitives/0/attributes/JOINTS_0", json!(joints));
+    // All corners hang on the same joint most of all, and a quarter on the other.
+    let mut shared = of_pieces();
+    let shares = shared.push_numbers("VEC4", &[0.75, 0.25, 0.0, 0.0].repeat(8));
+    let joints = shared.push_bytes("VEC4", &[0, 1, 0, 0].repeat(8));
+    let attributes = "/meshes/1/primitives/0/attributes";
+    let shared = shared
+        .set(&format!("{attributes}/WEIGHTS_0"), json!(shares))
+        .set(&format!("{attributes}/JOINTS_0"), json!(joints));
     let astray = of_pieces().set("/nodes/0/children", json!([2])).set("/scenes/0/nodes", json!([0, 1]));
-    for (glb, what) in [(bent, "bends"), (astray, "joints of a tracked body")] {
+    for (glb, what) in [(bent, "bends"), (shared, "shares"), (astray, "joints of a tracked body")] {
         let scene = load(&glb);
         assert!(told(&scene).contains("node 1 'right': its skin is shown as its joints lie"), "{what}");
         assert!(scene.bodies.iter().all(|b| b.motion.is_none()), "{what}");
