@@ -478,9 +478,14 @@ impl Laws {
         if self.is_frozen() || at - self.clock_moved_at < 4 * S || at - self.thawed_at < DARK_AT_LAST_NS {
             return;
         }
-        let predict_ns = self.predict_ns.unwrap_or(sent.predict_ns).max(3 * self.slot_ns);
+        let predict_ns = self.predict_ns.unwrap_or(sent.predict_ns);
         let held = at - lag - sent.due_at;
-        let allowed = predict_ns + 4 * self.stride_ns + 2 * self.slot_ns + 5 * MS;
+        // `dark from`: three slots after its own, or until its poses are older than prediction reaches and a slot. Where nothing
+        // ages, prediction's reach after its own slots.
+        let fresh = sent
+            .captured_at
+            .map_or(predict_ns, |captured_at| captured_at + predict_ns + self.slot_ns - sent.due_at);
+        let allowed = fresh.max(3 * self.slot_ns) + self.stride_ns + 2 * self.slot_ns + 5 * MS;
         if held > allowed {
             let frame = sent.frame;
             self.fail(
