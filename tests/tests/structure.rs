@@ -248,7 +248,7 @@ fn a_circle_is_found_and_a_diamond_is_none() {
     assert_eq!(found, Some(vec!["b".into(), "c".into()]));
 }
 
-/// A program that has another name now would run alone, and nobody would see why the tests take longer.
+/// A program that has another name now would run in the lane `single`, and nobody would see why the tests take longer.
 #[test]
 fn lanes_name_programs_that_exist() {
     let lanes = std::fs::read_to_string(root().join("tests/lanes")).unwrap();

@@ -5,7 +5,7 @@ use crate::config::{
     BodyConfig, BuiltinScene, EnvironmentConfig, FileAxis, GazeConfig, ProjectorBackend, RigConfig,
     TrackerConfig, TracksUse,
 };
-use crate::drive::{albedo_of, drive, DriveError};
+use crate::drive::{albedo_of, drive, DriveError, MAX_PICTURE_BYTES};
 use crate::mock::{Motion, MotionError, MotionSpec};
 use dpm_device::planes::{PlaneSchedule, Raster};
 use dpm_device::pose::Pose;
@@ -335,7 +335,7 @@ fn show_pictures(config: &RigConfig, scene: &mut Scene) -> Result<(), RigError> 
         let Some(file) = &body.texture else { continue };
         let wrong =
             |message: String| RigError::Picture { name: body.name.clone(), file: file.clone(), message };
-        let bytes = regular_file::read(file, limits.bytes).map_err(|e| wrong(e.to_string()))?;
+        let bytes = regular_file::read(file, MAX_PICTURE_BYTES).map_err(|e| wrong(e.to_string()))?;
         scene.show_picture(index as u16, bytes, &limits).map_err(|e| wrong(e.to_string()))?;
     }
     Ok(())

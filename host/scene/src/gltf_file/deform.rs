@@ -3,7 +3,7 @@
 //!
 //! A target or a skin that is broken is no reason to refuse a scene: its mesh is shown without it, and that is told.
 
-use std::collections::{BTreeSet, HashMap};
+use std::collections::{BTreeMap, HashMap};
 
 use glam::{DAffine3, DMat3, DMat4, DVec3, Vec3};
 
@@ -126,28 +126,34 @@ impl Deformations {
         self.meshes[mesh].primitives.iter().all(|p| !p.influences.is_empty()).then_some(skin)
     }
 
-    /// The joints of a mesh's skin on which its faces hang, if each face hangs on one alone; at most `most`. The mesh then is
-    /// made of rigid pieces.
+    /// The faces of a mesh by the joint of its skin on which each hangs, if each hangs on one alone, and these are at most
+    /// `most`. The mesh then is made of rigid pieces.
     ///
     /// # Errors
     /// A face is broken.
-    pub(crate) fn rigid_joints(
+    pub(crate) fn rigid_pieces(
         &self,
         mesh: usize,
         of_file: &[gltf::json::mesh::Primitive],
         data: &Data,
         most: usize,
-    ) -> Result<Option<BTreeSet<usize>>, SceneError> {
-        let mut joints = BTreeSet::new();
-        for (primitive, read) in of_file.iter().zip(&self.meshes[mesh].primitives) {
+    ) -> Result<Option<BTreeMap<usize, Piece>>, SceneError> {
+        let mut pieces: BTreeMap<usize, Piece> = BTreeMap::new();
+        for (number, primitive) in of_file.iter().enumerate() {
+            let influences = &self.meshes[mesh].primitives[number].influences;
             for face in faces(primitive, data)?.into_iter().flatten() {
-                match only_joint_of(&read.influences, data, &face) {
-                    Some(joint) if joints.len() < most || joints.contains(&joint) => joints.insert(joint),
-                    _ => return Ok(None),
-                };
+                let Some(joint) = only_joint_of(influences, data, &face) else { return Ok(None) };
+                let piece = pieces.entry(joint).or_default();
+                match piece.last_mut() {
+                    Some((last, faces)) if *last == number => faces.push(face),
+                    _ => piece.push((number, vec![face])),
+                }
+                if pieces.len() > most {
+                    return Ok(None);
+                }
             }
         }
-        Ok(Some(joints))
+        Ok(Some(pieces))
     }
 
     /// What deforms a primitive of `mesh` at a node. `pose` is that of its skin.
@@ -276,13 +282,16 @@ fn read_skin(skin: &Item, data: &Data, nodes: usize) -> Result<Skin, SceneError>
     Ok(Skin { joints, bind })
 }
 
+/// A rigid piece of a skin: its faces by primitive, in order.
+pub(crate) type Piece = Vec<(usize, Vec<[u64; 3]>)>;
+
 /// Where the joints of a skin are.
 #[derive(Clone, Copy, Debug)]
 pub(crate) enum Pose<'a> {
     /// Body-from-mesh of each joint.
     All(&'a [DAffine3]),
-    /// A rigid piece: the number of the joint on which it hangs, and body-from-mesh.
-    One(usize, DAffine3),
+    /// These faces alone, which hang on one joint: body-from-mesh.
+    One(&'a [[u64; 3]], DAffine3),
 }
 
 /// What deforms a primitive at a node.
@@ -296,11 +305,11 @@ pub(crate) struct Deformation<'a> {
 }
 
 impl Deformation<'_> {
-    /// Whether a face is part of what is shown.
-    pub(super) fn shows(&self, data: &Data, face: &[u64; 3]) -> bool {
+    /// The faces that are shown, if they are not all of the primitive's.
+    pub(super) fn faces(&self) -> Option<&[[u64; 3]]> {
         match self.pose {
-            Some(Pose::One(joint, _)) => only_joint_of(self.influences, data, face) == Some(joint),
-            _ => true,
+            Some(Pose::One(faces, _)) => Some(faces),
+            _ => None,
         }
     }
 

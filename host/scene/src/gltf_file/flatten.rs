@@ -446,7 +446,7 @@ impl<'a> Gatherer<'a> {
         Ok((self.parts.len() - 1, DAffine3::from_scale(own_scale * scale)))
     }
 
-    /// All primitives of a mesh of a node, at each place of the node's instances. `pose` is that of its skin.
+    /// All primitives of a mesh of a node. `pose` is that of its skin.
     fn add_mesh(
         &mut self,
         (mesh, node): (usize, usize),
@@ -454,28 +454,37 @@ impl<'a> Gatherer<'a> {
         body_from_node: &DAffine3,
         pose: Option<Pose<'_>>,
     ) -> Result<(), SceneError> {
+        let count = self.source.document.as_json().meshes[mesh].primitives.len();
+        (0..count)
+            .try_for_each(|number| self.add_primitive((mesh, node, number), group, body_from_node, pose))
+    }
+
+    /// A primitive of a mesh of a node, at each place of the node's instances.
+    fn add_primitive(
+        &mut self,
+        (mesh, node, number): (usize, usize, usize),
+        group: Group,
+        body_from_node: &DAffine3,
+        pose: Option<Pose<'_>>,
+    ) -> Result<(), SceneError> {
+        self.cancel.check(self.limits)?;
         let Source { document, data, look, instances, deformations, .. } = *self.source;
+        let primitive = &document.as_json().meshes[mesh].primitives[number];
+        let material = primitive.material.map_or(look.materials.len() - 1, |m| m.value());
+        let look = (material as u32, look.uv_sets[material]);
+        let deformation = deformations.of((node, mesh, number), pose);
+        let stop = (self.cancel, self.limits);
+        let read = read_primitive(primitive, data, look, &deformation, &mut self.paint, stop)?;
+        let Some((part, lost)) = read else { return Ok(()) };
         let into = self.meshes.entry(group).or_default();
         let here = [DAffine3::IDENTITY];
-        let places = instances.get(&node).map_or(&here[..], Vec::as_slice);
-        for (number, primitive) in document.as_json().meshes[mesh].primitives.iter().enumerate() {
+        for place in instances.get(&node).map_or(&here[..], Vec::as_slice) {
             self.cancel.check(self.limits)?;
-            let material = primitive.material.map_or(look.materials.len() - 1, |m| m.value());
-            let uv_set = look.uv_sets[material];
-            let deformation = deformations.of((node, mesh, number), pose);
-            let stop = (self.cancel, self.limits);
-            let painted = &mut self.paint;
-            let read =
-                read_primitive(primitive, data, (material as u32, uv_set), &deformation, painted, stop)?;
-            let Some((part, lost)) = read else { continue };
-            for place in places {
-                self.cancel.check(self.limits)?;
-                self.dropped.add(lost);
-                // An instance may be scaled to zero, to hide it.
-                let body_from_instance = *body_from_node * *place;
-                if is_invertible(&body_from_instance) {
-                    into.append_transformed(&part, &body_from_instance);
-                }
+            self.dropped.add(lost);
+            // An instance may be scaled to zero, to hide it.
+            let body_from_instance = *body_from_node * *place;
+            if is_invertible(&body_from_instance) {
+                into.append_transformed(&part, &body_from_instance);
             }
         }
         Ok(())

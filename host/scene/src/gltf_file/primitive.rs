@@ -25,8 +25,11 @@ pub(crate) fn read_primitive(
 ) -> Result<Option<(TriangleMesh, Dropped)>, SceneError> {
     let attribute = |semantic: Semantic| accessor_of(primitive, data, semantic);
     let Some(positions) = attribute(Semantic::Positions) else { return Ok(None) };
-    let Some(mut faces) = faces(primitive, data)? else { return Ok(None) };
-    faces.retain(|face| deformation.shows(data, face));
+    let all = match deformation.faces() {
+        Some(some) => Some(some.to_vec()),
+        None => faces(primitive, data)?,
+    };
+    let Some(faces) = all else { return Ok(None) };
     let colours = attribute(Semantic::Colors(0));
     let painted = match colours {
         Some(a) => paint.faces(&faces, material, |i| Vec3::from(data.floats::<3>(a, i)))?,

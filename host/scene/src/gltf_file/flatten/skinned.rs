@@ -1,12 +1,12 @@
 //! Meshes with skins: where their joints are at rest, or as rigid pieces in the parts that move with the joints.
 
-use std::collections::{BTreeSet, HashMap};
+use std::collections::{BTreeMap, HashMap};
 
 use glam::DAffine3;
 
 use super::super::super::SceneError;
 use super::super::animation::Channels;
-use super::super::deform::{Pose, Skin};
+use super::super::deform::{Piece, Pose, Skin};
 use super::{local_transform, Gatherer, Group, Source, MAX_PARTS};
 
 /// All nodes while nothing plays.
@@ -49,7 +49,7 @@ impl Gatherer<'_> {
             if skin.joints.iter().any(|joint| self.at_rest.moves[*joint]) {
                 let of_file = &document.as_json().meshes[mesh].primitives;
                 self.cancel.check(self.limits)?;
-                let pieces = deformations.rigid_joints(mesh, of_file, data, MAX_PARTS)?;
+                let pieces = deformations.rigid_pieces(mesh, of_file, data, MAX_PARTS)?;
                 if self.add_pieces((mesh, index), group, skin, pieces.as_ref())? {
                     continue;
                 }
@@ -73,17 +73,21 @@ impl Gatherer<'_> {
         (mesh, node): (usize, usize),
         group: Group,
         skin: &Skin,
-        joints: Option<&BTreeSet<usize>>,
+        pieces: Option<&BTreeMap<usize, Piece>>,
     ) -> Result<bool, SceneError> {
-        let place = |joint: &usize| {
+        let place = |(joint, piece): (&usize, _)| {
             let (of_joint, place) = self.places.get(skin.joints.get(*joint)?)?;
-            let piece = Group { part: of_joint.part, ..group };
-            (of_joint.claim == group.claim).then(|| (piece, *joint, *place * skin.bind[*joint]))
+            let of_piece = Group { part: of_joint.part, ..group };
+            (of_joint.claim == group.claim).then(|| (of_piece, piece, *place * skin.bind[*joint]))
         };
-        let places: Option<Vec<_>> = joints.and_then(|joints| joints.iter().map(place).collect());
-        let Some(places) = places else { return Ok(false) };
-        for (piece, joint, map) in places {
-            self.add_mesh((mesh, node), piece, &DAffine3::IDENTITY, Some(Pose::One(joint, map)))?;
+        let placed: Option<Vec<(Group, &Piece, DAffine3)>> =
+            pieces.and_then(|pieces| pieces.iter().map(place).collect());
+        let Some(placed) = placed else { return Ok(false) };
+        for (of_piece, piece, map) in placed {
+            for (number, faces) in piece {
+                let pose = Some(Pose::One(faces, map));
+                self.add_primitive((mesh, node, *number), of_piece, &DAffine3::IDENTITY, pose)?;
+            }
         }
         Ok(true)
     }
