@@ -18,7 +18,7 @@ pub(crate) use albedo::albedo_of;
 
 /// Largest table of a response, bytes.
 const MAX_TABLE_BYTES: u64 = 1 << 20;
-/// Largest picture of a flat field or of an albedo, bytes.
+/// Largest picture of a flat field, of an albedo or on a body, bytes.
 pub(crate) const MAX_PICTURE_BYTES: u64 = 256 << 20;
 /// Pixels darker than this share of the brightest cannot be compensated.
 const LEAST_BRIGHTNESS: f32 = 0.02;

@@ -477,9 +477,12 @@ mod tests {
     #[test]
     fn a_picture_is_shown_on_its_body_and_named_where_it_is_wrong() {
         let file = std::env::temp_dir().join(format!("dpm-texture-{}.png", std::process::id()));
-        std::fs::write(&file, b"no picture").unwrap();
         let flags = vec![format!("scene.bodies.1.texture=\"{}\"", file.display())];
-        let config = RigConfig::demo(&Overrides { variables: vec![], flags }).unwrap();
+        let demo = || RigConfig::demo(&Overrides { variables: vec![], flags: flags.clone() });
+        let missing = demo().err().unwrap().to_string();
+        assert!(missing.contains("scene.bodies.1.texture"), "{missing}");
+        std::fs::write(&file, b"no picture").unwrap();
+        let config = demo().unwrap();
         let build = || Rig::build(&config, Raster::new(8, 8));
         let told = build().err().unwrap().to_string();
         assert!(told.contains("body \"venus\"") && told.contains(&*file.to_string_lossy()), "{told}");
