@@ -185,6 +185,8 @@ fn what_once_broke_a_law_with_another_tracker_keeps_them_all() {
         (58, Vrpn, 6),
         // Two frames, each less than a second late on the GPU, one behind the other: nobody was told why it was dark.
         (110_000_292, Serial, 60),
+        // The law forgot that a pose is predicted on from the first photon to the middle of a long exposure.
+        (900_000_457, Serial, 53),
     ];
     for (seed, tracker, seconds) in found {
         let lived = lived(&Order { serial: None, tracker: Some(tracker), ..order(seed, None, seconds) });
