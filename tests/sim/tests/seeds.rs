@@ -187,6 +187,8 @@ fn what_once_broke_a_law_with_another_tracker_keeps_them_all() {
         (110_000_292, Serial, 60),
         // The law forgot that a pose is predicted on from the first photon to the middle of a long exposure.
         (900_000_457, Serial, 53),
+        // A stall of 4 ms, in the first 24 ms of peace that were judged as if they were a second of it.
+        (900_000_351, Serial, 47),
     ];
     for (seed, tracker, seconds) in found {
         let lived = lived(&Order { serial: None, tracker: Some(tracker), ..order(seed, None, seconds) });
