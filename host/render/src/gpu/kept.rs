@@ -11,9 +11,9 @@ use dpm_handoff::path::Lock;
 use std::collections::VecDeque;
 use std::sync::{MutexGuard, PoisonError};
 
-/// Most pipelines that are kept while nobody uses them: those of some two renderers. On software Vulkan a large one holds
-/// 10 MB.
-const MOST_KEPT: usize = 32;
+/// Most pipelines that are kept while nobody uses them: those of some six renderers, as a comparison of methods makes them
+/// in turn. A rig makes few and never reaches it. On software Vulkan a large one holds 10 MB.
+const MOST_KEPT: usize = 96;
 
 /// What a pipeline was compiled from.
 #[derive(Clone, Debug, PartialEq, Eq)]

@@ -336,8 +336,11 @@ fn better_place(bvh: &Bvh2, node: usize, stack: &mut Vec<(f32, u32)>, work: &mut
             }
             if !there.is_leaf() {
                 let below = rest + there.aabb().half_area();
-                stack.push((below, there.first_index));
-                stack.push((below, there.first_index + 1));
+                // What is below may gain no more than this; most of what would be stacked is left out here.
+                if below - own_area > best.gain {
+                    stack.push((below, there.first_index));
+                    stack.push((below, there.first_index + 1));
+                }
             }
         }
         if pivot != parent {
