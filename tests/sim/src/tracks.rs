@@ -3,7 +3,7 @@
 
 use crate::follow::{expected, moved, Expected, Memory, Present, Shift};
 use crate::machine::Sent;
-use crate::plan::Setup;
+use crate::plan::{Setup, TrackerSetup};
 use dpm_device::link::{DeviceState, Region, TrackCounts, Tracks};
 use dpm_device::projector::SlotMoves;
 use dpm_device::rng::Draws;
@@ -25,7 +25,8 @@ const FRESH_NS: i64 = 20 * MS;
 /// By how much farther from the body the light of one plane may be than without tracks, mirrors: half a mirror by rounding, and
 /// a filter that follows faster has more noise. The most that was seen in lawful lives is 1.3.
 const WORSE: f64 = 2.0;
-/// The same where a turn is over within a sample of the tracker, so that what is foretold goes on for a while: 2.2 was seen.
+/// The same where a turn is over before any sample of it can arrive, so that what is foretold goes on for a while: 2.2 was
+/// seen.
 const WORSE_TURN: f64 = 3.0;
 /// Poses of this age tell where the body is even while it turns, seconds.
 const FRESH_S: f64 = 0.03;
@@ -133,6 +134,12 @@ impl TrackLaws {
         let plane_ns = S / i64::from(setup.rate_hz) / rig.schedule.len() as i64;
         // From 0.3 m/s to 0.3 m/s the other way.
         let turn_s = 0.6 / setup.motion.acceleration();
+        // A sample comes once a period, and an adapter may hold it back.
+        let held_ns = match &setup.tracker {
+            TrackerSetup::Serial(line) => line.timer_ns,
+            _ => 0,
+        };
+        let unheard_s = 1.0 / f64::from(setup.tracker_hz) + held_ns as f64 * 1e-9;
         Ok(Self {
             rig: rig.clone(),
             motion: setup.motion.of(1.0)?,
@@ -146,7 +153,7 @@ impl TrackLaws {
             greatest_age: None,
             is_clean: false,
             windows: [Window::default(); 11],
-            worse: if turn_s * f64::from(setup.tracker_hz) < 1.0 { WORSE_TURN } else { WORSE },
+            worse: if turn_s < unheard_s { WORSE_TURN } else { WORSE },
             usual_age_ns: plane_ns / 2 + setup.travel_ns + 3 * MS / 2,
             few_slots: u64::from(setup.rate_hz) / 2,
             window: 0,

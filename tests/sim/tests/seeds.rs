@@ -189,6 +189,8 @@ fn what_once_broke_a_law_with_another_tracker_keeps_them_all() {
         (900_000_457, Serial, 53),
         // A stall of 4 ms, in the first 24 ms of peace that were judged as if they were a second of it.
         (900_000_351, Serial, 47),
+        // A turn that was over before the adapter handed on any sample of it: a bound that was too narrow.
+        (1_010_000_710, Serial, 7),
     ];
     for (seed, tracker, seconds) in found {
         let lived = lived(&Order { serial: None, tracker: Some(tracker), ..order(seed, None, seconds) });
