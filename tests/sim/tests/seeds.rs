@@ -55,6 +55,9 @@ fn what_once_broke_a_law_keeps_them_all() {
         (5_004_738, None, 21),
         // A frame that was sent 0.07 ms before the next slot began, and was counted as one that arrives in time.
         (5_007_078, None, 42),
+        // The program was stopped for two seconds, took the server for silent and forgot its clock, and dated the pose that had
+        // waited in its socket as new.
+        (108_383_129_337_383, None, 43),
     ];
     for (seed, rate_hz, seconds) in found {
         // They were found before there were tracks and serial lines; without them, a seed still describes the same life.

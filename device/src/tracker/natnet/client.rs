@@ -317,9 +317,11 @@ impl NatNetClient {
         let _ = self.command.send(&self.out, to);
     }
 
-    fn housekeeping(&mut self, now: HostTime) {
+    fn housekeeping(&mut self, now: HostTime, was_away: bool) {
         let port = self.config.command_port;
-        if self.heard_at.is_some_and(|h| now.ns_since(h) > SILENCE_NS) && self.server.is_some() {
+        let is_silent = self.heard_at.is_some_and(|h| now.ns_since(h) > SILENCE_NS);
+        // Who did not listen has heard nothing. What waits in the sockets is read first, by the clock that dates it.
+        if is_silent && !was_away && self.server.is_some() {
             self.forget_server(now);
         }
         // A server that answers but sends no frames may have restarted and lost this client.
@@ -634,10 +636,10 @@ enum Verdict {
 
 impl Tracker for NatNetClient {
     fn poll(&mut self, now: HostTime, sink: &mut dyn FnMut(&TrackerSample)) -> Result<usize, TrackerError> {
-        self.housekeeping(now);
         // What arrived while nobody read has an unknown arrival, unless the kernel stamped it.
         let was_away = self.polled_at.is_some_and(|at| now.ns_since(at) > AWAY_NS);
         self.polled_at = Some(now);
+        self.housekeeping(now, was_away);
         let foreign = |c: &TrackerCounters| (c.packets.foreign_source, c.packets.foreign_port);
         let before = foreign(self.gate.counters());
         let (mut delivered, mut budget, mut offset) = (0, Self::MAX_DATAGRAMS_PER_POLL, None);
