@@ -455,6 +455,10 @@ impl World {
                 continue;
             }
             if transfer.lane == Lane::Control {
+                if self.process.is_none() {
+                    // It was on its way when the program died, and feeds the watchdog once more.
+                    self.laws.heard_of_the_dead(self.t);
+                }
                 self.hear(&transfer.bytes, transfer.cut);
             }
             self.projector.receive(HostTime(self.t), transfer.lane, &transfer.bytes);
@@ -729,6 +733,9 @@ impl World {
             (beneath.crew_ready_at, beneath.crews)
         };
         let lag = self.lag.load(Ordering::Relaxed);
+        // A trap may go off late, in a stage that had nothing to do while the GPU hung: then a start is still to come.
+        let ends_late = self.restart_at != i64::MAX && self.restart_at - RESTART_NS - self.calm_since < S;
+        let start_ready = if ends_late { self.restart_at + 300 * MS } else { 0 };
         let longest = lock(&self.cable).longest;
         let is_frozen = self.t < self.frozen_until;
         if let Some(tracks) = &mut self.tracks {
@@ -741,7 +748,7 @@ impl World {
             self.t,
             calm_for,
             self.process.as_mut(),
-            (crew_ready + lag, crews),
+            ((crew_ready + lag).max(start_ready), crews),
             longest,
             is_frozen,
         );

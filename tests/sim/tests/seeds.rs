@@ -58,6 +58,8 @@ fn what_once_broke_a_law_keeps_them_all() {
         // The program was stopped for two seconds, took the server for silent and forgot its clock, and dated the pose that had
         // waited in its socket as new.
         (108_383_129_337_383, None, 43),
+        // A stage had nothing to do while the GPU hung, and panicked only after that: the start that followed was not expected.
+        (266_830_906_161_053, None, 28),
     ];
     for (seed, rate_hz, seconds) in found {
         // They were found before there were tracks and serial lines; without them, a seed still describes the same life.
@@ -133,14 +135,17 @@ fn what_once_broke_a_law_on_a_serial_line_keeps_them_all() {
 #[test]
 fn what_once_broke_a_law_with_chosen_kinds_keeps_them_all() {
     use Kind::{T18, U3, U4, X10, X11, X12, X13, X14, X15, X16, X8, X9};
-    let found: [(u64, i64, &[Kind]); 2] = [
+    let found: [(u64, i64, &[Kind], Option<bool>); 3] = [
         // The control lane was slow one way while the link came up: the projector's clock was 15 ms off, and so was light.
-        (420_002_689, 60, &[T18, X8, X9, X10, X11, X12, X13, X14, X15, X16]),
+        (420_002_689, 60, &[T18, X8, X9, X10, X11, X12, X13, X14, X15, X16], None),
         // The cable held a frame up for 20 ms that was on it already, and the projector lit it as soon as it came.
-        (211_121_319_849_707, 24, &[X8, X9, X10, X11, U3, U4]),
+        (211_121_319_849_707, 24, &[X8, X9, X10, X11, U3, U4], None),
+        // An ECHO was 20 ms on its way when the program was killed, and fed the watchdog after that: the simulator's mistake.
+        (1_040_000_200, 6, &[X8], Some(true)),
     ];
-    for (seed, seconds, first) in found {
+    for (seed, seconds, first, follows) in found {
         let lived = lived(&Order {
+            follows,
             serial: None,
             tracker: None,
             first: first.to_vec(),
