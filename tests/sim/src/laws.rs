@@ -25,6 +25,8 @@ const REMEMBERED: usize = 1024;
 const DARK_WITHIN_NS: i64 = 50 * MS;
 /// ... and within this time otherwise: the watchdog has done it by then.
 const DARK_AT_LAST_NS: i64 = 300 * MS;
+/// A program that starts finds its devices within this time.
+pub(crate) const BEGINS_WITHIN_NS: i64 = 300 * MS;
 /// Light returns within this time after all causes are gone.
 const LIT_WITHIN_NS: i64 = S;
 /// The body's greatest speed, metres a second.
@@ -661,7 +663,7 @@ impl Laws {
         let calm_since = t - calm_for;
         // What the law does not count: the GPU's own time, the service manager's second, a rest after flashes.
         let begin = calm_since.max(crew_ready).max(self.rested_until + 2 * S);
-        let begin = begin.max(self.started_at + 300 * MS).max(self.hidden_until);
+        let begin = begin.max(self.started_at + BEGINS_WITHIN_NS).max(self.hidden_until);
         let slow = 4 * self.stride_ns + 12 * self.slot_ns;
         let late = t - begin;
         self.slowest_return_ns = self.slowest_return_ns.max(late);

@@ -3,7 +3,7 @@
 use crate::cable::{lock, Cable};
 use crate::disk::Disk;
 use crate::kinds::{Kind, State};
-use crate::laws::Laws;
+use crate::laws::{Laws, BEGINS_WITHIN_NS};
 use crate::line::SerialLine;
 use crate::machine::{Beneath, SimMachine};
 use crate::net::{Net, ServerKind};
@@ -735,7 +735,7 @@ impl World {
         let lag = self.lag.load(Ordering::Relaxed);
         // A trap may go off late, in a stage that had nothing to do while the GPU hung: then a start is still to come.
         let ends_late = self.restart_at != i64::MAX && self.restart_at - RESTART_NS - self.calm_since < S;
-        let start_ready = if ends_late { self.restart_at + 300 * MS } else { 0 };
+        let start_ready = if ends_late { self.restart_at + BEGINS_WITHIN_NS } else { 0 };
         let longest = lock(&self.cable).longest;
         let is_frozen = self.t < self.frozen_until;
         if let Some(tracks) = &mut self.tracks {
