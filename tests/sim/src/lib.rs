@@ -11,6 +11,7 @@ pub mod disk;
 mod far;
 pub mod follow;
 pub mod kinds;
+mod lag;
 pub mod laws;
 pub mod life;
 pub mod line;

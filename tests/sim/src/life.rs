@@ -54,6 +54,8 @@ pub struct Lived {
     pub story: Vec<String>,
     /// The worst age of a pose, in thousandths of what is allowed.
     pub worst_age_milli: i64,
+    /// See [`Laws::worst_lag_milli`](crate::laws::Laws::worst_lag_milli).
+    pub worst_lag_milli: i64,
     /// The longest time from calm to light, nanoseconds.
     pub slowest_return_ns: i64,
     /// Planes of which tracks moved light, and how far it was from the body.
@@ -107,6 +109,7 @@ pub fn live(order: &Order) -> Result<Lived, String> {
         events: world.events,
         story: world.story.into(),
         worst_age_milli: world.laws.worst_age_milli,
+        worst_lag_milli: world.laws.worst_lag_milli,
         slowest_return_ns: world.laws.slowest_return_ns,
         planes_moved: world.tracks.as_ref().map_or(0, |tracks| tracks.planes_moved),
         placed: world.tracks.as_ref().map_or(Placed::default(), |tracks| tracks.placed),

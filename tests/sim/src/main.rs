@@ -155,6 +155,7 @@ struct Sum {
     failures: Vec<String>,
     by_rate: BTreeMap<u32, (i64, f64, u64)>,
     worst_age_milli: i64,
+    worst_lag_milli: i64,
     slowest_return_ns: i64,
     lives: u64,
     following: u64,
@@ -228,6 +229,7 @@ fn run() -> Result<bool, String> {
         sum.length_ns += lived.length_ns;
         sum.table.add(&lived.table);
         sum.worst_age_milli = sum.worst_age_milli.max(lived.worst_age_milli);
+        sum.worst_lag_milli = sum.worst_lag_milli.max(lived.worst_lag_milli);
         sum.slowest_return_ns = sum.slowest_return_ns.max(lived.slowest_return_ns);
         sum.lives += 1;
         sum.following += u64::from(lived.setup.follows);
@@ -269,8 +271,8 @@ fn run() -> Result<bool, String> {
     let hours = sum.length_ns as f64 / 3.6e12;
     let below = sum.table.cells_below(1000);
     println!(
-        "{hours:.2} h in {} lives ({} on serial lines; trackers: {} serial, {} VRPN), {} faults, {} laws broken; cells below 1000: {below}; oldest pose {:.0} % of what is \
-         allowed; slowest return of light {:.2} s; {:.0} s of real time",
+        "{hours:.2} h in {} lives ({} on serial lines; trackers: {} serial, {} VRPN), {} faults, {} laws broken; cells below 1000: {below}; of what is allowed: \
+         oldest pose {:.0} %, lag of a second {:.0} %; slowest return of light {:.2} s; {:.0} s of real time",
         sum.lives,
         sum.on_lines,
         sum.other_trackers[0],
@@ -278,6 +280,7 @@ fn run() -> Result<bool, String> {
         sum.table.total(),
         sum.failures.len(),
         sum.worst_age_milli as f64 / 10.0,
+        sum.worst_lag_milli as f64 / 10.0,
         sum.slowest_return_ns as f64 * 1e-9,
         begin.elapsed().as_secs_f64()
     );
