@@ -178,6 +178,7 @@ impl HostLink {
         let shown = match self.ordered {
             None => Shown::New(planes),
             Some(Verb::Freeze) => Shown::Same,
+            Some(Verb::Black) => Shown::Dark,
             Some(_) => Shown::Nothing,
         };
         let (rest_us, reason) = match self.field.slot(&slots, [target_at, dark_from], shown) {
