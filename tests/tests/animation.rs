@@ -1,13 +1,13 @@
 //! Parts that move by themselves, through the whole rig: each frame shows them where they are at the centre of its light, and
 //! each group of planes where they are at its own instant.
 
-use dpm_lab::sequence::draw;
+use dpm_lab::sequence::{draw, Placed};
 use dpm_render::Renderer;
 use dpm_rig::pipeline::renderer_settings;
 use dpm_rig::rig::Rig;
 use dpm_tests::gpu::with_gpu;
 use dpm_tests::rigs::{demo_rig, run};
-use glam::{DAffine3, DVec3};
+use glam::DVec3;
 use serde_json::json;
 use std::path::PathBuf;
 use std::sync::Arc;
@@ -102,16 +102,16 @@ fn the_light_is_that_of_the_part_at_the_centre_of_each_frames_light() {
         assert_eq!((outcome.light_mismatches, outcome.light.len()), (0, 20));
         let mut renderer = Renderer::new(gpu, &rig.scene, renderer_settings(&rig)).unwrap();
         let mut slot = renderer.create_slot(false).unwrap();
-        let (mut poses, mut lit) = (Vec::new(), 0);
+        let (mut bodies, mut lit) = (Placed::default(), 0);
         for (light, record) in outcome.light.iter().zip(&outcome.recent) {
-            rig.scene_poses(&record.tracked_poses, record.drawn_for.0, &mut poses);
-            let at = (record.tracked_poses[0].inverse() * poses[slide]).translation;
+            rig.scene_poses(&record.tracked_poses, record.drawn_for.0, &mut bodies.poses);
+            let at = (record.tracked_poses[0].inverse() * bodies[slide]).translation;
             assert!(at.distance(truth(record.drawn_for.0)) < 1e-6, "{at} {}", truth(record.drawn_for.0));
             // What was planned is what came.
             let centre = record.timeline.centre_at.expect("it was lit");
             assert!(centre.ns_since(record.drawn_for).abs() < 1_000, "{centre:?} {:?}", record.drawn_for);
-            let mut drawn = |poses: &[DAffine3]| {
-                draw(&rig, &mut renderer, &mut slot, poses, light.frame, rig.config.render.spp as f32)
+            let mut drawn = |bodies: &Placed| {
+                draw(&rig, &mut renderer, &mut slot, bodies, light.frame, rig.config.render.spp as f32)
                     .unwrap();
                 let fell = slot.codes().iter().zip(&light.codes);
                 fell.filter(|(code, fell)| {
@@ -119,11 +119,11 @@ fn the_light_is_that_of_the_part_at_the_centre_of_each_frames_light() {
                 })
                 .count()
             };
-            assert_eq!(drawn(&poses), 0, "frame {}", light.frame);
+            assert_eq!(drawn(&bodies), 0, "frame {}", light.frame);
             lit += light.codes.iter().filter(|code| **code != [0; 3]).count();
             // A frame later the part is elsewhere, and so would be its light.
-            poses[slide].translation += DVec3::new(SPEED / 947.0 * 20.0, 0.0, 0.0);
-            assert!(drawn(&poses) > 20);
+            bodies.poses[slide].translation += DVec3::new(SPEED / 947.0 * 20.0, 0.0, 0.0);
+            assert!(drawn(&bodies) > 20);
         }
         assert!(lit > 20 * 200, "{lit}");
     });

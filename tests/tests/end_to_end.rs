@@ -4,7 +4,7 @@
 use dpm_device::planes::{Channel, PlaneSpec};
 use dpm_device::time::HostTime;
 use dpm_lab::error::planes::{centre_of, middle_of};
-use dpm_lab::sequence::draw;
+use dpm_lab::sequence::{draw, Placed};
 use dpm_render::Renderer;
 use dpm_rig::light::recorder::LightFrame;
 use dpm_rig::pipeline::{self, renderer_settings, RunOptions};
@@ -37,14 +37,14 @@ fn the_light_is_the_rendered_picture_in_all_24_planes() {
         let mut renderer = Renderer::new(gpu, &rig.scene, renderer_settings(&rig)).unwrap();
         let mut slot = renderer.create_slot(false).unwrap();
         assert_eq!((outcome.light.len(), outcome.recent.len()), (12, 12));
-        let mut poses = Vec::new();
+        let mut bodies = Placed::default();
         let (mut lit_pixels, mut levels) = (0, [[false; 256]; 3]);
         for (light, record) in outcome.light.iter().zip(&outcome.recent) {
             assert_eq!(light.frame, record.id.0 as u32);
-            rig.scene_poses(&record.tracked_poses, 0, &mut poses);
+            rig.scene_poses(&record.tracked_poses, 0, &mut bodies.poses);
             assert_eq!(rig.observer.eye_and_gaze(&record.tracked_poses).0, record.eye);
             let spp = rig.config.render.spp;
-            draw(&rig, &mut renderer, &mut slot, &poses, light.frame, spp as f32).unwrap();
+            draw(&rig, &mut renderer, &mut slot, &bodies, light.frame, spp as f32).unwrap();
             for (i, (code, fell)) in slot.codes().iter().zip(&light.codes).enumerate() {
                 let rendered = [*code as u8, (*code >> 8) as u8, (*code >> 16) as u8];
                 assert_eq!(rendered, *fell, "frame {} pixel {i}", light.frame);

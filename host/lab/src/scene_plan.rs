@@ -192,7 +192,7 @@ pub(crate) fn method_entries(method: &Method, full: &Method, word: &str) -> Vec<
 
 fn rig_entries(rig: &Rig) -> Vec<PlanEntry> {
     let config = &rig.config;
-    let resting = rig.scene.bodies.iter().filter(|b| b.tracked.is_none() && b.motion.is_none()).count();
+    let resting = rig.scene.bodies.iter().filter(|b| b.tracked.is_none() && b.is_whole()).count();
     let planes = rig.schedule.len();
     let mono = rig.schedule.planes().iter().all(|plane| plane.channel == Channel::White);
     let depth = config.render.depth;

@@ -84,16 +84,33 @@ fn spp_of_frame(spp: f32, frame: u32) -> u32 {
     (at(frame + 1) - at(frame)).max(u32::from(spp > 0.0 && spp < 1.0 && frame == 0))
 }
 
-/// Poses of all bodies of the scene in the middle of a slot.
-pub fn poses_at(rig: &Rig, slot: u64) -> Vec<DAffine3> {
+/// Where the bodies of a scene are, and what shape they have.
+#[derive(Clone, Debug, Default)]
+pub struct Placed {
+    /// world-from-body of each.
+    pub poses: Vec<DAffine3>,
+    /// The instant at which those that deform are shown, nanoseconds.
+    pub deformed_at_ns: i64,
+}
+
+impl std::ops::Deref for Placed {
+    type Target = [DAffine3];
+
+    fn deref(&self) -> &[DAffine3] {
+        &self.poses
+    }
+}
+
+/// All bodies of the scene in the middle of a slot.
+pub fn poses_at(rig: &Rig, slot: u64) -> Placed {
     let rate = rig.rate();
     let t = rate.slot_start_ns(slot) + rate.slot_len_ns(slot) / 2;
     let tracked = rig
         .true_poses(t)
         .unwrap_or_else(|| rig.bodies.iter().map(|b| dpm_rig::rig::affine(&b.rest)).collect());
-    let mut out = Vec::new();
-    rig.scene_poses(&tracked, t, &mut out);
-    out
+    let mut poses = Vec::new();
+    rig.scene_poses(&tracked, t, &mut poses);
+    Placed { poses, deformed_at_ns: t }
 }
 
 /// Draws sequences of one rig.
@@ -207,7 +224,7 @@ impl Theatre {
     }
 
     /// Poses of frame `k` of `total`, the last of which is that of the span.
-    fn poses(&self, k: u32, total: u32) -> Vec<DAffine3> {
+    fn poses(&self, k: u32, total: u32) -> Placed {
         let before = if self.frozen { 0 } else { u64::from(total - 1 - k) };
         poses_at(&self.rig, self.span.last_slot.saturating_sub(before))
     }
@@ -314,11 +331,11 @@ pub fn draw(
     rig: &Rig,
     renderer: &mut Renderer,
     slot: &mut FrameSlot,
-    poses: &[DAffine3],
+    bodies: &Placed,
     frame: u32,
     spp: f32,
 ) -> Result<FrameCost, GpuError> {
-    submit(rig, renderer, slot, poses, frame, spp)?;
+    submit(rig, renderer, slot, bodies, frame, spp)?;
     slot.wait(FRAME_WAIT_NS)
 }
 
@@ -333,13 +350,18 @@ pub fn submit(
     rig: &Rig,
     renderer: &mut Renderer,
     slot: &mut FrameSlot,
-    poses: &[DAffine3],
+    bodies: &Placed,
     frame: u32,
     spp: f32,
 ) -> Result<(), GpuError> {
-    let tracked = tracked_poses(rig, poses);
-    let still = FrameInputs::new(&rig.camera, rig.observer.eye_and_gaze(&tracked), poses);
-    let drawn = FrameInputs { frame, spp: spp_of_frame(spp, frame), budget_spp: spp, ..still };
+    let tracked = tracked_poses(rig, bodies);
+    let drawn = FrameInputs {
+        frame,
+        spp: spp_of_frame(spp, frame),
+        budget_spp: spp,
+        deformed_at_ns: bodies.deformed_at_ns,
+        ..FrameInputs::new(&rig.camera, rig.observer.eye_and_gaze(&tracked), bodies)
+    };
     renderer.submit(slot, &drawn)
 }
 

@@ -1,9 +1,10 @@
 //! The memory of one frame in flight, on the GPU and on the host, and the buffer of each binding of the shaders.
 
 use super::body_tree::BodyTree;
+use super::deformed::DeformedTables;
 use super::fill::fill;
 use super::memory::{BytesPerPixel, SharedBuffers};
-use super::scene_gpu::{table_buffer, SceneGpu};
+use super::scene_gpu::{table_buffer, Geometry, SceneGpu};
 use super::settings::{Output, RendererSettings};
 use crate::gpu::{Buffer, FrameTree, Gpu, GpuError, MemoryKind, Place};
 use crate::pack;
@@ -52,6 +53,8 @@ pub(super) struct FrameBuffers {
     pub movers: Latched,
     /// The tree over the bodies, in which the device finds what a ray meets; `None`: the shaders walk.
     pub device_tree: Option<FrameTree>,
+    /// The tables of a scene in which bodies deform.
+    pub deformed: Option<DeformedTables>,
 }
 
 /// A buffer that the host writes, with its copy for the shaders. The frame's first commands make the copy.
@@ -134,6 +137,7 @@ impl FrameBuffers {
             motion: with("motion of surfaces", each.motion)?,
             movers: latched("movers", size_of::<Mover>() * bodies.max(1))?,
             device_tree: asks_device.then(|| FrameTree::new(gpu, bodies)).transpose()?,
+            deformed: None,
             debug_host: debug.then(|| DebugBuffers::new(gpu, pixels, tiles, each)).transpose()?,
             each,
         })
@@ -193,6 +197,11 @@ impl FrameBuffers {
         of_shaders.into_iter().chain(of_host).map(|(name, buffer)| (name, buffer.place())).collect()
     }
 
+    /// The scene's geometry, or that of this frame.
+    fn geometry<'a>(&'a self, scene: &'a SceneGpu) -> &'a Geometry {
+        self.deformed.as_ref().map_or(&scene.geometry, |deformed| &deformed.geometry)
+    }
+
     /// The buffer of the binding `name`, in frames that write the history buffer `parity`.
     pub(super) fn of<'a>(
         &'a self,
@@ -205,10 +214,10 @@ impl FrameBuffers {
             "B_FRAME" => &self.frame.device,
             "B_INSTANCES" => &self.instances.device,
             "B_BODY_NODES" => &self.body_nodes.device,
-            "B_NODES" => &scene.nodes,
-            "B_TRIANGLES" => &scene.triangles,
+            "B_NODES" => &self.geometry(scene).nodes,
+            "B_TRIANGLES" => &self.geometry(scene).triangles,
             "B_TRIANGLE_REFS" => &scene.refs,
-            "B_VERTICES" => &scene.vertices,
+            "B_VERTICES" => &self.geometry(scene).vertices,
             "B_MATERIALS" => &scene.materials,
             "B_TEXTURES" => &scene.textures,
             "B_TEXELS" => &scene.texels,

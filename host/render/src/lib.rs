@@ -19,6 +19,8 @@
 pub mod albedo_map;
 pub mod blue_noise;
 mod body_tree;
+mod deformed;
+mod deforming_body;
 pub mod drive;
 mod fill;
 mod frame_buffers;

@@ -70,9 +70,11 @@ impl RendererPlan {
     /// Ray queries are asked for, and the device has none.
     pub(super) fn reading(&self, device: &DeviceSummary) -> Result<Reading, GpuError> {
         let tracing = self.settings.tracing;
-        match tracing.asks_device(device) {
+        // The device's own trees are built once, so they do not follow bodies that deform.
+        let can_ask = self.data.deforming.is_empty();
+        match tracing.asks_device(device) && can_ask {
             true => Ok(Reading::Query),
-            false if tracing == Tracing::RayQuery => {
+            false if tracing == Tracing::RayQuery && can_ask => {
                 Err(GpuError::NoRayQuery { device: device.name.as_str().into() })
             }
             false if device.software && !self.keep.storage_tables => Ok(Reading::Texels),

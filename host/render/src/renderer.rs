@@ -1,6 +1,7 @@
 //! One frame on the GPU, from surfaces over radiance to code values. `Renderer::create_slot` records the passes in their order.
 
 use super::body_tree::BodyTree;
+use super::deformed::DeformedTables;
 use super::fill;
 use super::frame_buffers::FrameBuffers;
 use super::last_frame::{LastFrame, Turn};
@@ -9,7 +10,7 @@ use super::optics::OpticsLayout;
 use super::passes::{Grid, FIRST_PASSES, PASSES, TABLE};
 use super::plan::{Pipelines, RendererPlan};
 use super::resources::Resources;
-use super::scene_data::{rows, world_bounds, Keep, SceneData};
+use super::scene_data::{rows, world_bounds, BodyData, Keep, SceneData};
 use super::scene_gpu::SceneGpu;
 use super::settings::{FrameInputs, Overlapping, RenderError, RendererSettings};
 use super::slot::FrameSlot;
@@ -22,6 +23,7 @@ use crate::pack;
 use bytemuck::Zeroable;
 use dpm_scene::Scene;
 use dpm_shaders::structs::{self as gpu_structs, Counters, Frame, Instance, Mover, Schedule, Surface};
+use dpm_shaders::Reading;
 use glam::{DAffine3, Vec3};
 use std::ops::Range;
 use std::sync::Arc;
@@ -38,6 +40,8 @@ const REPROJECT: &str = "reproject";
 pub struct Renderer {
     pub(super) resources: Arc<Resources>,
     data: Arc<SceneData>,
+    /// The bodies of `data`, with the bounds that those have which deform.
+    bodies: Vec<BodyData>,
     pub(super) settings: RendererSettings,
     keep: Keep,
     /// For each body of the scene the tracked body that carries it.
@@ -54,6 +58,8 @@ pub struct Renderer {
     movers: Movers,
     /// Rays look for bodies in a tree that the host builds.
     walks_tree: bool,
+    /// How shaders read tables.
+    reading: Reading,
     /// The order of frames that overlap.
     orders: Orders,
     optics: OpticsLayout,
@@ -122,6 +128,8 @@ impl Renderer {
         let movers = Movers::new(data.bodies.len(), &settings.plane_groups, !settings.shows_halftones());
         Ok(Self {
             resources: Arc::new(Resources { pipelines, table, shared, scene: scene_gpu, overlap }),
+            bodies: data.bodies.clone(),
+            reading,
             data,
             settings,
             keep,
@@ -140,7 +148,7 @@ impl Renderer {
 
     /// Whether the device finds itself what a ray meets (ray query), or the shaders do.
     pub fn asks_device(&self) -> bool {
-        self.resources.scene.trees.is_some()
+        self.resources.scene.geometry.trees.is_some()
     }
 
     /// Interpolated normal of a surface, in its body's space and without the normal map.
@@ -175,10 +183,11 @@ impl Renderer {
     pub fn create_slot(&self, debug: bool) -> Result<FrameSlot, GpuError> {
         let (gpu, resources, settings) = (&self.gpu, &self.resources, &self.settings);
         let tile_list = self.tile_list.clone();
-        let asks_device = resources.scene.trees.is_some();
+        let asks_device = resources.scene.geometry.trees.is_some();
         let body_tree = BodyTree::new(if self.walks_tree { self.data.bodies.len() } else { 0 });
         let sizes = (self.data.bodies.len(), tile_list.len());
-        let buffers = FrameBuffers::new(gpu, settings, sizes, body_tree, (debug, asks_device))?;
+        let mut buffers = FrameBuffers::new(gpu, settings, sizes, body_tree, (debug, asks_device))?;
+        buffers.deformed = DeformedTables::new(gpu, &self.data, self.reading)?;
         buffers.clear(gpu, settings)?;
         let set_of = |parity| {
             let all = (&resources.shared, &resources.scene);
@@ -225,6 +234,9 @@ impl Renderer {
         r.copy(&self.resources.shared.schedule_start, &b.schedule, size_of::<Schedule>());
         for latched in [&b.frame, &b.instances, &b.body_nodes, &b.movers] {
             r.copy(&latched.host, &latched.device, latched.len_bytes);
+        }
+        if let Some(deformed) = &b.deformed {
+            deformed.record(r);
         }
         if let Some(tree) = &b.device_tree {
             r.build_frame_tree(tree);
@@ -306,20 +318,18 @@ impl Renderer {
     pub fn submit(&mut self, slot: &mut FrameSlot, inputs: &FrameInputs<'_>) -> Result<(), GpuError> {
         assert_eq!(inputs.poses.len(), self.data.bodies.len(), "one pose per body");
         slot.fence.check_free()?;
+        if let Some(deformed) = &mut slot.buffers.deformed {
+            deformed.write(&self.data, inputs.deformed_at_ns, &mut self.bodies);
+        }
         if self.settings.camera_is_eye || self.keep.every_tile {
             slot.tile_list.fill();
         } else {
-            slot.tile_list.update(
-                inputs.camera,
-                &self.data.bodies,
-                inputs.poses,
-                gpu_structs::INSTANCE_PROJECTED,
-            );
+            slot.tile_list.update(inputs.camera, &self.bodies, inputs.poses, gpu_structs::INSTANCE_PROJECTED);
         }
         let turn = self.last.turn_of(inputs.frame);
         self.movers.find(
             inputs.camera,
-            &self.data.bodies,
+            &self.bodies,
             inputs.poses,
             inputs.sweep,
             turn.drawn,
@@ -366,7 +376,9 @@ impl Renderer {
             let instance = self.instance(i, inputs);
             to.copy_from_slice(bytemuck::bytes_of(&instance));
             buffers.body_tree.add(&instance);
-            if let (Some(tree), Some(trees)) = (&mut buffers.device_tree, &self.resources.scene.trees) {
+            if let (Some(tree), Some(trees)) =
+                (&mut buffers.device_tree, &self.resources.scene.geometry.trees)
+            {
                 tree.place(i, &instance, trees);
             }
         }
@@ -395,7 +407,7 @@ impl Renderer {
 
     /// Body `i` of the scene for the shaders. The projector is the origin, because f32 is finest where the rays start.
     fn instance(&self, i: usize, inputs: &FrameInputs<'_>) -> Instance {
-        let (body, pose) = (&self.data.bodies[i], &inputs.poses[i]);
+        let (body, pose) = (&self.bodies[i], &inputs.poses[i]);
         let shift = DAffine3::from_translation(-inputs.camera.position());
         let world_from_object = shift * *pose;
         let before = self.last.poses.get(i).copied().unwrap_or(*pose);
@@ -440,7 +452,9 @@ impl Renderer {
         let raster = self.settings.raster;
         let method = &self.settings.method;
         let c = inputs.camera;
+        // What deforms moves by more than its pose tells.
         let steady = !self.keep.every_pixel
+            && self.data.deforming.is_empty()
             && self.last.is_steady(&self.data.bodies, inputs, |i| is_lost(&self.tracked, i, inputs.lost));
         let mut frame = Frame {
             projector_position: [0.0; 3],

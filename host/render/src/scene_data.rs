@@ -1,6 +1,7 @@
 //! A scene into the flat arrays that the shaders read: BVHs, vertices, materials, texels, lights and the environment.
 
 use super::body_tree::FEWEST_BODIES;
+use super::deforming_body::DeformingBody;
 pub use super::scene_needs::SceneNeeds;
 use crate::gpu::BodyTriangles;
 use bytemuck::Zeroable;
@@ -82,6 +83,8 @@ impl BodyData {
 pub struct SceneData {
     /// One entry per body of the scene.
     pub bodies: Vec<BodyData>,
+    /// The bodies that deform.
+    pub deforming: Vec<DeformingBody>,
     /// BVH nodes, five words each.
     pub nodes: Vec<[u32; 4]>,
     /// Three rows per triangle in BVH order: each is a corner as f32 bits, and a word of a horizon that tells nothing.
@@ -329,6 +332,11 @@ impl SceneData {
             tangent: mesh.tangents[i].into(),
             reserved: [0; 3],
         }));
+        if let Some(deforms) = body.deforms.as_ref().filter(|_| !mesh.triangles.is_empty()) {
+            let first = [self.nodes.len() / 5, self.refs.len(), vertex_base as usize];
+            let vertices = mesh.positions.len();
+            self.deforming.push(DeformingBody::new((index, deforms, &bvh), first, vertices));
+        }
         self.add_triangles(scene, index, mesh, &bvh, vertex_base, powers);
         self.nodes.extend_from_slice(&bvh.nodes);
         self.levels = self.levels.max(bvh.levels() as u32);
@@ -541,7 +549,11 @@ impl SceneData {
     pub fn triangles_with_horizons(&self) -> Vec<[u32; 4]> {
         let corner = |row: &[u32; 4]| Vec3::from_array([row[0], row[1], row[2]].map(f32::from_bits));
         let horizons = self.horizons.get_or_init(|| {
-            let of_body = |body: BodyTriangles| {
+            let deforms = |i: usize| self.deforming.iter().any(|deforming| deforming.body == i);
+            let of_body = |(i, body): (usize, BodyTriangles)| {
+                if deforms(i) {
+                    return vec![CLOSED; body.range.len()];
+                }
                 let rows = &self.triangles[3 * body.range.start as usize..3 * body.range.end as usize];
                 horizons(
                     &rows
@@ -550,7 +562,7 @@ impl SceneData {
                         .collect::<Vec<_>>(),
                 )
             };
-            self.triangles_of_bodies().into_iter().flat_map(of_body).collect()
+            self.triangles_of_bodies().into_iter().enumerate().flat_map(of_body).collect()
         });
         let words = horizons.iter().flatten();
         self.triangles.iter().zip(words).map(|(row, &word)| [row[0], row[1], row[2], word]).collect()

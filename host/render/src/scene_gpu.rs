@@ -9,26 +9,47 @@ use std::sync::Arc;
 
 /// The buffers of one scene; immutable after creation.
 pub(crate) struct SceneGpu {
-    pub(super) nodes: Buffer,
-    pub(super) triangles: Buffer,
+    /// Where nothing deforms; elsewhere each frame in flight has its own.
+    pub(super) geometry: Geometry,
     pub(super) refs: Buffer,
-    pub(super) vertices: Buffer,
     pub(super) materials: Buffer,
     pub(super) textures: Buffer,
     pub(super) texels: Buffer,
     pub(super) lights: Buffer,
     pub(super) environment: Buffer,
     pub(super) albedo: Buffer,
+}
+
+/// The tables that change when a body deforms.
+pub(super) struct Geometry {
+    pub(super) nodes: Buffer,
+    pub(super) triangles: Buffer,
+    pub(super) vertices: Buffer,
     /// The trees in which the device finds what a ray meets; `None`: the shaders walk through the nodes.
     pub(super) trees: Option<BodyTrees>,
 }
 
-impl SceneGpu {
-    /// Uploads `data` for shaders that read it in this way, and has the device build its trees if they ask it for hits.
+/// A table of whole rows of four words, for either way of reading it.
+fn rows(
+    gpu: &Arc<Gpu>,
+    reading: Reading,
+    what: &str,
+    words: &[[u32; 4]],
+    float: bool,
+) -> Result<Buffer, GpuError> {
+    if reading == Reading::Texels {
+        Buffer::texels(gpu, what, words, float)
+    } else {
+        Buffer::from_slice(gpu, what, words)
+    }
+}
+
+impl Geometry {
+    /// Uploads the geometry of `data`, and has the device build its trees if shaders ask it for hits.
     ///
     /// # Errors
     /// Out of memory or beyond the device's limits.
-    pub(crate) fn new(gpu: &Arc<Gpu>, data: &SceneData, reading: Reading) -> Result<Self, GpuError> {
+    pub(super) fn new(gpu: &Arc<Gpu>, data: &SceneData, reading: Reading) -> Result<Self, GpuError> {
         let (texel, query) = (reading == Reading::Texels, reading == Reading::Query);
         // Buffers cannot be empty; one element of padding is never read.
         let empty = [[0u32; 4]; 5];
@@ -37,13 +58,7 @@ impl SceneGpu {
         let triangles =
             if texel { Cow::from(&data.triangles) } else { Cow::from(data.triangles_with_horizons()) };
         let triangles = if triangles.is_empty() { &empty[..] } else { &triangles };
-        let rows = |what, words: &[[u32; 4]], float| {
-            if texel {
-                Buffer::texels(gpu, what, words, float)
-            } else {
-                Buffer::from_slice(gpu, what, words)
-            }
-        };
+        let rows = |what, words: &[[u32; 4]], float| rows(gpu, reading, what, words, float);
         let (triangles, trees) = if query {
             let triangles = triangle_buffer(gpu, triangles)?;
             let trees = BodyTrees::new(gpu, &triangles, &data.triangles_of_bodies())?;
@@ -54,9 +69,22 @@ impl SceneGpu {
         Ok(Self {
             nodes: rows("BVH nodes", nodes, false)?,
             triangles,
-            trees,
-            refs: rows("triangle indices", cast_slice(&data.refs), false)?,
             vertices: rows("vertices", cast_slice(&data.vertices), false)?,
+            trees,
+        })
+    }
+}
+
+impl SceneGpu {
+    /// Uploads `data` for shaders that read it in this way, and has the device build its trees if they ask it for hits.
+    ///
+    /// # Errors
+    /// Out of memory or beyond the device's limits.
+    pub(crate) fn new(gpu: &Arc<Gpu>, data: &SceneData, reading: Reading) -> Result<Self, GpuError> {
+        let rows = |what, words: &[[u32; 4]], float| rows(gpu, reading, what, words, float);
+        Ok(Self {
+            geometry: Geometry::new(gpu, data, reading)?,
+            refs: rows("triangle indices", cast_slice(&data.refs), false)?,
             materials: rows("materials", cast_slice(&data.materials), false)?,
             textures: Buffer::from_slice(gpu, "texture table", &data.textures)?,
             texels: Buffer::from_slice(gpu, "textures", &data.texels)?,

@@ -32,6 +32,8 @@ pub struct Pictures {
 /// Frames of light with the poses of the scene's bodies at the centre of each frame's light.
 struct Window<'a> {
     frames: Vec<(&'a LightFrame, Vec<DAffine3>)>,
+    /// The centre of the last frame's light.
+    at_ns: i64,
     /// Poses of the tracked bodies at the centre of the last frame's light; empty without any frame.
     tracked: Vec<DAffine3>,
 }
@@ -44,11 +46,12 @@ fn window<'a>(rig: &Rig, light: &'a [LightFrame], records: &[FrameRecord]) -> Wi
         Some(record.tracked_poses.clone())
     };
     let poses = |f: &LightFrame| true_poses_at_centre(rig, f.first_photon_at).or_else(|| drawn_for(f));
-    let mut window = Window { frames: Vec::new(), tracked: Vec::new() };
+    let mut window = Window { frames: Vec::new(), at_ns: 0, tracked: Vec::new() };
     for frame in light {
         let Some(tracked) = poses(frame) else { continue };
         let mut all = Vec::new();
-        rig.scene_poses(&tracked, light_centre_at(rig, frame.first_photon_at).0, &mut all);
+        window.at_ns = light_centre_at(rig, frame.first_photon_at).0;
+        rig.scene_poses(&tracked, window.at_ns, &mut all);
         window.frames.push((frame, all));
         window.tracked = tracked;
     }
@@ -166,7 +169,8 @@ fn integrate(
     shade: impl Fn(&Seen, Vec3) -> Vec3,
 ) -> Result<Vec<Vec3>, GpuError> {
     let mut slot = renderer.create_slot(true)?;
-    let inputs = FrameInputs::new(camera, (other, other), poses);
+    let inputs =
+        FrameInputs { deformed_at_ns: window.at_ns, ..FrameInputs::new(camera, (other, other), poses) };
     renderer.submit(&mut slot, &inputs)?;
     slot.wait(60_000_000_000)?;
     let surfaces = slot.surfaces().unwrap_or(&[]);

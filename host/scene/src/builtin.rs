@@ -87,6 +87,7 @@ fn hare_body() -> Body {
         projected: true,
         world_from_body_rest: DAffine3::from_translation(DVec3::new(-0.10, 0.0, 0.0)),
         motion: None,
+        deforms: None,
         mesh: textured_mesh(surface, 0.17, |_| GLAZE),
     }
 }
@@ -99,6 +100,7 @@ fn bust_body() -> Body {
         projected: true,
         world_from_body_rest: DAffine3::from_translation(DVec3::new(0.13, 0.03, -0.18)),
         motion: None,
+        deforms: None,
         mesh: textured_mesh(surface, 0.2, |p| if p.y < PLINTH_TOP_M + 0.0015 { PLINTH } else { BRONZE }),
     }
 }
@@ -125,6 +127,7 @@ fn lamp() -> Body {
             vec![[0, 2, 1], [0, 3, 2]]
         },
         materials: vec![LAMP; 2],
+        ..TriangleMesh::default()
     };
     mesh.generate_tangents();
     Body {
@@ -133,6 +136,7 @@ fn lamp() -> Body {
         projected: false,
         world_from_body_rest: DAffine3::from_translation(centre.as_dvec3()),
         motion: None,
+        deforms: None,
         mesh,
     }
 }

@@ -22,6 +22,7 @@ mod body_picture;
 pub mod builtin;
 pub mod bvh;
 pub mod camera_files;
+mod deforming;
 mod environment;
 mod error;
 pub mod geometry;
@@ -40,9 +41,12 @@ pub mod srgb;
 mod stats;
 mod studio;
 
+use std::sync::Arc;
+
 use glam::{DAffine3, Vec2, Vec3, Vec4};
 
 pub use builtin::builtin;
+pub use deforming::{Deformed, DeformingMesh};
 #[doc(hidden)]
 pub use environment::decode_environment;
 pub use environment::load_environment;
@@ -91,8 +95,17 @@ pub struct Body {
     pub world_from_body_rest: DAffine3,
     /// How it moves in the space of its carrier, the tracked body or the world. `None`: it lies in it as the identity.
     pub motion: Option<PartMotion>,
-    /// Geometry in body space.
+    /// Geometry in body space; of a mesh that deforms, at time 0.
     pub mesh: TriangleMesh,
+    /// How an animation deforms it. `None`: the body is rigid.
+    pub deforms: Option<Arc<DeformingMesh>>,
+}
+
+impl Body {
+    /// True if it is rigid and lies as what carries it: it is neither a part that moves by itself nor a mesh that deforms.
+    pub fn is_whole(&self) -> bool {
+        self.motion.is_none() && self.deforms.is_none()
+    }
 }
 
 /// Indexed triangles with per-vertex attributes; all vectors per vertex have the same length.
@@ -110,6 +123,8 @@ pub struct TriangleMesh {
     pub triangles: Vec<[u32; 3]>,
     /// Material of each triangle.
     pub materials: Vec<u32>,
+    /// For each vertex its number in the file's primitive; only while a mesh that deforms is read, else empty.
+    pub(crate) sources: Vec<u32>,
 }
 
 /// A use of a texture: its index, and the transform of KHR_texture_transform that is applied to the coordinates.
@@ -201,6 +216,22 @@ impl Scene {
             }
         }
         used
+    }
+}
+
+impl Scene {
+    /// The scene in which every mesh that deforms has the shape that it has at `t_ns` nanoseconds, and keeps it.
+    pub fn deformed_at(&self, t_ns: i64) -> Self {
+        let mut scene = self.clone();
+        let mut now = Deformed::default();
+        for body in &mut scene.bodies {
+            let Some(deforms) = body.deforms.take() else { continue };
+            deforms.at(t_ns, &mut now);
+            body.mesh.positions.clone_from(&now.positions);
+            body.mesh.normals.clone_from(&now.normals);
+            body.mesh.tangents.clone_from(&now.tangents);
+        }
+        scene
     }
 }
 

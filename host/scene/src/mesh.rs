@@ -108,6 +108,7 @@ impl TriangleMesh {
         compact(&mut self.normals, &used);
         compact(&mut self.tangents, &used);
         compact(&mut self.uvs, &used);
+        compact(&mut self.sources, &used);
         for i in self.triangles.iter_mut().flatten() {
             *i = new_index[*i as usize];
         }
@@ -128,6 +129,9 @@ impl TriangleMesh {
             .collect();
         self.positions = corners.iter().map(|&i| self.positions[i as usize]).collect();
         self.uvs = corners.iter().map(|&i| self.uvs[i as usize]).collect();
+        if !self.sources.is_empty() {
+            self.sources = corners.iter().map(|&i| self.sources[i as usize]).collect();
+        }
         self.tangents.clear();
         self.normals = normals;
         self.triangles = (0..corners.len() as u32 / 3).map(|t| [3 * t, 3 * t + 1, 3 * t + 2]).collect();
@@ -244,6 +248,7 @@ impl TriangleMesh {
                         self.positions.push(self.positions[i as usize]);
                         self.normals.push(self.normals[i as usize]);
                         self.uvs.push(self.uvs[i as usize]);
+                        self.sources.extend(self.sources.get(i as usize).copied());
                         side.push(w);
                     }
                     self.triangles[k][corner] = j;
@@ -268,6 +273,7 @@ impl TriangleMesh {
                 .map(|n| (normal_map * n.as_dvec3()).try_normalize().map_or(Vec3::Y, DVec3::as_vec3)),
         );
         self.uvs.extend_from_slice(&other.uvs);
+        self.sources.extend_from_slice(&other.sources);
         let first = self.tangents.len();
         self.tangents.extend(other.tangents.iter().map(|t| -> Vec4 {
             let turned = (linear * t.truncate().as_dvec3()).normalize_or_zero();
@@ -315,7 +321,7 @@ mod tests {
             uvs: vec![Vec2::new(0.0, 1.0), Vec2::new(1.0, 1.0), Vec2::new(1.0, 0.0), Vec2::new(0.0, 0.0)],
             triangles: vec![[0, 1, 2], [0, 2, 3]],
             materials: vec![0, 0],
-            tangents: vec![],
+            ..TriangleMesh::default()
         }
     }
 

@@ -101,6 +101,20 @@ impl Keyed for DVec3 {
     }
 }
 
+impl Keyed for f64 {
+    fn between(a: Self, b: Self, s: f64) -> Self {
+        a + (b - a) * s
+    }
+
+    fn weighted(of: [(Self, f64); 4]) -> Self {
+        of.iter().map(|(value, weight)| value * weight).sum()
+    }
+
+    fn is_near(self, other: Self) -> bool {
+        (self - other).abs() <= 1e-6 * (1.0 + self.abs())
+    }
+}
+
 impl Keyed for DQuat {
     fn between(a: Self, b: Self, s: f64) -> Self {
         a.slerp(b, s)
@@ -171,7 +185,7 @@ impl<T: Keyed> Keys<T> {
 
 impl<T: Keyed> Track<T> {
     /// The value at `t` seconds.
-    fn at(&self, t: f64) -> T {
+    pub(crate) fn at(&self, t: f64) -> T {
         match self {
             Self::Constant(value) => *value,
             Self::Keys(keys) => keys.at(t),

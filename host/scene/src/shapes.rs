@@ -27,6 +27,7 @@ pub fn add(scene: &mut Scene, mut mesh: TriangleMesh, material: Material) -> usi
         projected: true,
         world_from_body_rest: DAffine3::IDENTITY,
         motion: None,
+        deforms: None,
         mesh,
     });
     scene.bodies.len() - 1
@@ -42,6 +43,7 @@ pub fn mesh(positions: Vec<Vec3>, normals: Vec<Vec3>, triangles: Vec<[u32; 3]>) 
         positions,
         normals,
         triangles,
+        ..TriangleMesh::default()
     }
 }
 

@@ -208,10 +208,11 @@ fn a_morphed_mesh_is_skinned() {
 }
 
 #[test]
-fn joints_that_move_are_told() {
+fn joints_that_turn_deform_the_skin() {
     let (mut glb, truth) = with_skin([1.0; 3]);
     let times = glb.push_numbers("SCALAR", &[0.0, 1.0]);
-    let turns = glb.push_numbers("VEC4", &[0.0, 0.0, 0.0, 1.0, 0.0, 1.0, 0.0, 0.0]);
+    let turn = |angle| DQuat::from_rotation_x(angle).to_array().map(|x| x as f32);
+    let turns = glb.push_numbers("VEC4", &[turn(-0.4), turn(1.0)].concat());
     let glb = glb.set(
         "/animations",
         json!([{
@@ -220,10 +221,10 @@ fn joints_that_move_are_told() {
         }]),
     );
     let scene = load(&glb);
-    assert!(told(&scene).contains("node 1 'right': its skin is shown as its joints lie"), "{}", told(&scene));
-    assert!(off(&scene, "static", &truth) < 1e-6, "it is shown at rest");
+    assert!(told(&scene).contains("deforms 1 meshes"), "{}", told(&scene));
+    assert!(off(&scene, "static/right", &truth) < 1e-6, "at the beginning it is as at rest");
     let off = load_with(&glb, LoadOptions { animation: AnimationChoice::Off, ..LoadOptions::default() });
-    assert!(!told(&off).contains("its skin"), "{}", told(&off));
+    assert!(!told(&off).contains("skin") && off.bodies.iter().all(|b| b.deforms.is_none()), "{}", told(&off));
 }
 
 /// What is broken is left out and named, and the mesh is where its node is.
@@ -354,9 +355,9 @@ fn a_skin_of_rigid_pieces_moves_with_its_joints() {
     }
 }
 
-/// One face between two joints, or joints of another body, and the whole skin is at rest.
+/// One face between two joints, and the whole skin bends; with a joint of another body it is at rest.
 #[test]
-fn a_skin_that_bends_or_spans_bodies_is_at_rest() {
+fn a_skin_is_rigid_or_bends_or_is_at_rest() {
     let mut bent = of_pieces();
     let joints = bent.push_bytes("VEC4", &[[0u8; 4].repeat(3), [1, 0, 0, 0].repeat(5)].concat());
     let bent = bent.set("/meshes/1/primitives/0/attributes/JOINTS_0", json!(joints));
@@ -369,9 +370,13 @@ fn a_skin_that_bends_or_spans_bodies_is_at_rest() {
         .set(&format!("{attributes}/WEIGHTS_0"), json!(shares))
         .set(&format!("{attributes}/JOINTS_0"), json!(joints));
     let astray = of_pieces().set("/nodes/0/children", json!([2])).set("/scenes/0/nodes", json!([0, 1]));
-    for (glb, what) in [(bent, "bends"), (shared, "shares"), (astray, "joints of a tracked body")] {
+    for (glb, what, bends) in
+        [(bent, "bends", true), (shared, "shares", true), (astray, "joints of a tracked body", false)]
+    {
         let scene = load(&glb);
-        assert!(told(&scene).contains("node 1 'right': its skin is shown as its joints lie"), "{what}");
+        let is_told = told(&scene).contains("node 1 'right': its skin is shown as its joints lie");
+        assert_eq!(is_told, !bends, "{what}: {}", told(&scene));
         assert!(scene.bodies.iter().all(|b| b.motion.is_none()), "{what}");
+        assert_eq!(scene.bodies.iter().any(|b| b.deforms.is_some()), bends, "{what}");
     }
 }

@@ -65,6 +65,11 @@ impl Lag {
         Self { clock_s, ticks: [Sums::default(); TICKS], now: 0 }
     }
 
+    /// How far the tracker's clock is known, seconds.
+    pub(crate) fn clock_s(&self) -> f64 {
+        self.clock_s
+    }
+
     /// A frame was lit `off` beside the body, metres, which moved with `velocity`, m/s; its poses were `age_s` old.
     pub(crate) fn add(&mut self, off: [f64; 3], velocity: [f64; 3], age_s: f64) {
         let dot = |a: [f64; 3], b: [f64; 3]| a.iter().zip(b).map(|(a, b)| a * b).sum::<f64>();

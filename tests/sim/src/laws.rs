@@ -574,9 +574,10 @@ impl Laws {
         let slack = if peace { 0.002 } else { 0.004 + 2.0 * SPEED * age_s };
         // At its worst the filter takes noise for an acceleration of 40 m/s^2, for the 12 ms that it carries one on.
         // Poses are predicted to the middle of the light, which is half an exposure after the first photon.
-        let far_s = age_s + 0.5 * (last - at) as f64 * 1e-9;
+        let clock_s = self.lag.clock_s();
+        let far_s = age_s + 0.5 * (last - at) as f64 * 1e-9 + clock_s;
         let slack = slack + 40.0 * 0.012 * far_s;
-        let allowed = slack + 0.5 * self.acceleration * far_s * far_s + SPEED * (late_s + 0.001);
+        let allowed = slack + 0.5 * self.acceleration * far_s * far_s + SPEED * (late_s + clock_s);
         if off > allowed {
             let frame = sent.frame;
             self.fail(

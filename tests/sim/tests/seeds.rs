@@ -198,6 +198,8 @@ fn what_once_broke_a_law_with_another_tracker_keeps_them_all() {
         (110_000_292, Serial, 60),
         // The law forgot that a pose is predicted on from the first photon to the middle of a long exposure.
         (900_000_457, Serial, 53),
+        // A serial adapter that hands on every 16 ms, so that the device's clock is known to 2 ms: the law of place allowed one.
+        (1_510_002_342, Serial, 39),
         // A stall of 4 ms, in the first 24 ms of peace that were judged as if they were a second of it.
         (900_000_351, Serial, 47),
         // A turn that was over before the adapter handed on any sample of it: a bound that was too narrow.

@@ -9,7 +9,7 @@ pub mod views;
 
 pub use fit::{FittedView, SnapshotView};
 
-use super::sequence::{draw, poses_at};
+use super::sequence::{draw, poses_at, Placed};
 use dpm_common::files::{check_folder, write_atomically};
 use dpm_device::time::HostTime;
 use dpm_render::gpu::Gpu;
@@ -22,7 +22,7 @@ use dpm_rig::pictures::pictures;
 use dpm_rig::pipeline::{renderer_settings, PipelineError};
 use dpm_rig::rig::Rig;
 use dpm_rig::run_rig::{open_gpu, traced_raster};
-use glam::{DAffine3, Vec3};
+use glam::Vec3;
 use paint::Canvas;
 use serde::Serialize;
 use std::collections::VecDeque;
@@ -232,8 +232,8 @@ struct Player<'a> {
     method: Method,
     renderer: Renderer,
     slot: FrameSlot,
-    /// world-from-body of the last frame.
-    poses: Vec<DAffine3>,
+    /// The bodies in the last frame.
+    poses: Placed,
     /// See [`tile_errors`].
     errors: Vec<Option<f32>>,
     /// Of the last frames, as many as an eye integrates.
@@ -250,7 +250,7 @@ impl<'a> Player<'a> {
         let renderer = Renderer::keeping(gpu, &rig.scene, settings, keep).map_err(gpu_failure)?;
         let slot = renderer.create_slot(true).map_err(gpu_failure)?;
         let method = rig.config.render.to_method();
-        let (poses, errors, light) = (Vec::new(), Vec::new(), VecDeque::new());
+        let (poses, errors, light) = (Placed::default(), Vec::new(), VecDeque::new());
         Ok(Self { rig, gpu, method, renderer, slot, poses, errors, light })
     }
 

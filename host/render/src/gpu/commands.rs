@@ -207,7 +207,12 @@ impl Recorder<'_> {
 
     /// Copies the first `bytes` of one buffer to another.
     pub fn copy(&mut self, from: &Buffer, to: &Buffer, bytes: usize) {
-        let region = [vk::BufferCopy { src_offset: 0, dst_offset: 0, size: bytes as u64 }];
+        self.copy_to(from, to, bytes, 0);
+    }
+
+    /// Copies the first `bytes` of one buffer to another, from the byte `at` there on.
+    pub(crate) fn copy_to(&mut self, from: &Buffer, to: &Buffer, bytes: usize, at: usize) {
+        let region = [vk::BufferCopy { src_offset: 0, dst_offset: at as u64, size: bytes as u64 }];
         // SAFETY: recording; both buffers have transfer usage and are kept alive by the owner.
         unsafe { self.list.gpu.device.cmd_copy_buffer(self.list.buffer, from.handle, to.handle, &region) }
     }

@@ -48,7 +48,7 @@ impl Shape {
     fn of(rig: &Rig, tracked: usize) -> Option<Self> {
         let carried = |b: &&Body| b.tracked == Some(tracked as u16) && b.projected;
         let (parts, rigid): (Vec<&Body>, Vec<&Body>) =
-            rig.scene.bodies.iter().filter(carried).partition(|b| b.motion.is_some());
+            rig.scene.bodies.iter().filter(carried).partition(|b| !b.is_whole());
         let of = |bodies: &[&Body]| bodies.iter().flat_map(|b| points_of(b)).collect::<Vec<DVec3>>();
         let (mut all, moving) = (of(&rigid), of(&parts));
         let first = *all.first().or(moving.first())?;
@@ -67,8 +67,12 @@ impl Shape {
 }
 
 /// The vertices of a body in the space of its carrier; of a part that moves by itself the corners of the box around it,
-/// wherever it goes.
+/// wherever it goes, and of a mesh that deforms those of the box around all its shapes.
 fn points_of(body: &Body) -> Vec<DVec3> {
+    if let Some(deforms) = &body.deforms {
+        let [lower, upper] = deforms.bounds().map(|corner| corner.as_dvec3());
+        return corners_of(lower, upper).to_vec();
+    }
     let vertices = body.mesh.positions.iter().map(|p| p.as_dvec3());
     let Some(motion) = &body.motion else { return vertices.collect() };
     let (lower, upper) = vertices

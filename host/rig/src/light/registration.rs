@@ -120,13 +120,14 @@ impl RegistrationMeter {
     }
 }
 
-/// Points spread over the vertices of a tracked body. Those of parts that move by themselves are none of its points.
+/// Points spread over the vertices of a tracked body. Those of parts that move by themselves, and of meshes that
+/// deform, are none of its points.
 fn points_of(rig: &Rig, tracked: usize) -> Vec<DVec3> {
     let all: Vec<DVec3> = rig
         .scene
         .bodies
         .iter()
-        .filter(|b| b.tracked == Some(tracked as u16) && b.projected && b.motion.is_none())
+        .filter(|b| b.tracked == Some(tracked as u16) && b.projected && b.is_whole())
         .flat_map(|b| b.mesh.positions.iter().map(|p| p.as_dvec3()))
         .collect();
     let n = all.len().min(POINTS_PER_BODY);

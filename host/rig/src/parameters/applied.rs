@@ -60,11 +60,8 @@ fn nudged(start: DAffine3, centre: DVec3, nudge: &Nudge) -> DAffine3 {
 pub(crate) fn middles(rig: &Rig) -> Vec<DVec3> {
     (0..rig.bodies.len())
         .map(|i| {
-            let all = rig
-                .scene
-                .bodies
-                .iter()
-                .filter(|b| b.tracked.map(usize::from) == Some(i) && b.motion.is_none());
+            let all =
+                rig.scene.bodies.iter().filter(|b| b.tracked.map(usize::from) == Some(i) && b.is_whole());
             let points = all.flat_map(|b| b.mesh.positions.iter().map(|p| p.as_dvec3()));
             let (low, high) = points
                 .fold((DVec3::INFINITY, DVec3::NEG_INFINITY), |(low, high), p| (low.min(p), high.max(p)));

@@ -3,6 +3,7 @@
 //! The tree is built once in body space; a moving body changes only its entry in the top level.
 
 mod cluster;
+mod refit;
 
 use crate::TriangleMesh;
 use cluster::{clustered, optimise, Work};
@@ -13,6 +14,7 @@ use obvhs::bvh2::Bvh2;
 use obvhs::cwbvh::bvh2_to_cwbvh::bvh2_to_cwbvh;
 use obvhs::cwbvh::CwBvh;
 use obvhs::triangle::Triangle;
+pub use refit::Refit;
 
 /// Entries of the traversal stack in `bvh.glsl`, besides eight in registers. A ray pushes at most one entry a level below the root, so a tree of one more level than
 /// this never overflows it.

@@ -31,6 +31,13 @@ pub(crate) struct Animation {
     pub nodes: HashMap<usize, Channels>,
 }
 
+impl Animation {
+    /// True if a shape or a size changes.
+    pub(crate) fn deforms(&self) -> bool {
+        self.nodes.values().any(|channels| channels.resizes() || channels.morphs())
+    }
+}
+
 /// What an animation says of a node; `None`: nothing.
 #[derive(Clone, Debug, Default)]
 pub(crate) struct Channels {
@@ -38,12 +45,33 @@ pub(crate) struct Channels {
     pub translation: Option<Track<DVec3>>,
     /// Unit quaternions.
     pub rotation: Option<Track<DQuat>>,
+    /// Along the node's own axes.
+    pub scale: Option<Track<DVec3>>,
+    /// Of each morph target of the node's mesh.
+    pub weights: Option<Vec<Track<f64>>>,
 }
 
 impl Channels {
-    /// True if something about the node changes with time.
+    /// True if the node moves as something rigid does.
     pub(crate) fn moves(&self) -> bool {
         matches!(self.translation, Some(Track::Keys(_))) || matches!(self.rotation, Some(Track::Keys(_)))
+    }
+
+    /// True if the node's size changes.
+    pub(crate) fn resizes(&self) -> bool {
+        matches!(self.scale, Some(Track::Keys(_)))
+    }
+
+    /// True if the shape of the node's mesh changes.
+    pub(crate) fn morphs(&self) -> bool {
+        self.weights.iter().flatten().any(|weight| matches!(weight, Track::Keys(_)))
+    }
+
+    fn is_empty(&self) -> bool {
+        self.translation.is_none()
+            && self.rotation.is_none()
+            && self.scale.is_none()
+            && self.weights.is_none()
     }
 }
 
@@ -87,7 +115,7 @@ pub(super) fn read(
         let rest = if more.is_empty() { String::new() } else { format!(", and {} more such", more.len()) };
         warnings.push(format!("{}: {first}{rest}", item.name));
     }
-    animation.nodes.retain(|_, channels| channels.translation.is_some() || channels.rotation.is_some());
+    animation.nodes.retain(|_, channels| !channels.is_empty());
     Ok(animation)
 }
 
@@ -147,7 +175,6 @@ impl Reader<'_> {
         let path = target.text("path").map_err(text)?.unwrap_or("missing");
         let times = self.times(sampler)?;
         animation.length_s = animation.length_s.max(times.last().copied().unwrap_or(0.0));
-        let name = || format!("of {}", self.nodes[node].name);
         match path {
             "translation" => {
                 let keys = self.keys::<3, DVec3>(sampler, times, |v| {
@@ -165,19 +192,15 @@ impl Reader<'_> {
                 animation.nodes.entry(node).or_default().rotation = Some(track(keys));
             }
             "scale" => {
-                let keys =
-                    self.keys::<3, DVec3>(sampler, times, |v| Some(DVec3::from_array(v.map(f64::from))))?;
-                let rest = self.nodes[node].numbers::<3>("scale").ok().flatten().unwrap_or([1.0; 3]);
-                let rest = DVec3::from_array(rest.map(f64::from));
-                if !keys.constant().is_some_and(|scale| scale.distance(rest) < 1e-4 * rest.length()) {
-                    return Err(format!("the size {} changes, and its rest size is shown", name()));
-                }
+                let keys = self.keys::<3, DVec3>(sampler, times, |v| {
+                    let v = DVec3::from_array(v.map(f64::from));
+                    v.is_finite().then_some(v)
+                })?;
+                animation.nodes.entry(node).or_default().scale = Some(track(keys));
             }
             "weights" => {
-                return Err(format!(
-                    "the shape {} changes (morph targets), and its rest shape is shown",
-                    name()
-                ))
+                let weights = self.weights(sampler, &times)?;
+                animation.nodes.entry(node).or_default().weights = Some(weights);
             }
             other => return Err(format!("'path' is {}", shorten(other))),
         }
@@ -187,11 +210,8 @@ impl Reader<'_> {
     /// The rising times of a sampler.
     fn times(&mut self, sampler: &Item) -> Result<Vec<f64>, String> {
         let input = accessor(self.data, sampler, "input")?;
-        // A key frame has three values at most.
-        self.values_left = self
-            .values_left
-            .checked_sub(input.count.saturating_mul(3))
-            .ok_or_else(|| format!("the key frames of the animation have more than {MOST_VALUES} values"))?;
+        // A key frame has three values at most, but for weights.
+        self.spend(input.count.saturating_mul(3))?;
         if input.dimensions != 1 || input.component != Component::F32 {
             return Err(format!("{} serves as times: it must be SCALAR of 32-bit float", input.name));
         }
@@ -207,6 +227,47 @@ impl Reader<'_> {
         Ok(times)
     }
 
+    /// The weights of morph targets, of which each key frame has as many as there are targets.
+    fn weights(&mut self, sampler: &Item, times: &[f64]) -> Result<Vec<Track<f64>>, String> {
+        let interpolation = interpolation(sampler)?;
+        let output = accessor(self.data, sampler, "output")?;
+        let small =
+            matches!(output.component, Component::I8 | Component::U8 | Component::I16 | Component::U16);
+        if output.dimensions != 1 || !(output.component == Component::F32 || small && output.normalized) {
+            return Err(format!("{} has numbers of another type than its channel needs", output.name));
+        }
+        // Each target has a copy of the times.
+        self.spend(output.count.saturating_mul(2))?;
+        let per_key = interpolation.values_of_key();
+        let targets = output.count as usize / (times.len() * per_key).max(1);
+        if targets == 0 || output.count as usize != targets * times.len() * per_key {
+            return Err(format!(
+                "{} has {} elements, which {} key frames cannot share",
+                output.name,
+                output.count,
+                times.len()
+            ));
+        }
+        let value = |k: usize| f64::from(self.data.floats::<1>(output, k as u64)[0]);
+        let of = |target: usize| {
+            let values: Vec<f64> =
+                (0..times.len() * per_key).map(|part| value(part * targets + target)).collect();
+            let all_finite = values.iter().all(|v| v.is_finite());
+            all_finite.then(|| track(Keys { times: times.to_vec(), values, interpolation }))
+        };
+        let all: Option<Vec<_>> = (0..targets).map(of).collect();
+        all.ok_or_else(|| format!("{} holds what is no number", output.name))
+    }
+
+    /// Values that are about to be read, of those that may be.
+    fn spend(&mut self, values: u64) -> Result<(), String> {
+        self.values_left = self
+            .values_left
+            .checked_sub(values)
+            .ok_or_else(|| format!("the key frames of the animation have more than {MOST_VALUES} values"))?;
+        Ok(())
+    }
+
     /// The key frames of a sampler; `value` refuses numbers that are none.
     fn keys<const N: usize, T: Keyed>(
         &self,
@@ -214,12 +275,7 @@ impl Reader<'_> {
         times: Vec<f64>,
         value: impl Fn([f32; N]) -> Option<T>,
     ) -> Result<Keys<T>, String> {
-        let interpolation = match sampler.text("interpolation").map_err(|e| e.to_string())? {
-            None | Some("LINEAR") => Interpolation::Linear,
-            Some("STEP") => Interpolation::Step,
-            Some("CUBICSPLINE") => Interpolation::CubicSpline,
-            Some(other) => return Err(format!("'interpolation' is {}", shorten(other))),
-        };
+        let interpolation = interpolation(sampler)?;
         let output = accessor(self.data, sampler, "output")?;
         let small = N == 4
             && output.normalized
@@ -235,6 +291,16 @@ impl Reader<'_> {
             (0..output.count).map(|k| value(self.data.floats::<N>(output, k))).collect();
         let values = values.ok_or_else(|| format!("{} holds what is no number", output.name))?;
         Ok(Keys { times, values, interpolation })
+    }
+}
+
+/// How a sampler goes from key to key.
+fn interpolation(sampler: &Item) -> Result<Interpolation, String> {
+    match sampler.text("interpolation").map_err(|e| e.to_string())? {
+        None | Some("LINEAR") => Ok(Interpolation::Linear),
+        Some("STEP") => Ok(Interpolation::Step),
+        Some("CUBICSPLINE") => Ok(Interpolation::CubicSpline),
+        Some(other) => Err(format!("'interpolation' is {}", shorten(other))),
     }
 }
 

@@ -163,10 +163,51 @@ impl Deformations {
         pose: Option<Pose<'a>>,
     ) -> Deformation<'a> {
         let of_mesh = &self.meshes[mesh];
-        let weights = self.nodes.get(&node).and_then(|own| own.weights.as_ref()).unwrap_or(&of_mesh.weights);
         let Primitive { targets, influences } = &of_mesh.primitives[primitive];
+        let weights = if matches!(pose, Some(Pose::Bound)) { &[] } else { self.weights(node, mesh) };
         let targets = weights.iter().copied().zip(targets).filter(|(weight, _)| *weight != 0.0).collect();
         Deformation { targets, pose, influences }
+    }
+
+    /// The weights of a mesh's morph targets at a node while nothing plays.
+    pub(super) fn weights(&self, node: usize, mesh: usize) -> &[f64] {
+        let own = self.nodes.get(&node).and_then(|own| own.weights.as_ref());
+        own.unwrap_or(&self.meshes[mesh].weights)
+    }
+
+    /// True if a mesh has morph targets.
+    pub(super) fn has_targets(&self, mesh: usize) -> bool {
+        self.meshes[mesh].primitives.iter().any(|primitive| !primitive.targets.is_empty())
+    }
+
+    /// The joints that hold a vertex of a primitive of `mesh`, with their weights.
+    pub(super) fn joints_of<'a>(
+        &'a self,
+        (mesh, primitive): (usize, usize),
+        data: &'a Data,
+        vertex: u32,
+    ) -> impl Iterator<Item = (usize, f64)> + 'a {
+        held_by(&self.meshes[mesh].primitives[primitive].influences, data, vertex.into())
+    }
+
+    /// What a morph target adds to positions, normals and tangents of a primitive's vertices `sources`, by their places in it.
+    pub(super) fn moves_of(
+        &self,
+        (mesh, primitive): (usize, usize),
+        target: usize,
+        data: &Data,
+        sources: &[u32],
+    ) -> Vec<(usize, [Vec3; 3])> {
+        let Some(target) = self.meshes[mesh].primitives[primitive].targets.get(target) else { return vec![] };
+        let of = |accessor: Option<usize>, vertex: u32| {
+            accessor.map_or(Vec3::ZERO, |i| data.floats::<3>(&data.accessors[i], vertex.into()).into())
+        };
+        let moves =
+            sources.iter().map(|&v| [target.positions, target.normals, target.tangents].map(|a| of(a, v)));
+        let is_some = |(_, moved): &(usize, [Vec3; 3])| {
+            moved.iter().any(|v| *v != Vec3::ZERO) && moved.iter().all(|v| v.is_finite())
+        };
+        moves.enumerate().filter(is_some).collect()
     }
 }
 
@@ -292,6 +333,8 @@ pub(crate) enum Pose<'a> {
     All(&'a [DAffine3]),
     /// These faces alone, which hang on one joint: body-from-mesh.
     One(&'a [[u64; 3]], DAffine3),
+    /// As the file has it: what deforms it comes later, and needs the vertices' numbers in the file.
+    Bound,
 }
 
 /// What deforms a primitive at a node.
@@ -313,6 +356,11 @@ impl Deformation<'_> {
         }
     }
 
+    /// What deforms it comes later, and needs the vertices' numbers in the file.
+    pub(super) fn is_bound(&self) -> bool {
+        matches!(self.pose, Some(Pose::Bound))
+    }
+
     /// Moves the vertices `used` of the primitive's accessors, which are those of `mesh` in order.
     ///
     /// # Errors
@@ -328,7 +376,7 @@ impl Deformation<'_> {
             self.morph(data, used, mesh, stop)?;
         }
         match self.pose {
-            None => Ok(()),
+            None | Some(Pose::Bound) => Ok(()),
             Some(Pose::One(_, map)) => skin(&|_| map, used, mesh, stop),
             Some(Pose::All(joints)) => {
                 let map = |vertex| mean(joints, self.influences, data, vertex);

@@ -1,6 +1,7 @@
 //! Flattens the node tree into rigid bodies: nodes that a body of the rig file claims move with it, all others are
 //! static. What an animation moves is a part, a body of its own with the same carrier.
 
+mod deforming;
 mod skinned;
 
 use std::collections::{BTreeMap, HashMap, HashSet};
@@ -12,7 +13,8 @@ use super::super::limits::Cancel;
 use super::super::mesh::Dropped;
 use super::super::part_motion::{Link, NodeMotion, PartMotion, Track};
 use super::super::{
-    Body, BodySelector, Limits, LoadOptions, PunctualKind, PunctualLight, SceneError, TriangleMesh,
+    Body, BodySelector, DeformingMesh, Limits, LoadOptions, PunctualKind, PunctualLight, SceneError,
+    TriangleMesh,
 };
 use super::accessor::Data;
 use super::animation::{Animation, Channels};
@@ -28,6 +30,8 @@ const AUTO_BODIES: usize = 2;
 
 /// Most parts that an animation may move.
 const MAX_PARTS: usize = 128;
+/// Why a node is no rigid part.
+const UNEVEN: &str = "a node above it is scaled unevenly";
 /// Most places of which that of a part may be the product: it is worked out three times for every frame.
 const MAX_LINKS: usize = 48;
 
@@ -40,6 +44,15 @@ struct Group {
     is_virtual: bool,
     /// Index of the part, if an animation moves it.
     part: Option<usize>,
+    /// Index of the mesh that an animation deforms, if it is one.
+    deforming: Option<usize>,
+}
+
+impl Group {
+    /// What stays of a body, or of what does not move, when parts and meshes that deform are taken away.
+    fn is_whole(self) -> bool {
+        self.part.is_none() && self.deforming.is_none()
+    }
 }
 
 /// A subtree still to be walked.
@@ -50,6 +63,8 @@ struct Step {
     /// Part-from-parent, if the parent belongs to a part.
     place: DAffine3,
     group: Group,
+    /// The size of a node above it changes.
+    resizes: bool,
 }
 
 /// Nodes that an animation moves with all below them, up to the next such node.
@@ -279,6 +294,7 @@ pub(super) fn flatten(
             source.animation.period_ns as f64 * 1e-9
         ));
     }
+    gatherer.tell_of_deforming(warnings);
     let paint = std::mem::take(&mut gatherer.paint);
     paint.warn(warnings);
     Ok((gatherer.into_flat(warnings)?, paint))
@@ -298,6 +314,10 @@ struct Gatherer<'a> {
     /// By claim: world-from-body at rest.
     rest: Vec<DAffine3>,
     parts: Vec<Part>,
+    /// Meshes that an animation deforms, with the names of their nodes.
+    deforming: Vec<(String, DeformingMesh)>,
+    /// Nodes that show such a mesh without a skin.
+    bound: Vec<(usize, Group)>,
     meshes: BTreeMap<Group, TriangleMesh>,
     lights: Vec<(Group, PunctualLight)>,
     dropped: Dropped,
@@ -316,6 +336,8 @@ impl<'a> Gatherer<'a> {
             skinned: vec![],
             rest: vec![DAffine3::IDENTITY; claims.bodies.len()],
             parts: vec![],
+            deforming: vec![],
+            bound: vec![],
             meshes: BTreeMap::new(),
             lights: vec![],
             dropped: Dropped::default(),
@@ -333,14 +355,17 @@ impl<'a> Gatherer<'a> {
         let claim_of: HashMap<usize, usize> =
             claims.bodies.iter().enumerate().map(|(c, b)| (b.node, c)).collect();
         let document = self.source.document;
-        if self.source.deformations.has_skins() {
+        if self.source.deformations.has_skins() || !self.source.animation.nodes.is_empty() {
             self.at_rest = AtRest::of(self.source, &claim_of);
         }
         let world = self.source.world;
-        let group = Group { claim: None, is_virtual: false, part: None };
-        let mut walk: Vec<Step> =
-            roots(document).into_iter().rev().map(|node| Step { node, world, place: world, group }).collect();
-        while let Some(Step { node: index, world, place, mut group }) = walk.pop() {
+        let group = Group { claim: None, is_virtual: false, part: None, deforming: None };
+        let mut walk: Vec<Step> = roots(document)
+            .into_iter()
+            .rev()
+            .map(|node| Step { node, world, place: world, group, resizes: false })
+            .collect();
+        while let Some(Step { node: index, world, place, mut group, mut resizes }) = walk.pop() {
             self.cancel.check(self.limits)?;
             let Some(node) = document.nodes().nth(index) else { continue };
             let channels = self.source.animation.nodes.get(&index);
@@ -349,7 +374,13 @@ impl<'a> Gatherer<'a> {
             let world = world * local;
             let mut place = place * local;
             if let Some(&c) = claim_of.get(&index) {
-                group = Group { claim: Some(c), is_virtual: !claims.bodies[c].projected, part: None };
+                group = Group {
+                    claim: Some(c),
+                    is_virtual: !claims.bodies[c].projected,
+                    part: None,
+                    deforming: None,
+                };
+                resizes = false;
                 self.rest[c] = self.rest_of(c, &world)?;
                 if channels.is_some_and(Channels::moves) {
                     warnings.push(format!(
@@ -358,9 +389,13 @@ impl<'a> Gatherer<'a> {
                         claims.bodies[c].name
                     ));
                 }
-            } else if let Some(channels) = channels.filter(|channels| channels.moves()) {
+            } else if let Some(channels) = channels.filter(|channels| channels.moves() || channels.resizes())
+            {
+                resizes |= channels.resizes();
                 match self.part(&node, channels, &above, group) {
                     Ok((part, scale)) => (group.part, place) = (Some(part), scale),
+                    // Nothing rigid moves so, but a mesh that deforms does.
+                    Err(UNEVEN) => resizes = true,
                     Err(why) => warnings.push(format!(
                         "node {index} '{}': its motion is not played, because {why}",
                         node.name().unwrap_or("")
@@ -370,8 +405,12 @@ impl<'a> Gatherer<'a> {
             let place = self.place_at(group, &world, &place);
             group.is_virtual |= claims.virtual_nodes.binary_search(&index).is_ok();
             if let Some(mesh) = node.mesh() {
+                let morphs = channels.is_some_and(Channels::morphs)
+                    && self.source.deformations.has_targets(mesh.index());
                 if self.source.deformations.skin(index, mesh.index()).is_some() {
                     self.skinned.push((index, group));
+                } else if resizes || morphs {
+                    self.bound.push((index, group));
                 } else if is_invertible(&place) {
                     self.add_mesh((mesh.index(), index), group, &place, None)?;
                 } else {
@@ -379,15 +418,16 @@ impl<'a> Gatherer<'a> {
                     warnings.push(format!("node {index} '{name}' is scaled to nothing and is left out"));
                 }
             }
-            if self.source.deformations.has_skins() {
+            if self.source.deformations.has_skins() || !self.source.animation.nodes.is_empty() {
                 self.places.insert(index, (group, place));
             }
             if let Some(light) = node.light() {
                 self.lights.extend(place_light(&light, &place).map(|l| (group, l)));
             }
-            walk.extend(node.children().map(|c| Step { node: c.index(), world, place, group }));
+            walk.extend(node.children().map(|c| Step { node: c.index(), world, place, group, resizes }));
         }
-        self.add_skinned_meshes(warnings)
+        self.add_skinned_meshes(warnings)?;
+        self.add_bound_meshes(warnings)
     }
 
     /// The place of a node in the space of its body or part. `world` is its place at rest, `in_part` that in its part.
@@ -423,7 +463,7 @@ impl<'a> Gatherer<'a> {
         parent: &DAffine3,
         above: Group,
     ) -> Result<(usize, DAffine3), &'static str> {
-        let (rigid, scale) = even_part(parent).ok_or("a node above it is scaled unevenly")?;
+        let (rigid, scale) = even_part(parent).ok_or(UNEVEN)?;
         let (translation, rotation, own_scale) = decomposed(node).ok_or("it has a matrix")?;
         let mut links = above.part.map_or_else(Vec::new, |p| self.parts[p].links.clone());
         if links.len() + 2 > MAX_LINKS {
@@ -467,18 +507,10 @@ impl<'a> Gatherer<'a> {
         body_from_node: &DAffine3,
         pose: Option<Pose<'_>>,
     ) -> Result<(), SceneError> {
-        self.cancel.check(self.limits)?;
-        let Source { document, data, look, instances, deformations, .. } = *self.source;
-        let primitive = &document.as_json().meshes[mesh].primitives[number];
-        let material = primitive.material.map_or(look.materials.len() - 1, |m| m.value());
-        let look = (material as u32, look.uv_sets[material]);
-        let deformation = deformations.of((node, mesh, number), pose);
-        let stop = (self.cancel, self.limits);
-        let read = read_primitive(primitive, data, look, &deformation, &mut self.paint, stop)?;
-        let Some((part, lost)) = read else { return Ok(()) };
+        let Some((part, lost)) = self.read((mesh, node, number), pose)? else { return Ok(()) };
         let into = self.meshes.entry(group).or_default();
         let here = [DAffine3::IDENTITY];
-        for place in instances.get(&node).map_or(&here[..], Vec::as_slice) {
+        for place in self.source.instances.get(&node).map_or(&here[..], Vec::as_slice) {
             self.cancel.check(self.limits)?;
             self.dropped.add(lost);
             // An instance may be scaled to zero, to hide it.
@@ -488,6 +520,22 @@ impl<'a> Gatherer<'a> {
             }
         }
         Ok(())
+    }
+
+    /// A primitive of a mesh of a node, in the mesh's space or as its skin has it; `None` if there is nothing to see.
+    fn read(
+        &mut self,
+        (mesh, node, number): (usize, usize, usize),
+        pose: Option<Pose<'_>>,
+    ) -> Result<Option<(TriangleMesh, Dropped)>, SceneError> {
+        self.cancel.check(self.limits)?;
+        let Source { document, data, look, deformations, .. } = *self.source;
+        let primitive = &document.as_json().meshes[mesh].primitives[number];
+        let material = primitive.material.map_or(look.materials.len() - 1, |m| m.value());
+        let look = (material as u32, look.uv_sets[material]);
+        let deformation = deformations.of((node, mesh, number), pose);
+        let stop = (self.cancel, self.limits);
+        read_primitive(primitive, data, look, &deformation, &mut self.paint, stop)
     }
 
     /// Bodies of what was gathered.
@@ -501,8 +549,11 @@ impl<'a> Gatherer<'a> {
         let (fixed, moving): (Vec<_>, Vec<_>) =
             std::mem::take(&mut self.meshes).into_iter().partition(|(group, _)| group.claim.is_none());
         for (group, mut mesh) in moving.into_iter().chain(fixed) {
-            self.dropped.add(mesh.drop_unusable());
-            let is_carrier = group.claim.is_some() && group.part.is_none();
+            // What a mesh that deforms is made of was sorted out before it was bound.
+            if group.deforming.is_none() {
+                self.dropped.add(mesh.drop_unusable());
+            }
+            let is_carrier = group.claim.is_some() && group.is_whole();
             if mesh.triangles.is_empty() && !is_carrier {
                 continue;
             }
@@ -526,13 +577,14 @@ impl<'a> Gatherer<'a> {
         Ok(Flat { bodies, lights })
     }
 
-    /// A body for every claim that has parts: its pose at rest is that of the claim, even if all its surfaces move.
+    /// A body for every claim that has parts or meshes that deform: its pose at rest is that of the claim, even if all its surfaces move.
     fn add_carriers(&mut self) {
-        let with_parts = self.meshes.keys().filter(|group| group.claim.is_some() && group.part.is_some());
+        let with_parts = self.meshes.keys().filter(|group| group.claim.is_some() && !group.is_whole());
         let carriers: Vec<Group> = with_parts
             .map(|group| Group {
                 is_virtual: group.claim.is_some_and(|c| !self.claims.bodies[c].projected),
                 part: None,
+                deforming: None,
                 ..*group
             })
             .collect();
@@ -549,16 +601,19 @@ impl<'a> Gatherer<'a> {
         };
         let rest = group.claim.map_or(DAffine3::IDENTITY, |c| self.rest[c]);
         let motion = self.motion(group);
+        let deforming = group.deforming.map(|i| &self.deforming[i]);
         Body {
-            name: match group.part {
-                Some(part) => format!("{carrier}/{}", self.parts[part].name),
-                None => carrier.to_owned(),
+            name: match (group.part, deforming) {
+                (Some(part), _) => format!("{carrier}/{}", self.parts[part].name),
+                (None, Some((name, _))) => format!("{carrier}/{name}"),
+                (None, None) => carrier.to_owned(),
             },
             tracked: group.claim.map(|c| c as u16),
             projected: !group.is_virtual,
             world_from_body_rest: motion.as_ref().map_or(rest, |motion| rest * motion.at(0)),
             motion,
             mesh,
+            deforms: deforming.map(|(_, deforms)| Arc::new(deforms.clone())),
         }
     }
 
@@ -576,7 +631,7 @@ impl<'a> Gatherer<'a> {
         warnings: &mut Vec<String>,
     ) -> PunctualLight {
         let find = |part| {
-            let same = |g: &&Group| g.claim == group.claim && g.part == part;
+            let same = |g: &&Group| g.claim == group.claim && g.part == part && g.deforming.is_none();
             body_of.keys().find(same).map(|g| body_of[g])
         };
         let Some(motion) = self.motion(group) else {
@@ -610,7 +665,7 @@ fn decomposed(node: &gltf::Node) -> Option<(DVec3, glam::DQuat, DVec3)> {
 
 /// Parent-from-node: as `channels` say where these never change, elsewhere at rest.
 fn local_transform(node: &gltf::Node, channels: Option<&Channels>) -> DAffine3 {
-    let Some((mut translation, mut rotation, scale)) = decomposed(node) else {
+    let Some((mut translation, mut rotation, mut scale)) = decomposed(node) else {
         let matrix = node.transform().matrix().map(|c| c.map(f64::from));
         return DAffine3::from_mat4(DMat4::from_cols_array_2d(&matrix));
     };
@@ -619,6 +674,9 @@ fn local_transform(node: &gltf::Node, channels: Option<&Channels>) -> DAffine3 {
     }
     if let Some(Track::Constant(turn)) = channels.and_then(|c| c.rotation.as_ref()) {
         rotation = *turn;
+    }
+    if let Some(Track::Constant(size)) = channels.and_then(|c| c.scale.as_ref()) {
+        scale = *size;
     }
     DAffine3::from_scale_rotation_translation(scale, rotation, translation)
 }
