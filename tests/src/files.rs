@@ -1,8 +1,11 @@
 //! Files: scenes of every format and environments. No bytes make the reader panic. The readers run in the thread of the caller, not in
 //! the one that the program gives them, so that a panic and a loop without end are seen as such.
 
+use dpm_scene::bvh::{BodyBvh, Refit};
+use dpm_scene::mesh::MAX_COORDINATE_M;
 use dpm_scene::{
-    decode_environment, load_bytes_here, load_mesh_here, LoadOptions, MeshFormat, Scene, SceneError,
+    decode_environment, load_bytes_here, load_mesh_here, Deformed, DeformingMesh, LoadOptions, MeshFormat,
+    Scene, SceneError, TriangleMesh,
 };
 
 /// A glTF file as it is.
@@ -27,9 +30,41 @@ fn judge(read: Result<Scene, SceneError>) {
                 assert!(mesh.triangles.iter().flatten().all(|i| (*i as usize) < vertices));
                 assert!(mesh.materials.iter().all(|m| (*m as usize) < scene.materials.len()));
             }
+            scene
+                .bodies
+                .iter()
+                .filter_map(|body| body.deforms.as_ref().zip(Some(&body.mesh)))
+                .for_each(|(deforms, mesh)| judge_shapes(deforms, mesh));
         }
         Err(e @ (SceneError::Internal(_) | SceneError::TimedOut(_))) => panic!("{e}"),
         Err(e) => assert!(!e.to_string().is_empty()),
+    }
+}
+
+/// Whatever numbers deform a mesh, its vertices are such as a renderer can use, and its tree holds them.
+fn judge_shapes(deforms: &DeformingMesh, mesh: &TriangleMesh) {
+    let mut now = Deformed::default();
+    let bvh = BodyBvh::build(mesh);
+    let (mut nodes, mut refit) = (bvh.nodes.clone(), Refit::new(&bvh));
+    for t_ns in [0, 1, 333_333_333, 500_000_000, i64::MAX, i64::MIN] {
+        deforms.at(t_ns, &mut now);
+        let n = mesh.positions.len();
+        assert_eq!([now.positions.len(), now.normals.len(), now.tangents.len()], [n; 3]);
+        assert!(now.positions.iter().all(|p| p.abs().max_element() <= MAX_COORDINATE_M));
+        assert!(now.normals.iter().all(|n| (n.length() - 1.0).abs() < 1e-3), "{:?}", now.normals);
+        assert!(
+            now.tangents.iter().all(|t| (t.truncate().length() - 1.0).abs() < 1e-3),
+            "{:?}",
+            now.tangents
+        );
+        let corners =
+            |place: usize| mesh.triangles[bvh.order[place] as usize].map(|i| now.positions[i as usize]);
+        let [lower, upper] = refit.run(&mut nodes, corners);
+        let holds = |i: &u32| {
+            let p = now.positions[*i as usize];
+            p.cmpge(lower).all() && p.cmple(upper).all()
+        };
+        assert!(mesh.triangles.iter().flatten().all(holds));
     }
 }
 

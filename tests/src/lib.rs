@@ -4,6 +4,7 @@ pub mod compare;
 pub mod conversations;
 pub mod decoders;
 pub mod files;
+pub mod flag;
 pub mod gpu;
 pub mod programs;
 pub mod rigs;

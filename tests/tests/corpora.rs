@@ -255,6 +255,18 @@ fn skinned(is_rigid: bool) -> Glb {
         .set("/skins", json!([{"joints": [2, 1]}]))
 }
 
+/// The same, bending, with weights and a size that change.
+fn deforming() -> Glb {
+    let mut file = skinned(false);
+    let times = file.push_numbers("SCALAR", &[0.0, 0.5, 1.0]);
+    let weights = file.push_numbers("SCALAR", &[0.0, 1.0, 0.25]);
+    let sizes = file.push_numbers("VEC3", &[1.0, 1.0, 1.0, 2.0, 1.0, 0.5, 0.0, 0.0, 0.0]);
+    file.set("/animations/0/channels/2", json!({"sampler": 2, "target": {"node": 1, "path": "weights"}}))
+        .set("/animations/0/channels/3", json!({"sampler": 3, "target": {"node": 2, "path": "scale"}}))
+        .set("/animations/0/samplers/2", json!({"input": times, "output": weights}))
+        .set("/animations/0/samplers/3", json!({"input": times, "output": sizes, "interpolation": "STEP"}))
+}
+
 /// A scene with a texture and an environment of each format, as small as they get.
 fn files() -> Vec<(&'static str, &'static str, Vec<u8>)> {
     let mut seeds = Vec::new();
@@ -264,9 +276,12 @@ fn files() -> Vec<(&'static str, &'static str, Vec<u8>)> {
         let text = serde_json::to_vec(&file.json).unwrap();
         seeds.push(("gltf_parts", name, [&text[..], &[0], &file.bin].concat()));
     }
-    for (name, file) in
-        [("animated", animated()), ("skinned", skinned(false)), ("skinned_rigid", skinned(true))]
-    {
+    for (name, file) in [
+        ("animated", animated()),
+        ("skinned", skinned(false)),
+        ("skinned_rigid", skinned(true)),
+        ("deforming", deforming()),
+    ] {
         let text = serde_json::to_vec(&file.json).unwrap();
         seeds.push(("gltf_parts", name, [&text[..], &[0], &file.bin].concat()));
     }

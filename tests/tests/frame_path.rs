@@ -1,11 +1,15 @@
 //! The steady state allocates nothing: a counting allocator checks every thread of the frame path.
 
 use counting_allocator::{Counting, Request};
+use dpm_render::gpu::Gpu;
 use dpm_rig::pipeline::on_frame_path;
+use dpm_rig::rig::Rig;
+use dpm_tests::flag::Flag;
 use dpm_tests::gpu::with_gpu;
 use dpm_tests::rigs::{demo_rig, run};
 use std::cell::Cell;
 use std::sync::atomic::{AtomicU64, Ordering};
+use std::sync::Arc;
 
 /// Allocations and releases on the frame path.
 static COUNTED: AtomicU64 = AtomicU64::new(0);
@@ -46,17 +50,23 @@ fn the_steady_state_allocates_nothing() {
             &["real_time.pace=\"virtual\"", "render.spp=1", "projector.tracks=\"auto\""],
             &["real_time.pace=\"real\"", "projector.frame_rate=\"200\"", "projector.tracks=\"auto\""],
         ] {
-            let rig = demo_rig(32, 16, settings);
-            let (before, all) = (COUNTED.load(Ordering::Relaxed), ALL.load(Ordering::Relaxed));
-            let (_, monitor) = run(gpu, &rig, 220, 0);
-            let counts = monitor.counts();
-            assert_eq!(counts.frames_planned, 220);
-            assert_eq!(counts.frames_done(), 220);
-            let during = COUNTED.load(Ordering::Relaxed) - before;
-            assert_eq!(during, 0, "{settings:?}: allocations and releases on the frame path");
-            assert!(ALL.load(Ordering::Relaxed) > all, "the allocator is not the one in use");
+            rig_allocates_nothing(gpu, &demo_rig(32, 16, settings));
         }
+        // A mesh that deforms is moved, and its tree fitted, in the threads of the frame path.
+        let flag = Flag::new("frame-path");
+        rig_allocates_nothing(gpu, &flag.rig((32, 16), &["real_time.pace=\"virtual\""]));
         // The probe itself: a box that is made here is not on the frame path.
         assert!(!on_frame_path());
     });
+}
+
+fn rig_allocates_nothing(gpu: &Arc<Gpu>, rig: &Arc<Rig>) {
+    let (before, all) = (COUNTED.load(Ordering::Relaxed), ALL.load(Ordering::Relaxed));
+    let (_, monitor) = run(gpu, rig, 220, 0);
+    let counts = monitor.counts();
+    assert_eq!(counts.frames_planned, 220);
+    assert_eq!(counts.frames_done(), 220);
+    let during = COUNTED.load(Ordering::Relaxed) - before;
+    assert_eq!(during, 0, "{:?}: allocations and releases on the frame path", rig.config.render.method);
+    assert!(ALL.load(Ordering::Relaxed) > all, "the allocator is not the one in use");
 }
