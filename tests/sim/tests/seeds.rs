@@ -231,6 +231,12 @@ fn what_once_broke_a_law_with_a_tracker_that_fails_often_keeps_them_all() {
         assert_eq!(lived.broken, None, "seed {seed}");
         assert!(lived.table.total() > 0 && lived.setup.tracker.kind() != TrackerKind::NatNet, "seed {seed}");
     }
+    // The network was cut right after a VRPN server had greeted, and what had waited was dated as new.
+    let first = vec![Kind::X12, Kind::X13, Kind::X14, Kind::X15, Kind::X16];
+    let cut = Order { tracker: Some(TrackerKind::Vrpn), first, ..order(1_520_001_254, None, 19) };
+    let lived = lived(&cut);
+    assert_eq!(lived.broken, None);
+    assert!(lived.table.total() > 10);
 }
 
 /// A fifth of the lives each have a serial tracker and a VRPN server, which are struck by faults of their own.

@@ -34,8 +34,11 @@ const SETTLED_ROUND_TRIP_NS: i64 = 10 * MS;
 /// ... or so many pongs do that came back within this time, of which the map takes the quickest.
 const SETTLED_PONGS: u32 = 5;
 const SETTLED_ROUND_TRIPS_NS: i64 = 50 * MS;
-/// If no pong tells for this long, the map of the server's clock is forgotten, and poses are dated by the shortest delay.
+/// If no pong tells for this long, while the server is heard, the map of its clock is forgotten, and poses are dated by the
+/// shortest delay ...
 const UNSETTLED_NS: i64 = 300 * MS;
+/// ... without a pause of this length, after which what had been held back may arrive.
+const PAUSE_NS: i64 = 100 * MS;
 /// A server that has not been heard for this long is sent something. A machine that has forgotten the connection says so
 /// then, and not before.
 const PROBE_AFTER_NS: i64 = 200 * MS;
@@ -112,7 +115,8 @@ pub struct VrpnClient {
     pongs: u64,
     /// Pings of this connection have been answered.
     has_ponged: bool,
-    /// Since then the age of poses is unknown: the connection is new, or the server's clock contradicts their arrival.
+    /// Since then the age of poses is unknown: the connection is new, or the server's clock contradicts their arrival. Counted
+    /// anew from when the server is heard again after a pause.
     doubted_since: Option<HostTime>,
     /// Pongs since then that bear the server's clock out.
     agreeing: u32,
@@ -291,6 +295,8 @@ impl VrpnClient {
                 Ok(0) => return Ok(false),
                 Ok(n) => {
                     self.filled += n;
+                    let paused = now.ns_since(*heard_at) > PAUSE_NS;
+                    self.doubted_since = self.doubted_since.map(|since| if paused { now } else { since });
                     *heard_at = now;
                 }
                 Err(e) if e.kind() == ErrorKind::WouldBlock => break,
@@ -500,7 +506,9 @@ impl VrpnClient {
             return 0;
         }
         let at = self.clock.now();
-        if self.doubted_since.take_if(|since| at.ns_since(*since) >= UNSETTLED_NS).is_some() {
+        let is_heard = now.ns_since(*heard_at) <= PAUSE_NS;
+        let lapses = |since: &mut HostTime| is_heard && at.ns_since(*since) >= UNSETTLED_NS;
+        if self.doubted_since.take_if(lapses).is_some() {
             self.map = ClockMap::new(1_000_000).expect("a microsecond clock");
         }
         let delivered = match self.digest(at, sink) {
