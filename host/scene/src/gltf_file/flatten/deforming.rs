@@ -136,10 +136,9 @@ impl Gatherer<'_> {
         let mut next = Some(node);
         let mut above = loop {
             let Some(at) = next else {
-                if claim.is_some() {
-                    return Err("a joint does not lie in its body");
-                }
-                nodes.push(Joining { above: None, place: Place::Fixed(self.source.world) });
+                // Files often have the joints beside the node that shows the skin. They move against the body at rest.
+                let body_from_world = claim.map_or(DAffine3::IDENTITY, |c| self.rest[c].inverse());
+                nodes.push(Joining { above: None, place: Place::Fixed(body_from_world * self.source.world) });
                 break nodes.len() - 1;
             };
             if let Some(&place) = known.get(&at) {
