@@ -1,6 +1,7 @@
 //! `dpm plan`: a rig into what its scene and method need of the renderer, what is left out of it and how, and what that saves.
 
 use super::plan_savings::{changed, compare, flipped, keeping, Saving, Side};
+use dpm_common::clock::Stopwatch;
 use dpm_device::planes::Channel;
 use dpm_render::method::{Method, SamplerKind};
 use dpm_render::scene_data::{SceneData, SceneNeeds};
@@ -11,7 +12,8 @@ use dpm_rig::failure::{Failure, FailureKind};
 use dpm_rig::pipeline::{renderer_settings, PipelineError};
 use dpm_rig::rig::Rig;
 use dpm_rig::run_rig::{open_gpu, traced_raster};
-use dpm_scene::{Body, Environment, Material, Scene};
+use dpm_scene::bvh::{BodyBvh, Refit};
+use dpm_scene::{Body, Deformed, Environment, Material, Scene};
 use serde::Serialize;
 
 /// One part that not every rig needs.
@@ -147,7 +149,44 @@ pub(crate) fn scene_entries(scene: &Scene, needs: &SceneNeeds, clamp: f64) -> Ve
             Some(format!("{} bodies", scene.bodies.len())),
             "rays ask each of so few bodies",
         ),
+        entry(
+            "meshes that deform",
+            deforming(scene),
+            "no animation deforms a mesh",
+            "frames in flight share the scene's tables",
+        ),
     ]
+}
+
+/// Frames whose shapes are worked out to measure how long one takes.
+const SHAPES: u64 = 32;
+
+/// The meshes of a scene that deform, and what the host does for a frame of them: vertices are moved, and trees fitted.
+fn deforming(scene: &Scene) -> Option<String> {
+    let bodies: Vec<_> = scene.bodies.iter().filter_map(|b| b.deforms.as_ref().zip(Some(&b.mesh))).collect();
+    let vertices: usize = bodies.iter().map(|(_, mesh)| mesh.positions.len()).sum();
+    let triangles: usize = bodies.iter().map(|(_, mesh)| mesh.triangles.len()).sum();
+    let mut took_ns = 0;
+    for (deforms, mesh) in &bodies {
+        let bvh = BodyBvh::build(mesh);
+        let (mut nodes, mut refit, mut now) = (bvh.nodes.clone(), Refit::new(&bvh), Deformed::default());
+        deforms.at(0, &mut now);
+        let watch = Stopwatch::start();
+        for shape in 0..SHAPES {
+            deforms.at(shape as i64 * 10_000_000, &mut now);
+            let corners =
+                |place: usize| mesh.triangles[bvh.order[place] as usize].map(|i| now.positions[i as usize]);
+            refit.run(&mut nodes, corners);
+        }
+        took_ns += watch.elapsed_ns() / SHAPES;
+    }
+    (!bodies.is_empty()).then(|| {
+        format!(
+            "{} of {vertices} vertices and {triangles} triangles: {:.2} ms of the host in each frame",
+            bodies.len(),
+            took_ns as f64 * 1e-6
+        )
+    })
 }
 
 /// Parts that depend on the method and its switches. `full` is the method as it is without any switch of the rig file.

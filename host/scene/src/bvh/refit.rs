@@ -1,6 +1,6 @@
 //! The tree of a mesh that deforms, fitted to where its triangles are now. Which triangles a node holds stays as it was built.
 
-use glam::Vec3;
+use glam::{Vec3, Vec3A};
 
 use super::{BodyBvh, NODE_WORDS};
 
@@ -16,12 +16,12 @@ pub struct Refit {
 /// An axis-aligned box.
 #[derive(Clone, Copy, Debug)]
 struct Bounds {
-    lower: Vec3,
-    upper: Vec3,
+    lower: Vec3A,
+    upper: Vec3A,
 }
 
 impl Bounds {
-    const NOTHING: Self = Self { lower: Vec3::INFINITY, upper: Vec3::NEG_INFINITY };
+    const NOTHING: Self = Self { lower: Vec3A::INFINITY, upper: Vec3A::NEG_INFINITY };
 
     fn union(self, other: Self) -> Self {
         Self { lower: self.lower.min(other.lower), upper: self.upper.max(other.upper) }
@@ -39,12 +39,6 @@ enum Slot {
 
 fn byte(words: &[[u32; 4]], word: usize, first: usize, slot: usize) -> u8 {
     (words[word][first + slot / 4] >> (8 * (slot % 4))) as u8
-}
-
-fn set_byte(words: &mut [[u32; 4]], word: usize, first: usize, slot: usize, value: u8) {
-    let at = &mut words[word][first + slot / 4];
-    let shift = 8 * (slot % 4);
-    *at = *at & !(0xff << shift) | u32::from(value) << shift;
 }
 
 fn slot_of(words: &[[u32; 4]], slot: usize) -> Slot {
@@ -90,8 +84,8 @@ impl Refit {
     /// nothing.
     pub fn run(&mut self, nodes: &mut [[u32; 4]], corners_of: impl Fn(usize) -> [Vec3; 3]) -> [Vec3; 2] {
         let box_of = |triangle: usize| {
-            let corners = corners_of(triangle);
-            corners.iter().fold(Bounds::NOTHING, |all, p| all.union(Bounds { lower: *p, upper: *p }))
+            let [a, b, c] = corners_of(triangle).map(Vec3A::from);
+            Bounds { lower: a.min(b).min(c), upper: a.max(b).max(c) }
         };
         for &node in self.nodes.iter().rev() {
             let words = &mut nodes[node as usize * NODE_WORDS..][..NODE_WORDS];
@@ -110,7 +104,7 @@ impl Refit {
             write(words, all, &slots);
         }
         let Bounds { lower, upper } = self.nodes.first().map_or(Bounds::NOTHING, |_| self.bounds[0]);
-        [lower, upper]
+        [lower.into(), upper.into()]
     }
 }
 
@@ -123,13 +117,19 @@ fn write(words: &mut [[u32; 4]], all: Bounds, slots: &[Bounds; 8]) {
         words[0][axis] = origin.to_bits();
         exponents |= exponent << (8 * axis);
         let steps = 1.0 / f64::from(f32::from_bits(exponent << 23));
-        for (slot, bounds) in slots.iter().enumerate().filter(|(_, bounds)| bounds.lower.x <= bounds.upper.x)
-        {
-            // Exact: differences of f32 are numbers of f64 to within rounding far below a step, and a step is a power of two.
-            let of = |x: f32| (f64::from(x) - f64::from(origin)) * steps;
-            set_byte(words, 2 + axis, 0, slot, of(bounds.lower[axis]).floor().clamp(0.0, 255.0) as u8);
-            set_byte(words, 2 + axis, 2, slot, of(bounds.upper[axis]).ceil().clamp(0.0, 255.0) as u8);
+        // Not negative. Exact to within rounding far below a step: a step is a power of two.
+        let of = |x: f32| (f64::from(x) - f64::from(origin)) * steps;
+        let mut planes = [[0u8; 8]; 2];
+        for (slot, bounds) in slots.iter().enumerate() {
+            if bounds.lower.x > bounds.upper.x {
+                continue;
+            }
+            let (lower, upper) = (of(bounds.lower[axis]), of(bounds.upper[axis]));
+            let whole = upper as u32;
+            planes[0][slot] = (lower as u32).min(255) as u8;
+            planes[1][slot] = (whole + u32::from(f64::from(whole) < upper)).min(255) as u8;
         }
+        words[2 + axis] = bytemuck::cast(planes);
     }
     words[0][3] = words[0][3] & 0xff00_0000 | exponents;
 }
