@@ -263,8 +263,8 @@ section! {
         /// says so for formats that name none.
         up: Option<FileAxis> = None, "", Any;
         /// Which animation of a glTF file plays, over and over: `first`, `none`, or its name. It moves nodes; each that has
-        /// surfaces is a body of its own, at most 128. Its time is that of the light. Sizes, morph targets
-        /// and skins that bend are shown at rest.
+        /// surfaces is a body of its own, at most 128. It deforms skins, shapes and sizes, at most 32 meshes. Its time is
+        /// that of the light.
         animation: String = "first".into(), "", NotEmpty;
         /// How fast it plays; 1 is the file's own time.
         animation_speed: f64 = 1.0, "", Within(0.001, 1000.0);
