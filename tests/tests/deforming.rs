@@ -42,11 +42,11 @@ fn the_light_is_that_of_the_shape_at_the_centre_of_each_frames_light() {
         assert_eq!((outcome.light_mismatches, outcome.light.len()), (0, 12));
         for (light, record) in outcome.light.iter().zip(&outcome.recent).step_by(3) {
             let at = record.drawn_for.0;
-            let mut bodies = Placed { deformed_at_ns: at, ..Placed::default() };
+            let mut bodies = Placed { animated_at_ns: at, ..Placed::default() };
             rig.scene_poses(&record.tracked_poses, at, &mut bodies.poses);
             let fell: Vec<u32> =
                 light.codes.iter().map(|c| u32::from_le_bytes([c[0], c[1], c[2], 0])).collect();
-            let of = |t_ns| alone(gpu, &rig, &rig.scene.deformed_at(t_ns), &bodies, light.frame);
+            let of = |t_ns| alone(gpu, &rig, &rig.scene.still_at(t_ns), &bodies, light.frame);
             assert_eq!(differ(&fell, &of(at)), 0, "frame {}", light.frame);
             assert!(differ(&fell, &of(at + 10_000_000)) > 20, "frame {}", light.frame);
             assert!(fell.iter().filter(|code| **code != 0).count() > 400);
@@ -61,7 +61,7 @@ fn frames_in_flight_show_their_own_shapes() {
     with_gpu(|gpu| {
         let rig = flag.rig(SIZE, &ALONE);
         let poses = vec![DAffine3::IDENTITY; rig.scene.bodies.len()];
-        let placed = |k: i64| Placed { poses: poses.clone(), deformed_at_ns: 13_000_000 * k };
+        let placed = |k: i64| Placed { poses: poses.clone(), animated_at_ns: 13_000_000 * k };
         let wanted: Vec<Vec<u32>> =
             (0..6).map(|k| alone(gpu, &rig, &rig.scene, &placed(k), k as u32)).collect();
         assert!(wanted.windows(2).all(|pair| differ(&pair[0], &pair[1]) > 20), "the flag waves");
@@ -108,7 +108,7 @@ fn histories_follow_what_deforms() {
         let mut renderer = Renderer::new(gpu, &rig.scene, renderer_settings(&rig)).unwrap();
         let mut slot = renderer.create_slot(false).unwrap();
         let poses = vec![DAffine3::IDENTITY; rig.scene.bodies.len()];
-        let placed = |k: i64| Placed { poses: poses.clone(), deformed_at_ns: k * 1_055_966 };
+        let placed = |k: i64| Placed { poses: poses.clone(), animated_at_ns: k * 1_055_966 };
         let off = |a: &[u32], b: &[u32]| -> f64 {
             let bytes = |codes: &[u32]| codes.iter().flat_map(|c| c.to_le_bytes()).collect::<Vec<u8>>();
             let squares =

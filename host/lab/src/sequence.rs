@@ -89,8 +89,8 @@ fn spp_of_frame(spp: f32, frame: u32) -> u32 {
 pub struct Placed {
     /// world-from-body of each.
     pub poses: Vec<DAffine3>,
-    /// The instant at which those that deform are shown, nanoseconds.
-    pub deformed_at_ns: i64,
+    /// The time of the shapes of those that deform, and of the pictures of clips, nanoseconds.
+    pub animated_at_ns: i64,
 }
 
 impl std::ops::Deref for Placed {
@@ -110,7 +110,7 @@ pub fn poses_at(rig: &Rig, slot: u64) -> Placed {
         .unwrap_or_else(|| rig.bodies.iter().map(|b| dpm_rig::rig::affine(&b.rest)).collect());
     let mut poses = Vec::new();
     rig.scene_poses(&tracked, t, &mut poses);
-    Placed { poses, deformed_at_ns: t }
+    Placed { poses, animated_at_ns: t }
 }
 
 /// Draws sequences of one rig.
@@ -359,7 +359,7 @@ pub fn submit(
         frame,
         spp: spp_of_frame(spp, frame),
         budget_spp: spp,
-        deformed_at_ns: bodies.deformed_at_ns,
+        animated_at_ns: bodies.animated_at_ns,
         ..FrameInputs::new(&rig.camera, rig.observer.eye_and_gaze(&tracked), bodies)
     };
     renderer.submit(slot, &drawn)

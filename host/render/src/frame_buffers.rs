@@ -4,12 +4,16 @@ use super::body_tree::BodyTree;
 use super::deformed::DeformedTables;
 use super::fill::fill;
 use super::memory::{BytesPerPixel, SharedBuffers};
+use super::scene_data::{BodyData, SceneData};
 use super::scene_gpu::{table_buffer, Geometry, SceneGpu};
 use super::settings::{Output, RendererSettings};
 use crate::gpu::{Buffer, FrameTree, Gpu, GpuError, MemoryKind, Place};
 use crate::pack;
 use bytemuck::Zeroable;
-use dpm_shaders::structs::{BodyNode, Counters, Frame, Guide, Instance, Mover, Schedule, Surface, NO_HIT};
+use dpm_shaders::structs::{
+    BodyNode, Counters, Frame, Guide, Instance, Mover, Schedule, Surface, TextureInfo, NO_HIT,
+};
+use dpm_shaders::Reading;
 use std::sync::Arc;
 
 /// The buffers of one frame in flight.
@@ -55,6 +59,8 @@ pub(super) struct FrameBuffers {
     pub device_tree: Option<FrameTree>,
     /// The tables of a scene in which bodies deform.
     pub deformed: Option<DeformedTables>,
+    /// The texture table of a scene with clips.
+    pub textures: Option<Latched>,
 }
 
 /// A buffer that the host writes, with its copy for the shaders. The frame's first commands make the copy.
@@ -138,9 +144,47 @@ impl FrameBuffers {
             movers: latched("movers", size_of::<Mover>() * bodies.max(1))?,
             device_tree: asks_device.then(|| FrameTree::new(gpu, bodies)).transpose()?,
             deformed: None,
+            textures: None,
             debug_host: debug.then(|| DebugBuffers::new(gpu, pixels, tiles, each)).transpose()?,
             each,
         })
+    }
+
+    /// Makes what only scenes need in which something else than poses changes from frame to frame.
+    ///
+    /// # Errors
+    /// Out of memory.
+    pub(super) fn animate(
+        &mut self,
+        gpu: &Arc<Gpu>,
+        data: &SceneData,
+        reading: Reading,
+    ) -> Result<(), GpuError> {
+        self.deformed = DeformedTables::new(gpu, data, reading)?;
+        if !data.clips.is_empty() {
+            let len_bytes = size_of_val(&data.textures[..]);
+            let mut host = Buffer::new(gpu, "texture table", len_bytes, MemoryKind::Upload)?;
+            host.write(&data.textures);
+            let device = Buffer::from_slice(gpu, "texture table", &data.textures)?;
+            self.textures = Some(Latched { host, device, len_bytes });
+        }
+        Ok(())
+    }
+
+    /// Changes the shapes and pictures of this frame to those of `t_ns`, and the bounds of bodies that deform. Allocates
+    /// nothing.
+    pub(super) fn show(&mut self, data: &SceneData, t_ns: i64, bounds: &mut [BodyData]) {
+        if let Some(deformed) = &mut self.deformed {
+            deformed.write(data, t_ns, bounds);
+        }
+        if let Some(textures) = &mut self.textures {
+            let size = size_of::<TextureInfo>();
+            for clip in &data.clips {
+                let info = TextureInfo { offset: clip.offset_at(t_ns), ..data.textures[clip.texture] };
+                textures.host.bytes_mut()[clip.texture * size..][..size]
+                    .copy_from_slice(bytemuck::bytes_of(&info));
+            }
+        }
     }
 
     /// Fills the buffers so that tiles that are never traced have no hit and are black.
@@ -219,7 +263,7 @@ impl FrameBuffers {
             "B_TRIANGLE_REFS" => &scene.refs,
             "B_VERTICES" => &self.geometry(scene).vertices,
             "B_MATERIALS" => &scene.materials,
-            "B_TEXTURES" => &scene.textures,
+            "B_TEXTURES" => self.textures.as_ref().map_or(&scene.textures, |textures| &textures.device),
             "B_TEXELS" => &scene.texels,
             "B_LIGHTS" => &scene.lights,
             "B_ENVIRONMENT" => &scene.environment,

@@ -1,7 +1,6 @@
 //! One frame on the GPU, from surfaces over radiance to code values. `Renderer::create_slot` records the passes in their order.
 
 use super::body_tree::BodyTree;
-use super::deformed::DeformedTables;
 use super::fill;
 use super::frame_buffers::FrameBuffers;
 use super::last_frame::{LastFrame, Turn};
@@ -187,7 +186,7 @@ impl Renderer {
         let body_tree = BodyTree::new(if self.walks_tree { self.data.bodies.len() } else { 0 });
         let sizes = (self.data.bodies.len(), tile_list.len());
         let mut buffers = FrameBuffers::new(gpu, settings, sizes, body_tree, (debug, asks_device))?;
-        buffers.deformed = DeformedTables::new(gpu, &self.data, self.reading)?;
+        buffers.animate(gpu, &self.data, self.reading)?;
         buffers.clear(gpu, settings)?;
         let set_of = |parity| {
             let all = (&resources.shared, &resources.scene);
@@ -237,6 +236,9 @@ impl Renderer {
         }
         if let Some(deformed) = &b.deformed {
             deformed.record(r);
+        }
+        if let Some(textures) = &b.textures {
+            r.copy(&textures.host, &textures.device, textures.len_bytes);
         }
         if let Some(tree) = &b.device_tree {
             r.build_frame_tree(tree);
@@ -318,9 +320,7 @@ impl Renderer {
     pub fn submit(&mut self, slot: &mut FrameSlot, inputs: &FrameInputs<'_>) -> Result<(), GpuError> {
         assert_eq!(inputs.poses.len(), self.data.bodies.len(), "one pose per body");
         slot.fence.check_free()?;
-        if let Some(deformed) = &mut slot.buffers.deformed {
-            deformed.write(&self.data, inputs.deformed_at_ns, &mut self.bodies);
-        }
+        slot.buffers.show(&self.data, inputs.animated_at_ns, &mut self.bodies);
         if self.settings.camera_is_eye || self.keep.every_tile {
             slot.tile_list.fill();
         } else {

@@ -9,7 +9,7 @@ use dpm_scene::albedo_table::{tabulated, AlbedoTable, ALBEDO_NODES};
 use dpm_scene::bvh::BodyBvh;
 use dpm_scene::horizon::{horizons, Horizon, CLOSED};
 use dpm_scene::mesh::MAX_COORDINATE_M;
-use dpm_scene::{Environment, PunctualKind, Scene, TextureRef, TriangleMesh, Wrap};
+use dpm_scene::{picture_at, Environment, PunctualKind, Scene, TextureRef, TriangleMesh, Wrap};
 use dpm_shaders::structs::{
     self as gpu, AlbedoCell, Light, Material, TextureInfo, TextureUse, TriangleRef, Vertex,
 };
@@ -78,6 +78,24 @@ impl BodyData {
     }
 }
 
+/// A texture that shows pictures one after the other.
+#[derive(Clone, Debug)]
+pub struct Clip {
+    /// Index among the textures.
+    pub(super) texture: usize,
+    /// When each picture ends, as [`dpm_scene::Texture::ends_ns`].
+    ends_ns: Vec<i64>,
+    /// The first texel of each.
+    offsets: Vec<u32>,
+}
+
+impl Clip {
+    /// The first texel of the picture that is shown at `t_ns`.
+    pub(super) fn offset_at(&self, t_ns: i64) -> u32 {
+        self.offsets[picture_at(&self.ends_ns, t_ns)]
+    }
+}
+
 /// A scene ready for upload.
 #[derive(Clone, Debug, Default)]
 pub struct SceneData {
@@ -97,8 +115,10 @@ pub struct SceneData {
     pub vertices: Vec<Vertex>,
     /// All materials.
     pub materials: Vec<Material>,
-    /// All textures.
+    /// All textures; clips with their first pictures.
     pub textures: Vec<TextureInfo>,
+    /// The textures that show pictures one after the other.
+    pub clips: Vec<Clip>,
     /// Linear RGBA, 16 bits each.
     pub texels: Vec<[u32; 2]>,
     /// Emissive triangles and punctual lights with their alias table.
@@ -226,7 +246,12 @@ impl SceneData {
     }
 
     fn add_textures(&mut self, scene: &Scene) {
-        for t in &scene.textures {
+        for (index, t) in scene.textures.iter().enumerate() {
+            if !t.ends_ns.is_empty() {
+                let first = self.texels.len();
+                let offsets = (0..t.ends_ns.len()).map(|k| (first + k * t.picture_len()) as u32).collect();
+                self.clips.push(Clip { texture: index, ends_ns: t.ends_ns.clone(), offsets });
+            }
             let wrap = |w: Wrap| w as u32;
             self.textures.push(TextureInfo {
                 offset: self.texels.len() as u32,

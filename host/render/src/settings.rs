@@ -129,8 +129,9 @@ pub struct FrameInputs<'a> {
     pub widen_deg: f32,
     /// world-from-body of every body of the scene, at the time at which the frame is shown.
     pub poses: &'a [DAffine3],
-    /// The time at which the bodies that deform are shown, nanoseconds.
-    pub deformed_at_ns: i64,
+    /// The time of what an animation changes besides poses, nanoseconds: the shapes of bodies that deform, and the pictures of
+    /// clips.
+    pub animated_at_ns: i64,
     /// How the bodies move while the planes last; `None`: they stand still.
     pub sweep: Option<Sweep<'a>>,
     /// For each tracked body whether it is lost, so that no light falls on it. Bodies beyond the end are not lost.
@@ -156,7 +157,7 @@ impl<'a> FrameInputs<'a> {
             gaze,
             widen_deg: 0.0,
             poses,
-            deformed_at_ns: 0,
+            animated_at_ns: 0,
             sweep: None,
             lost: &[],
         }

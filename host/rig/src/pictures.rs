@@ -170,7 +170,7 @@ fn integrate(
 ) -> Result<Vec<Vec3>, GpuError> {
     let mut slot = renderer.create_slot(true)?;
     let inputs =
-        FrameInputs { deformed_at_ns: window.at_ns, ..FrameInputs::new(camera, (other, other), poses) };
+        FrameInputs { animated_at_ns: window.at_ns, ..FrameInputs::new(camera, (other, other), poses) };
     renderer.submit(&mut slot, &inputs)?;
     slot.wait(60_000_000_000)?;
     let surfaces = slot.surfaces().unwrap_or(&[]);

@@ -29,7 +29,7 @@ pub(crate) fn submit(
             gaze: plan.gaze,
             widen_deg: plan.widen_deg,
             poses: &plan.scene_poses,
-            deformed_at_ns: plan.centre_at.0,
+            animated_at_ns: plan.centre_at.0,
             sweep: plan.sweep(),
             lost: &plan.lost,
         },

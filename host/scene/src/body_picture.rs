@@ -39,7 +39,7 @@ impl Scene {
         })
     }
 
-    /// Shows a PNG, JPEG or KTX2 on a tracked body and its parts, over their texture coordinates and repeated, in the place of
+    /// Shows a PNG, JPEG, KTX2 or an animated PNG on a tracked body and its parts, over their texture coordinates and repeated, in the place of
     /// their base colours, and of the light of materials that are unlit. What else a material says stays.
     ///
     /// # Errors

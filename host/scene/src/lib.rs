@@ -220,8 +220,9 @@ impl Scene {
 }
 
 impl Scene {
-    /// The scene in which every mesh that deforms has the shape that it has at `t_ns` nanoseconds, and keeps it.
-    pub fn deformed_at(&self, t_ns: i64) -> Self {
+    /// The scene in which every mesh that deforms has the shape of `t_ns` nanoseconds, and every clip shows the picture of this
+    /// time, and keeps it. What moves without deforming is where its poses say.
+    pub fn still_at(&self, t_ns: i64) -> Self {
         let mut scene = self.clone();
         let mut now = Deformed::default();
         for body in &mut scene.bodies {
@@ -230,6 +231,12 @@ impl Scene {
             body.mesh.positions.clone_from(&now.positions);
             body.mesh.normals.clone_from(&now.normals);
             body.mesh.tangents.clone_from(&now.tangents);
+        }
+        for texture in scene.textures.iter_mut().filter(|texture| !texture.ends_ns.is_empty()) {
+            let (len, first) = (texture.picture_len(), texture.picture_len() * texture.picture_at(t_ns));
+            texture.texels.copy_within(first..first + len, 0);
+            texture.texels.truncate(len);
+            texture.ends_ns.clear();
         }
         scene
     }
@@ -280,7 +287,7 @@ pub struct Texture {
     pub width: u32,
     /// Rows.
     pub height: u32,
-    /// `width * height` RGBA values.
+    /// `width * height` RGBA values; of a clip those of its pictures one after the other.
     pub texels: Vec<[u8; 4]>,
     /// RGB are sRGB-encoded and are decoded **before** interpolation.
     pub srgb: bool,
@@ -290,6 +297,27 @@ pub struct Texture {
     pub wrap_v: Wrap,
     /// No interpolation.
     pub nearest: bool,
+    /// Of a clip: when each of its pictures ends, in nanoseconds from the beginning of a round; rising, above 0. Empty: there is
+    /// one picture.
+    pub ends_ns: Vec<i64>,
+}
+
+impl Texture {
+    /// Texels of one picture.
+    pub fn picture_len(&self) -> usize {
+        self.width as usize * self.height as usize
+    }
+
+    /// The picture that is shown at `t_ns` nanoseconds, any value; 0 of a texture that is no clip.
+    pub fn picture_at(&self, t_ns: i64) -> usize {
+        picture_at(&self.ends_ns, t_ns)
+    }
+}
+
+/// The picture of a clip that is shown at `t_ns` nanoseconds, any value; `ends_ns` as in [`Texture`].
+pub fn picture_at(ends_ns: &[i64], t_ns: i64) -> usize {
+    let round = ends_ns.last().map_or(0, |length| t_ns.rem_euclid((*length).max(1)));
+    ends_ns.partition_point(|end| *end <= round)
 }
 
 /// A light without extent (KHR_lights_punctual).

@@ -53,6 +53,7 @@ fn image(srgb: bool, texel: impl Fn(Vec2) -> Vec3) -> Texture {
         wrap_u: Wrap::Repeat,
         wrap_v: Wrap::Repeat,
         nearest: false,
+        ends_ns: vec![],
     }
 }
 

@@ -226,6 +226,7 @@ pub fn noise_texture(size: u32, seed: u64, low: u8, high: u8, srgb: bool) -> Tex
         wrap_u: Wrap::Repeat,
         wrap_v: Wrap::Mirror,
         nearest: false,
+        ends_ns: vec![],
     }
 }
 

@@ -394,6 +394,7 @@ fn patches() -> Texture {
         wrap_u: Wrap::Repeat,
         wrap_v: Wrap::Repeat,
         nearest: false,
+        ends_ns: vec![],
     }
 }
 

@@ -365,8 +365,9 @@ section! {
         /// axes are seldom those of the glTF node. `dpm calibrate body` measures it. The mock tracker reports the mesh
         /// itself and ignores it.
         mesh_to_body: PoseConfig = PoseConfig::default(), "", Any;
-        /// A picture that its mesh shows in the place of its file's colours: PNG, JPEG or KTX2. It lies over the texture
-        /// coordinates that the textures of its mesh use, and repeats. What else its materials say stays: roughness, metal,
+        /// A picture that its mesh shows in the place of its file's colours: PNG, JPEG or KTX2; or an
+        /// animated PNG, whose pictures follow each other over and over. It lies over the texture coordinates that the
+        /// textures of its mesh use, and repeats. What else its materials say stays: roughness, metal,
         /// bumps. An unlit material shows the picture as it is. Large pictures cost memory, not time.
         texture: Option<PathBuf> = None, "", NotEmpty;
         /// Albedo of its real surface, if it differs from `scene.surface_albedo`: one number, or one for each channel. With

@@ -260,6 +260,7 @@ impl Reader<'_> {
             nearest: sampler
                 .as_ref()
                 .is_some_and(|s| s.mag_filter() == Some(gltf::texture::MagFilter::Nearest)),
+            ends_ns: vec![],
         })
     }
 

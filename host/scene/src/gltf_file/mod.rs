@@ -5,6 +5,7 @@ mod accessor;
 mod animation;
 mod check;
 mod check_look;
+mod clip;
 mod compressed;
 mod container;
 mod deform;
@@ -33,14 +34,19 @@ pub(super) fn fetch_beside(uri: &str, beside: Option<&Path>, limit: u64) -> Resu
     container::fetch(uri, beside.map(Folder::of).transpose()?.as_ref(), limit)
 }
 
-/// A picture of colours that is not part of a file, PNG, JPEG or KTX2; it repeats. `texels_so_far` counts those of the scene.
+/// A picture of colours that is not part of a file, PNG, JPEG or KTX2, or an animated PNG; it repeats. `texels_so_far` counts
+/// those of the scene.
 pub(super) fn decode_picture(
     bytes: &[u8],
     texels_so_far: u64,
     limits: &Limits,
 ) -> Result<Texture, SceneError> {
     let nothing = Value::Object(serde_json::Map::new());
-    let picture = picture::decode(&Item::new(&nothing, "picture".into())?, bytes, texels_so_far, limits)?;
+    let item = Item::new(&nothing, "picture".into())?;
+    if let Some(clip) = clip::decode(&item, bytes, texels_so_far, limits)? {
+        return Ok(clip);
+    }
+    let picture = picture::decode(&item, bytes, texels_so_far, limits)?;
     let picture::Size { width, height } = picture.size;
     Ok(Texture {
         width,
@@ -50,6 +56,7 @@ pub(super) fn decode_picture(
         wrap_u: Wrap::Repeat,
         wrap_v: Wrap::Repeat,
         nearest: false,
+        ends_ns: vec![],
     })
 }
 

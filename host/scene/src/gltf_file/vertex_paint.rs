@@ -151,6 +151,7 @@ impl Paint {
             wrap_u: Wrap::Clamp,
             wrap_v: Wrap::Clamp,
             nearest: false,
+            ends_ns: vec![],
         }
     }
 }

@@ -7,7 +7,16 @@ use dpm_scene::{Texture, TextureRef, Wrap};
 use glam::{DQuat, DVec2};
 
 fn image(width: u32, height: u32, texels: Vec<[u8; 4]>) -> Texture {
-    Texture { width, height, texels, srgb: false, wrap_u: Wrap::Repeat, wrap_v: Wrap::Repeat, nearest: false }
+    Texture {
+        width,
+        height,
+        texels,
+        srgb: false,
+        wrap_u: Wrap::Repeat,
+        wrap_v: Wrap::Repeat,
+        nearest: false,
+        ends_ns: vec![],
+    }
 }
 
 fn use_of(texture: u32) -> TextureRef {
