@@ -102,7 +102,11 @@ impl Way {
         dice: &mut Dice,
         heard: &mut Vec<u8>,
     ) {
-        let spoiled = spoils.any() || self.gap > 0;
+        let spoiled = spoils.any();
+        if !spoiled {
+            // Where little is said, a gap of some hundred bytes would outlast its cause by seconds.
+            self.gap = 0;
+        }
         while self.over_at <= now {
             let Some(byte) = self.queue.pop_front() else { break };
             let at = self.over_at;

@@ -234,9 +234,13 @@ fn what_once_broke_a_law_with_a_tracker_that_fails_often_keeps_them_all() {
     // The network was cut right after a VRPN server had greeted, and what had waited was dated as new.
     let first = vec![Kind::X12, Kind::X13, Kind::X14, Kind::X15, Kind::X16];
     let cut = Order { tracker: Some(TrackerKind::Vrpn), first, ..order(1_520_001_254, None, 19) };
-    let lived = lived(&cut);
-    assert_eq!(lived.broken, None);
-    assert!(lived.table.total() > 10);
+    // The world lost 300 bytes of what the host said although the noise on its line was over: no echo for two seconds.
+    let noisy = Order { tracker: Some(TrackerKind::Serial), ..order(1_600_004_190, Some(60), 32) };
+    for order in [cut, noisy] {
+        let lived = lived(&order);
+        assert_eq!(lived.broken, None, "seed {}", order.seed);
+        assert!(lived.table.total() > 10);
+    }
 }
 
 /// A fifth of the lives each have a serial tracker and a VRPN server, which are struck by faults of their own.
