@@ -293,17 +293,41 @@ fn within(p: Vec3) -> Vec3 {
 
 /// The unit vector of `v`, and of `other` where it has none.
 fn unit(v: Vec3, other: Vec3) -> Vec3 {
-    // The normal of a tiny face is too short for f32.
-    let largest = v.abs().max_element();
-    (v * largest.recip()).try_normalize().or_else(|| other.try_normalize()).unwrap_or(Vec3::Y)
+    direction(v).or_else(|| other.try_normalize()).unwrap_or(Vec3::Y)
 }
 
 /// The unit vector along `v` that is across the unit vector `normal`.
 fn across(v: Vec3, normal: Vec3) -> Vec3 {
-    (v - normal * normal.dot(v)).try_normalize().unwrap_or_else(|| normal.any_orthonormal_vector())
+    direction(v - normal * normal.dot(v)).unwrap_or_else(|| normal.any_orthonormal_vector())
+}
+
+/// The unit vector of `v`, however short or long it is: the square of a tiny one has few bits left.
+fn direction(v: Vec3) -> Option<Vec3> {
+    (v * v.abs().max_element().recip()).try_normalize()
 }
 
 /// It maps area vectors, as [`crate::mesh::cofactor`] does.
 fn cofactor(m: Mat3A) -> Mat3A {
     Mat3A::from_cols(m.y_axis.cross(m.z_axis), m.z_axis.cross(m.x_axis), m.x_axis.cross(m.y_axis))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// Found by fuzzing: the square of a tangent of 1e-20 has so few bits that its root is off by a hundredth.
+    #[test]
+    fn directions_of_tiny_and_huge_vectors_have_the_length_one() {
+        let v = Vec3::new(0.3, -0.7, 0.2);
+        for scale in [1e-37, 1e-30, 3e-23, 1e-20, 1.0, 1e19, 1e38] {
+            let found = direction(v * scale).unwrap();
+            assert!(found.distance(v.normalize()) < 1e-6, "{scale:e}: {found}");
+            let tangent = across(v * scale, Vec3::Z);
+            assert!((tangent.length() - 1.0).abs() < 1e-6 && tangent.z == 0.0, "{scale:e}: {tangent}");
+        }
+        for v in [Vec3::ZERO, Vec3::NAN, Vec3::INFINITY, Vec3::splat(1e-45)] {
+            assert_eq!(unit(v, Vec3::X), Vec3::X, "{v}");
+            assert!((across(v, Vec3::Z).length() - 1.0).abs() < 1e-6);
+        }
+    }
 }
