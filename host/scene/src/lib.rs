@@ -303,6 +303,12 @@ pub struct Texture {
 }
 
 impl Texture {
+    /// One picture that repeats, and is interpolated.
+    pub fn repeated([width, height]: [u32; 2], texels: Vec<[u8; 4]>, srgb: bool) -> Self {
+        let (wrap_u, wrap_v) = (Wrap::Repeat, Wrap::Repeat);
+        Self { width, height, texels, srgb, wrap_u, wrap_v, nearest: false, ends_ns: vec![] }
+    }
+
     /// Texels of one picture.
     pub fn picture_len(&self) -> usize {
         self.width as usize * self.height as usize

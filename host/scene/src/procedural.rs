@@ -3,7 +3,7 @@
 use glam::{Vec2, Vec3};
 
 use super::srgb::from_linear;
-use super::{Texture, Wrap};
+use super::Texture;
 
 const SIZE: u32 = 256;
 
@@ -45,16 +45,7 @@ fn image(srgb: bool, texel: impl Fn(Vec2) -> Vec3) -> Texture {
             [r, g, b, 255]
         })
         .collect();
-    Texture {
-        width: SIZE,
-        height: SIZE,
-        texels,
-        srgb,
-        wrap_u: Wrap::Repeat,
-        wrap_v: Wrap::Repeat,
-        nearest: false,
-        ends_ns: vec![],
-    }
+    Texture::repeated([SIZE; 2], texels, srgb)
 }
 
 fn linear_image(texel: impl Fn(Vec2) -> Vec3) -> Texture {

@@ -218,16 +218,7 @@ pub fn noise_texture(size: u32, seed: u64, low: u8, high: u8, srgb: bool) -> Tex
     let mut random = Sampler::new(seed, 0);
     let mut value = || low + (random.uniform() * f64::from(high - low)) as u8;
     let texels = (0..size * size).map(|_| [value(), value(), value(), 255]).collect();
-    Texture {
-        width: size,
-        height: size,
-        texels,
-        srgb,
-        wrap_u: Wrap::Repeat,
-        wrap_v: Wrap::Mirror,
-        nearest: false,
-        ends_ns: vec![],
-    }
+    Texture { wrap_v: Wrap::Mirror, ..Texture::repeated([size; 2], texels, srgb) }
 }
 
 /// Adds a texture and a reference to it, stretched and rotated so that every part of the transform matters.

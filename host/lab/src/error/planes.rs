@@ -386,16 +386,7 @@ fn patches() -> Texture {
     };
     let texels = (0..PATCHES * PATCHES).map(|i| [value(i, 0), value(i, 1), value(i, 2), 255]).collect();
     let size = PATCHES as u32;
-    Texture {
-        width: size,
-        height: size,
-        texels,
-        srgb: false,
-        wrap_u: Wrap::Repeat,
-        wrap_v: Wrap::Repeat,
-        nearest: false,
-        ends_ns: vec![],
-    }
+    Texture::repeated([size; 2], texels, false)
 }
 
 /// Noise with the root of the mean square `rms`, of six octaves from 2 to 64 texels whose power grows with the wavelength.

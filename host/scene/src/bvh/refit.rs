@@ -1,6 +1,7 @@
 //! The tree of a mesh that deforms, fitted to where its triangles are now. Which triangles a node holds stays as it was built.
 
 use glam::{Vec3, Vec3A};
+use obvhs::aabb::Aabb;
 
 use super::{BodyBvh, NODE_WORDS};
 
@@ -10,23 +11,11 @@ pub struct Refit {
     /// Nodes that the walk can reach, each before those below it.
     nodes: Vec<u32>,
     /// Bounds of each node; of use while it runs.
-    bounds: Vec<Bounds>,
+    bounds: Vec<Aabb>,
 }
 
-/// An axis-aligned box.
-#[derive(Clone, Copy, Debug)]
-struct Bounds {
-    lower: Vec3A,
-    upper: Vec3A,
-}
-
-impl Bounds {
-    const NOTHING: Self = Self { lower: Vec3A::INFINITY, upper: Vec3A::NEG_INFINITY };
-
-    fn union(self, other: Self) -> Self {
-        Self { lower: self.lower.min(other.lower), upper: self.upper.max(other.upper) }
-    }
-}
+/// The box of nothing.
+const NOTHING: Aabb = Aabb { min: Vec3A::INFINITY, max: Vec3A::NEG_INFINITY };
 
 /// What stands in a slot of a node.
 enum Slot {
@@ -76,7 +65,7 @@ impl Refit {
             }));
             next += 1;
         }
-        Self { nodes, bounds: vec![Bounds::NOTHING; bvh.nodes.len() / NODE_WORDS] }
+        Self { nodes, bounds: vec![NOTHING; bvh.nodes.len() / NODE_WORDS] }
     }
 
     /// Changes the boxes of `nodes` to hold the triangles, whose corners `corners_of` gives for each place in BVH order, and
@@ -85,35 +74,35 @@ impl Refit {
     pub fn run(&mut self, nodes: &mut [[u32; 4]], corners_of: impl Fn(usize) -> [Vec3; 3]) -> [Vec3; 2] {
         let box_of = |triangle: usize| {
             let [a, b, c] = corners_of(triangle).map(Vec3A::from);
-            Bounds { lower: a.min(b).min(c), upper: a.max(b).max(c) }
+            Aabb { min: a.min(b).min(c), max: a.max(b).max(c) }
         };
         for &node in self.nodes.iter().rev() {
             let words = &mut nodes[node as usize * NODE_WORDS..][..NODE_WORDS];
-            let mut slots = [Bounds::NOTHING; 8];
+            let mut slots = [NOTHING; 8];
             for (slot, bounds) in slots.iter_mut().enumerate() {
                 *bounds = match slot_of(words, slot) {
                     Slot::Nothing => continue,
                     Slot::Inner(below) => self.bounds[below],
                     Slot::Triangles(first, count) => {
-                        (first..first + count).map(box_of).fold(Bounds::NOTHING, Bounds::union)
+                        (first..first + count).map(box_of).fold(NOTHING, |all, one| all.union(&one))
                     }
                 };
             }
-            let all = slots.iter().fold(Bounds::NOTHING, |all, slot| all.union(*slot));
+            let all = slots.iter().fold(NOTHING, |all, slot| all.union(slot));
             self.bounds[node as usize] = all;
             write(words, all, &slots);
         }
-        let Bounds { lower, upper } = self.nodes.first().map_or(Bounds::NOTHING, |_| self.bounds[0]);
-        [lower.into(), upper.into()]
+        let all = self.nodes.first().map_or(NOTHING, |_| self.bounds[0]);
+        [all.min.into(), all.max.into()]
     }
 }
 
 /// The boxes of a node's slots as steps from the lower corner of all, rounded outwards \[Ylitie17\].
-fn write(words: &mut [[u32; 4]], all: Bounds, slots: &[Bounds; 8]) {
+fn write(words: &mut [[u32; 4]], all: Aabb, slots: &[Aabb; 8]) {
     let mut exponents = 0;
     for axis in 0..3 {
-        let origin = all.lower[axis];
-        let exponent = step_bits(all.upper[axis] - origin);
+        let origin = all.min[axis];
+        let exponent = step_bits(all.max[axis] - origin);
         words[0][axis] = origin.to_bits();
         exponents |= exponent << (8 * axis);
         let steps = 1.0 / f64::from(f32::from_bits(exponent << 23));
@@ -121,10 +110,10 @@ fn write(words: &mut [[u32; 4]], all: Bounds, slots: &[Bounds; 8]) {
         let of = |x: f32| (f64::from(x) - f64::from(origin)) * steps;
         let mut planes = [[0u8; 8]; 2];
         for (slot, bounds) in slots.iter().enumerate() {
-            if bounds.lower.x > bounds.upper.x {
+            if bounds.min.x > bounds.max.x {
                 continue;
             }
-            let (lower, upper) = (of(bounds.lower[axis]), of(bounds.upper[axis]));
+            let (lower, upper) = (of(bounds.min[axis]), of(bounds.max[axis]));
             let whole = upper as u32;
             planes[0][slot] = (lower as u32).min(255) as u8;
             planes[1][slot] = (whole + u32::from(f64::from(whole) < upper)).min(255) as u8;

@@ -5,7 +5,7 @@ use std::io::Cursor;
 use image::codecs::png::PngDecoder;
 use image::{AnimationDecoder, ImageDecoder, ImageError};
 
-use super::super::{Limits, SceneError, Texture, Wrap};
+use super::super::{Limits, SceneError, Texture};
 use super::json::Item;
 use super::picture::{check_size, Size};
 
@@ -55,6 +55,5 @@ pub(super) fn decode(
     if ends_ns.is_empty() {
         return Err(item.error("is an animated PNG without pictures"));
     }
-    let (wrap_u, wrap_v) = (Wrap::Repeat, Wrap::Repeat);
-    Ok(Some(Texture { width, height, texels, srgb: true, wrap_u, wrap_v, nearest: false, ends_ns }))
+    Ok(Some(Texture { ends_ns, ..Texture::repeated([width, height], texels, true) }))
 }

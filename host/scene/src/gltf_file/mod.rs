@@ -23,7 +23,7 @@ use std::path::Path;
 use serde_json::Value;
 
 use super::limits::Cancel;
-use super::{Environment, Limits, LoadOptions, Scene, SceneError, Texture, Wrap};
+use super::{Environment, Limits, LoadOptions, Scene, SceneError, Texture};
 use container::Folder;
 use json::Item;
 
@@ -48,16 +48,7 @@ pub(super) fn decode_picture(
     }
     let picture = picture::decode(&item, bytes, texels_so_far, limits)?;
     let picture::Size { width, height } = picture.size;
-    Ok(Texture {
-        width,
-        height,
-        srgb: picture.srgb.unwrap_or(true),
-        texels: picture.texels,
-        wrap_u: Wrap::Repeat,
-        wrap_v: Wrap::Repeat,
-        nearest: false,
-        ends_ns: vec![],
-    })
+    Ok(Texture::repeated([width, height], picture.texels, picture.srgb.unwrap_or(true)))
 }
 
 /// Maximum number of warnings of one kind from a hostile file.

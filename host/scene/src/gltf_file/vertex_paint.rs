@@ -144,14 +144,9 @@ impl Paint {
             }
         }
         Texture {
-            width,
-            height,
-            texels,
-            srgb: true,
             wrap_u: Wrap::Clamp,
             wrap_v: Wrap::Clamp,
-            nearest: false,
-            ends_ns: vec![],
+            ..Texture::repeated([width, height], texels, true)
         }
     }
 }

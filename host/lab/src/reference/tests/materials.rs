@@ -7,16 +7,7 @@ use dpm_scene::{Texture, TextureRef, Wrap};
 use glam::{DQuat, DVec2};
 
 fn image(width: u32, height: u32, texels: Vec<[u8; 4]>) -> Texture {
-    Texture {
-        width,
-        height,
-        texels,
-        srgb: false,
-        wrap_u: Wrap::Repeat,
-        wrap_v: Wrap::Repeat,
-        nearest: false,
-        ends_ns: vec![],
-    }
+    Texture::repeated([width, height], texels, false)
 }
 
 fn use_of(texture: u32) -> TextureRef {
