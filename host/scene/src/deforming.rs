@@ -20,13 +20,10 @@ const MOST_LOOKS: usize = 1024;
 /// A mesh that deforms over and over.
 #[derive(Clone, Debug, Default)]
 pub struct DeformingMesh {
-    /// The nodes that its joints hang on, each after the one above it.
-    nodes: Vec<Joining>,
-    /// For each joint its node, and joint-from-mesh.
-    joints: Vec<(usize, DAffine3)>,
+    skeleton: Skeleton,
     targets: Vec<MorphTarget>,
     /// One for each vertex of the mesh.
-    vertices: Vec<Bound>,
+    vertices: Vec<BindVertex>,
     /// Joints and weights of all vertices, which have the sum 1 for each.
     influences: Vec<(u16, f32)>,
     /// Vertices of which each three in a row are a face with its own normal: the file has no normals.
@@ -43,7 +40,7 @@ pub struct DeformingMesh {
 
 /// A node on the way from the body to a joint.
 #[derive(Clone, Debug)]
-pub(crate) struct Joining {
+pub(crate) struct SkeletonNode {
     /// The one above it; `None`: the body.
     pub above: Option<usize>,
     /// Where it lies there.
@@ -88,7 +85,7 @@ pub(crate) struct MorphTarget {
 
 /// A vertex as the file has it, before anything moves it.
 #[derive(Clone, Copy, Debug)]
-struct Bound {
+struct BindVertex {
     position: Vec3,
     normal: Vec3,
     tangent: Vec4,
@@ -96,12 +93,12 @@ struct Bound {
     influences: [u32; 2],
 }
 
-/// What moves the vertices of a mesh, with [`DeformingMesh::bind`] for each piece of it.
+/// What moves the vertices of a mesh.
 #[derive(Clone, Debug, Default)]
-pub(crate) struct Rig {
-    /// See [`DeformingMesh::nodes`].
-    pub nodes: Vec<Joining>,
-    /// See [`DeformingMesh::joints`].
+pub(crate) struct Skeleton {
+    /// The nodes that joints hang on, each after the one above it.
+    pub nodes: Vec<SkeletonNode>,
+    /// For each joint its node, and joint-from-mesh.
     pub joints: Vec<(usize, DAffine3)>,
 }
 
@@ -120,11 +117,10 @@ pub struct Deformed {
 }
 
 impl DeformingMesh {
-    /// A mesh without vertices, which `rig` moves. A round of the animation has `length_s` seconds of the file's time and lasts
-    /// `period_ns`.
-    pub(crate) fn new(rig: Rig, length_s: f64, period_ns: i64) -> Self {
-        let Rig { nodes, joints } = rig;
-        Self { nodes, joints, length_s, period_ns: period_ns.max(1), ..Self::default() }
+    /// A mesh without vertices, which `skeleton` moves. A round of the animation has `length_s` seconds of the file's time and
+    /// lasts `period_ns`.
+    pub(crate) fn new(skeleton: Skeleton, length_s: f64, period_ns: i64) -> Self {
+        Self { skeleton, length_s, period_ns: period_ns.max(1), ..Self::default() }
     }
 
     /// Adds the vertices of `mesh`, as the file has them. `influences_of` gives the joints and weights of a vertex of the file;
@@ -137,7 +133,7 @@ impl DeformingMesh {
         let first = self.vertices.len();
         for (i, source) in mesh.sources.iter().enumerate() {
             let begin = self.influences.len();
-            let joints = self.joints.len();
+            let joints = self.skeleton.joints.len();
             let usable =
                 |(joint, weight): &(usize, f64)| *joint < joints && *weight > 0.0 && weight.is_finite();
             let sum: f64 = influences_of(*source).filter(usable).map(|(_, weight)| weight).sum();
@@ -147,7 +143,7 @@ impl DeformingMesh {
             if self.influences.len() == begin {
                 self.influences.push((0, 1.0));
             }
-            self.vertices.push(Bound {
+            self.vertices.push(BindVertex {
                 position: mesh.positions[i],
                 normal: mesh.normals[i],
                 tangent: mesh.tangents[i],
@@ -173,7 +169,7 @@ impl DeformingMesh {
     pub(crate) fn finish(&mut self, mesh: &mut TriangleMesh) {
         let mut now = Deformed::default();
         self.place(0, &mut now);
-        let mirrored = |v: &&Bound| self.map_of(v, &now.maps).matrix3.determinant() < 0.0;
+        let mirrored = |v: &&BindVertex| self.map_of(v, &now.maps).matrix3.determinant() < 0.0;
         self.is_mirrored = 2 * self.vertices.iter().filter(mirrored).count() > self.vertices.len();
         if self.is_mirrored {
             mesh.triangles.iter_mut().for_each(|[_, b, c]| std::mem::swap(b, c));
@@ -216,12 +212,12 @@ impl DeformingMesh {
     fn place(&self, t_ns: i64, now: &mut Deformed) -> f64 {
         let t = t_ns.rem_euclid(self.period_ns) as f64 / self.period_ns as f64 * self.length_s;
         now.places.clear();
-        for node in &self.nodes {
+        for node in &self.skeleton.nodes {
             let above = node.above.map_or(DAffine3::IDENTITY, |i| now.places[i]);
             now.places.push(above * node.place.at(t));
         }
         now.maps.clear();
-        now.maps.extend(self.joints.iter().map(|(node, bind)| {
+        now.maps.extend(self.skeleton.joints.iter().map(|(node, bind)| {
             let map = now.places[*node] * *bind;
             Affine3A { matrix3: map.matrix3.as_mat3().into(), translation: map.translation.as_vec3().into() }
         }));
@@ -251,7 +247,7 @@ impl DeformingMesh {
     }
 
     /// The mean of the maps of a vertex's joints.
-    fn map_of(&self, vertex: &Bound, maps: &[Affine3A]) -> Affine3A {
+    fn map_of(&self, vertex: &BindVertex, maps: &[Affine3A]) -> Affine3A {
         let [begin, end] = vertex.influences.map(|i| i as usize);
         match &self.influences[begin..end] {
             [(joint, _)] => maps[usize::from(*joint)],

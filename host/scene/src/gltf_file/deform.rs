@@ -115,11 +115,6 @@ impl Deformations {
         Ok(all)
     }
 
-    /// Whether the file has skins.
-    pub(crate) fn has_skins(&self) -> bool {
-        !self.skins.is_empty()
-    }
-
     /// The skin of a node that shows `mesh`, if there is one that can be used. It, and not the node, says where the mesh is.
     pub(crate) fn skin(&self, node: usize, mesh: usize) -> Option<&Skin> {
         let skin = self.skins[self.nodes.get(&node)?.skin?].as_ref()?;
@@ -164,7 +159,7 @@ impl Deformations {
     ) -> Deformation<'a> {
         let of_mesh = &self.meshes[mesh];
         let Primitive { targets, influences } = &of_mesh.primitives[primitive];
-        let weights = if matches!(pose, Some(Pose::Bound)) { &[] } else { self.weights(node, mesh) };
+        let weights = if matches!(pose, Some(Pose::Bind)) { &[] } else { self.weights(node, mesh) };
         let targets = weights.iter().copied().zip(targets).filter(|(weight, _)| *weight != 0.0).collect();
         Deformation { targets, pose, influences }
     }
@@ -334,7 +329,7 @@ pub(crate) enum Pose<'a> {
     /// These faces alone, which hang on one joint: body-from-mesh.
     One(&'a [[u64; 3]], DAffine3),
     /// As the file has it: what deforms it comes later, and needs the vertices' numbers in the file.
-    Bound,
+    Bind,
 }
 
 /// What deforms a primitive at a node.
@@ -356,9 +351,9 @@ impl Deformation<'_> {
         }
     }
 
-    /// What deforms it comes later, and needs the vertices' numbers in the file.
-    pub(super) fn is_bound(&self) -> bool {
-        matches!(self.pose, Some(Pose::Bound))
+    /// See [`Pose::Bind`].
+    pub(super) fn is_bind_pose(&self) -> bool {
+        matches!(self.pose, Some(Pose::Bind))
     }
 
     /// Moves the vertices `used` of the primitive's accessors, which are those of `mesh` in order.
@@ -376,7 +371,7 @@ impl Deformation<'_> {
             self.morph(data, used, mesh, stop)?;
         }
         match self.pose {
-            None | Some(Pose::Bound) => Ok(()),
+            None | Some(Pose::Bind) => Ok(()),
             Some(Pose::One(_, map)) => skin(&|_| map, used, mesh, stop),
             Some(Pose::All(joints)) => {
                 let map = |vertex| mean(joints, self.influences, data, vertex);

@@ -1,10 +1,11 @@
 //! Flattens the node tree into rigid bodies: nodes that a body of the rig file claims move with it, all others are
 //! static. What an animation moves is a part, a body of its own with the same carrier.
 
+mod claims;
 mod deforming;
 mod skinned;
 
-use std::collections::{BTreeMap, HashMap, HashSet};
+use std::collections::{BTreeMap, HashMap};
 use std::sync::Arc;
 
 use glam::{DAffine3, DMat3, DMat4, DVec3, Vec3};
@@ -13,8 +14,7 @@ use super::super::limits::Cancel;
 use super::super::mesh::Dropped;
 use super::super::part_motion::{Link, NodeMotion, PartMotion, Track};
 use super::super::{
-    Body, BodySelector, DeformingMesh, Limits, LoadOptions, PunctualKind, PunctualLight, SceneError,
-    TriangleMesh,
+    Body, DeformingMesh, Limits, LoadOptions, PunctualKind, PunctualLight, SceneError, TriangleMesh,
 };
 use super::accessor::Data;
 use super::animation::{Animation, Channels};
@@ -23,10 +23,9 @@ use super::instancing::Instances;
 use super::look::Look;
 use super::primitive::read_primitive;
 use super::vertex_paint::Paint;
+use claims::roots;
+pub(crate) use claims::{choose_bodies, Claims};
 use skinned::AtRest;
-
-/// Bodies that [`choose_bodies`] makes movable when the rig file names none.
-const AUTO_BODIES: usize = 2;
 
 /// Most parts that an animation may move.
 const MAX_PARTS: usize = 128;
@@ -80,165 +79,6 @@ pub(crate) struct Flat {
     pub bodies: Vec<Body>,
     /// All lights of the file that a scene uses.
     pub lights: Vec<PunctualLight>,
-}
-
-/// Nodes claimed by rigid bodies and nodes that are virtual.
-pub(crate) struct Claims {
-    /// In the order of the rig file.
-    bodies: Vec<Claim>,
-    virtual_nodes: Vec<usize>,
-}
-
-struct Claim {
-    name: String,
-    node: usize,
-    projected: bool,
-}
-
-/// Roots of the scene to show: the default scene, else the first, else every node without a parent.
-pub(super) fn roots(document: &gltf::Document) -> Vec<usize> {
-    match document.default_scene().or_else(|| document.scenes().next()) {
-        Some(scene) => scene.nodes().map(|n| n.index()).collect(),
-        None => {
-            let mut is_child = vec![false; document.nodes().len()];
-            for child in document.nodes().flat_map(|n| n.children()) {
-                is_child[child.index()] = true;
-            }
-            (0..is_child.len()).filter(|&i| !is_child[i]).collect()
-        }
-    }
-}
-
-/// Nodes of the scene from the roots down, parents before children.
-fn descendants(document: &gltf::Document, roots: &[usize]) -> Vec<usize> {
-    let mut order = roots.to_vec();
-    let mut next = 0;
-    while next < order.len() {
-        if let Some(node) = document.nodes().nth(order[next]) {
-            order.extend(node.children().map(|c| c.index()));
-        }
-        next += 1;
-    }
-    order
-}
-
-/// Resolves the names of the rig file; without selectors the first two objects of the scene become movable.
-pub(crate) fn choose_bodies(
-    document: &gltf::Document,
-    options: &LoadOptions,
-    warnings: &mut Vec<String>,
-) -> Result<Claims, SceneError> {
-    let roots = roots(document);
-    let present = descendants(document, &roots);
-    let names: Vec<Option<&str>> =
-        present.iter().map(|&i| document.nodes().nth(i).and_then(|n| n.name())).collect();
-    let find = |name: &str| find_node(&names, &present, name);
-    let mut virtual_nodes = options.virtual_nodes.iter().map(|n| find(n)).collect::<Result<Vec<_>, _>>()?;
-    let known: HashSet<&str> = names.iter().copied().flatten().collect();
-    let named = |name: &str| known.contains(name);
-    if options.bodies.iter().all(|b| b.node.is_none() && !named(&b.name)) {
-        return Ok(choose_automatically(document, roots, virtual_nodes, &options.bodies, warnings));
-    }
-    let mut bodies: Vec<Claim> = vec![];
-    for BodySelector { name, node, projected } in &options.bodies {
-        let node = node.as_ref().unwrap_or(name);
-        let index = find(node)?;
-        if let Some(other) = bodies.iter().find(|b| b.node == index) {
-            return Err(SceneError::broken(
-                format!("body '{name}'"),
-                format!("claims node '{node}', which body '{}' claims already", other.name),
-            ));
-        }
-        bodies.push(Claim { name: name.clone(), node: index, projected: *projected });
-    }
-    virtual_nodes.sort_unstable();
-    Ok(Claims { bodies, virtual_nodes })
-}
-
-/// The only node named `name` in `present`; `names` holds the nodes' names.
-fn find_node(names: &[Option<&str>], present: &[usize], name: &str) -> Result<usize, SceneError> {
-    let matching: Vec<usize> =
-        present.iter().zip(names).filter(|(_, n)| **n == Some(name)).map(|(i, _)| *i).collect();
-    if let [one] = matching[..] {
-        return Ok(one);
-    }
-    let known: Vec<String> = names.iter().flatten().take(30).map(|n| super::json::shorten(n)).collect();
-    let problem = match matching.len() {
-        0 => format!("the scene has no node '{name}'"),
-        n => format!(
-            "the scene has {n} nodes named '{name}', so which one is meant cannot be told: rename them"
-        ),
-    };
-    Err(SceneError::Node { problem, known: if known.is_empty() { "none".into() } else { known.join(", ") } })
-}
-
-/// The first objects of the scene with a mesh become the given movable bodies, or, if none are given, two bodies with
-/// the names of their nodes; lamps (all materials emit) become virtual.
-fn choose_automatically(
-    document: &gltf::Document,
-    mut roots: Vec<usize>,
-    mut virtual_nodes: Vec<usize>,
-    given: &[BodySelector],
-    warnings: &mut Vec<String>,
-) -> Claims {
-    // Exporters often wrap everything in one node: look inside it.
-    while let [only] = roots[..] {
-        let Some(node) = document.nodes().nth(only) else { break };
-        let below: Vec<usize> = node.children().map(|c| c.index()).collect();
-        if node.mesh().is_some() || below.is_empty() {
-            break;
-        }
-        roots = below;
-    }
-    let known_virtual: HashSet<usize> = virtual_nodes.iter().copied().collect();
-    let wanted = if given.is_empty() { AUTO_BODIES } else { given.len() };
-    let mut bodies = vec![];
-    for root in roots {
-        let materials: Vec<bool> = descendants(document, &[root])
-            .into_iter()
-            .filter_map(|i| document.nodes().nth(i)?.mesh())
-            .flat_map(|mesh| mesh.primitives())
-            .map(|p| {
-                Vec3::from(p.material().emissive_factor()).max_element() > 0.0
-                    && p.material().emissive_texture().is_none()
-                    && !p.material().unlit()
-            })
-            .collect();
-        let name = document
-            .nodes()
-            .nth(root)
-            .and_then(|n| n.name())
-            .map_or_else(|| format!("node {root}"), str::to_owned);
-        if materials.is_empty() || known_virtual.contains(&root) {
-            continue;
-        }
-        if materials.iter().all(|&emits| emits) {
-            warnings.push(format!("'{name}' emits light everywhere: taken for a lamp of the virtual world, nothing is projected on it"));
-            virtual_nodes.push(root);
-        } else if bodies.len() < wanted {
-            let body = given.get(bodies.len());
-            if let Some(body) = body {
-                warnings.push(format!(
-                    "body '{}' stands for '{name}': the scene has no node of its name",
-                    body.name
-                ));
-            }
-            bodies.push(Claim {
-                name: body.map_or(name, |b| b.name.clone()),
-                node: root,
-                projected: body.is_none_or(|b| b.projected),
-            });
-        }
-    }
-    for body in given.iter().skip(bodies.len()) {
-        warnings.push(format!(
-            "body '{}' has nothing to show: the scene has only {} objects",
-            body.name,
-            bodies.len()
-        ));
-    }
-    virtual_nodes.sort_unstable();
-    Claims { bodies, virtual_nodes }
 }
 
 /// A checked document and its decoded parts.
@@ -307,7 +147,7 @@ struct Gatherer<'a> {
     limits: &'a Limits,
     cancel: &'a Cancel,
     at_rest: AtRest,
-    /// Of each node: the body that it belongs to, and its place there. Only of files with skins.
+    /// Of each node: the body that it belongs to, and its place there.
     places: HashMap<usize, (Group, DAffine3)>,
     /// Nodes that show a skin, whose joints may be anywhere.
     skinned: Vec<(usize, Group)>,
@@ -317,7 +157,7 @@ struct Gatherer<'a> {
     /// Meshes that an animation deforms, with the names of their nodes.
     deforming: Vec<(String, DeformingMesh)>,
     /// Nodes that show such a mesh without a skin.
-    bound: Vec<(usize, Group)>,
+    unskinned: Vec<(usize, Group)>,
     meshes: BTreeMap<Group, TriangleMesh>,
     lights: Vec<(Group, PunctualLight)>,
     dropped: Dropped,
@@ -337,7 +177,7 @@ impl<'a> Gatherer<'a> {
             rest: vec![DAffine3::IDENTITY; claims.bodies.len()],
             parts: vec![],
             deforming: vec![],
-            bound: vec![],
+            unskinned: vec![],
             meshes: BTreeMap::new(),
             lights: vec![],
             dropped: Dropped::default(),
@@ -355,9 +195,7 @@ impl<'a> Gatherer<'a> {
         let claim_of: HashMap<usize, usize> =
             claims.bodies.iter().enumerate().map(|(c, b)| (b.node, c)).collect();
         let document = self.source.document;
-        if self.source.deformations.has_skins() || !self.source.animation.nodes.is_empty() {
-            self.at_rest = AtRest::of(self.source, &claim_of);
-        }
+        self.at_rest = AtRest::of(self.source, &claim_of);
         let world = self.source.world;
         let group = Group { claim: None, is_virtual: false, part: None, deforming: None };
         let mut walk: Vec<Step> = roots(document)
@@ -410,7 +248,7 @@ impl<'a> Gatherer<'a> {
                 if self.source.deformations.skin(index, mesh.index()).is_some() {
                     self.skinned.push((index, group));
                 } else if resizes || morphs {
-                    self.bound.push((index, group));
+                    self.unskinned.push((index, group));
                 } else if is_invertible(&place) {
                     self.add_mesh((mesh.index(), index), group, &place, None)?;
                 } else {
@@ -418,16 +256,14 @@ impl<'a> Gatherer<'a> {
                     warnings.push(format!("node {index} '{name}' is scaled to nothing and is left out"));
                 }
             }
-            if self.source.deformations.has_skins() || !self.source.animation.nodes.is_empty() {
-                self.places.insert(index, (group, place));
-            }
+            self.places.insert(index, (group, place));
             if let Some(light) = node.light() {
                 self.lights.extend(place_light(&light, &place).map(|l| (group, l)));
             }
             walk.extend(node.children().map(|c| Step { node: c.index(), world, place, group, resizes }));
         }
         self.add_skinned_meshes(warnings)?;
-        self.add_bound_meshes(warnings)
+        self.add_unskinned_meshes(warnings)
     }
 
     /// The place of a node in the space of its body or part. `world` is its place at rest, `in_part` that in its part.
@@ -577,7 +413,8 @@ impl<'a> Gatherer<'a> {
         Ok(Flat { bodies, lights })
     }
 
-    /// A body for every claim that has parts or meshes that deform: its pose at rest is that of the claim, even if all its surfaces move.
+    /// A body for every claim that has parts or meshes that deform: its pose at rest is that of the claim, even if all its
+    /// surfaces move.
     fn add_carriers(&mut self) {
         let with_parts = self.meshes.keys().filter(|group| group.claim.is_some() && !group.is_whole());
         let carriers: Vec<Group> = with_parts

@@ -63,7 +63,7 @@ pub(crate) fn read_primitive(
         uvs,
         materials: vec![material; triangles.len()],
         triangles,
-        sources: if deformation.is_bound() { used.iter().map(|&i| i as u32).collect() } else { vec![] },
+        sources: if deformation.is_bind_pose() { used.iter().map(|&i| i as u32).collect() } else { vec![] },
     };
     deformation.apply(data, &used, &mut mesh, stop)?;
     let dropped = mesh.drop_unusable();

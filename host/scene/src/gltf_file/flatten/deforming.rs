@@ -4,14 +4,13 @@
 use std::collections::HashMap;
 
 use glam::DAffine3;
-
 use gltf::json::mesh::Semantic;
 use gltf::json::validation::Checked;
 
-use super::super::super::deforming::{Joining, MorphTarget, Place, Rig};
+use super::super::super::deforming::{MorphTarget, Place, Skeleton, SkeletonNode};
+use super::super::super::mesh::Dropped;
 use super::super::super::part_motion::Track;
 use super::super::super::{DeformingMesh, SceneError, TriangleMesh};
-use super::super::animation::Animation;
 use super::super::deform::{Pose, Skin};
 use super::{decomposed, local_transform, Gatherer, Group, Source};
 
@@ -24,11 +23,13 @@ const MOST_NODES: usize = 1024;
 
 /// Why a mesh does not deform.
 type Reason = &'static str;
+/// Primitives by their numbers, with what was left out of them.
+type Pieces = Vec<(usize, (TriangleMesh, Dropped))>;
 
 impl Gatherer<'_> {
     /// The meshes without skins that deform.
-    pub(super) fn add_bound_meshes(&mut self, warnings: &mut Vec<String>) -> Result<(), SceneError> {
-        for (index, group) in std::mem::take(&mut self.bound) {
+    pub(super) fn add_unskinned_meshes(&mut self, warnings: &mut Vec<String>) -> Result<(), SceneError> {
+        for (index, group) in std::mem::take(&mut self.unskinned) {
             self.cancel.check(self.limits)?;
             let Some(node) = self.source.document.nodes().nth(index) else { continue };
             let Some(mesh) = node.mesh().map(|mesh| mesh.index()) else { continue };
@@ -55,45 +56,42 @@ impl Gatherer<'_> {
         group: Group,
         skin: Option<&Skin>,
     ) -> Result<Result<(), Reason>, SceneError> {
-        let Source { document, instances, animation, .. } = *self.source;
+        let Source { document, data, instances, animation, deformations, .. } = *self.source;
         if instances.contains_key(&node) {
             return Ok(Err("its node has instances"));
         }
         if self.deforming.len() >= MOST_MESHES {
             return Ok(Err("more than 32 meshes deform"));
         }
-        let rig = match self.rig(node, group.claim, skin) {
-            Ok(rig) => rig,
+        let skeleton = match self.skeleton(node, group.claim, skin) {
+            Ok(skeleton) => skeleton,
             Err(why) => return Ok(Err(why)),
         };
-        let Animation { length_s, period_ns, .. } = *animation;
-        let mut deforming = DeformingMesh::new(rig, length_s, period_ns);
+        let Some(pieces) = self.bind_pose((mesh, node))? else {
+            return Ok(Err("all that deforms together has more than 100,000 vertices"));
+        };
+        let mut deforming = DeformingMesh::new(skeleton, animation.length_s, animation.period_ns);
         let mut whole = TriangleMesh::default();
-        let mut moves: Vec<Vec<(u32, [glam::Vec3; 3])>> = vec![];
-        let weights = self.weights(node, mesh);
-        for (number, primitive) in document.as_json().meshes[mesh].primitives.iter().enumerate() {
-            let Some((piece, lost)) = self.read((mesh, node, number), Some(Pose::Bound))? else { continue };
-            self.dropped.add(lost);
-            let already: usize = self.deforming.iter().map(|(_, deforming)| deforming.len()).sum();
-            if already + deforming.len() + piece.positions.len() > MOST_VERTICES {
-                return Ok(Err("all that deforms together has more than 100,000 vertices"));
-            }
-            let Source { data, deformations, .. } = *self.source;
-            let first = deforming.len() as u32;
-            moves.resize(weights.len(), vec![]);
-            for (target, all) in moves.iter_mut().enumerate() {
-                let of_piece = deformations.moves_of((mesh, number), target, data, &piece.sources);
-                all.extend(of_piece.into_iter().map(|(place, moved)| (first + place as u32, moved)));
-            }
-            let has_normals = primitive.attributes.contains_key(&Checked::Valid(Semantic::Normals));
-            deforming.bind(&piece, !has_normals, |vertex| {
-                let joints = skin.map(|_| deformations.joints_of((mesh, number), data, vertex));
+        for (number, (piece, lost)) in &pieces {
+            self.dropped.add(*lost);
+            let attributes = &document.as_json().meshes[mesh].primitives[*number].attributes;
+            let is_flat = !attributes.contains_key(&Checked::Valid(Semantic::Normals));
+            deforming.bind(piece, is_flat, |vertex| {
+                let joints = skin.map(|_| deformations.joints_of((mesh, *number), data, vertex));
                 joints.into_iter().flatten()
             });
-            whole.append_transformed(&piece, &DAffine3::IDENTITY);
+            whole.append_transformed(piece, &DAffine3::IDENTITY);
         }
-        for (weight, moves) in weights.into_iter().zip(moves).filter(|(_, moves)| !moves.is_empty()) {
-            deforming.add_target(MorphTarget { weight, moves });
+        for (target, weight) in self.weights(node, mesh).into_iter().enumerate() {
+            let (mut moves, mut first) = (vec![], 0);
+            for (number, (piece, _)) in &pieces {
+                let of_piece = deformations.moves_of((mesh, *number), target, data, &piece.sources);
+                moves.extend(of_piece.into_iter().map(|(place, moved)| ((first + place) as u32, moved)));
+                first += piece.sources.len();
+            }
+            if !moves.is_empty() {
+                deforming.add_target(MorphTarget { weight, moves });
+            }
         }
         deforming.finish(&mut whole);
         whole.sources = vec![];
@@ -104,6 +102,21 @@ impl Gatherer<'_> {
         Ok(Ok(()))
     }
 
+    /// The primitives of a mesh by their numbers, as the file has them; `None` if they are too many vertices.
+    fn bind_pose(&mut self, (mesh, node): (usize, usize)) -> Result<Option<Pieces>, SceneError> {
+        let mut vertices: usize = self.deforming.iter().map(|(_, deforming)| deforming.len()).sum();
+        let mut pieces = vec![];
+        for number in 0..self.source.document.as_json().meshes[mesh].primitives.len() {
+            let Some(piece) = self.read((mesh, node, number), Some(Pose::Bind))? else { continue };
+            vertices += piece.0.positions.len();
+            if vertices > MOST_VERTICES {
+                return Ok(None);
+            }
+            pieces.push((number, piece));
+        }
+        Ok(Some(pieces))
+    }
+
     /// How much each morph target of a mesh counts at a node.
     fn weights(&self, node: usize, mesh: usize) -> Vec<Track<f64>> {
         let animated = self.source.animation.nodes.get(&node).and_then(|channels| channels.weights.clone());
@@ -112,16 +125,16 @@ impl Gatherer<'_> {
     }
 
     /// The joints of `skin`, or the one of a mesh without: the node `node` itself.
-    fn rig(&self, node: usize, claim: Option<usize>, skin: Option<&Skin>) -> Result<Rig, Reason> {
-        let mut rig = Rig::default();
+    fn skeleton(&self, node: usize, claim: Option<usize>, skin: Option<&Skin>) -> Result<Skeleton, Reason> {
+        let mut skeleton = Skeleton::default();
         let mut known = HashMap::new();
         let own = [node];
         let (joints, binds) = skin.map_or((&own[..], &[][..]), |skin| (&skin.joints[..], &skin.bind[..]));
         for (i, joint) in joints.iter().enumerate() {
-            let at = self.hang(*joint, claim, &mut rig.nodes, &mut known)?;
-            rig.joints.push((at, binds.get(i).copied().unwrap_or(DAffine3::IDENTITY)));
+            let at = self.hang(*joint, claim, &mut skeleton.nodes, &mut known)?;
+            skeleton.joints.push((at, binds.get(i).copied().unwrap_or(DAffine3::IDENTITY)));
         }
-        Ok(rig)
+        Ok(skeleton)
     }
 
     /// Adds a node and those above it, up to the body of `claim`, or to the world. Returns its place among `nodes`.
@@ -129,7 +142,7 @@ impl Gatherer<'_> {
         &self,
         node: usize,
         claim: Option<usize>,
-        nodes: &mut Vec<Joining>,
+        nodes: &mut Vec<SkeletonNode>,
         known: &mut HashMap<usize, usize>,
     ) -> Result<usize, Reason> {
         let mut chain = vec![];
@@ -138,7 +151,10 @@ impl Gatherer<'_> {
             let Some(at) = next else {
                 // Files often have the joints beside the node that shows the skin. They move against the body at rest.
                 let body_from_world = claim.map_or(DAffine3::IDENTITY, |c| self.rest[c].inverse());
-                nodes.push(Joining { above: None, place: Place::Fixed(body_from_world * self.source.world) });
+                nodes.push(SkeletonNode {
+                    above: None,
+                    place: Place::Fixed(body_from_world * self.source.world),
+                });
                 break nodes.len() - 1;
             };
             if let Some(&place) = known.get(&at) {
@@ -149,7 +165,7 @@ impl Gatherer<'_> {
                     return Err("a joint lies in another body");
                 }
                 let body_from_node = self.rest[c].inverse() * self.at_rest.world_from_node[at];
-                nodes.push(Joining { above: None, place: Place::Fixed(body_from_node) });
+                nodes.push(SkeletonNode { above: None, place: Place::Fixed(body_from_node) });
                 known.insert(at, nodes.len() - 1);
                 break nodes.len() - 1;
             }
@@ -160,7 +176,7 @@ impl Gatherer<'_> {
             return Err("its joints are made of more than 1,024 nodes");
         }
         for at in chain.into_iter().rev() {
-            nodes.push(Joining { above: Some(above), place: self.place_of(at) });
+            nodes.push(SkeletonNode { above: Some(above), place: self.place_of(at) });
             above = nodes.len() - 1;
             known.insert(at, above);
         }
