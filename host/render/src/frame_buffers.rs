@@ -87,19 +87,20 @@ pub(super) struct DebugBuffers {
 }
 
 impl FrameBuffers {
-    /// Memory for a scene of `bodies` bodies and a raster of `tiles` tiles. `debug` adds the copies for debugging, `asks_device` the tree over the
-    /// bodies of a device that traces rays itself.
+    /// Memory for the scene `data`, whose tables shaders read in this way, and a raster of `tiles` tiles. `debug` adds the copies for debugging.
     ///
     /// # Errors
     /// Out of memory.
     pub(super) fn new(
         gpu: &Arc<Gpu>,
         settings: &RendererSettings,
-        (bodies, tiles): (usize, usize),
+        (data, reading): (&SceneData, Reading),
+        tiles: usize,
         body_tree: BodyTree,
-        (debug, asks_device): (bool, bool),
+        debug: bool,
     ) -> Result<Self, GpuError> {
         use MemoryKind::{Device, Readback, Upload};
+        let (bodies, asks_device) = (data.bodies.len(), reading == Reading::Query);
         let pixels = settings.raster.pixel_count();
         let size = |what, bytes, kind| Buffer::new(gpu, what, bytes, kind);
         let table = |what, bytes, kind| table_buffer(gpu, what, bytes, kind);
@@ -143,32 +144,11 @@ impl FrameBuffers {
             motion: with("motion of surfaces", each.motion)?,
             movers: latched("movers", size_of::<Mover>() * bodies.max(1))?,
             device_tree: asks_device.then(|| FrameTree::new(gpu, bodies)).transpose()?,
-            deformed: None,
-            textures: None,
+            deformed: DeformedTables::new(gpu, data, reading)?,
+            textures: clip_table(gpu, data)?,
             debug_host: debug.then(|| DebugBuffers::new(gpu, pixels, tiles, each)).transpose()?,
             each,
         })
-    }
-
-    /// Makes what only scenes need in which something else than poses changes from frame to frame.
-    ///
-    /// # Errors
-    /// Out of memory.
-    pub(super) fn animate(
-        &mut self,
-        gpu: &Arc<Gpu>,
-        data: &SceneData,
-        reading: Reading,
-    ) -> Result<(), GpuError> {
-        self.deformed = DeformedTables::new(gpu, data, reading)?;
-        if !data.clips.is_empty() {
-            let len_bytes = size_of_val(&data.textures[..]);
-            let mut host = Buffer::new(gpu, "texture table", len_bytes, MemoryKind::Upload)?;
-            host.write(&data.textures);
-            let device = Buffer::from_slice(gpu, "texture table", &data.textures)?;
-            self.textures = Some(Latched { host, device, len_bytes });
-        }
-        Ok(())
     }
 
     /// Changes the shapes and pictures of this frame to those of `t_ns`, and the bounds of bodies that deform. Allocates
@@ -290,6 +270,17 @@ impl FrameBuffers {
             other => unreachable!("binding {other} has no buffer"),
         }
     }
+}
+
+/// The texture table of a frame in flight; `None` if the scene has no clips.
+fn clip_table(gpu: &Arc<Gpu>, data: &SceneData) -> Result<Option<Latched>, GpuError> {
+    if data.clips.is_empty() {
+        return Ok(None);
+    }
+    let len_bytes = size_of_val(&data.textures[..]);
+    let mut host = Buffer::new(gpu, "texture table", len_bytes, MemoryKind::Upload)?;
+    host.write(&data.textures);
+    Ok(Some(Latched { host, device: Buffer::from_slice(gpu, "texture table", &data.textures)?, len_bytes }))
 }
 
 impl DebugBuffers {

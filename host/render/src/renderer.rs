@@ -182,11 +182,9 @@ impl Renderer {
     pub fn create_slot(&self, debug: bool) -> Result<FrameSlot, GpuError> {
         let (gpu, resources, settings) = (&self.gpu, &self.resources, &self.settings);
         let tile_list = self.tile_list.clone();
-        let asks_device = resources.scene.geometry.trees.is_some();
         let body_tree = BodyTree::new(if self.walks_tree { self.data.bodies.len() } else { 0 });
-        let sizes = (self.data.bodies.len(), tile_list.len());
-        let mut buffers = FrameBuffers::new(gpu, settings, sizes, body_tree, (debug, asks_device))?;
-        buffers.animate(gpu, &self.data, self.reading)?;
+        let scene = (&*self.data, self.reading);
+        let buffers = FrameBuffers::new(gpu, settings, scene, tile_list.len(), body_tree, debug)?;
         buffers.clear(gpu, settings)?;
         let set_of = |parity| {
             let all = (&resources.shared, &resources.scene);

@@ -9,7 +9,6 @@ use crate::process::{Exit, Process};
 use crate::tracks::Moment;
 use dpm_device::light::{LightEvent, LightKind};
 use dpm_device::link::{frame_newer, DeviceState};
-use dpm_device::planes::PlaneSchedule;
 use dpm_rig::control::orders::Ticket;
 use dpm_rig::order::Order;
 use dpm_rig::pipeline::stepped::{SteppedEnd, StoredOrder};
@@ -55,13 +54,6 @@ struct Standing {
     is_orphan: bool,
 }
 
-/// The centre of the light of a frame whose planes last equally long, each as bright as its bit, as a share of the exposure.
-fn light_centre(schedule: &PlaneSchedule) -> f64 {
-    let bits = schedule.planes().iter().map(|plane| f64::from(1u32 << plane.bit));
-    let light: f64 = bits.clone().sum();
-    bits.enumerate().map(|(k, bit)| bit * (k as f64 + 0.5)).sum::<f64>() / (light * schedule.len() as f64)
-}
-
 /// See the module's documentation. All instants are true time.
 pub struct Laws {
     /// The first broken law.
@@ -72,8 +64,6 @@ pub struct Laws {
     rate_hz: u32,
     is_quick: bool,
     motion: Option<Motion>,
-    /// The centre of a frame's light, as a share of its exposure.
-    light_centre: f64,
     lag: Lag,
     /// The body's greatest acceleration, m/s2.
     acceleration: f64,
@@ -125,8 +115,6 @@ pub struct Laws {
     wordless_since: i64,
     /// The worst age of a pose at its first photon, as a share of what is allowed, in thousandths.
     pub worst_age_milli: i64,
-    /// The greatest time of a quiet second by which the light was behind the body or ahead of it, in the same units.
-    pub worst_lag_milli: i64,
     /// The longest time from calm to light.
     pub slowest_return_ns: i64,
     /// Print how far the light of each frame is from the body.
@@ -145,8 +133,7 @@ impl Laws {
             rate_hz: setup.rate_hz,
             is_quick: setup.render_milli < 800,
             motion: setup.motion.of(1.0).ok(),
-            light_centre: light_centre(&rig.schedule),
-            lag: Lag::new(setup),
+            lag: Lag::new(setup, &rig.schedule),
             acceleration: setup.motion.acceleration(),
             sent: vec![Sent::default(); REMEMBERED],
             stride_ns: slot_ns,
@@ -183,7 +170,6 @@ impl Laws {
             is_told: false,
             wordless_since: 0,
             worst_age_milli: 0,
-            worst_lag_milli: 0,
             slowest_return_ns: 0,
             is_loud: false,
         }
@@ -565,10 +551,7 @@ impl Laws {
                 age_s * 1e3
             );
         }
-        let exposure_ns = (last - at) as f64;
-        let (pose, twist) = motion.state_at(at + (exposure_ns * self.light_centre) as i64);
-        let beside = [0, 1, 2].map(|i| sent.position[i] - pose.position_m[i]);
-        self.lag.add(beside, twist.linear_m_s, age_s + 1e-9 * exposure_ns * self.light_centre);
+        self.lag.see(motion, sent.position, [at, last], age_s);
         let peace = at - self.disturbed_at > 2 * S;
         // The filter's error: noise in peace; a wrong speed after a gap.
         let slack = if peace { 0.002 } else { 0.004 + 2.0 * SPEED * age_s };
@@ -595,6 +578,11 @@ impl Laws {
                 ),
             );
         }
+    }
+
+    /// The greatest lag of a quiet second, as a share of what is allowed, in thousandths.
+    pub fn worst_lag_milli(&self) -> i64 {
+        self.lag.worst_milli
     }
 
     /// True when the light has been steady lately.
@@ -632,36 +620,15 @@ impl Laws {
                 );
             }
         }
-        self.lag_of_a_second(t, calm_for, crew.0);
+        if let Err(told) = self.lag.tick(self.is_in_peace(t, calm_for, crew.0)) {
+            self.fail(t, told);
+        }
         let health = process.as_ref().map(|p| p.health());
         if matches!(health, Some(ProjectorHealth::Resting(_) | ProjectorHealth::RestingAfterFlashes)) {
             self.rested_until = t;
         }
         self.words(t, process, is_frozen);
         self.light_is_due(t, calm_for, crew.0, health);
-    }
-
-    /// In a quiet second the light is where the body is, and not where it was.
-    fn lag_of_a_second(&mut self, t: i64, calm_for: i64, crew_ready: i64) {
-        let Some(second) = self.lag.tick() else { return };
-        // Half a second of frames, as elsewhere.
-        if second.frames * 2 < u64::from(self.rate_hz) || !self.is_in_peace(t, calm_for, crew_ready) {
-            return;
-        }
-        let share = second.lag_s.abs() / second.allowed_s;
-        self.worst_lag_milli = self.worst_lag_milli.max((share * 1e3) as i64);
-        if share > 1.0 {
-            self.fail(
-                t,
-                format!(
-                    "the light of a quiet second is {:.2} ms behind the body; {:.2} ms are allowed to either side; poses \
-                     are {:.2} ms old",
-                    second.lag_s * 1e3,
-                    second.allowed_s * 1e3,
-                    second.age_s * 1e3
-                ),
-            );
-        }
     }
 
     /// Every second of darkness has its reason.

@@ -109,7 +109,7 @@ pub fn live(order: &Order) -> Result<Lived, String> {
         events: world.events,
         story: world.story.into(),
         worst_age_milli: world.laws.worst_age_milli,
-        worst_lag_milli: world.laws.worst_lag_milli,
+        worst_lag_milli: world.laws.worst_lag_milli(),
         slowest_return_ns: world.laws.slowest_return_ns,
         planes_moved: world.tracks.as_ref().map_or(0, |tracks| tracks.planes_moved),
         placed: world.tracks.as_ref().map_or(Placed::default(), |tracks| tracks.placed),

@@ -297,8 +297,14 @@ impl World {
         }
     }
 
+    /// When the program runs: it finds nothing while it, or its machine, stands still.
+    fn awake_at(&self) -> i64 {
+        self.t.max(self.frozen_until)
+    }
+
     fn strike_gpu(&mut self, kind: Kind, dice: &mut Dice) {
         use Kind as K;
+        let awake_at = self.awake_at();
         let slot_ns = S / i64::from(self.setup.rate_hz);
         let mut beneath = lock(&self.beneath);
         let mut lasts_ns = 100 * MS;
@@ -309,7 +315,7 @@ impl World {
             K::G5 => {
                 beneath.gpu_traps.push_back(GpuTrap::Hangs);
                 // Frames that hang one after the other are found one after the other, each by a crew of its own.
-                self.gpu_hangs_until = (self.gpu_hangs_until + GPU_AGAIN_NS).max(self.t + GPU_FOUND_NS);
+                self.gpu_hangs_until = (self.gpu_hangs_until + GPU_AGAIN_NS).max(awake_at + GPU_FOUND_NS);
                 lasts_ns = self.gpu_hangs_until - self.t;
                 self.laws.hidden_until(self.gpu_hangs_until);
             }
@@ -317,7 +323,7 @@ impl World {
                 let ns = dice.between(300, 1_500) * MS;
                 beneath.gpu_traps.push_back(GpuTrap::Late(ns));
                 // A frame that comes late after another that is stuck is late from then on.
-                self.gpu_hangs_until = self.gpu_hangs_until.max(self.t) + ns + lasts_ns;
+                self.gpu_hangs_until = self.gpu_hangs_until.max(awake_at) + ns + lasts_ns;
                 lasts_ns = self.gpu_hangs_until - self.t;
                 self.laws.hidden_until(self.gpu_hangs_until);
             }
@@ -335,7 +341,7 @@ impl World {
         // The collector may be busy for five seconds; the frame path reports fifty times a second.
         let found_ns = if part == Part::Collector { 5_300 * MS } else { 300 * MS };
         if trap == Trap::Hangs {
-            self.laws.hidden_until(self.t + found_ns);
+            self.laws.hidden_until(self.awake_at() + found_ns);
         }
         lock(&self.beneath).traps.push((part, trap));
     }
@@ -397,7 +403,7 @@ impl World {
             }
             _ => {
                 lock(&self.beneath).gpu_traps.push_back(GpuTrap::Hangs);
-                self.laws.hidden_until(self.t + GPU_FOUND_NS);
+                self.laws.hidden_until(self.awake_at() + GPU_FOUND_NS);
                 let (at, us) = (self.t / 1000, dice.between(500, 2_000) * 1000);
                 self.strike_sample(&format!("dropout@{at}us+{us}us"), self.t + us * 1000);
                 return self.lasts(kind, us * 1000, Undo::Traps);

@@ -58,6 +58,8 @@ fn what_once_broke_a_law_keeps_them_all() {
         // The program was stopped for two seconds, took the server for silent and forgot its clock, and dated the pose that had
         // waited in its socket as new.
         (108_383_129_337_383, None, 43),
+        // The GPU hung while the machine was suspended, and the law counted the time until that is found from the hang.
+        (112_371_859_496_743, None, 34),
         // BLACK and ARM while the tracker's datagrams were damaged: the host did not count the ordered darkness as the projector
         // did, and the projector latched its flash limit first.
         (1_410_003_701, None, 42),
