@@ -2,7 +2,7 @@
 
 mod common;
 
-use common::{tetrahedra, Glb, TETRAHEDRON};
+use common::{binds, skinned, tetrahedra, Glb, TETRAHEDRON};
 use dpm_scene::{load_bytes, AnimationChoice, BodySelector, LoadOptions, Scene};
 use glam::{DAffine3, DQuat, DVec3};
 use serde_json::json;
@@ -92,37 +92,8 @@ fn place(at: [f64; 3], turn: DQuat, scale: [f64; 3]) -> (serde_json::Value, DAff
 fn with_skin(scale: [f64; 3]) -> (Glb, [DVec3; 4]) {
     let (shoulder, shoulder_at) = place([0.1, 0.4, 0.0], DQuat::from_rotation_z(0.7), scale);
     let (elbow, elbow_at) = place([0.0, 0.3, 0.2], DQuat::from_rotation_x(-0.4), [1.0; 3]);
-    let binds = [
-        DAffine3::from_rotation_translation(DQuat::from_rotation_y(0.3), DVec3::new(0.0, -0.1, 0.0)),
-        DAffine3::from_translation(DVec3::new(0.0, 0.05, -0.2)),
-    ];
-    // The weights of the second corner do not add up to 1, and mean shares.
-    let weights: [[f32; 4]; 4] =
-        [[1.0, 0.0, 0.0, 0.0], [0.5, 1.5, 0.0, 0.0], [0.0, 1.0, 0.0, 0.0], [0.75, 0.25, 0.0, 0.0]];
-    let mut glb = tetrahedra();
-    let matrices: Vec<f32> =
-        binds.iter().flat_map(|m| glam::DMat4::from(*m).to_cols_array().map(|x| x as f32)).collect();
-    let bind = glb.push_numbers("MAT4", &matrices);
-    let joints = glb.push_bytes("VEC4", &[0, 1, 0, 0].repeat(4));
-    let shares = glb.push_numbers("VEC4", weights.as_flattened());
-    let mut glb = glb
-        .set("/nodes/1/skin", json!(0))
-        .set("/nodes/2", shoulder)
-        .set("/nodes/2/children", json!([3]))
-        .set("/nodes/3", elbow)
-        .set("/scenes/0/nodes", json!([0, 1, 2]))
-        .set("/skins", json!([{"joints": [2, 3], "inverseBindMatrices": bind}]));
-    // A mesh of its own, so that the left one stays as it is.
-    let mut mesh = glb.json["meshes"][0].clone();
-    mesh["primitives"][0]["attributes"]["JOINTS_0"] = json!(joints);
-    mesh["primitives"][0]["attributes"]["WEIGHTS_0"] = json!(shares);
-    glb = glb.set("/meshes/1", mesh).set("/nodes/1/mesh", json!(1));
-    let maps = [shoulder_at * binds[0], shoulder_at * elbow_at * binds[1]];
-    let truth = std::array::from_fn(|i| {
-        let share = weights[i].map(|w| f64::from(w / weights[i].iter().sum::<f32>()));
-        share[0] * maps[0].transform_point3(corners()[i]) + share[1] * maps[1].transform_point3(corners()[i])
-    });
-    (glb, truth)
+    let truth = skinned(corners(), [shoulder_at, shoulder_at * elbow_at]);
+    (common::with_skin(shoulder, elbow), truth)
 }
 
 /// The joints say where a skin is, and not the node that shows it.
@@ -264,9 +235,8 @@ fn a_vertex_of_unknown_joints_follows_the_first_one() {
     let joints = glb.push_bytes("VEC4", &[[0, 1, 0, 0], [0, 1, 0, 0], [9, 9, 9, 9], [0, 1, 0, 0]].concat());
     let glb = glb.set("/meshes/1/primitives/0/attributes/JOINTS_0", json!(joints));
     let (_, shoulder) = place([0.1, 0.4, 0.0], DQuat::from_rotation_z(0.7), [1.0; 3]);
-    let bind = DAffine3::from_rotation_translation(DQuat::from_rotation_y(0.3), DVec3::new(0.0, -0.1, 0.0));
     let mut truth = truth;
-    truth[2] = (shoulder * bind).transform_point3(corners()[2]);
+    truth[2] = (shoulder * binds()[0]).transform_point3(corners()[2]);
     let scene = load(&glb);
     assert!(off(&scene, "static", &truth) < 1e-6, "{}", told(&scene));
 }
@@ -308,11 +278,7 @@ fn pieces_half_way() -> [DAffine3; 2] {
     let shoulder =
         DAffine3::from_rotation_translation(DQuat::from_rotation_z(0.6), DVec3::new(0.1, 0.4, 0.0));
     let elbow = DAffine3::from_rotation_translation(DQuat::from_rotation_x(0.6), DVec3::new(0.0, 0.3, 0.2));
-    let binds = [
-        DAffine3::from_rotation_translation(DQuat::from_rotation_y(0.3), DVec3::new(0.0, -0.1, 0.0)),
-        DAffine3::from_translation(DVec3::new(0.0, 0.05, -0.2)),
-    ];
-    [shoulder * binds[0], shoulder * elbow * binds[1]]
+    [shoulder * binds()[0], shoulder * elbow * binds()[1]]
 }
 
 /// The greatest distance of the vertices of the body from the tetrahedron under `truth`, a second after the start.

@@ -2,7 +2,7 @@
 
 mod common;
 
-use common::{tetrahedra, Glb, TETRAHEDRON};
+use common::{skinned, tetrahedra, with_skin, Glb, TETRAHEDRON};
 use dpm_scene::{load_bytes, BodySelector, Deformed, LoadOptions, Scene};
 use glam::{DAffine3, DMat3, DQuat, DVec3};
 use serde_json::{json, Value};
@@ -51,7 +51,7 @@ fn at(scene: &Scene, name: &str, t_ns: i64) -> Vec<DVec3> {
         scene.bodies.iter().find(|b| b.name == name).unwrap_or_else(|| panic!("no {name} among {names:?}"));
     let mut now = Deformed::default();
     body.deforms.as_ref().unwrap_or_else(|| panic!("{name} is rigid")).at(t_ns, &mut now);
-    let (n, mesh) = (mesh_len(&body.mesh), &body.mesh);
+    let (n, mesh) = (body.mesh.positions.len(), &body.mesh);
     assert_eq!([n; 3], [now.positions.len(), now.normals.len(), now.tangents.len()]);
     let place = |i: u32| now.positions[i as usize].as_dvec3();
     for t in &mesh.triangles {
@@ -69,11 +69,11 @@ fn at(scene: &Scene, name: &str, t_ns: i64) -> Vec<DVec3> {
     if t_ns == 0 {
         assert!(mesh.positions == now.positions && mesh.normals == now.normals, "the scene shows time 0");
     }
+    let [lower, upper] = body.deforms.as_ref().unwrap().bounds().map(|corner| corner.as_dvec3());
+    let slack = DVec3::splat(1e-3);
+    let holds = |p: DVec3| p.cmpge(lower - slack).all() && p.cmple(upper + slack).all();
+    assert!(mesh.triangles.iter().flatten().all(|i| holds(place(*i))), "outside of {lower} to {upper}");
     now.positions.iter().map(|p| p.as_dvec3()).collect()
-}
-
-fn mesh_len(mesh: &dpm_scene::TriangleMesh) -> usize {
-    mesh.positions.len()
 }
 
 /// The greatest distance of a position from the nearest of `truth`, and of one of `truth` from the nearest position.
@@ -83,34 +83,15 @@ fn off(seen: &[DVec3], truth: &[DVec3]) -> f64 {
     truth.iter().map(|p| nearest(p, seen)).fold(there, f64::max)
 }
 
-const WEIGHTS: [[f32; 4]; 4] =
-    [[1.0, 0.0, 0.0, 0.0], [0.5, 1.5, 0.0, 0.0], [0.0, 1.0, 0.0, 0.0], [0.75, 0.25, 0.0, 0.0]];
 const TARGET: [f32; 12] = [0.3, 0.0, 0.1, 0.0, 0.2, 0.0, -0.1, 0.0, 0.0, 0.05, 0.05, 0.4];
 
 /// The right tetrahedron hangs on a shoulder and an elbow. For two seconds the shoulder turns, the elbow grows and is pushed
-/// away, and a morph target comes in. `above`: the node that holds all of it is the first of them.
+/// away, and a morph target comes in.
 fn puppet(shoulder_scale: [f64; 3]) -> Glb {
-    let binds = binds();
-    let mut glb = tetrahedra();
-    let matrices: Vec<f32> =
-        binds.iter().flat_map(|m| glam::DMat4::from(*m).to_cols_array().map(|x| x as f32)).collect();
-    let bind = glb.push_numbers("MAT4", &matrices);
-    let joints = glb.push_bytes("VEC4", &[0, 1, 0, 0].repeat(4));
-    let shares = glb.push_numbers("VEC4", WEIGHTS.as_flattened());
+    let shoulder = json!({"translation": [0.1, 0.4, 0.0], "scale": shoulder_scale});
+    let mut glb = with_skin(shoulder, json!({"rotation": DQuat::from_rotation_x(-0.4).to_array()}));
     let target = glb.push_numbers("VEC3", &TARGET);
-    let mut mesh = glb.json["meshes"][0].clone();
-    mesh["primitives"][0]["attributes"]["JOINTS_0"] = json!(joints);
-    mesh["primitives"][0]["attributes"]["WEIGHTS_0"] = json!(shares);
-    mesh["primitives"][0]["targets"] = json!([{"POSITION": target}]);
-    let turn = DQuat::from_rotation_x(-0.4).to_array();
-    let glb = glb
-        .set("/nodes/1/skin", json!(0))
-        .set("/nodes/2", json!({"translation": [0.1, 0.4, 0.0], "scale": shoulder_scale, "children": [3]}))
-        .set("/nodes/3", json!({"rotation": turn}))
-        .set("/scenes/0/nodes", json!([0, 1, 2]))
-        .set("/skins", json!([{"joints": [2, 3], "inverseBindMatrices": bind}]))
-        .set("/meshes/1", mesh)
-        .set("/nodes/1/mesh", json!(1));
+    let glb = glb.set("/meshes/1/primitives/0/targets", json!([{"POSITION": target}]));
     let turns = [0.0, 1.2].map(|a| DQuat::from_rotation_z(a).to_array().map(|x| x as f32)).concat();
     animate(
         glb,
@@ -121,13 +102,6 @@ fn puppet(shoulder_scale: [f64; 3]) -> Glb {
             (1, "weights", &[0.0, 2.0], &[0.0, 0.8]),
         ],
     )
-}
-
-fn binds() -> [DAffine3; 2] {
-    [
-        DAffine3::from_rotation_translation(DQuat::from_rotation_y(0.3), DVec3::new(0.0, -0.1, 0.0)),
-        DAffine3::from_translation(DVec3::new(0.0, 0.05, -0.2)),
-    ]
 }
 
 /// Where the corners of [`puppet`] are a share `s` of the way.
@@ -142,13 +116,11 @@ fn puppet_at(s: f64, shoulder_scale: [f64; 3]) -> [DVec3; 4] {
         DQuat::from_rotation_x(-0.4),
         DVec3::new(0.0, 0.3 + 0.2 * s, 0.2 - 0.2 * s),
     );
-    let maps = [shoulder * binds()[0], shoulder * elbow * binds()[1]];
-    std::array::from_fn(|i| {
+    let moved = std::array::from_fn(|i| {
         let target = DVec3::new(TARGET[3 * i].into(), TARGET[3 * i + 1].into(), TARGET[3 * i + 2].into());
-        let corner = corners()[i] + 0.8 * s * target;
-        let share = WEIGHTS[i].map(|w| f64::from(w / WEIGHTS[i].iter().sum::<f32>()));
-        share[0] * maps[0].transform_point3(corner) + share[1] * maps[1].transform_point3(corner)
-    })
+        corners()[i] + 0.8 * s * target
+    });
+    skinned(moved, [shoulder, shoulder * elbow])
 }
 
 /// Skin, sizes and morph target together, at any time and over and over; and with a mirroring joint.

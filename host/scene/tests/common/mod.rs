@@ -1,6 +1,7 @@
 //! Builds small glTF files in memory, good and bad.
 #![allow(dead_code)]
 
+use glam::{DAffine3, DMat4, DQuat, DVec3};
 use serde_json::{json, Value};
 
 /// A document and its binary chunk.
@@ -48,6 +49,28 @@ pub(crate) fn tetrahedra() -> Glb {
 }
 
 impl Glb {
+    /// A document without anything.
+    pub(crate) fn empty() -> Self {
+        let json = json!({"asset": {"version": "2.0"}, "scene": 0, "scenes": [{"nodes": [0]}], "accessors": [], "bufferViews": [],
+            "buffers": [{"byteLength": 0}]});
+        Self { json, bin: vec![] }
+    }
+
+    /// Appends the accessors of a cube about the origin; returns a primitive of it without a material.
+    pub(crate) fn push_cube(&mut self, half: f32) -> Value {
+        let side = |high: usize| if high == 1 { half } else { -half };
+        let corners: Vec<f32> = (0..8).flat_map(|i| [i & 1, i >> 1 & 1, i >> 2 & 1].map(side)).collect();
+        let faces = [[0, 4, 6, 2], [1, 3, 7, 5], [0, 1, 5, 4], [2, 6, 7, 3], [0, 2, 3, 1], [4, 5, 7, 6]];
+        let (corners, faces) = (self.push_numbers("VEC3", &corners), self.push_quads(&faces));
+        json!({"attributes": {"POSITION": corners}, "indices": faces})
+    }
+
+    /// Appends the triangles of quads as indices.
+    pub(crate) fn push_quads(&mut self, quads: &[[u8; 4]]) -> usize {
+        let halves: Vec<u8> = quads.iter().flat_map(|[a, b, c, d]| [*a, *b, *c, *a, *c, *d]).collect();
+        self.push_bytes("SCALAR", &halves)
+    }
+
     /// The file's bytes.
     pub(crate) fn bytes(&self) -> Vec<u8> {
         let mut text = serde_json::to_vec(&self.json).unwrap();
@@ -137,6 +160,50 @@ pub(crate) fn png(width: u32, height: u32, texels: &[[u8; 4]]) -> Vec<u8> {
         .write_to(&mut out, image::ImageFormat::Png)
         .unwrap();
     out.into_inner()
+}
+
+/// The shares by which the corners of [`with_skin`] hang on its two joints. Those of the second corner do not add up to 1, and
+/// mean shares.
+pub(crate) const SHARES: [[f32; 4]; 4] =
+    [[1.0, 0.0, 0.0, 0.0], [0.5, 1.5, 0.0, 0.0], [0.0, 1.0, 0.0, 0.0], [0.75, 0.25, 0.0, 0.0]];
+
+/// Where the mesh of [`with_skin`] lay when it was bound to its two joints: joint-from-mesh of each.
+pub(crate) fn binds() -> [DAffine3; 2] {
+    [
+        DAffine3::from_rotation_translation(DQuat::from_rotation_y(0.3), DVec3::new(0.0, -0.1, 0.0)),
+        DAffine3::from_translation(DVec3::new(0.0, 0.05, -0.2)),
+    ]
+}
+
+/// The right one of [`tetrahedra`] hangs on two joints, the nodes 2 and 3, of which the second hangs on the first; their
+/// places are those of the JSON given. Its mesh is 1, so that the left one stays as it is.
+pub(crate) fn with_skin(shoulder: Value, elbow: Value) -> Glb {
+    let mut glb = tetrahedra();
+    let matrices: Vec<f32> =
+        binds().iter().flat_map(|m| DMat4::from(*m).to_cols_array().map(|x| x as f32)).collect();
+    let bind = glb.push_numbers("MAT4", &matrices);
+    let joints = glb.push_bytes("VEC4", &[0, 1, 0, 0].repeat(4));
+    let shares = glb.push_numbers("VEC4", SHARES.as_flattened());
+    let mut mesh = glb.json["meshes"][0].clone();
+    mesh["primitives"][0]["attributes"]["JOINTS_0"] = json!(joints);
+    mesh["primitives"][0]["attributes"]["WEIGHTS_0"] = json!(shares);
+    glb.set("/nodes/1/skin", json!(0))
+        .set("/nodes/1/mesh", json!(1))
+        .set("/nodes/2", shoulder)
+        .set("/nodes/2/children", json!([3]))
+        .set("/nodes/3", elbow)
+        .set("/scenes/0/nodes", json!([0, 1, 2]))
+        .set("/skins", json!([{"joints": [2, 3], "inverseBindMatrices": bind}]))
+        .set("/meshes/1", mesh)
+}
+
+/// Where the corners of the tetrahedron lie if `corners` of them hang by [`SHARES`] on joints at these places.
+pub(crate) fn skinned(corners: [DVec3; 4], joints: [DAffine3; 2]) -> [DVec3; 4] {
+    let maps = [joints[0] * binds()[0], joints[1] * binds()[1]];
+    std::array::from_fn(|i| {
+        let share = SHARES[i].map(|w| f64::from(w / SHARES[i].iter().sum::<f32>()));
+        share[0] * maps[0].transform_point3(corners[i]) + share[1] * maps[1].transform_point3(corners[i])
+    })
 }
 
 /// A file whose only material shows the image with these bytes.
