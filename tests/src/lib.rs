@@ -4,7 +4,6 @@ pub mod compare;
 pub mod conversations;
 pub mod decoders;
 pub mod files;
-pub mod flag;
 pub mod gpu;
 pub mod programs;
 pub mod rigs;

@@ -1,5 +1,7 @@
 //! Clips, which are animated PNG files: each frame shows the picture of the centre of its light.
 
+mod scene_files;
+
 use dpm_lab::sequence::{draw, Placed};
 use dpm_render::Renderer;
 use dpm_rig::pipeline::renderer_settings;
@@ -8,8 +10,8 @@ use dpm_scene::Scene;
 use dpm_tests::gpu::with_gpu;
 use dpm_tests::rigs::{demo_rig, run};
 use image::{ImageFormat, RgbaImage};
+use scene_files::TempFile;
 use std::io::Cursor;
-use std::path::PathBuf;
 use std::sync::Arc;
 
 /// Sides of a picture.
@@ -78,36 +80,24 @@ fn clip(last_ms: &[u16]) -> Vec<u8> {
     out
 }
 
-/// The demo's rig, on whose bunny the clip plays. The file is removed afterwards.
-struct Played(PathBuf);
-
-impl Played {
-    fn new() -> Self {
-        let file = std::env::temp_dir().join(format!("dpm-clip-{}.png", std::process::id()));
-        std::fs::write(&file, clip(&LAST_MS)).unwrap();
-        Self(file)
-    }
-
-    fn rig(&self, more: &[&str]) -> Arc<Rig> {
-        let bodies = format!(
-            "scene.bodies=[{{ name = \"bunny\", texture = \"{}\" }}, {{ name = \"venus\" }}]",
-            self.0.display()
-        );
-        demo_rig(96, 72, &[&[&bodies[..]][..], more].concat())
-    }
+/// The clip in a file.
+fn played(name: &str) -> TempFile {
+    TempFile::new(&format!("{name}.png"), &clip(&LAST_MS))
 }
 
-impl Drop for Played {
-    fn drop(&mut self) {
-        let _ = std::fs::remove_file(&self.0);
-    }
+/// The demo's rig, on whose bunny the clip plays.
+fn rig_with(clip: &TempFile, more: &[&str]) -> Arc<Rig> {
+    let file = clip.path().display();
+    let bodies =
+        format!("scene.bodies=[{{ name = \"bunny\", texture = \"{file}\" }}, {{ name = \"venus\" }}]");
+    demo_rig(96, 72, &[&[&bodies[..]][..], more].concat())
 }
 
 /// Pictures, their times, and the scene that keeps one of them.
 #[test]
 fn a_clip_is_read_with_its_times_and_repeats() {
-    let played = Played::new();
-    let rig = played.rig(&[]);
+    let clip = played("times");
+    let rig = rig_with(&clip, &[]);
     let clips: Vec<_> = rig.scene.textures.iter().filter(|t| !t.ends_ns.is_empty()).collect();
     assert_eq!(clips.len(), 1);
     let texture = clips[0];
@@ -129,9 +119,9 @@ fn a_clip_is_read_with_its_times_and_repeats() {
 
 #[test]
 fn the_light_shows_the_picture_of_its_centre() {
-    let played = Played::new();
+    let clip = played("light");
     with_gpu(|gpu| {
-        let rig = played.rig(&["render.method=\"full\"", "projector.plane_poses=\"frame\""]);
+        let rig = rig_with(&clip, &["render.method=\"full\"", "projector.plane_poses=\"frame\""]);
         let (outcome, _) = run(gpu, &rig, 60, 40);
         assert_eq!((outcome.light_mismatches, outcome.light.len()), (0, 40));
         let alone = |scene: &Scene, bodies: &Placed, frame: u32| {

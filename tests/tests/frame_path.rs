@@ -1,12 +1,14 @@
 //! The steady state allocates nothing: a counting allocator checks every thread of the frame path.
 
+mod scene_files;
+
 use counting_allocator::{Counting, Request};
 use dpm_render::gpu::Gpu;
 use dpm_rig::pipeline::on_frame_path;
 use dpm_rig::rig::Rig;
-use dpm_tests::flag::Flag;
 use dpm_tests::gpu::with_gpu;
 use dpm_tests::rigs::{demo_rig, run};
+use scene_files::{flag, rig_of};
 use std::cell::Cell;
 use std::sync::atomic::{AtomicU64, Ordering};
 use std::sync::Arc;
@@ -50,23 +52,24 @@ fn the_steady_state_allocates_nothing() {
             &["real_time.pace=\"virtual\"", "render.spp=1", "projector.tracks=\"auto\""],
             &["real_time.pace=\"real\"", "projector.frame_rate=\"200\"", "projector.tracks=\"auto\""],
         ] {
-            rig_allocates_nothing(gpu, &demo_rig(32, 16, settings));
+            rig_allocates_nothing(gpu, &demo_rig(32, 16, settings), &settings.join(" "));
         }
         // A mesh that deforms is moved, and its tree fitted, in the threads of the frame path.
-        let flag = Flag::new("frame-path");
-        rig_allocates_nothing(gpu, &flag.rig((32, 16), &["real_time.pace=\"virtual\""]));
+        let flag = flag("frame-path");
+        let rig = rig_of(&flag, (32, 16), "translate", &["real_time.pace=\"virtual\""]);
+        rig_allocates_nothing(gpu, &rig, "a mesh that deforms");
         // The probe itself: a box that is made here is not on the frame path.
         assert!(!on_frame_path());
     });
 }
 
-fn rig_allocates_nothing(gpu: &Arc<Gpu>, rig: &Arc<Rig>) {
+fn rig_allocates_nothing(gpu: &Arc<Gpu>, rig: &Arc<Rig>, what: &str) {
     let (before, all) = (COUNTED.load(Ordering::Relaxed), ALL.load(Ordering::Relaxed));
     let (_, monitor) = run(gpu, rig, 220, 0);
     let counts = monitor.counts();
     assert_eq!(counts.frames_planned, 220);
     assert_eq!(counts.frames_done(), 220);
     let during = COUNTED.load(Ordering::Relaxed) - before;
-    assert_eq!(during, 0, "{:?}: allocations and releases on the frame path", rig.config.render.method);
+    assert_eq!(during, 0, "{what}: allocations and releases on the frame path");
     assert!(ALL.load(Ordering::Relaxed) > all, "the allocator is not the one in use");
 }

@@ -2,7 +2,7 @@
 
 use crate::calibrated::{calibrated_camera, measured, measured_camera, told_of_measured, CameraFileError};
 use crate::config::{
-    BodyConfig, BuiltinScene, EnvironmentConfig, FileAxis, GazeConfig, ProjectorBackend, RigConfig,
+    BodyConfig, BuiltinScene, EnvironmentConfig, FileAxis, GazeConfig, ProjectorBackend, RigConfig, Tracing,
     TrackerConfig, TracksUse,
 };
 use crate::drive::{albedo_of, drive, DriveError, MAX_PICTURE_BYTES};
@@ -197,6 +197,13 @@ impl Rig {
         let (fitted, told) = environment(config, has_lights)?.unwrap_or(scene.environment).fitted();
         scene.environment = fitted;
         scene.warnings.extend(told.map(|t| format!("scene.environment: {t}")));
+        if config.render.tracing == Tracing::Query && scene.bodies.iter().any(|b| b.deforms.is_some()) {
+            scene.warnings.push(
+                "render.tracing = \"query\": the shaders walk all the same, because the trees that the GPU builds do not \
+                 follow meshes that deform"
+                    .into(),
+            );
+        }
         Self::around(scene, config, raster)
     }
 

@@ -17,7 +17,7 @@ use dpm_render::{
     FrameInputs, FrameSlot, Output, Overlapping, RenderError, Renderer, RendererSettings, Tracing,
 };
 use dpm_scene::geometry::projector::ProjectorCamera;
-use dpm_scene::{shapes, Material, Scene, Texture, Wrap};
+use dpm_scene::{shapes, Material, Scene, Texture};
 use dpm_shaders::structs::PlaneGroup;
 use glam::{DAffine3, DMat3, DQuat, DVec2, DVec3, Vec3};
 use serde::{Deserialize, Serialize};

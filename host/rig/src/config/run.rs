@@ -148,7 +148,7 @@ words! {
         Auto = "auto",
         /// The shaders, which walk through the program's own trees.
         Walk = "walk",
-        /// The device by ray queries, software or not. A device without them is refused.
+        /// The device by ray queries, software or not. A device without them is refused. Where meshes deform, the shaders walk.
         Query = "query",
     }
 }
