@@ -12,7 +12,7 @@ use dpm_device::planes::Raster;
 use dpm_scene::geometry::lens::Lens;
 use dpm_scene::geometry::projector::ProjectorCamera;
 use glam::{DMat3, DVec2, DVec3};
-use refine::{refine, Pinhole, Refined};
+use refine::{refine, Expected, Pinhole, Refined};
 use thiserror::Error;
 
 /// A point of the world and the pixel position that lights it.
@@ -141,9 +141,20 @@ pub fn calibrate(
     let used: Vec<Pair> = normal.iter().zip(&inliers).filter(|(_, i)| **i).map(|(p, _)| *p).collect();
     check_spread(&used)?;
     let (start, condition) = linear(&used)?;
-    let refined = refine(start, &used);
-    finish(raster, refined, &frame, &used, inliers, condition)
+    let refined = refine(start, &used, None);
+    if refined.converged {
+        return finish(raster, refined, &frame, &used, inliers, condition);
+    }
+    // Pixels that are good to one only may leave a valley of projectors, along which the focal length grows without end.
+    let expected = Expected { sigma: refined.rms, ..frame.expected(raster) };
+    let refined = refine(start, &used, Some(&expected));
+    let mut found = finish(raster, refined, &frame, &used, inliers, condition)?;
+    found.warnings.push(NOT_BY_POINTS_ALONE.to_owned());
+    Ok(found)
 }
+
+const NOT_BY_POINTS_ALONE: &str =
+    "the points alone do not tell the lens: square pixels and an axis near the picture's middle were expected";
 
 /// Refines a projector that is roughly known (a saved calibration, a data sheet) on new pairs.
 pub fn recalibrate(start: &ProjectorCamera, pairs: &[Pair]) -> Result<Calibration, CalibrationError> {
@@ -157,7 +168,7 @@ pub fn recalibrate(start: &ProjectorCamera, pairs: &[Pair]) -> Result<Calibratio
     let frame = Normalisation::of(pairs);
     let normal: Vec<Pair> = pairs.iter().map(|p| frame.apply(p)).collect();
     let condition = linear(&normal)?.1;
-    let refined = refine(frame.to_pinhole(start), &normal);
+    let refined = refine(frame.to_pinhole(start), &normal, None);
     finish(start.raster, refined, &frame, &normal, vec![true; pairs.len()], condition)
 }
 
@@ -412,6 +423,13 @@ impl Normalisation {
             world: (p.world - self.world_centre) * self.world_scale,
             pixel: (p.pixel - self.pixel_centre) * self.pixel_scale,
         }
+    }
+
+    /// What is expected of the projector of a raster, for pairs that are off by a unit.
+    fn expected(&self, raster: Raster) -> Expected {
+        let size = DVec2::new(f64::from(raster.width()), f64::from(raster.height()));
+        let centre = (0.5 * size - self.pixel_centre) * self.pixel_scale;
+        Expected { centre, size: size * self.pixel_scale, sigma: 1.0 }
     }
 
     fn to_camera(&self, raster: Raster, m: &Pinhole) -> ProjectorCamera {

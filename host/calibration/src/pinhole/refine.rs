@@ -34,8 +34,9 @@ impl Pinhole {
         self.centre + self.focal * q.truncate() / q.z - p.pixel
     }
 
-    fn cost(&self, pairs: &[Pair]) -> f64 {
-        pairs.iter().map(|p| self.residual(p).length_squared()).sum()
+    fn cost(&self, pairs: &[Pair], expected: Option<&Expected>) -> f64 {
+        let seen: f64 = pairs.iter().map(|p| self.residual(p).length_squared()).sum();
+        seen + expected.map_or(0.0, |e| e.rows(self).iter().map(|(r, _)| r * r).sum())
     }
 
     /// The pinhole after a step of (focal 2, centre 2, rotation 3, translation 3).
@@ -76,6 +77,47 @@ impl Pinhole {
     }
 }
 
+/// What is expected of a projector before any pair is seen, in the units of the pairs: soft, so that only what the pairs
+/// leave open follows it.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct Expected {
+    /// The middle of the picture.
+    pub centre: DVec2,
+    /// Width and height of the picture.
+    pub size: DVec2,
+    /// Deviation of a pair along one axis: what makes an expectation comparable with it.
+    pub sigma: f64,
+}
+
+/// Deviation of the logarithm of a pixel's height over its width: pixels are square.
+const ASPECT_SIGMA: f64 = 0.05;
+/// Deviation of the axis from the middle of the picture, over its width and its height: a lens shift moves it up or down.
+const CENTRE_SIGMA: DVec2 = DVec2::new(0.5, 1.0);
+/// Throw ratio of a usual projector, and the deviation of its logarithm: from ultra short throw to a long lens.
+const THROW: f64 = 1.5;
+const THROW_SIGMA: f64 = 1.0;
+
+impl Expected {
+    /// What a pinhole misses of the expectations, and the derivatives by its ten parameters, in the pairs' units.
+    fn rows(&self, m: &Pinhole) -> [(f64, [f64; 10]); 4] {
+        let off = (m.centre - self.centre) / self.size;
+        let throw = (0.5 * (m.focal.x.ln() + m.focal.y.ln()) - (THROW * self.size.x).ln()) / THROW_SIGMA;
+        let aspect = (m.focal.y.ln() - m.focal.x.ln()) / ASPECT_SIGMA;
+        let row = |parts: [(usize, f64); 2]| {
+            let mut row = [0.0; 10];
+            parts.iter().for_each(|(i, v)| row[*i] = self.sigma * v);
+            row
+        };
+        let by_centre = |axis: usize| 1.0 / (self.size[axis] * CENTRE_SIGMA[axis]);
+        [
+            (self.sigma * aspect, row([(0, -1.0 / ASPECT_SIGMA), (1, 1.0 / ASPECT_SIGMA)])),
+            (self.sigma * throw, row([(0, 0.5 / THROW_SIGMA), (1, 0.5 / THROW_SIGMA)])),
+            (self.sigma * off.x / CENTRE_SIGMA.x, row([(2, by_centre(0)), (3, 0.0)])),
+            (self.sigma * off.y / CENTRE_SIGMA.y, row([(3, by_centre(1)), (2, 0.0)])),
+        ]
+    }
+}
+
 /// The result of the refinement.
 pub(super) struct Refined {
     pub model: Pinhole,
@@ -88,10 +130,11 @@ pub(super) struct Refined {
 
 const STEPS: usize = 400;
 
-pub(super) fn refine(start: Pinhole, pairs: &[Pair]) -> Refined {
+/// Refines a pinhole, by the pairs alone or with what is expected of it.
+pub(super) fn refine(start: Pinhole, pairs: &[Pair], expected: Option<&Expected>) -> Refined {
     let n = pairs.len() as f64;
     let mut model = start;
-    let mut cost = model.cost(pairs);
+    let mut cost = model.cost(pairs, expected);
     let mut damping = 1e-3;
     let mut converged = false;
     let mut iterations = 0;
@@ -100,17 +143,17 @@ pub(super) fn refine(start: Pinhole, pairs: &[Pair]) -> Refined {
         iterations += 1;
         let mut gradient = [0.0; 10];
         normal.iter_mut().for_each(|row| row.fill(0.0));
+        let mut add = |r: f64, j: &[f64; 10]| {
+            for a in 0..10 {
+                gradient[a] -= j[a] * r;
+                (0..10).for_each(|b| normal[a][b] += j[a] * j[b]);
+            }
+        };
         for p in pairs {
             let (r, j) = (model.residual(p), model.jacobian(p));
-            for k in 0..2 {
-                for a in 0..10 {
-                    gradient[a] -= j[k][a] * r[k];
-                    for b in 0..10 {
-                        normal[a][b] += j[k][a] * j[k][b];
-                    }
-                }
-            }
+            (0..2).for_each(|k| add(r[k], &j[k]));
         }
+        expected.iter().flat_map(|e| e.rows(&model)).for_each(|(r, j)| add(r, &j));
         // Residuals are at the rounding error of the coordinates: no further gain is possible.
         if cost <= n * 1e-30 {
             converged = true;
@@ -121,7 +164,7 @@ pub(super) fn refine(start: Pinhole, pairs: &[Pair]) -> Refined {
             let mut damped = normal.clone();
             (0..10).for_each(|i| damped[i][i] += damping * normal[i][i].max(1e-12));
             let trial = solve_spd(&damped, &gradient).map(|d| (model.step(&d), d));
-            let better = trial.map(|(m, d)| (m, m.cost(pairs), d)).filter(|(_, c, _)| *c < cost);
+            let better = trial.map(|(m, d)| (m, m.cost(pairs, expected), d)).filter(|(_, c, _)| *c < cost);
             let Some((next, next_cost, d)) = better else {
                 damping *= 4.0;
                 continue;
@@ -147,11 +190,12 @@ pub(super) fn refine(start: Pinhole, pairs: &[Pair]) -> Refined {
             break;
         }
     }
+    let squares = model.cost(pairs, None);
     let freedom = (2.0 * n - 10.0).max(1.0);
-    let focal_uncertainty = if cost <= n * 1e-24 {
+    let focal_uncertainty = if squares <= n * 1e-24 {
         0.0
     } else {
-        inverse_diagonal(&normal).map_or(f64::INFINITY, |d| (d[0].max(d[1]) * cost / freedom).sqrt())
+        inverse_diagonal(&normal).map_or(f64::INFINITY, |d| (d[0].max(d[1]) * squares / freedom).sqrt())
     };
-    Refined { model, rms: (cost / n).sqrt(), converged, iterations, focal_uncertainty }
+    Refined { model, rms: (squares / n).sqrt(), converged, iterations, focal_uncertainty }
 }

@@ -164,7 +164,7 @@ pub fn solve(
     let fixes: Vec<Fix> = seen.iter().map(|s| s.fix).collect();
     let start = start(&problem, &fixes)?;
     let fitted = refine(&problem, start, &seen, &FINEST)?;
-    finish_told(&problem, &fitted, &seen, &FINEST)
+    finish_told(&problem, &fitted, (&seen, &fixes), &FINEST)
 }
 
 /// The planes of frames, and when their levels were.
@@ -277,22 +277,23 @@ pub(super) fn refine<M: Measured>(
     Ok(Fitted { state, equations, rms_level })
 }
 
-/// A fit into what is told of it. Whether its lens can be inverted over the raster is not asked here.
+/// A fit into what is told of it; `fixes` tell why, where the levels do not fit. Whether its lens can be inverted over the
+/// raster is not asked here.
 pub(super) fn finish<M: Measured>(
     problem: &Problem,
     fitted: &Fitted,
-    seen: &[M],
+    (seen, fixes): (&[M], &[Fix]),
 ) -> Result<Solution, SensorError> {
     let (settings, state, equations) = (problem.settings, &fitted.state, &fitted.equations);
     let (mut scores, mut brightness, mut depths) = (Scores::default(), Vec::new(), Vec::new());
     let position = state.model.position();
     for one in seen {
         let Some(tally) = one.tally(problem, state, fitted.sigma(), 0.0, None) else { continue };
-        let fix = one.fix();
-        let Some(at) = problem.sight(state, fix) else { continue };
-        scores.add(fix.from_middle_s, &tally);
-        let shift = (1e9 * (state.latency_s + state.drift * fix.from_middle_s)) as i64;
-        let Some(pose) = problem.path.at(fix.instant.0 + shift, 0.0) else { continue };
+        let moment = one.moment();
+        let Some(at) = problem.sight(state, moment) else { continue };
+        scores.add(moment.from_middle_s, &tally);
+        let shift = (1e9 * (state.latency_s + state.drift * moment.from_middle_s)) as i64;
+        let Some(pose) = problem.path.at(moment.instant.0 + shift, 0.0) else { continue };
         let tip = pose.position + pose.rotation * state.tip;
         depths.push(state.model.local(tip).z);
         let away = position - tip;
@@ -305,8 +306,7 @@ pub(super) fn finish<M: Measured>(
     }
     let rms_px = scores.rms_px();
     if rms_px > 2.5 {
-        let fixes: Vec<Fix> = seen.iter().map(|s| *s.fix()).collect();
-        return Err(why_no_fit(problem, &fixes, state, rms_px));
+        return Err(why_no_fit(problem, fixes, state, rms_px));
     }
     check_result(&state.model, &depths, &settings.known)?;
     let mut expected = Equations::new(UNKNOWNS);

@@ -3,10 +3,11 @@
 use super::code::Code;
 use super::decode::Decoded;
 use super::fit::{enough, planes_of, refine, sandwich, Fitted, Scores, SensorError, Settings, FINEST};
-use super::problem::{Fix, Measured, Problem, State, LATENCY, UNKNOWNS};
-use super::start::{from_bits, miss, prepare, MOST_START_PX};
+use super::problem::{Fix, Measured, Moment, Problem, State, LATENCY, UNKNOWNS};
+use super::start::{from_bits, prepare, MOST_START_PX};
 use crate::least_squares::Equations;
 use crate::model::ProjectorModel;
+use crate::projector::percentile;
 use crate::trajectory::Trajectory;
 
 /// What the sensor tells of the latency.
@@ -64,6 +65,12 @@ fn bound(problem: &Problem, state: &State) -> Option<SensorError> {
     is_at.then_some(SensorError::LatencyAtBound { ms: 1e3 * state.latency_s })
 }
 
+/// The median distance between where two states see the tip, pixels.
+fn apart<'a>(problem: &Problem, a: &State, b: &State, moments: impl Iterator<Item = &'a Moment>) -> f64 {
+    let one = |at: &Moment| Some((problem.sight(a, at)?.pixel - problem.sight(b, at)?.pixel).length());
+    percentile(moments.filter_map(one).collect(), 0.5)
+}
+
 pub(super) fn finish<M: Measured>(
     problem: &Problem,
     fitted: &Fitted,
@@ -74,7 +81,7 @@ pub(super) fn finish<M: Measured>(
     for one in seen {
         let Some(tally) = one.tally(problem, state, fitted.sigma(), 0.0, None) else { continue };
         frames += 1;
-        scores.add(one.fix().from_middle_s, &tally);
+        scores.add(one.moment().from_middle_s, &tally);
     }
     let rms_px = scores.rms_px();
     if let Some(at_bound) = bound(problem, state) {
@@ -86,8 +93,8 @@ pub(super) fn finish<M: Measured>(
     // A tip that moves further than it can be wrong makes up for a projector that is elsewhere.
     let before = problem.settings.tip;
     if (state.tip - before).abs().max_element() > MOST_TIP_SIGMAS * problem.tip_sigma {
-        let fixes: Vec<Fix> = seen.iter().map(|s| *s.fix()).collect();
-        let px = miss(problem, &State { tip: before, ..*state }, &fixes);
+        let moments = seen.iter().map(M::moment);
+        let px = apart(problem, state, &State { tip: before, ..*state }, moments);
         return Err(SensorError::OtherProjector { px });
     }
     let mut expected = Equations::new(UNKNOWNS);

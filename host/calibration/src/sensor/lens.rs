@@ -2,7 +2,7 @@
 //! the raster's border, the lens there is expected to be a usual one.
 
 use super::fit::{finish, refine, Fitted, SensorError, Settings, Solution};
-use super::problem::{Measured, Problem, State};
+use super::problem::{Fix, Measured, Problem, State};
 use crate::model::ProjectorModel;
 use crate::projector::{check_terms, moved_px, predict, LensTerms, Refusal};
 use glam::DVec2;
@@ -17,10 +17,10 @@ const MOST_OPEN: f64 = 0.01;
 pub(super) fn finish_told<M: Measured>(
     problem: &Problem,
     fitted: &Fitted,
-    seen: &[M],
+    (seen, fixes): (&[M], &[Fix]),
     stages: &[(f64, bool)],
 ) -> Result<Solution, SensorError> {
-    let solution = finish(problem, fitted, seen)?;
+    let solution = finish(problem, fitted, (seen, fixes))?;
     let priors = problem.settings.priors;
     if priors.is_beyond_brown() {
         check_folds(problem, &solution)?;
@@ -30,7 +30,8 @@ pub(super) fn finish_told<M: Measured>(
         check_terms(problem.raster, &solution.model, simple, &solution.predicted, &settings.volume)?;
         return Ok(solution);
     }
-    let usual = is_open(problem, &solution).then(|| usual(problem, &solution, fitted.state, seen, stages));
+    let usual =
+        is_open(problem, &solution).then(|| usual(problem, &solution, fitted.state, (seen, fixes), stages));
     let solution = usual.flatten().unwrap_or(solution);
     check_folds(problem, &solution)?;
     Ok(solution)
@@ -41,7 +42,7 @@ fn usual<M: Measured>(
     problem: &Problem,
     solution: &Solution,
     begun: State,
-    seen: &[M],
+    (seen, fixes): (&[M], &[Fix]),
     stages: &[(f64, bool)],
 ) -> Option<Solution> {
     let settings = Settings { priors: problem.settings.priors.with_usual_lens(), ..*problem.settings };
@@ -51,7 +52,7 @@ fn usual<M: Measured>(
     if moved > solution.predicted.p99_px {
         return None;
     }
-    let usual = finish(&expecting, &fitted, seen).ok()?;
+    let usual = finish(&expecting, &fitted, (seen, fixes)).ok()?;
     Some(Solution { is_lens_open: true, ..usual })
 }
 

@@ -16,12 +16,19 @@ pub(super) const DRIFT: usize = LATENCY + 1;
 pub(super) const RADIUS: usize = DRIFT + 1;
 pub(super) const UNKNOWNS: usize = RADIUS + 1;
 
-/// A moment in which the tip was seen.
+/// A moment in which the tip was in the light.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct Moment {
+    /// The instant by the host's clock, nanoseconds, and its part below one.
+    pub instant: (i64, f64),
+    /// Its distance from the middle of all, seconds.
+    pub from_middle_s: f64,
+}
+
+/// A moment for which the bits named a pixel.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct Fix {
-    /// The instant by the host's clock, and its distance from the middle of all, seconds.
-    pub instant: (i64, f64),
-    pub from_middle_s: f64,
+    pub moment: Moment,
     /// The pixel of the bits, good to a few.
     pub pixel: DVec2,
 }
@@ -46,7 +53,7 @@ pub(super) struct Seen<'a> {
 /// A measurement that is fitted.
 pub(super) trait Measured {
     /// The moment that stands for it.
-    fn fix(&self) -> &Fix;
+    fn moment(&self) -> &Moment;
 
     /// Full light less darkness, in the sensor's unit.
     fn contrast(&self) -> f64;
@@ -130,27 +137,26 @@ pub(super) struct Problem<'a> {
 }
 
 impl Problem<'_> {
-    pub(super) fn sight(&self, s: &State, seen: &Fix) -> Option<Sighting> {
-        let shift = 1e9 * (s.latency_s + s.drift * seen.from_middle_s) + seen.instant.1;
-        let pose =
-            self.path.at(seen.instant.0.saturating_add(shift.floor() as i64), shift - shift.floor())?;
+    pub(super) fn sight(&self, s: &State, at: &Moment) -> Option<Sighting> {
+        let shift = 1e9 * (s.latency_s + s.drift * at.from_middle_s) + at.instant.1;
+        let pose = self.path.at(at.instant.0.saturating_add(shift.floor() as i64), shift - shift.floor())?;
         let lever = pose.rotation * s.tip;
-        let at = s.model.derive(pose.position + lever)?;
+        let seen = s.model.derive(pose.position + lever)?;
         let velocity = pose.velocity + pose.turning.cross(lever);
         let to_body = pose.rotation.conjugate();
         let mut rows = [[0.0; UNKNOWNS]; 2];
         let mut moving = DVec2::ZERO;
         for k in 0..2 {
             for (i, row) in rows[k][..PARAMETERS].iter_mut().enumerate().filter(|(i, _)| self.free[*i]) {
-                *row = at.by_parameters[k][i];
+                *row = seen.by_parameters[k][i];
             }
-            rows[k][TIP..LATENCY].copy_from_slice(&(to_body * at.by_point[k]).to_array());
-            moving[k] = at.by_point[k].dot(velocity);
+            rows[k][TIP..LATENCY].copy_from_slice(&(to_body * seen.by_point[k]).to_array());
+            moving[k] = seen.by_point[k].dot(velocity);
             rows[k][LATENCY] = moving[k];
-            rows[k][DRIFT] = moving[k] * seen.from_middle_s;
+            rows[k][DRIFT] = moving[k] * at.from_middle_s;
         }
-        let scale = 0.5 * (at.by_point[0].length() + at.by_point[1].length());
-        Some(Sighting { pixel: at.pixel, velocity: moving, radius: s.radius_m * scale, rows })
+        let scale = 0.5 * (seen.by_point[0].length() + seen.by_point[1].length());
+        Some(Sighting { pixel: seen.pixel, velocity: moving, radius: s.radius_m * scale, rows })
     }
 
     pub(super) fn expect(&self, s: &State, all: &mut Equations) {
@@ -169,7 +175,7 @@ impl Problem<'_> {
     pub(super) fn of_bits(&self, s: &State, fixes: &[Fix], sigma_px: f64) -> Option<Equations> {
         let mut all = Equations::new(UNKNOWNS);
         for seen in fixes {
-            let Some(at) = self.sight(s, seen) else { continue };
+            let Some(at) = self.sight(s, &seen.moment) else { continue };
             let r = (at.pixel - seen.pixel) / sigma_px;
             let (weight, loss) = huber(r.length(), 2.0);
             all.cost += loss;
@@ -201,8 +207,8 @@ impl Problem<'_> {
 }
 
 impl<M: Measured> Measured for &M {
-    fn fix(&self) -> &Fix {
-        M::fix(self)
+    fn moment(&self) -> &Moment {
+        M::moment(self)
     }
 
     fn contrast(&self) -> f64 {
@@ -222,8 +228,8 @@ impl<M: Measured> Measured for &M {
 }
 
 impl Measured for Seen<'_> {
-    fn fix(&self) -> &Fix {
-        &self.fix
+    fn moment(&self) -> &Moment {
+        &self.fix.moment
     }
 
     fn contrast(&self) -> f64 {
@@ -238,7 +244,7 @@ impl Measured for Seen<'_> {
         finest: f64,
         all: Option<&mut Equations>,
     ) -> Option<Tally> {
-        let at = problem.sight(state, &self.fix)?;
+        let at = problem.sight(state, &self.fix.moment)?;
         let sums = self.sums(&at, sigma, finest);
         if let Some(all) = all {
             sums.add_to(&at, all);

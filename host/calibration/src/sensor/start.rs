@@ -3,7 +3,7 @@
 use super::code::{Code, Role, PLANES};
 use super::decode::{Decoded, Frame};
 use super::fit::{SensorError, Settings, MOST_LATENCY_S};
-use super::problem::{Fix, Planes, Problem, Seen, State};
+use super::problem::{Fix, Moment, Planes, Problem, Seen, State};
 use crate::least_squares::descend;
 use crate::model::ProjectorModel;
 use crate::pinhole::{calibrate, CalibrationError, CalibrationOptions, Pair};
@@ -29,7 +29,7 @@ pub(super) fn prepare<'a>(
         let levels = over_contrast(frame);
         let pixel = pixel_of_bits(planes.code, &levels);
         let from_middle_s = 1e-9 * instant.0.saturating_sub(middle_ns) as f64;
-        let fix = Fix { instant, from_middle_s, pixel };
+        let fix = Fix { moment: Moment { instant, from_middle_s }, pixel };
         is_inside(planes.code.raster(), pixel).then(|| Seen {
             planes,
             fix,
@@ -40,7 +40,7 @@ pub(super) fn prepare<'a>(
     // Whatever the latency is, there must be a pose.
     let reach = (1e9 * MOST_LATENCY_S) as i64;
     let known = |s: &Seen| {
-        let at = s.fix.instant.0;
+        let at = s.fix.moment.instant.0;
         at - reach > first && at + reach < last && path.at(at, 0.0).is_some()
     };
     decoded.frames.iter().filter_map(seen).filter(known).collect()
@@ -90,7 +90,7 @@ pub(super) fn thin<T>(seen: &[T], most: usize) -> impl Iterator<Item = &T> {
 /// Points of the wand and the pixels of their bits, for poses that are stamped `offset_ns` later than the light.
 fn sights(problem: &Problem, seen: &[Fix], most: usize, offset_ns: i64) -> Vec<Sight> {
     let place = |s: &Fix| {
-        let pose = problem.path.at(s.instant.0.saturating_add(offset_ns), 0.0)?;
+        let pose = problem.path.at(s.moment.instant.0.saturating_add(offset_ns), 0.0)?;
         Some(pose.position + pose.rotation * problem.settings.tip)
     };
     thin(seen, most).filter_map(|s| Some(Sight::at_rest(place(s)?, s.pixel))).collect()
@@ -142,7 +142,9 @@ fn late(problem: &Problem, seen: &[Fix]) -> Option<SensorError> {
     };
     let tried = (-50..=50).map(|i| (rms(20 * i), 20 * i));
     let (best, ms) = tried.min_by(|a, b| a.0.total_cmp(&b.0))?;
-    let explains = best < 0.015 * f64::from(raster.width()) && ms.unsigned_abs() >= 40;
+    // Of a wand that rests, any offset within the rest explains as much as none.
+    let is_better = best < 0.5 * rms(0) && ms.unsigned_abs() >= 40;
+    let explains = best < 0.015 * f64::from(raster.width()) && is_better;
     explains.then_some(SensorError::LatencyAtBound { ms: ms as f64 })
 }
 
@@ -194,6 +196,6 @@ pub(super) fn from_bits(
 
 /// The median distance between the pixels of the bits and where a state sees them.
 pub(super) fn miss(problem: &Problem, state: &State, seen: &[Fix]) -> f64 {
-    let one = |s: &Fix| problem.sight(state, s).map(|at| (at.pixel - s.pixel).length());
+    let one = |s: &Fix| problem.sight(state, &s.moment).map(|at| (at.pixel - s.pixel).length());
     percentile(seen.iter().filter_map(one).collect(), 0.5)
 }

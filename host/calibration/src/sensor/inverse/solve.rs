@@ -6,7 +6,7 @@
 use super::super::fit::{refine, Scores, SensorError, Settings, Solution};
 use super::super::latency::{self, Latency};
 use super::super::lens::finish_told;
-use super::super::problem::{Fix, Limits, Measured, Problem, State, Tally, RADIUS, UNKNOWNS};
+use super::super::problem::{Fix, Limits, Measured, Moment, Problem, State, Tally, RADIUS, UNKNOWNS};
 use super::super::start::{is_inside, start, thin};
 use super::code::{InverseCode, Stripe};
 use super::decode::{DecodedPairs, Pair};
@@ -37,15 +37,15 @@ const MOST_MISFIT: f64 = 0.1;
 /// A pair prepared for the fit.
 struct Paired {
     stripe: Stripe,
-    fix: Fix,
+    moment: Moment,
     /// Moments of the frame with the stripes and of that with the inverse, and the level of both.
-    ticks: Vec<([Fix; 2], f64)>,
+    ticks: Vec<([Moment; 2], f64)>,
     contrast: f64,
 }
 
 impl Measured for Paired {
-    fn fix(&self) -> &Fix {
-        &self.fix
+    fn moment(&self) -> &Moment {
+        &self.moment
     }
 
     fn contrast(&self) -> f64 {
@@ -117,7 +117,7 @@ pub fn solve_pairs(
     }
     let begun = with_latency(&problem, start(&problem, &fixes)?, &seen);
     let fitted = refine(&problem, begun, &seen, &stages(code))?;
-    finish_told(&problem, &fitted, &seen, &stages(code))
+    finish_told(&problem, &fitted, (&seen, &fixes), &stages(code))
 }
 
 /// Finds the latency of a projector that is known.
@@ -178,11 +178,11 @@ fn stages(code: &InverseCode) -> [(f64, bool); 5] {
     [(side / 32.0, false), (side / 80.0, false), (4.0, false), (0.0, false), (0.0, true)]
 }
 
-fn moment(path: &Trajectory, middle_ns: i64, ns: f64) -> Option<Fix> {
+fn moment(path: &Trajectory, middle_ns: i64, ns: f64) -> Option<Moment> {
     let at = ns.floor();
     path.at(at as i64, 0.0)?;
     let from_middle_s = 1e-9 * (at - middle_ns as f64);
-    Some(Fix { instant: (at as i64, ns - at), from_middle_s, pixel: glam::DVec2::ZERO })
+    Some(Moment { instant: (at as i64, ns - at), from_middle_s })
 }
 
 /// Pairs with a pose.
@@ -210,10 +210,10 @@ fn prepare(
         if from + early <= first || until + late >= last {
             return None;
         }
-        let ticks: Vec<([Fix; 2], f64)> = pair.levels.iter().enumerate().filter_map(tick).collect();
-        let fix = moment(path, middle_ns, 0.5 * (from as f64 + until as f64))?;
+        let ticks: Vec<([Moment; 2], f64)> = pair.levels.iter().enumerate().filter_map(tick).collect();
+        let moment = moment(path, middle_ns, 0.5 * (from as f64 + until as f64))?;
         let stripe = code.stripe(code.index(pair.number));
-        (!ticks.is_empty()).then_some(Paired { stripe, fix, ticks, contrast: pair.contrast })
+        (!ticks.is_empty()).then_some(Paired { stripe, moment, ticks, contrast: pair.contrast })
     };
     let seen: Vec<Paired> = decoded.pairs.iter().filter_map(seen).collect();
     match seen.len() {
@@ -240,7 +240,7 @@ fn still(code: &InverseCode, decoded: &DecodedPairs, path: &Trajectory, tip: DVe
         if is_inside(code.raster(), pixel) {
             let at = begin / 2 + end / 2;
             let from_middle_s = 1e-9 * at.saturating_sub(middle_ns) as f64;
-            fixes.push(Fix { instant: (at, 0.0), from_middle_s, pixel });
+            fixes.push(Fix { moment: Moment { instant: (at, 0.0), from_middle_s }, pixel });
         }
         // Half a round further on, half of the bits are new.
         from += count / 2;
@@ -282,7 +282,7 @@ fn is_still(path: &Trajectory, tip: DVec3, [begin, end]: [i64; 2]) -> bool {
 fn places(fixes: &[Fix], path: &Trajectory, tip: DVec3) -> usize {
     let mut found: Vec<DVec3> = Vec::new();
     for fix in fixes {
-        let Some(pose) = path.at(fix.instant.0, 0.0) else { continue };
+        let Some(pose) = path.at(fix.moment.instant.0, 0.0) else { continue };
         add_place(&mut found, pose.position + pose.rotation * tip);
     }
     found.len()
