@@ -64,9 +64,14 @@ fn frames_in_flight_show_their_own_shapes() {
         let rig = rig_of(&flag, SIZE, "translate", &ALONE);
         let poses = vec![DAffine3::IDENTITY; rig.scene.bodies.len()];
         let placed = |k: i64| Placed { poses: poses.clone(), animated_at_ns: 13_000_000 * k };
+        let shape =
+            |at: &Placed, t_ns: i64, frame: u32| alone(gpu, &rig, &rig.scene.still_at(t_ns), at, frame);
         let wanted: Vec<Vec<u32>> =
-            (0..6).map(|k| alone(gpu, &rig, &rig.scene, &placed(k), k as u32)).collect();
-        assert!(wanted.windows(2).all(|pair| differ(&pair[0], &pair[1]) > 20), "the flag waves");
+            (0..6).map(|k| shape(&placed(k), placed(k).animated_at_ns, k as u32)).collect();
+        for (k, wanted) in wanted.iter().enumerate() {
+            let other = shape(&placed(k as i64), placed(k as i64 + 1).animated_at_ns, k as u32);
+            assert!(differ(wanted, &other) > 20, "the flag waves");
+        }
         for (overlap, storage_tables) in [(Overlapping::Never, true), (Overlapping::Always, false)] {
             let settings = RendererSettings { overlap, ..renderer_settings(&rig) };
             let keep = Keep { storage_tables, ..Keep::default() };
@@ -126,12 +131,18 @@ fn histories_follow_what_deforms() {
         let last = frames - 1;
         let now = off(slot.codes(), &alone(gpu, &full, &full.scene, &placed(last), 7));
         let before = off(slot.codes(), &alone(gpu, &full, &full.scene, &placed(last - 20), 7));
-        // Surface that the flag uncovers, or comes to, is lit at once.
-        let shape = alone(gpu, &full, &full.scene, &placed(last), 7);
-        let missed =
-            slot.codes().iter().zip(&shape).filter(|(now, wanted)| **now == 0 && **wanted != 0).count();
-        assert!(missed <= 2, "{missed} pixels of the flag are dark");
         println!("rms off by {now:.4} of full drive, and from the shape 20 frames before by {before:.4}");
         assert!(now < 0.03 && now < 0.5 * before, "{now} {before}");
+        // Surface that the flag comes to is lit at once, however far it went: a frame may be late.
+        let lit_first = |wanted: &[u32], was: &[u32]| -> Vec<usize> {
+            (0..wanted.len()).filter(|i| wanted[*i] != 0 && was[*i] == 0).collect()
+        };
+        let was = slot.codes().to_vec();
+        let late = placed(last + 150);
+        draw(&rig, &mut renderer, &mut slot, &late, frames as u32, rig.config.render.spp as f32).unwrap();
+        let new = lit_first(&alone(gpu, &full, &full.scene, &late, 7), &was);
+        let missed = new.iter().filter(|i| slot.codes()[**i] == 0).count();
+        println!("{missed} of {} pixels that the flag came to are dark", new.len());
+        assert!(new.len() > 50 && 20 * missed <= new.len(), "{missed} of {}", new.len());
     });
 }

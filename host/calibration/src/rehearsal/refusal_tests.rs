@@ -3,7 +3,7 @@
 use super::photodiode::record;
 use super::tracker::Tracker;
 use super::truth::{Bias, Hand, Truth};
-use crate::projector::{Known, Priors, Refusal};
+use crate::projector::{moved_px, Known, Priors, Refusal};
 use crate::sensor::{
     decode, solve, Block, Code, Coverage, Decoded, Role, SensorError, Settings, Solution, Timing, PLANES,
 };
@@ -89,6 +89,32 @@ fn sweeps_with_a_fault_are_refused_by_name() {
     assert!(matches!(unit, SensorError::Projector(Refusal::WrongUnit { factor: 1000.0, .. })), "{unit}");
     let gone = sweep.with(|_, p| p.stamp_ns += 1_000_000_000_000).unwrap_err();
     assert!(matches!(gone, SensorError::TooFew { frames: 0, .. }), "{gone}");
+}
+
+/// Steps that the pixels of the bits do not show: the levels must tell of them, or the prediction must cover them.
+#[test]
+fn small_steps_of_the_tracker_are_told_or_predicted() {
+    for seed in [5, 6, 7] {
+        let sweep = sweep(seed, 15.0);
+        let Truth { raster, projector, volume, .. } = &sweep.truth;
+        let half = sweep.poses.len() / 2;
+        for moved_mm in [0.0, 1.0, 2.0, 4.0, 8.0, 15.0] {
+            let solved = sweep.with(|i, p| p.position.x += if i > half { 1e-3 * moved_mm } else { 0.0 });
+            match solved {
+                Ok(s) => {
+                    let (off, predicted) =
+                        (moved_px(*raster, &s.model, projector, volume), s.predicted.p99_px);
+                    println!("{seed}, {moved_mm} mm: {off:.3} px, predicted {predicted:.3} px");
+                    // Twice, because after a step no projector is near the light of both parts.
+                    assert!(off < 2.0 * predicted && moved_mm < 3.0, "{seed}: {moved_mm} mm, {off} px");
+                }
+                Err(SensorError::Changed { .. } | SensorError::Projector(Refusal::Moved { .. })) => {
+                    assert!(moved_mm > 0.0);
+                }
+                Err(other) => panic!("{seed}, {moved_mm} mm: {other}"),
+            }
+        }
+    }
 }
 
 #[test]

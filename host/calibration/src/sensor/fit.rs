@@ -8,6 +8,7 @@
 //! tracker's noise is correlated by interpolation. Noise is white by sample of the tracker, not by plane, so the usual
 //! inverse of J^T J would promise far too much.
 
+use super::change::largest_change;
 use super::code::{Code, PLANES};
 use super::decode::Decoded;
 use super::lens::finish_told;
@@ -132,6 +133,14 @@ pub enum SensorError {
         /// Residual, pixels.
         px: f64,
     },
+    /// The parts of the sweep belong to different projectors.
+    #[error("sensor: the first {after_s:.0} s of the sweep and the rest belong to different projectors, which light the same place {px:.1} px apart: projector or tracker were moved, the wand's body is not rigid, or the lens has more terms than were asked for (--lens); fasten what is loose, and begin again")]
+    Changed {
+        /// When the change was, seconds after the first frame.
+        after_s: f64,
+        /// How far apart the light of the two is, pixels.
+        px: f64,
+    },
     /// The light is not where a known projector puts it.
     #[error("sensor: the light is {px:.1} px away from where the calibrated projector puts it: projector or tracker were moved, or the tip is another one; run `dpm calibrate projector` again")]
     OtherProjector {
@@ -142,6 +151,11 @@ pub enum SensorError {
 
 /// Fewest frames.
 pub(super) const FEWEST: usize = 500;
+/// Beyond this residual, root mean square, the levels fit no projector, pixels.
+const MOST_RMS_PX: f64 = 2.5;
+/// Levels of a projector that stayed where it was miss by less than this, root mean square: by a few hundredths. In pixels
+/// they may look well nevertheless: a stripe that is lit where it should be dark has no slope that would say by how far.
+pub(super) const MOST_MISFIT: f64 = 0.1;
 /// Beyond this an offset is no latency, seconds.
 pub(super) const MOST_LATENCY_S: f64 = 0.05;
 const MOST_LATENCY_SIGMA_US: f64 = 100.0;
@@ -305,7 +319,7 @@ pub(super) fn finish<M: Measured>(
         });
     }
     let rms_px = scores.rms_px();
-    if rms_px > 2.5 {
+    if rms_px > MOST_RMS_PX || fitted.rms_level > MOST_MISFIT {
         return Err(why_no_fit(problem, fixes, state, rms_px));
     }
     check_result(&state.model, &depths, &settings.known)?;
@@ -326,8 +340,17 @@ pub(super) fn finish<M: Measured>(
         true => covariance[i][j],
         false => 0.0,
     };
-    let model_covariance: Vec<Vec<f64>> =
+    let mut model_covariance: Vec<Vec<f64>> =
         (0..PARAMETERS).map(|i| (0..PARAMETERS).map(|j| of_both(i, j)).collect()).collect();
+    let inverse = inverse_spd(&equations.matrix()).ok_or(Refusal::NotConverged { rms_px })?;
+    if let Some(change) =
+        largest_change(&state.model, (&inverse, &model_covariance), &scores.by_block, &points)
+    {
+        if change.is_certain() {
+            return Err(SensorError::Changed { after_s: change.after_s, px: change.px });
+        }
+        change.add_to(&mut model_covariance);
+    }
     Ok(Solution {
         model: state.model,
         predicted: predict(&state.model, &model_covariance, &points),

@@ -5,6 +5,7 @@
 //! frame in the samples of the sensor; [`solve()`] fits what the sensor must have seen. The sensor's own clock serves only
 //! to tell the planes apart: a level belongs to a plane of a frame, and the projector says when that plane was lit.
 
+mod change;
 mod code;
 mod coverage;
 mod decode;

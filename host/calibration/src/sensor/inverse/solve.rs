@@ -3,7 +3,7 @@
 //! Where the wand was held still for a round of the code, its bits name a pixel: enough to start. Then the levels of all
 //! pairs are fitted, those in motion too, each frame at its own instant: the latency comes from them.
 
-use super::super::fit::{refine, Scores, SensorError, Settings, Solution};
+use super::super::fit::{refine, Scores, SensorError, Settings, Solution, MOST_MISFIT};
 use super::super::latency::{self, Latency};
 use super::super::lens::finish_told;
 use super::super::problem::{Fix, Limits, Measured, Moment, Problem, State, Tally, RADIUS, UNKNOWNS};
@@ -30,9 +30,6 @@ const APART_M: f64 = 0.03;
 const LATENCIES_S: [f64; 2] = [-0.05, 0.3];
 /// A display's frame is long: its latency is never known as well as that of planes, microseconds.
 const MOST_LATENCY_SIGMA_US: f64 = 1000.0;
-
-/// Levels of a projector that is where it is said to be miss by less than this, root mean square: by a few hundredths.
-const MOST_MISFIT: f64 = 0.1;
 
 /// A pair prepared for the fit.
 struct Paired {
