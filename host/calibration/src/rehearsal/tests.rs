@@ -54,6 +54,14 @@ fn with_a_biased_tracker_the_light_is_within_half_a_pixel() {
     }
 }
 
+/// Reports that wander by a tenth of a millimetre make the parts of this sweep differ by half a pixel, beyond doubt. Nobody
+/// can fasten that: it is predicted, and not refused.
+#[test]
+fn a_tracker_that_wanders_is_predicted_and_not_refused() {
+    let draw = rehearse_one(5, Bias::Wandering(1e-4)).unwrap();
+    assert!(draw.p99_px < 1.5 * draw.predicted_p99_px, "{draw:?}");
+}
+
 #[test]
 fn a_rehearsal_repeats() {
     let (a, b) = (rehearse(1, 77).unwrap(), rehearse(1, 77).unwrap());

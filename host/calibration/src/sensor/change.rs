@@ -18,6 +18,9 @@ const LEAST_SHARE: f64 = 0.15;
 const USUAL: f64 = 2.0;
 /// No sweep in which nothing changed reaches this.
 const CERTAIN: f64 = 3.0;
+/// A change that moves the light by less is predicted and not refused, pixels: a tracker whose reports wander by a tenth of a
+/// millimetre changes by half a pixel, which nobody can fasten. It is also the usual limit of `dpm calibrate check`.
+const LEAST_REFUSED_PX: f64 = 2.0;
 
 /// The largest difference between the projectors of two parts of a sweep.
 #[derive(Clone, Copy, Debug)]
@@ -33,12 +36,12 @@ pub(super) struct Change {
 }
 
 impl Change {
-    /// Whether something changed, beyond doubt.
-    pub(super) fn is_certain(&self) -> bool {
-        self.ratio > CERTAIN
+    /// Whether something changed beyond doubt, and by so much that the sweep is worth nothing.
+    pub(super) fn is_refused(&self) -> bool {
+        self.ratio > CERTAIN && self.px > LEAST_REFUSED_PX
     }
 
-    /// Adds what a change that is not certain, but larger than usual, makes the numbers uncertain by.
+    /// Adds what a change that is larger than usual makes the numbers uncertain by.
     pub(super) fn add_to(&self, covariance: &mut [Vec<f64>]) {
         let weight = (1.0 - (USUAL / self.ratio).powi(2)).max(0.0);
         for (row, a) in covariance.iter_mut().zip(&self.step) {

@@ -346,7 +346,7 @@ pub(super) fn finish<M: Measured>(
     if let Some(change) =
         largest_change(&state.model, (&inverse, &model_covariance), &scores.by_block, &points)
     {
-        if change.is_certain() {
+        if change.is_refused() {
             return Err(SensorError::Changed { after_s: change.after_s, px: change.px });
         }
         change.add_to(&mut model_covariance);
