@@ -25,8 +25,8 @@ const FRESH_NS: i64 = 20 * MS;
 /// By how much farther from the body the light of one plane may be than without tracks, mirrors: half a mirror by rounding, and
 /// a filter that follows faster has more noise. The most that was seen in lawful lives is 1.3.
 const WORSE: f64 = 2.0;
-/// The same where a turn is over before any sample of it can arrive, so that what is foretold goes on for a while: 2.2 was
-/// seen.
+/// The same where a turn is over before a second sample of it can arrive, so that what is foretold goes on for a while: 2.2
+/// was seen.
 const WORSE_TURN: f64 = 3.0;
 /// Poses of this age tell where the body is even while it turns, seconds.
 const FRESH_S: f64 = 0.03;
@@ -134,12 +134,12 @@ impl TrackLaws {
         let plane_ns = S / i64::from(setup.rate_hz) / rig.schedule.len() as i64;
         // From 0.3 m/s to 0.3 m/s the other way.
         let turn_s = 0.6 / setup.motion.acceleration();
-        // A sample comes once a period, and an adapter may hold it back.
+        // A sample comes once a period, an adapter may hold it back, and one alone may be noise.
         let held_ns = match &setup.tracker {
             TrackerSetup::Serial(line) => line.timer_ns,
             _ => 0,
         };
-        let unheard_s = 1.0 / f64::from(setup.tracker_hz) + held_ns as f64 * 1e-9;
+        let unheard_s = 2.0 / f64::from(setup.tracker_hz) + held_ns as f64 * 1e-9;
         Ok(Self {
             rig: rig.clone(),
             motion: setup.motion.of(1.0)?,

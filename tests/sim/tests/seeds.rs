@@ -206,6 +206,8 @@ fn what_once_broke_a_law_with_another_tracker_keeps_them_all() {
         (900_000_351, Serial, 47),
         // A turn that was over before the adapter handed on any sample of it: a bound that was too narrow.
         (1_010_000_710, Serial, 7),
+        // The same where a turn was over before a second sample of it came, and a lost GPU kept the frame: another narrow bound.
+        (1_910_000_648, Vrpn, 52),
     ];
     for (seed, tracker, seconds) in found {
         let lived = lived(&Order { serial: None, tracker: Some(tracker), ..order(seed, None, seconds) });
