@@ -60,6 +60,14 @@ impl Rig {
         }
     }
 
+    /// A projector of binary planes with a small raster, of which the hand fills the inner half.
+    fn small(seed: u64) -> Self {
+        let usual = Self::new(128, 96, 120.0, seed);
+        let straight = ProjectorOptics::along_z([0.0, 0.0, 1.4], 225.0, 128, 96);
+        let optics = ProjectorOptics { brown: usual.optics.brown, ..straight };
+        Self { schedule: PlaneSchedule::rgb24(), optics, ..usual }
+    }
+
     /// The frame that a slot shows.
     fn frame_of(&self, slot: u64) -> u64 {
         let draws = Draws::new(self.seed).stream(17);
@@ -208,8 +216,12 @@ impl Rig {
 }
 
 fn visiting() -> Arc<Hand> {
+    visiting_since(0)
+}
+
+fn visiting_since(ns: i64) -> Arc<Hand> {
     let hand = Hand::new(Motion::still(Pose::IDENTITY).unwrap(), TIP);
-    hand.tell(0, Order::Visit);
+    hand.tell(ns, Order::Visit);
     Arc::new(hand)
 }
 
@@ -264,11 +276,8 @@ fn of_a_display_that_loses_half_of_the_frames_it_is_told_that_they_were_lost() {
 /// nevertheless, and its covariance must tell how far off the light in the corners may be.
 #[test]
 fn a_lens_that_was_seen_in_the_inner_half_only_is_given_and_its_corners_are_not_overrated() {
-    let straight = ProjectorOptics::along_z([0.0, 0.0, 1.4], 225.0, 128, 96);
-    let optics = ProjectorOptics { brown: [-0.06, 0.02, 0.0005, -0.0003, 0.0], ..straight };
     for seed in 1..=14 {
-        let schedule = PlaneSchedule::rgb24();
-        let rig = Rig { schedule, optics, lost: 0.05, ..Rig::new(128, 96, 120.0, seed) };
+        let rig = Rig { lost: 0.05, ..Rig::small(seed) };
         let code = InverseCode::new(rig.raster);
         let (blocks, poses) = rig.record(&code, &visiting(), 45.0);
         let decoded = decoded(&rig, &code, &blocks).unwrap();
@@ -285,40 +294,55 @@ fn a_lens_that_was_seen_in_the_inner_half_only_is_given_and_its_corners_are_not_
     }
 }
 
-/// A projector of small raster, and an operator who began to visit places some time before the sweep.
-fn small(seed: u64, lost: f64, begun_ns: i64) -> (Rig, Arc<Hand>) {
-    let straight = ProjectorOptics::along_z([0.0, 0.0, 1.4], 225.0, 128, 96);
-    let optics = ProjectorOptics { brown: [-0.06, 0.02, 0.0005, -0.0003, 0.0], ..straight };
-    let schedule = PlaneSchedule::rgb24();
-    let still = Rig { light_lag_ns: 0, tracker_latency_ns: 0, ..Rig::new(128, 96, 120.0, seed) };
-    let hand = Hand::new(Motion::still(Pose::IDENTITY).unwrap(), TIP);
-    hand.tell(-begun_ns, Order::Visit);
-    (Rig { schedule, optics, lost, ..still }, Arc::new(hand))
+/// A small projector without latencies, and an operator who began to visit places some time before the sweep.
+fn begun(seed: u64, lost: f64, before_ns: i64) -> (Rig, Arc<Hand>) {
+    let rig = Rig { lost, light_lag_ns: 0, tracker_latency_ns: 0, ..Rig::small(seed) };
+    (rig, visiting_since(-before_ns))
 }
 
-/// Solves a sweep of 42 s with a tip that was measured by a ruler, after `change` of the tracker's poses.
-fn small_sweep(
+/// Solves a sweep with a tip that was measured by a ruler, after `change` of the tracker's poses.
+fn by_ruler(
     rig: &Rig,
     hand: &Arc<Hand>,
+    seconds: f64,
     change: impl Fn(usize, &mut Stamped),
 ) -> Result<Solution, SensorError> {
     let code = InverseCode::new(rig.raster);
-    let (blocks, mut poses) = rig.record(&code, hand, 42.0);
+    let (blocks, mut poses) = rig.record(&code, hand, seconds);
     poses.iter_mut().enumerate().for_each(|(i, pose)| change(i, pose));
     let decoded = decoded(rig, &code, &blocks).unwrap();
-    let tip = DVec3::new(0.011, -0.004, 0.119);
+    let tip = DVec3::from_array(TIP);
     let volume = Volume::around(poses.iter().map(|p| p.place(tip))).unwrap();
-    let settings = Settings { volume, tip, tip_sigma_m: 2e-3 * 3f64.sqrt(), ..rig.settings() };
+    let measured = tip + DVec3::new(1e-3, 1e-3, -1e-3);
+    let settings = Settings { volume, tip: measured, tip_sigma_m: 2e-3 * 3f64.sqrt(), ..rig.settings() };
     solve_pairs(&code, &decoded, &Trajectory::new(&poses), &settings)
+}
+
+/// Sweeps of 42 s in which nothing changed, with up to a fifth of the frames lost: none may be refused.
+#[test]
+#[ignore = "five minutes: its figures are in docs/lab/CALIBRATION.md"]
+fn of_sweeps_in_which_nothing_changed_none_is_refused() {
+    let mut shares: Vec<f64> = (1..=300u64)
+        .map(|seed| {
+            let lost = 2e-3 * (seed * 7919 % 100) as f64;
+            let (rig, hand) = begun(seed, lost, seed as i64 * 1_234_567_891 % 40_000_000_000);
+            let solution =
+                by_ruler(&rig, &hand, 42.0, |_, _| ()).unwrap_or_else(|why| panic!("{seed}: {why}"));
+            rig.errors(&solution)[1] / solution.predicted.p99_px
+        })
+        .collect();
+    shares.sort_by(f64::total_cmp);
+    println!("{:.2} times the prediction in the median, {:.2} times at most", shares[150], shares[299]);
+    assert!(shares[299] < 2.0, "{shares:?}");
 }
 
 /// Thirteen places whose pixels are good to one leave a valley of pinholes, along which a fit of the pixels alone goes on for
 /// ever: the first of these sweeps was refused for clocks that were said to be 100 ms apart.
 #[test]
 fn pixels_that_leave_the_lens_open_are_a_start_all_the_same() {
-    for (seed, lost, begun_ns) in [(125, 0.15, 34_320_986_375), (126, 0.0, 0), (127, 0.1, 20_000_000_000)] {
-        let (rig, hand) = small(seed, lost, begun_ns);
-        let solution = small_sweep(&rig, &hand, |_, _| ()).unwrap_or_else(|why| panic!("{seed}: {why}"));
+    for (seed, lost, before_ns) in [(125, 0.15, 34_320_986_375), (126, 0.0, 0), (127, 0.1, 20_000_000_000)] {
+        let (rig, hand) = begun(seed, lost, before_ns);
+        let solution = by_ruler(&rig, &hand, 42.0, |_, _| ()).unwrap_or_else(|why| panic!("{seed}: {why}"));
         let ([_, p99], predicted) = (rig.errors(&solution), solution.predicted.p99_px);
         assert!(p99 < predicted, "{seed}: {p99} px, predicted {predicted} px");
         assert!(solution.latency_ns.abs() < 600_000, "{seed}: {} ns", solution.latency_ns);
@@ -326,17 +350,17 @@ fn pixels_that_leave_the_lens_open_are_a_start_all_the_same() {
 }
 
 /// A lens bends itself around a step of some millimetres, so that the levels hardly tell of it: of a tracker that was moved in
-/// the middle of the sweep by 2 to 40 mm, projectors were given whose light was 4 to 70 pixels off where 1 to 10 had been
+/// the middle of the sweep by 2 to 40 mm, projectors were given whose light was 4 to 96 pixels off where 0.6 to 20 had been
 /// predicted. And of a wand that rests, an offset of the clocks explains what anything else does not: it must not be blamed.
 #[test]
 fn of_a_tracker_that_was_moved_it_is_told_so_or_the_prediction_knows() {
     let display = Rig { schedule: PlaneSchedule::rgb24(), ..Rig::new(512, 384, 120.0, 3) };
-    for (rig, hand) in [small(3, 0.02, 0), small(3, 0.15, 11_000_000_000), (display, visiting())] {
+    for (rig, hand) in [begun(3, 0.02, 0), begun(3, 0.15, 11_000_000_000), (display, visiting())] {
         for moved_mm in [2.0, 15.0] {
             let moved = |i: usize, pose: &mut Stamped| {
                 pose.position.x += if i > 5500 { 1e-3 * moved_mm } else { 0.0 };
             };
-            let told = small_sweep(&rig, &hand, moved).map(|s| (rig.errors(&s)[1], s.predicted.p99_px));
+            let told = by_ruler(&rig, &hand, 42.0, moved).map(|s| (rig.errors(&s)[1], s.predicted.p99_px));
             println!("{} px, {moved_mm} mm: {told:?}", rig.raster.width());
             match told {
                 Ok((p99, predicted)) => assert!(p99 < predicted, "{p99} px, predicted {predicted} px"),
@@ -353,18 +377,10 @@ fn of_a_tracker_that_was_moved_it_is_told_so_or_the_prediction_knows() {
 #[test]
 #[ignore = "a minute: its figures are in docs/lab/CALIBRATION.md"]
 fn a_tip_by_the_ruler_is_found_as_well_as_predicted() {
-    let straight = ProjectorOptics::along_z([0.0, 0.0, 1.4], 225.0, 128, 96);
-    let optics = ProjectorOptics { brown: [-0.06, 0.02, 0.0005, -0.0003, 0.0], ..straight };
     let (mut shares, mut tips) = (Vec::new(), DVec3::ZERO);
     for seed in 1..=14 {
-        let rig = Rig { schedule: PlaneSchedule::rgb24(), optics, ..Rig::new(128, 96, 120.0, seed) };
-        let code = InverseCode::new(rig.raster);
-        let (blocks, poses) = rig.record(&code, &visiting(), 60.0);
-        let decoded = decoded(&rig, &code, &blocks).unwrap();
-        let volume = Volume::around(poses.iter().map(|p| p.place(DVec3::from_array(TIP)))).unwrap();
-        let by_ruler = DVec3::from_array(TIP) + DVec3::new(1e-3, 1e-3, -1e-3);
-        let settings = Settings { volume, tip: by_ruler, tip_sigma_m: 2e-3 * 3f64.sqrt(), ..rig.settings() };
-        let solution = solve_pairs(&code, &decoded, &Trajectory::new(&poses), &settings).unwrap();
+        let rig = Rig::small(seed);
+        let solution = by_ruler(&rig, &visiting(), 60.0, |_, _| ()).unwrap();
         let ([_, p99], predicted) = (rig.errors(&solution), solution.predicted.p99_px);
         let off_mm = 1e3 * (solution.tip - DVec3::from_array(TIP));
         println!("{seed}: {p99:.3} px, {predicted:.3} px predicted; tip off by {off_mm:.2} mm");

@@ -146,7 +146,7 @@ pub fn calibrate(
         return finish(raster, refined, &frame, &used, inliers, condition);
     }
     // Pixels that are good to one only may leave a valley of projectors, along which the focal length grows without end.
-    let expected = Expected { sigma: refined.rms, ..frame.expected(raster) };
+    let expected = frame.expected(raster, refined.rms);
     let refined = refine(start, &used, Some(&expected));
     let mut found = finish(raster, refined, &frame, &used, inliers, condition)?;
     found.warnings.push(NOT_BY_POINTS_ALONE.to_owned());
@@ -425,11 +425,11 @@ impl Normalisation {
         }
     }
 
-    /// What is expected of the projector of a raster, for pairs that are off by a unit.
-    fn expected(&self, raster: Raster) -> Expected {
+    /// What is expected of the projector of a raster, for pairs that are off by `sigma`.
+    fn expected(&self, raster: Raster, sigma: f64) -> Expected {
         let size = DVec2::new(f64::from(raster.width()), f64::from(raster.height()));
         let centre = (0.5 * size - self.pixel_centre) * self.pixel_scale;
-        Expected { centre, size: size * self.pixel_scale, sigma: 1.0 }
+        Expected { centre, size: size * self.pixel_scale, sigma }
     }
 
     fn to_camera(&self, raster: Raster, m: &Pinhole) -> ProjectorCamera {

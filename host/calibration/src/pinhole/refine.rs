@@ -100,20 +100,21 @@ const THROW_SIGMA: f64 = 1.0;
 impl Expected {
     /// What a pinhole misses of the expectations, and the derivatives by its ten parameters, in the pairs' units.
     fn rows(&self, m: &Pinhole) -> [(f64, [f64; 10]); 4] {
-        let off = (m.centre - self.centre) / self.size;
-        let throw = (0.5 * (m.focal.x.ln() + m.focal.y.ln()) - (THROW * self.size.x).ln()) / THROW_SIGMA;
-        let aspect = (m.focal.y.ln() - m.focal.x.ln()) / ASPECT_SIGMA;
-        let row = |parts: [(usize, f64); 2]| {
+        let throw = 0.5 * (m.focal.x.ln() + m.focal.y.ln()) - (THROW * self.size.x).ln();
+        let aspect = m.focal.y.ln() - m.focal.x.ln();
+        let off = m.centre - self.centre;
+        let centre_sigma = CENTRE_SIGMA * self.size;
+        let expect = |value: f64, sigma: f64, by: &[(usize, f64)]| {
+            let weight = self.sigma / sigma;
             let mut row = [0.0; 10];
-            parts.iter().for_each(|(i, v)| row[*i] = self.sigma * v);
-            row
+            by.iter().for_each(|(i, slope)| row[*i] = weight * slope);
+            (weight * value, row)
         };
-        let by_centre = |axis: usize| 1.0 / (self.size[axis] * CENTRE_SIGMA[axis]);
         [
-            (self.sigma * aspect, row([(0, -1.0 / ASPECT_SIGMA), (1, 1.0 / ASPECT_SIGMA)])),
-            (self.sigma * throw, row([(0, 0.5 / THROW_SIGMA), (1, 0.5 / THROW_SIGMA)])),
-            (self.sigma * off.x / CENTRE_SIGMA.x, row([(2, by_centre(0)), (3, 0.0)])),
-            (self.sigma * off.y / CENTRE_SIGMA.y, row([(3, by_centre(1)), (2, 0.0)])),
+            expect(aspect, ASPECT_SIGMA, &[(0, -1.0), (1, 1.0)]),
+            expect(throw, THROW_SIGMA, &[(0, 0.5), (1, 0.5)]),
+            expect(off.x, centre_sigma.x, &[(2, 1.0)]),
+            expect(off.y, centre_sigma.y, &[(3, 1.0)]),
         ]
     }
 }

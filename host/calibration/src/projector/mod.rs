@@ -15,7 +15,7 @@ pub use fit::{LensTerms, Priors};
 pub use refusal::Refusal;
 pub(crate) use solve::{check_result, check_terms, look_for_motion, moved_px};
 pub use solve::{relocate, solve, Solved};
-pub(crate) use uncertainty::percentile;
+pub(crate) use uncertainty::{percentile, variance};
 pub use uncertainty::{predict, Predicted, Volume};
 
 use crate::model::ProjectorModel;

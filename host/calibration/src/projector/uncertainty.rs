@@ -72,12 +72,8 @@ pub fn predict(model: &ProjectorModel, covariance: &[Vec<f64>], points: &[DVec3]
     let n = PARAMETERS;
     let slopes: Vec<_> =
         points.iter().filter_map(|p| model.derive(*p).map(|d| (*p, d.by_parameters))).collect();
-    let deviation = |rows: &[[f64; PARAMETERS]; 2]| {
-        let variance = |row: &[f64; PARAMETERS]| -> f64 {
-            (0..n).map(|i| row[i] * (0..n).map(|j| covariance[i][j] * row[j]).sum::<f64>()).sum()
-        };
-        (variance(&rows[0]) + variance(&rows[1])).max(0.0).sqrt()
-    };
+    let deviation =
+        |[x, y]: &[[f64; PARAMETERS]; 2]| (variance(covariance, x) + variance(covariance, y)).max(0.0).sqrt();
     let mut deviations: Vec<(f64, DVec3)> = slopes.iter().map(|(p, rows)| (deviation(rows), *p)).collect();
     deviations.sort_by(|a, b| a.0.total_cmp(&b.0));
     let Some(&(worst_px, worst)) = deviations.last() else {
@@ -104,6 +100,12 @@ pub fn predict(model: &ProjectorModel, covariance: &[Vec<f64>], points: &[DVec3]
     bounds.sort_by(f64::total_cmp);
     let p99_px = bounds[(0.99 * (bounds.len() - 1) as f64).round() as usize];
     Predicted { typical_px, p99_px, worst, worst_px }
+}
+
+/// The variance of what changes by `row` with the projector's numbers.
+pub(crate) fn variance(covariance: &[Vec<f64>], row: &[f64; PARAMETERS]) -> f64 {
+    let times = |i: usize| (0..PARAMETERS).map(|j| covariance[i][j] * row[j]).sum::<f64>();
+    (0..PARAMETERS).map(|i| row[i] * times(i)).sum()
 }
 
 /// A lower triangle whose square is the covariance of the numbers. Numbers that are held have no variance, so

@@ -8,7 +8,7 @@
 use super::fit::BLOCK_S;
 use super::problem::UNKNOWNS;
 use crate::model::{ProjectorModel, PARAMETERS};
-use crate::projector::percentile;
+use crate::projector::{percentile, variance};
 use glam::DVec3;
 
 /// Parts shorter than this share of a sweep are not compared: they have seen too few places.
@@ -60,11 +60,7 @@ pub(super) fn largest_change(
 ) -> Option<Change> {
     let slopes: Vec<[[f64; PARAMETERS]; 2]> =
         points.iter().filter_map(|p| model.derive(*p).map(|at| at.by_parameters)).collect();
-    let variance = |row: &[f64; PARAMETERS]| -> f64 {
-        let times = |i: usize| (0..PARAMETERS).map(|j| covariance[i][j] * row[j]).sum::<f64>();
-        (0..PARAMETERS).map(|i| row[i] * times(i)).sum()
-    };
-    let by_chance: f64 = slopes.iter().flatten().map(variance).sum();
+    let by_chance: f64 = slopes.iter().flatten().map(|row| variance(covariance, row)).sum();
     let first = by_block.first()?.0;
     let mut sum = [0.0; UNKNOWNS];
     let parts = by_block.iter().enumerate().filter_map(|(i, (block, score))| {

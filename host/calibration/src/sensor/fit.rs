@@ -17,7 +17,7 @@ use super::start::{prepare, start, thin, why_no_fit};
 use super::Timing;
 use crate::dense::inverse_spd;
 use crate::least_squares::{descend, Equations};
-use crate::model::{ProjectorModel, PARAMETERS};
+use crate::model::ProjectorModel;
 use crate::projector::{check_result, predict, Known, Predicted, Priors, Refusal, Volume};
 use crate::trajectory::Trajectory;
 use dpm_device::planes::Raster;
@@ -291,6 +291,40 @@ pub(super) fn refine<M: Measured>(
     Ok(Fitted { state, equations, rms_level })
 }
 
+/// What the measurements say of a fit.
+#[derive(Default)]
+struct Told {
+    scores: Scores,
+    brightness: Vec<Brightness>,
+    /// Distances of the tip along the projector's axis, metres.
+    depths: Vec<f64>,
+}
+
+impl Told {
+    fn of<M: Measured>(problem: &Problem, fitted: &Fitted, seen: &[M]) -> Self {
+        let (state, mut told) = (&fitted.state, Self::default());
+        let position = state.model.position();
+        for one in seen {
+            let Some(tally) = one.tally(problem, state, fitted.sigma(), 0.0, None) else { continue };
+            let moment = one.moment();
+            let Some(at) = problem.sight(state, moment) else { continue };
+            told.scores.add(moment.from_middle_s, &tally);
+            let shift = (1e9 * (state.latency_s + state.drift * moment.from_middle_s)) as i64;
+            let Some(pose) = problem.path.at(moment.instant.0 + shift, 0.0) else { continue };
+            let tip = pose.position + pose.rotation * state.tip;
+            told.depths.push(state.model.local(tip).z);
+            let away = position - tip;
+            told.brightness.push(Brightness {
+                pixel: at.pixel,
+                distance_m: away.length(),
+                towards: pose.rotation.conjugate() * away.normalize_or_zero(),
+                level: one.contrast(),
+            });
+        }
+        told
+    }
+}
+
 /// A fit into what is told of it; `fixes` tell why, where the levels do not fit. Whether its lens can be inverted over the
 /// raster is not asked here.
 pub(super) fn finish<M: Measured>(
@@ -298,35 +332,16 @@ pub(super) fn finish<M: Measured>(
     fitted: &Fitted,
     (seen, fixes): (&[M], &[Fix]),
 ) -> Result<Solution, SensorError> {
-    let (settings, state, equations) = (problem.settings, &fitted.state, &fitted.equations);
-    let (mut scores, mut brightness, mut depths) = (Scores::default(), Vec::new(), Vec::new());
-    let position = state.model.position();
-    for one in seen {
-        let Some(tally) = one.tally(problem, state, fitted.sigma(), 0.0, None) else { continue };
-        let moment = one.moment();
-        let Some(at) = problem.sight(state, moment) else { continue };
-        scores.add(moment.from_middle_s, &tally);
-        let shift = (1e9 * (state.latency_s + state.drift * moment.from_middle_s)) as i64;
-        let Some(pose) = problem.path.at(moment.instant.0 + shift, 0.0) else { continue };
-        let tip = pose.position + pose.rotation * state.tip;
-        depths.push(state.model.local(tip).z);
-        let away = position - tip;
-        brightness.push(Brightness {
-            pixel: at.pixel,
-            distance_m: away.length(),
-            towards: pose.rotation.conjugate() * away.normalize_or_zero(),
-            level: one.contrast(),
-        });
-    }
+    let (settings, state) = (problem.settings, &fitted.state);
+    let Told { scores, brightness, depths } = Told::of(problem, fitted, seen);
     let rms_px = scores.rms_px();
     if rms_px > MOST_RMS_PX || fitted.rms_level > MOST_MISFIT {
         return Err(why_no_fit(problem, fixes, state, rms_px));
     }
     check_result(&state.model, &depths, &settings.known)?;
-    let mut expected = Equations::new(UNKNOWNS);
-    problem.expect(state, &mut expected);
-    let covariance =
-        sandwich(equations, &expected, &scores.by_block).ok_or(Refusal::NotConverged { rms_px })?;
+    let unsettled = Refusal::NotConverged { rms_px };
+    let inverse = inverse_spd(&fitted.equations.matrix()).ok_or(unsettled.clone())?;
+    let covariance = sandwich(&inverse, &problem.expected(state), &scores.by_block).ok_or(unsettled)?;
     if state.latency_s.abs() > 0.9 * problem.limits.latency_s {
         return Err(SensorError::LatencyAtBound { ms: 1e3 * state.latency_s });
     }
@@ -336,25 +351,17 @@ pub(super) fn finish<M: Measured>(
     }
     let of_tip = |i: usize| DVec3::from_array(std::array::from_fn(|j| covariance[TIP + i][TIP + j]));
     let points = settings.volume.points(&state.model, problem.raster);
-    let of_both = |i: usize, j: usize| match problem.free[i] && problem.free[j] {
-        true => covariance[i][j],
-        false => 0.0,
-    };
-    let mut model_covariance: Vec<Vec<f64>> =
-        (0..PARAMETERS).map(|i| (0..PARAMETERS).map(|j| of_both(i, j)).collect()).collect();
-    let inverse = inverse_spd(&equations.matrix()).ok_or(Refusal::NotConverged { rms_px })?;
-    if let Some(change) =
-        largest_change(&state.model, (&inverse, &model_covariance), &scores.by_block, &points)
-    {
+    let mut of_model = problem.of_model(&covariance);
+    if let Some(change) = largest_change(&state.model, (&inverse, &of_model), &scores.by_block, &points) {
         if change.is_refused() {
             return Err(SensorError::Changed { after_s: change.after_s, px: change.px });
         }
-        change.add_to(&mut model_covariance);
+        change.add_to(&mut of_model);
     }
     Ok(Solution {
         model: state.model,
-        predicted: predict(&state.model, &model_covariance, &points),
-        covariance: model_covariance,
+        predicted: predict(&state.model, &of_model, &points),
+        covariance: of_model,
         is_lens_open: false,
         tip: state.tip,
         tip_covariance: DMat3::from_cols(of_tip(0), of_tip(1), of_tip(2)),
@@ -369,14 +376,13 @@ pub(super) fn finish<M: Measured>(
     })
 }
 
-/// Inverse of the second derivatives, times the covariance of the scores by block and of the expectations, times the
-/// inverse again.
+/// The inverse of the second derivatives, times the covariance of the scores by block and of the expectations, times the
+/// inverse again. `None` if the blocks are too few.
 pub(super) fn sandwich(
-    equations: &Equations,
+    inverse: &[Vec<f64>],
     expected: &Equations,
     scores: &[(i64, [f64; UNKNOWNS])],
 ) -> Option<Vec<Vec<f64>>> {
-    let inverse = inverse_spd(&equations.matrix())?;
     let blocks = scores.len() as f64;
     if blocks <= 2.0 * UNKNOWNS as f64 {
         return None;

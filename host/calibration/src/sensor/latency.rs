@@ -3,9 +3,9 @@
 use super::code::Code;
 use super::decode::Decoded;
 use super::fit::{enough, planes_of, refine, sandwich, Fitted, Scores, SensorError, Settings, FINEST};
-use super::problem::{Fix, Measured, Moment, Problem, State, LATENCY, UNKNOWNS};
+use super::problem::{Fix, Measured, Moment, Problem, State, LATENCY};
 use super::start::{from_bits, prepare, MOST_START_PX};
-use crate::least_squares::Equations;
+use crate::dense::inverse_spd;
 use crate::model::ProjectorModel;
 use crate::projector::percentile;
 use crate::trajectory::Trajectory;
@@ -76,7 +76,7 @@ pub(super) fn finish<M: Measured>(
     fitted: &Fitted,
     seen: &[M],
 ) -> Result<Latency, SensorError> {
-    let (state, equations) = (&fitted.state, &fitted.equations);
+    let state = &fitted.state;
     let (mut scores, mut frames) = (Scores::default(), 0);
     for one in seen {
         let Some(tally) = one.tally(problem, state, fitted.sigma(), 0.0, None) else { continue };
@@ -97,10 +97,10 @@ pub(super) fn finish<M: Measured>(
         let px = apart(problem, state, &State { tip: before, ..*state }, moments);
         return Err(SensorError::OtherProjector { px });
     }
-    let mut expected = Equations::new(UNKNOWNS);
-    problem.expect(state, &mut expected);
     let short = SensorError::TooFew { frames, need: 2 * frames, seconds: 5.0 };
-    let covariance = sandwich(equations, &expected, &scores.by_block).ok_or(short)?;
+    let covariance = inverse_spd(&fitted.equations.matrix())
+        .and_then(|inverse| sandwich(&inverse, &problem.expected(state), &scores.by_block))
+        .ok_or(short)?;
     let sigma_ns = 1e9 * covariance[LATENCY][LATENCY].sqrt();
     if sigma_ns > 1e3 * problem.limits.latency_sigma_us {
         return Err(SensorError::LatencyUncertain { us: 1e-3 * sigma_ns });

@@ -171,6 +171,19 @@ impl Problem<'_> {
         all.expect(RADIUS, (2.0 * s.radius_m / self.settings.aperture_m).ln(), 0.7);
     }
 
+    /// The equations of what is expected alone.
+    pub(super) fn expected(&self, s: &State) -> Equations {
+        let mut all = Equations::new(UNKNOWNS);
+        self.expect(s, &mut all);
+        all
+    }
+
+    /// The part of a covariance that is the projector's; what is held has none.
+    pub(super) fn of_model(&self, covariance: &[Vec<f64>]) -> Vec<Vec<f64>> {
+        let both = |i: usize, j: usize| if self.free[i] && self.free[j] { covariance[i][j] } else { 0.0 };
+        (0..PARAMETERS).map(|i| (0..PARAMETERS).map(|j| both(i, j)).collect()).collect()
+    }
+
     /// Equations from the pixels of the bits.
     pub(super) fn of_bits(&self, s: &State, fixes: &[Fix], sigma_px: f64) -> Option<Equations> {
         let mut all = Equations::new(UNKNOWNS);
@@ -200,9 +213,7 @@ impl Problem<'_> {
     /// Their cost alone.
     pub(super) fn cost_of_levels<M: Measured>(&self, s: &State, all: &[M], how: (f64, f64)) -> f64 {
         let losses = all.iter().filter_map(|m| Some(m.tally(self, s, how.0, how.1, None)?.loss));
-        let mut priors = Equations::new(UNKNOWNS);
-        self.expect(s, &mut priors);
-        losses.sum::<f64>() + priors.cost
+        losses.sum::<f64>() + self.expected(s).cost
     }
 }
 
