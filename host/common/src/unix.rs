@@ -134,6 +134,15 @@ pub fn wait_readable(descriptors: &[RawFd], limit_ms: i32, ready: &mut Vec<bool>
     }
 }
 
+/// Lets a pipe hold `bytes`, as far as this user may (pipe(7): a MiB).
+///
+/// # Errors
+/// Those of fcntl(2): it is no pipe, or the user's pipes hold too much already.
+pub fn widen_pipe(pipe: &impl AsRawFd, bytes: usize) -> io::Result<()> {
+    // SAFETY: plain numbers; the descriptor is open as long as `pipe` is borrowed.
+    checked(unsafe { libc::fcntl(pipe.as_raw_fd(), libc::F_SETPIPE_SZ, bytes as libc::c_int) })
+}
+
 /// Nanoseconds of the clock that all processes of this boot share and that nobody sets (CLOCK_MONOTONIC).
 pub fn monotonic_ns() -> u64 {
     let mut now = libc::timespec { tv_sec: 0, tv_nsec: 0 };

@@ -64,6 +64,11 @@ impl<T> Publisher<T> {
         let before = self.shared.middle.swap(self.back | FRESH, Ordering::AcqRel);
         self.back = before & INDEX;
     }
+
+    /// False once the reader is gone.
+    pub fn has_reader(&self) -> bool {
+        Arc::strong_count(&self.shared) > 1
+    }
 }
 
 impl<T> Reader<T> {
@@ -77,9 +82,13 @@ impl<T> Reader<T> {
             let before = self.shared.middle.swap(self.front, Ordering::AcqRel);
             self.front = before & INDEX;
         }
+        (self.held(), fresh)
+    }
+
+    /// The value that [`Reader::latest`] returned last, or the first one.
+    pub fn held(&self) -> &T {
         // SAFETY: `front` belongs to this reader alone until its next swap, which needs `&mut self` and so outlives the borrow.
-        let value = self.shared.cells[usize::from(self.front)].with(|cell| unsafe { &*cell });
-        (value, fresh)
+        self.shared.cells[usize::from(self.front)].with(|cell| unsafe { &*cell })
     }
 
     /// True when [`Reader::latest`] would return something new.
@@ -100,8 +109,12 @@ mod tests {
             publisher.publish(i);
         }
         assert!(reader.has_news());
+        assert_eq!(reader.held(), &0, "nothing is taken before it is asked for");
         assert_eq!(reader.latest(), (&5, true));
         assert_eq!(reader.latest(), (&5, false));
+        assert_eq!((reader.held(), publisher.has_reader()), (&5, true));
+        drop(reader);
+        assert!(!publisher.has_reader());
     }
 
     #[test]

@@ -3,6 +3,7 @@
 use super::body_tree::BodyTree;
 use super::deformed::DeformedTables;
 use super::fill::fill;
+use super::live_textures::{LiveTextures, Piece};
 use super::memory::{BytesPerPixel, SharedBuffers};
 use super::scene_data::{BodyData, SceneData};
 use super::scene_gpu::{table_buffer, Geometry, SceneGpu};
@@ -59,8 +60,10 @@ pub(super) struct FrameBuffers {
     pub device_tree: Option<FrameTree>,
     /// The tables of a scene in which bodies deform.
     pub deformed: Option<DeformedTables>,
-    /// The texture table of a scene with clips.
+    /// The texture table of a scene with clips or live textures.
     pub textures: Option<Latched>,
+    /// What goes to the GPU of live pictures.
+    pub piece: Option<Piece>,
 }
 
 /// A buffer that the host writes, with its copy for the shaders. The frame's first commands make the copy.
@@ -97,6 +100,7 @@ impl FrameBuffers {
         (data, reading): (&SceneData, Reading),
         tiles: usize,
         body_tree: BodyTree,
+        live: Option<&LiveTextures>,
         debug: bool,
     ) -> Result<Self, GpuError> {
         use MemoryKind::{Device, Readback, Upload};
@@ -145,7 +149,8 @@ impl FrameBuffers {
             movers: latched("movers", size_of::<Mover>() * bodies.max(1))?,
             device_tree: asks_device.then(|| FrameTree::new(gpu, bodies)).transpose()?,
             deformed: DeformedTables::new(gpu, data, reading)?,
-            textures: clip_table(gpu, data)?,
+            textures: texture_table(gpu, data)?,
+            piece: live.map(|live| live.piece(gpu)).transpose()?,
             debug_host: debug.then(|| DebugBuffers::new(gpu, pixels, tiles, each)).transpose()?,
             each,
         })
@@ -153,15 +158,22 @@ impl FrameBuffers {
 
     /// Changes the shapes and pictures of this frame to those of `t_ns`, and the bounds of bodies that deform. Allocates
     /// nothing.
-    pub(super) fn show(&mut self, data: &SceneData, t_ns: i64, bounds: &mut [BodyData]) {
+    pub(super) fn show(
+        &mut self,
+        data: &SceneData,
+        live: Option<&LiveTextures>,
+        t_ns: i64,
+        bounds: &mut [BodyData],
+    ) {
         if let Some(deformed) = &mut self.deformed {
             deformed.write(data, t_ns, bounds);
         }
         if let Some(textures) = &mut self.textures {
-            let size = size_of::<TextureInfo>();
-            for clip in &data.clips {
-                let info = TextureInfo { offset: clip.offset_at(t_ns), ..data.textures[clip.texture] };
-                textures.host.bytes_mut()[clip.texture * size..][..size]
+            let clips = data.clips.iter().map(|clip| (clip.texture, clip.offset_at(t_ns)));
+            for (texture, offset) in clips.chain(live.into_iter().flat_map(LiveTextures::shown)) {
+                let info = TextureInfo { offset, ..data.textures[texture] };
+                let size = size_of::<TextureInfo>();
+                textures.host.bytes_mut()[texture * size..][..size]
                     .copy_from_slice(bytemuck::bytes_of(&info));
             }
         }
@@ -272,9 +284,9 @@ impl FrameBuffers {
     }
 }
 
-/// The texture table of a frame in flight; `None` if the scene has no clips.
-fn clip_table(gpu: &Arc<Gpu>, data: &SceneData) -> Result<Option<Latched>, GpuError> {
-    if data.clips.is_empty() {
+/// The texture table of a frame in flight; `None` if the pictures of the scene stay.
+fn texture_table(gpu: &Arc<Gpu>, data: &SceneData) -> Result<Option<Latched>, GpuError> {
+    if data.clips.is_empty() && data.live.is_empty() {
         return Ok(None);
     }
     let len_bytes = size_of_val(&data.textures[..]);

@@ -26,6 +26,7 @@ mod fill;
 mod frame_buffers;
 pub mod gpu;
 mod last_frame;
+mod live_textures;
 mod memory;
 pub mod method;
 mod optics;

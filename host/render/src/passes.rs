@@ -500,6 +500,7 @@ mod tests {
             plane_groups: Vec::new(),
             output: crate::Output::Planes(dpm_device::planes::PlaneSchedule::rgb24()),
             overlap: crate::Overlapping::Never,
+            most_live_texels: usize::MAX,
             tracing: crate::Tracing::Auto,
         }
     }

@@ -4,6 +4,7 @@ use super::body_tree::BodyTree;
 use super::fill;
 use super::frame_buffers::FrameBuffers;
 use super::last_frame::{LastFrame, Turn};
+use super::live_textures::{LiveTextures, Piece};
 use super::memory::SharedBuffers;
 use super::optics::OpticsLayout;
 use super::passes::{Grid, FIRST_PASSES, PASSES, TABLE};
@@ -55,6 +56,8 @@ pub struct Renderer {
     tile_list: TileList,
     /// The bodies that move while the planes of a frame last.
     movers: Movers,
+    /// The textures that show what another program makes.
+    live: Option<LiveTextures>,
     /// Rays look for bodies in a tree that the host builds.
     walks_tree: bool,
     /// How shaders read tables.
@@ -125,6 +128,7 @@ impl Renderer {
         let tile_list = TileList::new(settings.raster, settings.lens.as_ref());
         let rated = vec![false; tile_list.len()];
         let movers = Movers::new(data.bodies.len(), &settings.plane_groups, !settings.shows_halftones());
+        let live = LiveTextures::new(&data.live, settings.most_live_texels);
         Ok(Self {
             resources: Arc::new(Resources { pipelines, table, shared, scene: scene_gpu, overlap }),
             bodies: data.bodies.clone(),
@@ -138,6 +142,7 @@ impl Renderer {
             rated,
             tile_list,
             movers,
+            live,
             walks_tree: plan.walks_body_tree(reading),
             orders: Orders::default(),
             optics,
@@ -184,7 +189,8 @@ impl Renderer {
         let tile_list = self.tile_list.clone();
         let body_tree = BodyTree::new(if self.walks_tree { self.data.bodies.len() } else { 0 });
         let scene = (&*self.data, self.reading);
-        let buffers = FrameBuffers::new(gpu, settings, scene, tile_list.len(), body_tree, debug)?;
+        let live = self.live.as_ref();
+        let buffers = FrameBuffers::new(gpu, settings, scene, tile_list.len(), body_tree, live, debug)?;
         buffers.clear(gpu, settings)?;
         let set_of = |parity| {
             let all = (&resources.shared, &resources.scene);
@@ -318,7 +324,11 @@ impl Renderer {
     pub fn submit(&mut self, slot: &mut FrameSlot, inputs: &FrameInputs<'_>) -> Result<(), GpuError> {
         assert_eq!(inputs.poses.len(), self.data.bodies.len(), "one pose per body");
         slot.fence.check_free()?;
-        slot.buffers.show(&self.data, inputs.animated_at_ns, &mut self.bodies);
+        let has_piece = match (&mut self.live, &mut slot.buffers.piece) {
+            (Some(live), Some(piece)) => live.advance(piece, &self.resources.scene.texels)?,
+            _ => false,
+        };
+        slot.buffers.show(&self.data, self.live.as_ref(), inputs.animated_at_ns, &mut self.bodies);
         if self.settings.camera_is_eye || self.keep.every_tile {
             slot.tile_list.fill();
         } else {
@@ -355,7 +365,12 @@ impl Renderer {
         let [first, second] = &slot.lists[slot.parity];
         let order = self.orders.next(slot.parity);
         let overlap = self.resources.overlap.as_ref().map(|overlap| (overlap, order));
-        submit_frame([first, second], overlap, &mut slot.fence)?;
+        let piece = slot.buffers.piece.as_ref().filter(|_| has_piece).map(Piece::list);
+        let submitted = submit_frame(piece, [first, second], overlap, &mut slot.fence);
+        if submitted.is_err() {
+            self.live.iter_mut().for_each(LiveTextures::take_back);
+        }
+        submitted?;
         self.orders.submitted(slot.parity, order);
         if decides_rates {
             self.rated.copy_from_slice(slot.tile_list.active());

@@ -4,6 +4,7 @@ mod lights;
 
 use super::body_tree::FEWEST_BODIES;
 use super::deforming_body::DeformingBody;
+use super::live_textures::{LiveTexture, PLACES};
 pub use super::scene_needs::SceneNeeds;
 use crate::gpu::BodyTriangles;
 use bytemuck::Zeroable;
@@ -11,7 +12,7 @@ use dpm_scene::albedo_table::{tabulated, AlbedoTable, ALBEDO_NODES};
 use dpm_scene::bvh::BodyBvh;
 use dpm_scene::horizon::{horizons, Horizon, CLOSED};
 use dpm_scene::mesh::MAX_COORDINATE_M;
-use dpm_scene::{picture_at, Scene, TextureRef, TriangleMesh, Wrap};
+use dpm_scene::{picture_at, LinearTexel, Scene, TextureRef, ToLinear, TriangleMesh, Wrap};
 use dpm_shaders::structs::{
     self as gpu, AlbedoCell, Light, Material, TextureInfo, TextureUse, TriangleRef, Vertex,
 };
@@ -121,8 +122,10 @@ pub struct SceneData {
     pub textures: Vec<TextureInfo>,
     /// The textures that show pictures one after the other.
     pub clips: Vec<Clip>,
-    /// Linear RGBA, 16 bits each.
-    pub texels: Vec<[u32; 2]>,
+    /// The textures that show what another program makes.
+    pub live: Vec<LiveTexture>,
+    /// The texels of all textures, and then the places of the live ones.
+    pub texels: Vec<LinearTexel>,
     /// Emissive triangles and punctual lights with their alias table.
     pub lights: Vec<Light>,
     /// Texels of the map with the conditional cdf, then the marginal cdf.
@@ -182,15 +185,6 @@ pub enum SceneDataError {
     /// A vertex is too far away for f32.
     #[error("body \"{0}\" has a vertex at {1} m; coordinates are finite and at most {MAX_COORDINATE_M:e} m. Check the file's unit")]
     TooFar(String, f32),
-}
-
-fn srgb_to_linear(v: u8) -> f32 {
-    let v = f32::from(v) / 255.0;
-    if v <= 0.040_45 {
-        v / 12.92
-    } else {
-        ((v + 0.055) / 1.055).powf(2.4)
-    }
 }
 
 fn texture_use(t: Option<TextureRef>) -> TextureUse {
@@ -264,20 +258,18 @@ impl SceneData {
                     | (u32::from(t.srgb) << 4)
                     | (u32::from(t.nearest) << 5),
             });
-            let linear: Vec<u32> =
-                (0..=255u8)
-                    .map(|v| {
-                        if t.srgb {
-                            (srgb_to_linear(v) * 65535.0).round() as u32
-                        } else {
-                            u32::from(v) * 257
-                        }
-                    })
-                    .collect();
-            self.texels.extend(t.texels.iter().map(|p| {
-                let c = |i: usize| linear[p[i] as usize];
-                [c(0) | (c(1) << 16), c(2) | ((u32::from(p[3]) * 257) << 16)]
-            }));
+            let to_linear = ToLinear::new(t.srgb);
+            self.texels.extend(t.texels.iter().map(|texel| to_linear.texel(*texel)));
+        }
+        for live in &scene.live {
+            let index = live.texture as usize;
+            let t = &scene.textures[index];
+            let (len, end) = (t.picture_len(), self.texels.len());
+            let later = (0..PLACES - 1).map(|k| (end + k * len) as u32);
+            let places = std::iter::once(self.textures[index].offset).chain(later).collect();
+            self.live.push(LiveTexture { texture: index, places, len, pictures: live.pictures.clone() });
+            // What is shown first is in the texture's own place.
+            self.texels.resize(end + (PLACES - 1) * len, [0; 2]);
         }
     }
 

@@ -42,6 +42,8 @@ pub struct RendererSettings {
     pub overlap: Overlapping,
     /// Who finds what a ray meets.
     pub tracing: Tracing,
+    /// Most texels of live pictures that a frame brings to the GPU. It shows a picture when the last of its texels are there.
+    pub most_live_texels: usize,
 }
 
 /// Who finds what a ray meets. The same triangles are found, but for those that are equally near.

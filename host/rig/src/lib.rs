@@ -43,6 +43,7 @@ pub mod order;
 pub mod pack;
 pub mod parameters;
 pub mod pattern;
+pub mod picture_stream;
 pub mod pictures;
 pub mod pipeline;
 pub mod plan;

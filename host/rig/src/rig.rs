@@ -2,7 +2,7 @@
 
 use crate::calibrated::{calibrated_camera, measured, measured_camera, told_of_measured, CameraFileError};
 use crate::config::{
-    BodyConfig, BuiltinScene, EnvironmentConfig, FileAxis, GazeConfig, ProjectorBackend, RigConfig, Tracing,
+    BodyConfig, BuiltinScene, EnvironmentConfig, FileAxis, GazeConfig, PictureSource, ProjectorBackend, RigConfig, Tracing,
     TrackerConfig, TracksUse,
 };
 use crate::drive::{albedo_of, drive, DriveError, MAX_PICTURE_BYTES};
@@ -14,10 +14,10 @@ use dpm_device::time::FrameRate;
 use dpm_render::drive::Drive;
 use dpm_scene::geometry::projector::{ProjectorCamera, ProjectorError};
 use dpm_scene::{
-    AnimationChoice, BodySelector, Environment, Limits, LoadOptions, Scene, SceneError, SceneFeatures, UpAxis,
+    AnimationChoice, BodySelector, Environment, Limits, LivePictures, LoadOptions, Scene, SceneError, SceneFeatures, UpAxis,
 };
 use glam::{DAffine3, DQuat, DVec3, Vec3};
-use std::path::PathBuf;
+use std::sync::Arc;
 
 /// Why a rig cannot be built from a configuration that passed its own checks.
 #[derive(Debug, thiserror::Error)]
@@ -29,12 +29,12 @@ pub enum RigError {
     #[error(transparent)]
     Projector(#[from] ProjectorError),
     /// A picture cannot be shown on a body.
-    #[error("scene.bodies[].texture: body \"{name}\": {}: {message}", file.display())]
+    #[error("scene.bodies[].texture: body \"{name}\": {picture}: {message}")]
     Picture {
         /// The body's name.
         name: String,
         /// The picture.
-        file: PathBuf,
+        picture: PictureSource,
         /// What is wrong.
         message: String,
     },
@@ -339,11 +339,19 @@ fn load_scene(config: &RigConfig) -> Result<Scene, SceneError> {
 fn show_pictures(config: &RigConfig, scene: &mut Scene) -> Result<(), RigError> {
     let limits = Limits::default();
     for (index, body) in config.scene.bodies.iter().enumerate() {
-        let Some(file) = &body.texture else { continue };
+        let Some(source) = &body.texture else { continue };
         let wrong =
-            |message: String| RigError::Picture { name: body.name.clone(), file: file.clone(), message };
-        let bytes = regular_file::read(file, MAX_PICTURE_BYTES).map_err(|e| wrong(e.to_string()))?;
-        scene.show_picture(index as u16, bytes, &limits).map_err(|e| wrong(e.to_string()))?;
+            |message: String| RigError::Picture { name: body.name.clone(), picture: source.clone(), message };
+        let shown = match source {
+            PictureSource::File(file) => {
+                let bytes = regular_file::read(file, MAX_PICTURE_BYTES).map_err(|e| wrong(e.to_string()))?;
+                scene.show_picture(index as u16, bytes, &limits)
+            }
+            PictureSource::Pipe(_) | PictureSource::PipeWire(_) => {
+                scene.show_live(index as u16, Arc::new(LivePictures::new(body.texture_size)), &limits)
+            }
+        };
+        shown.map_err(|e| wrong(e.to_string()))?;
     }
     Ok(())
 }

@@ -2,9 +2,10 @@
 
 use super::limits::Limits;
 use super::load::contained;
-use super::{gltf_file, Body, Material, Scene, SceneError, Texture, TextureRef};
+use super::{gltf_file, Body, LivePictures, LiveTexture, Material, Scene, SceneError, Texture, TextureRef};
 use glam::{Vec2, Vec3};
 use std::collections::HashMap;
+use std::sync::Arc;
 
 /// Share of a body's surface that may lack texture coordinates: a few triangles that nobody sees.
 const MOST_WITHOUT_UVS: f64 = 0.01;
@@ -45,13 +46,45 @@ impl Scene {
     /// # Errors
     /// The picture cannot be decoded or is beyond the limits, or a mesh has no place for it.
     pub fn show_picture(&mut self, tracked: u16, bytes: Vec<u8>, limits: &Limits) -> Result<(), SceneError> {
-        let is_carried = |body: &&Body| body.tracked == Some(tracked) && !body.mesh.triangles.is_empty();
-        for body in self.bodies.iter().filter(is_carried) {
-            self.check_coordinates(body).map_err(|e| SceneError::broken("mesh", e))?;
-        }
-        let texels: u64 = self.textures.iter().map(|t| t.texels.len() as u64).sum();
-        let owned = limits.clone();
+        self.check_carried(tracked)?;
+        let (texels, owned) = (self.texel_count(), limits.clone());
         let texture = contained(limits, move |_| gltf_file::decode_picture(&bytes, texels, &owned))?;
+        self.lay_over(tracked, texture);
+        Ok(())
+    }
+
+    /// Shows the pictures of another program, in the same way as [`Scene::show_picture`] does. They are black until the first is shown,
+    /// and their surfaces opaque.
+    ///
+    /// # Errors
+    /// The pictures are beyond the limits, or a mesh has no place for them.
+    pub fn show_live(
+        &mut self,
+        tracked: u16,
+        pictures: Arc<LivePictures>,
+        limits: &Limits,
+    ) -> Result<(), SceneError> {
+        self.check_carried(tracked)?;
+        let size = pictures.size();
+        gltf_file::check_picture(size, self.texel_count(), limits)?;
+        let texture = Texture::repeated(size, pictures.newest(), true);
+        self.live.push(LiveTexture { texture: self.textures.len() as u32, tracked, pictures });
+        self.lay_over(tracked, texture);
+        Ok(())
+    }
+
+    fn check_carried(&self, tracked: u16) -> Result<(), SceneError> {
+        let is_carried = |body: &&Body| body.tracked == Some(tracked) && !body.mesh.triangles.is_empty();
+        let carried = self.bodies.iter().filter(is_carried);
+        carried.map(|body| self.check_coordinates(body)).collect::<Result<(), _>>().map_err(|e| SceneError::broken("mesh", e))
+    }
+
+    fn texel_count(&self) -> u64 {
+        self.textures.iter().map(|t| t.texels.len() as u64).sum()
+    }
+
+    /// Lays a new texture over a tracked body and its parts.
+    fn lay_over(&mut self, tracked: u16, texture: Texture) {
         let picture = TextureRef {
             texture: self.textures.len() as u32,
             offset: Vec2::ZERO,
@@ -68,7 +101,6 @@ impl Scene {
                 });
             }
         }
-        Ok(())
     }
 }
 

@@ -71,6 +71,7 @@ pub fn builtin() -> Scene {
                 ..Material::default()
             },
         ],
+        live: Vec::new(),
         textures: vec![glaze_color, glaze_normal, bronze_color, bronze_surface],
         lights: vec![],
         environment: Environment::Constant(Vec3::new(0.30, 0.34, 0.40)),

@@ -30,6 +30,7 @@ mod gltf_file;
 pub mod horizon;
 mod limits;
 mod linear_picture;
+mod live_pictures;
 mod load;
 pub mod mesh;
 mod mesh_file;
@@ -40,6 +41,7 @@ pub mod shapes;
 pub mod srgb;
 mod stats;
 mod studio;
+mod texels;
 
 use std::sync::Arc;
 
@@ -53,6 +55,7 @@ pub use environment::load_environment;
 pub use error::SceneError;
 pub use limits::Limits;
 pub use linear_picture::{load_linear_picture, LinearPicture};
+pub use live_pictures::{LivePicture, LivePictures};
 pub use load::{load, load_bytes, AnimationChoice, BodySelector, LoadOptions, UpAxis};
 #[doc(hidden)]
 pub use load::{load_bytes_here, load_mesh_here};
@@ -61,6 +64,7 @@ pub use mesh_file::MeshFormat;
 pub use part_motion::PartMotion;
 pub use stats::SceneFeatures;
 pub use studio::studio;
+pub use texels::{LinearTexel, ToLinear};
 
 /// Everything that interacts with light. Immutable once loaded; the poses of bodies are kept elsewhere.
 #[derive(Clone, Debug, Default)]
@@ -71,12 +75,25 @@ pub struct Scene {
     pub materials: Vec<Material>,
     /// Images that materials refer to.
     pub textures: Vec<Texture>,
+    /// Which of them show what another program makes.
+    pub live: Vec<LiveTexture>,
     /// Point, spot and directional lights.
     pub lights: Vec<PunctualLight>,
     /// Light from infinitely far away.
     pub environment: Environment,
     /// Content that the loader accepted but does not reproduce, one line each, for the operator.
     pub warnings: Vec<String>,
+}
+
+/// A texture that shows the pictures of another program.
+#[derive(Clone, Debug)]
+pub struct LiveTexture {
+    /// Index into [`Scene::textures`], whose texels are black.
+    pub texture: u32,
+    /// The tracked body that has it.
+    pub tracked: u16,
+    /// The pictures, which have the texture's size.
+    pub pictures: Arc<LivePictures>,
 }
 
 /// A rigid set of triangles with one pose.
@@ -220,8 +237,8 @@ impl Scene {
 }
 
 impl Scene {
-    /// The scene in which every mesh that deforms has the shape of `t_ns` nanoseconds, and every clip shows the picture of this
-    /// time, and keeps it. What moves without deforming is where its poses say.
+    /// The scene in which every mesh that deforms has the shape of `t_ns` nanoseconds, every clip shows the picture of this time and
+    /// every live texture that of now, and all keep it. What moves without deforming is where its poses say.
     pub fn still_at(&self, t_ns: i64) -> Self {
         let mut scene = self.clone();
         let mut now = Deformed::default();
@@ -237,6 +254,9 @@ impl Scene {
             texture.texels.copy_within(first..first + len, 0);
             texture.texels.truncate(len);
             texture.ends_ns.clear();
+        }
+        for live in scene.live.drain(..) {
+            scene.textures[live.texture as usize].texels = live.pictures.newest();
         }
         scene
     }

@@ -267,6 +267,7 @@ impl Card {
             output: Output::Codes,
             overlap: Overlapping::Never,
             tracing: Tracing::Auto,
+            most_live_texels: usize::MAX,
         };
         let renderer = Renderer::new(&self.gpu, &self.scene, settings)?;
         let slot = renderer.create_slot(false)?;

@@ -105,6 +105,7 @@ impl<'a> Shot<'a> {
             output: Output::Codes,
             overlap: Overlapping::Never,
             tracing: self.tracing,
+            most_live_texels: usize::MAX,
         }
     }
 

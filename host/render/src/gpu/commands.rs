@@ -55,6 +55,27 @@ impl CommandList {
         }
     }
 
+    /// Records other commands in the place of the list's own, without time stamps. Its last run has ended. Allocates nothing.
+    ///
+    /// # Errors
+    /// A call of Vulkan failed.
+    pub(crate) fn record_again(&mut self, record: impl FnOnce(&mut Recorder<'_>)) -> Result<(), GpuError> {
+        let gpu = self.gpu.clone();
+        gpu.alive("recording commands")?;
+        let begin = vk::CommandBufferBeginInfo::default();
+        within(Place::Vulkan, || {
+            // SAFETY: the pool has this buffer alone, which is not pending.
+            unsafe {
+                gpu.device.reset_command_pool(self.pool, vk::CommandPoolResetFlags::empty())?;
+                gpu.device.begin_command_buffer(self.buffer, &begin)?;
+            }
+            record(&mut Recorder { list: self });
+            // SAFETY: recording began above.
+            unsafe { gpu.device.end_command_buffer(self.buffer) }
+        })
+        .on(&gpu, "recording commands")
+    }
+
     /// Fills in the time stamps of the last finished run, in nanoseconds since the first of them, and returns their number.
     /// Allocates nothing.
     pub(crate) fn stamps_ns(&self, out: &mut [u64]) -> usize {

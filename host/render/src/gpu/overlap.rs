@@ -66,11 +66,17 @@ impl Overlap {
         Ok(overlap)
     }
 
-    /// Runs a frame's lists. `fence` is signalled when the second is done.
+    /// Runs `before` and a frame's lists. `fence` is signalled when the last is done.
     ///
     /// # Errors
     /// As [`CommandList::submit`]. Nothing of the frame runs then, or the device is given up.
-    fn submit(&self, lists: [&CommandList; 2], order: Order, fence: &mut FrameFence) -> Result<(), GpuError> {
+    fn submit(
+        &self,
+        before: Option<&CommandList>,
+        lists: [&CommandList; 2],
+        order: Order,
+        fence: &mut FrameFence,
+    ) -> Result<(), GpuError> {
         let gpu = &self.gpu;
         fence.check_free()?;
         let (queues, _held) = gpu.queues()?;
@@ -79,7 +85,9 @@ impl Overlap {
         // A first list may have nothing to wait for: every count has reached 0.
         let waits = [(second, order.after), (first, order.number)];
         for (i, list) in lists.into_iter().enumerate() {
-            let (buffers, signals, values) = ([list.buffer], [self.ended[i]], [order.number]);
+            let all = [before.unwrap_or(list).buffer, list.buffer];
+            let buffers = if before.is_some() && i == 0 { &all[..] } else { &all[1..] };
+            let (signals, values) = ([self.ended[i]], [order.number]);
             let ((semaphore, value), stages) = (waits[i], [vk::PipelineStageFlags::ALL_COMMANDS]);
             let (semaphores, wait_values) = ([semaphore], [value]);
             let mut timeline = vk::TimelineSemaphoreSubmitInfo::default()
@@ -88,7 +96,7 @@ impl Overlap {
             let info = [vk::SubmitInfo::default()
                 .wait_semaphores(&semaphores)
                 .wait_dst_stage_mask(&stages)
-                .command_buffers(&buffers)
+                .command_buffers(buffers)
                 .signal_semaphores(&signals)
                 .push_next(&mut timeline)];
             let signalled = if i == 1 { fence.fence } else { vk::Fence::null() };
@@ -130,18 +138,21 @@ impl Drop for Overlap {
     }
 }
 
-/// Runs a frame's lists: in the order of `overlap`, or without one after the other on one queue. `fence` is signalled when both are done.
+/// Runs `before`, if there is one, and a frame's lists: in the order of `overlap`, or without one after the other on one queue. `fence` is signalled
+/// when all are done.
 ///
 /// # Errors
 /// As [`CommandList::submit`].
 pub(crate) fn submit_frame(
+    before: Option<&CommandList>,
     lists: [&CommandList; 2],
     overlap: Option<(&Overlap, Order)>,
     fence: &mut FrameFence,
 ) -> Result<(), GpuError> {
-    match overlap {
-        Some((overlap, order)) => overlap.submit(lists, order, fence),
-        None => submit_in_turn(&lists.map(|list| list.buffer), fence),
+    match (overlap, before) {
+        (Some((overlap, order)), _) => overlap.submit(before, lists, order, fence),
+        (None, Some(before)) => submit_in_turn(&[before, lists[0], lists[1]].map(|list| list.buffer), fence),
+        (None, None) => submit_in_turn(&lists.map(|list| list.buffer), fence),
     }
 }
 

@@ -2,7 +2,7 @@
 
 use super::check_projector::projector;
 use super::world::{EnvironmentConfig, GazeConfig, TrackerConfig};
-use super::{Pace, ProjectorBackend, Purpose, ResponseConfig, RigConfig};
+use super::{Pace, PictureSource, ProjectorBackend, Purpose, ResponseConfig, RigConfig};
 use crate::mock::{self, FaultError};
 use dpm_common::keys::read::{ConfigValue, Reader};
 use dpm_device::regular_file;
@@ -303,13 +303,24 @@ fn horizon(rig: &RigConfig, reader: &mut Reader) {
     }
 }
 
+/// Makes the path of `key` relative to `base`, the rig file's folder. A path from a flag or a variable is relative to the
+/// working directory.
+fn place(path: &mut PathBuf, base: &Path, reader: &Reader, key: &str) {
+    if path.is_relative() && matches!(reader.origin_of(key), super::Origin::File { .. }) {
+        *path = base.join(&*path);
+    }
+}
+
 /// Makes the paths of input files relative to `base`, the rig file's folder, and refuses missing files.
 pub(super) fn resolve_files(rig: &mut RigConfig, base: &Path, purpose: Purpose, reader: &mut Reader) {
-    let mut input = |path: &mut PathBuf, key: &str, is_made: bool| {
-        // A path from a flag or a variable is relative to the working directory.
-        if path.is_relative() && matches!(reader.origin_of(key), super::Origin::File { .. }) {
-            *path = base.join(&*path);
+    for (i, body) in rig.scene.bodies.iter_mut().enumerate() {
+        // The pipe may be made later: the rig says that there is none, and goes on.
+        if let Some(PictureSource::Pipe(pipe)) = &mut body.texture {
+            place(pipe, base, reader, &format!("scene.bodies.{i}.texture"));
         }
+    }
+    let mut input = |path: &mut PathBuf, key: &str, is_made: bool| {
+        place(path, base, reader, key);
         let problem = match regular_file::open(path) {
             Ok(_) => return,
             Err(e) if is_made && e.kind() == std::io::ErrorKind::NotFound => return,
@@ -335,7 +346,7 @@ pub(super) fn resolve_files(rig: &mut RigConfig, base: &Path, purpose: Purpose, 
         input(&mut table.file, "projector.response.file", false);
     }
     for (i, body) in rig.scene.bodies.iter_mut().enumerate() {
-        if let Some(file) = &mut body.texture {
+        if let Some(PictureSource::File(file)) = &mut body.texture {
             input(file, &format!("scene.bodies.{i}.texture"), false);
         }
         if let Some(file) = &mut body.albedo_map {

@@ -4,6 +4,8 @@ use dpm_common::keys::read::{ConfigValue, Limit, Reader};
 use dpm_common::keys::source::{Node, Value};
 use dpm_device::planes::PlaneSchedule;
 use glam::{DMat3, DVec3};
+use std::fmt;
+use std::path::PathBuf;
 
 /// Red, green and blue; written as one number for all of them, or as three.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -47,6 +49,60 @@ impl Limit<Option<PerChannel>> for Each {
     }
     fn describe(&self) -> String {
         Limit::<PerChannel>::describe(self)
+    }
+}
+
+/// Where the picture on a body comes from.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub enum PictureSource {
+    /// A file that is read once.
+    File(PathBuf),
+    /// A named pipe, into which another program writes PPM or PAM images.
+    Pipe(PathBuf),
+    /// A node of PipeWire by its name or number; empty: the one that PipeWire chooses.
+    PipeWire(String),
+}
+
+impl fmt::Display for PictureSource {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self {
+            Self::File(path) => write!(f, "{}", path.display()),
+            Self::Pipe(path) => write!(f, "pipe:{}", path.display()),
+            Self::PipeWire(node) => write!(f, "pipewire:{node}"),
+        }
+    }
+}
+
+impl ConfigValue for PictureSource {
+    fn kind() -> String {
+        "a path, or `pipe:` and a path, or `pipewire:` and a node".into()
+    }
+
+    fn read(node: &Node, reader: &mut Reader, key: &str) -> Option<Self> {
+        let path = PathBuf::read(node, reader, key)?;
+        let text = path.to_string_lossy();
+        let (source, is_sound) = match (text.strip_prefix("pipe:"), text.strip_prefix("pipewire:")) {
+            (Some(path), _) => (Self::Pipe(path.into()), !path.is_empty()),
+            // It becomes a word of a command of GStreamer, whose own words are others.
+            (_, Some(node)) => {
+                let is_word = node.chars().all(|c| c.is_ascii_alphanumeric() || "._-:".contains(c));
+                (Self::PipeWire(node.to_owned()), is_word)
+            }
+            _ => (Self::File(path.clone()), !text.is_empty()),
+        };
+        if is_sound {
+            return Some(source);
+        }
+        let problem = match source {
+            Self::PipeWire(_) => "is no node: names and numbers have letters, digits and the characters . _ - :",
+            Self::Pipe(_) | Self::File(_) => "names no file",
+        };
+        reader.refuse(&node.origin, key, problem, "");
+        None
+    }
+
+    fn show(&self) -> String {
+        format!("{:?}", self.to_string())
     }
 }
 

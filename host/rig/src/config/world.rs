@@ -1,6 +1,6 @@
 //! `[tracker]`, `[observer]`, `[scene]` and `[prediction]`: what moves, who looks, and what is shown.
 
-use super::values::{Axes, Each, PerChannel};
+use super::values::{Axes, Each, PerChannel, PictureSource};
 use crate::mock::{Motion, MotionSpec};
 use dpm_common::keys::read::{Any, ConfigValue, NotEmpty, Reader, Within};
 use dpm_common::keys::source::Node;
@@ -369,7 +369,11 @@ section! {
         /// animated PNG, whose pictures follow each other over and over. It lies over the texture coordinates that the
         /// textures of its mesh use, and repeats. What else its materials say stays: roughness, metal,
         /// bumps. An unlit material shows the picture as it is. Large pictures cost memory, not time.
-        texture: Option<PathBuf> = None, "", NotEmpty;
+        /// `pipe:` with the path of a named pipe, or `pipewire:` with the name or number of a node, shows what another
+        /// program makes while the rig runs (docs/SCENES.md).
+        texture: Option<PictureSource> = None, "", Any;
+        /// Columns and rows that pictures of another program have on the body. Others are fitted to it.
+        texture_size: [u32; 2] = [512, 512], "texels", Within(1, 4096);
         /// Albedo of its real surface, if it differs from `scene.surface_albedo`: one number, or one for each channel. With
         /// `albedo_map` it is a factor for the picture, 1 if left out.
         albedo: Option<PerChannel> = None, "", Each(0.01, 1.0);

@@ -12,6 +12,7 @@ use crate::engine::options::RunOptions;
 use crate::light::collector::Collector;
 use crate::light::recorder::LightRecorder;
 use crate::pack::source::PatternSource;
+use crate::picture_stream::PictureStreams;
 use crate::rig::Rig;
 use crate::telemetry::monitor::RunMonitor;
 use crate::telemetry::projector::ProjectorReport;
@@ -99,6 +100,7 @@ fn run_from(
     if matches!(origin, Origin::Pattern(..)) {
         monitor.parameters().close();
     }
+    let _streams = PictureStreams::start(&rig, monitor);
     let ran = match rig.config.real_time.pace {
         // Hashing every frame costs a millisecond at full size, which only virtual pace can afford.
         Pace::Real => run_at_real_pace(&rig, origin, open, RunOptions { verify: false, ..options }, monitor),

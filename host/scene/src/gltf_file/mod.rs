@@ -51,6 +51,14 @@ pub(super) fn decode_picture(
     Ok(Texture::repeated([width, height], picture.texels, picture.srgb.unwrap_or(true)))
 }
 
+/// Checks that a picture of `size` fits beside the scene's other textures.
+pub(super) fn check_picture(size: [u32; 2], texels_so_far: u64, limits: &Limits) -> Result<(), SceneError> {
+    let nothing = Value::Object(serde_json::Map::new());
+    let [width, height] = size;
+    let size = picture::Size { width, height };
+    picture::check_size(&Item::new(&nothing, "picture".into())?, size, texels_so_far, limits)
+}
+
 /// Maximum number of warnings of one kind from a hostile file.
 const MAX_WARNINGS: usize = 100;
 
@@ -106,6 +114,7 @@ pub(super) fn read(
         bodies: flat.bodies,
         materials: look.materials,
         textures: look.textures,
+        live: Vec::new(),
         lights: flat.lights,
         environment: Environment::default(),
         warnings,

@@ -1,0 +1,177 @@
+//! Pictures that other programs make, from a pipe or from PipeWire onto the bodies of the rig file
+//! (`scene.bodies[].texture`). One thread for each body reads them, beside the frame path.
+//!
+//! A body is black until the first picture is there, and again when its program has ended: what is old or missing is
+//! not shown as if it were new. A program that keeps its pipe open and sends nothing keeps its last picture, as a
+//! screen does on which nothing moves.
+
+mod decode;
+mod source;
+
+use crate::config::PictureSource;
+use crate::rig::Rig;
+use crate::telemetry::monitor::RunMonitor;
+use decode::Decoder;
+use dpm_common::realtime::os::give_way;
+use dpm_scene::LivePictures;
+use source::{Ended, Stream};
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::Arc;
+use std::thread::{sleep, Builder, JoinHandle};
+use std::time::{Duration, Instant};
+
+/// Rest before a source is opened again, at first and at most.
+const FIRST_REST: Duration = Duration::from_millis(200);
+const LONGEST_REST: Duration = Duration::from_secs(5);
+/// The longest wait in which nothing is looked at.
+const STEP: Duration = Duration::from_millis(50);
+/// Shortest time between two notes about one body.
+const NOTE_EVERY: Duration = Duration::from_secs(2);
+
+/// The threads that read the pictures of a rig, until this is dropped.
+pub struct PictureStreams {
+    stop: Arc<AtomicBool>,
+    threads: Vec<JoinHandle<()>>,
+    pictures: Vec<Arc<LivePictures>>,
+}
+
+impl PictureStreams {
+    /// Begins to read for every body of the rig that shows another program's pictures. What an operator has to know
+    /// goes to the notes of `monitor`.
+    pub fn start(rig: &Rig, monitor: &Arc<RunMonitor>) -> Self {
+        let stop = Arc::new(AtomicBool::new(false));
+        let mut streams = Self { stop: stop.clone(), threads: Vec::new(), pictures: Vec::new() };
+        for live in &rig.scene.live {
+            let body = rig.config.scene.bodies.get(usize::from(live.tracked));
+            let Some((body, source)) = body.and_then(|body| Some((body, body.texture.as_ref()?))) else { continue };
+            let mut reader = StreamReader {
+                body: body.name.clone(),
+                source: source.clone(),
+                pictures: live.pictures.clone(),
+                monitor: monitor.clone(),
+                stop: stop.clone(),
+                told: None,
+            };
+            streams.pictures.push(live.pictures.clone());
+            match Builder::new().name("dpm-pictures".into()).spawn(move || reader.run()) {
+                Ok(thread) => streams.threads.push(thread),
+                Err(e) => monitor.note(format!("{}: its pictures are not read: no thread: {e}", body.name)),
+            }
+        }
+        streams
+    }
+
+    /// Waits until every body has its first picture, at most `limit`. Says whether they have.
+    pub fn wait_for_first(&self, limit: Duration) -> bool {
+        let begin = Instant::now();
+        loop {
+            let all = self.pictures.iter().all(|pictures| pictures.number() > 0);
+            if all || begin.elapsed() >= limit {
+                return all;
+            }
+            sleep(Duration::from_millis(5));
+        }
+    }
+}
+
+impl Drop for PictureStreams {
+    fn drop(&mut self) {
+        self.stop.store(true, Ordering::Relaxed);
+        for thread in self.threads.drain(..) {
+            // A panic of a reader has lost its pictures and nothing else.
+            let _ = thread.join();
+        }
+    }
+}
+
+/// The thread of one body.
+struct StreamReader {
+    body: String,
+    source: PictureSource,
+    pictures: Arc<LivePictures>,
+    monitor: Arc<RunMonitor>,
+    stop: Arc<AtomicBool>,
+    /// The last note, and when.
+    told: Option<(String, Instant)>,
+}
+
+impl StreamReader {
+    fn run(&mut self) {
+        give_way(5);
+        let mut rest = FIRST_REST;
+        while !self.is_stopped() {
+            let mut shown = 0;
+            let ended = self.read(&mut shown);
+            if self.is_stopped() {
+                return;
+            }
+            if shown > 0 {
+                self.pictures.show_black();
+                rest = FIRST_REST;
+            }
+            self.note(format!("{ended}; it is black until pictures come again"));
+            self.rest(rest);
+            rest = (2 * rest).min(LONGEST_REST);
+        }
+    }
+
+    /// Opens the source and shows what it sends, until it ends or is no sequence of pictures. Counts in `shown`.
+    fn read(&mut self, shown: &mut u64) -> Ended {
+        let size = self.pictures.size();
+        let mut stream = match Stream::open(&self.source, size) {
+            Ok(stream) => stream,
+            Err(ended) => return ended,
+        };
+        let mut decoder = Decoder::new(stream.form(), size);
+        let mut bytes = vec![0; source::MOST_BYTES];
+        loop {
+            if self.is_stopped() {
+                return Ended::Stopped;
+            }
+            let count = match stream.read(&mut bytes, STEP) {
+                Ok(count) => count,
+                Err(ended) => return ended,
+            };
+            let before = *shown;
+            let decoded = decoder.push(&bytes[..count], |picture| {
+                self.pictures.show(picture);
+                *shown += 1;
+            });
+            if before == 0 && *shown > 0 {
+                let [width, height] = decoder.sent();
+                let [columns, rows] = size;
+                let fitted = if [width, height] == size { String::new() } else { format!(", shown as {columns} x {rows}") };
+                self.note(format!("pictures of {width} x {height} have begun{fitted}"));
+            }
+            if let Err(wrong) = decoded {
+                return Ended::Wrong(wrong);
+            }
+        }
+    }
+
+    fn is_stopped(&self) -> bool {
+        self.stop.load(Ordering::Relaxed)
+    }
+
+    fn rest(&self, for_: Duration) {
+        let begin = Instant::now();
+        while begin.elapsed() < for_ && !self.is_stopped() {
+            sleep(STEP.min(for_));
+        }
+    }
+
+    /// Tells the operator, but not the same again and again.
+    fn note(&mut self, text: String) {
+        let now = Instant::now();
+        if let Some((last, at)) = &self.told {
+            if *last == text || now.duration_since(*at) < NOTE_EVERY && !text.starts_with("pictures") {
+                return;
+            }
+        }
+        self.monitor.note(format!("{}: {}: {text}", self.body, self.source));
+        self.told = Some((text, now));
+    }
+}
+
+#[cfg(test)]
+mod tests;

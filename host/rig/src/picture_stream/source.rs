@@ -1,0 +1,205 @@
+//! Where pictures come from: a named pipe, or PipeWire by a program of GStreamer in a process of its own, so that what
+//! it does to itself cannot reach the rig.
+
+use super::decode::Form;
+use crate::config::PictureSource;
+use dpm_common::unix::{wait_readable, widen_pipe};
+use std::fmt;
+use std::fs::File;
+use std::io::{self, Read};
+use std::os::fd::{AsRawFd, RawFd};
+use std::os::unix::fs::{FileTypeExt, OpenOptionsExt};
+use std::path::Path;
+use std::process::{Child, Command, Stdio};
+use std::time::Duration;
+
+/// Most bytes that are read at once, and what a pipe should hold.
+pub(super) const MOST_BYTES: usize = 1 << 20;
+/// The program that reads from PipeWire.
+const PROGRAM: &str = "gst-launch-1.0";
+/// Most that is kept of what it says.
+const MOST_SAID: usize = 4096;
+
+/// Why no more pictures come.
+#[derive(Debug)]
+pub(super) enum Ended {
+    /// The run is over.
+    Stopped,
+    /// The source cannot be opened.
+    NotOpened(String),
+    /// The program at the other end has closed its end.
+    Closed,
+    /// The program that was started has ended, with what it said last.
+    Program(String),
+    /// What comes is no picture.
+    Wrong(String),
+    /// Reading fails.
+    Failed(io::Error),
+}
+
+impl fmt::Display for Ended {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self {
+            Self::Stopped => write!(f, "the run is over"),
+            Self::NotOpened(why) | Self::Wrong(why) => write!(f, "{why}"),
+            Self::Closed => write!(f, "the program that made the pictures has closed the pipe"),
+            Self::Program(said) if said.is_empty() => write!(f, "{PROGRAM} has ended"),
+            Self::Program(said) => write!(f, "{PROGRAM} has ended: {said}"),
+            Self::Failed(e) => write!(f, "it cannot be read: {e}"),
+        }
+    }
+}
+
+/// An open source.
+pub(super) enum Stream {
+    /// A named pipe, and whether anything has come.
+    Pipe(File, bool),
+    /// A program of its own, and the end of what it has said.
+    Program(Child, Vec<u8>),
+}
+
+impl Stream {
+    /// Opens a source for pictures of `size`. Never waits for a program at the other end.
+    ///
+    /// # Errors
+    /// Why it cannot be opened.
+    pub(super) fn open(source: &PictureSource, size: [u32; 2]) -> Result<Self, Ended> {
+        match source {
+            PictureSource::File(_) => Err(Ended::NotOpened("it is a file".into())),
+            PictureSource::Pipe(path) => open_pipe(path).map_err(Ended::NotOpened),
+            PictureSource::PipeWire(target) => start(gstreamer_at(Path::new(PROGRAM), target, size)).map_err(Ended::NotOpened),
+        }
+    }
+
+    /// What it sends.
+    pub(super) fn form(&self) -> Form {
+        match self {
+            Self::Pipe(..) => Form::Netpbm,
+            Self::Program(..) => Form::Rgba,
+        }
+    }
+
+    /// Waits at most `limit` for bytes and reads them; 0: none have come.
+    ///
+    /// # Errors
+    /// Nothing more comes.
+    pub(super) fn read(&mut self, bytes: &mut [u8], limit: Duration) -> Result<usize, Ended> {
+        match self {
+            Self::Pipe(file, has_come) => {
+                // Before a program has opened it, a pipe has nothing to wait for.
+                let is_ready = readable(&[file.as_raw_fd()], limit)?[0];
+                match if is_ready { file.read(bytes) } else { return Ok(0) } {
+                    Ok(0) if *has_come => Err(Ended::Closed),
+                    Ok(0) => {
+                        std::thread::sleep(limit);
+                        Ok(0)
+                    }
+                    Ok(count) => {
+                        *has_come = true;
+                        Ok(count)
+                    }
+                    Err(e) if e.kind() == io::ErrorKind::WouldBlock => Ok(0),
+                    Err(e) => Err(Ended::Failed(e)),
+                }
+            }
+            Self::Program(child, said) => {
+                let Some(out) = &mut child.stdout else { return Err(Ended::Program(String::new())) };
+                let both: Vec<RawFd> =
+                    [Some(out.as_raw_fd()), child.stderr.as_ref().map(AsRawFd::as_raw_fd)].into_iter().flatten().collect();
+                let ready = readable(&both, limit)?;
+                if let (Some(err), Some(true)) = (&mut child.stderr, ready.get(1)) {
+                    let mut part = [0; 512];
+                    match err.read(&mut part) {
+                        Ok(count) if count > 0 => said.extend_from_slice(&part[..count]),
+                        _ => child.stderr = None,
+                    }
+                    said.drain(..said.len().saturating_sub(MOST_SAID));
+                }
+                match if ready[0] { out.read(bytes) } else { return Ok(0) } {
+                    Ok(0) => {
+                        let _ = child.kill();
+                        if let Some(err) = &mut child.stderr {
+                            let _ = err.take(MOST_SAID as u64).read_to_end(said);
+                        }
+                        Err(Ended::Program(told(said)))
+                    }
+                    Ok(count) => Ok(count),
+                    Err(e) => Err(Ended::Failed(e)),
+                }
+            }
+        }
+    }
+}
+
+impl Drop for Stream {
+    fn drop(&mut self) {
+        if let Self::Program(child, _) = self {
+            // It may have ended already.
+            let _ = child.kill();
+            let _ = child.wait();
+        }
+    }
+}
+
+fn readable(descriptors: &[RawFd], limit: Duration) -> Result<Vec<bool>, Ended> {
+    let mut ready = Vec::with_capacity(descriptors.len());
+    wait_readable(descriptors, limit.as_millis() as i32, &mut ready).map_err(Ended::Failed)?;
+    Ok(ready)
+}
+
+fn open_pipe(path: &Path) -> Result<Stream, String> {
+    let file = File::options().read(true).custom_flags(libc::O_NONBLOCK | libc::O_CLOEXEC).open(path);
+    let file = file.map_err(|e| match e.kind() {
+        io::ErrorKind::NotFound => "there is no such pipe; `mkfifo` makes one".into(),
+        _ => format!("it cannot be opened: {e}"),
+    })?;
+    let kind = file.metadata().map_err(|e| e.to_string())?.file_type();
+    if !kind.is_fifo() {
+        return Err("it is no named pipe; `mkfifo` makes one".into());
+    }
+    // A smaller one only means more calls.
+    let _ = widen_pipe(&file, MOST_BYTES);
+    Ok(Stream::Pipe(file, false))
+}
+
+/// The program that writes the pictures of a PipeWire node to its output, as RGBA texels of this size.
+pub(super) fn gstreamer_at(program: &Path, target: &str, [width, height]: [u32; 2]) -> Command {
+    let mut command = Command::new(program);
+    command.args(["-q", "pipewiresrc"]);
+    if !target.is_empty() {
+        command.arg(format!("target-object={target}"));
+    }
+    let caps = format!("video/x-raw,format=RGBA,width={width},height={height},pixel-aspect-ratio=1/1");
+    // The newest picture waits, and no older one.
+    let newest = ["!", "queue", "leaky=downstream", "max-size-buffers=1", "!", "videoconvert", "!"];
+    command.args(newest).args(["videoscale", "add-borders=false", "!"]);
+    command.arg(caps).args(["!", "fdsink", "fd=1", "sync=false"]);
+    command
+}
+
+/// Starts it.
+///
+/// # Errors
+/// It is not installed, or cannot be started.
+pub(super) fn start(mut command: Command) -> Result<Stream, String> {
+    let child = command.stdin(Stdio::null()).stdout(Stdio::piped()).stderr(Stdio::piped()).spawn();
+    let child = child.map_err(|e| match e.kind() {
+        io::ErrorKind::NotFound => format!(
+            "{PROGRAM} is not installed; on Debian: apt install gstreamer1.0-tools gstreamer1.0-plugins-base \
+             gstreamer1.0-pipewire"
+        ),
+        _ => format!("{PROGRAM} cannot be started: {e}"),
+    })?;
+    if let Some(out) = &child.stdout {
+        let _ = widen_pipe(out, MOST_BYTES);
+    }
+    Ok(Stream::Program(child, Vec::new()))
+}
+
+/// The first error in what a program has said, or its last line.
+fn told(said: &[u8]) -> String {
+    let said = String::from_utf8_lossy(said);
+    let lines = || said.lines().map(str::trim).filter(|line| !line.is_empty());
+    let line = lines().find(|line| line.starts_with("ERROR")).or_else(|| lines().last());
+    line.unwrap_or_default().chars().filter(|c| !c.is_control()).take(200).collect()
+}
