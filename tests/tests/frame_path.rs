@@ -10,8 +10,9 @@ use dpm_tests::gpu::with_gpu;
 use dpm_tests::rigs::{demo_rig, run};
 use scene_files::{flag, rig_of};
 use std::cell::Cell;
-use std::sync::atomic::{AtomicU64, Ordering};
+use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 use std::sync::Arc;
+use std::time::Duration;
 
 /// Allocations and releases on the frame path.
 static COUNTED: AtomicU64 = AtomicU64::new(0);
@@ -58,6 +59,23 @@ fn the_steady_state_allocates_nothing() {
         let flag = flag("frame-path");
         let rig = rig_of(&flag, (32, 16), "translate", &["real_time.pace=\"virtual\""]);
         rig_allocates_nothing(gpu, &rig, "a mesh that deforms");
+        // Pictures of another program come while the rig runs, and go to the GPU in pieces.
+        let bodies = "scene.bodies=[{ name = \"bunny\", texture = \"pipe:/nowhere\" }, { name = \"venus\" }]";
+        let rig = demo_rig(32, 16, &[bodies, "real_time.pace=\"real\"", "projector.frame_rate=\"200\""]);
+        let (pictures, is_over) = (rig.scene.live[0].pictures.clone(), Arc::new(AtomicBool::new(false)));
+        let over = is_over.clone();
+        let program = std::thread::spawn(move || {
+            let [width, height] = pictures.size();
+            let picture = vec![[200; 4]; (width * height) as usize];
+            while !over.load(Ordering::Relaxed) {
+                pictures.show(&picture);
+                std::thread::sleep(Duration::from_millis(20));
+            }
+            pictures.number()
+        });
+        rig_allocates_nothing(gpu, &rig, "live pictures");
+        is_over.store(true, Ordering::Relaxed);
+        assert!(program.join().unwrap() > 5, "pictures came");
         // The probe itself: a box that is made here is not on the frame path.
         assert!(!on_frame_path());
     });

@@ -103,7 +103,8 @@ impl LiveTextures {
         self.frames += 1;
         piece.frame = self.frames;
         let count = self.each.len();
-        let turn = (0..count).map(|k| (self.first + k) % count).find(|turn| self.each[*turn].begin(self.ended));
+        let turn =
+            (0..count).map(|k| (self.first + k) % count).find(|turn| self.each[*turn].begin(self.ended));
         self.before = turn.map(|turn| (turn, self.each[turn].state));
         if let Some(turn) = turn {
             self.first = (turn + 1) % count;
@@ -132,7 +133,9 @@ impl LiveTextures {
 
     /// For each live texture its number among all, and the first texel of what the frame shows.
     pub(super) fn shown(&self) -> impl Iterator<Item = (usize, u32)> + '_ {
-        self.each.iter().map(|followed| (followed.texture.texture, followed.texture.places[followed.state.shown]))
+        self.each
+            .iter()
+            .map(|followed| (followed.texture.texture, followed.texture.places[followed.state.shown]))
     }
 }
 
@@ -215,7 +218,10 @@ mod tests {
                     let count = texels.len();
                     assert!((1..=most).contains(&count));
                     for (_, read) in &in_order {
-                        assert!(at + count <= *read || *read + LEN <= at, "frame {frame} writes what is read");
+                        assert!(
+                            at + count <= *read || *read + LEN <= at,
+                            "frame {frame} writes what is read"
+                        );
                     }
                     memory[at..at + count].copy_from_slice(texels);
                     followed.copied(count);

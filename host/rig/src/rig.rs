@@ -2,8 +2,8 @@
 
 use crate::calibrated::{calibrated_camera, measured, measured_camera, told_of_measured, CameraFileError};
 use crate::config::{
-    BodyConfig, BuiltinScene, EnvironmentConfig, FileAxis, GazeConfig, PictureSource, ProjectorBackend, RigConfig, Tracing,
-    TrackerConfig, TracksUse,
+    BodyConfig, BuiltinScene, EnvironmentConfig, FileAxis, GazeConfig, PictureSource, ProjectorBackend,
+    RigConfig, Tracing, TrackerConfig, TracksUse,
 };
 use crate::drive::{albedo_of, drive, DriveError, MAX_PICTURE_BYTES};
 use crate::mock::{Motion, MotionError, MotionSpec};
@@ -14,7 +14,8 @@ use dpm_device::time::FrameRate;
 use dpm_render::drive::Drive;
 use dpm_scene::geometry::projector::{ProjectorCamera, ProjectorError};
 use dpm_scene::{
-    AnimationChoice, BodySelector, Environment, Limits, LivePictures, LoadOptions, Scene, SceneError, SceneFeatures, UpAxis,
+    AnimationChoice, BodySelector, Environment, Limits, LivePictures, LoadOptions, Scene, SceneError,
+    SceneFeatures, UpAxis,
 };
 use glam::{DAffine3, DQuat, DVec3, Vec3};
 use std::sync::Arc;

@@ -76,7 +76,10 @@ impl Scene {
     fn check_carried(&self, tracked: u16) -> Result<(), SceneError> {
         let is_carried = |body: &&Body| body.tracked == Some(tracked) && !body.mesh.triangles.is_empty();
         let carried = self.bodies.iter().filter(is_carried);
-        carried.map(|body| self.check_coordinates(body)).collect::<Result<(), _>>().map_err(|e| SceneError::broken("mesh", e))
+        carried
+            .map(|body| self.check_coordinates(body))
+            .collect::<Result<(), _>>()
+            .map_err(|e| SceneError::broken("mesh", e))
     }
 
     fn texel_count(&self) -> u64 {

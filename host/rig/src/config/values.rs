@@ -94,7 +94,9 @@ impl ConfigValue for PictureSource {
             return Some(source);
         }
         let problem = match source {
-            Self::PipeWire(_) => "is no node: names and numbers have letters, digits and the characters . _ - :",
+            Self::PipeWire(_) => {
+                "is no node: names and numbers have letters, digits and the characters . _ - :"
+            }
             Self::Pipe(_) | Self::File(_) => "names no file",
         };
         reader.refuse(&node.origin, key, problem, "");

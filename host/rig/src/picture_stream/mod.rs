@@ -6,6 +6,7 @@
 //! screen does on which nothing moves.
 
 mod decode;
+mod fit;
 mod source;
 
 use crate::config::PictureSource;
@@ -25,6 +26,9 @@ const FIRST_REST: Duration = Duration::from_millis(200);
 const LONGEST_REST: Duration = Duration::from_secs(5);
 /// The longest wait in which nothing is looked at.
 const STEP: Duration = Duration::from_millis(50);
+/// How long a source that is open may send nothing before the operator is told. It may have nothing new to show; but a
+/// node of PipeWire that is gone does not tell of itself.
+const SILENT: Duration = Duration::from_secs(3);
 /// Shortest time between two notes about one body.
 const NOTE_EVERY: Duration = Duration::from_secs(2);
 
@@ -43,7 +47,9 @@ impl PictureStreams {
         let mut streams = Self { stop: stop.clone(), threads: Vec::new(), pictures: Vec::new() };
         for live in &rig.scene.live {
             let body = rig.config.scene.bodies.get(usize::from(live.tracked));
-            let Some((body, source)) = body.and_then(|body| Some((body, body.texture.as_ref()?))) else { continue };
+            let Some((body, source)) = body.and_then(|body| Some((body, body.texture.as_ref()?))) else {
+                continue;
+            };
             let mut reader = StreamReader {
                 body: body.name.clone(),
                 source: source.clone(),
@@ -124,9 +130,15 @@ impl StreamReader {
         };
         let mut decoder = Decoder::new(stream.form(), size);
         let mut bytes = vec![0; source::MOST_BYTES];
+        let mut silent_since = Some(Instant::now());
         loop {
             if self.is_stopped() {
                 return Ended::Stopped;
+            }
+            if silent_since.is_some_and(|since| since.elapsed() >= SILENT) {
+                silent_since = None;
+                let stays = if *shown == 0 { "it is black" } else { "the last one stays" };
+                self.note(format!("no picture has come for {} s; {stays}", SILENT.as_secs()));
             }
             let count = match stream.read(&mut bytes, STEP) {
                 Ok(count) => count,
@@ -137,10 +149,17 @@ impl StreamReader {
                 self.pictures.show(picture);
                 *shown += 1;
             });
+            if *shown > before {
+                silent_since = Some(Instant::now());
+            }
             if before == 0 && *shown > 0 {
                 let [width, height] = decoder.sent();
                 let [columns, rows] = size;
-                let fitted = if [width, height] == size { String::new() } else { format!(", shown as {columns} x {rows}") };
+                let fitted = if [width, height] == size {
+                    String::new()
+                } else {
+                    format!(", shown as {columns} x {rows}")
+                };
                 self.note(format!("pictures of {width} x {height} have begun{fitted}"));
             }
             if let Err(wrong) = decoded {

@@ -67,7 +67,9 @@ impl Stream {
         match source {
             PictureSource::File(_) => Err(Ended::NotOpened("it is a file".into())),
             PictureSource::Pipe(path) => open_pipe(path).map_err(Ended::NotOpened),
-            PictureSource::PipeWire(target) => start(gstreamer_at(Path::new(PROGRAM), target, size)).map_err(Ended::NotOpened),
+            PictureSource::PipeWire(target) => {
+                start(gstreamer_at(Path::new(PROGRAM), target, size)).map_err(Ended::NotOpened)
+            }
         }
     }
 
@@ -104,8 +106,10 @@ impl Stream {
             }
             Self::Program(child, said) => {
                 let Some(out) = &mut child.stdout else { return Err(Ended::Program(String::new())) };
-                let both: Vec<RawFd> =
-                    [Some(out.as_raw_fd()), child.stderr.as_ref().map(AsRawFd::as_raw_fd)].into_iter().flatten().collect();
+                let both: Vec<RawFd> = [Some(out.as_raw_fd()), child.stderr.as_ref().map(AsRawFd::as_raw_fd)]
+                    .into_iter()
+                    .flatten()
+                    .collect();
                 let ready = readable(&both, limit)?;
                 if let (Some(err), Some(true)) = (&mut child.stderr, ready.get(1)) {
                     let mut part = [0; 512];
