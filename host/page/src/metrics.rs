@@ -38,6 +38,7 @@ families! {
     ORDERED = "dpm_slots_ordered_dark_total", "counter", "Slots in which no new picture was wanted, by reason";
     BODY_LIT = "dpm_body_lit", "gauge", "1 while light falls on the body";
     BODY_DARK = "dpm_body_dark_frames_total", "counter", "Lit frames in which the body was dark, by cause";
+    PICTURES = "dpm_live_pictures_total", "counter", "Pictures of another program that the body was given (scene.bodies[].texture)";
     INTERVAL = "dpm_interval_seconds", "histogram", "Time between two stamps of a frame (docs/LATENCY.md); negative times count in the lowest bucket";
     SAMPLE_AGE = "dpm_sample_age_seconds", "gauge", "Age of the oldest sample among the lit bodies when the newest frame was due";
     PREDICT = "dpm_prediction_seconds", "gauge", "The longest time for which prediction may extend a track";
@@ -62,6 +63,10 @@ pub(crate) fn text(state: &State) -> String {
     match &state.figures {
         Some(figures) => run(&mut out, figures),
         None => counted(&mut out, state),
+    }
+    out.family(PICTURES);
+    for (body, count) in &state.pictures {
+        out.value(&[("body", body)], *count as f64);
     }
     link(&mut out, &state.carried);
     out.family(CELSIUS);

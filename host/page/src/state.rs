@@ -7,6 +7,7 @@ use dpm_rig::telemetry::histogram_steps::UPPER_NS;
 use dpm_rig::telemetry::live::LiveSnapshot;
 use dpm_rig::telemetry::monitor::{ProjectorHealth, RunCounts};
 use dpm_rig::telemetry::projector::ProjectorReport;
+use dpm_scene::LiveTexture;
 use serde_json::{json, Value};
 use std::sync::Arc;
 
@@ -43,6 +44,8 @@ pub(crate) struct State {
     pub figures: Option<Arc<LiveSnapshot>>,
     /// What the link has carried.
     pub carried: ProjectorReport,
+    /// The bodies that show another program's pictures, and how many of them have come.
+    pub pictures: Vec<(String, u64)>,
     setup: Value,
 }
 
@@ -75,7 +78,14 @@ impl State {
             viewers: shared.viewers(),
         };
         let figures = monitor.live().snapshot();
-        Self { now, health, figures, carried: monitor.carried(), setup: setup(shared) }
+        let pictures = monitor.live().rig().map_or(Vec::new(), |rig| {
+            let of = |live: &LiveTexture| {
+                let body = rig.bodies.get(usize::from(live.tracked)).map_or("", |body| &body.name);
+                (body.to_owned(), live.pictures.number())
+            };
+            rig.scene.live.iter().map(of).collect()
+        });
+        Self { now, health, figures, carried: monitor.carried(), pictures, setup: setup(shared) }
     }
 
     pub(crate) fn to_json(&self) -> StateJson<'_> {

@@ -75,11 +75,9 @@ impl Scene {
 
     fn check_carried(&self, tracked: u16) -> Result<(), SceneError> {
         let is_carried = |body: &&Body| body.tracked == Some(tracked) && !body.mesh.triangles.is_empty();
-        let carried = self.bodies.iter().filter(is_carried);
-        carried
-            .map(|body| self.check_coordinates(body))
-            .collect::<Result<(), _>>()
-            .map_err(|e| SceneError::broken("mesh", e))
+        let mut carried = self.bodies.iter().filter(is_carried);
+        let checked = carried.try_for_each(|body| self.check_coordinates(body));
+        checked.map_err(|e| SceneError::broken("mesh", e))
     }
 
     fn texel_count(&self) -> u64 {

@@ -255,10 +255,15 @@ impl Scene {
             texture.texels.truncate(len);
             texture.ends_ns.clear();
         }
-        for live in scene.live.drain(..) {
-            scene.textures[live.texture as usize].texels = live.pictures.newest();
-        }
+        scene.keep_live();
         scene
+    }
+
+    /// Every live texture keeps the picture of now.
+    pub fn keep_live(&mut self) {
+        for live in self.live.drain(..) {
+            self.textures[live.texture as usize].texels = live.pictures.newest();
+        }
     }
 }
 

@@ -18,10 +18,12 @@ use dpm_render::{FrameSlot, Keep, RenderError, Renderer, RendererSettings};
 use dpm_rig::config::{BodyConfig, MotionValue, RenderConfig, RigConfig};
 use dpm_rig::failure::{Failure, FailureKind};
 use dpm_rig::light::recorder::LightFrame;
+use dpm_rig::picture_stream::PictureStreams;
 use dpm_rig::pictures::pictures;
 use dpm_rig::pipeline::{renderer_settings, PipelineError};
 use dpm_rig::rig::Rig;
 use dpm_rig::run_rig::{open_gpu, traced_raster};
+use dpm_rig::telemetry::monitor::RunMonitor;
 use glam::Vec3;
 use paint::Canvas;
 use serde::Serialize;
@@ -29,6 +31,7 @@ use std::collections::VecDeque;
 use std::io::Write;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
+use std::time::Duration;
 use views::{missing, scale_to_white, srgb_canvas, tile_errors, Views};
 
 /// A frame that comes later takes too long to reach; histories have settled long before.
@@ -151,7 +154,9 @@ pub fn snapshot(
     let gpu = open_gpu(config)?;
     let mut warnings = Vec::new();
     let raster = traced_raster(config, &gpu, &mut warnings);
-    let (rig, view) = stage(Rig::build(config, raster)?, request, &gpu)?;
+    let mut rig = Rig::build(config, raster)?;
+    warnings.extend(keep_live(&mut rig));
+    let (rig, view) = stage(rig, request, &gpu)?;
     warnings.extend(rig.scene.warnings.iter().cloned());
     let mut player = Player::new(&rig, &gpu)?;
     let what = &request.what;
@@ -172,6 +177,29 @@ pub fn snapshot(
         player.save(image, dir, &mut report)?;
     }
     Ok(report)
+}
+
+/// How long to wait for the first picture of another program.
+const LIVE_WAIT: Duration = Duration::from_secs(3);
+
+/// Every body that shows another program's pictures keeps the first that comes. Returns what there is to say about them.
+fn keep_live(rig: &mut Rig) -> Vec<String> {
+    if rig.scene.live.is_empty() {
+        return Vec::new();
+    }
+    let monitor = Arc::new(RunMonitor::default());
+    let streams = PictureStreams::start(rig, &monitor);
+    let have_come = streams.wait_for_first(LIVE_WAIT);
+    drop(streams);
+    let mut told = monitor.take_notes();
+    if !have_come {
+        told.push(format!(
+            "not every picture of another program has come within {} s; those bodies are black",
+            LIVE_WAIT.as_secs()
+        ));
+    }
+    rig.scene.keep_live();
+    told
 }
 
 /// Refuses what can be refused before the GPU is opened.

@@ -204,6 +204,6 @@ pub(super) fn start(mut command: Command) -> Result<Stream, String> {
 fn told(said: &[u8]) -> String {
     let said = String::from_utf8_lossy(said);
     let lines = || said.lines().map(str::trim).filter(|line| !line.is_empty());
-    let line = lines().find(|line| line.starts_with("ERROR")).or_else(|| lines().last());
+    let line = lines().find(|line| line.starts_with("ERROR")).or_else(|| lines().next_back());
     line.unwrap_or_default().chars().filter(|c| !c.is_control()).take(200).collect()
 }
