@@ -79,7 +79,7 @@ fn an_overview_of_rigs_refuses_what_it_cannot_show() {
         (&["stage"], "write HOST:PORT"),
         (&["127.0.0.1:0"], "ports from 1 to 65535"),
         (&["a=127.0.0.1:1", "a=127.0.0.1:2"], "two rigs are called \"a\""),
-        (&["a=127.0.0.1:1", "b=localhost:1/8947"], "have the same address"),
+        (&["a=127.0.0.1:1", "b=localhost:1"], "have the same address"),
         (&["a=127.0.0.1:8940"], "--listen 127.0.0.1:8940: this is the address of the rig \"a\""),
         (&["127.0.0.1:1", "--listen", "0.0.0.0:8940"], "listen on 127.0.0.1"),
         (&["127.0.0.1:1", "--listen", "8940"], "--listen"),

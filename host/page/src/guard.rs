@@ -58,15 +58,11 @@ impl Guard {
 
     /// Any request: it was sent to this page by name, and not by another site.
     pub(crate) fn check(&self, headers: &HeaderMap) -> Result<(), Refused> {
-        match single(headers, &HOST) {
-            Some(host) if self.hosts.iter().any(|h| h.eq_ignore_ascii_case(host)) => {}
-            _ => {
-                return Err(refused(
-                    421,
-                    format!("this page answers to {} only{}", self.hosts.join(", "), self.remedy),
-                ))
-            }
-        }
+        let named = single(headers, &HOST).filter(|host| self.is_mine(host));
+        let Some(host) = named else {
+            let names = self.hosts.join(", ");
+            return Err(refused(421, format!("this page answers to {names} only{}", self.remedy)));
+        };
         if headers.contains_key(FETCH_SITE)
             && !single(headers, &FETCH_SITE).is_some_and(|site| ["same-origin", "none"].contains(&site))
             && !is_link_on_this_machine(headers)
@@ -74,12 +70,26 @@ impl Guard {
             return Err(refused(403, "refused: another site asks"));
         }
         if headers.contains_key(ORIGIN)
-            && !single(headers, &ORIGIN)
-                .is_some_and(|origin| self.origins.iter().any(|o| o.eq_ignore_ascii_case(origin)))
+            && !single(headers, &ORIGIN).is_some_and(|origin| self.is_from_here(origin, host))
         {
             return Err(refused(403, "refused: another site asks"));
         }
         Ok(())
+    }
+
+    /// A name of this page, or of this machine: through a tunnel the page has whatever port the tunnel has. A name that was rebound to
+    /// this address is neither.
+    fn is_mine(&self, host: &str) -> bool {
+        self.hosts.iter().any(|h| h.eq_ignore_ascii_case(host)) || is_loopback(host)
+    }
+
+    /// A page of this server has caused the request, which was sent to `host`. Other ports of this machine are other pages.
+    fn is_from_here(&self, origin: &str, host: &str) -> bool {
+        let through_tunnel = || {
+            let asked = origin.strip_prefix("http://").filter(|asked| asked.eq_ignore_ascii_case(host));
+            is_loopback(host) && asked.is_some()
+        };
+        self.origins.iter().any(|o| o.eq_ignore_ascii_case(origin)) || through_tunnel()
     }
 
     /// An order: it knows the token.
@@ -94,6 +104,18 @@ impl Guard {
             _ => Err(refused(403, "wrong token: open the page by the link that the rig has printed")),
         }
     }
+}
+
+/// Whether a host is this machine by a name that no name server decides, with any port or none.
+fn is_loopback(host: &str) -> bool {
+    let (name, port) = match host.rsplit_once(':') {
+        Some((name, port)) if !port.is_empty() && port.bytes().all(|b| b.is_ascii_digit()) => {
+            (name, Some(port))
+        }
+        _ => (host, None),
+    };
+    let is_port = port.is_none_or(|port| port.parse::<u16>().is_ok());
+    is_port && ["127.0.0.1", "[::1]", "localhost"].iter().any(|known| known.eq_ignore_ascii_case(name))
 }
 
 /// A link on a page of this machine was followed, as those of the overview of several rigs. To a browser all ports of
@@ -138,11 +160,23 @@ mod tests {
 
     #[test]
     fn only_the_pages_own_names_are_answered() {
-        for good in ["127.0.0.1:8947", "localhost:8947", "LOCALHOST:8947", "rig.example.org"] {
+        let tunnels = ["127.0.0.1:9000", "localhost:9000", "[::1]:9000", "127.0.0.1", "localhost", "[::1]"];
+        let names = ["127.0.0.1:8947", "localhost:8947", "LOCALHOST:8947", "rig.example.org"];
+        for good in names.into_iter().chain(tunnels) {
             assert_eq!(guard().check(&headers(&[("host", good)])), Ok(()), "{good}");
         }
-        for bad in ["evil.example:8947", "127.0.0.1", "localhost", "127.0.0.1:80", "", "rig.example.org:443"]
-        {
+        for bad in [
+            "evil.example:8947",
+            "127.0.0.2:8947",
+            "127.0.0.1.evil.example",
+            "localhost.evil.example:8947",
+            "localhost:",
+            "localhost:99999",
+            "evil@localhost:80",
+            "[::1",
+            "",
+            "rig.example.org:443",
+        ] {
             let told = guard().check(&headers(&[("host", bad)])).unwrap_err();
             assert_eq!(told.status, 421, "{bad}");
         }
@@ -167,6 +201,14 @@ mod tests {
             "http://localhost:8947.evil.example",
         ] {
             assert!(guard().check(&headers(&[host, ("origin", bad)])).is_err(), "{bad}");
+        }
+        // Through a tunnel only its own pages may ask, and not those of other servers of this machine.
+        let tunnel = ("host", "localhost:9000");
+        assert_eq!(guard().check(&headers(&[tunnel, ("origin", "http://localhost:9000")])), Ok(()));
+        for bad in
+            ["http://localhost:9001", "http://127.0.0.1:9000", "https://localhost:9000", "http://localhost"]
+        {
+            assert!(guard().check(&headers(&[tunnel, ("origin", bad)])).is_err(), "{bad}");
         }
         for (site, may) in
             [("same-origin", true), ("none", true), ("cross-site", false), ("same-site", false)]

@@ -38,7 +38,6 @@ families! {
     ORDERED = "dpm_slots_ordered_dark_total", "counter", "Slots in which no new picture was wanted, by reason";
     BODY_LIT = "dpm_body_lit", "gauge", "1 while light falls on the body";
     BODY_DARK = "dpm_body_dark_frames_total", "counter", "Lit frames in which the body was dark, by cause";
-    PICTURES = "dpm_live_pictures_total", "counter", "Pictures of another program that the body was given (scene.bodies[].texture)";
     INTERVAL = "dpm_interval_seconds", "histogram", "Time between two stamps of a frame (docs/LATENCY.md); negative times count in the lowest bucket";
     SAMPLE_AGE = "dpm_sample_age_seconds", "gauge", "Age of the oldest sample among the lit bodies when the newest frame was due";
     PREDICT = "dpm_prediction_seconds", "gauge", "The longest time for which prediction may extend a track";
@@ -46,6 +45,7 @@ families! {
     SAMPLES = "dpm_samples_total", "counter", "Samples taken";
     RAYS = "dpm_rays_total", "counter", "Rays traced";
     REGISTRATION = "dpm_registration_error_pixels", "gauge", "Distance of light from its place in projector pixels; only with a mock tracker";
+    PICTURES = "dpm_live_pictures_total", "counter", "Pictures of another program that the body was given (scene.bodies[].texture)";
     SESSIONS = "dpm_link_sessions_total", "counter", "Sessions opened with the projector";
     REARMED = "dpm_link_rearmed_total", "counter", "Times that light came back after the watchdog or damaged packets";
     SENT = "dpm_link_sent_bytes_total", "counter", "Bytes handed to the medium";

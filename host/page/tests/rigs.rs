@@ -144,7 +144,7 @@ fn a_rig_that_answers_is_shown_and_each_that_does_not_says_why() {
             "without a whole answer",
         ),
         ("endless", endless.address, "longer than 256 KiB"),
-        ("other", Fake::saying(http("421 Misdirected Request", "no")).address, "append the rig's own port"),
+        ("other", Fake::saying(http("421 Misdirected Request", "no")).address, "so it is no rig's page"),
         ("guide", Fake::saying(http("404 Not Found", "no")).address, "no run is shown there"),
         ("ill", Fake::saying(http("500 Internal Server Error", "no")).address, "status 500"),
         ("words", Fake::saying(http("200 OK", "up")).address, "not the state of a rig"),
@@ -161,7 +161,7 @@ fn a_rig_that_answers_is_shown_and_each_that_does_not_says_why() {
     let page = overview(&names);
     let rig = wait(&page, "good", Duration::from_secs(2), |rig| rig["contact"] == "yes");
     assert_eq!(rig["address"], good.address.to_string());
-    assert_eq!(rig["link_port"], good.address.port());
+    assert_eq!(rig["port"], good.address.port());
     assert!(
         rig["why"].is_null() && rig["told"]["projector"] == "up" && rig["told"]["is_light"] == true,
         "{rig}"
@@ -209,28 +209,53 @@ fn nobody_who_looks_means_no_question() {
 }
 
 #[test]
-fn a_rig_is_asked_by_the_port_that_it_knows() {
-    let (plain, tunnel) = (Fake::good(), Fake::good());
-    let page = overview(&[format!("plain={}", plain.address), format!("tunnel={}/8947", tunnel.address)]);
-    for name in ["plain", "tunnel"] {
-        wait(&page, name, PATIENCE, |rig| rig["contact"] == "yes");
-    }
-    for (fake, port) in [(&plain, plain.address.port()), (&tunnel, 8947)] {
-        let head = fake.heads.lock().unwrap()[0].to_ascii_lowercase();
-        assert!(head.starts_with("get /api/state http/1.1\r\n"), "{head}");
-        assert!(head.contains(&format!("\r\nhost: localhost:{port}\r\n")), "{head}");
-    }
-    // A browser would name the tunnel's port, which the rig refuses.
-    assert!(told(&page, "tunnel")["link_port"].is_null());
+fn a_rig_is_asked_by_the_port_of_its_address() {
+    let good = Fake::good();
+    let page = overview(&[format!("good={}", good.address)]);
+    wait(&page, "good", PATIENCE, |rig| rig["contact"] == "yes");
+    let head = good.heads.lock().unwrap()[0].to_ascii_lowercase();
+    assert!(head.starts_with("get /api/state http/1.1\r\n"), "{head}");
+    assert!(head.contains(&format!("\r\nhost: localhost:{}\r\n", good.address.port())), "{head}");
+}
+
+/// What `ssh -L` does: another port of this machine leads to the rig's. The overview shows the rig, and its page takes orders of its own
+/// and of nobody else.
+#[test]
+fn a_rig_is_shown_and_commanded_through_a_tunnel() {
+    let mut rig = Running::start("tunnel");
+    let to = rig.address;
+    let listener = TcpListener::bind("127.0.0.1:0").unwrap();
+    let tunnel = listener.local_addr().unwrap();
+    // It ends with the test's process.
+    std::thread::spawn(move || {
+        for near in listener.incoming().map_while(Result::ok) {
+            let Ok(far) = TcpStream::connect(to) else { continue };
+            for (mut from, mut into) in [(near.try_clone().unwrap(), far.try_clone().unwrap()), (far, near)] {
+                std::thread::spawn(move || {
+                    let _ = std::io::copy(&mut from, &mut into);
+                    let _ = into.shutdown(std::net::Shutdown::Write);
+                });
+            }
+        }
+    });
+    let page = overview(&[format!("rig={tunnel}")]);
+    let now = wait(&page, "rig", PATIENCE, |rig| rig["contact"] == "yes");
+    assert_eq!(now["port"], tunnel.port());
+    let order = |origin: &str| {
+        let host = tunnel.to_string();
+        let headers = [("Host", host.as_str()), ("Origin", origin), ("X-Dpm-Token", rig.token.as_str())];
+        ask(tunnel, "POST", "/api/orders/black", &headers).status
+    };
+    assert_eq!(order(&format!("http://{to}")), 200, "the rig's own name stays one of its own");
+    assert_eq!(order("http://127.0.0.1:1"), 403, "a server at another port of this machine");
+    assert_eq!(order(&format!("http://{tunnel}")), 200);
+    wait(&page, "rig", PATIENCE, |rig| rig["told"]["projector"] == "BLACK");
+    rig.end_run();
 }
 
 #[test]
 fn a_real_rig_is_understood_and_its_silence_is_told() {
     let mut rig = Running::start("overview");
-    let wrong = overview(&[format!("rig={}/1", rig.address)]);
-    let now = wait(&wrong, "rig", PATIENCE, |rig| rig["contact"] == "no");
-    let why = now["why"].as_str().unwrap();
-    assert!(why.contains("localhost:1") && why.contains("append the rig's own port"), "{why}");
     let page = overview(&[format!("rig={}", rig.address)]);
     let now = wait(&page, "rig", PATIENCE, |rig| rig["told"]["lit_per_s"].as_f64().is_some_and(|n| n > 1.0));
     assert!(now["told"]["projector"] == "up" && now["told"]["is_light"] == true, "{now}");

@@ -9,8 +9,7 @@ use std::net::SocketAddr;
 /// Flags of `dpm rigs`.
 #[derive(clap::Args, Clone, Debug)]
 pub(crate) struct RigsArgs {
-    /// The page of a rig, or the tunnel to it: HOST:PORT or NAME=HOST:PORT; if the rig's own port differs from the
-    /// tunnel's, NAME=HOST:PORT/RIGPORT
+    /// The page of a rig, or the tunnel to it: HOST:PORT or NAME=HOST:PORT
     #[arg(value_name = "ADDRESS", required = true)]
     rigs: Vec<RigAddress>,
     /// Where to serve the overview, an address of this machine

@@ -1,4 +1,4 @@
-//! Where a rig's page is, as the operator writes it: `HOST:PORT`, `NAME=HOST:PORT` or `NAME=HOST:PORT/RIGPORT`.
+//! Where a rig's page is, as the operator writes it: `HOST:PORT` or `NAME=HOST:PORT`.
 
 use std::net::{Ipv4Addr, SocketAddr};
 use std::str::FromStr;
@@ -11,15 +11,15 @@ const MAX_NAME: usize = 40;
 pub struct RigAddress {
     name: String,
     address: SocketAddr,
-    /// The port on which the rig itself listens; another one than that of `address` where a tunnel changes it.
-    rig_port: u16,
 }
 
 /// What is wrong with the address of a rig.
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
 pub enum BadAddress {
     /// It has another form.
-    #[error("write HOST:PORT, NAME=HOST:PORT or NAME=HOST:PORT/RIGPORT with ports from 1 to 65535, for example stage=127.0.0.1:8947")]
+    #[error(
+        "write HOST:PORT or NAME=HOST:PORT with ports from 1 to 65535, for example stage=127.0.0.1:8947"
+    )]
     Form,
     /// The name is empty, too long, or cannot be shown.
     #[error("a name has 1 to {MAX_NAME} characters and no control characters")]
@@ -40,15 +40,9 @@ impl RigAddress {
         self.address
     }
 
-    /// The name under which the rig's page answers: a page takes only requests that name its own port.
+    /// The name under which a rig's page answers, with the port of a tunnel where there is one.
     pub(super) fn host(&self) -> String {
-        format!("localhost:{}", self.rig_port)
-    }
-
-    /// The port under which a browser may open the rig's page: none if a tunnel changes it, because a browser names the
-    /// tunnel's port.
-    pub(super) fn link_port(&self) -> Option<u16> {
-        (self.rig_port == self.address.port()).then_some(self.rig_port)
+        format!("localhost:{}", self.address.port())
     }
 }
 
@@ -57,7 +51,6 @@ impl FromStr for RigAddress {
 
     fn from_str(text: &str) -> Result<Self, BadAddress> {
         let (name, place) = text.rsplit_once('=').map_or((None, text), |(name, place)| (Some(name), place));
-        let (place, rig_port) = place.split_once('/').map_or((place, None), |(p, port)| (p, Some(port)));
         let (host, port) = place.rsplit_once(':').ok_or(BadAddress::Form)?;
         let address = match host {
             "localhost" => SocketAddr::from((Ipv4Addr::LOCALHOST, self::port(port)?)),
@@ -80,8 +73,7 @@ impl FromStr for RigAddress {
         if name.is_empty() || name.chars().count() > MAX_NAME || name.contains(char::is_control) {
             return Err(BadAddress::Name);
         }
-        let rig_port = rig_port.map_or(Ok(address.port()), self::port)?;
-        Ok(Self { name, address, rig_port })
+        Ok(Self { name, address })
     }
 }
 
@@ -102,17 +94,15 @@ mod tests {
 
     #[test]
     fn an_address_is_what_it_says() {
-        for (text, name, address, host, link) in [
-            ("127.0.0.1:8947", "127.0.0.1:8947", "127.0.0.1:8947", "localhost:8947", Some(8947)),
-            ("localhost:8947", "127.0.0.1:8947", "127.0.0.1:8947", "localhost:8947", Some(8947)),
-            ("Left wall=127.0.0.1:8948", "Left wall", "127.0.0.1:8948", "localhost:8948", Some(8948)),
-            ("a=b=[::1]:9", "a=b", "[::1]:9", "localhost:9", Some(9)),
-            ("rig2=127.0.0.1:8948/8947", "rig2", "127.0.0.1:8948", "localhost:8947", None),
-            ("127.0.0.1:8948/8948", "127.0.0.1:8948", "127.0.0.1:8948", "localhost:8948", Some(8948)),
+        for (text, name, address, host) in [
+            ("127.0.0.1:8947", "127.0.0.1:8947", "127.0.0.1:8947", "localhost:8947"),
+            ("localhost:8947", "127.0.0.1:8947", "127.0.0.1:8947", "localhost:8947"),
+            ("Left wall=127.0.0.1:8948", "Left wall", "127.0.0.1:8948", "localhost:8948"),
+            ("a=b=[::1]:9", "a=b", "[::1]:9", "localhost:9"),
         ] {
             let rig: RigAddress = text.parse().unwrap_or_else(|e| panic!("{text}: {e}"));
             assert_eq!((rig.name(), rig.address().to_string().as_str()), (name, address), "{text}");
-            assert_eq!((rig.host().as_str(), rig.link_port()), (host, link), "{text}");
+            assert_eq!(rig.host(), host, "{text}");
         }
     }
 
@@ -120,7 +110,8 @@ mod tests {
     fn a_bad_address_is_refused_for_what_is_wrong_with_it() {
         let told = |text: &str| text.parse::<RigAddress>().unwrap_err();
         let forms = ["", "8947", "127.0.0.1", "127.0.0.1:0", "127.0.0.1:65536", "a=localhost:0", "a=:1"];
-        let more = ["127.0.0.1:1/", "127.0.0.1:1/0", "127.0.0.1:1/x", "http://127.0.0.1:1", "a=", "::1:1:x"];
+        let more =
+            ["127.0.0.1:1/", "127.0.0.1:1/0", "127.0.0.1:1/8947", "http://127.0.0.1:1", "a=", "::1:1:x"];
         for text in forms.iter().chain(&more) {
             assert_eq!(told(text), BadAddress::Form, "{text}");
         }

@@ -39,8 +39,7 @@ pub(super) enum Unheard {
     )]
     Ended,
     #[error(
-        "the page does not answer to {0} (status 421); where a tunnel changes the port, append the rig's own port, as in \
-         NAME=127.0.0.1:8948/8947"
+        "what answers there does not answer to {0} (status 421), so it is no rig's page; check the port"
     )]
     Misdirected(String),
     #[error("no run is shown there (status 404): it is another page or another program; start the rig with --page")]

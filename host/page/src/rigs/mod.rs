@@ -91,8 +91,8 @@ struct RigJson {
     name: String,
     /// Where it is asked.
     address: String,
-    /// The port under which a browser may open the rig's page at that address; `None` if the rig would refuse it.
-    link_port: Option<u16>,
+    /// The port under which a browser opens the rig's page.
+    port: u16,
     contact: Contact,
     /// Seconds since it told its state; `None` if it never did.
     heard_s_ago: Option<f64>,
@@ -186,7 +186,7 @@ impl Rig {
         RigJson {
             name: self.address.name().to_owned(),
             address: self.address.address().to_string(),
-            link_port: self.address.link_port(),
+            port: self.address.address().port(),
             contact,
             heard_s_ago: ago.map(|ago| (ago.as_secs_f64() * 1e3).round() / 1e3),
             why: (contact == Contact::No).then(why),
