@@ -15,6 +15,7 @@ use crate::telemetry::monitor::RunMonitor;
 use decode::Decoder;
 use dpm_common::realtime::os::give_way;
 use dpm_scene::LivePictures;
+pub use source::look_at;
 use source::{Ended, Stream};
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::Arc;

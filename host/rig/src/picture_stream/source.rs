@@ -5,7 +5,7 @@ use super::decode::Form;
 use crate::config::PictureSource;
 use dpm_common::unix::{wait_readable, widen_pipe};
 use std::fmt;
-use std::fs::File;
+use std::fs::{File, Metadata};
 use std::io::{self, Read};
 use std::os::fd::{AsRawFd, RawFd};
 use std::os::unix::fs::{FileTypeExt, OpenOptionsExt};
@@ -151,16 +151,48 @@ fn readable(descriptors: &[RawFd], limit: Duration) -> Result<Vec<bool>, Ended> 
     Ok(ready)
 }
 
-fn open_pipe(path: &Path) -> Result<Stream, String> {
-    let file = File::options().read(true).custom_flags(libc::O_NONBLOCK | libc::O_CLOEXEC).open(path);
-    let file = file.map_err(|e| match e.kind() {
+/// Whether there is what a source needs, without opening it: a program that waits for the rig would take whoever looks for it.
+///
+/// # Errors
+/// What is missing, and what to do.
+pub fn look_at(source: &PictureSource) -> Result<(), String> {
+    match source {
+        PictureSource::File(_) => Ok(()),
+        PictureSource::Pipe(path) => match std::fs::metadata(path) {
+            Ok(found) => check_kind(&found),
+            Err(e) => Err(not_opened(&e)),
+        },
+        PictureSource::PipeWire(_) => {
+            let folders = std::env::var_os("PATH").unwrap_or_default();
+            let is_there = std::env::split_paths(&folders).any(|folder| folder.join(PROGRAM).is_file());
+            is_there.then_some(()).ok_or_else(not_installed)
+        }
+    }
+}
+
+fn not_opened(e: &io::Error) -> String {
+    match e.kind() {
         io::ErrorKind::NotFound => "there is no such pipe; `mkfifo` makes one".into(),
         _ => format!("it cannot be opened: {e}"),
-    })?;
-    let kind = file.metadata().map_err(|e| e.to_string())?.file_type();
-    if !kind.is_fifo() {
-        return Err("it is no named pipe; `mkfifo` makes one".into());
     }
+}
+
+fn check_kind(found: &Metadata) -> Result<(), String> {
+    let is_pipe = found.file_type().is_fifo();
+    is_pipe.then_some(()).ok_or_else(|| "it is no named pipe; `mkfifo` makes one".into())
+}
+
+fn not_installed() -> String {
+    format!(
+        "{PROGRAM} is not installed; on Debian: apt install gstreamer1.0-tools gstreamer1.0-plugins-base \
+         gstreamer1.0-pipewire"
+    )
+}
+
+fn open_pipe(path: &Path) -> Result<Stream, String> {
+    let file = File::options().read(true).custom_flags(libc::O_NONBLOCK | libc::O_CLOEXEC).open(path);
+    let file = file.map_err(|e| not_opened(&e))?;
+    check_kind(&file.metadata().map_err(|e| e.to_string())?)?;
     // A smaller one only means more calls.
     let _ = widen_pipe(&file, MOST_BYTES);
     Ok(Stream::Pipe(file, false))
@@ -188,10 +220,7 @@ pub(super) fn gstreamer_at(program: &Path, target: &str, [width, height]: [u32; 
 pub(super) fn start(mut command: Command) -> Result<Stream, String> {
     let child = command.stdin(Stdio::null()).stdout(Stdio::piped()).stderr(Stdio::piped()).spawn();
     let child = child.map_err(|e| match e.kind() {
-        io::ErrorKind::NotFound => format!(
-            "{PROGRAM} is not installed; on Debian: apt install gstreamer1.0-tools gstreamer1.0-plugins-base \
-             gstreamer1.0-pipewire"
-        ),
+        io::ErrorKind::NotFound => not_installed(),
         _ => format!("{PROGRAM} cannot be started: {e}"),
     })?;
     if let Some(out) = &child.stdout {

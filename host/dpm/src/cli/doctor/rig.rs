@@ -8,6 +8,7 @@ use dpm_calibration::file;
 use dpm_rig::calibration_steps::age::{aged, days_since, OLD_DAYS};
 use dpm_rig::calibration_steps::is_simulated;
 use dpm_rig::config::RigConfig;
+use dpm_rig::picture_stream::look_at;
 use dpm_rig::rig::Rig;
 use dpm_rig::standing::{standing_in, state_folder, Identity};
 use std::net::{SocketAddr, TcpListener};
@@ -24,7 +25,10 @@ pub(super) fn findings(config: &RigConfig) -> Vec<Finding> {
     let mut all = vec![set_up(config)];
     match Rig::build(config, None) {
         Err(e) => all.push(Finding::new("scene", State::Missing, e.to_string(), "correct the rig file")),
-        Ok(rig) => all.extend([scene(&rig), devices::tracker(&rig)]),
+        Ok(rig) => {
+            all.extend([scene(&rig), devices::tracker(&rig)]);
+            all.extend(pictures(&rig));
+        }
     }
     all.push(calibration(config));
     all.extend(standing_order(config));
@@ -64,6 +68,24 @@ fn scene(rig: &Rig) -> Finding {
     let more = if more > 0 { format!("; and {more} more") } else { String::new() };
     let remedy = "`dpm plan` of this rig file lists every note, docs/SCENES.md says what is read";
     Finding::new("scene", State::Warning, format!("{found}; {}{more}", told.join("; ")), remedy)
+}
+
+/// The bodies that show what another program makes. Without it they are black, and all else works.
+fn pictures(rig: &Rig) -> Vec<Finding> {
+    let bodies =
+        rig.scene.live.iter().filter_map(|live| rig.config.scene.bodies.get(usize::from(live.tracked)));
+    let sources = bodies.filter_map(|body| Some((&body.name, body.texture.as_ref()?)));
+    sources
+        .map(|(body, source)| {
+            let name = format!("pictures of {body}");
+            match look_at(source) {
+                Ok(()) => Finding::new(&name, State::Ok, source.to_string(), ""),
+                Err(why) => {
+                    Finding::new(&name, State::Warning, format!("{source}: {why}"), "it is black until then")
+                }
+            }
+        })
+        .collect()
 }
 
 /// Whether the rig was measured, what of it, and how long ago.
@@ -188,6 +210,22 @@ mod tests {
         drop(taken);
         assert_eq!(page(&config).unwrap().state, State::Ok);
         assert!(page(&demo(&[])).is_none());
+    }
+
+    #[test]
+    fn a_body_without_its_pipe_is_a_warning() {
+        let of = |texture: &str| {
+            let body = format!("scene.bodies=[{{ name = \"bunny\", texture = \"{texture}\" }}]");
+            pictures(&Rig::build(&demo(&[body]), None).unwrap())
+        };
+        let missing = &of("pipe:/nowhere/bunny")[0];
+        assert_eq!((missing.state, &missing.name[..]), (State::Warning, "pictures of bunny"));
+        assert!(
+            missing.found.contains("pipe:/nowhere/bunny: there is no such pipe; `mkfifo`"),
+            "{missing:?}"
+        );
+        assert!(of("pipe:/etc/passwd")[0].found.contains("it is no named pipe"));
+        assert!(pictures(&Rig::build(&demo(&[]), None).unwrap()).is_empty());
     }
 
     #[test]
