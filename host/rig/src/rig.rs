@@ -205,6 +205,7 @@ impl Rig {
                     .into(),
             );
         }
+        scene.warnings.extend(dark_glass(&scene, config.render.depth));
         Self::around(scene, config, raster)
     }
 
@@ -334,6 +335,22 @@ fn load_scene(config: &RigConfig) -> Result<Scene, SceneError> {
         ..LoadOptions::default()
     };
     dpm_scene::load(file, &options)
+}
+
+/// Rays of a path that see what lies behind a simple solid of glass with a reflection in it.
+const DEPTH_FOR_GLASS: u32 = 6;
+
+/// What to say of solids of glass whose paths end inside them.
+fn dark_glass(scene: &Scene, depth: u32) -> Option<String> {
+    let used = scene.used_materials();
+    let mut glass =
+        scene.materials.iter().zip(used).filter(|(m, used)| *used && m.transmission > 0.0 && !m.thin_walled);
+    let (material, _) = glass.next().filter(|_| depth < DEPTH_FOR_GLASS)?;
+    Some(format!(
+        "material \"{}\" is solid glass: with render.depth = {depth} paths end inside it, and it is too dark; {DEPTH_FOR_GLASS} \
+         to 12 show it",
+        material.name
+    ))
 }
 
 /// Shows the pictures that the rig file names on its bodies.
@@ -515,6 +532,17 @@ mod tests {
             (3, true, false)
         );
         std::fs::remove_file(&file).unwrap();
+    }
+
+    /// Paths that end inside a solid of glass leave it dark, which is told; those of a thin pane leave it at once.
+    #[test]
+    fn glass_that_is_too_deep_for_its_paths_is_told() {
+        for (thin_walled, depth, is_told) in [(false, 3, true), (false, 6, false), (true, 1, false)] {
+            let scene = dpm_scene::shapes::clear_slab(1.5, 0.0, thin_walled);
+            let told = dark_glass(&scene, depth);
+            assert_eq!(told.is_some(), is_told, "{told:?}");
+            assert!(told.is_none_or(|told| told.contains("render.depth = 3")));
+        }
     }
 
     #[test]

@@ -304,6 +304,23 @@ fn materials_textures_and_transforms_arrive() {
     );
 }
 
+/// Exporters write a texture for every use of an image. In memory there is one for each image, sampler and colour space.
+#[test]
+fn textures_that_show_the_same_image_alike_are_one() {
+    let mut glb = tetrahedra();
+    let image = glb.push_view(&png(1, 1, &[[1, 2, 3, 255]]));
+    let look = |index: usize| json!({"pbrMetallicRoughness": {"baseColorTexture": {"index": index}}});
+    let glb = glb
+        .set("/images", json!([{"bufferView": image, "mimeType": "image/png"}]))
+        .set("/samplers", json!([{"wrapS": 33071}, {"wrapS": 33648}]))
+        .set("/textures", json!([{"source": 0, "sampler": 0}, {"source": 0, "sampler": 0}, {"source": 0, "sampler": 1}, {"source": 0}]))
+        .set("/materials", json!([look(0), look(1), look(2), look(3)]));
+    let scene = load(&glb);
+    let of: Vec<u32> =
+        scene.materials.iter().filter_map(|m| m.base_color_texture.map(|t| t.texture)).collect();
+    assert_eq!((of, scene.textures.len()), (vec![0, 0, 1, 2], 3));
+}
+
 #[test]
 fn texture_transform_turns_counter_clockwise_on_the_image() {
     let quarter = TextureRef {

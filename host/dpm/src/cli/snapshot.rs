@@ -72,6 +72,9 @@ fn text(report: &SnapshotReport) -> String {
     text
 }
 
+/// From this exposure on, surfaces that are black look grey.
+const FAR_BRIGHTER: f64 = 4.0;
+
 /// What a rig file says that has the same view.
 fn view(view: &FittedView) -> String {
     let [lower, upper] = view.bounds;
@@ -82,8 +85,12 @@ fn view(view: &FittedView) -> String {
     let sides = sides.map(|side| rounded(side, longest)).join(" x ");
     let intensity = view.max_intensity;
     let (intensity, exposure) = (numbers(intensity, intensity[0]), rounded(view.exposure, view.exposure));
+    let brighter = match view.exposure > FAR_BRIGHTER {
+        true => format!("note: the scene is dark, so its pictures are {exposure} times as bright; --set render.exposure=E chooses another factor\n"),
+        false => String::new(),
+    };
     format!(
-        "note: the view was chosen to show the bodies, which fill {sides} m; --view rig takes the rig's. In a rig file:\n      \
+        "{brighter}note: the view was chosen to show the bodies, which fill {sides} m; --view rig takes the rig's. In a rig file:\n      \
          [projector]\n      position = [{position}]\n      look_at = [{look_at}]\n      \
          max_intensity = [{intensity}]\n      [observer]\n      position = [{position}]\n      \
          [render]\n      exposure = {exposure}\n",

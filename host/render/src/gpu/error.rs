@@ -66,9 +66,7 @@ pub enum GpuError {
         device: Arc<str>,
     },
     /// A limit of the device is too small.
-    #[error(
-        "{what}: {needed} is beyond this device's limit of {limit}; use a smaller scene or a smaller raster"
-    )]
+    #[error("{what}: {needed} is beyond this device's limit of {limit}; {}", smaller(what))]
     Limit {
         /// What is too large.
         what: String,
@@ -196,6 +194,15 @@ impl GpuError {
     }
 }
 
+/// What to do about a limit.
+fn smaller(what: &str) -> &'static str {
+    if what.starts_with("textures") {
+        "use smaller or fewer textures, or another device with render.gpu"
+    } else {
+        "use a smaller scene or a smaller raster"
+    }
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -220,6 +227,9 @@ mod tests {
         }
         let timeout = GpuError::Timeout { device: device.clone(), waited_ms: 100 };
         assert!(!timeout.is_loss() && timeout.to_string().contains("Some GPU"));
+        let limit = |what: &str| GpuError::Limit { what: what.into(), needed: 2, limit: 1 }.to_string();
+        assert!(limit("textures (bytes)").contains("smaller or fewer textures"));
+        assert!(limit("history (bytes)").contains("a smaller raster"));
         let given_up = GpuError::GivenUp { operation: "submitting a frame", device };
         assert!(given_up.is_loss() && given_up.to_string().contains("Some GPU"));
     }

@@ -10,7 +10,7 @@ use serde_json::{json, Value};
 use super::super::limits::Cancel;
 use super::super::{Limits, SceneError};
 use super::accessor::range_of;
-use super::json::{shorten, Item};
+use super::json::{shorten, shorten_to, Item};
 
 /// The extension of Draco, at primitives.
 pub(super) const DRACO: &str = "KHR_draco_mesh_compression";
@@ -296,7 +296,7 @@ fn bytes_of<'a>(item: &Item, buffers: &'a [Vec<u8>]) -> Result<&'a [u8], SceneEr
 
 /// What a decoder says of `item`.
 fn undecodable(item: &Item, why: impl std::fmt::Display) -> SceneError {
-    item.error(format!("cannot be decoded: {}", shorten(&why.to_string())))
+    item.error(format!("cannot be decoded: {}", shorten_to(&why.to_string(), 200)))
 }
 
 /// The type of an accessor of so many components.

@@ -245,8 +245,13 @@ impl<'a> Item<'a> {
 
 /// Text from a file, shortened to one line for a message.
 pub(crate) fn shorten(text: &str) -> String {
-    let mut out: String = text.chars().take(60).map(|c| if c.is_control() { '?' } else { c }).collect();
-    if text.chars().nth(60).is_some() {
+    shorten_to(text, 60)
+}
+
+/// The same with at most so many characters of the text.
+pub(super) fn shorten_to(text: &str, most: usize) -> String {
+    let mut out: String = text.chars().take(most).map(|c| if c.is_control() { '?' } else { c }).collect();
+    if text.chars().nth(most).is_some() {
         out.push_str("...");
     }
     out

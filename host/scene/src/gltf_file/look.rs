@@ -86,8 +86,8 @@ struct Reader<'a> {
     cancel: &'a Cancel,
     /// Decoded images.
     images: HashMap<usize, Picture>,
-    /// (glTF texture, sRGB, with heights) to index in `textures`.
-    known: HashMap<(usize, bool, bool), u32>,
+    /// (image, sampler, sRGB, with heights) to index in `textures`: textures of a file may differ in their names alone.
+    known: HashMap<(usize, Option<usize>, bool, bool), u32>,
     textures: Vec<Texture>,
     texels: u64,
 }
@@ -182,7 +182,8 @@ impl Reader<'_> {
     fn reference(&mut self, u: &Use, warnings: &mut Vec<String>) -> Result<TextureRef, SceneError> {
         let image = self.image(u, warnings)?;
         let heights = u.slot == NORMAL && self.images[&image].red_green_only;
-        let key = (u.texture, u.srgb, heights);
+        let sampler = self.document.textures().nth(u.texture).and_then(|t| t.sampler().index());
+        let key = (image, sampler, u.srgb, heights);
         let texture = match self.known.get(&key) {
             Some(&known) => known,
             None => {

@@ -148,6 +148,8 @@ fn declare(words: &[&str], elements: &mut Vec<Element>) -> Option<()> {
 struct Values<'a> {
     form: Form,
     rest: &'a [u8],
+    /// Lines of a text that hold more than their element.
+    too_long: usize,
 }
 
 impl Values<'_> {
@@ -178,6 +180,17 @@ impl Values<'_> {
             Kind::F32 => f64::from(f32::from_le_bytes([a, b, c, d])),
             Kind::F64 => f64::from_le_bytes(raw),
         })
+    }
+
+    /// Leaves out what a text has behind an element in its line: an element has a line of its own, and what is more than the header
+    /// declares is no part of the next one.
+    fn end_line(&mut self) {
+        if self.form != Form::Text {
+            return;
+        }
+        let end = self.rest.iter().position(|b| matches!(b, b'\n' | b'\r')).unwrap_or(self.rest.len());
+        self.too_long += usize::from(self.rest[..end].iter().any(|b| !b.is_ascii_whitespace()));
+        self.rest = &self.rest[end..];
     }
 
     /// One element; lists are given to `list` with the number of their property.
@@ -237,7 +250,7 @@ pub(super) fn read(
     cancel: &Cancel,
 ) -> Result<Document, SceneError> {
     let (header, rest) = read_header(bytes)?;
-    let mut values = Values { form: header.form, rest };
+    let mut values = Values { form: header.form, rest, too_long: 0 };
     let (mut part, mut document) = (Part::default(), Document::default());
     let mut corners_of_texture = 0;
     for element in header.elements.iter().filter(|element| !element.properties.is_empty()) {
@@ -253,13 +266,21 @@ pub(super) fn read(
         }
     }
     if part.triangles.is_empty() {
-        return Err(SceneError::broken(
-            "file",
-            "has no faces: a cloud of points reflects no light, make a mesh of it",
-        ));
+        let why = if part.positions.is_empty() {
+            "is empty: it has no vertices and no faces"
+        } else {
+            "has no faces: a cloud of points reflects no light, make a mesh of it"
+        };
+        return Err(SceneError::broken("file", why));
     }
     if part.normals.is_empty() {
         part.normals = smooth_normals(&part.positions, &part.triangles);
+    }
+    if values.too_long > 0 {
+        let lines = values.too_long;
+        document
+            .warnings
+            .push(format!("{lines} lines hold more than the header declares: the rest of them is ignored"));
     }
     if corners_of_texture > 0 {
         document.warnings.push("texture coordinates of faces are ignored: save them for vertices".into());
@@ -308,6 +329,7 @@ impl Reader<'_, '_> {
                 let what = format!("{} {i} of {}", self.element.name, self.element.count);
                 SceneError::broken(what, "is cut off, or holds what is no number")
             })?;
+            self.values.end_line();
             take(i, &row, &list)?;
         }
         Ok(())

@@ -124,6 +124,25 @@ fn a_ply_says_the_same_as_text_and_in_either_order_of_bytes() {
     }
 }
 
+/// As of MeshLab, which writes colours of corners without declaring them: the next element begins in the next line.
+#[test]
+fn what_a_line_of_a_ply_holds_beyond_its_element_is_ignored_and_told() {
+    let text = ply(
+        "ascii",
+        b"0 0 0 255 128 0 8 8\n1 0 0 255 128 0\n0 1 0 255 128 0  \r\n7 3 0 1 2 9 1 1 1 1 1 1 1 1 1\n9\n",
+    );
+    let scene = load_with(&text, MeshFormat::Ply, plain()).unwrap();
+    assert_eq!(corners(&scene), [Vec3::ZERO, Vec3::X, Vec3::Y]);
+    assert!(
+        scene.warnings.iter().any(|w| w.contains("2 lines hold more than the header declares")),
+        "{:?}",
+        scene.warnings
+    );
+    let usual = ply("ascii", b"0 0 0 255 128 0\n1 0 0 255 128 0\n0 1 0 255 128 0\n7 3 0 1 2\n9\n");
+    let scene = load_with(&usual, MeshFormat::Ply, plain()).unwrap();
+    assert!(!scene.warnings.iter().any(|w| w.contains("lines hold")), "{:?}", scene.warnings);
+}
+
 fn stl_binary(triangles: u32) -> Vec<u8> {
     let mut bytes = b"solid is what some binary files begin with".to_vec();
     bytes.resize(80, b' ');
@@ -212,7 +231,7 @@ fn what_is_wrong_is_named_with_its_line() {
         ("ply\nformat ascii 1.0\nelement vertex many\nend_header\n", Ply, "line 3 is no declaration"),
         ("ply\nformat ascii 1.0\nelement vertex 4000000000\nproperty float x\nproperty float y\nproperty float z\nend_header\n1 2 3", Ply, "cut off"),
         ("ply\nformat ascii 1.0\nelement vertex 1\nproperty float x\nproperty float y\nproperty float z\nend_header\n1 2 3\n", Ply, "a cloud of points"),
-        ("ply\nformat ascii 1.0\nelement none 4000000000\nend_header\n", Ply, "a cloud of points"),
+        ("ply\nformat ascii 1.0\nelement none 4000000000\nend_header\n", Ply, "is empty: it has no vertices"),
         ("solid\nvertex 0 0\n", Stl, "line 2: a vertex needs 3 numbers"),
         ("solid\nfacet\nvertex 0 0 0\nendfacet\n", Stl, "line 4: ends a facet of 1 vertices"),
         ("short", Stl, "too few for STL"),
