@@ -53,7 +53,8 @@ impl Refusal {
             Self::Absent => "is it plugged in? `dpm doctor` lists the ports that are there",
             Self::InUse => "end the program that has it; `fuser -v` on the device file names it",
             Self::Denied => {
-                "add this user to the group that owns it (`sudo usermod -aG dialout $USER`, then log in again)"
+                "run as the user that owns it or in its group, which `ls -l` shows; for most ports `sudo usermod -aG dialout USER`, \
+                 then log in again or restart the service"
             }
             Self::NotAPort => "this is no serial port; `dpm doctor` lists those that are there",
             Self::NoHardware => "no hardware is behind this port; `dpm doctor` lists the ports that are there",

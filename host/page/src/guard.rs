@@ -100,8 +100,8 @@ impl Guard {
         let told = headers.get_all(TOKEN).iter().collect::<Vec<&HeaderValue>>();
         match told.as_slice() {
             [told] if token.is(told.as_bytes()) => Ok(()),
-            [] => Err(refused(401, "no token: open the page by the link that the rig has printed")),
-            _ => Err(refused(403, "wrong token: open the page by the link that the rig has printed")),
+            [] => Err(refused(401, "no token: open the page by the link that the rig has printed, or send what its file page.token holds")),
+            _ => Err(refused(403, "wrong token: open the page by the link that the rig has printed, or send what its file page.token holds")),
         }
     }
 }

@@ -17,8 +17,8 @@ section! {
         budget_spp: Option<f64> = None, "samples/px", Within(0.125, 4096.0);
         /// Closest-hit rays per path: 1 shows emission only, 2 direct light, 3 one bounce.
         depth: u32 = 3, "", Within(1, 64);
-        /// Raster that is traced and projected instead of the projector's if only software Vulkan is available.
-        /// `--raster` sets it.
+        /// Raster that is traced and projected instead of the mock projector's if only software Vulkan is available.
+        /// `--raster` sets it. Every other projector keeps the mirrors that it has.
         software_raster: [u32; 2] = [320, 240], "px", Within(1, Raster::MAX_SIDE);
         /// Factor by which radiance is multiplied before it becomes light.
         exposure: f64 = 1.0, "", Within(1e-6, 1e6);

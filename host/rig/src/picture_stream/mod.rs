@@ -37,7 +37,8 @@ const NOTE_EVERY: Duration = Duration::from_secs(2);
 pub struct PictureStreams {
     stop: Arc<AtomicBool>,
     threads: Vec<JoinHandle<()>>,
-    pictures: Vec<Arc<LivePictures>>,
+    /// What each is called for the operator, and its pictures.
+    pictures: Vec<(String, Arc<LivePictures>)>,
 }
 
 impl PictureStreams {
@@ -59,7 +60,7 @@ impl PictureStreams {
                 stop: stop.clone(),
                 told: None,
             };
-            streams.pictures.push(live.pictures.clone());
+            streams.pictures.push((format!("{}: {source}", body.name), live.pictures.clone()));
             match Builder::new().name("dpm-pictures".into()).spawn(move || reader.run()) {
                 Ok(thread) => streams.threads.push(thread),
                 Err(e) => monitor.note(format!("{}: its pictures are not read: no thread: {e}", body.name)),
@@ -68,11 +69,17 @@ impl PictureStreams {
         streams
     }
 
+    /// One sentence for every body that has had no picture.
+    pub(crate) fn without_pictures(&self) -> impl Iterator<Item = String> + '_ {
+        let without = self.pictures.iter().filter(|(_, pictures)| pictures.number() == 0);
+        without.map(|(told, _)| format!("{told}: no picture has come, so it was black"))
+    }
+
     /// Waits until every body has its first picture, at most `limit`. Says whether they have.
     pub fn wait_for_first(&self, limit: Duration) -> bool {
         let begin = Instant::now();
         loop {
-            let all = self.pictures.iter().all(|pictures| pictures.number() > 0);
+            let all = self.pictures.iter().all(|(_, pictures)| pictures.number() > 0);
             if all || begin.elapsed() >= limit {
                 return all;
             }
@@ -136,7 +143,9 @@ impl StreamReader {
             if self.is_stopped() {
                 return Ended::Stopped;
             }
-            if silent_since.is_some_and(|since| since.elapsed() >= SILENT) {
+            // That it is black was told when the program before has ended.
+            let is_told = *shown == 0 && self.told.is_some();
+            if !is_told && silent_since.is_some_and(|since| since.elapsed() >= SILENT) {
                 silent_since = None;
                 let stays = if *shown == 0 { "it is black" } else { "the last one stays" };
                 self.note(format!("no picture has come for {} s; {stays}", SILENT.as_secs()));

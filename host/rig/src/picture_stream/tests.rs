@@ -76,6 +76,8 @@ fn a_pipe_shows_one_program_after_another() {
     let monitor = Arc::new(RunMonitor::default());
     let streams = PictureStreams::start(&rig, &monitor);
     assert!(!streams.wait_for_first(Duration::from_millis(30)));
+    let without: Vec<_> = streams.without_pictures().collect();
+    assert!(without.len() == 1 && without[0].starts_with("bunny: pipe:"), "{without:?}");
     wait_for(&rig, 0);
     let open = || File::options().write(true).open(&pipe).unwrap();
     let mut notes = vec![];
@@ -90,7 +92,7 @@ fn a_pipe_shows_one_program_after_another() {
         writer.write_all(&picture[9..]).unwrap();
         wait_for(&rig, value);
     }
-    assert!(streams.wait_for_first(Duration::ZERO));
+    assert!(streams.wait_for_first(Duration::ZERO) && streams.without_pictures().next().is_none());
     wait_for_note(&monitor, &mut notes, "pictures of 3 x 2 have begun");
     assert!(notes.iter().all(|note| note.starts_with("bunny: pipe:")), "{notes:?}");
     // The last one stays while its program is there.

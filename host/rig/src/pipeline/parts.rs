@@ -17,7 +17,7 @@ use crate::plan::link_time::LinkTime;
 use crate::render::WarmUp;
 use crate::rig::{Rig, RigError};
 use crate::telemetry::monitor::RunMonitor;
-use crate::tracks::{open_for, NoTracker, TrackingStage};
+use crate::tracks::{open_for, NoTracker, SeenBodies, TrackingStage};
 use dpm_common::clock::{MonotonicClock, Stopwatch};
 use dpm_device::link::{HostLink, LinkSettings};
 use dpm_device::time::{HostClock, HostTime};
@@ -173,6 +173,11 @@ impl CrewParts {
             self.tracking = self.tracking.with_lively(rig);
         }
         Ok(self)
+    }
+
+    /// The same, in a run that has seen the bodies of `seen` before.
+    pub(super) fn remembering(self, seen: &Arc<SeenBodies>) -> Self {
+        Self { tracking: self.tracking.remembering(seen.clone()), ..self }
     }
 
     /// Draws a frame that is never shown, if a GPU draws, and keeps what it took. Returns the samples that it had, in

@@ -23,6 +23,7 @@ use crate::light::recorder::{light_channel, LightNote, LightReceiver, LightRecor
 use crate::rig::{Rig, RigError};
 use crate::telemetry::monitor::RunMonitor;
 use crate::telemetry::projector::ProjectorReport;
+use crate::tracks::SeenBodies;
 use dpm_common::clock::{Clock, MonotonicClock, Stopwatch};
 use dpm_common::realtime::os::{standing_of, thread_id, usable_cores};
 use dpm_common::realtime::standstill::StandstillMonitor;
@@ -64,7 +65,8 @@ pub(super) fn run_at_real_pace(
     // On a machine with fewer cores than stages, a spinning thread delays the very stages that it waits for.
     let spin_ns = if usable_cores() > STAGE_THREADS { 50_000 } else { 0 };
     let clock = origin.clock().map_or_else(|| MonotonicClock::new(spin_ns), |clock| clock.spinning(spin_ns));
-    let parts = crew_parts(rig, origin, options, clock, true)?;
+    let seen = Arc::new(SeenBodies::new(rig.bodies.len()));
+    let parts = crew_parts(rig, origin, options, clock, true)?.remembering(&seen);
     let (lights_in, lights) = light_channel();
     let rights = Arc::new(Rights::new(&rig.config.real_time));
     let standstill =
@@ -97,7 +99,7 @@ pub(super) fn run_at_real_pace(
         Collector::new(rig.clone(), options.keep_frames.max(options.keep_records), options.verify)
             .about(origin.gpu().is_none(), standstill.as_ref().map(StandstillMonitor::seen));
 
-    let maker = maker(rig, origin.clone(), options, clock);
+    let maker = maker(rig, origin.clone(), options, clock, seen);
     let (threads, mut inbox, notes_back) = Threads::start(&shared, parts, line, maker, lights)?;
     // A panic before the end of this function ends the light.
     let stop_on_panic = OnExit(|| {
@@ -138,7 +140,13 @@ fn crew_parts(
 }
 
 /// Makes crews that take over. A GPU that failed is reopened with the same options.
-fn maker(rig: &Arc<Rig>, origin: Origin, options: RunOptions, clock: MonotonicClock) -> Maker {
+fn maker(
+    rig: &Arc<Rig>,
+    origin: Origin,
+    options: RunOptions,
+    clock: MonotonicClock,
+    seen: Arc<SeenBodies>,
+) -> Maker {
     let rig = rig.clone();
     let origin = Lock::new(origin);
     Arc::new(move |remake| {
@@ -146,7 +154,7 @@ fn maker(rig: &Arc<Rig>, origin: Origin, options: RunOptions, clock: MonotonicCl
         if let (Origin::Gpu(old), Remake::CrewAndGpu) = (&mut *origin, remake) {
             *old = old.reopen().map_err(RenderError::from)?;
         }
-        crew_parts(&rig, &origin, options, clock, false)
+        Ok(crew_parts(&rig, &origin, options, clock, false)?.remembering(&seen))
     })
 }
 

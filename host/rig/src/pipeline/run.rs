@@ -100,12 +100,13 @@ fn run_from(
     if matches!(origin, Origin::Pattern(..)) {
         monitor.parameters().close();
     }
-    let _streams = PictureStreams::start(&rig, monitor);
-    let ran = match rig.config.real_time.pace {
+    let streams = PictureStreams::start(&rig, monitor);
+    let mut ran = match rig.config.real_time.pace {
         // Hashing every frame costs a millisecond at full size, which only virtual pace can afford.
         Pace::Real => run_at_real_pace(&rig, origin, open, RunOptions { verify: false, ..options }, monitor),
         Pace::Virtual => run_at_virtual_pace(&rig, origin, options, monitor),
     }?;
+    ran.warnings.extend(streams.without_pictures());
     Ok(ran.into_outcome(&rig, origin))
 }
 

@@ -226,8 +226,11 @@ impl FramePlan {
                         (affine(&pose) * mesh_to_body, affine(&sampled.pose) * mesh_to_body);
                     (pose, sampled, used.position_sigma_m, dark)
                 }
-                // The body was never seen, so nothing may be lit.
-                None => (affine(&body.rest), affine(&body.rest), 0.0, Some(DarkCause::NeverSeen)),
+                // Where the body is is not known, so nothing may be lit.
+                None => {
+                    let cause = if snapshot.ever_seen[i] { DarkCause::Silent } else { DarkCause::NeverSeen };
+                    (affine(&body.rest), affine(&body.rest), 0.0, Some(cause))
+                }
             };
             self.tracked_poses.push(pose);
             self.sampled_poses.push(sampled);

@@ -1,9 +1,11 @@
 //! From the tracker's samples to the tracks of all bodies.
 
+mod seen;
 mod source;
 mod stage;
 mod tracker_frame;
 
+pub use seen::SeenBodies;
 pub(crate) use source::NoTracker;
 pub use source::{open_for, open_in_world, SourceError};
 pub use stage::{TrackSnapshot, TrackingStage};

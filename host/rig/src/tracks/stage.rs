@@ -1,5 +1,6 @@
 //! The first stage of a frame: puts newly arrived samples into the tracks of all bodies.
 
+use super::seen::SeenBodies;
 use super::tracker_frame::TrackerFrame;
 use crate::config::{PredictionConfig, TrackerConfig, MAX_TRACKED};
 use crate::rig::Rig;
@@ -7,6 +8,7 @@ use dpm_device::time::HostTime;
 use dpm_device::tracker::{BodyIndex, Tracker, TrackerError};
 use dpm_handoff::latest::Publisher;
 use dpm_tracking::{PoseFilterBank, TrackState};
+use std::sync::Arc;
 
 /// The tracking stage's result, for the latest-wins slot.
 #[derive(Clone, Debug)]
@@ -15,6 +17,8 @@ pub struct TrackSnapshot {
     pub through: HostTime,
     /// Per body: its track, and when the newest sample arrived.
     pub tracks: Vec<Option<(TrackState, HostTime)>>,
+    /// Per body: it was reported at some time of the run, maybe before the stages were restarted.
+    pub ever_seen: Vec<bool>,
     /// Time from the tracker's mid-exposure to the arrival of a sample, the longest among the last samples,
     /// nanoseconds.
     pub latency_ns: i64,
@@ -23,7 +27,13 @@ pub struct TrackSnapshot {
 impl TrackSnapshot {
     /// A snapshot in which nothing is known of `bodies` bodies.
     pub fn empty(bodies: usize) -> Self {
-        Self { through: HostTime(i64::MIN), tracks: vec![None; bodies.min(MAX_TRACKED)], latency_ns: 0 }
+        let bodies = bodies.min(MAX_TRACKED);
+        Self {
+            through: HostTime(i64::MIN),
+            tracks: vec![None; bodies],
+            ever_seen: vec![false; bodies],
+            latency_ns: 0,
+        }
     }
 }
 
@@ -35,6 +45,7 @@ pub struct TrackingStage {
     lively: Option<PoseFilterBank>,
     received_at: Vec<HostTime>,
     bodies: usize,
+    seen: Arc<SeenBodies>,
     /// From the tracker's coordinates to the world's; `None` if they are the same.
     frame: Option<TrackerFrame>,
     /// The longest latency of the last samples; it decays by 1/1024 per sample.
@@ -98,11 +109,17 @@ impl TrackingStage {
             lively: None,
             received_at: vec![HostTime(0); bodies],
             bodies,
+            seen: Arc::new(SeenBodies::new(bodies)),
             frame: TrackerFrame::of(&rig.config.tracker, rig.latency_ns),
             latency_ns: 0,
             began_at: None,
             looked: false,
         }
+    }
+
+    /// The same, in a run that has seen the bodies of `seen` before.
+    pub(crate) fn remembering(self, seen: Arc<SeenBodies>) -> Self {
+        Self { seen, ..self }
     }
 
     /// The same with filters that follow faster, for [`TrackingStage::publish_lively`].
@@ -157,6 +174,12 @@ impl TrackingStage {
             snapshot.latency_ns = latency_ns;
             for (i, (track, at)) in snapshot.tracks.iter_mut().zip(received_at).enumerate() {
                 *track = bank.state(BodyIndex(i as u16)).map(|s| (s, *at));
+                if track.is_some() {
+                    self.seen.mark(i);
+                }
+            }
+            for (i, ever) in snapshot.ever_seen.iter_mut().enumerate() {
+                *ever = self.seen.has(i);
             }
         });
     }
@@ -174,7 +197,7 @@ impl TrackingStage {
     }
 
     fn is_unseen(&self, body: usize) -> bool {
-        self.bank.state(BodyIndex(body as u16)).is_none()
+        !self.seen.has(body)
     }
 
     /// True once per run: one second after the first step, if some body has not been seen by then. Allocates nothing.
@@ -252,6 +275,30 @@ mod tests {
         fn status(&self) -> String {
             format!("speaks of {}", self.of)
         }
+    }
+
+    /// The stages were restarted while the tracker was silent: what was seen before is not told as never seen.
+    #[test]
+    fn a_stage_that_takes_over_remembers_what_was_seen() {
+        let config = RigConfig::demo(&Overrides::default()).unwrap_or_else(|e| panic!("{e}"));
+        let rig = Rig::build(&config, Raster::new(16, 16)).unwrap_or_else(|e| panic!("{e}"));
+        let seen = Arc::new(SeenBodies::new(2));
+        let (mut publisher, mut reader) = latest(TrackSnapshot::empty(2));
+        let mut run = |of: u16| {
+            let mut stage = TrackingStage::new(&rig, Box::new(Speaks { of })).remembering(seen.clone());
+            for step in 0..3 {
+                stage.step(HostTime(7_000_000_000 + step * 10_000_000), &mut publisher).expect("it speaks");
+            }
+            let snapshot = reader.latest().0.clone();
+            let tracked: Vec<bool> = snapshot.tracks.iter().map(Option::is_some).collect();
+            (tracked, snapshot.ever_seen, stage.never_seen(&rig))
+        };
+        let (tracked, ever, told) = run(1);
+        assert_eq!((tracked, ever), (vec![true, false], vec![true, false]));
+        assert!(told.is_some_and(|told| told.contains("venus") && !told.contains("bunny")));
+        let (tracked, ever, _) = run(0);
+        assert_eq!((tracked, ever), (vec![false, false], vec![true, false]));
+        assert!(run(2).2.is_none());
     }
 
     #[test]

@@ -29,6 +29,7 @@ use crate::rig::Rig;
 use crate::telemetry::monitor::RunMonitor;
 use crate::telemetry::projector::ProjectorReport;
 use crate::telemetry::report::Report;
+use crate::tracks::SeenBodies;
 use crew::Crew;
 use dpm_device::link::HostLink;
 use dpm_device::time::{DeviceTicks, HostTime};
@@ -193,6 +194,8 @@ struct Running {
     crew: Option<Crew>,
     /// A new crew is being made: when it is ready, and what comes of it.
     making: Option<(HostTime, Result<i64, GpuError>)>,
+    /// The bodies that any crew has seen.
+    seen: Arc<SeenBodies>,
     line: Line,
     mind: Supervision,
     supervised_at: HostTime,
@@ -378,7 +381,8 @@ impl Running {
         let stage = LinkStage::new(facts.clone(), link, keeper, lead);
         let mut line = Line::new(stage, done_in, now);
         let tracker = run.machine.opens_tracker(now);
-        let parts = CrewParts::stepped(&rig, tracker, options.in_flight, frame_ns);
+        let seen = Arc::new(SeenBodies::new(rig.bodies.len()));
+        let parts = CrewParts::stepped(&rig, tracker, options.in_flight, frame_ns).remembering(&seen);
         let crew = Crew::new(&facts, parts, time, &mut line, now);
         Self {
             mind: Supervision::new(facts.clone(), |_| None),
@@ -395,6 +399,7 @@ impl Running {
             time,
             crew: Some(crew),
             making: None,
+            seen,
             line,
         }
     }
@@ -485,7 +490,8 @@ impl Running {
             Some((_, Ok(frame_ns))) => {
                 let tracker = machine.opens_tracker(now);
                 let parts =
-                    CrewParts::stepped(&self.facts.rig, tracker, self.facts.options.in_flight, frame_ns);
+                    CrewParts::stepped(&self.facts.rig, tracker, self.facts.options.in_flight, frame_ns)
+                        .remembering(&self.seen);
                 self.crew = Some(Crew::new(&self.facts, parts, self.time, &mut self.line, now));
                 self.facts.monitor.note("the stages are running again; the picture is back".into());
             }
