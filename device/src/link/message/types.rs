@@ -26,6 +26,9 @@ pub mod faults {
     pub const FLASH_LIMIT: u32 = 1 << 6;
     /// A limit on the amount of light was reached.
     pub const LIGHT_LIMIT: u32 = 1 << 7;
+    /// Those that say something about a host or a cable alone. Light may come back after them without the operator; heat, lamp,
+    /// emergency stop and flashes have to be acknowledged.
+    pub const PASSING: u32 = WATCHDOG | CHECKSUM_STORM;
 
     /// Names of the faults in `mask`, for messages: `"watchdog, lamp"`; `"none"` when empty.
     #[cfg(feature = "std")]

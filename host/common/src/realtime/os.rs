@@ -36,11 +36,23 @@ pub fn set_fifo_priority(priority: u32) -> Result<(), Refusal> {
     }
     Err(refusal(
         format!("SCHED_FIFO priority {wanted}"),
-        format!(
-            "put \"{} - rtprio {wanted}\" into {LIMITS_FILE} and log in again, or set LimitRTPRIO={wanted} in dpm.service",
-            user()
-        ),
+        priority_remedy(wanted, std::path::Path::new(LIMITS_FILE).exists()),
     ))
+}
+
+/// What to do for a priority that is refused. `is_installed`: the file of limits is there, with its line for a group.
+#[cfg(target_os = "linux")]
+fn priority_remedy(wanted: u32, is_installed: bool) -> String {
+    if is_installed {
+        return format!(
+            "add this user to a group that {LIMITS_FILE} names (`sudo usermod -aG dpm USER`) and log in again, or set \
+             LimitRTPRIO={wanted} in dpm.service"
+        );
+    }
+    format!(
+        "put \"{} - rtprio {wanted}\" into {LIMITS_FILE} and log in again, or set LimitRTPRIO={wanted} in dpm.service",
+        user()
+    )
 }
 
 /// The SCHED_FIFO or SCHED_RR priority of the calling thread; 0 under the normal scheduler.
@@ -343,6 +355,16 @@ pub use elsewhere::*;
 #[cfg(all(test, target_os = "linux"))]
 mod tests {
     use super::*;
+
+    /// A file of limits that is there names a group already, so it is the user that is missing.
+    #[cfg(target_os = "linux")]
+    #[test]
+    fn a_priority_is_had_by_the_file_of_limits_or_by_its_group() {
+        let (without, with) = (priority_remedy(50, false), priority_remedy(50, true));
+        assert!(without.contains(" - rtprio 50") && !without.contains("usermod"), "{without}");
+        assert!(with.contains("usermod -aG dpm USER") && !with.contains(" - rtprio"), "{with}");
+        assert!([with, without].iter().all(|told| told.contains("LimitRTPRIO=50 in dpm.service")));
+    }
 
     /// Runs `f` on a thread of its own, because rights stay with the thread.
     fn apart<R: Send + 'static>(f: impl FnOnce() -> R + Send + 'static) -> R {

@@ -35,9 +35,8 @@ pub enum ConnectError {
     Stopped,
 }
 
-/// Latched faults that say something about an earlier host or cable. Starting a run acknowledges them. Heat, lamp,
-/// emergency stop and flashes require the operator's acknowledgement, and SAFE requires `dpm arm`.
-pub const ENDED_WITH_THE_LAST_RUN: u32 = faults::WATCHDOG | faults::CHECKSUM_STORM;
+/// Latched faults that starting a run acknowledges.
+pub const ENDED_WITH_THE_LAST_RUN: u32 = faults::PASSING;
 
 /// Brings a link up, step by step: connects, learns the projector's clock, and arms.
 ///

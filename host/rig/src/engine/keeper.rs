@@ -22,8 +22,6 @@ use dpm_device::transport::Transport;
 use dpm_handoff::channel::Sender;
 use dpm_handoff::latest::Publisher;
 
-/// Faults after which light comes back without the operator.
-const PASSING: u32 = faults::WATCHDOG | faults::CHECKSUM_STORM;
 /// The shortest time between two such returns. A projector that keeps faulting stays mostly dark.
 const REARM_NS: i64 = 1_000_000_000;
 /// A correction of the map beyond this is a step of one of the clocks (a machine that was suspended), nanoseconds.
@@ -262,7 +260,7 @@ impl LinkKeeper {
             LinkState::Faulted => {
                 let latched = link.status().map_or(0, |s| s.faults);
                 let rested = self.rearmed_at.0 == i64::MIN || now.ns_since(self.rearmed_at) >= REARM_NS;
-                if latched != 0 && latched & !PASSING == 0 && rested {
+                if latched != 0 && latched & !faults::PASSING == 0 && rested {
                     self.rearmed_at = now;
                     self.rearmed += 1;
                     link.arm(latched);
@@ -350,7 +348,7 @@ fn ordered_dark(
         Some(OrderedDark::Rest)
     } else if link.state() == LinkState::Faulted && latched & faults::HOST_SAFE != 0 {
         Some(OrderedDark::Safe)
-    } else if link.state() == LinkState::Faulted && latched & !PASSING != 0 {
+    } else if link.state() == LinkState::Faulted && latched & !faults::PASSING != 0 {
         Some(OrderedDark::Fault)
     } else {
         None

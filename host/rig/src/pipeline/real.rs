@@ -68,7 +68,7 @@ pub(super) fn run_at_real_pace(
     let seen = Arc::new(SeenBodies::new(rig.bodies.len()));
     let parts = crew_parts(rig, origin, options, clock, true)?.remembering(&seen);
     let (lights_in, lights) = light_channel();
-    let rights = Arc::new(Rights::new(&rig.config.real_time));
+    let rights = Arc::new(Rights::new(&rig.config.real_time, monitor));
     let standstill =
         StandstillMonitor::start(Arc::new(clock.sleeping()), STANDSTILL_NS, rights.highest_priority()).ok();
     let watch = Stopwatch::start();

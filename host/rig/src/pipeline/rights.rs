@@ -1,8 +1,10 @@
 //! What each stage requests from the operating system: granted rights, and one warning per refusal.
 
 use crate::config::RealTimeConfig;
+use crate::telemetry::monitor::RunMonitor;
 use dpm_common::realtime::{enter_frame_path, os, Refusal, ThreadRights};
 use dpm_handoff::path::Lock;
+use std::sync::Arc;
 
 /// The mock projector's index in the list of cores, after the stages.
 const PROJECTOR: usize = 4;
@@ -13,17 +15,22 @@ pub(super) struct Rights {
     cores: Vec<u32>,
     locked: bool,
     refusals: Lock<Vec<Refusal>>,
+    /// Tells the operator of a refusal at once: a service may run for weeks before its report is written.
+    monitor: Arc<RunMonitor>,
 }
 
 impl Rights {
     /// Reads `[real_time]` and locks memory if it says so.
-    pub(super) fn new(config: &RealTimeConfig) -> Self {
+    pub(super) fn new(config: &RealTimeConfig, monitor: &Arc<RunMonitor>) -> Self {
         let mut refusals = Vec::new();
         let mut locked = false;
         if config.lock_memory {
             match os::lock_memory() {
                 Ok(()) => locked = true,
-                Err(refusal) => refusals.push(refusal),
+                Err(refusal) => {
+                    monitor.note(refusal.to_string());
+                    refusals.push(refusal);
+                }
             }
         }
         Self {
@@ -31,6 +38,7 @@ impl Rights {
             cores: config.affinity.clone(),
             locked,
             refusals: Lock::new(refusals),
+            monitor: monitor.clone(),
         }
     }
 
@@ -42,6 +50,7 @@ impl Rights {
         if let Ok(mut refusals) = self.refusals.lock() {
             for refusal in granted.refusals {
                 if !refusals.contains(&refusal) {
+                    self.monitor.note(refusal.to_string());
                     refusals.push(refusal);
                 }
             }
@@ -91,7 +100,8 @@ mod tests {
     #[test]
     fn a_right_refused_to_every_stage_is_one_warning() {
         let config = RealTimeConfig { priority: 0, affinity: vec![1023; 3], ..RealTimeConfig::default() };
-        let rights = Rights::new(&config);
+        let monitor = Arc::new(RunMonitor::default());
+        let rights = Rights::new(&config, &monitor);
         std::thread::scope(|scope| {
             for stage in 0..3 {
                 let rights = &rights;
@@ -101,5 +111,6 @@ mod tests {
         let warnings = rights.warnings();
         assert_eq!(warnings.len(), 1, "{warnings:?}");
         assert!(warnings[0].contains("core 1023"));
+        assert_eq!(monitor.take_notes(), warnings, "the operator hears of it at once");
     }
 }

@@ -112,14 +112,26 @@ impl ProjectorHealth {
     }
 }
 
+/// What brings light back after latched faults.
+const fn remedy(mask: u32) -> &'static str {
+    if mask & !faults::PASSING != 0 {
+        "`dpm arm` acknowledges them"
+    } else if mask & faults::WATCHDOG != 0 {
+        "no frame came in safety.watchdog_ms; light comes back by itself"
+    } else {
+        "packets were damaged; light comes back by itself"
+    }
+}
+
 impl fmt::Display for ProjectorHealth {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         match self {
             Self::Connecting => write!(f, "connecting"),
             Self::Up => write!(f, "up"),
             Self::Lost => write!(f, "lost, dark; plug it in again and the run goes on"),
+            Self::Faulted(0) => write!(f, "dark, and it names no fault"),
             Self::Faulted(mask) => {
-                write!(f, "dark, latched faults: {}; `dpm arm` acknowledges them", faults::names(*mask))
+                write!(f, "dark, latched faults: {}; {}", faults::names(*mask), remedy(*mask))
             }
             Self::Black => write!(f, "black; `dpm arm` shows the picture again"),
             Self::Frozen => write!(f, "frozen; `dpm arm` lets the picture move again"),
@@ -427,6 +439,21 @@ impl RunMonitor {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    /// What comes back by itself needs no order, and what needs one is told so.
+    #[test]
+    fn a_fault_says_what_brings_light_back() {
+        for (mask, part) in [
+            (0, "names no fault"),
+            (faults::WATCHDOG, "watchdog; no frame came in safety.watchdog_ms; light comes back by itself"),
+            (faults::CHECKSUM_STORM, "packets were damaged; light comes back by itself"),
+            (faults::WATCHDOG | faults::LAMP, "watchdog, lamp; `dpm arm` acknowledges them"),
+            (faults::HOST_SAFE, "`dpm arm`"),
+        ] {
+            let told = ProjectorHealth::Faulted(mask).to_string();
+            assert!(told.starts_with("dark, ") && told.contains(part), "{told}");
+        }
+    }
 
     #[test]
     fn an_order_is_taken_once_the_newest_wins_and_nothing_but_arm_takes_safe_back() {
