@@ -59,6 +59,7 @@ impl PictureStreams {
                 monitor: monitor.clone(),
                 stop: stop.clone(),
                 told: None,
+                waiting: None,
             };
             streams.pictures.push((format!("{}: {source}", body.name), live.pictures.clone()));
             match Builder::new().name("dpm-pictures".into()).spawn(move || reader.run()) {
@@ -107,6 +108,8 @@ struct StreamReader {
     stop: Arc<AtomicBool>,
     /// The last note, and when.
     told: Option<(String, Instant)>,
+    /// The next one, which came too soon after it.
+    waiting: Option<String>,
 }
 
 impl StreamReader {
@@ -144,7 +147,8 @@ impl StreamReader {
                 return Ended::Stopped;
             }
             // That it is black was told when the program before has ended.
-            let is_told = *shown == 0 && self.told.is_some();
+            let is_told = *shown == 0 && (self.told.is_some() || self.waiting.is_some());
+            self.tell_waiting();
             if !is_told && silent_since.is_some_and(|since| since.elapsed() >= SILENT) {
                 silent_since = None;
                 let stays = if *shown == 0 { "it is black" } else { "the last one stays" };
@@ -182,23 +186,27 @@ impl StreamReader {
         self.stop.load(Ordering::Relaxed)
     }
 
-    fn rest(&self, for_: Duration) {
+    fn rest(&mut self, for_: Duration) {
         let begin = Instant::now();
         while begin.elapsed() < for_ && !self.is_stopped() {
+            self.tell_waiting();
             sleep(STEP.min(for_));
         }
     }
 
-    /// Tells the operator, but not the same again and again.
+    /// Tells the operator: not the same again and again, and of what changes quickly the last.
     fn note(&mut self, text: String) {
-        let now = Instant::now();
-        if let Some((last, at)) = &self.told {
-            if *last == text || now.duration_since(*at) < NOTE_EVERY && !text.starts_with("pictures") {
-                return;
-            }
+        self.waiting = Some(text);
+        self.tell_waiting();
+    }
+
+    fn tell_waiting(&mut self) {
+        let is_soon = self.told.as_ref().is_some_and(|(_, at)| at.elapsed() < NOTE_EVERY);
+        let Some(text) = self.waiting.take_if(|_| !is_soon) else { return };
+        if self.told.as_ref().is_none_or(|(last, _)| *last != text) {
+            self.monitor.note(format!("{}: {}: {text}", self.body, self.source));
+            self.told = Some((text, Instant::now()));
         }
-        self.monitor.note(format!("{}: {}: {text}", self.body, self.source));
-        self.told = Some((text, now));
     }
 }
 

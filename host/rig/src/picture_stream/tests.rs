@@ -114,6 +114,26 @@ fn a_pipe_shows_one_program_after_another() {
     assert!(begin.elapsed() < Duration::from_secs(2), "the threads end soon");
 }
 
+/// A program that sends one picture and ends at once: in the end the operator knows that the body is black.
+#[test]
+fn the_last_of_quick_changes_is_told() {
+    let folder = Folder::new("quick");
+    let pipe = folder.pipe("pictures");
+    let rig = rig_of(&format!("pipe:{}", pipe.display()));
+    let monitor = Arc::new(RunMonitor::default());
+    let _streams = PictureStreams::start(&rig, &monitor);
+    let mut notes = vec![];
+    let mut writer = File::options().write(true).open(&pipe).unwrap();
+    writer.write_all(&even(9)).unwrap();
+    wait_for_note(&monitor, &mut notes, "have begun");
+    drop(writer);
+    wait_for_note(&monitor, &mut notes, "has closed the pipe; it is black until pictures come again");
+    // Nothing else is said while nothing changes.
+    sleep(SILENT + NOTE_EVERY);
+    notes.extend(monitor.take_notes());
+    assert_eq!(notes.len(), 2, "{notes:?}");
+}
+
 /// What cannot be opened is told once, and tried again.
 #[test]
 fn a_pipe_that_is_made_later_is_found() {
