@@ -193,8 +193,8 @@ fn the_package_holds_what_its_parts_name() {
     }
     assert!(packaged("debian/postinst").contains("systemd-sysusers dpm.conf"));
     let unit = unit();
-    assert_eq!(value(&unit, "Unit", "Documentation"), "file:/usr/share/doc/dpm/README.md");
-    assert!(make.contains("for page in README.md") && make.contains("usr/share/doc/dpm; done"));
+    assert_eq!(value(&unit, "Unit", "Documentation"), "file:/usr/share/doc/dpm/README.Debian");
+    assert!(make.contains("place packaging/debian/README.Debian 644 usr/share/doc/dpm\n"));
     // A purge takes the rig file that the unit runs, and the folder of its state.
     let rig = value(&unit, "Service", "ExecStart").split(' ').next_back().expect("a rig file").to_owned();
     let purge = packaged("debian/postrm");
