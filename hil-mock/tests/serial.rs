@@ -250,9 +250,13 @@ fn a_device_without_echo_is_heard_after_a_moment() {
     let mut tracker = tracker(&path, &clock);
     let mut samples = Vec::new();
     let started = clock.now();
-    for sequence in 0..60 {
+    // The moment is a time, so on a busy machine it may take any share of a fixed number of packets.
+    for sequence in 0..300 {
         ours.write_all(&pose(sequence)).unwrap();
         samples.extend(run(&mut tracker, &clock, 10));
+        if samples.len() >= 10 {
+            break;
+        }
     }
     let first = samples.first().expect("heard").received_at.ns_since(started);
     assert!((300 * MS..1_000 * MS).contains(&first), "{first}");
