@@ -161,8 +161,11 @@ fn a_rig_shows_what_another_program_writes_into_a_pipe() {
         let pictures = &rig.scene.live[0].pictures;
         assert!(pictures.number() > 2, "{} pictures", pictures.number());
         assert_eq!(pictures.newest(), picture(1));
-        let light = outcome.light.last().expect("the last frames of light are kept");
-        let record = outcome.recent.last().unwrap();
+        // The newest light of which the poses are known: on a busy machine not every frame is lit.
+        let drawn = |frame: u32| outcome.recent.iter().find(|record| record.id.0 as u32 == frame);
+        let mut newest = outcome.light.iter().rev();
+        let (light, record) =
+            newest.find_map(|light| Some((light, drawn(light.frame)?))).expect("a lit frame with its record");
         let mut bodies = dpm_lab::sequence::Placed::default();
         rig.scene_poses(&record.tracked_poses, record.drawn_for.0, &mut bodies.poses);
         let fell: Vec<u32> = light.codes.iter().map(|c| u32::from_le_bytes([c[0], c[1], c[2], 0])).collect();
