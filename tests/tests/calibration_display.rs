@@ -320,7 +320,7 @@ fn by_ruler(
 
 /// Sweeps of 42 s in which nothing changed, with up to a fifth of the frames lost: none may be refused.
 #[test]
-#[ignore = "five minutes: its figures are in docs/lab/CALIBRATION.md"]
+#[ignore = "eight minutes: its figures are in docs/lab/CALIBRATION.md"]
 fn of_sweeps_in_which_nothing_changed_none_is_refused() {
     let mut shares: Vec<f64> = (1..=300u64)
         .map(|seed| {
