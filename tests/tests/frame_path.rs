@@ -71,7 +71,7 @@ fn the_steady_state_allocates_nothing() {
                 pictures.show(&picture);
                 std::thread::sleep(Duration::from_millis(20));
             }
-            pictures.number()
+            pictures.count()
         });
         rig_allocates_nothing(gpu, &rig, "live pictures");
         is_over.store(true, Ordering::Relaxed);

@@ -159,7 +159,7 @@ fn a_rig_shows_what_another_program_writes_into_a_pipe() {
         let notes = monitor.take_notes();
         assert!(notes.iter().any(|note| note.contains("pictures of 8 x 8 have begun")), "{notes:?}");
         let pictures = &rig.scene.live[0].pictures;
-        assert!(pictures.number() > 2, "{} pictures", pictures.number());
+        assert!(pictures.count() > 2, "{} pictures", pictures.count());
         assert_eq!(pictures.newest(), picture(1));
         // The newest light of which the poses are known: on a busy machine not every frame is lit.
         let drawn = |frame: u32| outcome.recent.iter().find(|record| record.id.0 as u32 == frame);

@@ -110,3 +110,68 @@ fn what_cannot_be_shown_is_told() {
         assert!(err(&output).contains(told), "{}", err(&output));
     }
 }
+
+/// A snapshot keeps the first picture of another program; without one the body is black, which is told.
+#[test]
+fn a_picture_of_another_program_is_waited_for_and_kept() {
+    let folder = Folder::new("snapshot-live");
+    let pipe = Path::new(folder.text()).join("pictures");
+    assert!(std::process::Command::new("mkfifo").arg(&pipe).status().expect("mkfifo").success());
+    let bodies = format!(
+        "scene.bodies=[{{ name = \"bunny\", texture = \"pipe:{}\", texture_size = [2, 2], motion = {{ kind = \"still\" }} }}, \
+         {{ name = \"venus\", motion = {{ kind = \"still\" }} }}]",
+        pipe.display()
+    );
+    let args = ["--set", &bodies, "--set", "render.exposure=2"];
+    let shown = |report: &serde_json::Value| -> (f32, String) {
+        let pixels = radiance(&Path::new(folder.text()).join("radiance.pfm"));
+        (pixels.iter().sum(), report["warnings"].to_string())
+    };
+    let (black, told) = shown(&snapshot(&folder, &args));
+    assert!(told.contains("not every picture of another program has come within 3 s"), "{told}");
+    let writer = std::thread::spawn({
+        let pipe = pipe.clone();
+        move || {
+            let mut pipe = std::fs::File::options().write(true).open(pipe).expect("the pipe");
+            std::io::Write::write_all(&mut pipe, b"P6 2 2 255 aaaabbbbcccc").expect("a reader");
+            // It is closed when the snapshot has been made.
+            std::thread::sleep(std::time::Duration::from_secs(2));
+        }
+    });
+    let (red, told) = shown(&snapshot(&folder, &args));
+    writer.join().expect("it wrote");
+    assert!(told.contains("pictures of 2 x 2 have begun") && !told.contains("not every picture"), "{told}");
+    assert!(red > 1.1 * black, "{red} of light, and {black} without a picture");
+}
+
+/// A scene that is too dark is shown brighter, and how much is told.
+#[test]
+fn a_far_greater_exposure_is_told() {
+    let folder = Folder::new("snapshot-dark");
+    let file = folder.write("thing.obj", &cuboid([0.0; 3], [1.0; 3]));
+    let told = |radiance: &str| {
+        let light = format!(
+            "scene.environment={{ kind = \"constant\", radiance = [{radiance}, {radiance}, {radiance}] }}"
+        );
+        let output = dpm(
+            &[
+                "snapshot",
+                &file,
+                "--raster",
+                "64x48",
+                "--frame",
+                "1",
+                "--out",
+                folder.text(),
+                "--set",
+                &light,
+            ],
+            &[],
+        );
+        assert_eq!(code(&output), 0, "{}", err(&output));
+        out(&output)
+    };
+    let (dark, usual) = (told("0.01"), told("0.7"));
+    assert!(dark.contains("the scene is dark, so its pictures are "), "{dark}");
+    assert!(!usual.contains("the scene is dark"), "{usual}");
+}

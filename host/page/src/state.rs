@@ -3,12 +3,10 @@
 use crate::shared::Shared;
 use dpm_device::link::faults;
 use dpm_rig::control::rig_name;
-use dpm_rig::plan::dark::DarkCause;
 use dpm_rig::telemetry::histogram_steps::UPPER_NS;
 use dpm_rig::telemetry::live::LiveSnapshot;
 use dpm_rig::telemetry::monitor::{ProjectorHealth, RunCounts};
 use dpm_rig::telemetry::projector::ProjectorReport;
-use dpm_scene::LiveTexture;
 use serde_json::{json, Value};
 use std::sync::Arc;
 
@@ -61,7 +59,6 @@ impl State {
     pub(crate) fn of(shared: &Shared) -> Self {
         let monitor = &shared.monitor;
         let health = monitor.projector();
-        let figures = monitor.live().snapshot();
         let now = Now {
             pid: std::process::id(),
             up_s: (shared.began.elapsed().as_secs_f64() * 1e3).round() / 1e3,
@@ -74,20 +71,14 @@ impl State {
             is_light: matches!(health, ProjectorHealth::Up | ProjectorHealth::Frozen),
             standing: shared.orders.kept().map(|order| order.word()),
             interlock: monitor.interlock().map(|i| (i.what().to_owned(), i.is_closed())),
-            tracker: monitor
-                .tracker()
-                .filter(|told| names_unseen(told, figures.as_deref()))
-                .map(str::to_owned),
+            tracker: monitor.tracker().map(str::to_owned),
             is_stopping: monitor.stop_requested(),
             counts: monitor.counts(),
             viewers: shared.viewers(),
         };
+        let figures = monitor.live().snapshot();
         let pictures = monitor.live().rig().map_or(Vec::new(), |rig| {
-            let of = |live: &LiveTexture| {
-                let body = rig.bodies.get(usize::from(live.tracked)).map_or("", |body| &body.name);
-                (body.to_owned(), live.pictures.number())
-            };
-            rig.scene.live.iter().map(of).collect()
+            rig.live_pictures().map(|(body, _, pictures)| (body.to_owned(), pictures.count())).collect()
         });
         Self { now, health, figures, carried: monitor.carried(), pictures, setup: setup(shared) }
     }
@@ -117,13 +108,6 @@ fn setup(shared: &Shared) -> Value {
         all["seconds"] = json!(config.run.seconds);
     }
     all
-}
-
-/// Whether what the tracker said at the start, which names bodies that it had not seen, still holds for all of them.
-fn names_unseen(told: &str, figures: Option<&LiveSnapshot>) -> bool {
-    let bodies = figures.map_or(&[][..], |figures| &figures.bodies);
-    let mut named = bodies.iter().filter(|body| told.contains(&format!("{:?}", body.name)));
-    named.all(|body| body.dark == Some(DarkCause::NeverSeen))
 }
 
 fn told_of(f: &LiveSnapshot) -> Value {

@@ -142,3 +142,26 @@ fn histograms(told: &Values, profiler: &dpm_rig::telemetry::profile::Profiler) {
         }
     }
 }
+
+/// Black is no picture of the other program, and a body that never had one is told of in the report.
+#[test]
+fn pictures_of_other_programs_are_counted() {
+    let bodies = "scene.bodies=[{ name = \"bunny\", texture = \"pipe:/nowhere/a\", texture_size = [1, 1] }, \
+                  { name = \"venus\", texture = \"pipe:/nowhere/b\" }]";
+    let mut rig =
+        Running::with("pictures", &["real_time.pace=\"real\"", "projector.frame_rate=\"100/1\"", bodies]);
+    let count = |name: &str| {
+        parse(&rig.ask("GET", "/metrics", &[]).body)[&format!("dpm_live_pictures_total{{body=\"{name}\"}}")]
+    };
+    assert_eq!(count("bunny"), 0.0);
+    let live = rig.monitor.live().rig().expect("it runs").clone();
+    let (_, _, pictures) = live.live_pictures().next().expect("the bunny's");
+    for _ in 0..3 {
+        pictures.show(&[[1, 2, 3, 255]]);
+    }
+    pictures.show_black();
+    assert_eq!((count("bunny"), count("venus")), (3.0, 0.0));
+    let warnings = rig.end_run().report.warnings;
+    let told: Vec<&String> = warnings.iter().filter(|told| told.contains("no picture has come")).collect();
+    assert!(told.len() == 1 && told[0].starts_with("venus: pipe:/nowhere/b"), "{warnings:?}");
+}

@@ -2,8 +2,8 @@
 
 use crate::calibrated::{calibrated_camera, measured, measured_camera, told_of_measured, CameraFileError};
 use crate::config::{
-    BodyConfig, BuiltinScene, EnvironmentConfig, FileAxis, GazeConfig, PictureSource, ProjectorBackend,
-    RigConfig, Tracing, TrackerConfig, TracksUse,
+    BodyConfig, BuiltinScene, EnvironmentConfig, FileAxis, GazeConfig, LiveSource, PictureSource,
+    ProjectorBackend, RigConfig, Tracing, TrackerConfig, TracksUse,
 };
 use crate::drive::{albedo_of, drive, DriveError, MAX_PICTURE_BYTES};
 use crate::mock::{Motion, MotionError, MotionSpec};
@@ -274,6 +274,15 @@ impl Rig {
         }
     }
 
+    /// The bodies that show what another program makes: their names, where it comes from, and the pictures.
+    pub fn live_pictures(&self) -> impl Iterator<Item = (&str, &LiveSource, &Arc<LivePictures>)> {
+        self.scene.live.iter().filter_map(|live| {
+            let body = self.config.scene.bodies.get(usize::from(live.tracked))?;
+            let Some(PictureSource::Live(source)) = &body.texture else { return None };
+            Some((body.name.as_str(), source, &live.pictures))
+        })
+    }
+
     /// The true world-from-mesh transform of every tracked body at an instant; `None` unless the tracker is the mock.
     pub fn true_poses(&self, t_ns: i64) -> Option<Vec<DAffine3>> {
         self.bodies.iter().map(|b| b.motion.as_ref().map(|m| affine(&m.pose_at(t_ns)))).collect()
@@ -365,7 +374,7 @@ fn show_pictures(config: &RigConfig, scene: &mut Scene) -> Result<(), RigError> 
                 let bytes = regular_file::read(file, MAX_PICTURE_BYTES).map_err(|e| wrong(e.to_string()))?;
                 scene.show_picture(index as u16, bytes, &limits)
             }
-            PictureSource::Pipe(_) | PictureSource::PipeWire(_) => {
+            PictureSource::Live(_) => {
                 scene.show_live(index as u16, Arc::new(LivePictures::new(body.texture_size)), &limits)
             }
         };
@@ -537,12 +546,30 @@ mod tests {
     /// Paths that end inside a solid of glass leave it dark, which is told; those of a thin pane leave it at once.
     #[test]
     fn glass_that_is_too_deep_for_its_paths_is_told() {
-        for (thin_walled, depth, is_told) in [(false, 3, true), (false, 6, false), (true, 1, false)] {
-            let scene = dpm_scene::shapes::clear_slab(1.5, 0.0, thin_walled);
-            let told = dark_glass(&scene, depth);
-            assert_eq!(told.is_some(), is_told, "{told:?}");
-            assert!(told.is_none_or(|told| told.contains("render.depth = 3")));
-        }
+        let file = std::env::temp_dir().join(format!("dpm-glass-{}.gltf", std::process::id()));
+        let told = |extensions: &str, depth: u32| {
+            let text = r#"{"asset":{"version":"2.0"},"scene":0,"scenes":[{"nodes":[0]}],"nodes":[{"mesh":0,"name":"pane"}],
+                "meshes":[{"primitives":[{"attributes":{"POSITION":0},"material":0}]}],
+                "buffers":[{"byteLength":36,"uri":"data:application/octet-stream;base64,AAAAAAAAAAAAAAAAAACAPwAAAAAAAAAAAAAAAAAAgD8AAAAA"}],
+                "bufferViews":[{"buffer":0,"byteLength":36}],
+                "accessors":[{"bufferView":0,"componentType":5126,"count":3,"type":"VEC3","min":[0,0,0],"max":[1,1,0]}],
+                "materials":[{"name":"flint","extensions":{EXTENSIONS}}]}"#;
+            std::fs::write(&file, text.replace("EXTENSIONS", extensions)).unwrap();
+            let flags = vec![
+                format!("scene.file=\"{}\"", file.display()),
+                "scene.bodies=[{ name = \"pane\" }]".to_owned(),
+                format!("render.depth={depth}"),
+            ];
+            let config = RigConfig::demo(&Overrides { variables: vec![], flags }).unwrap();
+            let warnings = Rig::build(&config, Raster::new(8, 8)).unwrap().scene.warnings;
+            warnings.into_iter().find(|told| told.contains("is solid glass"))
+        };
+        let thin = r#""KHR_materials_transmission":{"transmissionFactor":1}"#;
+        let solid = format!(r#"{thin},"KHR_materials_volume":{{"thicknessFactor":0.1}}"#);
+        let deep = told(&solid, 3).expect("too few rays");
+        assert!(deep.contains("material \"flint\"") && deep.contains("render.depth = 3"), "{deep}");
+        assert_eq!((told(&solid, 6), told(thin, 1)), (None, None));
+        std::fs::remove_file(&file).unwrap();
     }
 
     #[test]

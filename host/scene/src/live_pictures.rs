@@ -18,13 +18,15 @@ pub struct LivePictures {
 struct Shown {
     newest: LivePicture,
     srgb: Vec<[u8; 4]>,
+    /// Pictures of the other program so far.
+    count: u64,
     followers: Vec<Publisher<LivePicture>>,
 }
 
 /// One picture, as shaders read it.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct LivePicture {
-    /// How many pictures had been shown when this one was; 0: none has been.
+    /// Rises from one to the next; 0: none has been shown.
     pub number: u64,
     /// Rows from top to bottom.
     pub texels: Vec<LinearTexel>,
@@ -40,7 +42,7 @@ impl LivePictures {
         let to_linear = ToLinear::new(true);
         let texels = srgb.iter().map(|texel| to_linear.texel(*texel)).collect();
         let newest = LivePicture { number: 0, texels };
-        Self { size, to_linear, shown: Mutex::new(Shown { newest, srgb, followers: vec![] }) }
+        Self { size, to_linear, shown: Mutex::new(Shown { newest, srgb, count: 0, followers: vec![] }) }
     }
 
     /// Columns and rows of every picture.
@@ -52,31 +54,34 @@ impl LivePictures {
     /// of another length is not shown.
     pub fn show(&self, picture: &[[u8; 4]]) {
         let mut shown = self.lock();
-        let Shown { newest, srgb, followers } = &mut *shown;
-        if picture.len() != srgb.len() {
-            return;
+        if picture.len() == shown.srgb.len() {
+            shown.count += 1;
+            self.publish(&mut shown, picture.iter().copied());
         }
+    }
+
+    /// Makes black the newest picture: nothing old stays in the light when the other program has ended.
+    pub fn show_black(&self) {
+        self.publish(&mut self.lock(), std::iter::repeat(BLACK));
+    }
+
+    fn publish(&self, shown: &mut Shown, picture: impl Iterator<Item = [u8; 4]>) {
+        let Shown { newest, srgb, followers, .. } = shown;
         for ((kept, texel), [r, g, b, _]) in srgb.iter_mut().zip(&mut newest.texels).zip(picture) {
-            *kept = [*r, *g, *b, 255];
+            *kept = [r, g, b, 255];
             *texel = self.to_linear.texel(*kept);
         }
         newest.number += 1;
-        // Renderers come and go: when the GPU was lost, and for the pictures of the page.
+        // Renderers come and go: when the GPU was lost, and for the pictures that a run leaves.
         followers.retain(Publisher::has_reader);
         for follower in followers {
             follower.publish_with(|picture| picture.clone_from(newest));
         }
     }
 
-    /// Makes black the newest picture: nothing old stays in the light when the other program has ended.
-    pub fn show_black(&self) {
-        let black = vec![BLACK; self.size[0] as usize * self.size[1] as usize];
-        self.show(&black);
-    }
-
-    /// How many pictures have been shown.
-    pub fn number(&self) -> u64 {
-        self.lock().newest.number
+    /// How many pictures of the other program have been shown.
+    pub fn count(&self) -> u64 {
+        self.lock().count
     }
 
     /// The newest picture: RGBA, sRGB.
@@ -117,12 +122,12 @@ mod tests {
         let mut late = pictures.follow();
         let whole = LivePicture { number: 3, texels: vec![[0x0000_ffff, 0xffff_ffff]; 6] };
         assert_eq!((early.latest(), late.latest()), ((&whole, true), (&whole, false)));
-        assert_eq!((pictures.number(), &pictures.newest()[..]), (3, &[[255, 0, 255, 255]; 6][..]));
+        assert_eq!((pictures.count(), &pictures.newest()[..]), (3, &[[255, 0, 255, 255]; 6][..]));
         // Of another size: not shown.
         pictures.show(&even(9)[..5]);
-        assert_eq!((early.latest(), pictures.number()), ((&whole, false), 3));
+        assert_eq!((early.latest(), pictures.count()), ((&whole, false), 3));
         pictures.show_black();
-        assert_eq!(late.latest().0.texels, vec![[0, 0xffff_0000]; 6]);
+        assert_eq!((late.latest().0.texels[..].to_vec(), pictures.count()), (vec![[0, 0xffff_0000]; 6], 3));
     }
 
     #[test]

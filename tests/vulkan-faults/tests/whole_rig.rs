@@ -13,9 +13,9 @@ use dpm_rig::telemetry::monitor::RunMonitor;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
-fn rig() -> Arc<Rig> {
+fn rig(more: &[&str]) -> Arc<Rig> {
     let flags = ["real_time.pace=\"real\"", "projector.frame_rate=60", "render.spp=1", "render.method=full"];
-    let flags = flags.map(str::to_owned).to_vec();
+    let flags = flags.iter().chain(more).map(|flag| (*flag).to_owned()).collect();
     let config = RigConfig::demo(&Overrides { variables: vec![], flags }).unwrap_or_else(|e| panic!("{e}"));
     Arc::new(Rig::build(&config, Raster::new(48, 32)).unwrap_or_else(|e| panic!("{e}")))
 }
@@ -28,10 +28,15 @@ struct Running {
 
 impl Running {
     fn start() -> Self {
+        Self::with(&[])
+    }
+
+    fn with(more: &[&str]) -> Self {
+        let rig = rig(more);
         let gpu = Gpu::open(&GpuOptions::default()).unwrap_or_else(|e| panic!("{e}"));
         let monitor = Arc::new(RunMonitor::default());
         let watched = monitor.clone();
-        let thread = std::thread::spawn(move || pipeline::run(rig(), &gpu, RunOptions::default(), &watched));
+        let thread = std::thread::spawn(move || pipeline::run(rig, &gpu, RunOptions::default(), &watched));
         Self { monitor, thread: Some(thread) }
     }
 
@@ -103,4 +108,34 @@ fn a_gpu_that_is_lost_again_and_again_ends_the_run_in_the_dark_with_a_clear_word
         Err(error) => error.to_string(),
     };
     assert!(error.contains("in the dark") || error.contains("lost"), "{error}");
+}
+
+/// The stages are restarted while the tracker says nothing: bodies that were lit are silent now, and not never seen.
+#[test]
+fn what_was_lit_before_a_restart_is_not_told_as_never_seen() {
+    let session = layer("");
+    let run = Running::with(&["tracker.faults=\"dropout@8s+600s\""]);
+    run.lit(20, BACK_WITHIN);
+    let mut notes = Vec::new();
+    let mut wait = |part: &str| {
+        let begin = Instant::now();
+        while !notes.iter().any(|note: &String| note.contains(part)) {
+            assert!(begin.elapsed() < BACK_WITHIN, "{part}: {notes:?}");
+            notes.extend(run.monitor.take_notes());
+            std::thread::sleep(Duration::from_millis(5));
+        }
+    };
+    wait("is dark: ");
+    session.set("lost@frame=1");
+    wait("are running again");
+    // Long enough for frames of the new crew, and for its look at what it has not seen.
+    std::thread::sleep(Duration::from_millis(1500));
+    assert_eq!(run.monitor.tracker(), None);
+    let report = run.end().unwrap_or_else(|e| panic!("{e}")).report;
+    assert!(
+        report.dark_by_body.iter().all(|body| body.silent > 20 && body.never_seen < 20),
+        "{:?}",
+        report.dark_by_body
+    );
+    assert!(!report.warnings.iter().any(|told| told.contains("never saw")), "{:?}", report.warnings);
 }

@@ -2,7 +2,7 @@
 
 use super::check_projector::projector;
 use super::world::{EnvironmentConfig, GazeConfig, TrackerConfig};
-use super::{Pace, PictureSource, ProjectorBackend, Purpose, ResponseConfig, RigConfig};
+use super::{LiveSource, Pace, PictureSource, ProjectorBackend, Purpose, ResponseConfig, RigConfig};
 use crate::mock::{self, FaultError};
 use dpm_common::keys::read::{ConfigValue, Reader};
 use dpm_device::regular_file;
@@ -315,7 +315,7 @@ fn place(path: &mut PathBuf, base: &Path, reader: &Reader, key: &str) {
 pub(super) fn resolve_files(rig: &mut RigConfig, base: &Path, purpose: Purpose, reader: &mut Reader) {
     for (i, body) in rig.scene.bodies.iter_mut().enumerate() {
         // The pipe may be made later: the rig says that there is none, and goes on.
-        if let Some(PictureSource::Pipe(pipe)) = &mut body.texture {
+        if let Some(PictureSource::Live(LiveSource::Pipe(pipe))) = &mut body.texture {
             place(pipe, base, reader, &format!("scene.bodies.{i}.texture"));
         }
     }

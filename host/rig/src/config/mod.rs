@@ -35,7 +35,7 @@ pub use safety::{
     InterlockConfig, InterlockSignal, KeyInterlockConfig, LimitsConfig, LineInterlockConfig,
     NoInterlockConfig, ProcessInterlockConfig, SafetyConfig,
 };
-pub use values::{Axes, BitOrder, PerChannel, PictureSource};
+pub use values::{Axes, BitOrder, LiveSource, PerChannel, PictureSource};
 pub use world::*;
 
 use crate::mock::MotionSpec;

@@ -57,6 +57,13 @@ impl Limit<Option<PerChannel>> for Each {
 pub enum PictureSource {
     /// A file that is read once.
     File(PathBuf),
+    /// Another program, while the rig runs.
+    Live(LiveSource),
+}
+
+/// Where another program's pictures come from.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub enum LiveSource {
     /// A named pipe, into which another program writes PPM or PAM images.
     Pipe(PathBuf),
     /// A node of PipeWire by its name or number; empty: the one that PipeWire chooses.
@@ -67,6 +74,14 @@ impl fmt::Display for PictureSource {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         match self {
             Self::File(path) => write!(f, "{}", path.display()),
+            Self::Live(source) => write!(f, "{source}"),
+        }
+    }
+}
+
+impl fmt::Display for LiveSource {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self {
             Self::Pipe(path) => write!(f, "pipe:{}", path.display()),
             Self::PipeWire(node) => write!(f, "pipewire:{node}"),
         }
@@ -82,11 +97,11 @@ impl ConfigValue for PictureSource {
         let path = PathBuf::read(node, reader, key)?;
         let text = path.to_string_lossy();
         let (source, is_sound) = match (text.strip_prefix("pipe:"), text.strip_prefix("pipewire:")) {
-            (Some(path), _) => (Self::Pipe(path.into()), !path.is_empty()),
+            (Some(path), _) => (Self::Live(LiveSource::Pipe(path.into())), !path.is_empty()),
             // It becomes a word of a command of GStreamer, whose own words are others.
             (_, Some(node)) => {
                 let is_word = node.chars().all(|c| c.is_ascii_alphanumeric() || "._-:".contains(c));
-                (Self::PipeWire(node.to_owned()), is_word)
+                (Self::Live(LiveSource::PipeWire(node.to_owned())), is_word)
             }
             _ => (Self::File(path.clone()), !text.is_empty()),
         };
@@ -94,10 +109,10 @@ impl ConfigValue for PictureSource {
             return Some(source);
         }
         let problem = match source {
-            Self::PipeWire(_) => {
+            Self::Live(LiveSource::PipeWire(_)) => {
                 "is no node: names and numbers have letters, digits and the characters . _ - :"
             }
-            Self::Pipe(_) | Self::File(_) => "names no file",
+            Self::Live(LiveSource::Pipe(_)) | Self::File(_) => "names no file",
         };
         reader.refuse(&node.origin, key, problem, "");
         None

@@ -9,7 +9,7 @@ mod decode;
 mod fit;
 mod source;
 
-use crate::config::PictureSource;
+use crate::config::LiveSource;
 use crate::rig::Rig;
 use crate::telemetry::monitor::RunMonitor;
 use decode::Decoder;
@@ -47,24 +47,20 @@ impl PictureStreams {
     pub fn start(rig: &Rig, monitor: &Arc<RunMonitor>) -> Self {
         let stop = Arc::new(AtomicBool::new(false));
         let mut streams = Self { stop: stop.clone(), threads: Vec::new(), pictures: Vec::new() };
-        for live in &rig.scene.live {
-            let body = rig.config.scene.bodies.get(usize::from(live.tracked));
-            let Some((body, source)) = body.and_then(|body| Some((body, body.texture.as_ref()?))) else {
-                continue;
-            };
+        for (body, source, pictures) in rig.live_pictures() {
             let mut reader = StreamReader {
-                body: body.name.clone(),
+                told_as: format!("{body}: {source}"),
                 source: source.clone(),
-                pictures: live.pictures.clone(),
+                pictures: pictures.clone(),
                 monitor: monitor.clone(),
                 stop: stop.clone(),
                 told: None,
                 waiting: None,
             };
-            streams.pictures.push((format!("{}: {source}", body.name), live.pictures.clone()));
+            streams.pictures.push((reader.told_as.clone(), pictures.clone()));
             match Builder::new().name("dpm-pictures".into()).spawn(move || reader.run()) {
                 Ok(thread) => streams.threads.push(thread),
-                Err(e) => monitor.note(format!("{}: its pictures are not read: no thread: {e}", body.name)),
+                Err(e) => monitor.note(format!("{body}: its pictures are not read: no thread: {e}")),
             }
         }
         streams
@@ -72,7 +68,7 @@ impl PictureStreams {
 
     /// One sentence for every body that has had no picture.
     pub(crate) fn without_pictures(&self) -> impl Iterator<Item = String> + '_ {
-        let without = self.pictures.iter().filter(|(_, pictures)| pictures.number() == 0);
+        let without = self.pictures.iter().filter(|(_, pictures)| pictures.count() == 0);
         without.map(|(told, _)| format!("{told}: no picture has come, so it was black"))
     }
 
@@ -80,7 +76,7 @@ impl PictureStreams {
     pub fn wait_for_first(&self, limit: Duration) -> bool {
         let begin = Instant::now();
         loop {
-            let all = self.pictures.iter().all(|(_, pictures)| pictures.number() > 0);
+            let all = self.pictures.iter().all(|(_, pictures)| pictures.count() > 0);
             if all || begin.elapsed() >= limit {
                 return all;
             }
@@ -101,8 +97,9 @@ impl Drop for PictureStreams {
 
 /// The thread of one body.
 struct StreamReader {
-    body: String,
-    source: PictureSource,
+    /// What the operator knows it by.
+    told_as: String,
+    source: LiveSource,
     pictures: Arc<LivePictures>,
     monitor: Arc<RunMonitor>,
     stop: Arc<AtomicBool>,
@@ -204,7 +201,7 @@ impl StreamReader {
         let is_soon = self.told.as_ref().is_some_and(|(_, at)| at.elapsed() < NOTE_EVERY);
         let Some(text) = self.waiting.take_if(|_| !is_soon) else { return };
         if self.told.as_ref().is_none_or(|(last, _)| *last != text) {
-            self.monitor.note(format!("{}: {}: {text}", self.body, self.source));
+            self.monitor.note(format!("{}: {text}", self.told_as));
             self.told = Some((text, Instant::now()));
         }
     }

@@ -2,7 +2,7 @@
 //! it does to itself cannot reach the rig.
 
 use super::decode::Form;
-use crate::config::PictureSource;
+use crate::config::LiveSource;
 use dpm_common::unix::{wait_readable, widen_pipe};
 use std::fmt;
 use std::fs::{File, Metadata};
@@ -63,11 +63,10 @@ impl Stream {
     ///
     /// # Errors
     /// Why it cannot be opened.
-    pub(super) fn open(source: &PictureSource, size: [u32; 2]) -> Result<Self, Ended> {
+    pub(super) fn open(source: &LiveSource, size: [u32; 2]) -> Result<Self, Ended> {
         match source {
-            PictureSource::File(_) => Err(Ended::NotOpened("it is a file".into())),
-            PictureSource::Pipe(path) => open_pipe(path).map_err(Ended::NotOpened),
-            PictureSource::PipeWire(target) => {
+            LiveSource::Pipe(path) => open_pipe(path).map_err(Ended::NotOpened),
+            LiveSource::PipeWire(target) => {
                 start(gstreamer_at(Path::new(PROGRAM), target, size)).map_err(Ended::NotOpened)
             }
         }
@@ -155,14 +154,13 @@ fn readable(descriptors: &[RawFd], limit: Duration) -> Result<Vec<bool>, Ended> 
 ///
 /// # Errors
 /// What is missing, and what to do.
-pub fn look_at(source: &PictureSource) -> Result<(), String> {
+pub fn look_at(source: &LiveSource) -> Result<(), String> {
     match source {
-        PictureSource::File(_) => Ok(()),
-        PictureSource::Pipe(path) => match std::fs::metadata(path) {
+        LiveSource::Pipe(path) => match std::fs::metadata(path) {
             Ok(found) => check_kind(&found),
             Err(e) => Err(not_opened(&e)),
         },
-        PictureSource::PipeWire(_) => {
+        LiveSource::PipeWire(_) => {
             let folders = std::env::var_os("PATH").unwrap_or_default();
             let is_there = std::env::split_paths(&folders).any(|folder| folder.join(PROGRAM).is_file());
             is_there.then_some(()).ok_or_else(not_installed)

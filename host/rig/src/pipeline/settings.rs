@@ -78,7 +78,7 @@ pub fn renderer_settings(rig: &Rig) -> RendererSettings {
 }
 
 /// Texels of live pictures that a frame brings to the GPU in a millisecond of its slot, 0.2 MB: a small part of what memory and
-/// bus carry in this time. A picture of 512 x 512 texels is there after 11 ms, one of 1920 x 1080 after 85 ms.
+/// bus carry in this time. So a picture of 512 x 512 texels needs 11 ms, one of 1920 x 1080 85 ms.
 const LIVE_TEXELS_PER_MS: i64 = 24_576;
 
 fn most_live_texels(rig: &Rig) -> usize {
@@ -97,5 +97,24 @@ pub fn output(rig: &Rig, gpu: &Gpu, check: bool) -> Output {
         (false, _) => Output::Codes,
         (true, false) => Output::Planes(schedule),
         (true, true) => Output::Both(schedule),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::config::{Overrides, RigConfig};
+    use dpm_device::planes::Raster;
+
+    /// As many texels a millisecond at every frame rate, so that a picture is there after the same time.
+    #[test]
+    fn live_texels_follow_the_length_of_a_slot() {
+        for (rate, texels) in [("500", 49_152), ("50", 491_520), ("125", 196_608)] {
+            let flags = vec![format!("projector.frame_rate=\"{rate}\"")];
+            let config =
+                RigConfig::demo(&Overrides { variables: vec![], flags }).unwrap_or_else(|e| panic!("{e}"));
+            let rig = Rig::build(&config, Raster::new(8, 8)).unwrap_or_else(|e| panic!("{e}"));
+            assert_eq!(renderer_settings(&rig).most_live_texels, texels, "{rate} frames/s");
+        }
     }
 }

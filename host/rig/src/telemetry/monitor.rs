@@ -8,6 +8,7 @@ use super::projector::ProjectorReport;
 use crate::interlock::Interlock;
 use crate::order::Order;
 use crate::parameters::ParameterDesk;
+use crate::tracks::Unseen;
 use dpm_common::stopping;
 use dpm_device::link::{faults, LimitReached};
 use dpm_handoff::path::Lock;
@@ -167,7 +168,7 @@ pub struct RunMonitor {
     found_safe: AtomicBool,
     projector: AtomicU64,
     /// Written at most once.
-    tracker: OnceLock<String>,
+    tracker: OnceLock<Unseen>,
     /// Why the run will never return; written at most once.
     gave_up: OnceLock<String>,
     /// Written at most once, before there is light.
@@ -324,13 +325,13 @@ impl RunMonitor {
 
     /// Reports, once per run, which bodies the tracker has not seen one second after its start, why, and what to do.
     /// Not for the frame path.
-    pub(crate) fn tell_of_tracker(&self, word: String) {
-        let _ = self.tracker.set(word);
+    pub(crate) fn tell_of_tracker(&self, unseen: Unseen) {
+        let _ = self.tracker.set(unseen);
     }
 
-    /// The message about the tracker; `None` if there is none.
+    /// The message about the tracker, as long as it holds.
     pub fn tracker(&self) -> Option<&str> {
-        self.tracker.get().map(String::as_str)
+        self.tracker.get().filter(|unseen| unseen.holds()).map(|unseen| unseen.told.as_str())
     }
 
     /// Records that the thread that would return from the run hangs, so nobody should wait for it. The projector was

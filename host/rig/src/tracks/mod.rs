@@ -5,7 +5,7 @@ mod source;
 mod stage;
 mod tracker_frame;
 
-pub use seen::SeenBodies;
+pub use seen::{SeenBodies, Unseen};
 pub(crate) use source::NoTracker;
 pub use source::{open_for, open_in_world, SourceError};
 pub use stage::{TrackSnapshot, TrackingStage};

@@ -1,6 +1,6 @@
 //! The first stage of a frame: puts newly arrived samples into the tracks of all bodies.
 
-use super::seen::SeenBodies;
+use super::seen::{SeenBodies, Unseen};
 use super::tracker_frame::TrackerFrame;
 use crate::config::{PredictionConfig, TrackerConfig, MAX_TRACKED};
 use crate::rig::Rig;
@@ -212,8 +212,10 @@ impl TrackingStage {
 
     /// Names the bodies that have not been seen yet and are therefore dark, the tracker's explanation, and what to
     /// do. `None` if all were seen.
-    pub(crate) fn not_seen_yet(&self, rig: &Rig) -> Option<String> {
-        self.unseen(rig, "has not seen", "and no light falls there until it does")
+    pub(crate) fn not_seen_yet(&self, rig: &Rig) -> Option<Unseen> {
+        let told = self.unseen(rig, "has not seen", "and no light falls there until it does")?;
+        let bodies = (0..self.bodies).filter(|body| self.is_unseen(*body)).collect();
+        Some(Unseen { told, bodies, seen: self.seen.clone() })
     }
 
     /// The same at the end of a run, with any other message of the tracker.
@@ -296,9 +298,13 @@ mod tests {
         let (tracked, ever, told) = run(1);
         assert_eq!((tracked, ever), (vec![true, false], vec![true, false]));
         assert!(told.is_some_and(|told| told.contains("venus") && !told.contains("bunny")));
+        let early = TrackingStage::new(&rig, Box::new(Speaks { of: 0 })).remembering(seen.clone());
+        let early = early.not_seen_yet(&rig).expect("venus was not seen");
+        assert!(early.holds() && early.told.contains("venus"));
         let (tracked, ever, _) = run(0);
         assert_eq!((tracked, ever), (vec![false, false], vec![true, false]));
         assert!(run(2).2.is_none());
+        assert!(!early.holds(), "it was seen");
     }
 
     #[test]
@@ -320,7 +326,7 @@ mod tests {
                 .map(|now| now.0 - 7_000_000_000)
                 .collect();
             assert_eq!(due, if of < 2 { vec![1_000_000_000] } else { vec![] }, "{of} of 2 are told");
-            let (early, late) = (stage.not_seen_yet(&rig), stage.never_seen(&rig));
+            let (early, late) = (stage.not_seen_yet(&rig).map(|unseen| unseen.told), stage.never_seen(&rig));
             assert_eq!(early.is_some(), of < 2);
             for text in [early, late].into_iter().flatten() {
                 assert!(

@@ -7,7 +7,7 @@ use super::{Finding, State};
 use dpm_calibration::file;
 use dpm_rig::calibration_steps::age::{aged, days_since, OLD_DAYS};
 use dpm_rig::calibration_steps::is_simulated;
-use dpm_rig::config::RigConfig;
+use dpm_rig::config::{LiveSource, RigConfig};
 use dpm_rig::picture_stream::look_at;
 use dpm_rig::rig::Rig;
 use dpm_rig::standing::{standing_in, state_folder, Identity};
@@ -72,20 +72,16 @@ fn scene(rig: &Rig) -> Finding {
 
 /// The bodies that show what another program makes. Without it they are black, and all else works.
 fn pictures(rig: &Rig) -> Vec<Finding> {
-    let bodies =
-        rig.scene.live.iter().filter_map(|live| rig.config.scene.bodies.get(usize::from(live.tracked)));
-    let sources = bodies.filter_map(|body| Some((&body.name, body.texture.as_ref()?)));
-    sources
-        .map(|(body, source)| {
-            let name = format!("pictures of {body}");
-            match look_at(source) {
-                Ok(()) => Finding::new(&name, State::Ok, source.to_string(), ""),
-                Err(why) => {
-                    Finding::new(&name, State::Warning, format!("{source}: {why}"), "it is black until then")
-                }
+    let finding = |body: &str, source: &LiveSource| {
+        let name = format!("pictures of {body}");
+        match look_at(source) {
+            Ok(()) => Finding::new(&name, State::Ok, source.to_string(), ""),
+            Err(why) => {
+                Finding::new(&name, State::Warning, format!("{source}: {why}"), "it is black until then")
             }
-        })
-        .collect()
+        }
+    };
+    rig.live_pictures().map(|(body, source, _)| finding(body, source)).collect()
 }
 
 /// Whether the rig was measured, what of it, and how long ago.
