@@ -10,22 +10,22 @@ layout(local_size_x = 8, local_size_y = 8) in;
 
 layout(set = 0, binding = B_TILES, scalar) readonly buffer Tiles { uint tiles[]; };
 layout(set = 0, binding = B_RADIANCE, scalar) readonly buffer Radiance { vec4 radiance_in[]; };
-layout(set = 0, binding = B_HISTORY, scalar) buffer Histories { History histories[]; };
+layout(set = 0, binding = B_HISTORY, scalar) writeonly buffer HistoryLights { HistoryLight history_lights[]; };
 layout(set = 0, binding = B_FILTERED, scalar) writeonly buffer FilteredBlock { Filtered filtered[]; };
 
 // Frames are counted up to here. The weight of a new frame has long been the one by angle then.
 const float MOST_FRAMES = 4096.0;
 
 // Blends in the frame that was traced.
-void add_frame(inout History h, vec3 traced, uint at) {
-    float least = (frame.flags & FRAME_TEMPORAL) != 0u ? frame.zone_alpha[zone_of(guide_at(at).angle)] : 1.0;
+void add_frame(inout HistoryLight h, vec3 traced, uint at) {
+    float least = (frame.flags & FRAME_TEMPORAL) != 0u ? frame.zone_alpha[zone_of(sight_at(at).angle)] : 1.0;
     float alpha = max(1.0 / (h.weight + 1.0), least);
     h.mean = mix(h.mean, traced, alpha);
     h.weight = min(h.weight + 1.0, MOST_FRAMES);
 }
 
 // For a pixel of which nothing is known and that is not traced: shows the first of the four neighbouring coarse pixels that is traced.
-void borrow(inout History h, uvec2 pixel, uvec2 size) {
+void borrow(inout HistoryLight h, uvec2 pixel, uvec2 size) {
     const ivec2 beside[4] = ivec2[](ivec2(-1, 0), ivec2(1, 0), ivec2(0, -1), ivec2(0, 1));
     for (int i = 0; i < 4; i++) {
         ivec2 q = ivec2(pixel) + beside[i] * ivec2(size);
@@ -49,7 +49,7 @@ void main() {
         filtered[at] = Filtered(vec3(0.0), 0.0);
         return;
     }
-    History h = histories[at];
+    HistoryLight h = history_light_at(at);
     uvec2 size = block_size(pixel);
     uvec2 source = traced_pixel(pixel, size);
     uint from = source.y * frame.width + source.x;
@@ -57,5 +57,5 @@ void main() {
     if (traced.w > 0.0) add_frame(h, traced.rgb, at);
     else if (!(h.weight > 0.0)) borrow(h, pixel, size);
     filtered[at] = Filtered(h.mean, 1.0);
-    histories[at] = h;
+    history_lights[HISTORY_LIGHT_AT(at)] = h;
 }

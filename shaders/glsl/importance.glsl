@@ -13,6 +13,6 @@ uint importance_of(History h) {
     if ((h.flags & HISTORY_EXACT) != 0u) return 0u;
     float sigma = h.weight > 0.0 ? sqrt(max(h.variance, 0.0)) : 1.0;
     sigma /= 1.0 + max(h.weight / samples_a_frame(), 1.0) / ENOUGH_FRAMES;
-    if ((h.flags & HISTORY_BORDER) != 0u) sigma *= GOOD_START;
+    if ((h.flags & HISTORY_BORDER) != 0u && h.used == 0u) sigma *= GOOD_START;
     return uint(clamp(sigma, 0.004, 8.0) * 256.0);
 }

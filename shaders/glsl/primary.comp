@@ -1,4 +1,4 @@
-// Pixels into surfaces and guides: what the projector's ray of each pixel meets, whether the eye sees that point, how it moves and how large it looks.
+// Pixels into surfaces, sights and tints: what the projector's ray of each pixel meets, whether the eye sees that point, how it moves and how large it looks.
 #version 460
 #extension GL_GOOGLE_include_directive : require
 #ifdef RAY_QUERY
@@ -13,7 +13,8 @@ layout(local_size_x = 8, local_size_y = 8) in;
 
 layout(set = 0, binding = B_TILES, scalar) readonly buffer Tiles { uint tiles[]; };
 layout(set = 0, binding = B_SURFACES, scalar) writeonly buffer Surfaces { Surface surfaces[]; };
-layout(set = 0, binding = B_GUIDES, scalar) writeonly buffer Guides { Guide guides[]; };
+layout(set = 0, binding = B_GUIDES, scalar) writeonly buffer Sights { Sight sights[]; };
+layout(set = 0, binding = B_GUIDES, scalar) writeonly buffer Tints { Tint tints[]; };
 
 // Reflectance of the look for uniform white light, approximately. It varies with the texture but not with the light. Light from below the surface
 // itself is lost, whatever the direction of the shading normal: that share of a cosine lobe is (1 - cos) / 2 of the angle between the normals.
@@ -41,7 +42,7 @@ bool still_dark(uvec2 pixel) {
         ivec2 q = ivec2(pixel) + ivec2(i % 5, i / 5) - 2;
         // Anything may enter over the border of the raster.
         bool inside = all(greaterThanEqual(q, ivec2(0))) && all(lessThan(q, ivec2(frame.width, frame.height)));
-        dark = inside && former_at(uint(q.y) * frame.width + uint(q.x)).frame != frame.history_frame;
+        dark = inside && former_tag_at(uint(q.y) * frame.width + uint(q.x)).frame != frame.history_frame;
     }
     return dark;
 }
@@ -59,8 +60,8 @@ bool still_seen(uvec2 pixel, uint instance, vec2 before) {
     for (int i = 0; i < 5; i++) {
         ivec2 q = corner + around[i];
         bool inside = all(greaterThanEqual(q, ivec2(0))) && all(lessThan(q, ivec2(frame.width, frame.height)));
-        History h = former_at(inside ? uint(q.y) * frame.width + uint(q.x) : 0u);
-        seen = seen && inside && h.frame == frame.history_frame && h.instance == instance && (h.flags & HISTORY_HIDDEN) == 0u;
+        HistoryTag tag = former_tag_at(inside ? uint(q.y) * frame.width + uint(q.x) : 0u);
+        seen = seen && inside && tag.frame == frame.history_frame && tag.owner >> 24u == instance && (tag.owner & HISTORY_HIDDEN) == 0u;
     }
     return seen;
 }
@@ -98,19 +99,21 @@ void main() {
             }
             if (!lit) surface.distance = -hit.t;
             if (HAS_GUIDES) {
-                Guide guide;
-                guide.motion = vec2(pixel) + 0.5 - before;
                 vec3 to_projector = -p;
                 float l_p = length(to_projector), l_e = length(to_eye);
-                // [paper] eq. 3, limited where the light falls at a grazing angle.
-                guide.size = min((abs(eye_side) / max(l_e * l_e, 1e-12)) * (l_p * l_p / max(abs(dot(g, to_projector)), 1e-6)), 1e3);
                 vec3 to_gaze = frame.gaze_point - frame.eye_position;
                 float c = dot(-to_eye, to_gaze) / max(l_e * length(to_gaze), 1e-12);
-                guide.angle = degrees(acos(clamp(c, -1.0, 1.0)));
-                vec3 albedo = HAS_DEMODULATION ? demodulation(hit, to_eye / max(l_e, 1e-12)) : vec3(1.0);
-                guide.albedo_rg = packHalf2x16(albedo.rg);
-                guide.albedo_b = packHalf2x16(vec2(albedo.b, 0.0));
-                guides[pixel.y * frame.width + pixel.x] = guide;
+                float angle = degrees(acos(clamp(c, -1.0, 1.0)));
+                uint at = pixel.y * frame.width + pixel.x;
+                if (HAS_DEMODULATION) {
+                    vec3 albedo = demodulation(hit, to_eye / max(l_e, 1e-12));
+                    tints[GUIDES_TINT_AT(at)] = Tint(packHalf2x16(albedo.rg), packHalf2x16(vec2(albedo.b, angle)));
+                }
+                if (!HAS_DEMODULATION || (frame.flags & FRAME_SHOWS_ALL) != 0u) {
+                    // [paper] eq. 3, limited where the light falls at a grazing angle.
+                    float size = min((abs(eye_side) / max(l_e * l_e, 1e-12)) * (l_p * l_p / max(abs(dot(g, to_projector)), 1e-6)), 1e3);
+                    sights[GUIDES_SIGHT_AT(at)] = Sight(vec2(pixel) + 0.5 - before, size, angle);
+                }
             }
         }
     }

@@ -56,7 +56,7 @@ float known_luminance(uint x, uint y, out bool lit) {
     uint at = y * frame.width + x;
     lit = is_lit(surface_at(at));
     if (!lit) return 0.0;
-    History h = history_at(at);
+    HistoryLight h = history_light_at(at);
     vec3 c = h.mean;
     precise float l = c.x * 0.2126 + c.y * 0.7152 + c.z * 0.0722;
     return h.weight > 0.0 ? l : -1.0;
@@ -76,7 +76,7 @@ Row read_row(uvec2 origin, uint y) {
         r.luminance_sum = sum;
         r.lit++;
         uint at = y * frame.width + x;
-        Guide g = guide_at(at);
+        Sight g = sight_at(at);
         float vx = abs(g.motion.x), vy = abs(g.motion.y);
         if (!finite(vx) || !finite(vy) || !finite(g.size)) r.odd++;
         r.speed_x = vx < r.speed_x ? vx : r.speed_x;

@@ -1,8 +1,9 @@
 // What both reprojections share: which histories of the last frame may serve a surface point, and the history that a lit pixel starts from.
 #include "scene.glsl"
+#include "history.glsl"
+#include "write_history.glsl"
 
 layout(set = 0, binding = B_TILES, scalar) readonly buffer Tiles { uint tiles[]; };
-layout(set = 0, binding = B_HISTORY, scalar) writeonly buffer Histories { History histories[]; };
 
 // Two normals are alike where their cosine is above this: they differ by less than 26 degrees.
 const float LIKE_NORMAL = 0.9;
@@ -16,12 +17,26 @@ struct Place {
     vec2 before;     // Raster position in the last frame, pixels.
 };
 
+// Whether something is known at `index` of the body since the last frame.
+bool is_known(uint index, uint instance) {
+    HistoryTag tag = former_tag_at(index);
+    return tag.frame == frame.history_frame && tag.owner >> 24u == instance && former_light_at(index).weight > 0.0;
+}
+
+// Where the last frame showed a point of a body, pixels. What deforms counts as rigid.
+vec2 place_before(uint instance, vec3 position) { return project(transform_point(instance_at(instance).previous_world_from_object, position)); }
+
+// The surface point of a lit pixel, body space.
+vec3 body_point(uvec2 pixel, Surface surface) {
+    return transform_point(instance_at(surface.id >> 24u).object_from_world, pixel_direction(pixel) * surface.distance);
+}
+
 // Whether the history at `index` is of the last frame, of the same body, and of a point close to `position` with a like normal. Positions and
 // normals are in body space. `depth` is how far the point may lie off the tangent plane, in footprints.
 bool tap_valid(uint index, uint instance, vec3 position, vec3 normal, float footprint, float depth) {
-    if (former_at(index).frame != frame.history_frame || former_at(index).instance != instance || !(former_at(index).weight > 0.0)) return false;
-    vec3 apart = former_at(index).position - position;
-    vec3 tap_normal = decode_normal(former_at(index).normal);
+    if (!is_known(index, instance)) return false;
+    vec3 apart = former_place_at(index).position - position;
+    vec3 tap_normal = decode_normal(former_place_at(index).normal);
     // Within four footprints.
     return dot(tap_normal, normal) > LIKE_NORMAL && abs(dot(apart, normal)) < depth * footprint && dot(apart, apart) < 16.0 * footprint * footprint;
 }
@@ -39,25 +54,19 @@ History begin_history(uvec2 pixel, uint at, out Place place) {
     float cosine = abs(dot(transform_vector(instance_at(instance).world_from_object, normal), normalize(world)));
     place.normal = normal;
     place.footprint = surface.distance * frame.pixel_size / max(cosine, LEAST_COSINE);
-    place.before = vec2(pixel) + 0.5 - guide_at(at).motion;
     History h;
     h.mean = vec3(0.0);
     h.weight = 0.0;
-    h.position = transform_point(instance_at(instance).object_from_world, world);
+    h.position = body_point(pixel, surface);
     h.normal = encode_normal(normal);
     h.drift = 0.0;
     h.variance = 0.0;
     h.surprise = 0.0;
     h.seed = hash_u32(at + hash_u32(frame.frame + hash_u32(frame.seed)));
-    h.index = 0u;
+    h.used = 0u;
     h.instance = instance;
     h.frame = frame.frame;
     h.flags = 0u;
+    place.before = place_before(instance, h.position);
     return h;
-}
-
-// A pixel that is not lit has no history.
-void write_no_history(uint at) {
-    histories[at].weight = 0.0;
-    histories[at].frame = frame.frame - 1u;
 }

@@ -41,8 +41,8 @@ Blend blend_around(History h, Place place) {
         if (w <= 0.0 || !on_raster(q)) continue;
         uint tap = uint(q.y) * frame.width + uint(q.x);
         if (!tap_valid(tap, h.instance, h.position, place.normal, place.footprint, DEPTH)) continue;
-        c.mean += w * former_at(tap).mean;
-        c.weight += w * former_at(tap).weight;
+        c.mean += w * former_light_at(tap).mean;
+        c.weight += w * former_light_at(tap).weight;
         c.total += w;
         if (w > c.best) {
             c.best = w;
@@ -60,9 +60,7 @@ void carry_bilinear(inout History h, Place place) {
     float s = 1.0 / c.total;
     h.mean = c.mean * s;
     h.weight = c.weight * s;
-    // The sample sequence continues where the nearest history left it.
-    h.seed = former_at(c.nearest).seed;
-    h.index = former_at(c.nearest).index;
+    h.seed = former_tag_at(c.nearest).seed;
 }
 
 void main() {
@@ -76,5 +74,5 @@ void main() {
     Place place;
     History h = begin_history(pixel, at, place);
     carry_bilinear(h, place);
-    histories[at] = h;
+    write_history(at, h);
 }

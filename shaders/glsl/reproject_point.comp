@@ -6,13 +6,14 @@
 #extension GL_GOOGLE_include_directive : require
 #include "reproject.glsl"
 #include "importance.glsl"
+#include "demand.glsl"
 
 layout(local_size_x = 8, local_size_y = 8) in;
 
 layout(set = 0, binding = B_SCHEDULE, scalar) buffer ScheduleBlock { Schedule schedule; };
-// What accumulate_samples.comp adds to a history's mean to get the light at the pixel's own surface point. The buffer holds the picture from
-// the pass spatial on.
-layout(set = 0, binding = B_SHOWN, scalar) writeonly buffer Shifts { vec4 shifts[]; };
+// What accumulate_samples.comp adds to a history's mean to get the light at the pixel's own surface point. Where the host reads the shown light,
+// the buffer holds that from the pass spatial on.
+layout(set = 0, binding = B_SHOWN, scalar) writeonly buffer Shifts { vec3 shifts[]; };
 
 // Where histories are looked for.
 // A history may lie this many footprints off the tangent plane of the surface point.
@@ -84,9 +85,10 @@ struct Plane {
 
 // Adds the history `tap`, whose point is at `e` from the pixel's centre. A history that is not finite is skipped.
 void add_history(inout Around a, uint tap, vec2 e) {
-    vec3 m = former_at(tap).mean;
-    float w = former_at(tap).weight;
-    bool sound = finite(former_at(tap).drift) && finite(former_at(tap).variance) && finite(former_at(tap).surprise);
+    vec3 m = former_light_at(tap).mean;
+    float w = former_light_at(tap).weight;
+    HistoryNoise noise = former_noise_at(tap);
+    bool sound = finite(noise.drift) && finite(noise.variance) && finite(noise.surprise);
     if (!sound || !finite3(m) || !finite(w) || !finite(e.x + e.y)) return;
     a.weight += w;
     a.count++;
@@ -99,9 +101,9 @@ void add_history(inout Around a, uint tap, vec2 e) {
     a.squares += w * luminance(m) * luminance(m);
     a.mean_x += w * e.x * m;
     a.mean_y += w * e.y * m;
-    a.lag_power += former_at(tap).drift * former_at(tap).drift;
-    a.noise_power += former_at(tap).surprise;
-    a.variance += former_at(tap).variance;
+    a.lag_power += noise.drift * noise.drift;
+    a.noise_power += noise.surprise;
+    a.variance += noise.variance;
     a.lower = min(a.lower, m);
     a.upper = max(a.upper, m);
     float far = max(abs(e.x), abs(e.y));
@@ -122,7 +124,7 @@ Around look_around(History h, Place place, vec2 centre) {
         if (!on_raster(q)) continue;
         uint tap = uint(q.y) * frame.width + uint(q.x);
         if (!tap_valid(tap, h.instance, h.position, place.normal, place.footprint, DEPTH)) continue;
-        add_history(a, tap, project(transform_point(instance_at(h.instance).world_from_object, former_at(tap).position)) - centre);
+        add_history(a, tap, project(transform_point(instance_at(h.instance).world_from_object, former_place_at(tap).position)) - centre);
     }
     return a;
 }
@@ -230,7 +232,7 @@ vec3 carry_point(inout History h, Place place, uvec2 pixel, uint at) {
     Plane p = plane_through(a);
     History known = former_at(a.nearest);
     known.frame = h.frame;
-    float light = luminance(albedo_of(guide_at(at))), per_frame = samples_a_frame();
+    float light = luminance(albedo_of(tint_at(at))), per_frame = samples_a_frame();
     float useful = longest_useful(a, p, light, per_frame, centre - place.before);
     known.weight = min(known.weight, useful * per_frame);
     if (a.distance <= IN_PIXEL_PX) {
@@ -242,26 +244,21 @@ vec3 carry_point(inout History h, Place place, uvec2 pixel, uint at) {
     known.position = h.position;
     known.normal = h.normal;
     known.seed = h.seed;
-    known.index = 0u;
+    known.used = 0u;
     known.flags = (known.flags & ~HISTORY_BORDER) | (a.count < ALL_AROUND ? HISTORY_BORDER : 0u);
-    known.weight = taken_over(known, a, p, light, per_frame, guide_at(at).angle);
+    known.weight = taken_over(known, a, p, light, per_frame, angle_of(tint_at(at)));
     h = known;
     return bounded_shift(known.mean, step_along(p, e), a.lower, a.upper);
 }
 
-// The body that is lit in one of the eight pixels around, NO_HIT: none. `before` is where it would have shown this pixel in the last frame.
-uint lit_beside(uvec2 pixel, out vec2 before) {
-    before = vec2(pixel) + 0.5;
+// One of the eight pixels around that is lit, the pixel itself: none.
+uvec2 lit_beside(uvec2 pixel) {
+    const ivec2 beside[8] = ivec2[](ivec2(-1, 0), ivec2(1, 0), ivec2(0, -1), ivec2(0, 1), ivec2(-1, -1), ivec2(1, -1), ivec2(-1, 1), ivec2(1, 1));
     for (int i = 0; i < 8; i++) {
-        const ivec2 beside[8] = ivec2[](ivec2(-1, 0), ivec2(1, 0), ivec2(0, -1), ivec2(0, 1), ivec2(-1, -1), ivec2(1, -1), ivec2(-1, 1), ivec2(1, 1));
         ivec2 q = ivec2(pixel) + beside[i];
-        if (!on_raster(q)) continue;
-        uint other = uint(q.y) * frame.width + uint(q.x);
-        if (!is_lit(surface_at(other))) continue;
-        before -= guide_at(other).motion;
-        return surface_at(other).id >> 24u;
+        if (on_raster(q) && is_lit(surface_at(uint(q.y) * frame.width + uint(q.x)))) return uvec2(q);
     }
-    return NO_HIT;
+    return pixel;
 }
 
 // The history of the body `instance` whose point is now in the pixel and faces the projector, NO_HIT: none.
@@ -273,11 +270,11 @@ uint hidden_in(uint instance, vec2 centre, vec2 before) {
         ivec2 q = corner + ivec2(i % 3, i / 3) - 1;
         if (!on_raster(q)) continue;
         uint tap = uint(q.y) * frame.width + uint(q.x);
-        if (former_at(tap).frame != frame.history_frame || former_at(tap).instance != instance || !(former_at(tap).weight > 0.0)) continue;
-        vec3 p = transform_point(instance_at(instance).world_from_object, former_at(tap).position);
+        if (!is_known(tap, instance)) continue;
+        vec3 p = transform_point(instance_at(instance).world_from_object, former_place_at(tap).position);
         vec2 e = project(p) - centre;
         float far = max(abs(e.x), abs(e.y));
-        if (far < nearest && dot(transform_vector(instance_at(instance).world_from_object, decode_normal(former_at(tap).normal)), p) < 0.0) {
+        if (far < nearest && dot(transform_vector(instance_at(instance).world_from_object, decode_normal(former_place_at(tap).normal)), p) < 0.0) {
             nearest = far;
             owner = tap;
         }
@@ -286,35 +283,49 @@ uint hidden_in(uint instance, vec2 centre, vec2 before) {
 }
 
 // A pixel beside a body's edge keeps the history of a point that is in it, although its own ray misses the body. The next frame may bring the pixel
-// back onto the body.
-void keep_hidden(uvec2 pixel, uint at) {
-    vec2 before;
-    uint instance = lit_beside(pixel, before);
-    if (instance == NO_HIT) return;
-    uint owner = hidden_in(instance, vec2(pixel) + 0.5, before);
-    if (owner == NO_HIT) return;
-    History h = former_at(owner);
-    h.frame = frame.frame;
-    h.flags |= HISTORY_HIDDEN;
-    histories[at] = h;
+// back onto the body. NO_HIT: there is none.
+uint hidden_beside(uvec2 pixel) {
+    uvec2 other = lit_beside(pixel);
+    if (other == pixel) return NO_HIT;
+    // The body that is lit there would have shown this pixel in the last frame as far away as it did that one.
+    Surface surface = surface_at(other.y * frame.width + other.x);
+    uint instance = surface.id >> 24u;
+    vec2 before = place_before(instance, body_point(other, surface)) + (vec2(pixel) - vec2(other));
+    return hidden_in(instance, vec2(pixel) + 0.5, before);
 }
 
 void main() {
     uvec2 pixel;
     if (!tile_pixel(tiles[gl_WorkGroupID.x >> 2u], pixel)) return;
     uint at = pixel.y * frame.width + pixel.x;
-    uint importance = 0u, lit = 0u;
+    uint importance = 0u, lit = 0u, demand = DEMAND_NOT_LIT;
+    bool keeps = false;
+    History h;
     if (is_lit(surface_at(at))) {
         lit = 1u;
+        keeps = true;
         Place place;
-        History h = begin_history(pixel, at, place);
-        shifts[at] = vec4(carry_point(h, place, pixel, at), 0.0);
+        h = begin_history(pixel, at, place);
+        shifts[at] = carry_point(h, place, pixel, at);
         h.flags &= ~HISTORY_HIDDEN;
-        histories[at] = h;
         importance = importance_of(h);
+        demand = importance | ((h.flags & HISTORY_EXACT) != 0u ? DEMAND_EXACT : 0u) | (h.used == 0u ? DEMAND_NEW : 0u);
+    } else {
+        uint hidden = hidden_beside(pixel);
+        keeps = hidden != NO_HIT;
+        if (keeps) {
+            h = former_at(hidden);
+            h.frame = frame.frame;
+            h.flags |= HISTORY_HIDDEN;
+        }
+    }
+    set_demand(at, demand);
+    // Once for both, because software Vulkan writes lane by lane.
+    if (keeps) {
+        write_history(at, h);
+        write_noise(at, h);
     } else {
         write_no_history(at);
-        keep_hidden(pixel, at);
     }
     uint total = subgroupAdd(importance);
     uint lit_total = subgroupAdd(lit);

@@ -125,7 +125,10 @@ bool tile_pixel(uint tile, out uvec2 pixel) {
 bool on_raster(ivec2 q) { return all(greaterThanEqual(q, ivec2(0))) && all(lessThan(q, ivec2(frame.width, frame.height))); }
 
 // Reflectance of the surface. Method dpm divides radiance by it before it is stored and filtered.
-vec3 albedo_of(Guide g) { return vec3(unpackHalf2x16(g.albedo_rg), unpackHalf2x16(g.albedo_b).x); }
+vec3 albedo_of(Tint t) { return vec3(unpackHalf2x16(t.albedo_rg), unpackHalf2x16(t.albedo_b_and_angle).x); }
+
+// Angle at the eye between the gaze point and the surface point, degrees.
+float angle_of(Tint t) { return unpackHalf2x16(t.albedo_b_and_angle).y; }
 
 bool is_lit(Surface s) { return s.id != NO_HIT && s.distance > 0.0; }
 

@@ -9,12 +9,14 @@
 
 layout(local_size_x = 8, local_size_y = 8) in;
 
+layout(set = 0, binding = B_RADIANCE, scalar) writeonly buffer Radiance { vec4 radiance_out[]; };
+
 uint samples_of(uvec2 pixel, uint at) {
     if (!is_lit(surface_at(at))) return 0u;
     uvec2 size = block_size(pixel);
     if (!is_traced_block(pixel, size)) return 0u;
     if (traced_pixel(pixel, size) != pixel) return 0u;
-    return (frame.flags & FRAME_SPP_BY_ANGLE) != 0u ? frame.zone_spp[zone_of(guide_at(at).angle)] : frame.spp;
+    return (frame.flags & FRAME_SPP_BY_ANGLE) != 0u ? frame.zone_spp[zone_of(sight_at(at).angle)] : frame.spp;
 }
 
 void main() {
@@ -22,5 +24,7 @@ void main() {
     bool inside = tile_pixel(tiles[gl_WorkGroupID.x >> 2u], pixel);
     uint at = pixel.y * frame.width + pixel.x;
     uint spp = !inside ? 0u : camera_is_eye() ? samples_of_camera(at) : samples_of(pixel, at);
-    list_work(at, inside, spp);
+    // The radiance of the other pixels is written by the pass `trace`.
+    if (inside && spp == 0u) radiance_out[at] = vec4(0.0);
+    list_work(at, spp);
 }

@@ -12,11 +12,11 @@ const float NORMAL_POWER = 32.0;
 
 // [paper]: the disk's mean is blended in between two angles from the gaze.
 vec3 disk_mean(uvec2 pixel, uint at, vec3 own) {
-    float blend = periphery(guide_at(at).angle);
+    float blend = periphery(sight_at(at).angle);
     if (!(blend > 0.0)) return own;
     uint instance = surface_at(at).id >> 24u;
-    vec3 position = history_at(at).position;
-    vec3 normal = decode_normal(history_at(at).normal);
+    vec3 position = history_place_at(at).position;
+    vec3 normal = decode_normal(history_place_at(at).normal);
     float footprint = abs(surface_at(at).distance) * frame.pixel_size;
     mat2 rotation = turn_of(pixel, 1u);
     vec3 sum = own;
@@ -25,8 +25,8 @@ vec3 disk_mean(uvec2 pixel, uint at, vec3 own) {
         ivec2 q = ivec2(pixel) + ivec2(round(rotation * DISK[i] * RADIUS_PX));
         uint tap;
         if (q == ivec2(pixel) || !neighbour(q, instance, tap)) continue;
-        vec3 apart = history_at(tap).position - position;
-        float w = max(dot(decode_normal(history_at(tap).normal), normal), 0.0);
+        vec3 apart = history_place_at(tap).position - position;
+        float w = max(dot(decode_normal(history_place_at(tap).normal), normal), 0.0);
         w = pow(w, NORMAL_POWER) * exp(-abs(dot(apart, normal)) / max(footprint, 1e-12));
         sum += w * filtered_at(tap).light;
         total += w;

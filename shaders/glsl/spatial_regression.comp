@@ -1,10 +1,11 @@
 // Spatial filter of the picture, never of the history: a local linear regression (method dpm).
 //
 // A pixel's light is replaced by that of a plane through its neighbours, as far as noise explains what the plane misses. Then the lag of the
-// histories around is corrected. All of this is without albedo, which is multiplied in at the end.
+// histories around is corrected. All of this is without albedo, which is multiplied in at the end. Then the light becomes code values at once.
 #version 460
 #extension GL_GOOGLE_include_directive : require
 #include "spatial.glsl"
+#include "compensate.glsl"
 
 layout(local_size_x = 8, local_size_y = 8) in;
 
@@ -46,17 +47,17 @@ float sequence_variance(float held) {
 // How far the history lags: a slope of the light over the histories' age is fitted to the drifts around, as far as chance does not explain it.
 float lag_of(uvec2 pixel, uint at) {
     uint instance = surface_at(at).id >> 24u;
-    vec3 normal = decode_normal(history_at(at).normal);
+    vec3 normal = decode_normal(history_place_at(at).normal);
     mat2 rotation = turn_of(pixel, 0u);
     float per_frame = samples_a_frame();
-    float age = history_at(at).weight / per_frame, drift = history_at(at).drift;
+    float age = filtered_at(at).weight / per_frame, drift = history_noise_at(at).drift;
     float xx = age * age, xy = age * drift, yy = drift * drift, used = 1.0;
     for (int i = 0; i < 12; i++) {
         ivec2 q = ivec2(pixel) + ivec2(round(rotation * DISK[i] * LAG_RADIUS_PX));
         uint tap;
         if (q == ivec2(pixel) || !neighbour(q, instance, tap)) continue;
-        float w = pow(max(dot(decode_normal(history_at(tap).normal), normal), 0.0), 8.0);
-        float x = history_at(tap).weight / per_frame, y = history_at(tap).drift;
+        float w = pow(max(dot(decode_normal(history_place_at(tap).normal), normal), 0.0), 8.0);
+        float x = filtered_at(tap).weight / per_frame, y = history_noise_at(tap).drift;
         xx += w * x * x;
         xy += w * x * y;
         yy += w * y * y;
@@ -65,7 +66,7 @@ float lag_of(uvec2 pixel, uint at) {
     float fit = xy * xy / max(xx, 1e-12);
     float chance = max(yy - fit, 0.0) / max(used - 1.0, 1.0);
     // Errors of the correction change from frame to frame. In the periphery, where the eye sees flicker best, only what is beyond doubt is corrected.
-    float doubt = mix(0.5, 8.0, periphery(guide_at(at).angle));
+    float doubt = mix(0.5, 8.0, periphery(angle_of(tint_at(at))));
     float trust = fit > 0.0 ? max(1.0 - doubt * chance / fit, 0.0) : 0.0;
     return trust * xy / max(xx, 1e-12) * age;
 }
@@ -73,8 +74,8 @@ float lag_of(uvec2 pixel, uint at) {
 // Fills the normal equations `a` (lower triangle by rows) and `b` from the 5 x 5 pixels around.
 Sums gather(uvec2 pixel, uint at, vec3 own, float tolerated, out float a[15], out vec3 b[N]) {
     uint instance = surface_at(at).id >> 24u;
-    vec3 position = history_at(at).position;
-    vec3 normal = decode_normal(history_at(at).normal);
+    vec3 position = history_place_at(at).position;
+    vec3 normal = decode_normal(history_place_at(at).normal);
     vec3 across = normalize(abs(normal.x) < 0.7 ? cross(normal, vec3(1.0, 0.0, 0.0)) : cross(normal, vec3(0.0, 1.0, 0.0)));
     vec3 along = cross(normal, across);
     float footprint = abs(surface_at(at).distance) * frame.pixel_size;
@@ -85,10 +86,10 @@ Sums gather(uvec2 pixel, uint at, vec3 own, float tolerated, out float a[15], ou
         ivec2 d = ivec2(i % 5, i / 5) - 2;
         uint tap;
         if (!neighbour(ivec2(pixel) + d, instance, tap)) continue;
-        vec3 n = decode_normal(history_at(tap).normal);
-        if (dot(n, normal) < LIKE_NORMAL || abs(dot(history_at(tap).position - position, normal)) > DEPTH * footprint) continue;
-        float light = luminance(albedo_of(guide_at(tap)));
-        float noise = filtered_at(tap).variance * sequence_variance(history_at(tap).weight) / (light * light);
+        vec3 n = decode_normal(history_place_at(tap).normal);
+        if (dot(n, normal) < LIKE_NORMAL || abs(dot(history_place_at(tap).position - position, normal)) > DEPTH * footprint) continue;
+        float light = luminance(albedo_of(tint_at(tap))), weight = filtered_at(tap).weight;
+        float noise = weight > 0.0 ? history_noise_at(tap).variance * sequence_variance(weight) / (weight * light * light) : 0.0;
         float w = 1.0 / (noise + tolerated);
         vec3 m = filtered_at(tap).light - own;
         float v[N] = float[](1.0, float(d.x), float(d.y), dot(n, across), dot(n, along));
@@ -102,7 +103,7 @@ Sums gather(uvec2 pixel, uint at, vec3 own, float tolerated, out float a[15], ou
         s.total += w;
         s.used += 1.0;
         s.expected += w * noise;
-        s.single += noise * history_at(tap).weight;
+        s.single += noise * weight;
     }
     return s;
 }
@@ -141,32 +142,40 @@ vec3 regressed(uvec2 pixel, uint at, vec3 own) {
     // The structure that the fit misses, around or at this very pixel, against the noise that the eye's mean leaves [Lee80].
     float structure = max(max(s.power - explained, 0.0) / s.total * s.used / max(s.used - 4.0, 1.0) - s.expected / s.total, 0.0);
     // A single pixel hardly knows the variance of its samples, so that of the neighbourhood is taken. It does know their number.
-    float held = history_at(at).weight;
+    float held = filtered_at(at).weight;
     float noise = s.single / s.used / max(held, 1e-6);
     float apart = luminance(b[0]);
     // In the periphery the eye sees flicker better than blur.
-    float beyond = periphery(guide_at(at).angle);
+    float beyond = periphery(angle_of(tint_at(at)));
     structure = max(structure, apart * apart - mix(3.0, 16.0, beyond) * noise);
     // The eye's mean removes what changes from frame to frame. Of a young point that is little, because all its frames share the same samples.
-    float changing = min(SEEN_FRAMES * samples_a_frame(), OWN_CHANGING * float(history_at(at).index));
+    float changing = min(SEEN_FRAMES * samples_a_frame(), OWN_CHANGING * float(history_noise_at(at).used & ~HISTORY_EXACT));
     noise *= mix(1.0, 5.0, beyond) * held / (held + changing);
     vec3 result = own + b[0] * (noise / max(structure + noise, 1e-12));
     return finite3(result) ? max(result, vec3(0.0)) : own;
 }
 
-void main() {
-    uvec2 pixel;
-    if (!tile_pixel(tiles[gl_WorkGroupID.x >> 2u], pixel)) return;
-    uint at = pixel.y * frame.width + pixel.x;
-    if (!is_lit(surface_at(at))) {
-        shown[at] = vec4(0.0);
-        return;
-    }
+// The light of the pixel toward the eye.
+vec3 light_of(uvec2 pixel, uint at) {
+    if (!is_lit(surface_at(at))) return vec3(0.0);
     vec3 light = filtered_at(at).light;
-    if (HAS_FILTER && (history_at(at).flags & HISTORY_EXACT) == 0u) {
+    if (HAS_FILTER && (history_noise_at(at).used & HISTORY_EXACT) == 0u) {
         light = regressed(pixel, at, light);
         float level = luminance(light);
         light *= clamp((level + lag_of(pixel, at)) / max(level, 1e-6), LEAST_CORRECTION, MOST_CORRECTION);
     }
-    shown[at] = vec4(light * albedo_of(guide_at(at)), 1.0);
+    return light * albedo_of(tint_at(at));
+}
+
+// It is computed before all else, so that what compensation needs does not take registers meanwhile.
+vec3 own_light;
+vec3 light_at(uvec2 pixel, uint at) { return own_light; }
+
+void main() {
+    uvec2 pixel;
+    if (!tile_pixel(tiles[gl_WorkGroupID.x >> 2u], pixel)) return;
+    uint at = pixel.y * frame.width + pixel.x;
+    own_light = light_of(pixel, at);
+    if ((frame.flags & FRAME_SHOWS_ALL) != 0u) shown[at] = vec4(own_light, is_lit(surface_at(at)) ? 1.0 : 0.0);
+    compensate(pixel, at);
 }

@@ -4,21 +4,22 @@
 // not used of an element is not read.
 
 #ifdef TEXEL_TABLES
-layout(set = 0, binding = B_INSTANCES, rgba32ui) uniform readonly uimageBuffer instance_rows;
+layout(set = 0, binding = B_INSTANCES, rgba32ui) uniform readonly uimageBuffer instances_image;
 Instance instance_at(uint i) {
-    uvec4 r0 = imageLoad(instance_rows, int(i) * 13 + 0);
-    uvec4 r1 = imageLoad(instance_rows, int(i) * 13 + 1);
-    uvec4 r2 = imageLoad(instance_rows, int(i) * 13 + 2);
-    uvec4 r3 = imageLoad(instance_rows, int(i) * 13 + 3);
-    uvec4 r4 = imageLoad(instance_rows, int(i) * 13 + 4);
-    uvec4 r5 = imageLoad(instance_rows, int(i) * 13 + 5);
-    uvec4 r6 = imageLoad(instance_rows, int(i) * 13 + 6);
-    uvec4 r7 = imageLoad(instance_rows, int(i) * 13 + 7);
-    uvec4 r8 = imageLoad(instance_rows, int(i) * 13 + 8);
-    uvec4 r9 = imageLoad(instance_rows, int(i) * 13 + 9);
-    uvec4 r10 = imageLoad(instance_rows, int(i) * 13 + 10);
-    uvec4 r11 = imageLoad(instance_rows, int(i) * 13 + 11);
-    uvec4 r12 = imageLoad(instance_rows, int(i) * 13 + 12);
+    uint at = i;
+    uvec4 r0 = imageLoad(instances_image, int(at) * 13 + 0);
+    uvec4 r1 = imageLoad(instances_image, int(at) * 13 + 1);
+    uvec4 r2 = imageLoad(instances_image, int(at) * 13 + 2);
+    uvec4 r3 = imageLoad(instances_image, int(at) * 13 + 3);
+    uvec4 r4 = imageLoad(instances_image, int(at) * 13 + 4);
+    uvec4 r5 = imageLoad(instances_image, int(at) * 13 + 5);
+    uvec4 r6 = imageLoad(instances_image, int(at) * 13 + 6);
+    uvec4 r7 = imageLoad(instances_image, int(at) * 13 + 7);
+    uvec4 r8 = imageLoad(instances_image, int(at) * 13 + 8);
+    uvec4 r9 = imageLoad(instances_image, int(at) * 13 + 9);
+    uvec4 r10 = imageLoad(instances_image, int(at) * 13 + 10);
+    uvec4 r11 = imageLoad(instances_image, int(at) * 13 + 11);
+    uvec4 r12 = imageLoad(instances_image, int(at) * 13 + 12);
     return Instance(vec4[3](vec4(uintBitsToFloat(r0.x), uintBitsToFloat(r0.y), uintBitsToFloat(r0.z), uintBitsToFloat(r0.w)), vec4(uintBitsToFloat(r1.x), uintBitsToFloat(r1.y), uintBitsToFloat(r1.z), uintBitsToFloat(r1.w)), vec4(uintBitsToFloat(r2.x), uintBitsToFloat(r2.y), uintBitsToFloat(r2.z), uintBitsToFloat(r2.w))),
         vec4[3](vec4(uintBitsToFloat(r3.x), uintBitsToFloat(r3.y), uintBitsToFloat(r3.z), uintBitsToFloat(r3.w)), vec4(uintBitsToFloat(r4.x), uintBitsToFloat(r4.y), uintBitsToFloat(r4.z), uintBitsToFloat(r4.w)), vec4(uintBitsToFloat(r5.x), uintBitsToFloat(r5.y), uintBitsToFloat(r5.z), uintBitsToFloat(r5.w))),
         vec3(uintBitsToFloat(r6.x), uintBitsToFloat(r6.y), uintBitsToFloat(r6.z)),
@@ -36,27 +37,29 @@ Instance instance_at(uint i) {
 #else
 layout(set = 0, binding = B_INSTANCES, scalar) readonly buffer instance_block { Instance instance_table[]; };
 Instance instance_at(uint i) {
-    return Instance(instance_table[i].world_from_object,
-        instance_table[i].object_from_world,
-        instance_table[i].bounds_min,
-        instance_table[i].node_offset,
-        instance_table[i].bounds_max,
-        instance_table[i].triangle_offset,
-        instance_table[i].previous_world_from_object,
-        instance_table[i].flags,
-        instance_table[i].body,
-        instance_table[i].extent,
-        instance_table[i].mover,
-        instance_table[i].drive_gain,
-        instance_table[i].albedo_map);
+    uint at = i;
+    return Instance(instance_table[at].world_from_object,
+        instance_table[at].object_from_world,
+        instance_table[at].bounds_min,
+        instance_table[at].node_offset,
+        instance_table[at].bounds_max,
+        instance_table[at].triangle_offset,
+        instance_table[at].previous_world_from_object,
+        instance_table[at].flags,
+        instance_table[at].body,
+        instance_table[at].extent,
+        instance_table[at].mover,
+        instance_table[at].drive_gain,
+        instance_table[at].albedo_map);
 }
 #endif
 
 #ifdef TEXEL_TABLES
-layout(set = 0, binding = B_BODY_NODES, rgba32ui) uniform readonly uimageBuffer body_node_rows;
+layout(set = 0, binding = B_BODY_NODES, rgba32ui) uniform readonly uimageBuffer body_nodes_image;
 BodyNode body_node_at(uint i) {
-    uvec4 r0 = imageLoad(body_node_rows, int(i) * 2 + 0);
-    uvec4 r1 = imageLoad(body_node_rows, int(i) * 2 + 1);
+    uint at = i;
+    uvec4 r0 = imageLoad(body_nodes_image, int(at) * 2 + 0);
+    uvec4 r1 = imageLoad(body_nodes_image, int(at) * 2 + 1);
     return BodyNode(vec3(uintBitsToFloat(r0.x), uintBitsToFloat(r0.y), uintBitsToFloat(r0.z)),
         r0.w,
         vec3(uintBitsToFloat(r1.x), uintBitsToFloat(r1.y), uintBitsToFloat(r1.z)),
@@ -65,19 +68,21 @@ BodyNode body_node_at(uint i) {
 #else
 layout(set = 0, binding = B_BODY_NODES, scalar) readonly buffer body_node_block { BodyNode body_node_table[]; };
 BodyNode body_node_at(uint i) {
-    return BodyNode(body_node_table[i].lower,
-        body_node_table[i].after,
-        body_node_table[i].upper,
-        body_node_table[i].body);
+    uint at = i;
+    return BodyNode(body_node_table[at].lower,
+        body_node_table[at].after,
+        body_node_table[at].upper,
+        body_node_table[at].body);
 }
 #endif
 
 #ifdef TEXEL_TABLES
-layout(set = 0, binding = B_VERTICES, rgba32ui) uniform readonly uimageBuffer vertex_rows;
+layout(set = 0, binding = B_VERTICES, rgba32ui) uniform readonly uimageBuffer vertices_image;
 Vertex vertex_at(uint i) {
-    uvec4 r0 = imageLoad(vertex_rows, int(i) * 3 + 0);
-    uvec4 r1 = imageLoad(vertex_rows, int(i) * 3 + 1);
-    uvec4 r2 = imageLoad(vertex_rows, int(i) * 3 + 2);
+    uint at = i;
+    uvec4 r0 = imageLoad(vertices_image, int(at) * 3 + 0);
+    uvec4 r1 = imageLoad(vertices_image, int(at) * 3 + 1);
+    uvec4 r2 = imageLoad(vertices_image, int(at) * 3 + 2);
     return Vertex(vec3(uintBitsToFloat(r0.x), uintBitsToFloat(r0.y), uintBitsToFloat(r0.z)),
         vec2(uintBitsToFloat(r0.w), uintBitsToFloat(r1.x)),
         vec4(uintBitsToFloat(r1.y), uintBitsToFloat(r1.z), uintBitsToFloat(r1.w), uintBitsToFloat(r2.x)),
@@ -86,18 +91,20 @@ Vertex vertex_at(uint i) {
 #else
 layout(set = 0, binding = B_VERTICES, scalar) readonly buffer vertex_block { Vertex vertex_table[]; };
 Vertex vertex_at(uint i) {
-    return Vertex(vertex_table[i].normal,
-        vertex_table[i].uv,
-        vertex_table[i].tangent,
-        vertex_table[i].reserved);
+    uint at = i;
+    return Vertex(vertex_table[at].normal,
+        vertex_table[at].uv,
+        vertex_table[at].tangent,
+        vertex_table[at].reserved);
 }
 #endif
 
 #ifdef TEXEL_TABLES
-layout(set = 0, binding = B_TRIANGLE_REFS, rgba32ui) uniform readonly uimageBuffer triangle_ref_rows;
+layout(set = 0, binding = B_TRIANGLE_REFS, rgba32ui) uniform readonly uimageBuffer triangle_refs_image;
 TriangleRef triangle_ref_at(uint i) {
-    uvec4 r0 = imageLoad(triangle_ref_rows, int(i) * 2 + 0);
-    uvec4 r1 = imageLoad(triangle_ref_rows, int(i) * 2 + 1);
+    uint at = i;
+    uvec4 r0 = imageLoad(triangle_refs_image, int(at) * 2 + 0);
+    uvec4 r1 = imageLoad(triangle_refs_image, int(at) * 2 + 1);
     return TriangleRef(uvec3(r0.x, r0.y, r0.z),
         r0.w,
         r1.x,
@@ -106,29 +113,31 @@ TriangleRef triangle_ref_at(uint i) {
 #else
 layout(set = 0, binding = B_TRIANGLE_REFS, scalar) readonly buffer triangle_ref_block { TriangleRef triangle_ref_table[]; };
 TriangleRef triangle_ref_at(uint i) {
-    return TriangleRef(triangle_ref_table[i].vertices,
-        triangle_ref_table[i].material,
-        triangle_ref_table[i].light,
-        triangle_ref_table[i].reserved);
+    uint at = i;
+    return TriangleRef(triangle_ref_table[at].vertices,
+        triangle_ref_table[at].material,
+        triangle_ref_table[at].light,
+        triangle_ref_table[at].reserved);
 }
 #endif
 
 #ifdef TEXEL_TABLES
-layout(set = 0, binding = B_MATERIALS, rgba32ui) uniform readonly uimageBuffer material_rows;
+layout(set = 0, binding = B_MATERIALS, rgba32ui) uniform readonly uimageBuffer materials_image;
 Material material_at(uint i) {
-    uvec4 r0 = imageLoad(material_rows, int(i) * 13 + 0);
-    uvec4 r1 = imageLoad(material_rows, int(i) * 13 + 1);
-    uvec4 r2 = imageLoad(material_rows, int(i) * 13 + 2);
-    uvec4 r3 = imageLoad(material_rows, int(i) * 13 + 3);
-    uvec4 r4 = imageLoad(material_rows, int(i) * 13 + 4);
-    uvec4 r5 = imageLoad(material_rows, int(i) * 13 + 5);
-    uvec4 r6 = imageLoad(material_rows, int(i) * 13 + 6);
-    uvec4 r7 = imageLoad(material_rows, int(i) * 13 + 7);
-    uvec4 r8 = imageLoad(material_rows, int(i) * 13 + 8);
-    uvec4 r9 = imageLoad(material_rows, int(i) * 13 + 9);
-    uvec4 r10 = imageLoad(material_rows, int(i) * 13 + 10);
-    uvec4 r11 = imageLoad(material_rows, int(i) * 13 + 11);
-    uvec4 r12 = imageLoad(material_rows, int(i) * 13 + 12);
+    uint at = i;
+    uvec4 r0 = imageLoad(materials_image, int(at) * 13 + 0);
+    uvec4 r1 = imageLoad(materials_image, int(at) * 13 + 1);
+    uvec4 r2 = imageLoad(materials_image, int(at) * 13 + 2);
+    uvec4 r3 = imageLoad(materials_image, int(at) * 13 + 3);
+    uvec4 r4 = imageLoad(materials_image, int(at) * 13 + 4);
+    uvec4 r5 = imageLoad(materials_image, int(at) * 13 + 5);
+    uvec4 r6 = imageLoad(materials_image, int(at) * 13 + 6);
+    uvec4 r7 = imageLoad(materials_image, int(at) * 13 + 7);
+    uvec4 r8 = imageLoad(materials_image, int(at) * 13 + 8);
+    uvec4 r9 = imageLoad(materials_image, int(at) * 13 + 9);
+    uvec4 r10 = imageLoad(materials_image, int(at) * 13 + 10);
+    uvec4 r11 = imageLoad(materials_image, int(at) * 13 + 11);
+    uvec4 r12 = imageLoad(materials_image, int(at) * 13 + 12);
     return Material(vec3(uintBitsToFloat(r0.x), uintBitsToFloat(r0.y), uintBitsToFloat(r0.z)),
         uintBitsToFloat(r0.w),
         vec3(uintBitsToFloat(r1.x), uintBitsToFloat(r1.y), uintBitsToFloat(r1.z)),
@@ -160,43 +169,47 @@ Material material_at(uint i) {
 #else
 layout(set = 0, binding = B_MATERIALS, scalar) readonly buffer material_block { Material material_table[]; };
 Material material_at(uint i) {
-    return Material(material_table[i].base_color,
-        material_table[i].alpha,
-        material_table[i].emissive,
-        material_table[i].alpha_cutoff,
-        material_table[i].metallic,
-        material_table[i].roughness,
-        material_table[i].ior,
-        material_table[i].transmission,
-        material_table[i].normal_scale,
-        material_table[i].flags,
-        material_table[i].albedo_table,
-        material_table[i].base_color_texture,
-        material_table[i].metallic_roughness_texture,
-        material_table[i].normal_texture,
-        material_table[i].emissive_texture,
-        material_table[i].transmission_texture,
-        material_table[i].reserved);
+    uint at = i;
+    return Material(material_table[at].base_color,
+        material_table[at].alpha,
+        material_table[at].emissive,
+        material_table[at].alpha_cutoff,
+        material_table[at].metallic,
+        material_table[at].roughness,
+        material_table[at].ior,
+        material_table[at].transmission,
+        material_table[at].normal_scale,
+        material_table[at].flags,
+        material_table[at].albedo_table,
+        material_table[at].base_color_texture,
+        material_table[at].metallic_roughness_texture,
+        material_table[at].normal_texture,
+        material_table[at].emissive_texture,
+        material_table[at].transmission_texture,
+        material_table[at].reserved);
 }
 #endif
 
 #ifdef TEXEL_TABLES
-layout(set = 0, binding = B_ALBEDO, rgba32ui) uniform readonly uimageBuffer albedo_cell_rows;
+layout(set = 0, binding = B_ALBEDO, rgba32ui) uniform readonly uimageBuffer albedo_image;
 AlbedoCell albedo_cell_at(uint i) {
-    uvec4 r0 = imageLoad(albedo_cell_rows, int(i) * 1 + 0);
+    uint at = i;
+    uvec4 r0 = imageLoad(albedo_image, int(at) * 1 + 0);
     return AlbedoCell(vec4(uintBitsToFloat(r0.x), uintBitsToFloat(r0.y), uintBitsToFloat(r0.z), uintBitsToFloat(r0.w)));
 }
 #else
 layout(set = 0, binding = B_ALBEDO, scalar) readonly buffer albedo_cell_block { AlbedoCell albedo_cell_table[]; };
 AlbedoCell albedo_cell_at(uint i) {
-    return AlbedoCell(albedo_cell_table[i].corners);
+    uint at = i;
+    return AlbedoCell(albedo_cell_table[at].corners);
 }
 #endif
 
 #ifdef TEXEL_TABLES
-layout(set = 0, binding = B_SURFACE_ROWS, rgba32ui) uniform readonly uimageBuffer surface_rows;
+layout(set = 0, binding = B_SURFACE_ROWS, rgba32ui) uniform readonly uimageBuffer surface_rows_image;
 Surface surface_at(uint i) {
-    uvec4 r0 = imageLoad(surface_rows, int(i) * 1 + 0);
+    uint at = i;
+    uvec4 r0 = imageLoad(surface_rows_image, int(at) * 1 + 0);
     return Surface(r0.x,
         vec2(uintBitsToFloat(r0.y), uintBitsToFloat(r0.z)),
         uintBitsToFloat(r0.w));
@@ -204,123 +217,208 @@ Surface surface_at(uint i) {
 #else
 layout(set = 0, binding = B_SURFACES, scalar) readonly buffer surface_block { Surface surface_table[]; };
 Surface surface_at(uint i) {
-    return Surface(surface_table[i].id,
-        surface_table[i].barycentric,
-        surface_table[i].distance);
+    uint at = i;
+    return Surface(surface_table[at].id,
+        surface_table[at].barycentric,
+        surface_table[at].distance);
 }
 #endif
 
 #ifdef TEXEL_TABLES
-layout(set = 0, binding = B_GUIDE_ROWS, rgba32ui) uniform readonly uimageBuffer guide_rows;
-Guide guide_at(uint i) {
-    uvec4 r0 = imageLoad(guide_rows, int(i) * 2 + 0);
-    uvec4 r1 = imageLoad(guide_rows, int(i) * 2 + 1);
-    return Guide(vec2(uintBitsToFloat(r0.x), uintBitsToFloat(r0.y)),
+layout(set = 0, binding = B_GUIDE_ROWS, rgba32ui) uniform readonly uimageBuffer guide_rows_image;
+Sight sight_at(uint i) {
+    uint at = GUIDES_SIGHT_AT(i);
+    uvec4 r0 = imageLoad(guide_rows_image, int(at) * 1 + 0);
+    return Sight(vec2(uintBitsToFloat(r0.x), uintBitsToFloat(r0.y)),
         uintBitsToFloat(r0.z),
-        uintBitsToFloat(r0.w),
-        r1.x,
-        r1.y,
-        uvec2(r1.z, r1.w));
+        uintBitsToFloat(r0.w));
 }
 #else
-layout(set = 0, binding = B_GUIDES, scalar) readonly buffer guide_block { Guide guide_table[]; };
-Guide guide_at(uint i) {
-    return Guide(guide_table[i].motion,
-        guide_table[i].size,
-        guide_table[i].angle,
-        guide_table[i].albedo_rg,
-        guide_table[i].albedo_b,
-        guide_table[i].reserved);
+layout(set = 0, binding = B_GUIDES, scalar) readonly buffer sight_block { Sight sight_table[]; };
+Sight sight_at(uint i) {
+    uint at = GUIDES_SIGHT_AT(i);
+    return Sight(sight_table[at].motion,
+        sight_table[at].size,
+        sight_table[at].angle);
 }
 #endif
 
 #ifdef TEXEL_TABLES
-layout(set = 0, binding = B_HISTORY_ROWS, rgba32ui) uniform readonly uimageBuffer history_rows;
-History history_at(uint i) {
-    uvec4 r0 = imageLoad(history_rows, int(i) * 4 + 0);
-    uvec4 r1 = imageLoad(history_rows, int(i) * 4 + 1);
-    uvec4 r2 = imageLoad(history_rows, int(i) * 4 + 2);
-    uvec4 r3 = imageLoad(history_rows, int(i) * 4 + 3);
-    return History(vec3(uintBitsToFloat(r0.x), uintBitsToFloat(r0.y), uintBitsToFloat(r0.z)),
-        uintBitsToFloat(r0.w),
-        vec3(uintBitsToFloat(r1.x), uintBitsToFloat(r1.y), uintBitsToFloat(r1.z)),
-        r1.w,
-        uintBitsToFloat(r2.x),
-        uintBitsToFloat(r2.y),
-        uintBitsToFloat(r2.z),
-        r2.w,
-        r3.x,
-        r3.y,
-        r3.z,
-        r3.w);
+layout(set = 0, binding = B_GUIDE_WORDS_ROWS, r32ui) uniform readonly uimageBuffer guide_words_rows_image;
+Tint tint_at(uint i) {
+    uint at = GUIDES_TINT_AT(i);
+    uvec4 r0 = uvec4(imageLoad(guide_words_rows_image, int(at) * 2 + 0).x, imageLoad(guide_words_rows_image, int(at) * 2 + 1).x, 0u, 0u);
+    return Tint(r0.x,
+        r0.y);
 }
 #else
-layout(set = 0, binding = B_HISTORY, scalar) readonly buffer history_block { History history_table[]; };
-History history_at(uint i) {
-    return History(history_table[i].mean,
-        history_table[i].weight,
-        history_table[i].position,
-        history_table[i].normal,
-        history_table[i].drift,
-        history_table[i].variance,
-        history_table[i].surprise,
-        history_table[i].seed,
-        history_table[i].index,
-        history_table[i].instance,
-        history_table[i].frame,
-        history_table[i].flags);
+layout(set = 0, binding = B_GUIDES, scalar) readonly buffer tint_block { Tint tint_table[]; };
+Tint tint_at(uint i) {
+    uint at = GUIDES_TINT_AT(i);
+    return Tint(tint_table[at].albedo_rg,
+        tint_table[at].albedo_b_and_angle);
 }
 #endif
 
 #ifdef TEXEL_TABLES
-layout(set = 0, binding = B_FORMER, rgba32ui) uniform readonly uimageBuffer former_rows;
-History former_at(uint i) {
-    uvec4 r0 = imageLoad(former_rows, int(i) * 4 + 0);
-    uvec4 r1 = imageLoad(former_rows, int(i) * 4 + 1);
-    uvec4 r2 = imageLoad(former_rows, int(i) * 4 + 2);
-    uvec4 r3 = imageLoad(former_rows, int(i) * 4 + 3);
-    return History(vec3(uintBitsToFloat(r0.x), uintBitsToFloat(r0.y), uintBitsToFloat(r0.z)),
-        uintBitsToFloat(r0.w),
-        vec3(uintBitsToFloat(r1.x), uintBitsToFloat(r1.y), uintBitsToFloat(r1.z)),
-        r1.w,
-        uintBitsToFloat(r2.x),
-        uintBitsToFloat(r2.y),
-        uintBitsToFloat(r2.z),
-        r2.w,
-        r3.x,
-        r3.y,
-        r3.z,
-        r3.w);
+layout(set = 0, binding = B_HISTORY_ROWS, rgba32ui) uniform readonly uimageBuffer history_rows_image;
+HistoryLight history_light_at(uint i) {
+    uint at = HISTORY_LIGHT_AT(i);
+    uvec4 r0 = imageLoad(history_rows_image, int(at) * 1 + 0);
+    return HistoryLight(vec3(uintBitsToFloat(r0.x), uintBitsToFloat(r0.y), uintBitsToFloat(r0.z)),
+        uintBitsToFloat(r0.w));
 }
 #else
-layout(set = 0, binding = B_FORMER, scalar) readonly buffer former_block { History former_table[]; };
-History former_at(uint i) {
-    return History(former_table[i].mean,
-        former_table[i].weight,
-        former_table[i].position,
-        former_table[i].normal,
-        former_table[i].drift,
-        former_table[i].variance,
-        former_table[i].surprise,
-        former_table[i].seed,
-        former_table[i].index,
-        former_table[i].instance,
-        former_table[i].frame,
-        former_table[i].flags);
+layout(set = 0, binding = B_HISTORY, scalar) readonly buffer history_light_block { HistoryLight history_light_table[]; };
+HistoryLight history_light_at(uint i) {
+    uint at = HISTORY_LIGHT_AT(i);
+    return HistoryLight(history_light_table[at].mean,
+        history_light_table[at].weight);
 }
 #endif
 
 #ifdef TEXEL_TABLES
-layout(set = 0, binding = B_FILTERED_ROWS, rgba32ui) uniform readonly uimageBuffer filtered_rows;
+HistoryPlace history_place_at(uint i) {
+    uint at = HISTORY_PLACE_AT(i);
+    uvec4 r0 = imageLoad(history_rows_image, int(at) * 1 + 0);
+    return HistoryPlace(vec3(uintBitsToFloat(r0.x), uintBitsToFloat(r0.y), uintBitsToFloat(r0.z)),
+        r0.w);
+}
+#else
+layout(set = 0, binding = B_HISTORY, scalar) readonly buffer history_place_block { HistoryPlace history_place_table[]; };
+HistoryPlace history_place_at(uint i) {
+    uint at = HISTORY_PLACE_AT(i);
+    return HistoryPlace(history_place_table[at].position,
+        history_place_table[at].normal);
+}
+#endif
+
+#ifdef TEXEL_TABLES
+HistoryNoise history_noise_at(uint i) {
+    uint at = HISTORY_NOISE_AT(i);
+    uvec4 r0 = imageLoad(history_rows_image, int(at) * 1 + 0);
+    return HistoryNoise(uintBitsToFloat(r0.x),
+        uintBitsToFloat(r0.y),
+        uintBitsToFloat(r0.z),
+        r0.w);
+}
+#else
+layout(set = 0, binding = B_HISTORY, scalar) readonly buffer history_noise_block { HistoryNoise history_noise_table[]; };
+HistoryNoise history_noise_at(uint i) {
+    uint at = HISTORY_NOISE_AT(i);
+    return HistoryNoise(history_noise_table[at].drift,
+        history_noise_table[at].variance,
+        history_noise_table[at].surprise,
+        history_noise_table[at].used);
+}
+#endif
+
+#ifdef TEXEL_TABLES
+HistoryTag history_tag_at(uint i) {
+    uint at = HISTORY_TAG_AT(i);
+    uvec4 r0 = imageLoad(history_rows_image, int(at) * 1 + 0);
+    return HistoryTag(r0.x,
+        r0.y,
+        r0.z,
+        r0.w);
+}
+#else
+layout(set = 0, binding = B_HISTORY, scalar) readonly buffer history_tag_block { HistoryTag history_tag_table[]; };
+HistoryTag history_tag_at(uint i) {
+    uint at = HISTORY_TAG_AT(i);
+    return HistoryTag(history_tag_table[at].seed,
+        history_tag_table[at].used_before,
+        history_tag_table[at].owner,
+        history_tag_table[at].frame);
+}
+#endif
+
+#ifdef TEXEL_TABLES
+layout(set = 0, binding = B_FORMER, rgba32ui) uniform readonly uimageBuffer former_image;
+HistoryLight former_light_at(uint i) {
+    uint at = HISTORY_LIGHT_AT(i);
+    uvec4 r0 = imageLoad(former_image, int(at) * 1 + 0);
+    return HistoryLight(vec3(uintBitsToFloat(r0.x), uintBitsToFloat(r0.y), uintBitsToFloat(r0.z)),
+        uintBitsToFloat(r0.w));
+}
+#else
+layout(set = 0, binding = B_FORMER, scalar) readonly buffer former_light_block { HistoryLight former_light_table[]; };
+HistoryLight former_light_at(uint i) {
+    uint at = HISTORY_LIGHT_AT(i);
+    return HistoryLight(former_light_table[at].mean,
+        former_light_table[at].weight);
+}
+#endif
+
+#ifdef TEXEL_TABLES
+HistoryPlace former_place_at(uint i) {
+    uint at = HISTORY_PLACE_AT(i);
+    uvec4 r0 = imageLoad(former_image, int(at) * 1 + 0);
+    return HistoryPlace(vec3(uintBitsToFloat(r0.x), uintBitsToFloat(r0.y), uintBitsToFloat(r0.z)),
+        r0.w);
+}
+#else
+layout(set = 0, binding = B_FORMER, scalar) readonly buffer former_place_block { HistoryPlace former_place_table[]; };
+HistoryPlace former_place_at(uint i) {
+    uint at = HISTORY_PLACE_AT(i);
+    return HistoryPlace(former_place_table[at].position,
+        former_place_table[at].normal);
+}
+#endif
+
+#ifdef TEXEL_TABLES
+HistoryNoise former_noise_at(uint i) {
+    uint at = HISTORY_NOISE_AT(i);
+    uvec4 r0 = imageLoad(former_image, int(at) * 1 + 0);
+    return HistoryNoise(uintBitsToFloat(r0.x),
+        uintBitsToFloat(r0.y),
+        uintBitsToFloat(r0.z),
+        r0.w);
+}
+#else
+layout(set = 0, binding = B_FORMER, scalar) readonly buffer former_noise_block { HistoryNoise former_noise_table[]; };
+HistoryNoise former_noise_at(uint i) {
+    uint at = HISTORY_NOISE_AT(i);
+    return HistoryNoise(former_noise_table[at].drift,
+        former_noise_table[at].variance,
+        former_noise_table[at].surprise,
+        former_noise_table[at].used);
+}
+#endif
+
+#ifdef TEXEL_TABLES
+HistoryTag former_tag_at(uint i) {
+    uint at = HISTORY_TAG_AT(i);
+    uvec4 r0 = imageLoad(former_image, int(at) * 1 + 0);
+    return HistoryTag(r0.x,
+        r0.y,
+        r0.z,
+        r0.w);
+}
+#else
+layout(set = 0, binding = B_FORMER, scalar) readonly buffer former_tag_block { HistoryTag former_tag_table[]; };
+HistoryTag former_tag_at(uint i) {
+    uint at = HISTORY_TAG_AT(i);
+    return HistoryTag(former_tag_table[at].seed,
+        former_tag_table[at].used_before,
+        former_tag_table[at].owner,
+        former_tag_table[at].frame);
+}
+#endif
+
+#ifdef TEXEL_TABLES
+layout(set = 0, binding = B_FILTERED_ROWS, rgba32ui) uniform readonly uimageBuffer filtered_rows_image;
 Filtered filtered_at(uint i) {
-    uvec4 r0 = imageLoad(filtered_rows, int(i) * 1 + 0);
+    uint at = i;
+    uvec4 r0 = imageLoad(filtered_rows_image, int(at) * 1 + 0);
     return Filtered(vec3(uintBitsToFloat(r0.x), uintBitsToFloat(r0.y), uintBitsToFloat(r0.z)),
         uintBitsToFloat(r0.w));
 }
 #else
 layout(set = 0, binding = B_FILTERED, scalar) readonly buffer filtered_block { Filtered filtered_table[]; };
 Filtered filtered_at(uint i) {
-    return Filtered(filtered_table[i].light,
-        filtered_table[i].variance);
+    uint at = i;
+    return Filtered(filtered_table[at].light,
+        filtered_table[at].weight);
 }
 #endif

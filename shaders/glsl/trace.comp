@@ -13,8 +13,6 @@ layout(set = 0, binding = B_SCHEDULE, scalar) readonly buffer ScheduleBlock { Sc
 layout(set = 0, binding = B_WORK, scalar) readonly buffer Work { WorkItem work[]; };
 // Mean of the samples in rgb, and their number in w.
 layout(set = 0, binding = B_RADIANCE, scalar) writeonly buffer Radiance { vec4 radiance_out[]; };
-// Method dpm: `Moments` of the samples. The buffer holds the history's picture from the pass accumulate on.
-layout(set = 0, binding = B_FILTERED, scalar) writeonly buffer MomentsBlock { Filtered moments[]; };
 
 // The list of this frame: its items, and the samples of all of them.
 struct WorkList {
@@ -46,9 +44,9 @@ Sampler begin_sampler(uint at, uint spp) {
         rng.seed = hash_u32(at + hash_u32(frame.seed));
         rng.index = (frame.flags & FRAME_SPP_BY_ANGLE) != 0u ? frame.drawn * spp : frame.first_sample;
     } else {
-        History h = history_at(at);
-        rng.seed = h.seed;
-        rng.index = h.index;
+        HistoryTag tag = history_tag_at(at);
+        rng.seed = tag.seed;
+        rng.index = tag.used_before & ~HISTORY_EXACT;
     }
     return rng;
 }
@@ -92,7 +90,7 @@ bool add_sample(inout Sums sums, vec3 light, bool exact) {
 
 void write_sums(uint at, Sums sums) {
     radiance_out[at] = vec4(sums.count > 0u ? sums.light / float(sums.count) : vec3(0.0), float(sums.count));
-    if ((frame.flags & FRAME_DPM) != 0u) moments[at] = pack_moments(Moments(sums.squares, sums.exact));
+    if ((frame.flags & FRAME_DPM) != 0u) set_demand(at, pack_moments(Moments(sums.squares, sums.exact)));
 }
 
 #ifdef TEXEL_TABLES

@@ -68,7 +68,7 @@ void fill_slots(uint base) {
     bool dpm = (frame.flags & FRAME_DPM) != 0u;
     for (uint item = range.first_item + lane; item < range.end_item; item += TRACE_LANES) {
         uint at = work[item].pixel, first = work[item].first, end = end_of(item);
-        bool was_exact = dpm && (history_at(at).flags & HISTORY_EXACT) != 0u;
+        bool was_exact = dpm && (history_tag_at(at).used_before & HISTORY_EXACT) != 0u;
         for (uint i = max(first, base); i < min(end, base + TRACE_SLOTS); i++) {
             uint slot = i - base;
             // What comes first in a round waits for nothing.

@@ -4,7 +4,6 @@
 #extension GL_EXT_shader_atomic_int64 : require
 
 layout(set = 0, binding = B_TILES, scalar) readonly buffer Tiles { uint tiles[]; };
-layout(set = 0, binding = B_RADIANCE, scalar) writeonly buffer Radiance { vec4 radiance_out[]; };
 layout(set = 0, binding = B_SCHEDULE, scalar) buffer ScheduleBlock { Schedule schedule; };
 layout(set = 0, binding = B_WORK, scalar) writeonly buffer Work { WorkItem work[]; };
 
@@ -32,11 +31,8 @@ void ask_for_groups(uint groups) {
     if (groups > GROUPS_IN_A_ROW) atomicMax(schedule.groups[1], (groups + GROUPS_IN_A_ROW - 1u) / GROUPS_IN_A_ROW);
 }
 
-// Lists the pixel at index `at` with `spp` samples. To be called by every invocation of a workgroup; those that are not `inside` the raster bring
-// no samples.
-void list_work(uint at, bool inside, uint spp) {
-    // The radiance of traced pixels is written by the pass `trace`, that of the others here.
-    if (inside && spp == 0u) radiance_out[at] = vec4(0.0);
+// Lists the pixel at index `at` with `spp` samples. To be called by every invocation of a workgroup; those outside the raster bring no samples.
+void list_work(uint at, uint spp) {
     uvec4 ballot = subgroupBallot(spp > 0u);
     uint items = subgroupBallotBitCount(ballot);
     if (items == 0u) return;

@@ -8,6 +8,10 @@ pub trait GlslType {
     fn member(name: &str) -> String;
     /// The value, from the words of the rows r0, r1, ... that begin with `word`, which moves past them.
     fn read(word: &mut usize) -> String;
+    /// `f` for each float and `u` for each integer of a number or vector; empty for anything else.
+    fn numbers() -> String {
+        String::new()
+    }
 }
 
 macro_rules! glsl_types {
@@ -19,6 +23,9 @@ macro_rules! glsl_types {
             fn read(word: &mut usize) -> String {
                 let words: Vec<_> = (0..$words).map(|_| cast(word, $cast)).collect();
                 if words.len() == 1 { words[0].clone() } else { format!("{}({})", $glsl, words.join(", ")) }
+            }
+            fn numbers() -> String {
+                if $cast == "uintBitsToFloat" { "f" } else { "u" }.repeat($words)
             }
         }
     )*};
@@ -89,6 +96,15 @@ pub fn generated_glsl() -> String {
     for (name, value) in structs::CONSTANTS.iter().chain(structs::BINDINGS).chain([&structs::TREE_BINDING]) {
         out.push_str(&format!("#define {name} {value}u\n"));
     }
+    out.push_str("// Index of a pixel's element in a part of a buffer.\n");
+    for part in structs::PARTS.iter().filter(|part| part.binding != "B_FORMER") {
+        let ([block, first], last) = (part.steps(), structs::PART_BLOCK - 1);
+        let shift = structs::PART_BLOCK.ilog2();
+        let name = macro_of(part);
+        out.push_str(&format!(
+            "#define {name}(i) (((i) >> {shift}u) * {block}u + {first}u + ((i) & {last}u))\n"
+        ));
+    }
     out.push_str(&format!("// Sobol dimensions 1 to 3 of the lowest {SOBOL_BITS} bits of an index, without branch or table look-up.\n"));
     out.push_str("#define SOBOL_123(i) uvec3(");
     let dimension = |row: &[u32; 32]| -> String {
@@ -109,24 +125,50 @@ pub fn generated_glsl() -> String {
     out
 }
 
+/// Name of the macro for the index of a pixel's element. Former histories lie as those of the frame do.
+fn macro_of(part: &structs::Part) -> String {
+    let binding = part.binding.trim_start_matches("B_").replace("FORMER", "HISTORY");
+    format!("{binding}_{}_AT", part.name.to_uppercase())
+}
+
 /// The text of `glsl/tables.glsl`: how tables are read.
 pub fn tables_glsl() -> String {
     let mut out = String::from(
         "// Written by build-shaders from shaders/src/structs.rs. Do not edit.\n//\n// Tables: storage on GPUs; rows of texel buffers on \
          software Vulkan, which reads storage lane by lane where lanes part. What is\n// not used of an element is not read.\n",
     );
-    for structs::Table { name, reader, storage, texel, bytes, from_rows, from_storage } in structs::tables() {
-        let rows = bytes / 16;
-        let fetches: String = (0..rows)
-            .map(|row| format!("    uvec4 r{row} = imageLoad({reader}_rows, int(i) * {rows} + {row});\n"))
+    let mut declared = Vec::new();
+    for table in structs::tables() {
+        let structs::Table { name, reader, storage, texel, bytes, part, from_rows, from_storage } = &table;
+        let words = table.texel_words();
+        let image = format!("{}_image", texel.trim_start_matches("B_").to_lowercase());
+        let declaration = if declared.contains(texel) {
+            String::new()
+        } else {
+            let format = if words == 4 { "rgba32ui" } else { "r32ui" };
+            format!("layout(set = 0, binding = {texel}, {format}) uniform readonly uimageBuffer {image};\n")
+        };
+        declared.push(texel);
+        let texels = bytes / 4 / words;
+        let fetch = |texel: usize| format!("imageLoad({image}, int(at) * {texels} + {texel})");
+        let fetches: String = (0..bytes.div_ceil(16))
+            .map(|row| match words {
+                4 => format!("    uvec4 r{row} = {};\n", fetch(row)),
+                _ => {
+                    let word = |i| if i < texels { format!("{}.x", fetch(i)) } else { "0u".to_owned() };
+                    let words: Vec<_> = (4 * row..4 * row + 4).map(word).collect();
+                    format!("    uvec4 r{row} = uvec4({});\n", words.join(", "))
+                }
+            })
             .collect();
+        let at = part.map_or("i".to_owned(), |part| format!("{}(i)", macro_of(&part)));
         out.push_str(&format!(
             "\n#ifdef TEXEL_TABLES\n\
-             layout(set = 0, binding = {texel}, rgba32ui) uniform readonly uimageBuffer {reader}_rows;\n\
-             {name} {reader}_at(uint i) {{\n{fetches}    return {from_rows};\n}}\n\
+             {declaration}\
+             {name} {reader}_at(uint i) {{\n    uint at = {at};\n{fetches}    return {from_rows};\n}}\n\
              #else\n\
              layout(set = 0, binding = {storage}, scalar) readonly buffer {reader}_block {{ {name} {reader}_table[]; }};\n\
-             {name} {reader}_at(uint i) {{\n    return {from_storage};\n}}\n\
+             {name} {reader}_at(uint i) {{\n    uint at = {at};\n    return {from_storage};\n}}\n\
              #endif\n"
         ));
     }

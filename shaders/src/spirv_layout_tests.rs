@@ -17,6 +17,8 @@ struct Module {
     pointers: HashMap<u32, u32>,
     /// Struct type to its members' types.
     structs: HashMap<u32, Vec<u32>>,
+    /// Types of numbers and vectors, as `f` and `u` for each number.
+    numbers: HashMap<u32, String>,
     /// Array type to its element's type.
     arrays: HashMap<u32, u32>,
     /// Array type to its stride.
@@ -41,6 +43,12 @@ fn parse(spirv: &[u8]) -> Module {
         assert!(count > 0, "an instruction without length");
         let w = &words[at + 1..at + count];
         match opcode {
+            21 => drop(module.numbers.insert(w[0], "u".to_owned())),
+            22 => drop(module.numbers.insert(w[0], "f".to_owned())),
+            23 => {
+                let of = module.numbers.get(&w[1]).cloned().unwrap_or_default();
+                module.numbers.insert(w[0], of.repeat(w[2] as usize));
+            }
             28 | 29 => drop(module.arrays.insert(w[0], w[1])),
             30 => drop(module.structs.insert(w[0], w[1..].to_vec())),
             32 => drop(module.pointers.insert(w[0], w[2])),
@@ -59,7 +67,15 @@ fn parse(spirv: &[u8]) -> Module {
     module
 }
 
-/// The Rust struct behind each binding that holds one, and its size.
+impl Module {
+    /// The numbers of a struct's members, as `structs::members_of`.
+    fn members(&self, id: u32) -> String {
+        let members: Vec<_> = self.structs[&id].iter().map(|m| self.numbers.get(m).cloned()).collect();
+        members.into_iter().map(Option::unwrap_or_default).collect::<Vec<_>>().join(",")
+    }
+}
+
+/// The Rust structs behind each binding that holds some, and their sizes.
 const BLOCKS: &[(&str, &str, usize)] = &[
     ("B_FRAME", "Frame", size_of::<structs::Frame>()),
     ("B_INSTANCES", "Instance", size_of::<structs::Instance>()),
@@ -72,9 +88,16 @@ const BLOCKS: &[(&str, &str, usize)] = &[
     ("B_ALBEDO", "AlbedoCell", size_of::<structs::AlbedoCell>()),
     ("B_SURFACES", "Surface", size_of::<structs::Surface>()),
     ("B_COUNTERS", "Counters", size_of::<structs::Counters>()),
-    ("B_GUIDES", "Guide", size_of::<structs::Guide>()),
-    ("B_HISTORY", "History", size_of::<structs::History>()),
-    ("B_FORMER", "History", size_of::<structs::History>()),
+    ("B_GUIDES", "Sight", size_of::<structs::Sight>()),
+    ("B_GUIDES", "Tint", size_of::<structs::Tint>()),
+    ("B_HISTORY", "HistoryLight", size_of::<structs::HistoryLight>()),
+    ("B_HISTORY", "HistoryPlace", size_of::<structs::HistoryPlace>()),
+    ("B_HISTORY", "HistoryNoise", size_of::<structs::HistoryNoise>()),
+    ("B_HISTORY", "HistoryTag", size_of::<structs::HistoryTag>()),
+    ("B_FORMER", "HistoryLight", size_of::<structs::HistoryLight>()),
+    ("B_FORMER", "HistoryPlace", size_of::<structs::HistoryPlace>()),
+    ("B_FORMER", "HistoryNoise", size_of::<structs::HistoryNoise>()),
+    ("B_FORMER", "HistoryTag", size_of::<structs::HistoryTag>()),
     ("B_FILTERED", "Filtered", size_of::<structs::Filtered>()),
     ("B_SCHEDULE", "Schedule", size_of::<structs::Schedule>()),
     ("B_WORK", "WorkItem", size_of::<structs::WorkItem>()),
@@ -110,7 +133,10 @@ fn offsets_and_strides_are_those_of_the_rust_structs() {
             let (binding_name, _) = (BINDINGS.iter())
                 .find(|(_, b)| b == binding)
                 .unwrap_or_else(|| panic!("{}: binding {binding} is not in BINDINGS", shader.name));
-            let Some(&(_, name, size)) = BLOCKS.iter().find(|(b, _, _)| b == binding_name) else { continue };
+            let known: Vec<_> = BLOCKS.iter().filter(|(b, _, _)| b == binding_name).collect();
+            if known.is_empty() {
+                continue;
+            }
             let what = format!("{} {binding_name}", shader.name);
             // variable -> pointer -> block -> struct, or -> runtime array -> struct
             let block = module.pointers[&module.variables[variable]];
@@ -124,13 +150,25 @@ fn offsets_and_strides_are_those_of_the_rust_structs() {
             };
             let member = members[0];
             assert_eq!(module.offsets[&(block, 0)], 0, "{what}");
-            let id = match module.arrays.get(&member) {
-                Some(&element) => {
-                    assert_eq!(module.strides[&member] as usize, size, "{what}: stride");
-                    element
-                }
-                None => member,
+            let id = module.arrays.get(&member).copied().unwrap_or(member);
+            if !module.structs.contains_key(&id) {
+                // Numbers in a buffer that has parts.
+                assert!(
+                    structs::PARTS.iter().any(|p| p.binding == *binding_name && p.element.is_empty()),
+                    "{what}"
+                );
+                continue;
+            }
+            // The parts of a buffer are told by their members.
+            let members = module.members(id);
+            let Some(&&(_, name, size)) =
+                known.iter().find(|(_, name, _)| known.len() == 1 || structs::members_of(name) == members)
+            else {
+                panic!("{what}: nothing of {known:?} has the members {members}");
             };
+            if let Some(stride) = module.strides.get(&member) {
+                assert_eq!(*stride as usize, size, "{what}: stride");
+            }
             assert_struct(&module, &what, id, name);
             seen.insert(name);
             if name == "Material" {

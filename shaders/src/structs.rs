@@ -31,6 +31,14 @@ macro_rules! gpu_structs {
                 }
             }
         )*
+        /// The numbers of each member of a struct, `f` for a float and `u` for an integer, with commas between members: by these the parts of
+        /// a buffer are told from one another in SPIR-V. A number is no struct, and has no name.
+        pub fn members_of(name: &str) -> String {
+            match name {
+                $(stringify!($name) => [$(<$ty as GlslType>::numbers()),*].join(","),)*
+                _ => "u".to_owned(),
+            }
+        }
         /// The GLSL of every struct, in order.
         pub fn glsl() -> String {
             let mut out = String::new();
@@ -183,48 +191,62 @@ gpu_structs! {
         instant: i32,
     }
 
-    /// What is known of a pixel without noise.
-    struct Guide {
+    /// Where a pixel's surface point moves, and how the eye sees it: what decides shading rates.
+    struct Sight {
         /// Pixels per frame that the surface point moved on the raster.
         motion: [f32; 2],
         /// Apparent pixel size, \[paper\] eq. 3.
         size: f32,
         /// Angle at the eye between the gaze point and this point, degrees.
         angle: f32,
-        /// Reflectance by which radiance is divided before it is filtered: red and green as halves.
-        albedo_rg: u32,
-        /// Blue, as a half.
-        albedo_b: u32,
-        /// 0.
-        reserved: [u32; 2],
     }
 
-    /// What former frames say about the surface point that a pixel shows now.
-    struct History {
+    /// What the light of a pixel is filtered by (method dpm).
+    struct Tint {
+        /// Reflectance by which radiance is divided before it is filtered: red and green as halves.
+        albedo_rg: u32,
+        /// Blue, and the angle at the eye between the gaze point and this point in degrees, as halves.
+        albedo_b_and_angle: u32,
+    }
+
+    /// The light that former frames found at the surface point that a pixel shows now.
+    struct HistoryLight {
         /// Mean radiance, divided by the albedo where the method does so.
         mean: [f32; 3],
         /// Frames (paper) or samples (dpm) that the mean stands on; 0: none.
         weight: f32,
+    }
+
+    /// Where that point is.
+    struct HistoryPlace {
         /// The surface point, body space. Method dpm: the point that the history belongs to, at most about half a pixel from the pixel's own.
         position: [f32; 3],
         /// Its normal, body space, octahedral.
         normal: u32,
-        /// What the last few frames say beyond the mean, as luminance without albedo: how far the mean lags behind (method dpm).
+    }
+
+    /// How far the mean can be trusted (method dpm).
+    struct HistoryNoise {
+        /// What the last few frames say beyond the mean, as luminance without albedo: how far the mean lags behind.
         drift: f32,
         /// Variance of one sample's luminance.
         variance: f32,
-        /// Mean square by which the luminance of a frame is beyond the history (method dpm): its noise, and what the history gets wrong.
+        /// Mean square by which the luminance of a frame is beyond the history: its noise, and what the history gets wrong.
         surprise: f32,
+        /// Samples of the point's sequence already used, and the bit `HISTORY_EXACT`.
+        used: u32,
+    }
+
+    /// Whose history it is.
+    struct HistoryTag {
         /// Seed of the point's sample sequence.
         seed: u32,
-        /// Samples of it already used.
-        index: u32,
-        /// Body.
-        instance: u32,
+        /// `used` before the frame's own samples.
+        used_before: u32,
+        /// Body in the high 8 bits, `HISTORY_HIDDEN` and `HISTORY_BORDER` below.
+        owner: u32,
         /// Frame that wrote it.
         frame: u32,
-        /// Bits: see `HISTORY_*`.
-        flags: u32,
     }
 
     /// A pixel to be traced. Its samples end where those of the next item begin.
@@ -251,11 +273,10 @@ gpu_structs! {
 
     /// A pixel's light before the spatial filter.
     struct Filtered {
-        /// Radiance, divided by the albedo where the method does so. Between the passes trace and accumulate of method dpm this holds
-        /// `Moments` instead (`moments.glsl`).
+        /// Radiance, divided by the albedo where the method does so.
         light: [f32; 3],
-        /// Variance of its luminance.
-        variance: f32,
+        /// Samples that it stands on (method dpm).
+        weight: f32,
     }
 
     /// One rigid body in the top level.
@@ -479,6 +500,11 @@ pub const CONSTANTS: &[(&str, u32)] = &[
     ("HISTORY_BORDER", HISTORY_BORDER),
     ("FRAME_ALLOCATE", FRAME_ALLOCATE),
     ("FRAME_STEADY", FRAME_STEADY),
+    ("FRAME_SHOWS_ALL", FRAME_SHOWS_ALL),
+    ("DEMAND_NOT_LIT", DEMAND_NOT_LIT),
+    ("DEMAND_NOT_TRACED", DEMAND_NOT_TRACED),
+    ("DEMAND_EXACT", DEMAND_EXACT),
+    ("DEMAND_NEW", DEMAND_NEW),
     ("RATE_TABLE_OCTAVE", RATE_TABLE_OCTAVE),
     ("RATE_TABLE_OCTAVES", RATE_TABLE_OCTAVES),
     ("NOISE_SIZE", NOISE_SIZE),
@@ -550,16 +576,29 @@ pub const FRAME_SPP_BY_ANGLE: u32 = 8;
 pub const FRAME_TEMPORAL: u32 = 16;
 /// Method dpm: every sample counts once in the history, radiance is filtered without its albedo.
 pub const FRAME_DPM: u32 = 32;
-/// Chance had no part in the last frame's light (a mirror of the sky), so that one sample told all of it.
-pub const HISTORY_EXACT: u32 = 1;
-/// The pixel itself was not lit in the last frame: its history waits for a surface point that has just slipped out of it.
+/// Bit of [`HistoryNoise::used`]: chance had no part in the last frame's light (a mirror of the sky), so that one sample told all of it.
+pub const HISTORY_EXACT: u32 = 1 << 31;
+/// Bit of [`HistoryTag::owner`]: the pixel itself was not lit in the last frame. Its history waits for a surface point that has just slipped out of it.
 pub const HISTORY_HIDDEN: u32 = 2;
-/// The point has come into view at the border of what is known, and has no sample of its own yet.
+/// Bit of [`HistoryTag::owner`]: the point came into view at the border of what was known. It counts as long as the point has no sample of its
+/// own.
 pub const HISTORY_BORDER: u32 = 4;
 /// Method dpm: samples go where they lower the error most.
 pub const FRAME_ALLOCATE: u32 = 64;
 /// Nothing has jumped, come or gone since the last frame: by so little has light moved that most pixels need not ask for it.
 pub const FRAME_STEADY: u32 = 128;
+/// The host reads what no pass needs: sights and the shown light of method dpm.
+pub const FRAME_SHOWS_ALL: u32 = 256;
+/// A pixel's demand (method dpm): it is not lit. Otherwise the pass `reproject` leaves its importance and the bits below, the pass `schedule`
+/// [`DEMAND_NOT_TRACED`], and the pass `trace` the sum of the squared luminances of the samples as the bits of a float, with the sign if they are
+/// exact.
+pub const DEMAND_NOT_LIT: u32 = u32::MAX;
+/// No ray of this frame begins at the pixel.
+pub const DEMAND_NOT_TRACED: u32 = 0x7fff_ffff;
+/// Bit of the demand before the pass `schedule`: as [`HISTORY_EXACT`].
+pub const DEMAND_EXACT: u32 = 1 << 30;
+/// Bit of the demand before the pass `schedule`: no sample of the point's sequence has been used.
+pub const DEMAND_NEW: u32 = 1 << 29;
 /// Entries of the table of \[Yang19\]'s b functions per octave of velocity.
 pub const RATE_TABLE_OCTAVE: u32 = 1024;
 /// Octaves of that table, from 2^-6 pixels per frame.
@@ -623,7 +662,118 @@ pub const SAMPLER_CONTINUED: u32 = 2;
 /// One sequence a pixel, continued over frames.
 pub const SAMPLER_PIXEL_SEQUENCE: u32 = 3;
 
-/// A table that shaders read by `{reader}_at(i)`: elements of whole rows of four words.
+/// Part of a buffer that holds several values of each pixel: of every [`PART_BLOCK`] pixels those of one kind, then those of the next. A shader that
+/// needs one kind does not touch the others.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Part {
+    /// Binding of the buffer.
+    pub binding: &'static str,
+    /// Name of the part, as in `B_HISTORY.light`.
+    pub name: &'static str,
+    /// The struct of an element; empty: a number.
+    pub element: &'static str,
+    /// Bytes of an element.
+    pub bytes: usize,
+    /// Bytes of a pixel in the parts before it.
+    pub before: usize,
+    /// Bytes of a pixel in all parts.
+    pub all: usize,
+}
+
+impl Part {
+    /// Where the element of a pixel is, in elements: those of a block from one block to the next, and those before the part's first in a block.
+    pub const fn steps(&self) -> [usize; 2] {
+        let [all, before] = [self.all * PART_BLOCK, self.before];
+        assert!(all.is_multiple_of(self.bytes) && before.is_multiple_of(self.bytes), "whole elements");
+        [self.all * PART_BLOCK / self.bytes, self.before * PART_BLOCK / self.bytes]
+    }
+
+    /// Index of a pixel's element, in elements.
+    pub const fn index(&self, pixel: usize) -> usize {
+        let [block, first] = self.steps();
+        pixel / PART_BLOCK * block + first + pixel % PART_BLOCK
+    }
+}
+
+/// Consecutive pixels whose elements of one kind lie side by side. Parts that were as long as the raster would begin, for usual rasters, at the same
+/// sets of a processor's caches, and would push each other out where a few pixels around one are read.
+pub const PART_BLOCK: usize = 64;
+
+/// Pixels for which a buffer with parts has room: whole blocks.
+pub const fn in_blocks(pixels: usize) -> usize {
+    pixels.next_multiple_of(PART_BLOCK)
+}
+
+macro_rules! parts {
+    ($($binding:literal: $($name:literal $element:ident,)+;)*) => {
+        /// The parts of every buffer that has some, in the order in which they lie.
+        pub const PARTS: &[Part] = &[$($(Part {
+            binding: $binding,
+            name: $name,
+            element: element_name(stringify!($element)),
+            bytes: size_of::<$element>(),
+            before: bytes_before($binding, $name),
+            all: bytes_before($binding, ""),
+        }),+),*];
+
+        /// Bytes of a pixel in the parts of a buffer that lie before one of them; in all of them for no name.
+        const fn bytes_before(binding: &str, name: &str) -> usize {
+            let mut before = 0;
+            $($(
+                if same($binding, binding) {
+                    if same($name, name) {
+                        return before;
+                    }
+                    before += size_of::<$element>();
+                }
+            )+)*
+            before
+        }
+    };
+}
+
+/// Whether two texts are equal, in constants.
+const fn same(a: &str, b: &str) -> bool {
+    let (a, b) = (a.as_bytes(), b.as_bytes());
+    let mut i = 0;
+    while i < a.len() && i < b.len() && a[i] == b[i] {
+        i += 1;
+    }
+    i == a.len() && i == b.len()
+}
+
+/// A number is no struct.
+const fn element_name(of: &'static str) -> &'static str {
+    if same(of, "u32") {
+        ""
+    } else {
+        of
+    }
+}
+
+// The larger elements come first, so that each part begins at a whole element.
+parts! {
+    "B_GUIDES": "sight" Sight, "tint" Tint, "demand" u32,;
+    "B_HISTORY": "light" HistoryLight, "place" HistoryPlace, "noise" HistoryNoise, "tag" HistoryTag,;
+    "B_FORMER": "light" HistoryLight, "place" HistoryPlace, "noise" HistoryNoise, "tag" HistoryTag,;
+}
+
+/// The part of a buffer.
+///
+/// # Panics
+/// There is no such part, which is a mistake of the caller.
+pub const fn part(binding: &str, name: &str) -> Part {
+    let mut i = 0;
+    while i < PARTS.len() {
+        if same(PARTS[i].binding, binding) && same(PARTS[i].name, name) {
+            return PARTS[i];
+        }
+        i += 1;
+    }
+    panic!("no such part")
+}
+
+/// A table that shaders read by `{reader}_at(i)`.
 pub(crate) struct Table {
     pub name: &'static str,
     pub reader: &'static str,
@@ -632,25 +782,39 @@ pub(crate) struct Table {
     /// Binding as texels; another one where some shader writes the table.
     pub texel: &'static str,
     pub bytes: usize,
+    /// Part of the buffer; `None`: the whole.
+    pub part: Option<Part>,
     /// GLSL that makes an element of the rows r0, r1, ...
     pub from_rows: String,
-    /// GLSL that makes it of the storage `{reader}_table[i]`.
+    /// GLSL that makes it of the storage `{reader}_table[at]`.
     pub from_storage: String,
 }
 
+impl Table {
+    /// Words of a texel: a whole row, or one word where elements are no whole rows.
+    pub(crate) fn texel_words(&self) -> usize {
+        if self.bytes.is_multiple_of(16) {
+            4
+        } else {
+            1
+        }
+    }
+}
+
 macro_rules! tables {
-    ($($name:ident $reader:literal, $storage:literal or $texel:literal;)*) => {
+    ($($name:ident $reader:literal, $storage:literal $(. $part:literal)? or $texel:literal;)*) => {
         /// What `tables.glsl` is written from.
         pub(crate) fn tables() -> Vec<Table> {
-            $(const { assert!(size_of::<$name>() % 16 == 0) };)*
+            $(const { assert!(size_of::<$name>() % 4 == 0) };)*
             vec![$(Table {
                 name: stringify!($name),
                 reader: $reader,
                 storage: $storage,
                 texel: $texel,
                 bytes: size_of::<$name>(),
+                part: [$(Some(part($storage, $part)),)? None][0],
                 from_rows: $name::read_members(&mut 0),
-                from_storage: $name::copy_members(concat!($reader, "_table[i]")),
+                from_storage: $name::copy_members(concat!($reader, "_table[at]")),
             }),*]
         }
 
@@ -667,9 +831,16 @@ tables! {
     Material "material", "B_MATERIALS" or "B_MATERIALS";
     AlbedoCell "albedo_cell", "B_ALBEDO" or "B_ALBEDO";
     Surface "surface", "B_SURFACES" or "B_SURFACE_ROWS";
-    Guide "guide", "B_GUIDES" or "B_GUIDE_ROWS";
-    History "history", "B_HISTORY" or "B_HISTORY_ROWS";
-    History "former", "B_FORMER" or "B_FORMER";
+    Sight "sight", "B_GUIDES"."sight" or "B_GUIDE_ROWS";
+    Tint "tint", "B_GUIDES"."tint" or "B_GUIDE_WORDS_ROWS";
+    HistoryLight "history_light", "B_HISTORY"."light" or "B_HISTORY_ROWS";
+    HistoryPlace "history_place", "B_HISTORY"."place" or "B_HISTORY_ROWS";
+    HistoryNoise "history_noise", "B_HISTORY"."noise" or "B_HISTORY_ROWS";
+    HistoryTag "history_tag", "B_HISTORY"."tag" or "B_HISTORY_ROWS";
+    HistoryLight "former_light", "B_FORMER"."light" or "B_FORMER";
+    HistoryPlace "former_place", "B_FORMER"."place" or "B_FORMER";
+    HistoryNoise "former_noise", "B_FORMER"."noise" or "B_FORMER";
+    HistoryTag "former_tag", "B_FORMER"."tag" or "B_FORMER";
     Filtered "filtered", "B_FILTERED" or "B_FILTERED_ROWS";
 }
 
@@ -711,10 +882,11 @@ pub const BINDINGS: &[(&str, u32)] = &[
     ("B_MOTION", 33),
     ("B_MOVERS", 34),
     ("B_PLANE_GROUPS", 35),
+    ("B_GUIDE_WORDS_ROWS", 36),
 ];
 
 /// The binding after them, of the shaders that ask the device for hits: no buffer, but the tree over the bodies of the frame.
-pub const TREE_BINDING: (&str, u32) = ("B_BODY_TREE", 36);
+pub const TREE_BINDING: (&str, u32) = ("B_BODY_TREE", 37);
 
 impl Surface {
     /// Light falls on it: something was met, and the eye sees it. As `is_lit` of the shaders.

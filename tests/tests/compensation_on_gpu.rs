@@ -6,14 +6,15 @@ use dpm_lab::twins::compensation::{interpolated, on_albedo, ray_of, real_cosine,
 use dpm_render::albedo_map::AlbedoMap;
 use dpm_render::drive::Response;
 use dpm_render::gpu::{
-    BindingKind, BindingSet, BindingTable, Buffer, CommandList, ComputePipeline, FrameFence, Gpu, MemoryKind,
+    shared_bindings, BindingSet, BindingTable, Buffer, CommandList, ComputePipeline, FrameFence, Gpu,
+    MemoryKind,
 };
 use dpm_render::pack::{quantise, QuantiseCounts};
 use dpm_render::scene_data::SceneNeeds;
 use dpm_shaders::specialization as ids;
 use dpm_shaders::structs::{
     Counters, Frame, Instance, Rows, Surface, TriangleRef, Vertex, BINDINGS, LENS_BROWN, LENS_NONE,
-    NO_ALBEDO_MAP, NO_HIT, TEXEL_BINDINGS,
+    NO_ALBEDO_MAP, NO_HIT,
 };
 use dpm_shaders::Reading;
 use dpm_tests::gpu::with_gpu;
@@ -95,7 +96,10 @@ fn on_gpu_through(gpu: &Arc<Gpu>, input: &Input, texel: bool) -> (Vec<u32>, Coun
     let tiles: Vec<u32> = (0..WIDTH.div_ceil(16) * HEIGHT.div_ceil(16)).collect();
     let device = |what, bytes| Buffer::new(gpu, what, bytes, MemoryKind::Device).unwrap();
     let host = |what, bytes| Buffer::new(gpu, what, bytes, MemoryKind::Readback).unwrap();
-    let unused = rows("unused", &[0; 16]);
+    let unused = Buffer::new_texels(gpu, "unused", 1, false, MemoryKind::Device)
+        .unwrap()
+        .viewed_as_words("unused")
+        .unwrap();
     let (mut frame, mut instances) = (input.frame, input.instances.clone());
     let (optics, optics_constants) = input.optics.table(&mut frame, &mut instances);
     let frame = uploaded("frame", bytemuck::bytes_of(&frame));
@@ -111,16 +115,11 @@ fn on_gpu_through(gpu: &Arc<Gpu>, input: &Input, texel: bool) -> (Vec<u32>, Coun
     let codes_host = host("codes", PIXELS * 4);
     let counters_host = host("counters", size_of::<Counters>());
     let bound = || BINDINGS.iter().filter(|(name, _)| texel || !name.ends_with("_ROWS"));
-    let kinds: Vec<_> = bound()
-        .map(|&(name, binding)| {
-            let of_rows = texel && TEXEL_BINDINGS.contains(&name);
-            (binding, if of_rows { BindingKind::Texel } else { BindingKind::Storage })
-        })
-        .collect();
-    let table = BindingTable::new(gpu, &kinds).unwrap();
+    let reading = if texel { Reading::Texels } else { Reading::Storage };
+    let table = BindingTable::new(gpu, &shared_bindings(reading)).unwrap();
     let mut constants = SceneNeeds::default().everything().constants();
     constants.extend(optics_constants);
-    let shader = dpm_shaders::COMPENSATE.reading(if texel { Reading::Texels } else { Reading::Storage });
+    let shader = dpm_shaders::COMPENSATE.reading(reading);
     let pipeline = ComputePipeline::new(&table, shader, &constants).unwrap();
     let buffers: Vec<(u32, &Buffer)> = bound()
         .map(|&(name, binding)| {

@@ -92,7 +92,7 @@ fn light_falls_where_the_lens_projects_and_moves_as_it_does() {
             let (mut surfaces, mut guides) = (vec![], vec![]);
             let renderer = draw(gpu, &scene, &camera, &[before, now], Keep::default(), |slot| {
                 surfaces = slot.surfaces().unwrap().to_vec();
-                guides = slot.guides().unwrap().to_vec();
+                guides = slot.guides().unwrap();
             });
             let (mut worst, mut worst_motion, mut lit) = (0.0f64, 0.0f64, 0);
             for (i, surface) in surfaces.iter().enumerate().filter(|(_, s)| s.id != NO_HIT) {
@@ -101,7 +101,7 @@ fn light_falls_where_the_lens_projects_and_moves_as_it_does() {
                 let at = camera.project(now.transform_point3(point)).unwrap();
                 worst = worst.max((at - centre).length());
                 let was = camera.project(before.transform_point3(point)).unwrap();
-                let motion = guides[i].motion.map(f64::from);
+                let motion = guides[i].sight.motion.map(f64::from);
                 worst_motion = worst_motion.max((centre - was - DVec2::from_array(motion)).length());
                 lit += 1;
             }

@@ -149,7 +149,7 @@ impl Theatre {
         let mut slot = renderer.create_slot(true)?;
         let poses = poses_at(&rig, span.last_slot);
         draw(&rig, &mut renderer, &mut slot, &poses, 0, 1.0)?;
-        let (surfaces, guides) = (slot.surfaces().unwrap_or(&[]), slot.guides().unwrap_or(&[]));
+        let (surfaces, guides) = (slot.surfaces().unwrap_or(&[]), slot.guides().unwrap_or_default());
         let width = rig.camera.raster.width();
         let probes = surfaces
             .iter()
@@ -165,7 +165,7 @@ impl Theatre {
                     body,
                     point: poses[body].inverse().transform_point3(world),
                     pixel: i as u32,
-                    angle: g.angle,
+                    angle: g.sight.angle,
                 }
             })
             .collect();

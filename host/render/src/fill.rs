@@ -2,23 +2,19 @@
 
 use crate::gpu::{run_now, Buffer, Gpu, GpuError, MemoryKind};
 use bytemuck::Pod;
-use std::ops::Range;
 use std::sync::Arc;
 
-/// Changes a range of a buffer's values on the host, and waits.
-pub(super) fn edit<T: Pod>(
+/// Changes the first bytes of a buffer on the host, and waits.
+pub(super) fn edit(
     gpu: &Arc<Gpu>,
     buffer: &Buffer,
-    range: Range<usize>,
-    mut change: impl FnMut(&mut T),
+    bytes: usize,
+    change: impl FnOnce(&[u8]) -> Vec<u8>,
 ) -> Result<(), GpuError> {
-    let bytes = range.end * size_of::<T>();
     let back = Buffer::new(gpu, "read back", bytes, MemoryKind::Readback)?;
     run_now(gpu, |r| r.copy(buffer, &back, bytes))?;
     let mut staging = Buffer::new(gpu, "staging", bytes, MemoryKind::Upload)?;
-    let mut values: Vec<T> = back.read::<T>(range.end).to_vec();
-    values[range].iter_mut().for_each(&mut change);
-    staging.bytes_mut()[..bytes].copy_from_slice(bytemuck::cast_slice(&values));
+    staging.bytes_mut()[..bytes].copy_from_slice(&change(back.read::<u8>(bytes)));
     run_now(gpu, |r| r.copy(&staging, buffer, bytes))
 }
 

@@ -5,6 +5,7 @@ use super::deformed::DeformedTables;
 use super::fill::fill;
 use super::live_textures::{LiveTextures, Piece};
 use super::memory::{BytesPerPixel, SharedBuffers};
+use super::read_back::Guide;
 use super::scene_data::{BodyData, SceneData};
 use super::scene_gpu::{table_buffer, Geometry, SceneGpu};
 use super::settings::{Output, RendererSettings};
@@ -12,10 +13,13 @@ use crate::gpu::{Buffer, FrameTree, Gpu, GpuError, MemoryKind, Place};
 use crate::pack;
 use bytemuck::Zeroable;
 use dpm_shaders::structs::{
-    BodyNode, Counters, Frame, Guide, Instance, Mover, Schedule, Surface, TextureInfo, NO_HIT,
+    in_blocks, BodyNode, Counters, Frame, Instance, Mover, Schedule, Surface, TextureInfo, NO_HIT,
 };
 use dpm_shaders::Reading;
 use std::sync::Arc;
+
+/// Bytes of a pixel of the picture that the host can read.
+pub(super) const SHOWN_BYTES: usize = size_of::<[f32; 4]>();
 
 /// The buffers of one frame in flight.
 pub(super) struct FrameBuffers {
@@ -44,9 +48,10 @@ pub(super) struct FrameBuffers {
     pub guides: Buffer,
     pub schedule: Buffer,
     pub work: Buffer,
-    /// The history's picture. In method dpm the pass `trace` leaves `Moments` here, which the pass `accumulate` reads before it writes the picture.
+    /// The history's picture.
     pub filtered: Buffer,
-    /// The picture after the spatial filter. In method dpm the pass `reproject` leaves shifts here, which the pass `accumulate` reads.
+    /// The picture after the spatial filter. In method dpm the pass `reproject` leaves shifts here, which the pass `accumulate` reads, and only a
+    /// host that reads everything gets the picture.
     pub filtered_shown: Buffer,
     /// Copies for debugging, if they were asked for.
     pub debug_host: Option<DebugBuffers>,
@@ -116,6 +121,7 @@ impl FrameBuffers {
         // A buffer that the method does not need is bound all the same, but is as small as possible.
         let with = |what, each: usize| table(what, (pixels * each).max(16), Device);
         let packed = settings.output.schedule();
+        let guides = table("guides", (in_blocks(pixels) * each.guides).max(16), Device)?;
         let plane_bytes = packed.map_or(4, |schedule| pack::gpu::len_bytes(settings.raster, schedule));
         let codes_host = match settings.output {
             Output::Planes(_) => None,
@@ -140,11 +146,17 @@ impl FrameBuffers {
             planes: size("bit planes", plane_bytes, Device)?,
             planes_host: packed.map(|_| size("bit planes", plane_bytes, Readback)).transpose()?,
             plane_bytes,
-            guides: with("guides", each.guides)?,
+            guides: match reading {
+                Reading::Texels => guides.viewed_as_words("guides")?,
+                _ => guides,
+            },
             schedule: size("schedule", size_of::<Schedule>(), Device)?,
             work: size("work list", pixels * each.work, Device)?,
             filtered: with("filtered radiance", each.filtered)?,
-            filtered_shown: with("shown radiance", each.shown)?,
+            filtered_shown: with(
+                "shown radiance",
+                if debug && each.shown > 0 { SHOWN_BYTES } else { each.shown },
+            )?,
             motion: with("motion of surfaces", each.motion)?,
             movers: latched("movers", size_of::<Mover>() * bodies.max(1))?,
             device_tree: asks_device.then(|| FrameTree::new(gpu, bodies)).transpose()?,
@@ -190,9 +202,14 @@ impl FrameBuffers {
         fill(gpu, &self.codes, &0u32, pixels)?;
         fill(gpu, &self.radiance, &[0f32; 4], pixels)?;
         if self.each.guides > 0 {
-            fill(gpu, &self.guides, &Guide::zeroed(), pixels)?;
+            fill(gpu, &self.guides, &[0u8; Guide::BYTES], in_blocks(pixels))?;
         }
-        fill(gpu, self.shown(settings), &[0f32; 4], pixels)
+        let is_shown = !settings.method.dpm || self.debug_host.is_some();
+        if is_shown {
+            fill(gpu, self.shown(settings), &[0u8; SHOWN_BYTES], pixels)
+        } else {
+            Ok(())
+        }
     }
 
     /// The picture that is shown: that of the method's last pass before the pass `compensate`.
@@ -265,7 +282,7 @@ impl FrameBuffers {
             "B_RADIANCE" => &self.radiance,
             "B_CODES" => &self.codes,
             "B_COUNTERS" => &self.counters,
-            "B_GUIDES" | "B_GUIDE_ROWS" => &self.guides,
+            "B_GUIDES" | "B_GUIDE_ROWS" | "B_GUIDE_WORDS_ROWS" => &self.guides,
             "B_HISTORY" | "B_HISTORY_ROWS" => &shared.history[parity],
             "B_FORMER" => &shared.history[1 - parity],
             "B_RATES" => &shared.rates,
@@ -298,18 +315,18 @@ fn texture_table(gpu: &Arc<Gpu>, data: &SceneData) -> Result<Option<Latched>, Gp
 impl DebugBuffers {
     fn new(gpu: &Arc<Gpu>, pixels: usize, tiles: usize, each: BytesPerPixel) -> Result<Self, GpuError> {
         let size = |what, bytes| Buffer::new(gpu, what, bytes, MemoryKind::Readback);
-        let kept = |what, each: usize| (each > 0).then(|| size(what, pixels * each)).transpose();
+        let kept = |what, pixels, each: usize| (each > 0).then(|| size(what, pixels * each)).transpose();
         Ok(Self {
-            shown: size("shown radiance", pixels * 16)?,
+            shown: size("shown radiance", pixels * SHOWN_BYTES)?,
             surfaces: size("surfaces", pixels * each.surfaces)?,
-            guides: kept("guides", each.guides)?,
-            history: kept("history", each.history)?,
-            prior: kept("prior history", each.history)?,
+            guides: kept("guides", in_blocks(pixels), each.guides)?,
+            history: kept("history", in_blocks(pixels), each.history)?,
+            prior: kept("prior history", in_blocks(pixels), each.history)?,
             traced: size("radiance", pixels * each.radiance)?,
             rates: size("shading rates", tiles * 4)?,
             schedule: size("schedule", size_of::<Schedule>())?,
             work: size("work list", pixels * each.work)?,
-            motion: kept("motion of surfaces", each.motion)?,
+            motion: kept("motion of surfaces", pixels, each.motion)?,
         })
     }
 }

@@ -5,15 +5,14 @@ use super::blue_noise;
 use super::fill::fill;
 use super::method::Method;
 use super::optics::OpticsLayout;
+use super::read_back::{Guide, History};
 use super::scene_gpu::table_buffer;
 use super::settings::{RasterTooLarge, RenderError, RendererSettings};
 use super::tiles::TILE;
 use crate::gpu::{Buffer, Gpu, GpuError, MemoryKind};
 use bytemuck::Zeroable;
 use dpm_device::planes::Raster;
-use dpm_shaders::structs::{
-    Filtered, Guide, History, Moved, PlaneGroup, Schedule, Surface, WorkItem, NO_FRAME,
-};
+use dpm_shaders::structs::{Filtered, Moved, PlaneGroup, Schedule, Surface, WorkItem, PARTS};
 use std::sync::Arc;
 
 /// Bytes a pixel of every buffer that grows with the raster; 0 if the method does not need the buffer.
@@ -21,7 +20,7 @@ use std::sync::Arc;
 pub(super) struct BytesPerPixel {
     /// What is known of the pixel's surface point. There are two such buffers, which frames write in turns.
     pub history: usize,
-    /// Motion, apparent size, angle and albedo.
+    /// Motion, apparent size, angle and albedo; demands of method dpm.
     pub guides: usize,
     /// What each pixel's ray hit.
     pub surfaces: usize,
@@ -29,7 +28,7 @@ pub(super) struct BytesPerPixel {
     pub radiance: usize,
     /// The history's picture.
     pub filtered: usize,
-    /// The filtered picture.
+    /// The filtered picture. Method dpm turns it into code values at once, and keeps a step of the light here before.
     pub shown: usize,
     /// The work list of the tracer.
     pub work: usize,
@@ -44,12 +43,12 @@ impl BytesPerPixel {
     pub(crate) fn of(method: &Method) -> Self {
         let when = |wanted: bool, bytes: usize| if wanted { bytes } else { 0 };
         Self {
-            history: when(method.needs_history(), size_of::<History>()),
-            guides: when(method.needs_guides(), size_of::<Guide>()),
+            history: when(method.needs_history(), History::BYTES),
+            guides: when(method.needs_guides(), Guide::BYTES),
             surfaces: size_of::<Surface>(),
             radiance: size_of::<[f32; 4]>(),
             filtered: when(method.needs_history(), size_of::<Filtered>()),
-            shown: when(method.needs_spatial(), size_of::<[f32; 4]>()),
+            shown: when(method.needs_spatial(), size_of::<[f32; 3]>() + when(!method.dpm, size_of::<f32>())),
             work: size_of::<WorkItem>(),
             codes: size_of::<u32>(),
             motion: 0,
@@ -63,12 +62,16 @@ impl BytesPerPixel {
         2 * self.history + slots * of_slot
     }
 
-    /// Bytes a pixel of the buffer of a binding; 0 if it does not grow with the raster. `None`: the bit planes, whose number the projector decides.
-    pub(super) fn of_buffer(&self, binding: &str) -> Option<f64> {
+    /// Bytes a pixel of the buffer of a binding, or of one of its parts (`B_HISTORY.light`); 0 if it does not grow with the raster. `None`: the bit
+    /// planes, whose number the projector decides.
+    pub(super) fn of_buffer(&self, name: &str) -> Option<f64> {
+        let (binding, name) = name.split_once('.').unwrap_or((name, ""));
+        let part = PARTS.iter().find(|part| part.binding == binding && part.name == name);
+        let part = part.map_or(0, |part| part.bytes);
         Some(match binding {
             "B_SURFACES" => self.surfaces,
-            "B_GUIDES" => self.guides,
-            "B_HISTORY" | "B_FORMER" => self.history,
+            "B_GUIDES" if self.guides > 0 => part,
+            "B_HISTORY" | "B_FORMER" if self.history > 0 => part,
             "B_RADIANCE" => self.radiance,
             "B_FILTERED" => self.filtered,
             // The picture that is shown: that of the last pass that the method has.
@@ -165,8 +168,9 @@ impl SharedBuffers {
         let optics = OpticsLayout::new(settings);
         let pixels = if settings.method.needs_history() { raster.pixel_count() } else { 1 };
         let history = || -> Result<Buffer, GpuError> {
-            let buffer = table_buffer(gpu, "history", pixels * size_of::<History>(), MemoryKind::Device)?;
-            fill(gpu, &buffer, &History { frame: NO_FRAME, ..History::zeroed() }, pixels)?;
+            let bytes = History::buffer_bytes(pixels);
+            let buffer = table_buffer(gpu, "history", bytes, MemoryKind::Device)?;
+            fill(gpu, &buffer, &History::block_of_none(), bytes / size_of_val(&History::block_of_none()))?;
             Ok(buffer)
         };
         let tiles = raster.width().div_ceil(TILE) * raster.height().div_ceil(TILE);

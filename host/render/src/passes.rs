@@ -41,11 +41,14 @@ pub(super) enum Code {
 pub(super) struct Kernel {
     /// The shader that reads in this way.
     pub shader: fn(Reading) -> Shader,
-    /// Buffers that an earlier pass of this frame, or the frame before, has written and that this shader reads. Inputs that no pass writes
+    /// Buffers, or their parts, that an earlier pass of this frame, or the frame before, has written and that this shader reads. Inputs that no pass writes
     /// are not listed: the frame's constants, the tiles, the scene, the noise and the table of rates.
     pub reads: &'static [&'static str],
     /// Buffers that this shader writes.
     pub writes: &'static [&'static str],
+    /// What it touches only by other methods, or if the host reads everything. It is not counted.
+    #[cfg_attr(not(test), expect(dead_code, reason = "documentation that a test checks"))]
+    pub seldom: &'static [&'static str],
 }
 
 /// How many workgroups of a pass run.
@@ -67,11 +70,20 @@ pub(super) enum Grid {
 pub(super) const TABLE: [Pass; 12] = [
     Pass {
         name: "primary",
-        code: Code::OfAll(Kernel {
-            shader: |reading| shaders::PRIMARY.reading(reading),
-            reads: &["B_COUNTERS", "B_FORMER"],
-            writes: &["B_SURFACES", "B_COUNTERS", "B_GUIDES"],
-        }),
+        code: Code::ByMethod {
+            dpm: Kernel {
+                shader: |reading| shaders::PRIMARY.reading(reading),
+                reads: &["B_COUNTERS", "B_FORMER.tag"],
+                writes: &["B_SURFACES", "B_COUNTERS", "B_GUIDES.tint"],
+                seldom: &["B_GUIDES.sight"],
+            },
+            others: Kernel {
+                shader: |reading| shaders::PRIMARY.reading(reading),
+                reads: &["B_COUNTERS"],
+                writes: &["B_SURFACES", "B_COUNTERS", "B_GUIDES.sight"],
+                seldom: &["B_GUIDES.tint", "B_FORMER.tag"],
+            },
+        },
         when: |_, _| true,
         grid: Grid::Tiles,
         walks: true,
@@ -82,13 +94,31 @@ pub(super) const TABLE: [Pass; 12] = [
         code: Code::ByMethod {
             dpm: Kernel {
                 shader: |reading| shaders::REPROJECT_POINT.reading(reading),
-                reads: &["B_SURFACES", "B_GUIDES", "B_SCHEDULE", "B_FORMER"],
-                writes: &["B_HISTORY", "B_SCHEDULE", "B_SHOWN"],
+                reads: &[
+                    "B_SURFACES",
+                    "B_GUIDES.tint",
+                    "B_SCHEDULE",
+                    "B_FORMER.light",
+                    "B_FORMER.place",
+                    "B_FORMER.noise",
+                    "B_FORMER.tag",
+                ],
+                writes: &[
+                    "B_HISTORY.light",
+                    "B_HISTORY.place",
+                    "B_HISTORY.noise",
+                    "B_HISTORY.tag",
+                    "B_SCHEDULE",
+                    "B_SHOWN",
+                    "B_GUIDES.demand",
+                ],
+                seldom: &[],
             },
             others: Kernel {
                 shader: |reading| shaders::REPROJECT_BILINEAR.reading(reading),
-                reads: &["B_SURFACES", "B_GUIDES", "B_FORMER"],
-                writes: &["B_HISTORY"],
+                reads: &["B_SURFACES", "B_FORMER.light", "B_FORMER.place", "B_FORMER.tag"],
+                writes: &["B_HISTORY.light", "B_HISTORY.place", "B_HISTORY.tag"],
+                seldom: &[],
             },
         },
         when: |s, _| s.method.needs_history(),
@@ -100,8 +130,9 @@ pub(super) const TABLE: [Pass; 12] = [
         name: "rate map",
         code: Code::OfAll(Kernel {
             shader: |reading| shaders::RATE_MAP.reading(reading),
-            reads: &["B_SURFACES", "B_GUIDES", "B_HISTORY"],
+            reads: &["B_SURFACES", "B_GUIDES.sight", "B_HISTORY.light"],
             writes: &["B_RATES"],
+            seldom: &[],
         }),
         when: |s, keep| s.method.needs_rates() || keep.rate_map && s.method.needs_history(),
         grid: Grid::Rates,
@@ -113,13 +144,15 @@ pub(super) const TABLE: [Pass; 12] = [
         code: Code::ByMethod {
             dpm: Kernel {
                 shader: |reading| shaders::SCHEDULE_BUDGET.reading(reading),
-                reads: &["B_SURFACES", "B_HISTORY", "B_SCHEDULE"],
-                writes: &["B_RADIANCE", "B_SCHEDULE", "B_WORK"],
+                reads: &["B_GUIDES.demand", "B_SCHEDULE"],
+                writes: &["B_GUIDES.demand", "B_SCHEDULE", "B_WORK"],
+                seldom: &["B_SURFACES", "B_RADIANCE"],
             },
             others: Kernel {
                 shader: |reading| shaders::SCHEDULE_BLOCKS.reading(reading),
-                reads: &["B_SURFACES", "B_GUIDES", "B_RATES", "B_SCHEDULE"],
+                reads: &["B_SURFACES", "B_GUIDES.sight", "B_RATES", "B_SCHEDULE"],
                 writes: &["B_RADIANCE", "B_SCHEDULE", "B_WORK"],
+                seldom: &[],
             },
         },
         when: |_, _| true,
@@ -129,11 +162,20 @@ pub(super) const TABLE: [Pass; 12] = [
     },
     Pass {
         name: "trace",
-        code: Code::OfAll(Kernel {
-            shader: |reading| shaders::TRACE.reading(reading),
-            reads: &["B_SURFACES", "B_COUNTERS", "B_HISTORY", "B_SCHEDULE", "B_WORK"],
-            writes: &["B_RADIANCE", "B_COUNTERS", "B_FILTERED"],
-        }),
+        code: Code::ByMethod {
+            dpm: Kernel {
+                shader: |reading| shaders::TRACE.reading(reading),
+                reads: &["B_SURFACES", "B_COUNTERS", "B_HISTORY.tag", "B_SCHEDULE", "B_WORK"],
+                writes: &["B_RADIANCE", "B_COUNTERS", "B_GUIDES.demand"],
+                seldom: &[],
+            },
+            others: Kernel {
+                shader: |reading| shaders::TRACE.reading(reading),
+                reads: &["B_SURFACES", "B_COUNTERS", "B_SCHEDULE", "B_WORK"],
+                writes: &["B_RADIANCE", "B_COUNTERS"],
+                seldom: &["B_HISTORY.tag", "B_GUIDES.demand"],
+            },
+        },
         when: |_, _| true,
         grid: Grid::Work,
         walks: true,
@@ -144,13 +186,22 @@ pub(super) const TABLE: [Pass; 12] = [
         code: Code::ByMethod {
             dpm: Kernel {
                 shader: |reading| shaders::ACCUMULATE_SAMPLES.reading(reading),
-                reads: &["B_SURFACES", "B_RADIANCE", "B_GUIDES", "B_HISTORY", "B_FILTERED", "B_SHOWN"],
-                writes: &["B_HISTORY", "B_FILTERED"],
+                reads: &[
+                    "B_RADIANCE",
+                    "B_GUIDES.tint",
+                    "B_GUIDES.demand",
+                    "B_HISTORY.light",
+                    "B_HISTORY.noise",
+                    "B_SHOWN",
+                ],
+                writes: &["B_HISTORY.light", "B_HISTORY.noise", "B_FILTERED"],
+                seldom: &[],
             },
             others: Kernel {
                 shader: |reading| shaders::ACCUMULATE_FRAMES.reading(reading),
-                reads: &["B_SURFACES", "B_RADIANCE", "B_GUIDES", "B_HISTORY", "B_RATES"],
-                writes: &["B_HISTORY", "B_FILTERED"],
+                reads: &["B_SURFACES", "B_RADIANCE", "B_GUIDES.sight", "B_HISTORY.light", "B_RATES"],
+                writes: &["B_HISTORY.light", "B_FILTERED"],
+                seldom: &[],
             },
         },
         when: |s, _| s.method.needs_history(),
@@ -159,17 +210,27 @@ pub(super) const TABLE: [Pass; 12] = [
         overlaps: false,
     },
     Pass {
+        // By method dpm with the pass `compensate` at its end.
         name: "spatial",
         code: Code::ByMethod {
             dpm: Kernel {
                 shader: |reading| shaders::SPATIAL_REGRESSION.reading(reading),
-                reads: &["B_SURFACES", "B_GUIDES", "B_HISTORY", "B_FILTERED"],
-                writes: &["B_SHOWN"],
+                reads: &[
+                    "B_SURFACES",
+                    "B_COUNTERS",
+                    "B_GUIDES.tint",
+                    "B_HISTORY.place",
+                    "B_HISTORY.noise",
+                    "B_FILTERED",
+                ],
+                writes: &["B_CODES", "B_COUNTERS"],
+                seldom: &["B_SHOWN"],
             },
             others: Kernel {
                 shader: |reading| shaders::SPATIAL_DISK.reading(reading),
-                reads: &["B_SURFACES", "B_GUIDES", "B_HISTORY", "B_FILTERED"],
+                reads: &["B_SURFACES", "B_GUIDES.sight", "B_HISTORY.place", "B_FILTERED"],
                 writes: &["B_SHOWN"],
+                seldom: &[],
             },
         },
         when: |s, _| s.method.needs_spatial(),
@@ -183,8 +244,9 @@ pub(super) const TABLE: [Pass; 12] = [
             shader: |reading| shaders::COMPENSATE.reading(reading),
             reads: &["B_SURFACES", "B_COUNTERS", "B_SHOWN"],
             writes: &["B_CODES", "B_COUNTERS"],
+            seldom: &[],
         }),
-        when: |_, _| true,
+        when: |s, _| !s.method.dpm,
         grid: Grid::Tiles,
         walks: false,
         overlaps: true,
@@ -195,6 +257,7 @@ pub(super) const TABLE: [Pass; 12] = [
             shader: |reading| shaders::HALFTONE.reading(reading),
             reads: &["B_SURFACES", "B_CODES"],
             writes: &["B_CODES"],
+            seldom: &[],
         }),
         when: |s, _| s.halftone.is_some(),
         grid: Grid::Tiles,
@@ -207,6 +270,7 @@ pub(super) const TABLE: [Pass; 12] = [
             shader: |reading| shaders::MOTION.reading(reading),
             reads: &["B_SURFACES", "B_CODES"],
             writes: &["B_MOTION"],
+            seldom: &[],
         }),
         when: |s, _| !s.plane_groups.is_empty(),
         grid: Grid::Moving,
@@ -219,6 +283,7 @@ pub(super) const TABLE: [Pass; 12] = [
             shader: |reading| shaders::WARP.reading(reading),
             reads: &["B_MOTION"],
             writes: &["B_CODES"],
+            seldom: &[],
         }),
         when: |s, _| !s.plane_groups.is_empty(),
         grid: Grid::Moving,
@@ -227,7 +292,12 @@ pub(super) const TABLE: [Pass; 12] = [
     },
     Pass {
         name: "pack",
-        code: Code::OfAll(Kernel { shader: |_| shaders::PACK, reads: &["B_CODES"], writes: &["B_PLANES"] }),
+        code: Code::OfAll(Kernel {
+            shader: |_| shaders::PACK,
+            reads: &["B_CODES"],
+            writes: &["B_PLANES"],
+            seldom: &[],
+        }),
         when: |s, _| s.output.schedule().is_some(),
         grid: Grid::Planes,
         walks: false,
@@ -320,7 +390,7 @@ pub fn traffic(settings: &RendererSettings, keep: Keep) -> Vec<Traffic> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use dpm_shaders::structs::{BINDINGS, TREE_BINDING};
+    use dpm_shaders::structs::{members_of, BINDINGS, PARTS, TREE_BINDING};
     use std::collections::{BTreeSet, HashMap};
 
     const READINGS: [Reading; 3] = [Reading::Texels, Reading::Storage, Reading::Query];
@@ -347,12 +417,15 @@ mod tests {
         "B_PLANE_GROUPS",
     ];
 
-    /// Names of the buffers that a shader loads from and stores to, as its SPIR-V says: every pointer is followed back to the variable that it
-    /// was made from. Inputs are left out; a second binding of a buffer as texels counts as the buffer.
-    fn loads_and_stores(shader: &Shader) -> [BTreeSet<&'static str>; 2] {
+    /// Names of the buffers, or of their parts, that a shader loads from and stores to, as its SPIR-V says: every pointer is followed back to the
+    /// variable that it was made from, and a part is told by the types of an element's members. Inputs are left out; a second binding of a buffer
+    /// as texels counts as the buffer.
+    fn loads_and_stores(shader: &Shader) -> [BTreeSet<String>; 2] {
         let words: Vec<u32> =
             shader.spirv.chunks_exact(4).map(|w| u32::from_le_bytes(w.try_into().unwrap())).collect();
-        let (mut binding, mut origin) = (HashMap::new(), HashMap::new());
+        let (mut binding, mut origin, mut type_of) = (HashMap::new(), HashMap::new(), HashMap::new());
+        // What types consist of: "f" and "u" for numbers, what they point at or hold for the others.
+        let mut types: HashMap<u32, String> = HashMap::new();
         let mut touched = [BTreeSet::new(), BTreeSet::new()];
         let mut at = 5;
         while at < words.len() {
@@ -382,14 +455,25 @@ mod tests {
                 ),
                 _ => {}
             }
+            let of = |t: &u32| types.get(t).cloned().unwrap_or_default();
             match op {
-                59 => drop(origin.insert(a[1], a[1])),
+                59 => {
+                    origin.insert(a[1], a[1]);
+                    type_of.insert(a[1], a[0]);
+                }
                 // Access chains and copies.
                 65 | 66 | 83 => {
                     if let Some(&variable) = origin.get(&a[2]) {
                         origin.insert(a[1], variable);
                     }
                 }
+                // OpTypeInt, OpTypeFloat, OpTypeVector, OpTypeArray, OpTypeRuntimeArray, OpTypeStruct, OpTypePointer.
+                21 => drop(types.insert(a[0], "u".to_owned())),
+                22 => drop(types.insert(a[0], "f".to_owned())),
+                23 => drop(types.insert(a[0], of(&a[1]).repeat(a[2] as usize))),
+                28 | 29 => drop(types.insert(a[0], of(&a[1]))),
+                30 => drop(types.insert(a[0], a[1..].iter().map(of).collect::<Vec<_>>().join(","))),
+                32 => drop(types.insert(a[0], of(&a[2]))),
                 _ => {}
             }
             at += length;
@@ -397,18 +481,23 @@ mod tests {
         touched.map(|variables| {
             variables
                 .into_iter()
-                .filter_map(|v| binding.get(&v))
+                .filter_map(|v| binding.get(&v).map(|b| (v, *b)))
                 // The tree over the bodies is no buffer.
-                .filter(|b| **b != TREE_BINDING.1)
-                .map(|b| BINDINGS.iter().find(|(_, known)| known == b).expect("a known binding").0)
-                .map(|name| match name {
-                    "B_SURFACE_ROWS" => "B_SURFACES",
-                    "B_GUIDE_ROWS" => "B_GUIDES",
-                    "B_HISTORY_ROWS" => "B_HISTORY",
-                    "B_FILTERED_ROWS" => "B_FILTERED",
-                    name => name,
+                .filter(|(_, b)| *b != TREE_BINDING.1)
+                .map(|(v, b)| {
+                    let name = BINDINGS.iter().find(|(_, known)| *known == b).expect("a known binding").0;
+                    let name = match name {
+                        "B_SURFACE_ROWS" => "B_SURFACES",
+                        "B_GUIDE_ROWS" | "B_GUIDE_WORDS_ROWS" => "B_GUIDES",
+                        "B_HISTORY_ROWS" => "B_HISTORY",
+                        "B_FILTERED_ROWS" => "B_FILTERED",
+                        name => name,
+                    };
+                    let members = &types[&type_of[&v]];
+                    let part = PARTS.iter().find(|p| p.binding == name && members_of(p.element) == *members);
+                    part.map_or(name.to_owned(), |part| format!("{name}.{}", part.name))
                 })
-                .filter(|name| !INPUTS.contains(name))
+                .filter(|name| !INPUTS.contains(&name.as_str()))
                 .collect()
         })
     }
@@ -424,9 +513,26 @@ mod tests {
         for (_, kernel) in kernels(true).chain(kernels(false)) {
             for reading in READINGS {
                 let shader = (kernel.shader)(reading);
-                let listed = [kernel.reads, kernel.writes].map(|names| names.iter().copied().collect());
-                let [loads, stores] = loads_and_stores(&shader);
-                assert_eq!([loads, stores], listed, "{}: [reads, writes]", shader.name);
+                // Of an image nobody sees which part of a buffer it reads.
+                let name = |name: &str| match reading {
+                    Reading::Texels => name.split('.').next().unwrap_or(name).to_owned(),
+                    _ => name.to_owned(),
+                };
+                let names = |names: &[&str]| -> BTreeSet<String> { names.iter().map(|n| name(n)).collect() };
+                let touched = loads_and_stores(&shader).map(|all| all.iter().map(|n| name(n)).collect());
+                let [loads, stores]: [BTreeSet<String>; 2] = touched;
+                let seldom = names(kernel.seldom);
+                for (listed, found) in [(names(kernel.reads), &loads), (names(kernel.writes), &stores)] {
+                    let not_told: Vec<_> = found.difference(&(&listed | &seldom)).cloned().collect();
+                    let not_done: Vec<_> = listed.difference(found).collect();
+                    assert!(
+                        not_told.is_empty() && not_done.is_empty(),
+                        "{}: {not_told:?}, {not_done:?}",
+                        shader.name
+                    );
+                }
+                let never: Vec<_> = seldom.difference(&(&loads | &stores)).cloned().collect();
+                assert!(never.is_empty(), "{}: {never:?}", shader.name);
             }
         }
     }
@@ -434,15 +540,17 @@ mod tests {
     /// What a pass reads was written by a pass before it in this frame, is cleared or filled before the first, or is kept from the frame before.
     #[test]
     fn nothing_is_read_before_it_is_written() {
-        let kept = ["B_COUNTERS", "B_SCHEDULE", "B_FORMER", "B_RATES"];
+        let kept = ["B_COUNTERS", "B_SCHEDULE", "B_RATES"];
         for is_dpm in [true, false] {
             let mut written: BTreeSet<&str> = kept.into();
             for (pass, kernel) in kernels(is_dpm) {
                 for name in kernel.reads {
                     // The history's pass is left out together with all that read what it writes.
-                    assert!(written.contains(name), "{pass} reads {name}");
+                    assert!(written.contains(name) || name.starts_with("B_FORMER"), "{pass} reads {name}");
                 }
                 written.extend(kernel.writes);
+                // What the pass of shading rates reads, which method dpm runs only to measure what leaving it out saves.
+                written.extend(kernel.seldom);
             }
         }
     }
@@ -455,11 +563,9 @@ mod tests {
         for (pass, kernel) in kernels(true).chain(kernels(false)) {
             let overlaps = TABLE.iter().any(|row| row.name == pass && row.overlaps);
             for name in ["B_HISTORY", "B_FORMER", "B_RATES"] {
-                assert!(!overlaps || !kernel.writes.contains(&name), "{pass} writes {name}");
-                assert!(
-                    !overlaps || name == "B_HISTORY" || !kernel.reads.contains(&name),
-                    "{pass} reads {name}"
-                );
+                let is_in = |names: &[&str]| names.iter().any(|n| n.split('.').next() == Some(name));
+                assert!(!overlaps || !is_in(kernel.writes) && !is_in(kernel.seldom), "{pass} writes {name}");
+                assert!(!overlaps || name == "B_HISTORY" || !is_in(kernel.reads), "{pass} reads {name}");
             }
         }
     }
@@ -521,13 +627,12 @@ mod tests {
             all.iter().map(|t| (t.pass, t.read + t.written)).collect()
         };
         let expected = [
-            ("primary", 112.0),
-            ("reproject", 192.0),
-            ("schedule", 104.0),
-            ("trace", 120.0),
-            ("accumulate", 240.0),
-            ("spatial", 144.0),
-            ("compensate", 36.0),
+            ("primary", 40.0),
+            ("reproject", 168.0),
+            ("schedule", 16.0),
+            ("trace", 60.0),
+            ("accumulate", 120.0),
+            ("spatial", 76.0),
             ("pack", 7.0),
         ];
         assert_eq!(moved(dpm), expected);

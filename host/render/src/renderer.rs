@@ -2,13 +2,14 @@
 
 use super::body_tree::BodyTree;
 use super::fill;
-use super::frame_buffers::FrameBuffers;
+use super::frame_buffers::{FrameBuffers, SHOWN_BYTES};
 use super::last_frame::{LastFrame, Turn};
 use super::live_textures::{LiveTextures, Piece};
 use super::memory::SharedBuffers;
 use super::optics::OpticsLayout;
 use super::passes::{Grid, FIRST_PASSES, PASSES, TABLE};
 use super::plan::{Pipelines, RendererPlan};
+use super::read_back::History;
 use super::resources::Resources;
 use super::scene_data::{rows, world_bounds, BodyData, Keep, SceneData};
 use super::scene_gpu::SceneGpu;
@@ -22,7 +23,9 @@ use crate::gpu::{
 use crate::pack;
 use bytemuck::Zeroable;
 use dpm_scene::Scene;
-use dpm_shaders::structs::{self as gpu_structs, Counters, Frame, Instance, Mover, Schedule, Surface};
+use dpm_shaders::structs::{
+    self as gpu_structs, in_blocks, Counters, Frame, Instance, Mover, Schedule, Surface,
+};
 use dpm_shaders::Reading;
 use glam::{DAffine3, Vec3};
 use std::ops::Range;
@@ -276,7 +279,11 @@ impl Renderer {
             // The history before this frame's samples.
             let prior = b.debug_host.as_ref().and_then(|d| d.prior.as_ref());
             if let (REPROJECT, Some(prior)) = (pass.name, prior) {
-                r.copy(&resources.shared.history[parity], prior, raster.pixel_count() * b.each.history);
+                r.copy(
+                    &resources.shared.history[parity],
+                    prior,
+                    in_blocks(raster.pixel_count()) * b.each.history,
+                );
                 r.barrier();
             }
         }
@@ -293,13 +300,13 @@ impl Renderer {
         }
         r.copy(&b.counters, &b.counters_host, size_of::<Counters>());
         if let Some(d) = &b.debug_host {
-            r.copy(b.shown(&self.settings), &d.shown, pixels * 16);
+            r.copy(b.shown(&self.settings), &d.shown, pixels * SHOWN_BYTES);
             r.copy(&b.surfaces, &d.surfaces, pixels * b.each.surfaces);
             if let Some(to) = &d.guides {
-                r.copy(&b.guides, to, pixels * b.each.guides);
+                r.copy(&b.guides, to, in_blocks(pixels) * b.each.guides);
             }
             if let Some(to) = &d.history {
-                r.copy(&shared.history[parity], to, pixels * b.each.history);
+                r.copy(&shared.history[parity], to, in_blocks(pixels) * b.each.history);
             }
             r.copy(&b.radiance, &d.traced, pixels * b.each.radiance);
             r.copy(&shared.rates, &d.rates, tiles * 4);
@@ -359,7 +366,8 @@ impl Renderer {
         slot.buffers.arguments.write(&groups.map(|groups| [groups, 1u32, 1, 0]));
         let body_nodes = self.write_bodies(&mut slot.buffers, inputs);
         let constants = self.frame_constants(inputs, &turn, (tile_count, slot.tile_list.tiles_x()));
-        let frame = Frame { body_nodes, ..constants };
+        let shows_all = if slot.buffers.debug_host.is_some() { gpu_structs::FRAME_SHOWS_ALL } else { 0 };
+        let frame = Frame { body_nodes, flags: constants.flags | shows_all, ..constants };
         slot.buffers.frame.host.write(&[frame]);
         slot.parity = 1 - self.last.parity;
         let [first, second] = &slot.lists[slot.parity];
@@ -409,13 +417,19 @@ impl Renderer {
     pub fn edit_history(
         &self,
         range: Range<usize>,
-        mut change: impl FnMut(&mut gpu_structs::History),
+        mut change: impl FnMut(&mut History),
     ) -> Result<(), GpuError> {
         if !self.settings.method.needs_history() {
             return Ok(());
         }
-        (self.resources.shared.history.iter())
-            .try_for_each(|buffer| fill::edit(&self.gpu, buffer, range.clone(), &mut change))
+        (self.resources.shared.history.iter()).try_for_each(|buffer| {
+            let pixels = self.settings.raster.pixel_count();
+            fill::edit(&self.gpu, buffer, History::buffer_bytes(pixels), |bytes| {
+                let mut all = History::all(bytes, pixels);
+                all[range.clone()].iter_mut().for_each(&mut change);
+                History::bytes_of(&all)
+            })
+        })
     }
 
     /// Body `i` of the scene for the shaders. The projector is the origin, because f32 is finest where the rays start.

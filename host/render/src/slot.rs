@@ -2,11 +2,12 @@
 
 use super::frame_buffers::FrameBuffers;
 use super::passes::{FIRST_PASSES, PASSES};
+use super::read_back::{elements, Guide, History};
 use super::resources::Resources;
 use super::tiles::{TileList, TILE};
 use crate::gpu::{BindingSet, CommandList, FrameFence, GpuError, Place};
 use dpm_device::planes::Raster;
-use dpm_shaders::structs::{Counters, Guide, History, Moved, Schedule, Surface, WorkItem};
+use dpm_shaders::structs::{part, Counters, HistoryLight, Moved, Schedule, Surface, WorkItem};
 use std::sync::Arc;
 
 /// What a frame cost.
@@ -120,22 +121,24 @@ impl FrameSlot {
     }
 
     /// Motion, apparent size, angle and albedo of each lit pixel. Only with `debug` at creation, and for methods that use them.
-    pub fn guides(&self) -> Option<&[Guide]> {
+    pub fn guides(&self) -> Option<Vec<Guide>> {
         let guides = self.buffers.debug_host.as_ref()?.guides.as_ref()?;
-        Some(guides.read(self.raster.pixel_count()))
+        let pixels = self.raster.pixel_count();
+        Some(Guide::all(guides.read(Guide::buffer_bytes(pixels)), pixels))
     }
 
     /// The history after this frame. Only with `debug` at creation, and for methods that keep one.
-    pub fn history(&self) -> Option<&[History]> {
+    pub fn history(&self) -> Option<Vec<History>> {
         let history = self.buffers.debug_host.as_ref()?.history.as_ref()?;
-        Some(history.read(self.raster.pixel_count()))
+        let pixels = self.raster.pixel_count();
+        Some(History::all(history.read(History::buffer_bytes(pixels)), pixels))
     }
 
     /// Luminance of each pixel's history before this frame's samples, -1 where there is none. Only with `debug` at creation, and for methods that
     /// keep a history.
     pub fn prior_luminance(&self) -> Option<Vec<f32>> {
         self.buffers.debug_host.as_ref()?.prior.as_ref().map(|prior| {
-            let known = |h: &History| {
+            let known = |h: &HistoryLight| {
                 let [r, g, b] = h.mean;
                 if h.weight > 0.0 {
                     r * 0.2126 + g * 0.7152 + b * 0.0722
@@ -143,7 +146,9 @@ impl FrameSlot {
                     -1.0
                 }
             };
-            prior.read::<History>(self.raster.pixel_count()).iter().map(known).collect()
+            let pixels = self.raster.pixel_count();
+            let bytes = prior.read(History::buffer_bytes(pixels));
+            elements(bytes, part("B_HISTORY", "light"), pixels).iter().map(known).collect()
         })
     }
 

@@ -7,8 +7,8 @@ mod common;
 
 use common::{assert_no_validation_messages, clean, layer, submit, Bench, PATIENCE_NS, SLACK};
 use dpm_render::gpu::{memory_given_up, Gpu, GpuError};
+use dpm_render::History;
 use dpm_render::{FrameSlot, Renderer};
-use dpm_shaders::structs::History;
 use std::sync::mpsc::channel;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
@@ -134,7 +134,7 @@ fn a_submission_that_never_ends_is_waited_for_in_pieces_then_left_without_waitin
     assert!(bench.gpu.is_lost());
     let after = memory_given_up();
     assert_eq!(after.devices, before.devices + 1);
-    let history = 2 * u64::from(common::WIDTH * common::HEIGHT) * size_of::<History>() as u64;
+    let history = 2 * u64::from(common::WIDTH * common::HEIGHT) * History::BYTES as u64;
     assert!(after.bytes - before.bytes >= history, "{} bytes were held", after.bytes - before.bytes);
     assert!(bench.submit(3).expect_err("given up").is_loss());
     let next = goes_on(&bench.gpu);
@@ -281,7 +281,7 @@ fn a_history_full_of_what_is_no_number_is_forgotten_within_two_frames() {
     clean();
     let pixels = (common::WIDTH * common::HEIGHT) as usize;
     let mut bench = Bench::open();
-    session.set(&format!("poison@frame=4,bytes={}", pixels * size_of::<History>()));
+    session.set(&format!("poison@frame=4,bytes={}", pixels * History::BYTES));
     for (i, wanted) in clean().iter().enumerate() {
         bench.submit(i as u32).unwrap();
         let cost = bench.slot.wait(PATIENCE_NS).unwrap();

@@ -5,9 +5,9 @@ use super::SnapshotImage;
 use crate::twins::rate_map::{estimate, PixelGuide, RateConstants};
 use dpm_device::planes::Raster;
 use dpm_render::method::Method;
-use dpm_render::{FrameSlot, Renderer};
+use dpm_render::{FrameSlot, Guide, History, Renderer};
 use dpm_rig::pictures::to_srgb;
-use dpm_shaders::structs::{Guide, History, Surface, NO_HIT};
+use dpm_shaders::structs::{Surface, NO_HIT};
 use glam::{DAffine3, Vec3};
 
 /// Side of a tile, pixels.
@@ -59,11 +59,11 @@ impl Views<'_> {
     }
 
     fn guide<U>(&self, value: impl Fn(&Guide) -> U) -> Vec<Option<U>> {
-        self.lit(self.slot.guides(), value)
+        self.lit(self.slot.guides().as_deref(), value)
     }
 
     fn history(&self, value: impl Fn(&History) -> f32) -> Vec<Option<f32>> {
-        self.lit(self.slot.history(), value)
+        self.lit(self.slot.history().as_deref(), value)
     }
 
     /// Radiance of every pixel, black where nothing is lit.
@@ -92,14 +92,14 @@ impl Views<'_> {
             }
             I::Error => quantity(self.errors(), Scale::FromZero, "e of eq. 1\n(scene units)\npink: unknown"),
             I::Size => quantity(
-                self.guide(|g| g.size),
+                self.guide(|g| g.sight.size),
                 Scale::Log,
                 "d of eq. 3\n(pixel size as\nthe eye sees\nit, relative)",
             ),
             I::Angle => {
-                quantity(self.guide(|g| g.angle), Scale::FromZero, "phi, angle\nfrom the gaze\n(deg)")
+                quantity(self.guide(|g| g.sight.angle), Scale::FromZero, "phi, angle\nfrom the gaze\n(deg)")
             }
-            I::Motion => paint::directions(raster, &self.guide(|g| g.motion), "motion\n(px/frame)"),
+            I::Motion => paint::directions(raster, &self.guide(|g| g.sight.motion), "motion\n(px/frame)"),
             I::Spp => quantity(
                 self.lit(self.slot.traced(), |r| r[3]),
                 Scale::FromZero,
@@ -107,10 +107,10 @@ impl Views<'_> {
             ),
             I::History => {
                 let title = if self.method.dpm { "history\n(samples/px)" } else { "history\n(frames)" };
-                quantity(self.history(|h| h.weight), Scale::FromZero, title)
+                quantity(self.history(|h| h.light.weight), Scale::FromZero, title)
             }
             I::Variance => {
-                quantity(self.history(|h| h.variance), Scale::Log, "variance of\none sample\nluminance")
+                quantity(self.history(|h| h.noise.variance), Scale::Log, "variance of\none sample\nluminance")
             }
             I::Albedo => paint::colours(raster, &self.guide(albedo_of)),
             I::Normal => {
@@ -203,9 +203,9 @@ pub(crate) fn tile_errors(raster: Raster, method: &Method, slot: &FrameSlot) -> 
         let i = y * w + x;
         (x < w && y < h && surfaces[i].is_lit()).then(|| PixelGuide {
             luminance: (prior[i] >= 0.0).then_some(prior[i]),
-            motion: guides[i].motion,
-            size: guides[i].size,
-            angle: guides[i].angle,
+            motion: guides[i].sight.motion,
+            size: guides[i].sight.size,
+            angle: guides[i].sight.angle,
         })
     };
     let mut out = Vec::new();
@@ -221,7 +221,7 @@ pub(crate) fn tile_errors(raster: Raster, method: &Method, slot: &FrameSlot) -> 
 /// Reflectance by which a pixel's radiance is divided before it is filtered.
 pub(crate) fn albedo_of(g: &Guide) -> [f32; 3] {
     let half = |bits: u32| half_to_f32(bits as u16);
-    [half(g.albedo_rg), half(g.albedo_rg >> 16), half(g.albedo_b)]
+    [half(g.tint.albedo_rg), half(g.tint.albedo_rg >> 16), half(g.tint.albedo_b_and_angle)]
 }
 
 /// IEEE 754 binary16.

@@ -7,10 +7,10 @@ use super::gpu_history::{dpm, even, from_one, methods, play};
 use super::gpu_shot::Shot;
 use dpm_render::gpu::Gpu;
 use dpm_render::method::Method;
-use dpm_render::Renderer;
+use dpm_render::{History, Renderer};
 use dpm_scene::shapes::*;
 use dpm_scene::{Environment, Material, Scene};
-use dpm_shaders::structs::{History, Surface};
+use dpm_shaders::structs::Surface;
 use glam::{DAffine3, DQuat, DVec3, Vec3};
 use std::sync::Arc;
 
@@ -161,7 +161,10 @@ fn stale_history(gpu: &Arc<Gpu>, seed: u64) -> f64 {
         let mut renderer = Renderer::new(gpu, &scene, shot.settings()).expect("the scene fits the GPU");
         let poses = shot.world_from_body();
         shot.play(&mut renderer, 0..6, |_| poses.clone(), |_, _, _| ());
-        let old = |h: &mut History| *h = History { mean: [5.0; 3], frame: h.frame.wrapping_sub(2), ..*h };
+        let old = |h: &mut History| {
+            h.light.mean = [5.0; 3];
+            h.tag.frame = h.tag.frame.wrapping_sub(2);
+        };
         renderer.edit_history(0..33 * 33, old).expect("memory");
         shot.play(
             &mut renderer,

@@ -7,7 +7,7 @@ use dpm_render::method::Method;
 use dpm_render::{Keep, Renderer};
 use dpm_scene::shapes::*;
 use dpm_scene::{Material, Scene};
-use dpm_shaders::structs::{Surface, HISTORY_EXACT};
+use dpm_shaders::structs::Surface;
 use glam::{DAffine3, DVec3, Vec3};
 use std::sync::Arc;
 
@@ -80,19 +80,19 @@ fn faults_where_chance_comes_in(gpu: &Arc<Gpu>, seed: u64, storage_tables: bool)
     let keep = Keep { storage_tables, ..Keep::default() };
     let mut renderer = Renderer::keeping(gpu, &scene, shot.settings(), keep).expect("the scene fits the GPU");
     shot.play(&mut renderer, 0..shot.frames, poses, |_, slot, _| {
-        let (history, traced) = (slot.history().unwrap_or(&[]), slot.traced().unwrap_or(&[]));
+        let (history, traced) = (slot.history().unwrap_or_default(), slot.traced().unwrap_or(&[]));
         let mirrors = |s: &Surface| s.is_lit() && s.id >> 24 == 0;
         let lit: Vec<bool> = slot.surfaces().unwrap_or(&[]).iter().map(mirrors).collect();
-        let exact: Vec<bool> = history.iter().map(|h| h.flags & HISTORY_EXACT != 0).collect();
+        let exact: Vec<bool> = history.iter().map(|h| h.is_exact()).collect();
         for (i, was) in before.iter().enumerate().filter(|(i, _)| lit[*i]) {
             match (*was, exact[i]) {
                 (true, false) => {
                     begun += 1;
-                    faults += u32::from(traced[i][3] < 4.0 || history[i].weight != traced[i][3]);
+                    faults += u32::from(traced[i][3] < 4.0 || history[i].light.weight != traced[i][3]);
                 }
                 (false, true) => {
                     ended += 1;
-                    faults += u32::from(history[i].weight != 1.0 || history[i].variance != 0.0);
+                    faults += u32::from(history[i].light.weight != 1.0 || history[i].noise.variance != 0.0);
                 }
                 _ => {}
             }

@@ -261,7 +261,7 @@ fn light_lost(gpu: &Arc<Gpu>, seed: u64) -> f64 {
     // Of the light by its closed form: samples of all frames, and what the histories hold at the end.
     let (mut traced, mut samples, mut held, mut pixels) = (0f64, 0f64, 0f64, 0f64);
     play_at_rest(gpu, &shot, |frame, slot| {
-        let (guides, history) = (slot.guides().unwrap_or(&[]), slot.history().unwrap_or(&[]));
+        let (guides, history) = (slot.guides().unwrap_or_default(), slot.history().unwrap_or_default());
         for (i, distance) in lit(slot) {
             let p = point_of(&shot, i, distance);
             // Where the shading normal leans away from the eye it is bent.
@@ -277,7 +277,7 @@ fn light_lost(gpu: &Arc<Gpu>, seed: u64) -> f64 {
             traced += f64::from(of[3]) * f64::from(of[1]) / (exact(1) * f64::from(light));
             samples += f64::from(of[3]);
             if frame + 1 == shot.frames {
-                held += f64::from(history[i].mean[1] / light);
+                held += f64::from(history[i].light.mean[1] / light);
                 pixels += 1.0;
             }
         }
@@ -330,7 +330,7 @@ fn good_start(gpu: &Arc<Gpu>, seed: u64) -> f64 {
         (Share::default(), Share::default(), Share::default(), Share::default());
     let mut before: Vec<Option<u32>> = Vec::new();
     play(gpu, &shot, poses, |frame, slot| {
-        let (history, traced) = (slot.history().unwrap_or(&[]), slot.traced().unwrap_or(&[]));
+        let (history, traced) = (slot.history().unwrap_or_default(), slot.traced().unwrap_or(&[]));
         let body = |s: &Surface| s.is_lit().then_some(s.id >> 24);
         let bodies: Vec<_> = slot.surfaces().unwrap_or(&[]).iter().map(body).collect();
         for (i, _) in lit(slot).filter(|_| frame >= 60) {
@@ -342,11 +342,11 @@ fn good_start(gpu: &Arc<Gpu>, seed: u64) -> f64 {
             // The body filled all around in the last frame.
             let known =
                 within(2) && (0..25).all(|k| before[(y + k / 5 - 2) * 64 + x + k % 5 - 2] == bodies[i]);
-            let begins = history[i].index == traced[i][3] as u32;
+            let begins = history[i].samples_used() == traced[i][3] as u32;
             match (begins, known) {
                 (true, true) => inside.add(samples),
                 (true, false) if x == 0 => border.add(samples),
-                (false, true) if f64::from(history[i].weight) >= 60.0 * 4.0 => old.add(samples),
+                (false, true) if f64::from(history[i].light.weight) >= 60.0 * 4.0 => old.add(samples),
                 _ => {}
             }
         }
@@ -374,10 +374,10 @@ fn watched(
         shot,
         |frame| vec![pose(frame)],
         |frame, slot| {
-            let (shown, history) = (slot.radiance().unwrap_or(&[]), slot.history().unwrap_or(&[]));
+            let (shown, history) = (slot.radiance().unwrap_or(&[]), slot.history().unwrap_or_default());
             for (i, _) in lit(slot).filter(|_| frame >= from) {
                 means[i].add([0, 1, 2].map(|c| f64::from(shown[i][c])));
-                length.add(history.get(i).map_or(0.0, |h| f64::from(h.weight / 4.0)));
+                length.add(history.get(i).map_or(0.0, |h| f64::from(h.light.weight / 4.0)));
             }
         },
     );

@@ -11,11 +11,11 @@ use crate::twins::rate_map::{decide, PixelGuide, RateConstants};
 use dpm_render::gpu::Gpu;
 use dpm_render::method::Method;
 use dpm_render::rate_table::rate_table;
-use dpm_render::{FrameSlot, Renderer};
+use dpm_render::{FrameSlot, History, Renderer};
 use dpm_rig::config::{RenderConfig, RenderMethod};
 use dpm_scene::shapes::*;
 use dpm_scene::{Environment, PunctualKind, PunctualLight, Scene};
-use dpm_shaders::structs::{History, NO_HIT};
+use dpm_shaders::structs::{HistoryNoise, NO_HIT};
 use glam::{DAffine3, DVec3, Vec3};
 use std::sync::Arc;
 
@@ -344,7 +344,8 @@ fn poisoned(gpu: &Arc<Gpu>, seed: u64) -> f64 {
 }
 
 fn poison(h: &mut History, bad: f32) {
-    *h = History { mean: [bad; 3], drift: bad, variance: bad, surprise: bad, ..*h };
+    h.light.mean = [bad; 3];
+    h.noise = HistoryNoise { drift: bad, variance: bad, surprise: bad, ..h.noise };
 }
 
 /// The paper's method with angles that cut through a small picture.
@@ -408,7 +409,7 @@ fn rate_map(gpu: &Arc<Gpu>, seed: u64) -> f64 {
         if frame % 2 == 1 {
             return;
         }
-        let (surfaces, guides) = (slot.surfaces().unwrap_or(&[]), slot.guides().unwrap_or(&[]));
+        let (surfaces, guides) = (slot.surfaces().unwrap_or(&[]), slot.guides().unwrap_or_default());
         let prior = slot.prior_luminance().unwrap_or_default();
         for (tile, &rate) in slot.rates().unwrap_or(&[]).iter().enumerate() {
             let pixels: [Option<PixelGuide>; 256] = std::array::from_fn(|i| {
@@ -416,9 +417,9 @@ fn rate_map(gpu: &Arc<Gpu>, seed: u64) -> f64 {
                 let s = surfaces.get(at)?;
                 s.is_lit().then(|| PixelGuide {
                     luminance: (prior[at] >= 0.0).then_some(prior[at]),
-                    motion: guides[at].motion,
-                    size: guides[at].size,
-                    angle: guides[at].angle,
+                    motion: guides[at].sight.motion,
+                    size: guides[at].sight.size,
+                    angle: guides[at].sight.angle,
                 })
             });
             if pixels.iter().any(Option::is_some) {
@@ -507,12 +508,12 @@ fn new_points(gpu: &Arc<Gpu>, seed: u64) -> f64 {
     let poses = |frame: u32| vec![DAffine3::from_translation(DVec3::X * (f64::from(frame) * 0.06 - 1.2))];
     let (mut new, mut waits, mut faults) = (0u32, 0u32, 0u32);
     play(gpu, &shot, poses, |_, slot| {
-        let (history, traced) = (slot.history().unwrap_or(&[]), slot.traced().unwrap_or(&[]));
+        let (history, traced) = (slot.history().unwrap_or_default(), slot.traced().unwrap_or(&[]));
         let surfaces = slot.surfaces().unwrap_or(&[]);
         for i in (0..surfaces.len()).filter(|i| surfaces[*i].is_lit()) {
             waits += u32::from(traced[i][3] == 0.0);
-            new += u32::from(traced[i][3] > 0.0 && history[i].index == traced[i][3] as u32);
-            faults += u32::from(history[i].index == 0);
+            new += u32::from(traced[i][3] > 0.0 && history[i].samples_used() == traced[i][3] as u32);
+            faults += u32::from(history[i].samples_used() == 0);
         }
     });
     // Some must be new, and some not be traced in every frame, or nothing is told.

@@ -96,14 +96,14 @@ fn apparent_size(gpu: &Arc<Gpu>, seed: u64) -> f64 {
     };
     let (mut worst, mut telling) = (0f64, 0u32);
     play_at_rest(gpu, &shot, |_, slot| {
-        let guides = slot.guides().unwrap_or(&[]);
+        let guides = slot.guides().unwrap_or_default();
         for i in lit(slot.surfaces()) {
             let p = on_floor(&shot, i);
             // The floor's normal is the vertical.
             let (to_eye, to_projector) = (eye - p, shot.camera.position() - p);
             let wanted = (to_eye.normalize().y / to_eye.length())
                 * (to_projector.length() / to_projector.normalize().y);
-            let off = (f64::from(guides[i].size) / wanted - 1.0).abs();
+            let off = (f64::from(guides[i].sight.size) / wanted - 1.0).abs();
             worst = if off.is_nan() { f64::INFINITY } else { worst.max(off) };
             telling += u32::from(wanted < 0.7);
         }

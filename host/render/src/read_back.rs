@@ -1,0 +1,141 @@
+//! What the host reads of a pixel for checks and pictures, put together from the parts in which the GPU keeps it.
+
+use bytemuck::{Pod, Zeroable};
+use dpm_shaders::structs::{
+    in_blocks, part, HistoryLight, HistoryNoise, HistoryPlace, HistoryTag, Part, Sight, Tint, DEMAND_NOT_LIT,
+    HISTORY_EXACT, NO_FRAME, PART_BLOCK,
+};
+
+/// Where the surface point of a pixel moves, how the eye sees it, and what its light is divided by.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Guide {
+    /// Motion, apparent size and angle from the gaze.
+    pub sight: Sight,
+    /// Reflectance (method dpm).
+    pub tint: Tint,
+}
+
+/// What former frames say about the surface point that a pixel shows.
+#[derive(Clone, Copy, Debug, PartialEq, Zeroable)]
+#[repr(C)]
+pub struct History {
+    /// The light that they found.
+    pub light: HistoryLight,
+    /// Where the point is.
+    pub place: HistoryPlace,
+    /// How far the light can be trusted (method dpm).
+    pub noise: HistoryNoise,
+    /// Whose history it is.
+    pub tag: HistoryTag,
+}
+
+impl Guide {
+    /// Bytes of a pixel.
+    pub(crate) const BYTES: usize = size_of::<Sight>() + size_of::<Tint>() + size_of_val(&DEMAND_NOT_LIT);
+
+    /// Bytes of the buffer for so many pixels.
+    pub(crate) fn buffer_bytes(pixels: usize) -> usize {
+        in_blocks(pixels) * Self::BYTES
+    }
+
+    /// Those of all pixels, from the bytes of the buffer.
+    pub(crate) fn all(bytes: &[u8], pixels: usize) -> Vec<Self> {
+        let sights = elements::<Sight>(bytes, part("B_GUIDES", "sight"), pixels);
+        let tints = elements::<Tint>(bytes, part("B_GUIDES", "tint"), pixels);
+        sights.into_iter().zip(tints).map(|(sight, tint)| Self { sight, tint }).collect()
+    }
+}
+
+impl History {
+    /// Bytes of a pixel.
+    pub const BYTES: usize = size_of::<Self>();
+
+    /// Chance had no part in the last frame's light.
+    pub fn is_exact(&self) -> bool {
+        self.noise.used & HISTORY_EXACT != 0
+    }
+
+    /// Samples of the point's sequence that were used.
+    pub fn samples_used(&self) -> u32 {
+        self.noise.used & !HISTORY_EXACT
+    }
+
+    /// Those of all pixels, from the bytes of the buffer.
+    pub(crate) fn all(bytes: &[u8], pixels: usize) -> Vec<Self> {
+        let lights = elements::<HistoryLight>(bytes, part("B_HISTORY", "light"), pixels);
+        let places = elements::<HistoryPlace>(bytes, part("B_HISTORY", "place"), pixels);
+        let noises = elements::<HistoryNoise>(bytes, part("B_HISTORY", "noise"), pixels);
+        let tags = elements::<HistoryTag>(bytes, part("B_HISTORY", "tag"), pixels);
+        (0..pixels)
+            .map(|i| Self { light: lights[i], place: places[i], noise: noises[i], tag: tags[i] })
+            .collect()
+    }
+
+    /// Bytes of the buffer for so many pixels.
+    pub(crate) fn buffer_bytes(pixels: usize) -> usize {
+        in_blocks(pixels) * Self::BYTES
+    }
+
+    /// The bytes of a block of pixels of which nothing is known.
+    pub(crate) fn block_of_none() -> [u8; PART_BLOCK * Self::BYTES] {
+        let none = Self { tag: HistoryTag { frame: NO_FRAME, ..Zeroable::zeroed() }, ..Self::zeroed() };
+        let bytes = Self::bytes_of(&[none; PART_BLOCK]);
+        std::array::from_fn(|i| bytes[i])
+    }
+
+    /// The bytes of the buffer that holds `all`.
+    pub(crate) fn bytes_of(all: &[Self]) -> Vec<u8> {
+        let mut bytes = vec![0; Self::buffer_bytes(all.len())];
+        place_elements(&mut bytes, part("B_HISTORY", "light"), all.iter().map(|h| h.light));
+        place_elements(&mut bytes, part("B_HISTORY", "place"), all.iter().map(|h| h.place));
+        place_elements(&mut bytes, part("B_HISTORY", "noise"), all.iter().map(|h| h.noise));
+        place_elements(&mut bytes, part("B_HISTORY", "tag"), all.iter().map(|h| h.tag));
+        bytes
+    }
+}
+
+/// The elements of a part of a buffer, one for each pixel.
+pub(crate) fn elements<T: Pod>(bytes: &[u8], part: Part, pixels: usize) -> Vec<T> {
+    assert_eq!(part.bytes, size_of::<T>(), "{}.{}", part.binding, part.name);
+    let at = |pixel| part.index(pixel) * part.bytes;
+    (0..pixels).map(|pixel| bytemuck::pod_read_unaligned(&bytes[at(pixel)..at(pixel) + part.bytes])).collect()
+}
+
+/// Writes such elements.
+pub(crate) fn place_elements<T: Pod>(bytes: &mut [u8], part: Part, values: impl Iterator<Item = T>) {
+    assert_eq!(part.bytes, size_of::<T>(), "{}.{}", part.binding, part.name);
+    for (pixel, value) in values.enumerate() {
+        bytes[part.index(pixel) * part.bytes..][..part.bytes].copy_from_slice(bytemuck::bytes_of(&value));
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// The order of the parts in memory is declared once, in `dpm_shaders::structs::PARTS`, and the parts of a pixel fill it without gaps.
+    #[test]
+    fn histories_survive_the_way_into_their_parts_and_back() {
+        let history = |i: u32| History {
+            light: HistoryLight { weight: i as f32, ..HistoryLight::zeroed() },
+            place: HistoryPlace { normal: i + 100, ..HistoryPlace::zeroed() },
+            noise: HistoryNoise { used: i + 200, ..HistoryNoise::zeroed() },
+            tag: HistoryTag { frame: i + 300, ..HistoryTag::zeroed() },
+        };
+        let all: Vec<_> = (0..200).map(history).collect();
+        let bytes = History::bytes_of(&all);
+        assert_eq!(bytes.len(), 256 * History::BYTES);
+        assert_eq!(History::all(&bytes, 200), all);
+        let end = |binding| {
+            dpm_shaders::structs::PARTS
+                .iter()
+                .filter(|p| p.binding == binding)
+                .map(|p| p.before + p.bytes)
+                .max()
+        };
+        assert_eq!(
+            (end("B_HISTORY"), end("B_FORMER"), end("B_GUIDES")),
+            (Some(64), Some(64), Some(Guide::BYTES))
+        );
+    }
+}

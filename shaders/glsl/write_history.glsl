@@ -1,0 +1,21 @@
+// A history into its parts. Only method dpm knows of its noise.
+layout(set = 0, binding = B_HISTORY, scalar) writeonly buffer HistoryLights { HistoryLight history_lights[]; };
+layout(set = 0, binding = B_HISTORY, scalar) writeonly buffer HistoryPlaces { HistoryPlace history_places[]; };
+layout(set = 0, binding = B_HISTORY, scalar) writeonly buffer HistoryNoises { HistoryNoise history_noises[]; };
+layout(set = 0, binding = B_HISTORY, scalar) writeonly buffer HistoryTags { HistoryTag history_tags[]; };
+
+void write_history(uint at, History h) {
+    history_lights[HISTORY_LIGHT_AT(at)] = HistoryLight(h.mean, h.weight);
+    history_places[HISTORY_PLACE_AT(at)] = HistoryPlace(h.position, h.normal);
+    history_tags[HISTORY_TAG_AT(at)] = HistoryTag(h.seed, used_and_exact(h), h.instance << 24u | (h.flags & 0xffffffu & ~HISTORY_EXACT), h.frame);
+}
+
+void write_noise(uint at, History h) {
+    history_noises[HISTORY_NOISE_AT(at)] = HistoryNoise(h.drift, h.variance, h.surprise, used_and_exact(h));
+}
+
+// A pixel that is not lit has no history.
+void write_no_history(uint at) {
+    history_lights[HISTORY_LIGHT_AT(at)].weight = 0.0;
+    history_tags[HISTORY_TAG_AT(at)].frame = frame.frame - 1u;
+}
