@@ -46,7 +46,7 @@ void main() {
     if (!tile_pixel(tiles[gl_WorkGroupID.x >> 2u], pixel)) return;
     uint at = pixel.y * frame.width + pixel.x;
     if (!is_lit(surface_at(at))) {
-        filtered[at] = Filtered(vec3(0.0), 0.0);
+        filtered[at] = Filtered(vec3(0.0), 0u);
         return;
     }
     HistoryLight h = history_light_at(at);
@@ -56,6 +56,6 @@ void main() {
     vec4 traced = is_traced_block(pixel, size) ? radiance_in[from] : vec4(0.0);
     if (traced.w > 0.0) add_frame(h, traced.rgb, at);
     else if (!(h.weight > 0.0)) borrow(h, pixel, size);
-    filtered[at] = Filtered(h.mean, 1.0);
+    filtered[at] = Filtered(h.mean, 0u);
     history_lights[HISTORY_LIGHT_AT(at)] = h;
 }

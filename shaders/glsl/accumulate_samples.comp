@@ -13,8 +13,6 @@ layout(set = 0, binding = B_RADIANCE, scalar) readonly buffer Radiance { vec4 ra
 layout(set = 0, binding = B_HISTORY, scalar) writeonly buffer HistoryLights { HistoryLight history_lights[]; };
 layout(set = 0, binding = B_HISTORY, scalar) writeonly buffer HistoryNoises { HistoryNoise history_noises[]; };
 layout(set = 0, binding = B_FILTERED, scalar) writeonly buffer FilteredBlock { Filtered filtered[]; };
-// From the history's surface point to the pixel's: written by reproject_point.comp.
-layout(set = 0, binding = B_SHOWN, scalar) readonly buffer Shifts { vec3 shifts[]; };
 
 // Share of the light by which a frame's noise may stray before a history helps against it.
 const float UNSEEN = 0.002;
@@ -26,6 +24,7 @@ const float LEAST_VARIANCE = 0.25;
 const float SURPRISE_WEIGHT = 0.1;
 // Powers are never taken as smaller than this, so that one can divide by them.
 const float LEAST_POWER = 1e-12;
+const float MOST_HALF = 65504.0;
 
 // The variance of one sample, after a frame of `count` samples with the mean luminance `y`. Several samples are compared with their frame's mean,
 // so that a change of the light does not enter. A single sample is compared with `known`, the luminance of the history.
@@ -43,12 +42,13 @@ void add_samples(inout HistoryLight l, inout HistoryNoise n, vec4 traced, vec3 s
     float y = luminance(traced.rgb);
     bool exact = moments.exact;
     // A deterministic pixel needs no history, so drop it. Also drop it when a pixel stops being deterministic.
-    if (exact || (n.used & HISTORY_EXACT) != 0u) {
+    if (exact || (n.body_and_used & HISTORY_EXACT) != 0u) {
         l.weight = 0.0;
         n.drift = 0.0;
         n.surprise = 0.0;
     }
-    n.used = ((n.used & ~HISTORY_EXACT) + uint(traced.w)) | (exact ? HISTORY_EXACT : 0u);
+    uint used = (n.body_and_used + uint(traced.w)) & HISTORY_USED;
+    n.body_and_used = (n.body_and_used & ~(HISTORY_USED | HISTORY_EXACT)) | used | (exact ? HISTORY_EXACT : 0u);
     float known = luminance((l.mean + shift) * albedo);
     n.variance = exact ? 0.0 : new_variance(l.weight, n.variance, traced.w, y, known, moments.sum_squares);
     // Mean square of what single frames add to the history: their noise, and the history's error.
@@ -72,19 +72,21 @@ void main() {
     uint at = pixel.y * frame.width + pixel.x;
     uint demand = demand_at(at);
     if (demand == DEMAND_NOT_LIT) {
-        filtered[at] = Filtered(vec3(0.0), 0.0);
+        filtered[at] = Filtered(vec3(0.0), 0u);
         return;
     }
     HistoryLight l = history_light_at(at);
-    vec3 shift = shifts[at];
+    // From the history's surface point to the pixel's, left by reproject_point.comp.
+    vec3 shift = filtered_at(at).light, albedo = albedo_of(tint_at(at));
     if (demand != DEMAND_NOT_TRACED) {
         vec4 traced = radiance_in[at];
         if (traced.w > 0.0) {
             HistoryNoise n = history_noise_at(at);
-            add_samples(l, n, traced, shift, albedo_of(tint_at(at)), unpack_moments(demand));
+            add_samples(l, n, traced, shift, albedo, unpack_moments(demand));
             history_lights[HISTORY_LIGHT_AT(at)] = l;
             history_noises[HISTORY_NOISE_AT(at)] = n;
         }
     }
-    filtered[at] = Filtered(max(l.mean + shift, vec3(0.0)), l.weight);
+    // A half is finite up to MOST_HALF.
+    filtered[at] = Filtered(max(l.mean + shift, vec3(0.0)), packHalf2x16(vec2(min(l.weight, MOST_HALF), luminance(albedo))));
 }

@@ -25,6 +25,7 @@
 #define FRAME_SPP_BY_ANGLE 8u
 #define FRAME_TEMPORAL 16u
 #define FRAME_DPM 32u
+#define HISTORY_USED 8388607u
 #define HISTORY_EXACT 2147483648u
 #define HISTORY_HIDDEN 2u
 #define HISTORY_BORDER 4u
@@ -273,7 +274,7 @@ struct HistoryNoise {
     float drift;
     float variance;
     float surprise;
-    uint used;
+    uint body_and_used;
 };
 
 struct HistoryTag {
@@ -298,7 +299,7 @@ struct Schedule {
 
 struct Filtered {
     vec3 light;
-    float weight;
+    uint weight_and_albedo;
 };
 
 struct Instance {

@@ -8,7 +8,6 @@ struct History {
     float drift;
     float variance;
     float surprise;
-    // Without `HISTORY_EXACT`.
     uint used;
     uint seed;
     uint instance;
@@ -23,8 +22,6 @@ History former_at(uint i) {
     HistoryPlace p = former_place_at(i);
     HistoryNoise n = former_noise_at(i);
     HistoryTag t = former_tag_at(i);
-    uint flags = (t.owner & 0xffffffu) | (n.used & HISTORY_EXACT);
-    return History(l.mean, l.weight, p.position, p.normal, n.drift, n.variance, n.surprise, n.used & ~HISTORY_EXACT, t.seed, t.owner >> 24u, t.frame, flags);
+    uint flags = (t.owner & 0xffffffu) | (n.body_and_used & HISTORY_EXACT);
+    return History(l.mean, l.weight, p.position, p.normal, n.drift, n.variance, n.surprise, n.body_and_used & HISTORY_USED, t.seed, t.owner >> 24u, t.frame, flags);
 }
-
-uint used_and_exact(History h) { return h.used | (h.flags & HISTORY_EXACT); }

@@ -11,9 +11,9 @@
 layout(local_size_x = 8, local_size_y = 8) in;
 
 layout(set = 0, binding = B_SCHEDULE, scalar) buffer ScheduleBlock { Schedule schedule; };
-// What accumulate_samples.comp adds to a history's mean to get the light at the pixel's own surface point. Where the host reads the shown light,
-// the buffer holds that from the pass spatial on.
-layout(set = 0, binding = B_SHOWN, scalar) writeonly buffer Shifts { vec3 shifts[]; };
+// What accumulate_samples.comp adds to a history's mean to get the light at the pixel's own surface point. It lies in the place of the light that
+// accumulate_samples.comp then writes.
+layout(set = 0, binding = B_FILTERED, scalar) writeonly buffer Shifts { Filtered shifts[]; };
 
 // Where histories are looked for.
 // A history may lie this many footprints off the tangent plane of the surface point.
@@ -306,7 +306,7 @@ void main() {
         keeps = true;
         Place place;
         h = begin_history(pixel, at, place);
-        shifts[at] = carry_point(h, place, pixel, at);
+        shifts[at].light = carry_point(h, place, pixel, at);
         h.flags &= ~HISTORY_HIDDEN;
         importance = importance_of(h);
         demand = importance | ((h.flags & HISTORY_EXACT) != 0u ? DEMAND_EXACT : 0u) | (h.used == 0u ? DEMAND_NEW : 0u);

@@ -44,20 +44,30 @@ float sequence_variance(float held) {
     return mix(SEQUENCE_VARIANCE_FEW, SEQUENCE_VARIANCE_MANY, clamp(held / (MANY_FRAMES * samples_a_frame()), 0.0, 1.0));
 }
 
+float weight_of(Filtered f) { return unpackHalf2x16(f.weight_and_albedo).x; }
+
+// Whether something is known of the light at raster position `q`, on the body `instance`. The surface itself need not be read.
+bool known_beside(ivec2 q, uint instance, out uint tap) {
+    tap = 0u;
+    if (!on_raster(q)) return false;
+    tap = uint(q.y) * frame.width + uint(q.x);
+    return weight_of(filtered_at(tap)) > 0.0 && ((history_noise_at(tap).body_and_used / (HISTORY_USED + 1u)) & 255u) == instance;
+}
+
 // How far the history lags: a slope of the light over the histories' age is fitted to the drifts around, as far as chance does not explain it.
 float lag_of(uvec2 pixel, uint at) {
     uint instance = surface_at(at).id >> 24u;
     vec3 normal = decode_normal(history_place_at(at).normal);
     mat2 rotation = turn_of(pixel, 0u);
     float per_frame = samples_a_frame();
-    float age = filtered_at(at).weight / per_frame, drift = history_noise_at(at).drift;
+    float age = weight_of(filtered_at(at)) / per_frame, drift = history_noise_at(at).drift;
     float xx = age * age, xy = age * drift, yy = drift * drift, used = 1.0;
     for (int i = 0; i < 12; i++) {
         ivec2 q = ivec2(pixel) + ivec2(round(rotation * DISK[i] * LAG_RADIUS_PX));
         uint tap;
-        if (q == ivec2(pixel) || !neighbour(q, instance, tap)) continue;
+        if (q == ivec2(pixel) || !known_beside(q, instance, tap)) continue;
         float w = pow(max(dot(decode_normal(history_place_at(tap).normal), normal), 0.0), 8.0);
-        float x = filtered_at(tap).weight / per_frame, y = history_noise_at(tap).drift;
+        float x = weight_of(filtered_at(tap)) / per_frame, y = history_noise_at(tap).drift;
         xx += w * x * x;
         xy += w * x * y;
         yy += w * y * y;
@@ -85,19 +95,38 @@ Sums gather(uvec2 pixel, uint at, vec3 own, float tolerated, out float a[15], ou
     for (int i = 0; i < 25; i++) {
         ivec2 d = ivec2(i % 5, i / 5) - 2;
         uint tap;
-        if (!neighbour(ivec2(pixel) + d, instance, tap)) continue;
+        if (!known_beside(ivec2(pixel) + d, instance, tap)) continue;
         vec3 n = decode_normal(history_place_at(tap).normal);
         if (dot(n, normal) < LIKE_NORMAL || abs(dot(history_place_at(tap).position - position, normal)) > DEPTH * footprint) continue;
-        float light = luminance(albedo_of(tint_at(tap))), weight = filtered_at(tap).weight;
-        float noise = weight > 0.0 ? history_noise_at(tap).variance * sequence_variance(weight) / (weight * light * light) : 0.0;
+        vec2 weight_and_albedo = unpackHalf2x16(filtered_at(tap).weight_and_albedo);
+        float weight = weight_and_albedo.x, light = weight_and_albedo.y;
+        float noise = history_noise_at(tap).variance * sequence_variance(weight) / (weight * light * light);
         float w = 1.0 / (noise + tolerated);
         vec3 m = filtered_at(tap).light - own;
-        float v[N] = float[](1.0, float(d.x), float(d.y), dot(n, across), dot(n, along));
-        int k = 0;
-        for (int r = 0; r < N; r++) {
-            for (int c = 0; c <= r; c++) a[k++] += w * v[r] * v[c];
-            b[r] += w * v[r] * m;
-        }
+        // Without loops, of which software Vulkan would keep the arrays in memory.
+        vec2 e = vec2(d);
+        vec2 f = vec2(dot(n, across), dot(n, along));
+        vec2 we = w * e, wf = w * f;
+        a[0] += w;
+        a[1] += we.x;
+        a[2] += we.x * e.x;
+        a[3] += we.y;
+        a[4] += we.y * e.x;
+        a[5] += we.y * e.y;
+        a[6] += wf.x;
+        a[7] += wf.x * e.x;
+        a[8] += wf.x * e.y;
+        a[9] += wf.x * f.x;
+        a[10] += wf.y;
+        a[11] += wf.y * e.x;
+        a[12] += wf.y * e.y;
+        a[13] += wf.y * f.x;
+        a[14] += wf.y * f.y;
+        b[0] += w * m;
+        b[1] += we.x * m;
+        b[2] += we.y * m;
+        b[3] += wf.x * m;
+        b[4] += wf.y * m;
         float y = luminance(m);
         s.power += w * y * y;
         s.total += w;
@@ -142,14 +171,14 @@ vec3 regressed(uvec2 pixel, uint at, vec3 own) {
     // The structure that the fit misses, around or at this very pixel, against the noise that the eye's mean leaves [Lee80].
     float structure = max(max(s.power - explained, 0.0) / s.total * s.used / max(s.used - 4.0, 1.0) - s.expected / s.total, 0.0);
     // A single pixel hardly knows the variance of its samples, so that of the neighbourhood is taken. It does know their number.
-    float held = filtered_at(at).weight;
+    float held = weight_of(filtered_at(at));
     float noise = s.single / s.used / max(held, 1e-6);
     float apart = luminance(b[0]);
     // In the periphery the eye sees flicker better than blur.
     float beyond = periphery(angle_of(tint_at(at)));
     structure = max(structure, apart * apart - mix(3.0, 16.0, beyond) * noise);
     // The eye's mean removes what changes from frame to frame. Of a young point that is little, because all its frames share the same samples.
-    float changing = min(SEEN_FRAMES * samples_a_frame(), OWN_CHANGING * float(history_noise_at(at).used & ~HISTORY_EXACT));
+    float changing = min(SEEN_FRAMES * samples_a_frame(), OWN_CHANGING * float(history_noise_at(at).body_and_used & HISTORY_USED));
     noise *= mix(1.0, 5.0, beyond) * held / (held + changing);
     vec3 result = own + b[0] * (noise / max(structure + noise, 1e-12));
     return finite3(result) ? max(result, vec3(0.0)) : own;
@@ -159,7 +188,7 @@ vec3 regressed(uvec2 pixel, uint at, vec3 own) {
 vec3 light_of(uvec2 pixel, uint at) {
     if (!is_lit(surface_at(at))) return vec3(0.0);
     vec3 light = filtered_at(at).light;
-    if (HAS_FILTER && (history_noise_at(at).used & HISTORY_EXACT) == 0u) {
+    if (HAS_FILTER && (history_noise_at(at).body_and_used & HISTORY_EXACT) == 0u) {
         light = regressed(pixel, at, light);
         float level = luminance(light);
         light *= clamp((level + lag_of(pixel, at)) / max(level, 1e-6), LEAST_CORRECTION, MOST_CORRECTION);

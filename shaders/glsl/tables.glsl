@@ -309,7 +309,7 @@ HistoryNoise history_noise_at(uint i) {
     return HistoryNoise(history_noise_table[at].drift,
         history_noise_table[at].variance,
         history_noise_table[at].surprise,
-        history_noise_table[at].used);
+        history_noise_table[at].body_and_used);
 }
 #endif
 
@@ -382,7 +382,7 @@ HistoryNoise former_noise_at(uint i) {
     return HistoryNoise(former_noise_table[at].drift,
         former_noise_table[at].variance,
         former_noise_table[at].surprise,
-        former_noise_table[at].used);
+        former_noise_table[at].body_and_used);
 }
 #endif
 
@@ -412,13 +412,13 @@ Filtered filtered_at(uint i) {
     uint at = i;
     uvec4 r0 = imageLoad(filtered_rows_image, int(at) * 1 + 0);
     return Filtered(vec3(uintBitsToFloat(r0.x), uintBitsToFloat(r0.y), uintBitsToFloat(r0.z)),
-        uintBitsToFloat(r0.w));
+        r0.w);
 }
 #else
 layout(set = 0, binding = B_FILTERED, scalar) readonly buffer filtered_block { Filtered filtered_table[]; };
 Filtered filtered_at(uint i) {
     uint at = i;
     return Filtered(filtered_table[at].light,
-        filtered_table[at].weight);
+        filtered_table[at].weight_and_albedo);
 }
 #endif

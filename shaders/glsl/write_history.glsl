@@ -7,11 +7,12 @@ layout(set = 0, binding = B_HISTORY, scalar) writeonly buffer HistoryTags { Hist
 void write_history(uint at, History h) {
     history_lights[HISTORY_LIGHT_AT(at)] = HistoryLight(h.mean, h.weight);
     history_places[HISTORY_PLACE_AT(at)] = HistoryPlace(h.position, h.normal);
-    history_tags[HISTORY_TAG_AT(at)] = HistoryTag(h.seed, used_and_exact(h), h.instance << 24u | (h.flags & 0xffffffu & ~HISTORY_EXACT), h.frame);
+    history_tags[HISTORY_TAG_AT(at)] = HistoryTag(h.seed, h.used | (h.flags & HISTORY_EXACT), h.instance << 24u | (h.flags & 0xffffffu & ~HISTORY_EXACT), h.frame);
 }
 
 void write_noise(uint at, History h) {
-    history_noises[HISTORY_NOISE_AT(at)] = HistoryNoise(h.drift, h.variance, h.surprise, used_and_exact(h));
+    uint body_and_used = h.used | h.instance * (HISTORY_USED + 1u) | (h.flags & HISTORY_EXACT);
+    history_noises[HISTORY_NOISE_AT(at)] = HistoryNoise(h.drift, h.variance, h.surprise, body_and_used);
 }
 
 // A pixel that is not lit has no history.

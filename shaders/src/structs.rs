@@ -233,15 +233,15 @@ gpu_structs! {
         variance: f32,
         /// Mean square by which the luminance of a frame is beyond the history: its noise, and what the history gets wrong.
         surprise: f32,
-        /// Samples of the point's sequence already used, and the bit `HISTORY_EXACT`.
-        used: u32,
+        /// Samples of the point's sequence already used in the bits of `HISTORY_USED`, body in the 8 bits above, and the bit `HISTORY_EXACT`.
+        body_and_used: u32,
     }
 
     /// Whose history it is.
     struct HistoryTag {
         /// Seed of the point's sample sequence.
         seed: u32,
-        /// `used` before the frame's own samples.
+        /// Samples used before the frame's own, and `HISTORY_EXACT`.
         used_before: u32,
         /// Body in the high 8 bits, `HISTORY_HIDDEN` and `HISTORY_BORDER` below.
         owner: u32,
@@ -275,8 +275,8 @@ gpu_structs! {
     struct Filtered {
         /// Radiance, divided by the albedo where the method does so.
         light: [f32; 3],
-        /// Samples that it stands on (method dpm).
-        weight: f32,
+        /// Method dpm: samples that it stands on, 0: nothing is known; and luminance of the albedo. Both as halves.
+        weight_and_albedo: u32,
     }
 
     /// One rigid body in the top level.
@@ -495,6 +495,7 @@ pub const CONSTANTS: &[(&str, u32)] = &[
     ("FRAME_SPP_BY_ANGLE", FRAME_SPP_BY_ANGLE),
     ("FRAME_TEMPORAL", FRAME_TEMPORAL),
     ("FRAME_DPM", FRAME_DPM),
+    ("HISTORY_USED", HISTORY_USED),
     ("HISTORY_EXACT", HISTORY_EXACT),
     ("HISTORY_HIDDEN", HISTORY_HIDDEN),
     ("HISTORY_BORDER", HISTORY_BORDER),
@@ -576,7 +577,9 @@ pub const FRAME_SPP_BY_ANGLE: u32 = 8;
 pub const FRAME_TEMPORAL: u32 = 16;
 /// Method dpm: every sample counts once in the history, radiance is filtered without its albedo.
 pub const FRAME_DPM: u32 = 32;
-/// Bit of [`HistoryNoise::used`]: chance had no part in the last frame's light (a mirror of the sky), so that one sample told all of it.
+/// Bits of [`HistoryNoise::body_and_used`]: samples used. They begin anew after the last; long before, the sequence repeats its points.
+pub const HISTORY_USED: u32 = (1 << 23) - 1;
+/// Bit of [`HistoryNoise::body_and_used`]: chance had no part in the last frame's light (a mirror of the sky), so that one sample told all of it.
 pub const HISTORY_EXACT: u32 = 1 << 31;
 /// Bit of [`HistoryTag::owner`]: the pixel itself was not lit in the last frame. Its history waits for a surface point that has just slipped out of it.
 pub const HISTORY_HIDDEN: u32 = 2;

@@ -13,7 +13,7 @@ use crate::gpu::{Buffer, FrameTree, Gpu, GpuError, MemoryKind, Place};
 use crate::pack;
 use bytemuck::Zeroable;
 use dpm_shaders::structs::{
-    in_blocks, BodyNode, Counters, Frame, Instance, Mover, Schedule, Surface, TextureInfo, NO_HIT,
+    in_blocks, BodyNode, Counters, Filtered, Frame, Instance, Mover, Schedule, Surface, TextureInfo, NO_HIT,
 };
 use dpm_shaders::Reading;
 use std::sync::Arc;
@@ -48,10 +48,9 @@ pub(super) struct FrameBuffers {
     pub guides: Buffer,
     pub schedule: Buffer,
     pub work: Buffer,
-    /// The history's picture.
+    /// The history's picture. In method dpm the pass `reproject` leaves shifts here, which the pass `accumulate` reads before it writes the picture.
     pub filtered: Buffer,
-    /// The picture after the spatial filter. In method dpm the pass `reproject` leaves shifts here, which the pass `accumulate` reads, and only a
-    /// host that reads everything gets the picture.
+    /// The picture after the spatial filter. By method dpm only a host that reads everything gets it.
     pub filtered_shown: Buffer,
     /// Copies for debugging, if they were asked for.
     pub debug_host: Option<DebugBuffers>,
@@ -153,10 +152,7 @@ impl FrameBuffers {
             schedule: size("schedule", size_of::<Schedule>(), Device)?,
             work: size("work list", pixels * each.work, Device)?,
             filtered: with("filtered radiance", each.filtered)?,
-            filtered_shown: with(
-                "shown radiance",
-                if debug && each.shown > 0 { SHOWN_BYTES } else { each.shown },
-            )?,
+            filtered_shown: with("shown radiance", if debug { SHOWN_BYTES } else { each.shown })?,
             motion: with("motion of surfaces", each.motion)?,
             movers: latched("movers", size_of::<Mover>() * bodies.max(1))?,
             device_tree: asks_device.then(|| FrameTree::new(gpu, bodies)).transpose()?,
@@ -203,6 +199,9 @@ impl FrameBuffers {
         fill(gpu, &self.radiance, &[0f32; 4], pixels)?;
         if self.each.guides > 0 {
             fill(gpu, &self.guides, &[0u8; Guide::BYTES], in_blocks(pixels))?;
+        }
+        if self.each.filtered > 0 {
+            fill(gpu, &self.filtered, &[0u8; size_of::<Filtered>()], pixels)?;
         }
         let is_shown = !settings.method.dpm || self.debug_host.is_some();
         if is_shown {

@@ -3,6 +3,7 @@
 
 use super::blue_noise;
 use super::fill::fill;
+use super::frame_buffers::SHOWN_BYTES;
 use super::method::Method;
 use super::optics::OpticsLayout;
 use super::read_back::{Guide, History};
@@ -28,7 +29,7 @@ pub(super) struct BytesPerPixel {
     pub radiance: usize,
     /// The history's picture.
     pub filtered: usize,
-    /// The filtered picture. Method dpm turns it into code values at once, and keeps a step of the light here before.
+    /// The filtered picture; 0 for method dpm, which turns it into code values at once.
     pub shown: usize,
     /// The work list of the tracer.
     pub work: usize,
@@ -48,7 +49,7 @@ impl BytesPerPixel {
             surfaces: size_of::<Surface>(),
             radiance: size_of::<[f32; 4]>(),
             filtered: when(method.needs_history(), size_of::<Filtered>()),
-            shown: when(method.needs_spatial(), size_of::<[f32; 3]>() + when(!method.dpm, size_of::<f32>())),
+            shown: when(method.needs_spatial() && !method.dpm, SHOWN_BYTES),
             work: size_of::<WorkItem>(),
             codes: size_of::<u32>(),
             motion: 0,

@@ -109,7 +109,7 @@ pub(super) const TABLE: [Pass; 12] = [
                     "B_HISTORY.noise",
                     "B_HISTORY.tag",
                     "B_SCHEDULE",
-                    "B_SHOWN",
+                    "B_FILTERED",
                     "B_GUIDES.demand",
                 ],
                 seldom: &[],
@@ -192,7 +192,7 @@ pub(super) const TABLE: [Pass; 12] = [
                     "B_GUIDES.demand",
                     "B_HISTORY.light",
                     "B_HISTORY.noise",
-                    "B_SHOWN",
+                    "B_FILTERED",
                 ],
                 writes: &["B_HISTORY.light", "B_HISTORY.noise", "B_FILTERED"],
                 seldom: &[],
@@ -628,10 +628,10 @@ mod tests {
         };
         let expected = [
             ("primary", 40.0),
-            ("reproject", 168.0),
+            ("reproject", 172.0),
             ("schedule", 16.0),
             ("trace", 60.0),
-            ("accumulate", 120.0),
+            ("accumulate", 124.0),
             ("spatial", 76.0),
             ("pack", 7.0),
         ];

@@ -3,7 +3,7 @@
 use bytemuck::{Pod, Zeroable};
 use dpm_shaders::structs::{
     in_blocks, part, HistoryLight, HistoryNoise, HistoryPlace, HistoryTag, Part, Sight, Tint, DEMAND_NOT_LIT,
-    HISTORY_EXACT, NO_FRAME, PART_BLOCK,
+    HISTORY_EXACT, HISTORY_USED, NO_FRAME, PART_BLOCK,
 };
 
 /// Where the surface point of a pixel moves, how the eye sees it, and what its light is divided by.
@@ -52,12 +52,12 @@ impl History {
 
     /// Chance had no part in the last frame's light.
     pub fn is_exact(&self) -> bool {
-        self.noise.used & HISTORY_EXACT != 0
+        self.noise.body_and_used & HISTORY_EXACT != 0
     }
 
     /// Samples of the point's sequence that were used.
     pub fn samples_used(&self) -> u32 {
-        self.noise.used & !HISTORY_EXACT
+        self.noise.body_and_used & HISTORY_USED
     }
 
     /// Those of all pixels, from the bytes of the buffer.
@@ -119,7 +119,7 @@ mod tests {
         let history = |i: u32| History {
             light: HistoryLight { weight: i as f32, ..HistoryLight::zeroed() },
             place: HistoryPlace { normal: i + 100, ..HistoryPlace::zeroed() },
-            noise: HistoryNoise { used: i + 200, ..HistoryNoise::zeroed() },
+            noise: HistoryNoise { body_and_used: i + 200, ..HistoryNoise::zeroed() },
             tag: HistoryTag { frame: i + 300, ..HistoryTag::zeroed() },
         };
         let all: Vec<_> = (0..200).map(history).collect();
