@@ -111,7 +111,6 @@ fn wait(page: &Page, name: &str, limit: Duration, is: impl Fn(&Value) -> bool) -
 fn a_rig_that_answers_is_shown_and_each_that_does_not_says_why() {
     let nobody = TcpListener::bind("127.0.0.1:0").unwrap();
     let closed = nobody.local_addr().unwrap();
-    drop(nobody);
     let good = Fake::good();
     let silent = Fake::serve(|stream| {
         std::thread::sleep(PATIENCE);
@@ -158,6 +157,8 @@ fn a_rig_that_answers_is_shown_and_each_that_does_not_says_why() {
     ];
     let mut names: Vec<String> = bad.iter().map(|(name, address, _)| format!("{name}={address}")).collect();
     names.push(format!("good={}", good.address));
+    // Until here, so that none of the others was given its port.
+    drop(nobody);
     let page = overview(&names);
     let rig = wait(&page, "good", Duration::from_secs(2), |rig| rig["contact"] == "yes");
     assert_eq!(rig["address"], good.address.to_string());

@@ -4,7 +4,7 @@ use super::body_tree::BodyTree;
 use super::deformed::DeformedTables;
 use super::fill::fill;
 use super::live_textures::{LiveTextures, Piece};
-use super::memory::{BytesPerPixel, SharedBuffers};
+use super::memory::{BytesPerPixel, SharedBuffers, SHOWN_BYTES};
 use super::read_back::Guide;
 use super::scene_data::{BodyData, SceneData};
 use super::scene_gpu::{table_buffer, Geometry, SceneGpu};
@@ -17,9 +17,6 @@ use dpm_shaders::structs::{
 };
 use dpm_shaders::Reading;
 use std::sync::Arc;
-
-/// Bytes of a pixel of the picture that the host can read.
-pub(super) const SHOWN_BYTES: usize = size_of::<[f32; 4]>();
 
 /// The buffers of one frame in flight.
 pub(super) struct FrameBuffers {

@@ -3,7 +3,6 @@
 
 use super::blue_noise;
 use super::fill::fill;
-use super::frame_buffers::SHOWN_BYTES;
 use super::method::Method;
 use super::optics::OpticsLayout;
 use super::read_back::{Guide, History};
@@ -15,6 +14,9 @@ use bytemuck::Zeroable;
 use dpm_device::planes::Raster;
 use dpm_shaders::structs::{Filtered, Moved, PlaneGroup, Schedule, Surface, WorkItem, PARTS};
 use std::sync::Arc;
+
+/// Bytes of a pixel of the picture that the host can read.
+pub(super) const SHOWN_BYTES: usize = size_of::<[f32; 4]>();
 
 /// Bytes a pixel of every buffer that grows with the raster; 0 if the method does not need the buffer.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]

@@ -2,10 +2,10 @@
 
 use super::body_tree::BodyTree;
 use super::fill;
-use super::frame_buffers::{FrameBuffers, SHOWN_BYTES};
+use super::frame_buffers::FrameBuffers;
 use super::last_frame::{LastFrame, Turn};
 use super::live_textures::{LiveTextures, Piece};
-use super::memory::SharedBuffers;
+use super::memory::{SharedBuffers, SHOWN_BYTES};
 use super::optics::OpticsLayout;
 use super::passes::{Grid, FIRST_PASSES, PASSES, TABLE};
 use super::plan::{Pipelines, RendererPlan};
