@@ -96,8 +96,7 @@
 #define B_MOTION 33u
 #define B_MOVERS 34u
 #define B_PLANE_GROUPS 35u
-#define B_GUIDE_WORDS_ROWS 36u
-#define B_BODY_TREE 37u
+#define B_BODY_TREE 36u
 // Index of a pixel's element in a part of a buffer.
 #define GUIDES_SIGHT_AT(i) (((i) >> 6u) * 112u + 0u + ((i) & 63u))
 #define GUIDES_TINT_AT(i) (((i) >> 6u) * 224u + 128u + ((i) & 63u))

@@ -244,10 +244,10 @@ Sight sight_at(uint i) {
 #endif
 
 #ifdef TEXEL_TABLES
-layout(set = 0, binding = B_GUIDE_WORDS_ROWS, r32ui) uniform readonly uimageBuffer guide_words_rows_image;
 Tint tint_at(uint i) {
     uint at = GUIDES_TINT_AT(i);
-    uvec4 r0 = uvec4(imageLoad(guide_words_rows_image, int(at) * 2 + 0).x, imageLoad(guide_words_rows_image, int(at) * 2 + 1).x, 0u, 0u);
+    uvec4 row = imageLoad(guide_rows_image, int(at >> 1u));
+    uvec4 r0 = (at & 1u) == 0u ? row : row.zwxy;
     return Tint(r0.x,
         r0.y);
 }

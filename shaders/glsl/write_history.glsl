@@ -7,7 +7,7 @@ layout(set = 0, binding = B_HISTORY, scalar) writeonly buffer HistoryTags { Hist
 void write_history(uint at, History h) {
     history_lights[HISTORY_LIGHT_AT(at)] = HistoryLight(h.mean, h.weight);
     history_places[HISTORY_PLACE_AT(at)] = HistoryPlace(h.position, h.normal);
-    history_tags[HISTORY_TAG_AT(at)] = HistoryTag(h.seed, h.used | (h.flags & HISTORY_EXACT), h.instance << 24u | (h.flags & 0xffffffu & ~HISTORY_EXACT), h.frame);
+    history_tags[HISTORY_TAG_AT(at)] = HistoryTag(h.seed, h.used | (h.flags & HISTORY_EXACT), h.instance << 24u | (h.flags & 0xffffffu), h.frame);
 }
 
 void write_noise(uint at, History h) {

@@ -138,29 +138,25 @@ pub fn tables_glsl() -> String {
          software Vulkan, which reads storage lane by lane where lanes part. What is\n// not used of an element is not read.\n",
     );
     let mut declared = Vec::new();
-    for table in structs::tables() {
-        let structs::Table { name, reader, storage, texel, bytes, part, from_rows, from_storage } = &table;
-        let words = table.texel_words();
+    for structs::Table { name, reader, storage, texel, bytes, part, from_rows, from_storage } in
+        structs::tables()
+    {
+        // The parts of a buffer share its image.
         let image = format!("{}_image", texel.trim_start_matches("B_").to_lowercase());
-        let declaration = if declared.contains(texel) {
+        let declaration = if declared.contains(&texel) {
             String::new()
         } else {
-            let format = if words == 4 { "rgba32ui" } else { "r32ui" };
-            format!("layout(set = 0, binding = {texel}, {format}) uniform readonly uimageBuffer {image};\n")
+            format!("layout(set = 0, binding = {texel}, rgba32ui) uniform readonly uimageBuffer {image};\n")
         };
         declared.push(texel);
-        let texels = bytes / 4 / words;
-        let fetch = |texel: usize| format!("imageLoad({image}, int(at) * {texels} + {texel})");
-        let fetches: String = (0..bytes.div_ceil(16))
-            .map(|row| match words {
-                4 => format!("    uvec4 r{row} = {};\n", fetch(row)),
-                _ => {
-                    let word = |i| if i < texels { format!("{}.x", fetch(i)) } else { "0u".to_owned() };
-                    let words: Vec<_> = (4 * row..4 * row + 4).map(word).collect();
-                    format!("    uvec4 r{row} = uvec4({});\n", words.join(", "))
-                }
-            })
-            .collect();
+        let fetches: String = match bytes / 16 {
+            0 => format!(
+                "    uvec4 row = imageLoad({image}, int(at >> 1u));\n    uvec4 r0 = (at & 1u) == 0u ? row : row.zwxy;\n"
+            ),
+            rows => (0..rows)
+                .map(|row| format!("    uvec4 r{row} = imageLoad({image}, int(at) * {rows} + {row});\n"))
+                .collect(),
+        };
         let at = part.map_or("i".to_owned(), |part| format!("{}(i)", macro_of(&part)));
         out.push_str(&format!(
             "\n#ifdef TEXEL_TABLES\n\

@@ -776,7 +776,7 @@ pub const fn part(binding: &str, name: &str) -> Part {
     panic!("no such part")
 }
 
-/// A table that shaders read by `{reader}_at(i)`.
+/// A table that shaders read by `{reader}_at(i)`: elements of whole rows of four words, or of half a row.
 pub(crate) struct Table {
     pub name: &'static str,
     pub reader: &'static str,
@@ -793,22 +793,11 @@ pub(crate) struct Table {
     pub from_storage: String,
 }
 
-impl Table {
-    /// Words of a texel: a whole row, or one word where elements are no whole rows.
-    pub(crate) fn texel_words(&self) -> usize {
-        if self.bytes.is_multiple_of(16) {
-            4
-        } else {
-            1
-        }
-    }
-}
-
 macro_rules! tables {
     ($($name:ident $reader:literal, $storage:literal $(. $part:literal)? or $texel:literal;)*) => {
         /// What `tables.glsl` is written from.
         pub(crate) fn tables() -> Vec<Table> {
-            $(const { assert!(size_of::<$name>() % 4 == 0) };)*
+            $(const { assert!(size_of::<$name>() % 16 == 0 || size_of::<$name>() == 8) };)*
             vec![$(Table {
                 name: stringify!($name),
                 reader: $reader,
@@ -835,7 +824,7 @@ tables! {
     AlbedoCell "albedo_cell", "B_ALBEDO" or "B_ALBEDO";
     Surface "surface", "B_SURFACES" or "B_SURFACE_ROWS";
     Sight "sight", "B_GUIDES"."sight" or "B_GUIDE_ROWS";
-    Tint "tint", "B_GUIDES"."tint" or "B_GUIDE_WORDS_ROWS";
+    Tint "tint", "B_GUIDES"."tint" or "B_GUIDE_ROWS";
     HistoryLight "history_light", "B_HISTORY"."light" or "B_HISTORY_ROWS";
     HistoryPlace "history_place", "B_HISTORY"."place" or "B_HISTORY_ROWS";
     HistoryNoise "history_noise", "B_HISTORY"."noise" or "B_HISTORY_ROWS";
@@ -885,11 +874,10 @@ pub const BINDINGS: &[(&str, u32)] = &[
     ("B_MOTION", 33),
     ("B_MOVERS", 34),
     ("B_PLANE_GROUPS", 35),
-    ("B_GUIDE_WORDS_ROWS", 36),
 ];
 
 /// The binding after them, of the shaders that ask the device for hits: no buffer, but the tree over the bodies of the frame.
-pub const TREE_BINDING: (&str, u32) = ("B_BODY_TREE", 37);
+pub const TREE_BINDING: (&str, u32) = ("B_BODY_TREE", 36);
 
 impl Surface {
     /// Light falls on it: something was met, and the eye sees it. As `is_lit` of the shaders.

@@ -96,10 +96,7 @@ fn on_gpu_through(gpu: &Arc<Gpu>, input: &Input, texel: bool) -> (Vec<u32>, Coun
     let tiles: Vec<u32> = (0..WIDTH.div_ceil(16) * HEIGHT.div_ceil(16)).collect();
     let device = |what, bytes| Buffer::new(gpu, what, bytes, MemoryKind::Device).unwrap();
     let host = |what, bytes| Buffer::new(gpu, what, bytes, MemoryKind::Readback).unwrap();
-    let unused = Buffer::new_texels(gpu, "unused", 1, false, MemoryKind::Device)
-        .unwrap()
-        .viewed_as_words("unused")
-        .unwrap();
+    let unused = rows("unused", &[0; 16]);
     let (mut frame, mut instances) = (input.frame, input.instances.clone());
     let (optics, optics_constants) = input.optics.table(&mut frame, &mut instances);
     let frame = uploaded("frame", bytemuck::bytes_of(&frame));

@@ -106,7 +106,7 @@ impl FrameBuffers {
     ) -> Result<Self, GpuError> {
         use MemoryKind::{Device, Readback, Upload};
         let (bodies, asks_device) = (data.bodies.len(), reading == Reading::Query);
-        let pixels = settings.raster.pixel_count();
+        let pixels = in_blocks(settings.raster.pixel_count());
         let size = |what, bytes, kind| Buffer::new(gpu, what, bytes, kind);
         let table = |what, bytes, kind| table_buffer(gpu, what, bytes, kind);
         let latched = |what, len_bytes| -> Result<Latched, GpuError> {
@@ -117,7 +117,6 @@ impl FrameBuffers {
         // A buffer that the method does not need is bound all the same, but is as small as possible.
         let with = |what, each: usize| table(what, (pixels * each).max(16), Device);
         let packed = settings.output.schedule();
-        let guides = table("guides", (in_blocks(pixels) * each.guides).max(16), Device)?;
         let plane_bytes = packed.map_or(4, |schedule| pack::gpu::len_bytes(settings.raster, schedule));
         let codes_host = match settings.output {
             Output::Planes(_) => None,
@@ -142,10 +141,7 @@ impl FrameBuffers {
             planes: size("bit planes", plane_bytes, Device)?,
             planes_host: packed.map(|_| size("bit planes", plane_bytes, Readback)).transpose()?,
             plane_bytes,
-            guides: match reading {
-                Reading::Texels => guides.viewed_as_words("guides")?,
-                _ => guides,
-            },
+            guides: with("guides", each.guides)?,
             schedule: size("schedule", size_of::<Schedule>(), Device)?,
             work: size("work list", pixels * each.work, Device)?,
             filtered: with("filtered radiance", each.filtered)?,
@@ -189,13 +185,13 @@ impl FrameBuffers {
     /// # Errors
     /// The GPU's own.
     pub(super) fn clear(&self, gpu: &Arc<Gpu>, settings: &RendererSettings) -> Result<(), GpuError> {
-        let pixels = settings.raster.pixel_count();
+        let pixels = in_blocks(settings.raster.pixel_count());
         let nothing = Surface { id: NO_HIT, ..Surface::zeroed() };
         fill(gpu, &self.surfaces, &nothing, pixels)?;
         fill(gpu, &self.codes, &0u32, pixels)?;
         fill(gpu, &self.radiance, &[0f32; 4], pixels)?;
         if self.each.guides > 0 {
-            fill(gpu, &self.guides, &[0u8; Guide::BYTES], in_blocks(pixels))?;
+            fill(gpu, &self.guides, &[0u8; Guide::BYTES], pixels)?;
         }
         if self.each.filtered > 0 {
             fill(gpu, &self.filtered, &[0u8; size_of::<Filtered>()], pixels)?;
@@ -278,7 +274,7 @@ impl FrameBuffers {
             "B_RADIANCE" => &self.radiance,
             "B_CODES" => &self.codes,
             "B_COUNTERS" => &self.counters,
-            "B_GUIDES" | "B_GUIDE_ROWS" | "B_GUIDE_WORDS_ROWS" => &self.guides,
+            "B_GUIDES" | "B_GUIDE_ROWS" => &self.guides,
             "B_HISTORY" | "B_HISTORY_ROWS" => &shared.history[parity],
             "B_FORMER" => &shared.history[1 - parity],
             "B_RATES" => &shared.rates,
@@ -311,18 +307,18 @@ fn texture_table(gpu: &Arc<Gpu>, data: &SceneData) -> Result<Option<Latched>, Gp
 impl DebugBuffers {
     fn new(gpu: &Arc<Gpu>, pixels: usize, tiles: usize, each: BytesPerPixel) -> Result<Self, GpuError> {
         let size = |what, bytes| Buffer::new(gpu, what, bytes, MemoryKind::Readback);
-        let kept = |what, pixels, each: usize| (each > 0).then(|| size(what, pixels * each)).transpose();
+        let kept = |what, each: usize| (each > 0).then(|| size(what, pixels * each)).transpose();
         Ok(Self {
             shown: size("shown radiance", pixels * SHOWN_BYTES)?,
             surfaces: size("surfaces", pixels * each.surfaces)?,
-            guides: kept("guides", in_blocks(pixels), each.guides)?,
-            history: kept("history", in_blocks(pixels), each.history)?,
-            prior: kept("prior history", in_blocks(pixels), each.history)?,
+            guides: kept("guides", each.guides)?,
+            history: kept("history", each.history)?,
+            prior: kept("prior history", each.history)?,
             traced: size("radiance", pixels * each.radiance)?,
             rates: size("shading rates", tiles * 4)?,
             schedule: size("schedule", size_of::<Schedule>())?,
             work: size("work list", pixels * each.work)?,
-            motion: kept("motion of surfaces", pixels, each.motion)?,
+            motion: kept("motion of surfaces", each.motion)?,
         })
     }
 }

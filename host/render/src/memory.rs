@@ -12,7 +12,7 @@ use super::tiles::TILE;
 use crate::gpu::{Buffer, Gpu, GpuError, MemoryKind};
 use bytemuck::Zeroable;
 use dpm_device::planes::Raster;
-use dpm_shaders::structs::{Filtered, Moved, PlaneGroup, Schedule, Surface, WorkItem, PARTS};
+use dpm_shaders::structs::{in_blocks, Filtered, Moved, PlaneGroup, Schedule, Surface, WorkItem, PARTS};
 use std::sync::Arc;
 
 /// Bytes of a pixel of the picture that the host can read.
@@ -128,7 +128,7 @@ pub(super) fn check_raster(
     limit: u64,
     device: &str,
 ) -> Result<(), RasterTooLarge> {
-    let pixels = raster.pixel_count() as u64;
+    let pixels = in_blocks(raster.pixel_count()) as u64;
     let (what, bytes) = BytesPerPixel::of(method).largest();
     let needed = pixels * bytes as u64;
     if needed <= limit {
@@ -170,10 +170,11 @@ impl SharedBuffers {
         check_raster(raster, &settings.method, gpu.max_buffer_bytes(), &gpu.summary().name)?;
         let optics = OpticsLayout::new(settings);
         let pixels = if settings.method.needs_history() { raster.pixel_count() } else { 1 };
+        let none = History::block_of_none();
         let history = || -> Result<Buffer, GpuError> {
             let bytes = History::buffer_bytes(pixels);
             let buffer = table_buffer(gpu, "history", bytes, MemoryKind::Device)?;
-            fill(gpu, &buffer, &History::block_of_none(), bytes / size_of_val(&History::block_of_none()))?;
+            fill(gpu, &buffer, &none, bytes / none.len())?;
             Ok(buffer)
         };
         let tiles = raster.width().div_ceil(TILE) * raster.height().div_ceil(TILE);

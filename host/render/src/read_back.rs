@@ -2,8 +2,8 @@
 
 use bytemuck::{Pod, Zeroable};
 use dpm_shaders::structs::{
-    in_blocks, part, HistoryLight, HistoryNoise, HistoryPlace, HistoryTag, Part, Sight, Tint, DEMAND_NOT_LIT,
-    HISTORY_EXACT, HISTORY_USED, NO_FRAME, PART_BLOCK,
+    in_blocks, part, HistoryLight, HistoryNoise, HistoryPlace, HistoryTag, Part, Sight, Tint, HISTORY_EXACT,
+    HISTORY_USED, NO_FRAME, PART_BLOCK,
 };
 
 /// Where the surface point of a pixel moves, how the eye sees it, and what its light is divided by.
@@ -31,7 +31,7 @@ pub struct History {
 
 impl Guide {
     /// Bytes of a pixel.
-    pub(crate) const BYTES: usize = size_of::<Sight>() + size_of::<Tint>() + size_of_val(&DEMAND_NOT_LIT);
+    pub(crate) const BYTES: usize = part("B_GUIDES", "sight").all;
 
     /// Bytes of the buffer for so many pixels.
     pub(crate) fn buffer_bytes(pixels: usize) -> usize {
@@ -48,7 +48,7 @@ impl Guide {
 
 impl History {
     /// Bytes of a pixel.
-    pub const BYTES: usize = size_of::<Self>();
+    pub const BYTES: usize = part("B_HISTORY", "light").all;
 
     /// Chance had no part in the last frame's light.
     pub fn is_exact(&self) -> bool {
@@ -97,12 +97,12 @@ impl History {
 /// The elements of a part of a buffer, one for each pixel.
 pub(crate) fn elements<T: Pod>(bytes: &[u8], part: Part, pixels: usize) -> Vec<T> {
     assert_eq!(part.bytes, size_of::<T>(), "{}.{}", part.binding, part.name);
-    let at = |pixel| part.index(pixel) * part.bytes;
-    (0..pixels).map(|pixel| bytemuck::pod_read_unaligned(&bytes[at(pixel)..at(pixel) + part.bytes])).collect()
+    let at = |pixel| &bytes[part.index(pixel) * part.bytes..][..part.bytes];
+    (0..pixels).map(|pixel| bytemuck::pod_read_unaligned(at(pixel))).collect()
 }
 
 /// Writes such elements.
-pub(crate) fn place_elements<T: Pod>(bytes: &mut [u8], part: Part, values: impl Iterator<Item = T>) {
+fn place_elements<T: Pod>(bytes: &mut [u8], part: Part, values: impl Iterator<Item = T>) {
     assert_eq!(part.bytes, size_of::<T>(), "{}.{}", part.binding, part.name);
     for (pixel, value) in values.enumerate() {
         bytes[part.index(pixel) * part.bytes..][..part.bytes].copy_from_slice(bytemuck::bytes_of(&value));

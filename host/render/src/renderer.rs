@@ -291,7 +291,7 @@ impl Renderer {
 
     /// Records the copies that the host reads, those for debugging included.
     fn record_readback(&self, r: &mut Recorder<'_>, b: &FrameBuffers, parity: usize, tiles: usize) {
-        let (shared, pixels) = (&self.resources.shared, self.settings.raster.pixel_count());
+        let (shared, pixels) = (&self.resources.shared, in_blocks(self.settings.raster.pixel_count()));
         if let Some(planes_host) = &b.planes_host {
             r.copy(&b.planes, planes_host, b.plane_bytes);
         }
@@ -303,10 +303,10 @@ impl Renderer {
             r.copy(b.shown(&self.settings), &d.shown, pixels * SHOWN_BYTES);
             r.copy(&b.surfaces, &d.surfaces, pixels * b.each.surfaces);
             if let Some(to) = &d.guides {
-                r.copy(&b.guides, to, in_blocks(pixels) * b.each.guides);
+                r.copy(&b.guides, to, pixels * b.each.guides);
             }
             if let Some(to) = &d.history {
-                r.copy(&shared.history[parity], to, in_blocks(pixels) * b.each.history);
+                r.copy(&shared.history[parity], to, pixels * b.each.history);
             }
             r.copy(&b.radiance, &d.traced, pixels * b.each.radiance);
             r.copy(&shared.rates, &d.rates, tiles * 4);

@@ -38,10 +38,7 @@ pub struct Place {
 /// A buffer with its own memory. Mapped kinds are coherent: no flushes.
 pub struct Buffer {
     pub(super) handle: vk::Buffer,
-    /// By texels of 16 bytes.
     pub(super) view: Option<vk::BufferView>,
-    /// By texels of one word.
-    pub(super) words_view: Option<vk::BufferView>,
     memory: vk::DeviceMemory,
     mapped: Option<NonNull<u8>>,
     len_bytes: usize,
@@ -130,26 +127,14 @@ impl Buffer {
     /// Adds the view through which shaders read it. The buffer has texel usage.
     fn viewed_as_texels(mut self, float: bool) -> Result<Self, GpuError> {
         let format = if float { vk::Format::R32G32B32A32_SFLOAT } else { vk::Format::R32G32B32A32_UINT };
-        self.view = Some(self.view_as(format)?);
-        Ok(self)
-    }
-
-    /// A buffer of [`Buffer::new_texels`] that shaders also read by single words.
-    ///
-    /// # Errors
-    /// [`GpuError::Limit`] when there are more words than the device's texel buffers hold.
-    pub fn viewed_as_words(mut self, what: &str) -> Result<Self, GpuError> {
-        Self::check_texels(&self.gpu, what, self.len_bytes / 4)?;
-        self.words_view = Some(self.view_as(vk::Format::R32_UINT)?);
-        Ok(self)
-    }
-
-    fn view_as(&self, format: vk::Format) -> Result<vk::BufferView, GpuError> {
         let info =
             vk::BufferViewCreateInfo::default().buffer(self.handle).format(format).range(vk::WHOLE_SIZE);
         // SAFETY: the buffer was created with texel usage and is alive.
-        unsafe { self.gpu.device.create_buffer_view(&info, None) }
-            .on(&self.gpu, "creating a texel-buffer view")
+        self.view = Some(
+            unsafe { self.gpu.device.create_buffer_view(&info, None) }
+                .on(&self.gpu, "creating a texel-buffer view")?,
+        );
+        Ok(self)
     }
 
     /// An uninitialised buffer with an address of its own, for what ray tracing reads and writes.
@@ -238,7 +223,6 @@ impl Buffer {
             let mut buffer = Self {
                 handle,
                 view: None,
-                words_view: None,
                 memory,
                 mapped: None,
                 len_bytes,
@@ -365,7 +349,7 @@ impl Drop for Buffer {
         }
         // SAFETY: owners wait for the GPU before dropping (FrameFence does in its Drop), or the device is lost; handles are ours alone.
         unsafe {
-            for view in [self.view, self.words_view].into_iter().flatten() {
+            if let Some(view) = self.view {
                 self.gpu.device.destroy_buffer_view(view, None);
             }
             self.gpu.device.destroy_buffer(self.handle, None);

@@ -165,18 +165,14 @@ impl Abilities {
             missing.push("a compute queue".to_owned());
         }
         let bindings = bindings_of(software);
-        let bound = |kinds: &[BindingKind]| bindings.iter().filter(|b| kinds.contains(&b.1)).count() as u32;
+        let bound = |kind| bindings.iter().filter(|b| b.1 == kind).count() as u32;
         let mut at_least = |what: &str, due: u32, has: u32| {
             if has < due {
                 missing.push(format!("{what} (has {has}, needs {due})"));
             }
         };
-        at_least("storage buffers of a shader", bound(&[BindingKind::Storage]), self.storage_buffers);
-        at_least(
-            "texel buffers of a shader",
-            bound(&[BindingKind::Texel, BindingKind::Words]),
-            self.storage_images,
-        );
+        at_least("storage buffers of a shader", bound(BindingKind::Storage), self.storage_buffers);
+        at_least("texel buffers of a shader", bound(BindingKind::Texel), self.storage_images);
         at_least("resources of a shader", bindings.len() as u32, self.resources);
         at_least("invocations of a workgroup", INVOCATIONS, self.invocations);
         at_least("bytes of shared memory", SHARED_BYTES, self.shared_bytes);
@@ -424,7 +420,7 @@ mod tests {
             atomics_of_64_bits: true,
             compute_queue: true,
             storage_buffers: bound(BindingKind::Storage),
-            storage_images: bound(BindingKind::Texel) + bound(BindingKind::Words),
+            storage_images: bound(BindingKind::Texel),
             resources: bindings.len() as u32,
             invocations: INVOCATIONS,
             shared_bytes: SHARED_BYTES,

@@ -16,10 +16,8 @@ pub enum BindingKind {
     Uniform,
     /// Storage buffer.
     Storage,
-    /// Storage texel buffer of whole rows, which the driver reads by image instructions.
+    /// Storage texel buffer, which the driver reads by image instructions.
     Texel,
-    /// The same of single words.
-    Words,
     /// The tree over the bodies of a frame, in which the device finds what a ray meets.
     BodyTree,
 }
@@ -29,7 +27,7 @@ impl BindingKind {
         match self {
             Self::Uniform => vk::DescriptorType::UNIFORM_BUFFER,
             Self::Storage => vk::DescriptorType::STORAGE_BUFFER,
-            Self::Texel | Self::Words => vk::DescriptorType::STORAGE_TEXEL_BUFFER,
+            Self::Texel => vk::DescriptorType::STORAGE_TEXEL_BUFFER,
             Self::BodyTree => vk::DescriptorType::ACCELERATION_STRUCTURE_KHR,
         }
     }
@@ -43,12 +41,8 @@ pub fn shared_bindings(reading: Reading) -> Vec<(u32, BindingKind)> {
     (structs::BINDINGS.iter())
         .filter(|(name, _)| texel || !name.ends_with("_ROWS"))
         .map(|&(name, binding)| {
-            let kind = match texel && structs::TEXEL_BINDINGS.contains(&name) {
-                true if name.ends_with("_WORDS_ROWS") => BindingKind::Words,
-                true => BindingKind::Texel,
-                false => BindingKind::Storage,
-            };
-            (binding, kind)
+            let rows = texel && structs::TEXEL_BINDINGS.contains(&name);
+            (binding, if rows { BindingKind::Texel } else { BindingKind::Storage })
         })
         .chain(tree)
         .collect()
@@ -151,12 +145,11 @@ impl BindingSet {
         tree: Option<&FrameTree>,
     ) -> Result<Self, GpuError> {
         let gpu = &table.gpu;
-        let count = |ty| table.bindings.iter().filter(|b| b.1.vulkan() == ty).count() as u32;
+        let count = |kind| table.bindings.iter().filter(|b| b.1 == kind).count() as u32;
         let kinds = [BindingKind::Uniform, BindingKind::Storage, BindingKind::Texel, BindingKind::BodyTree];
         let sizes: Vec<_> = kinds
-            .map(BindingKind::vulkan)
-            .into_iter()
-            .map(|ty| vk::DescriptorPoolSize { ty, descriptor_count: count(ty) })
+            .iter()
+            .map(|&k| vk::DescriptorPoolSize { ty: k.vulkan(), descriptor_count: count(k) })
             .filter(|s| s.descriptor_count > 0)
             .collect();
         let info = vk::DescriptorPoolCreateInfo::default().max_sets(1).pool_sizes(&sizes);
@@ -188,11 +181,10 @@ impl BindingSet {
     /// Binds a buffer.
     fn bind(&self, binding: u32, kind: BindingKind, buffer: &Buffer) {
         let infos = [vk::DescriptorBufferInfo { buffer: buffer.handle, offset: 0, range: vk::WHOLE_SIZE }];
-        let view = if kind == BindingKind::Words { buffer.words_view } else { buffer.view };
-        let views = [view.unwrap_or_default()];
+        let views = [buffer.view.unwrap_or_default()];
         let write = self.write_of(binding, kind);
         let write = match kind {
-            BindingKind::Texel | BindingKind::Words => write.texel_buffer_view(&views),
+            BindingKind::Texel => write.texel_buffer_view(&views),
             _ => write.buffer_info(&infos),
         };
         // SAFETY: the set is not in use yet, and the buffer is alive.
