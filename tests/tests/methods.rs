@@ -4,17 +4,21 @@
 
 use dpm_device::planes::Raster;
 use dpm_lab::sequence::{eye_mean, poses_at, rmse, submit, Span, Theatre, FRAME_WAIT_NS};
+use dpm_lab::stability::gpu_shot::Shot;
 use dpm_render::gpu::{validation_messages, Gpu};
-use dpm_render::method::{Method, SamplerKind};
+use dpm_render::method::{Method, SamplerKind, HISTORY_CAP};
+use dpm_render::scene_data::Keep;
 use dpm_render::{FrameInputs, Output, Overlapping, Renderer, RendererSettings};
 use dpm_rig::config::{Overrides, RenderMethod, RigConfig};
 use dpm_rig::pipeline::renderer_settings;
 use dpm_rig::rig::{affine, Rig};
 use dpm_rig::run_rig::{open_gpu, traced_raster};
 use dpm_scene::geometry::projector::ProjectorCamera;
+use dpm_scene::shapes::{add, camera, diffuse, image_sky, quad, scene_of};
+use dpm_scene::Scene;
 use dpm_tests::gpu::with_gpu;
 use dpm_tests::rigs::demo_rig;
-use glam::{DAffine3, DVec3};
+use glam::{DAffine3, DVec3, Vec3};
 use std::sync::Arc;
 
 const RASTER: &str = "render.software_raster=[64,48]";
@@ -224,6 +228,49 @@ fn frames_that_overlap_show_what_frames_one_after_the_other_show() {
                 [Overlapping::Never, Overlapping::Always].map(|overlap| codes_in_line(gpu, which, overlap));
             assert!(alone.len() == 10 && alone[9].iter().any(|&code| code != 0), "{which:?}");
             assert!(alone == together, "{which:?}: the pictures differ");
+        }
+    });
+}
+
+/// Two squares in one plane, each a body of its own. Neither sees the other, so the light of one is the same whether the other is there; its
+/// noisy neighbours beyond the border are alike in all but their body, and the filter must not take them in.
+#[test]
+fn the_filter_keeps_to_the_body() {
+    let square = |left: f32| quad(Vec3::new(left, -1.0, 0.0), Vec3::X, Vec3::Y * 2.0);
+    let mut alone = scene_of(square(-1.0), diffuse(Vec3::splat(0.6)));
+    alone.environment = image_sky(1.0);
+    let mut both = alone.clone();
+    add(&mut both, square(0.0), diffuse(Vec3::splat(0.6)));
+    // Every pixel has as many samples as the others, whatever they are worth.
+    let method = Method {
+        dpm: true,
+        spatial: true,
+        sampler: SamplerKind::Continued,
+        history_cap: HISTORY_CAP,
+        ..Method::full(1)
+    };
+    with_gpu(|gpu| {
+        for storage_tables in [false, true] {
+            let draw = |scene: &Scene| {
+                let camera = camera(32, 24, DVec3::Z * 3.0, DVec3::ZERO);
+                let eye = Some(DVec3::new(0.1, 0.2, 3.0));
+                let shot =
+                    Shot { eye, spp: 1, frames: 4, method: Some(method.clone()), ..Shot::new(scene, camera) };
+                shot.draw_keeping(gpu, Keep { storage_tables, ..Keep::default() })
+            };
+            let [wanted, got] = [&alone, &both].map(draw);
+            let of_first = |i: &usize| got.lit(*i) && got.surfaces[*i].id >> 24 == 0;
+            let pixels: Vec<usize> = (0..got.radiance.len()).filter(of_first).collect();
+            let beside =
+                pixels.iter().filter(|i| got.lit(**i + 1) && got.surfaces[**i + 1].id >> 24 == 1).count();
+            assert!(pixels.len() > 50 && beside > 8, "{} pixels, {beside} at the border", pixels.len());
+            for i in pixels {
+                assert_eq!(
+                    got.radiance[i].map(f32::to_bits),
+                    wanted.radiance[i].map(f32::to_bits),
+                    "pixel {i}"
+                );
+            }
         }
     });
 }
