@@ -199,7 +199,11 @@ fn pictures() {
         std::thread::sleep(Duration::from_millis(1));
     }
     drop(window);
-    assert_eq!(looker.window(), None, "the window goes with its run");
+    // The server may answer others before it sees that a program has gone.
+    while looker.window().is_some() {
+        assert!(Instant::now() < limit, "the window goes with its run");
+        std::thread::sleep(Duration::from_millis(1));
+    }
 }
 
 /// The slots of the link are the server's frames: as many in two seconds as the server shows.
