@@ -20,9 +20,7 @@ const PIVOT_RAD: f64 = 0.5;
 /// Turns about two axes while the wand is turned about its tip, hertz.
 const PIVOT_HZ: [f64; 2] = [0.31, 0.47];
 
-/// From place to place while places are visited, nanoseconds; the rest of the time at each the tip is held still.
-const VISIT_NS: i64 = 3_000_000_000;
-/// On the way from one to the next, nanoseconds.
+/// On the way from one place to the next while places are visited, nanoseconds.
 const GO_NS: i64 = 1_000_000_000;
 /// The box in which the places lie, metres: its middle and its sides.
 const VISITED_M: [[f64; 3]; 2] = [[0.0, 0.0, 0.12], [0.4, 0.3, 0.3]];
@@ -34,8 +32,11 @@ pub enum Order {
     Wander,
     /// Hold the tip at a point of the world, metres.
     Tip([f64; 3]),
-    /// Hold the tip still for two seconds at one place after another, near and far, and go slowly between them.
-    Visit,
+    /// Hold the tip still at one place after another, near and far, and go slowly between them.
+    Visit {
+        /// At each place, nanoseconds.
+        rest_ns: i64,
+    },
     /// Turn the wand about its tip, which stays at a point of the world, metres.
     Pivot([f64; 3]),
 }
@@ -96,7 +97,7 @@ impl Hand {
     fn doing(&self, stretch: &Stretch, t_ns: i64) -> Pose {
         let (place, turn) = match stretch.order {
             Order::Wander => return self.wander.pose_at(t_ns),
-            Order::Visit => return self.visiting(t_ns - stretch.since_ns),
+            Order::Visit { rest_ns } => return self.visiting(t_ns - stretch.since_ns, rest_ns),
             Order::Tip(place) => (place, tilt(TILT_RAD, stretch.number)),
             Order::Pivot(place) => {
                 let seconds = 1e-9 * (t_ns - stretch.since_ns) as f64;
@@ -114,7 +115,7 @@ impl Hand {
     }
 
     /// Where it is some time after it was told to visit places.
-    fn visiting(&self, since_ns: i64) -> Pose {
+    fn visiting(&self, since_ns: i64, rest_ns: i64) -> Pose {
         let at = |number: i64| {
             let [middle, sides] = VISITED_M;
             let shares = [2, 3, 5].map(|base| van_der_corput(number.max(0) as u64 + 1, base) - 0.5);
@@ -123,7 +124,8 @@ impl Hand {
             let far = 2.0 * TILT_RAD * van_der_corput(number.max(0) as u64 + 1, 7);
             self.holding(place, tilt(far, number.max(0) as u32))
         };
-        let (number, within_ns) = (since_ns.div_euclid(VISIT_NS), since_ns.rem_euclid(VISIT_NS));
+        let visit_ns = GO_NS + rest_ns.max(0);
+        let (number, within_ns) = (since_ns.div_euclid(visit_ns), since_ns.rem_euclid(visit_ns));
         let share = (within_ns as f64 / GO_NS as f64).min(1.0);
         match number {
             // The way to the first place is that from where it was.
@@ -221,7 +223,7 @@ mod tests {
     #[test]
     fn places_are_visited_near_and_far_and_rested_at() {
         let hand = Hand::new(Motion::still(Pose::IDENTITY).unwrap(), TIP);
-        hand.tell(0, Order::Visit);
+        hand.tell(0, Order::Visit { rest_ns: 2_000_000_000 });
         let tip = |ms: i64| tip_of(&hand.pose_at(ms * 1_000_000));
         let mut places: Vec<[f64; 3]> = Vec::new();
         for number in 0..20 {

@@ -221,7 +221,7 @@ fn visiting() -> Arc<Hand> {
 
 fn visiting_since(ns: i64) -> Arc<Hand> {
     let hand = Hand::new(Motion::still(Pose::IDENTITY).unwrap(), TIP);
-    hand.tell(ns, Order::Visit);
+    hand.tell(ns, Order::Visit { rest_ns: 2_000_000_000 });
     Arc::new(hand)
 }
 

@@ -17,8 +17,8 @@ const WAITING: usize = 64;
 const LEAD_NS: i64 = 5_000_000;
 /// What the lines may say.
 const HELP: &str =
-    "orders: wander; visit; tip X Y Z; pivot X Y Z; touch BODY X Y Z (in the body's space); dot [BODY] X Y Z (into \
-                    the middle of the light, as far away as this point); metres";
+    "orders: wander; visit [SECONDS at each place, 2 if not told]; tip X Y Z; pivot X Y Z; touch BODY X Y Z (in the \
+                    body's space); dot [BODY] X Y Z (into the middle of the light, as far away as this point); metres";
 
 /// A line.
 #[derive(Clone, Debug, PartialEq)]
@@ -28,6 +28,16 @@ enum Line {
     Touch(String, [f64; 3]),
     /// The tip into the middle of the light, at the depth of a point of the world or of a body's space.
     Dot(Option<String>, [f64; 3]),
+}
+
+/// How long the wand rests at each place, nanoseconds.
+fn rest_ns(words: &[&str]) -> Option<i64> {
+    let seconds = match words {
+        [] => 2.0,
+        [word] => word.parse().ok().filter(|s: &f64| (0.0..=3600.0).contains(s))?,
+        _ => return None,
+    };
+    Some((1e9 * seconds) as i64)
 }
 
 fn line_of(text: &str) -> Option<Line> {
@@ -43,7 +53,7 @@ fn line_of(text: &str) -> Option<Line> {
     };
     match order {
         "wander" if words.is_empty() => Some(Line::To(Order::Wander)),
-        "visit" if words.is_empty() => Some(Line::To(Order::Visit)),
+        "visit" => Some(Line::To(Order::Visit { rest_ns: rest_ns(&words)? })),
         "tip" => Some(Line::To(Order::Tip(place(&words)?))),
         "pivot" => Some(Line::To(Order::Pivot(place(&words)?))),
         "dot" if words.len() == 3 => Some(Line::Dot(None, place(&words)?)),
@@ -110,7 +120,7 @@ impl Orders {
                     self.hand.tell(now.plus_ns(LEAD_NS).0, order);
                     let told = match order {
                         Order::Wander => "the wand wanders".to_owned(),
-                        Order::Visit => "the wand rests at one place after another".to_owned(),
+                        Order::Visit { .. } => "the wand rests at one place after another".to_owned(),
                         Order::Tip([x, y, z]) => format!("the tip is at {x:.5} {y:.5} {z:.5}"),
                         Order::Pivot([x, y, z]) => {
                             format!("the wand turns about its tip at {x:.5} {y:.5} {z:.5}")
@@ -174,6 +184,8 @@ mod tests {
     fn lines_are_orders_and_others_are_none() {
         assert_eq!(line_of("wander\n"), Some(Line::To(Order::Wander)));
         assert_eq!(line_of(" tip 1 -2 0.5 "), Some(Line::To(Order::Tip([1.0, -2.0, 0.5]))));
+        assert_eq!(line_of("visit"), Some(Line::To(Order::Visit { rest_ns: 2_000_000_000 })));
+        assert_eq!(line_of("visit 3.5"), Some(Line::To(Order::Visit { rest_ns: 3_500_000_000 })));
         assert_eq!(line_of("pivot 0 0 0"), Some(Line::To(Order::Pivot([0.0; 3]))));
         assert_eq!(line_of("dot 0 0 1e-1"), Some(Line::Dot(None, [0.0, 0.0, 0.1])));
         assert_eq!(line_of("dot box 0 0 1"), Some(Line::Dot(Some("box".into()), [0.0, 0.0, 1.0])));
@@ -189,6 +201,8 @@ mod tests {
             "tip 1e9 0 0",
             "touch 1 2 3",
             "wander off",
+            "visit -1",
+            "visit 1 2",
             "x",
         ] {
             assert_eq!(line_of(bad), None, "{bad}");

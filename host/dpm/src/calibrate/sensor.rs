@@ -273,18 +273,21 @@ fn record(
     poses.wait_until_seen()?;
     let rate = config.projector.frame_rate;
     let frames = (setup.seconds * setup.rate_hz).clamp(LEAST_FRAMES, FRAMES);
-    let seconds = setup.seconds.max(frames / rate.hz());
+    let is_again = setup.has_begun.load(Ordering::Relaxed);
+    let least_s = if is_again { guide.least_s() } else { 0.0 };
+    let seconds = setup.seconds.max(frames / rate.hz()).max(least_s);
     let moved = || {
         wait_until_up(monitor)?;
         recorder.wait_until_mapped(monitor)?;
         if let Some(carried_hz) = Pace::of(config, monitor).try_out()? {
             return Ok(Paced::TooFast { carried_hz });
         }
-        if setup.has_begun.swap(true, Ordering::Relaxed) {
-            dialogue.tell(&format!("Go on for {seconds:.0} s."));
+        if is_again {
+            dialogue.tell(&guide.again(seconds));
         } else {
             dialogue.tell(&guide.task(seconds));
             dialogue.ask("Press Enter to begin.")?;
+            setup.has_begun.store(true, Ordering::Relaxed);
         }
         poses.take();
         recorder.take();
@@ -323,6 +326,27 @@ impl Guide {
                  {FEWEST_PLACES} places are needed, twenty are good.",
                 hold_s + 0.5
             ),
+        }
+    }
+
+    /// A sweep that needs no more places than the least number of them takes so long, with some to spare, seconds.
+    fn least_s(&self) -> f64 {
+        match self {
+            Self::Coverage(_) => 0.0,
+            Self::Rests { hold_s, .. } => 1.5 * FEWEST_PLACES as f64 * (hold_s + 1.5),
+        }
+    }
+
+    /// What is told where the rate was lowered: a round of the code takes longer then.
+    fn again(&self, seconds: f64) -> String {
+        match self {
+            Self::Coverage(_) => format!("Go on for {seconds:.0} s."),
+            Self::Rests { hold_s, .. } => {
+                let hold_s = hold_s + 0.5;
+                format!(
+                    "Go on for {seconds:.0} s, and hold the wand still for {hold_s:.1} s at each place now."
+                )
+            }
         }
     }
 

@@ -2,7 +2,8 @@
 //!
 //! A display's light comes some frames after the instant that its driver tells, and nobody knows how many. The lag is
 //! found from the light: at the right one, pairs with the same stripes have differences of the same sign from round to
-//! round, once each is taken with the sign of its identity; at any other lag, half of them do.
+//! round, once each is taken with the sign of its identity; at any other lag, half of them do. While the wand moves, half
+//! of them do at the right one, too: what counts is that more do than could by chance.
 
 use super::super::decode::DecodeError;
 use super::super::Timing;
@@ -28,6 +29,33 @@ const LEAST_CONTRAST: f64 = 0.15;
 const MOST_BEYOND: f64 = 0.25;
 /// Fewest pairs.
 const FEWEST: usize = 60;
+/// Pairs of a hundred that agree if there is no doubt.
+const SURE_PERCENT: f64 = 80.0;
+/// Agreement over its standard deviation if the signs were random. Of some thousand lags the best one reaches four by chance.
+const LEAST_SIGNIFICANCE: f64 = 7.0;
+
+/// How well pairs agree with those of the next round.
+#[derive(Clone, Copy, Debug, Default)]
+struct Agreement {
+    /// Sum of the products of two differences.
+    sum: f64,
+    /// Sum of their sizes.
+    size: f64,
+    /// Sum of their squares.
+    squares: f64,
+}
+
+impl Agreement {
+    /// Of a hundred pairs, weighted by their light.
+    fn percent(&self) -> f64 {
+        50.0 + 50.0 * self.sum / self.size.max(f64::MIN_POSITIVE)
+    }
+
+    /// Whether it is no chance.
+    fn is_sure(&self) -> bool {
+        self.percent() >= SURE_PERCENT || self.sum >= LEAST_SIGNIFICANCE * self.squares.sqrt()
+    }
+}
 
 /// A pair as the sensor saw it.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -198,13 +226,13 @@ impl Search<'_> {
         Some(if self.code.is_inverse(2 * pair.pair) { -difference } else { difference })
     }
 
-    /// Sum over pairs of the product of their differences in one round and in the next, and the sum of its sizes.
-    fn agreement(&self, lag_ns: f64) -> (f64, f64) {
+    /// The differences of pairs in one round times those in the next.
+    fn agreement(&self, lag_ns: f64) -> Agreement {
         let [from, until] = self.brightest.map(|share| lag_ns + share * self.frame_ns);
         let all: Vec<Option<f64>> = self.pairs.iter().map(|p| self.difference(p, from, until)).collect();
         let round = self.code.pairs() as u64;
         let mut next = 0;
-        let mut sums = (0.0, 0.0);
+        let mut found = Agreement::default();
         for (pair, now) in self.pairs.iter().zip(&all) {
             while self.pairs.get(next).is_some_and(|p| p.pair < pair.pair + round) {
                 next += 1;
@@ -212,21 +240,23 @@ impl Search<'_> {
             let is_same = self.pairs.get(next).is_some_and(|p| p.pair == pair.pair + round);
             let later = all.get(next).copied().flatten().filter(|_| is_same);
             if let Some(product) = now.zip(later).map(|(a, b)| a * b) {
-                sums = (sums.0 + product, sums.1 + product.abs());
+                found.sum += product;
+                found.size += product.abs();
+                found.squares += product * product;
             }
         }
-        sums
+        found
     }
 
     /// The lag, and the agreement at it, percent.
     fn lag(&self) -> Result<(f64, f64), DecodeError> {
         let lag = self.best_lag();
-        let (sum, size) = self.agreement(lag);
-        if size <= 0.0 {
+        let found = self.agreement(lag);
+        if found.size <= 0.0 {
             return Err(DecodeError::NoLight);
         }
-        let percent = 50.0 + 50.0 * sum / size;
-        if self.pairs.len() < FEWEST || percent < 80.0 {
+        let percent = found.percent();
+        if self.pairs.len() < FEWEST || !found.is_sure() {
             return Err(DecodeError::NoIdentity { percent });
         }
         Ok((lag, percent))
@@ -237,7 +267,7 @@ impl Search<'_> {
         let best = |from: f64, until: f64, step: f64| {
             let count = ((until - from) / step) as usize + 1;
             let all = (0..count).map(|i| from + i as f64 * step);
-            let scored = all.map(|lag| (self.agreement(lag).0, lag));
+            let scored = all.map(|lag| (self.agreement(lag).sum, lag));
             scored.max_by(|a, b| a.0.total_cmp(&b.0)).map_or(0.0, |(_, lag)| lag)
         };
         let [from, until] = self.brightest;
