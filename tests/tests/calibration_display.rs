@@ -251,6 +251,22 @@ fn a_display_that_loses_a_tenth_of_the_frames_is_found_too() {
     is_found(&Rig { lost: 0.1, ..Rig::new(256, 192, 120.0, 3) }, 45.0);
 }
 
+/// A round takes 0.8 s at 41 frames a second. The wand rests for hardly longer, so most pairs are compared with a round in
+/// which it was elsewhere; they are those of the code nevertheless, and their lag is found.
+#[test]
+fn a_slow_display_is_recognised_although_the_wand_moves_between_rounds() {
+    let rig = Rig { lost: 0.12, ..Rig::new(128, 96, 41.0, 3) };
+    let code = InverseCode::new(rig.raster);
+    let hand = Hand::new(Motion::still(Pose::IDENTITY).unwrap(), TIP);
+    hand.tell(0, Order::Visit { rest_ns: 1_400_000_000 });
+    let (blocks, _) = rig.record(&code, &Arc::new(hand), 42.0);
+    let decoded = decoded(&rig, &code, &blocks).unwrap();
+    println!("{:.1} % agree, lag {:.3} ms", decoded.identity_percent, 1e-6 * decoded.lag_ns);
+    assert!(decoded.identity_percent < 79.0, "this test wants a wand that moves");
+    let late = (decoded.lag_ns - rig.light_lag_ns as f64).abs();
+    assert!(late < 3e5, "the display's lag is off by {late} ns");
+}
+
 /// Half of the pictures come too late there. The wand rests as long as it should, yet too few of its places are seen, and what
 /// is told of the pictures says why.
 #[test]
