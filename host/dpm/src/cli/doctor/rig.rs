@@ -157,7 +157,7 @@ fn page(config: &RigConfig) -> Option<Finding> {
         Ok(_) => Finding::new("page", State::Ok, format!("http://{address} is free"), ""),
         Err(e) => {
             let remedy =
-                "another program uses the port, or the machine has no such address: change page.listen";
+                "a dpm that runs, or another program, has the port: stop it, or change page.listen (which must be an address of this machine)";
             Finding::new("page", State::Missing, format!("cannot listen on {address}: {e}"), remedy)
         }
     })
