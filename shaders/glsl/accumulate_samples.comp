@@ -5,6 +5,7 @@
 #extension GL_GOOGLE_include_directive : require
 #include "scene.glsl"
 #include "moments.glsl"
+#include "shift.glsl"
 
 layout(local_size_x = 8, local_size_y = 8) in;
 
@@ -24,7 +25,6 @@ const float LEAST_VARIANCE = 0.25;
 const float SURPRISE_WEIGHT = 0.1;
 // Powers are never taken as smaller than this, so that one can divide by them.
 const float LEAST_POWER = 1e-12;
-const float MOST_HALF = 65504.0;
 
 // The variance of one sample, after a frame of `count` samples with the mean luminance `y`. Several samples are compared with their frame's mean,
 // so that a change of the light does not enter. A single sample is compared with `known`, the luminance of the history.
@@ -77,7 +77,7 @@ void main() {
     }
     HistoryLight l = history_light_at(at);
     // From the history's surface point to the pixel's, left by reproject_point.comp.
-    vec3 shift = filtered_at(at).light, albedo = albedo_of(tint_at(at));
+    vec3 shift = unpack_shift(shift_at(at)), albedo = albedo_of(tint_at(at));
     if (demand != DEMAND_NOT_TRACED) {
         vec4 traced = radiance_in[at];
         if (traced.w > 0.0) {

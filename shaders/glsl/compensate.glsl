@@ -108,7 +108,7 @@ void compensate(uvec2 pixel, uint index) {
     if (surface.id != NO_HIT && surface.distance > 0.0) {
         uint instance = surface.id >> 24u;
         TriangleRef ref = triangle_ref_at(instance_at(instance).triangle_offset + (surface.id & 0xffffffu));
-        vec2 b = surface.barycentric;
+        vec2 b = barycentric_at(index).weights;
         // The real surface is smooth, so its normal is the interpolated one, without the normal map of the look.
         float cosine = real_cosine(instance_at(instance).world_from_object, vertex_at(ref.vertices.x).normal, vertex_at(ref.vertices.y).normal,
                                    vertex_at(ref.vertices.z).normal, b, ray_of(pixel));

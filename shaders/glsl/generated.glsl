@@ -98,13 +98,18 @@
 #define B_PLANE_GROUPS 35u
 #define B_BODY_TREE 36u
 // Index of a pixel's element in a part of a buffer.
-#define GUIDES_SIGHT_AT(i) (((i) >> 6u) * 112u + 0u + ((i) & 63u))
-#define GUIDES_TINT_AT(i) (((i) >> 6u) * 224u + 128u + ((i) & 63u))
-#define GUIDES_DEMAND_AT(i) (((i) >> 6u) * 448u + 384u + ((i) & 63u))
+#define SURFACES_HIT_AT(i) (((i) >> 6u) * 128u + 0u + ((i) & 63u))
+#define SURFACES_INSIDE_AT(i) (((i) >> 6u) * 128u + 64u + ((i) & 63u))
+#define GUIDES_SIGHT_AT(i) (((i) >> 6u) * 144u + 0u + ((i) & 63u))
+#define GUIDES_TINT_AT(i) (((i) >> 6u) * 288u + 128u + ((i) & 63u))
+#define GUIDES_SHIFT_AT(i) (((i) >> 6u) * 288u + 192u + ((i) & 63u))
+#define GUIDES_DEMAND_AT(i) (((i) >> 6u) * 576u + 512u + ((i) & 63u))
 #define HISTORY_LIGHT_AT(i) (((i) >> 6u) * 256u + 0u + ((i) & 63u))
 #define HISTORY_PLACE_AT(i) (((i) >> 6u) * 256u + 64u + ((i) & 63u))
 #define HISTORY_NOISE_AT(i) (((i) >> 6u) * 256u + 128u + ((i) & 63u))
-#define HISTORY_TAG_AT(i) (((i) >> 6u) * 256u + 192u + ((i) & 63u))
+#define HISTORY_TAG_AT(i) (((i) >> 6u) * 512u + 384u + ((i) & 63u))
+#define HISTORY_SEED_AT(i) (((i) >> 6u) * 1024u + 896u + ((i) & 63u))
+#define HISTORY_USED_AT(i) (((i) >> 6u) * 1024u + 960u + ((i) & 63u))
 // Sobol dimensions 1 to 3 of the lowest 16 bits of an index, without branch or table look-up.
 #define SOBOL_123(i) uvec3((uint(bitfieldExtract(int(i), 0, 1)) & 2147483648u) ^ (uint(bitfieldExtract(int(i), 1, 1)) & 3221225472u) ^ (uint(bitfieldExtract(int(i), 2, 1)) & 2684354560u) ^ (uint(bitfieldExtract(int(i), 3, 1)) & 4026531840u) ^ (uint(bitfieldExtract(int(i), 4, 1)) & 2281701376u) ^ (uint(bitfieldExtract(int(i), 5, 1)) & 3422552064u) ^ (uint(bitfieldExtract(int(i), 6, 1)) & 2852126720u) ^ (uint(bitfieldExtract(int(i), 7, 1)) & 4278190080u) ^ (uint(bitfieldExtract(int(i), 8, 1)) & 2155872256u) ^ (uint(bitfieldExtract(int(i), 9, 1)) & 3233808384u) ^ (uint(bitfieldExtract(int(i), 10, 1)) & 2694840320u) ^ (uint(bitfieldExtract(int(i), 11, 1)) & 4042260480u) ^ (uint(bitfieldExtract(int(i), 12, 1)) & 2290614272u) ^ (uint(bitfieldExtract(int(i), 13, 1)) & 3435921408u) ^ (uint(bitfieldExtract(int(i), 14, 1)) & 2863267840u) ^ (uint(bitfieldExtract(int(i), 15, 1)) & 4294901760u), (uint(bitfieldExtract(int(i), 0, 1)) & 2147483648u) ^ (uint(bitfieldExtract(int(i), 1, 1)) & 3221225472u) ^ (uint(bitfieldExtract(int(i), 2, 1)) & 1610612736u) ^ (uint(bitfieldExtract(int(i), 3, 1)) & 2415919104u) ^ (uint(bitfieldExtract(int(i), 4, 1)) & 3892314112u) ^ (uint(bitfieldExtract(int(i), 5, 1)) & 1543503872u) ^ (uint(bitfieldExtract(int(i), 6, 1)) & 2382364672u) ^ (uint(bitfieldExtract(int(i), 7, 1)) & 3305111552u) ^ (uint(bitfieldExtract(int(i), 8, 1)) & 1753219072u) ^ (uint(bitfieldExtract(int(i), 9, 1)) & 2629828608u) ^ (uint(bitfieldExtract(int(i), 10, 1)) & 3999268864u) ^ (uint(bitfieldExtract(int(i), 11, 1)) & 1435500544u) ^ (uint(bitfieldExtract(int(i), 12, 1)) & 2154299392u) ^ (uint(bitfieldExtract(int(i), 13, 1)) & 3231449088u) ^ (uint(bitfieldExtract(int(i), 14, 1)) & 1626210304u) ^ (uint(bitfieldExtract(int(i), 15, 1)) & 2421489664u), (uint(bitfieldExtract(int(i), 0, 1)) & 2147483648u) ^ (uint(bitfieldExtract(int(i), 1, 1)) & 3221225472u) ^ (uint(bitfieldExtract(int(i), 2, 1)) & 536870912u) ^ (uint(bitfieldExtract(int(i), 3, 1)) & 1342177280u) ^ (uint(bitfieldExtract(int(i), 4, 1)) & 4160749568u) ^ (uint(bitfieldExtract(int(i), 5, 1)) & 1946157056u) ^ (uint(bitfieldExtract(int(i), 6, 1)) & 2717908992u) ^ (uint(bitfieldExtract(int(i), 7, 1)) & 2466250752u) ^ (uint(bitfieldExtract(int(i), 8, 1)) & 3632267264u) ^ (uint(bitfieldExtract(int(i), 9, 1)) & 624951296u) ^ (uint(bitfieldExtract(int(i), 10, 1)) & 1507852288u) ^ (uint(bitfieldExtract(int(i), 11, 1)) & 3872391168u) ^ (uint(bitfieldExtract(int(i), 12, 1)) & 2013790208u) ^ (uint(bitfieldExtract(int(i), 13, 1)) & 3020685312u) ^ (uint(bitfieldExtract(int(i), 14, 1)) & 2181169152u) ^ (uint(bitfieldExtract(int(i), 15, 1)) & 3271884800u))
 
@@ -259,6 +264,10 @@ struct Tint {
     uint albedo_b_and_angle;
 };
 
+struct Shift {
+    uvec2 halves;
+};
+
 struct HistoryLight {
     vec3 mean;
     float weight;
@@ -277,10 +286,16 @@ struct HistoryNoise {
 };
 
 struct HistoryTag {
-    uint seed;
-    uint used_before;
     uint owner;
     uint frame;
+};
+
+struct HistorySeed {
+    uint seed;
+};
+
+struct HistoryUsed {
+    int before;
 };
 
 struct WorkItem {
@@ -392,8 +407,11 @@ struct AlbedoCell {
 
 struct Surface {
     uint id;
-    vec2 barycentric;
     float distance;
+};
+
+struct Barycentric {
+    vec2 weights;
 };
 
 struct Counters {

@@ -23,5 +23,5 @@ History former_at(uint i) {
     HistoryNoise n = former_noise_at(i);
     HistoryTag t = former_tag_at(i);
     uint flags = (t.owner & 0xffffffu) | (n.body_and_used & HISTORY_EXACT);
-    return History(l.mean, l.weight, p.position, p.normal, n.drift, n.variance, n.surprise, n.body_and_used & HISTORY_USED, t.seed, t.owner >> 24u, t.frame, flags);
+    return History(l.mean, l.weight, p.position, p.normal, n.drift, n.variance, n.surprise, n.body_and_used & HISTORY_USED, former_seed_at(i).seed, t.owner >> 24u, t.frame, flags);
 }

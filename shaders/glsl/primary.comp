@@ -13,6 +13,7 @@ layout(local_size_x = 8, local_size_y = 8) in;
 
 layout(set = 0, binding = B_TILES, scalar) readonly buffer Tiles { uint tiles[]; };
 layout(set = 0, binding = B_SURFACES, scalar) writeonly buffer Surfaces { Surface surfaces[]; };
+layout(set = 0, binding = B_SURFACES, scalar) writeonly buffer Barycentrics { Barycentric barycentrics[]; };
 layout(set = 0, binding = B_GUIDES, scalar) writeonly buffer Sights { Sight sights[]; };
 layout(set = 0, binding = B_GUIDES, scalar) writeonly buffer Tints { Tint tints[]; };
 
@@ -69,17 +70,15 @@ bool still_seen(uvec2 pixel, uint instance, vec2 before) {
 void main() {
     uvec2 pixel;
     if (!tile_pixel(tiles[gl_WorkGroupID.x >> 2u], pixel)) return;
-    Surface surface = Surface(NO_HIT, vec2(0.0), 0.0);
+    Surface surface = Surface(NO_HIT, 0.0);
     vec3 direction = pixel_direction(pixel);
     bool camera_is_eye = (frame.flags & FRAME_CAMERA_IS_EYE) != 0u;
     uint mask = camera_is_eye ? 0u : INSTANCE_PROJECTED;
-    Hit hit;
-    hit.t = INFINITY;
-    uint closest = still_dark(pixel) ? 0u : 1u, shadow = 0u;
+    Hit hit = Hit(NO_HIT, vec2(0.0), INFINITY);
+    uint at = pixel.y * frame.width + pixel.x, closest = still_dark(pixel) ? 0u : 1u, shadow = 0u;
     if (closest > 0u && trace_ray(frame.projector_position, direction, mask, NONE_LEFT, false, hit)) {
         uint instance = instance_of(hit.id), triangle = triangle_of(hit.id);
         surface.id = hit.id;
-        surface.barycentric = hit.barycentric;
         surface.distance = hit.t;
         if (!camera_is_eye) {
             vec3 o = object_position(instance, triangle, hit.barycentric);
@@ -104,7 +103,6 @@ void main() {
                 vec3 to_gaze = frame.gaze_point - frame.eye_position;
                 float c = dot(-to_eye, to_gaze) / max(l_e * length(to_gaze), 1e-12);
                 float angle = degrees(acos(clamp(c, -1.0, 1.0)));
-                uint at = pixel.y * frame.width + pixel.x;
                 if (HAS_DEMODULATION) {
                     vec3 albedo = demodulation(hit, to_eye / max(l_e, 1e-12));
                     tints[GUIDES_TINT_AT(at)] = Tint(packHalf2x16(albedo.rg), packHalf2x16(vec2(albedo.b, angle)));
@@ -117,6 +115,7 @@ void main() {
             }
         }
     }
-    surfaces[pixel.y * frame.width + pixel.x] = surface;
+    surfaces[SURFACES_HIT_AT(at)] = surface;
+    barycentrics[SURFACES_INSIDE_AT(at)] = Barycentric(hit.barycentric);
     COUNT(rays, closest + shadow)
 }

@@ -47,7 +47,7 @@ History begin_history(uvec2 pixel, uint at, out Place place) {
     uint instance = surface.id >> 24u;
     uint triangle = surface.id & 0xffffffu;
     TriangleRef ref = triangle_ref_at(instance_at(instance).triangle_offset + triangle);
-    vec2 b = surface.barycentric;
+    vec2 b = barycentric_at(at).weights;
     // Only rotations and translations lie between world and body space, so lengths are the same in both.
     vec3 world = pixel_direction(pixel) * surface.distance;
     vec3 normal = normalize(vertex_at(ref.vertices.x).normal * (1.0 - b.x - b.y) + vertex_at(ref.vertices.y).normal * b.x + vertex_at(ref.vertices.z).normal * b.y);

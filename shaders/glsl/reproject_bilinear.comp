@@ -60,7 +60,7 @@ void carry_bilinear(inout History h, Place place) {
     float s = 1.0 / c.total;
     h.mean = c.mean * s;
     h.weight = c.weight * s;
-    h.seed = former_tag_at(c.nearest).seed;
+    h.seed = former_seed_at(c.nearest).seed;
 }
 
 void main() {

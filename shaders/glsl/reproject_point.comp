@@ -7,13 +7,13 @@
 #include "reproject.glsl"
 #include "importance.glsl"
 #include "demand.glsl"
+#include "shift.glsl"
 
 layout(local_size_x = 8, local_size_y = 8) in;
 
 layout(set = 0, binding = B_SCHEDULE, scalar) buffer ScheduleBlock { Schedule schedule; };
-// What accumulate_samples.comp adds to a history's mean to get the light at the pixel's own surface point. It lies in the place of the light that
-// accumulate_samples.comp then writes.
-layout(set = 0, binding = B_FILTERED, scalar) writeonly buffer Shifts { Filtered shifts[]; };
+// What accumulate_samples.comp adds to a history's mean to get the light at the pixel's own surface point.
+layout(set = 0, binding = B_GUIDES, scalar) writeonly buffer Shifts { Shift shifts[]; };
 
 // Where histories are looked for.
 // A history may lie this many footprints off the tangent plane of the surface point.
@@ -306,7 +306,7 @@ void main() {
         keeps = true;
         Place place;
         h = begin_history(pixel, at, place);
-        shifts[at].light = carry_point(h, place, pixel, at);
+        shifts[GUIDES_SHIFT_AT(at)] = pack_shift(carry_point(h, place, pixel, at));
         h.flags &= ~HISTORY_HIDDEN;
         importance = importance_of(h);
         demand = importance | ((h.flags & HISTORY_EXACT) != 0u ? DEMAND_EXACT : 0u) | (h.used == 0u ? DEMAND_NEW : 0u);

@@ -208,19 +208,33 @@ AlbedoCell albedo_cell_at(uint i) {
 #ifdef TEXEL_TABLES
 layout(set = 0, binding = B_SURFACE_ROWS, rgba32ui) uniform readonly uimageBuffer surface_rows_image;
 Surface surface_at(uint i) {
-    uint at = i;
-    uvec4 r0 = imageLoad(surface_rows_image, int(at) * 1 + 0);
+    uint at = SURFACES_HIT_AT(i);
+    uvec4 row = imageLoad(surface_rows_image, int(at >> 1u));
+    uvec4 r0 = (at & 1u) == 0u ? row : row.zwxy;
     return Surface(r0.x,
-        vec2(uintBitsToFloat(r0.y), uintBitsToFloat(r0.z)),
-        uintBitsToFloat(r0.w));
+        uintBitsToFloat(r0.y));
 }
 #else
 layout(set = 0, binding = B_SURFACES, scalar) readonly buffer surface_block { Surface surface_table[]; };
 Surface surface_at(uint i) {
-    uint at = i;
+    uint at = SURFACES_HIT_AT(i);
     return Surface(surface_table[at].id,
-        surface_table[at].barycentric,
         surface_table[at].distance);
+}
+#endif
+
+#ifdef TEXEL_TABLES
+Barycentric barycentric_at(uint i) {
+    uint at = SURFACES_INSIDE_AT(i);
+    uvec4 row = imageLoad(surface_rows_image, int(at >> 1u));
+    uvec4 r0 = (at & 1u) == 0u ? row : row.zwxy;
+    return Barycentric(vec2(uintBitsToFloat(r0.x), uintBitsToFloat(r0.y)));
+}
+#else
+layout(set = 0, binding = B_SURFACES, scalar) readonly buffer barycentric_block { Barycentric barycentric_table[]; };
+Barycentric barycentric_at(uint i) {
+    uint at = SURFACES_INSIDE_AT(i);
+    return Barycentric(barycentric_table[at].weights);
 }
 #endif
 
@@ -257,6 +271,21 @@ Tint tint_at(uint i) {
     uint at = GUIDES_TINT_AT(i);
     return Tint(tint_table[at].albedo_rg,
         tint_table[at].albedo_b_and_angle);
+}
+#endif
+
+#ifdef TEXEL_TABLES
+Shift shift_at(uint i) {
+    uint at = GUIDES_SHIFT_AT(i);
+    uvec4 row = imageLoad(guide_rows_image, int(at >> 1u));
+    uvec4 r0 = (at & 1u) == 0u ? row : row.zwxy;
+    return Shift(uvec2(r0.x, r0.y));
+}
+#else
+layout(set = 0, binding = B_GUIDES, scalar) readonly buffer shift_block { Shift shift_table[]; };
+Shift shift_at(uint i) {
+    uint at = GUIDES_SHIFT_AT(i);
+    return Shift(shift_table[at].halves);
 }
 #endif
 
@@ -314,22 +343,30 @@ HistoryNoise history_noise_at(uint i) {
 #endif
 
 #ifdef TEXEL_TABLES
-HistoryTag history_tag_at(uint i) {
-    uint at = HISTORY_TAG_AT(i);
-    uvec4 r0 = imageLoad(history_rows_image, int(at) * 1 + 0);
-    return HistoryTag(r0.x,
-        r0.y,
-        r0.z,
-        r0.w);
+HistorySeed history_seed_at(uint i) {
+    uint at = HISTORY_SEED_AT(i);
+    uvec4 r0 = uvec4(imageLoad(history_rows_image, int(at >> 2u))[at & 3u]);
+    return HistorySeed(r0.x);
 }
 #else
-layout(set = 0, binding = B_HISTORY, scalar) readonly buffer history_tag_block { HistoryTag history_tag_table[]; };
-HistoryTag history_tag_at(uint i) {
-    uint at = HISTORY_TAG_AT(i);
-    return HistoryTag(history_tag_table[at].seed,
-        history_tag_table[at].used_before,
-        history_tag_table[at].owner,
-        history_tag_table[at].frame);
+layout(set = 0, binding = B_HISTORY, scalar) readonly buffer history_seed_block { HistorySeed history_seed_table[]; };
+HistorySeed history_seed_at(uint i) {
+    uint at = HISTORY_SEED_AT(i);
+    return HistorySeed(history_seed_table[at].seed);
+}
+#endif
+
+#ifdef TEXEL_TABLES
+HistoryUsed history_used_at(uint i) {
+    uint at = HISTORY_USED_AT(i);
+    uvec4 r0 = uvec4(imageLoad(history_rows_image, int(at >> 2u))[at & 3u]);
+    return HistoryUsed(int(r0.x));
+}
+#else
+layout(set = 0, binding = B_HISTORY, scalar) readonly buffer history_used_block { HistoryUsed history_used_table[]; };
+HistoryUsed history_used_at(uint i) {
+    uint at = HISTORY_USED_AT(i);
+    return HistoryUsed(history_used_table[at].before);
 }
 #endif
 
@@ -389,20 +426,31 @@ HistoryNoise former_noise_at(uint i) {
 #ifdef TEXEL_TABLES
 HistoryTag former_tag_at(uint i) {
     uint at = HISTORY_TAG_AT(i);
-    uvec4 r0 = imageLoad(former_image, int(at) * 1 + 0);
+    uvec4 row = imageLoad(former_image, int(at >> 1u));
+    uvec4 r0 = (at & 1u) == 0u ? row : row.zwxy;
     return HistoryTag(r0.x,
-        r0.y,
-        r0.z,
-        r0.w);
+        r0.y);
 }
 #else
 layout(set = 0, binding = B_FORMER, scalar) readonly buffer former_tag_block { HistoryTag former_tag_table[]; };
 HistoryTag former_tag_at(uint i) {
     uint at = HISTORY_TAG_AT(i);
-    return HistoryTag(former_tag_table[at].seed,
-        former_tag_table[at].used_before,
-        former_tag_table[at].owner,
+    return HistoryTag(former_tag_table[at].owner,
         former_tag_table[at].frame);
+}
+#endif
+
+#ifdef TEXEL_TABLES
+HistorySeed former_seed_at(uint i) {
+    uint at = HISTORY_SEED_AT(i);
+    uvec4 r0 = uvec4(imageLoad(former_image, int(at >> 2u))[at & 3u]);
+    return HistorySeed(r0.x);
+}
+#else
+layout(set = 0, binding = B_FORMER, scalar) readonly buffer former_seed_block { HistorySeed former_seed_table[]; };
+HistorySeed former_seed_at(uint i) {
+    uint at = HISTORY_SEED_AT(i);
+    return HistorySeed(former_seed_table[at].seed);
 }
 #endif
 

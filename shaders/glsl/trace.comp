@@ -14,6 +14,9 @@ layout(set = 0, binding = B_WORK, scalar) readonly buffer Work { WorkItem work[]
 // Mean of the samples in rgb, and their number in w.
 layout(set = 0, binding = B_RADIANCE, scalar) writeonly buffer Radiance { vec4 radiance_out[]; };
 
+// Samples that the pixel's point had used before the frame, and `HISTORY_EXACT`.
+uint used_before(uint at) { return uint(history_used_at(at).before); }
+
 // The list of this frame: its items, and the samples of all of them.
 struct WorkList {
     uint items;
@@ -44,15 +47,17 @@ Sampler begin_sampler(uint at, uint spp) {
         rng.seed = hash_u32(at + hash_u32(frame.seed));
         rng.index = (frame.flags & FRAME_SPP_BY_ANGLE) != 0u ? frame.drawn * spp : frame.first_sample;
     } else {
-        HistoryTag tag = history_tag_at(at);
-        rng.seed = tag.seed;
-        rng.index = tag.used_before & ~HISTORY_EXACT;
+        rng.seed = history_seed_at(at).seed;
+        rng.index = used_before(at) & ~HISTORY_EXACT;
     }
     return rng;
 }
 
-// Where the paths of a pixel begin.
-Hit first_hit(Surface surface) { return Hit(surface.id, surface.barycentric, abs(surface.distance)); }
+// Where the paths of the pixel at index `at` begin.
+Hit first_hit(uint at) {
+    Surface surface = surface_at(at);
+    return Hit(surface.id, barycentric_at(at).weights, abs(surface.distance));
+}
 
 // Unit direction from there to the eye.
 vec3 toward_eye(Hit first) {

@@ -68,7 +68,7 @@ void fill_slots(uint base) {
     bool dpm = (frame.flags & FRAME_DPM) != 0u;
     for (uint item = range.first_item + lane; item < range.end_item; item += TRACE_LANES) {
         uint at = work[item].pixel, first = work[item].first, end = end_of(item);
-        bool was_exact = dpm && (history_tag_at(at).used_before & HISTORY_EXACT) != 0u;
+        bool was_exact = dpm && (used_before(at) & HISTORY_EXACT) != 0u;
         for (uint i = max(first, base); i < min(end, base + TRACE_SLOTS); i++) {
             uint slot = i - base;
             // What comes first in a round waits for nothing.
@@ -91,9 +91,8 @@ void keep_light(uint slot, vec3 light, bool exact) {
 // Where the path of a slot's sample begins. Its random numbers are then told by the slot. False: it has no path, because it is the background.
 bool begin_slot(uint slot, out Hit hit) {
     uint at = slots[slot];
-    Surface surface = surface_at(at);
-    hit = first_hit(surface);
-    if (surface.id == NO_HIT) return false;
+    hit = first_hit(at);
+    if (hit.id == NO_HIT) return false;
     Sampler rng = begin_sampler(at, slots[slot + 2u * TRACE_SLOTS]);
     slots[slot + 2u * TRACE_SLOTS] = rng.seed;
     slots[slot + TRACE_SLOTS] += rng.index;

@@ -7,12 +7,12 @@ void main() {
     uint at = work[min(item, list.items - 1u)].pixel;
     uint spp = first_sample_of(list, item + 1u) - first_sample_of(list, item);
     if (item >= list.items) return;
-    Surface surface = surface_at(at);
-    if (surface.id == NO_HIT) {
+    Hit hit_first = first_hit(at);
+    if (hit_first.id == NO_HIT) {
         radiance_out[at] = vec4(background(at), 1.0);
         return;
     }
-    Point first = shading_point(first_hit(surface), toward_eye(first_hit(surface)));
+    Point first = shading_point(hit_first, toward_eye(hit_first));
     Sampler rng = begin_sampler(at, spp);
     bool dpm = (frame.flags & FRAME_DPM) != 0u;
     Sums sums = NO_SAMPLES;

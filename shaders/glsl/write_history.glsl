@@ -3,11 +3,15 @@ layout(set = 0, binding = B_HISTORY, scalar) writeonly buffer HistoryLights { Hi
 layout(set = 0, binding = B_HISTORY, scalar) writeonly buffer HistoryPlaces { HistoryPlace history_places[]; };
 layout(set = 0, binding = B_HISTORY, scalar) writeonly buffer HistoryNoises { HistoryNoise history_noises[]; };
 layout(set = 0, binding = B_HISTORY, scalar) writeonly buffer HistoryTags { HistoryTag history_tags[]; };
+layout(set = 0, binding = B_HISTORY, scalar) writeonly buffer HistorySeeds { HistorySeed history_seeds[]; };
+layout(set = 0, binding = B_HISTORY, scalar) writeonly buffer HistoryUses { HistoryUsed history_uses[]; };
 
 void write_history(uint at, History h) {
     history_lights[HISTORY_LIGHT_AT(at)] = HistoryLight(h.mean, h.weight);
     history_places[HISTORY_PLACE_AT(at)] = HistoryPlace(h.position, h.normal);
-    history_tags[HISTORY_TAG_AT(at)] = HistoryTag(h.seed, h.used | (h.flags & HISTORY_EXACT), h.instance << 24u | (h.flags & 0xffffffu), h.frame);
+    history_tags[HISTORY_TAG_AT(at)] = HistoryTag(h.instance << 24u | (h.flags & 0xffffffu), h.frame);
+    history_seeds[HISTORY_SEED_AT(at)] = HistorySeed(h.seed);
+    history_uses[HISTORY_USED_AT(at)] = HistoryUsed(int(h.used | (h.flags & HISTORY_EXACT)));
 }
 
 void write_noise(uint at, History h) {

@@ -8,7 +8,7 @@ pub trait GlslType {
     fn member(name: &str) -> String;
     /// The value, from the words of the rows r0, r1, ... that begin with `word`, which moves past them.
     fn read(word: &mut usize) -> String;
-    /// `f` for each float and `u` for each integer of a number or vector; empty for anything else.
+    /// `f` for each float, `i` for each integer with a sign and `u` for each other one of a number or vector; empty for anything else.
     fn numbers() -> String {
         String::new()
     }
@@ -25,7 +25,12 @@ macro_rules! glsl_types {
                 if words.len() == 1 { words[0].clone() } else { format!("{}({})", $glsl, words.join(", ")) }
             }
             fn numbers() -> String {
-                if $cast == "uintBitsToFloat" { "f" } else { "u" }.repeat($words)
+                match $cast {
+                    "uintBitsToFloat" => "f",
+                    "int" => "i",
+                    _ => "u",
+                }
+                .repeat($words)
             }
         }
     )*};
@@ -149,12 +154,13 @@ pub fn tables_glsl() -> String {
             format!("layout(set = 0, binding = {texel}, rgba32ui) uniform readonly uimageBuffer {image};\n")
         };
         declared.push(texel);
-        let fetches: String = match bytes / 16 {
-            0 => format!(
+        let fetches: String = match bytes {
+            4 => format!("    uvec4 r0 = uvec4(imageLoad({image}, int(at >> 2u))[at & 3u]);\n"),
+            8 => format!(
                 "    uvec4 row = imageLoad({image}, int(at >> 1u));\n    uvec4 r0 = (at & 1u) == 0u ? row : row.zwxy;\n"
             ),
-            rows => (0..rows)
-                .map(|row| format!("    uvec4 r{row} = imageLoad({image}, int(at) * {rows} + {row});\n"))
+            _ => (0..bytes / 16)
+                .map(|row| format!("    uvec4 r{row} = imageLoad({image}, int(at) * {} + {row});\n", bytes / 16))
                 .collect(),
         };
         let at = part.map_or("i".to_owned(), |part| format!("{}(i)", macro_of(&part)));

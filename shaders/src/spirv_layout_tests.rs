@@ -43,7 +43,7 @@ fn parse(spirv: &[u8]) -> Module {
         assert!(count > 0, "an instruction without length");
         let w = &words[at + 1..at + count];
         match opcode {
-            21 => drop(module.numbers.insert(w[0], "u".to_owned())),
+            21 => drop(module.numbers.insert(w[0], if w[2] == 1 { "i" } else { "u" }.to_owned())),
             22 => drop(module.numbers.insert(w[0], "f".to_owned())),
             23 => {
                 let of = module.numbers.get(&w[1]).cloned().unwrap_or_default();
@@ -87,17 +87,22 @@ const BLOCKS: &[(&str, &str, usize)] = &[
     ("B_LIGHTS", "Light", size_of::<structs::Light>()),
     ("B_ALBEDO", "AlbedoCell", size_of::<structs::AlbedoCell>()),
     ("B_SURFACES", "Surface", size_of::<structs::Surface>()),
+    ("B_SURFACES", "Barycentric", size_of::<structs::Barycentric>()),
     ("B_COUNTERS", "Counters", size_of::<structs::Counters>()),
     ("B_GUIDES", "Sight", size_of::<structs::Sight>()),
     ("B_GUIDES", "Tint", size_of::<structs::Tint>()),
+    ("B_GUIDES", "Shift", size_of::<structs::Shift>()),
     ("B_HISTORY", "HistoryLight", size_of::<structs::HistoryLight>()),
     ("B_HISTORY", "HistoryPlace", size_of::<structs::HistoryPlace>()),
     ("B_HISTORY", "HistoryNoise", size_of::<structs::HistoryNoise>()),
     ("B_HISTORY", "HistoryTag", size_of::<structs::HistoryTag>()),
+    ("B_HISTORY", "HistorySeed", size_of::<structs::HistorySeed>()),
+    ("B_HISTORY", "HistoryUsed", size_of::<structs::HistoryUsed>()),
     ("B_FORMER", "HistoryLight", size_of::<structs::HistoryLight>()),
     ("B_FORMER", "HistoryPlace", size_of::<structs::HistoryPlace>()),
     ("B_FORMER", "HistoryNoise", size_of::<structs::HistoryNoise>()),
     ("B_FORMER", "HistoryTag", size_of::<structs::HistoryTag>()),
+    ("B_FORMER", "HistorySeed", size_of::<structs::HistorySeed>()),
     ("B_FILTERED", "Filtered", size_of::<structs::Filtered>()),
     ("B_SCHEDULE", "Schedule", size_of::<structs::Schedule>()),
     ("B_WORK", "WorkItem", size_of::<structs::WorkItem>()),

@@ -31,7 +31,7 @@ macro_rules! gpu_structs {
                 }
             }
         )*
-        /// The numbers of each member of a struct, `f` for a float and `u` for an integer, with commas between members: by these the parts of
+        /// The numbers of each member of a struct, `f` for a float, `i` and `u` for integers, with commas between members: by these the parts of
         /// a buffer are told from one another in SPIR-V. A number is no struct, and has no name.
         pub fn members_of(name: &str) -> String {
             match name {
@@ -209,6 +209,12 @@ gpu_structs! {
         albedo_b_and_angle: u32,
     }
 
+    /// What is added to the mean of a pixel's history, whose surface point lies beside that of the pixel (method dpm).
+    struct Shift {
+        /// Red and green, and blue, as halves.
+        halves: [u32; 2],
+    }
+
     /// The light that former frames found at the surface point that a pixel shows now.
     struct HistoryLight {
         /// Mean radiance, divided by the albedo where the method does so.
@@ -239,14 +245,22 @@ gpu_structs! {
 
     /// Whose history it is.
     struct HistoryTag {
-        /// Seed of the point's sample sequence.
-        seed: u32,
-        /// Samples used before the frame's own, and `HISTORY_EXACT`.
-        used_before: u32,
         /// Body in the high 8 bits, `HISTORY_HIDDEN` and `HISTORY_BORDER` below.
         owner: u32,
         /// Frame that wrote it.
         frame: u32,
+    }
+
+    /// Which sample sequence the point has (methods whose points have one).
+    struct HistorySeed {
+        /// Its seed.
+        seed: u32,
+    }
+
+    /// How far the point's sample sequence was used before the frame.
+    struct HistoryUsed {
+        /// Samples of it, and `HISTORY_EXACT`. Signed, so that it can be told from the seed.
+        before: i32,
     }
 
     /// A pixel to be traced. Its samples end where those of the next item begin.
@@ -445,10 +459,14 @@ gpu_structs! {
     struct Surface {
         /// Instance in the high 8 bits, triangle of the body in BVH order in the low 24; `NO_HIT`: nothing.
         id: u32,
-        /// Barycentric weights of vertices 1 and 2.
-        barycentric: [f32; 2],
         /// Distance from the projector along the unit ray; negative: not lit (the eye cannot see it).
         distance: f32,
+    }
+
+    /// Where in the triangle it met it.
+    struct Barycentric {
+        /// Weights of vertices 1 and 2.
+        weights: [f32; 2],
     }
 
     /// What one frame counted. Zeroed by the host before the frame.
@@ -756,9 +774,10 @@ const fn element_name(of: &'static str) -> &'static str {
 
 // The larger elements come first, so that each part begins at a whole element.
 parts! {
-    "B_GUIDES": "sight" Sight, "tint" Tint, "demand" u32,;
-    "B_HISTORY": "light" HistoryLight, "place" HistoryPlace, "noise" HistoryNoise, "tag" HistoryTag,;
-    "B_FORMER": "light" HistoryLight, "place" HistoryPlace, "noise" HistoryNoise, "tag" HistoryTag,;
+    "B_SURFACES": "hit" Surface, "inside" Barycentric,;
+    "B_GUIDES": "sight" Sight, "tint" Tint, "shift" Shift, "demand" u32,;
+    "B_HISTORY": "light" HistoryLight, "place" HistoryPlace, "noise" HistoryNoise, "tag" HistoryTag, "seed" HistorySeed, "used" HistoryUsed,;
+    "B_FORMER": "light" HistoryLight, "place" HistoryPlace, "noise" HistoryNoise, "tag" HistoryTag, "seed" HistorySeed, "used" HistoryUsed,;
 }
 
 /// The part of a buffer.
@@ -776,7 +795,7 @@ pub const fn part(binding: &str, name: &str) -> Part {
     panic!("no such part")
 }
 
-/// A table that shaders read by `{reader}_at(i)`: elements of whole rows of four words, or of half a row.
+/// A table that shaders read by `{reader}_at(i)`: elements of whole rows of four words, or of a half or a quarter of one.
 pub(crate) struct Table {
     pub name: &'static str,
     pub reader: &'static str,
@@ -797,7 +816,7 @@ macro_rules! tables {
     ($($name:ident $reader:literal, $storage:literal $(. $part:literal)? or $texel:literal;)*) => {
         /// What `tables.glsl` is written from.
         pub(crate) fn tables() -> Vec<Table> {
-            $(const { assert!(size_of::<$name>() % 16 == 0 || size_of::<$name>() == 8) };)*
+            $(const { assert!(size_of::<$name>() % 16 == 0 || matches!(size_of::<$name>(), 4 | 8)) };)*
             vec![$(Table {
                 name: stringify!($name),
                 reader: $reader,
@@ -822,17 +841,21 @@ tables! {
     TriangleRef "triangle_ref", "B_TRIANGLE_REFS" or "B_TRIANGLE_REFS";
     Material "material", "B_MATERIALS" or "B_MATERIALS";
     AlbedoCell "albedo_cell", "B_ALBEDO" or "B_ALBEDO";
-    Surface "surface", "B_SURFACES" or "B_SURFACE_ROWS";
+    Surface "surface", "B_SURFACES"."hit" or "B_SURFACE_ROWS";
+    Barycentric "barycentric", "B_SURFACES"."inside" or "B_SURFACE_ROWS";
     Sight "sight", "B_GUIDES"."sight" or "B_GUIDE_ROWS";
     Tint "tint", "B_GUIDES"."tint" or "B_GUIDE_ROWS";
+    Shift "shift", "B_GUIDES"."shift" or "B_GUIDE_ROWS";
     HistoryLight "history_light", "B_HISTORY"."light" or "B_HISTORY_ROWS";
     HistoryPlace "history_place", "B_HISTORY"."place" or "B_HISTORY_ROWS";
     HistoryNoise "history_noise", "B_HISTORY"."noise" or "B_HISTORY_ROWS";
-    HistoryTag "history_tag", "B_HISTORY"."tag" or "B_HISTORY_ROWS";
+    HistorySeed "history_seed", "B_HISTORY"."seed" or "B_HISTORY_ROWS";
+    HistoryUsed "history_used", "B_HISTORY"."used" or "B_HISTORY_ROWS";
     HistoryLight "former_light", "B_FORMER"."light" or "B_FORMER";
     HistoryPlace "former_place", "B_FORMER"."place" or "B_FORMER";
     HistoryNoise "former_noise", "B_FORMER"."noise" or "B_FORMER";
     HistoryTag "former_tag", "B_FORMER"."tag" or "B_FORMER";
+    HistorySeed "former_seed", "B_FORMER"."seed" or "B_FORMER";
     Filtered "filtered", "B_FILTERED" or "B_FILTERED_ROWS";
 }
 
@@ -878,10 +901,3 @@ pub const BINDINGS: &[(&str, u32)] = &[
 
 /// The binding after them, of the shaders that ask the device for hits: no buffer, but the tree over the bodies of the frame.
 pub const TREE_BINDING: (&str, u32) = ("B_BODY_TREE", 36);
-
-impl Surface {
-    /// Light falls on it: something was met, and the eye sees it. As `is_lit` of the shaders.
-    pub fn is_lit(&self) -> bool {
-        self.id != NO_HIT && self.distance > 0.0
-    }
-}

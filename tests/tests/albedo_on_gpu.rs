@@ -68,7 +68,7 @@ fn frame(gpu: &Arc<Gpu>, rig: &Rig) -> Vec<Lit> {
     slot.wait(60_000_000_000).unwrap();
     let width = rig.camera.raster.width() as usize;
     let intensity = rig.config.projector.max_intensity.0;
-    let seen = slot.surfaces().unwrap().iter().enumerate().filter(|(_, s)| s.is_lit());
+    let seen = slot.surfaces().unwrap().into_iter().enumerate().filter(|(_, s)| s.is_lit());
     let lit = seen.map(|(pixel, surface)| {
         let body = (surface.id >> 24) as usize;
         let mesh_vertex = |v: u32| {
@@ -77,7 +77,7 @@ fn frame(gpu: &Arc<Gpu>, rig: &Rig) -> Vec<Lit> {
             v as usize - before
         };
         let mesh = &rig.scene.bodies[body].mesh;
-        let [a, b, c] = renderer.corners(surface).map(mesh_vertex);
+        let [a, b, c] = renderer.corners(&surface).map(mesh_vertex);
         let [u, v] = surface.barycentric.map(f64::from);
         let blend = |at: &dyn Fn(usize) -> DVec3| at(a) * (1.0 - u - v) + at(b) * u + at(c) * v;
         let uv = blend(&|i| mesh.uvs[i].as_dvec2().extend(0.0));

@@ -11,10 +11,11 @@ use dpm_render::gpu::{
 };
 use dpm_render::pack::{quantise, QuantiseCounts};
 use dpm_render::scene_data::SceneNeeds;
+use dpm_render::Surface;
 use dpm_shaders::specialization as ids;
 use dpm_shaders::structs::{
-    Counters, Frame, Instance, Rows, Surface, TriangleRef, Vertex, BINDINGS, LENS_BROWN, LENS_NONE,
-    NO_ALBEDO_MAP, NO_HIT,
+    Counters, Frame, Instance, Rows, TriangleRef, Vertex, BINDINGS, LENS_BROWN, LENS_NONE, NO_ALBEDO_MAP,
+    NO_HIT,
 };
 use dpm_shaders::Reading;
 use dpm_tests::gpu::with_gpu;
@@ -104,7 +105,7 @@ fn on_gpu_through(gpu: &Arc<Gpu>, input: &Input, texel: bool) -> (Vec<u32>, Coun
     let instances = rows("instances", bytemuck::cast_slice(&instances));
     let refs = rows("refs", bytemuck::cast_slice(&input.refs));
     let vertices = rows("vertices", bytemuck::cast_slice(&input.vertices));
-    let surfaces = rows("surfaces", bytemuck::cast_slice(&input.surfaces));
+    let surfaces = rows("surfaces", &Surface::bytes_of(&input.surfaces));
     let radiance = uploaded("radiance", bytemuck::cast_slice(&input.radiance));
     let tile_list = uploaded("tiles", bytemuck::cast_slice(&tiles));
     let codes = device("codes", PIXELS * 4);

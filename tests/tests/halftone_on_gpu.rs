@@ -7,9 +7,10 @@ use dpm_lab::reference::Sampler;
 use dpm_render::blue_noise;
 use dpm_render::gpu::{Buffer, Gpu};
 use dpm_render::pack::{halftone, halftone_of_bodies, Halftone};
+use dpm_render::Surface;
 use dpm_rig::light::recorder::LightFrame;
 use dpm_shaders::specialization as ids;
-use dpm_shaders::structs::{Frame, Instance, Mover, Surface, NO_HIT};
+use dpm_shaders::structs::{Frame, Instance, Mover, NO_HIT};
 use dpm_shaders::Reading;
 use dpm_tests::gpu::{run_shader, uploaded, with_gpu};
 use dpm_tests::rigs::{demo_rig, run};
@@ -72,7 +73,7 @@ fn on_gpu(
         shows.centres.iter().map(|&centre| Mover { centre, ..Mover::zeroed() }).collect();
     // Buffers are never empty.
     let table = |name, bytes: &[u8]| uploaded(gpu, name, if bytes.is_empty() { &[0; 16] } else { bytes });
-    let surfaces = table("surfaces", bytemuck::cast_slice(&surfaces));
+    let surfaces = table("surfaces", &Surface::bytes_of(&surfaces));
     let instances = table("instances", bytemuck::cast_slice(&instances));
     let movers = table("movers", bytemuck::cast_slice(&movers));
     let buffers = [

@@ -5,11 +5,11 @@ use dpm_device::planes::Raster;
 use dpm_lab::stability::gpu_shot::Shot;
 use dpm_render::gpu::Gpu;
 use dpm_render::method::Method;
-use dpm_render::{FrameInputs, FrameSlot, Keep, Renderer};
+use dpm_render::{FrameInputs, FrameSlot, Keep, Renderer, Surface};
 use dpm_scene::geometry::lens::Lens;
 use dpm_scene::geometry::projector::ProjectorCamera;
 use dpm_scene::{shapes, Scene};
-use dpm_shaders::structs::{Surface, NO_HIT};
+use dpm_shaders::structs::NO_HIT;
 use dpm_tests::gpu::with_gpu;
 use glam::{DAffine3, DQuat, DVec2, DVec3, Vec3};
 use std::sync::Arc;
@@ -91,7 +91,7 @@ fn light_falls_where_the_lens_projects_and_moves_as_it_does() {
             let camera = projector(lens);
             let (mut surfaces, mut guides) = (vec![], vec![]);
             let renderer = draw(gpu, &scene, &camera, &[before, now], Keep::default(), |slot| {
-                surfaces = slot.surfaces().unwrap().to_vec();
+                surfaces = slot.surfaces().unwrap();
                 guides = slot.guides().unwrap();
             });
             let (mut worst, mut worst_motion, mut lit) = (0.0f64, 0.0f64, 0);

@@ -3,10 +3,10 @@
 use dpm_lab::stability::gpu_shot::{Picture, Shot};
 use dpm_render::gpu::Gpu;
 use dpm_render::scene_data::Keep;
-use dpm_render::{FrameInputs, Renderer, PASSES};
+use dpm_render::{FrameInputs, Renderer, Surface, PASSES};
 use dpm_scene::shapes::*;
 use dpm_scene::{Material, Scene};
-use dpm_shaders::structs::{Surface, NO_HIT};
+use dpm_shaders::structs::NO_HIT;
 use dpm_tests::compare::{assert_same_picture, bits};
 use dpm_tests::gpu::with_gpu;
 use glam::{DAffine3, DQuat, DVec3, Vec3};

@@ -7,11 +7,11 @@
 use dpm_lab::sequence::{draw, poses_at};
 use dpm_lab::stability::gpu_shot::Shot;
 use dpm_render::gpu::{Gpu, GpuOptions};
-use dpm_render::{FrameInputs, Renderer, RendererSettings, Tracing};
+use dpm_render::{FrameInputs, Renderer, RendererSettings, Surface, Tracing};
 use dpm_rig::pipeline::renderer_settings;
 use dpm_scene::shapes::*;
 use dpm_scene::{Material, Scene};
-use dpm_shaders::structs::{Surface, NO_HIT};
+use dpm_shaders::structs::NO_HIT;
 use dpm_tests::compare::bits;
 use dpm_tests::gpu::with_gpu;
 use dpm_tests::rigs::demo_rig;
@@ -167,7 +167,7 @@ fn moving_frames_are_the_same(gpu: &Arc<Gpu>) {
             let poses = poses_at(&rig, u64::from(frame) * 40);
             draw(&rig, &mut renderer, &mut slot, &poses, frame, 2.0).expect("the frame ends");
             let light = slot.radiance().expect("a debug slot").to_vec();
-            (slot.surfaces().expect("a debug slot").to_vec(), light)
+            (slot.surfaces().expect("a debug slot"), light)
         };
         (0..6).map(frame).collect::<Vec<_>>()
     });
@@ -198,7 +198,7 @@ fn frames_in_flight_have_their_own_bodies(gpu: &Arc<Gpu>) {
     for (slot, poses) in slots.iter_mut().zip(places) {
         slot.wait(120_000_000_000).expect("the frame ends");
         let alone = Shot { poses, ..shot.clone() }.draw(gpu);
-        assert_eq!(slot.surfaces(), Some(&alone.surfaces[..]));
+        assert_eq!(slot.surfaces().as_ref(), Some(&alone.surfaces));
     }
 }
 
@@ -211,7 +211,7 @@ fn a_device_that_comes_back_draws_the_same(gpu: &Arc<Gpu>) {
         let inputs = FrameInputs::new(&shot.camera, (EYE, EYE), &poses);
         renderer.submit(&mut slot, &inputs).expect("submit");
         slot.wait(120_000_000_000).expect("the frame ends");
-        slot.surfaces().expect("a debug slot").to_vec()
+        slot.surfaces().expect("a debug slot")
     };
     let renderer = Renderer::new(gpu, &scene, shot.settings()).expect("the scene fits the GPU");
     let plan = renderer.plan();

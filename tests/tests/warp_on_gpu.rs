@@ -8,12 +8,12 @@ use dpm_render::gpu::Gpu;
 use dpm_render::pack::Kernel;
 use dpm_render::warp::gather::{is_rough, motion_of, owner_of, within, Drawn};
 use dpm_render::warp::{plane_groups, Sweep, Warper};
-use dpm_render::{FrameInputs, Renderer, RendererSettings};
+use dpm_render::{FrameInputs, Renderer, RendererSettings, Surface};
 use dpm_rig::config::BitOrder;
 use dpm_scene::geometry::lens::Lens;
 use dpm_scene::geometry::projector::ProjectorCamera;
 use dpm_scene::{shapes, Material, Scene};
-use dpm_shaders::structs::{Moved, Mover, PlaneGroup, Surface, OWNER_NONE, OWNER_STILL, WORD_ROUGH};
+use dpm_shaders::structs::{Moved, Mover, PlaneGroup, OWNER_NONE, OWNER_STILL, WORD_ROUGH};
 use dpm_tests::gpu::with_gpu;
 use glam::{DAffine3, DQuat, DVec2, DVec3, Vec3};
 use std::sync::Arc;
@@ -90,7 +90,7 @@ fn draw_frame(
     Shown {
         codes: slot.codes().to_vec(),
         motions: slot.motions().map(<[_]>::to_vec).unwrap_or_default(),
-        surfaces: slot.surfaces().unwrap().to_vec(),
+        surfaces: slot.surfaces().unwrap(),
         movers: renderer.movers().to_vec(),
     }
 }

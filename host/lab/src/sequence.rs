@@ -8,10 +8,10 @@ use dpm_common::clock::Stopwatch;
 use dpm_device::planes::Raster;
 use dpm_render::gpu::{Gpu, GpuError};
 use dpm_render::method::Method;
-use dpm_render::{FrameCost, FrameInputs, FrameSlot, RenderError, Renderer, RendererSettings};
+use dpm_render::{FrameCost, FrameInputs, FrameSlot, RenderError, Renderer, RendererSettings, Surface};
 use dpm_rig::pipeline::renderer_settings;
 use dpm_rig::rig::Rig;
-use dpm_shaders::structs::{Surface, NO_HIT};
+use dpm_shaders::structs::NO_HIT;
 use glam::{DAffine3, DVec2, DVec3, Vec3};
 use std::sync::Arc;
 
@@ -149,7 +149,7 @@ impl Theatre {
         let mut slot = renderer.create_slot(true)?;
         let poses = poses_at(&rig, span.last_slot);
         draw(&rig, &mut renderer, &mut slot, &poses, 0, 1.0)?;
-        let (surfaces, guides) = (slot.surfaces().unwrap_or(&[]), slot.guides().unwrap_or_default());
+        let (surfaces, guides) = (slot.surfaces().unwrap_or_default(), slot.guides().unwrap_or_default());
         let width = rig.camera.raster.width();
         let probes = surfaces
             .iter()
@@ -216,7 +216,7 @@ impl Theatre {
                 seen.frames.push(self.look(
                     &poses,
                     slot.radiance().unwrap_or(&[]),
-                    slot.surfaces().unwrap_or(&[]),
+                    &slot.surfaces().unwrap_or_default(),
                 ));
             }
         }

@@ -5,15 +5,14 @@ use super::deformed::DeformedTables;
 use super::fill::fill;
 use super::live_textures::{LiveTextures, Piece};
 use super::memory::{BytesPerPixel, SharedBuffers, SHOWN_BYTES};
-use super::read_back::Guide;
+use super::read_back::{Guide, Surface};
 use super::scene_data::{BodyData, SceneData};
 use super::scene_gpu::{table_buffer, Geometry, SceneGpu};
 use super::settings::{Output, RendererSettings};
 use crate::gpu::{Buffer, FrameTree, Gpu, GpuError, MemoryKind, Place};
 use crate::pack;
-use bytemuck::Zeroable;
 use dpm_shaders::structs::{
-    in_blocks, BodyNode, Counters, Filtered, Frame, Instance, Mover, Schedule, Surface, TextureInfo, NO_HIT,
+    in_blocks, BodyNode, Counters, Filtered, Frame, Instance, Mover, Schedule, TextureInfo, PART_BLOCK,
 };
 use dpm_shaders::Reading;
 use std::sync::Arc;
@@ -186,12 +185,11 @@ impl FrameBuffers {
     /// The GPU's own.
     pub(super) fn clear(&self, gpu: &Arc<Gpu>, settings: &RendererSettings) -> Result<(), GpuError> {
         let pixels = in_blocks(settings.raster.pixel_count());
-        let nothing = Surface { id: NO_HIT, ..Surface::zeroed() };
-        fill(gpu, &self.surfaces, &nothing, pixels)?;
+        fill(gpu, &self.surfaces, &Surface::block_of_none(), pixels / PART_BLOCK)?;
         fill(gpu, &self.codes, &0u32, pixels)?;
         fill(gpu, &self.radiance, &[0f32; 4], pixels)?;
         if self.each.guides > 0 {
-            fill(gpu, &self.guides, &[0u8; Guide::BYTES], pixels)?;
+            fill(gpu, &self.guides, &0u32, pixels * Guide::BYTES / 4)?;
         }
         if self.each.filtered > 0 {
             fill(gpu, &self.filtered, &[0u8; size_of::<Filtered>()], pixels)?;

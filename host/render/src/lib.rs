@@ -48,7 +48,7 @@ pub mod warp;
 pub use memory::least_memory_bytes;
 pub use passes::{traffic, Traffic, PASSES};
 pub use plan::{trace_groups, Program, RendererPlan};
-pub use read_back::{Guide, History};
+pub use read_back::{Guide, History, Surface};
 pub use renderer::Renderer;
 pub use scene_data::Keep;
 pub use settings::{FrameInputs, Output, Overlapping, RenderError, RendererSettings, Tracing};

@@ -5,14 +5,14 @@ use super::blue_noise;
 use super::fill::fill;
 use super::method::Method;
 use super::optics::OpticsLayout;
-use super::read_back::{Guide, History};
+use super::read_back::{Guide, History, Surface};
 use super::scene_gpu::table_buffer;
 use super::settings::{RasterTooLarge, RenderError, RendererSettings};
 use super::tiles::TILE;
 use crate::gpu::{Buffer, Gpu, GpuError, MemoryKind};
 use bytemuck::Zeroable;
 use dpm_device::planes::Raster;
-use dpm_shaders::structs::{in_blocks, Filtered, Moved, PlaneGroup, Schedule, Surface, WorkItem, PARTS};
+use dpm_shaders::structs::{in_blocks, Filtered, Moved, PlaneGroup, Schedule, WorkItem, PARTS};
 use std::sync::Arc;
 
 /// Bytes of a pixel of the picture that the host can read.
@@ -48,7 +48,7 @@ impl BytesPerPixel {
         Self {
             history: when(method.needs_history(), History::BYTES),
             guides: when(method.needs_guides(), Guide::BYTES),
-            surfaces: size_of::<Surface>(),
+            surfaces: Surface::BYTES,
             radiance: size_of::<[f32; 4]>(),
             filtered: when(method.needs_history(), size_of::<Filtered>()),
             shown: when(method.needs_spatial() && !method.dpm, SHOWN_BYTES),
@@ -72,7 +72,7 @@ impl BytesPerPixel {
         let part = PARTS.iter().find(|part| part.binding == binding && part.name == name);
         let part = part.map_or(0, |part| part.bytes);
         Some(match binding {
-            "B_SURFACES" => self.surfaces,
+            "B_SURFACES" => part,
             "B_GUIDES" if self.guides > 0 => part,
             "B_HISTORY" | "B_FORMER" if self.history > 0 => part,
             "B_RADIANCE" => self.radiance,

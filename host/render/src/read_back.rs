@@ -2,9 +2,21 @@
 
 use bytemuck::{Pod, Zeroable};
 use dpm_shaders::structs::{
-    in_blocks, part, HistoryLight, HistoryNoise, HistoryPlace, HistoryTag, Part, Sight, Tint, HISTORY_EXACT,
-    HISTORY_USED, NO_FRAME, PART_BLOCK,
+    self as gpu, in_blocks, part, Barycentric, HistoryLight, HistoryNoise, HistoryPlace, HistorySeed,
+    HistoryTag, HistoryUsed, Part, Sight, Tint, HISTORY_EXACT, HISTORY_USED, NO_FRAME, NO_HIT, PART_BLOCK,
 };
+
+/// What the projector ray of a pixel met.
+#[derive(Clone, Copy, Debug, PartialEq, Zeroable)]
+#[repr(C)]
+pub struct Surface {
+    /// Instance in the high 8 bits, triangle of the body in BVH order in the low 24; `NO_HIT`: nothing.
+    pub id: u32,
+    /// Barycentric weights of vertices 1 and 2.
+    pub barycentric: [f32; 2],
+    /// Distance from the projector along the unit ray; negative: not lit (the eye cannot see it).
+    pub distance: f32,
+}
 
 /// Where the surface point of a pixel moves, how the eye sees it, and what its light is divided by.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -27,6 +39,49 @@ pub struct History {
     pub noise: HistoryNoise,
     /// Whose history it is.
     pub tag: HistoryTag,
+    /// Which sample sequence the point has.
+    pub seed: HistorySeed,
+    /// How far it was used before the frame.
+    pub used: HistoryUsed,
+}
+
+impl Surface {
+    /// Bytes of a pixel.
+    pub(crate) const BYTES: usize = part("B_SURFACES", "hit").all;
+
+    /// Light falls on it: something was met, and the eye sees it. As `is_lit` of the shaders.
+    pub fn is_lit(&self) -> bool {
+        self.id != NO_HIT && self.distance > 0.0
+    }
+
+    /// Bytes of the buffer for so many pixels.
+    pub(crate) fn buffer_bytes(pixels: usize) -> usize {
+        in_blocks(pixels) * Self::BYTES
+    }
+
+    /// Those of all pixels, from the bytes of the buffer.
+    pub(crate) fn all(bytes: &[u8], pixels: usize) -> Vec<Self> {
+        let hits = elements::<gpu::Surface>(bytes, part("B_SURFACES", "hit"), pixels);
+        let inside = elements::<Barycentric>(bytes, part("B_SURFACES", "inside"), pixels);
+        let both = hits.into_iter().zip(inside);
+        both.map(|(hit, b)| Self { id: hit.id, barycentric: b.weights, distance: hit.distance }).collect()
+    }
+
+    /// The bytes of a block of pixels whose rays met nothing.
+    pub(crate) fn block_of_none() -> [u8; PART_BLOCK * Self::BYTES] {
+        let bytes = Self::bytes_of(&[Self { id: NO_HIT, ..Self::zeroed() }; PART_BLOCK]);
+        std::array::from_fn(|i| bytes[i])
+    }
+
+    /// The bytes of the buffer that holds `all`.
+    pub fn bytes_of(all: &[Self]) -> Vec<u8> {
+        let mut bytes = vec![0; Self::buffer_bytes(all.len())];
+        let hits = all.iter().map(|s| gpu::Surface { id: s.id, distance: s.distance });
+        place_elements(&mut bytes, part("B_SURFACES", "hit"), hits);
+        let inside = all.iter().map(|s| Barycentric { weights: s.barycentric });
+        place_elements(&mut bytes, part("B_SURFACES", "inside"), inside);
+        bytes
+    }
 }
 
 impl Guide {
@@ -66,9 +121,17 @@ impl History {
         let places = elements::<HistoryPlace>(bytes, part("B_HISTORY", "place"), pixels);
         let noises = elements::<HistoryNoise>(bytes, part("B_HISTORY", "noise"), pixels);
         let tags = elements::<HistoryTag>(bytes, part("B_HISTORY", "tag"), pixels);
-        (0..pixels)
-            .map(|i| Self { light: lights[i], place: places[i], noise: noises[i], tag: tags[i] })
-            .collect()
+        let seeds = elements::<HistorySeed>(bytes, part("B_HISTORY", "seed"), pixels);
+        let uses = elements::<HistoryUsed>(bytes, part("B_HISTORY", "used"), pixels);
+        let of = |i: usize| Self {
+            light: lights[i],
+            place: places[i],
+            noise: noises[i],
+            tag: tags[i],
+            seed: seeds[i],
+            used: uses[i],
+        };
+        (0..pixels).map(of).collect()
     }
 
     /// Bytes of the buffer for so many pixels.
@@ -90,6 +153,8 @@ impl History {
         place_elements(&mut bytes, part("B_HISTORY", "place"), all.iter().map(|h| h.place));
         place_elements(&mut bytes, part("B_HISTORY", "noise"), all.iter().map(|h| h.noise));
         place_elements(&mut bytes, part("B_HISTORY", "tag"), all.iter().map(|h| h.tag));
+        place_elements(&mut bytes, part("B_HISTORY", "seed"), all.iter().map(|h| h.seed));
+        place_elements(&mut bytes, part("B_HISTORY", "used"), all.iter().map(|h| h.used));
         bytes
     }
 }
@@ -121,6 +186,8 @@ mod tests {
             place: HistoryPlace { normal: i + 100, ..HistoryPlace::zeroed() },
             noise: HistoryNoise { body_and_used: i + 200, ..HistoryNoise::zeroed() },
             tag: HistoryTag { frame: i + 300, ..HistoryTag::zeroed() },
+            seed: HistorySeed { seed: i + 400 },
+            used: HistoryUsed { before: i as i32 + 500 },
         };
         let all: Vec<_> = (0..200).map(history).collect();
         let bytes = History::bytes_of(&all);
@@ -134,8 +201,8 @@ mod tests {
                 .max()
         };
         assert_eq!(
-            (end("B_HISTORY"), end("B_FORMER"), end("B_GUIDES")),
-            (Some(64), Some(64), Some(Guide::BYTES))
+            (end("B_HISTORY"), end("B_FORMER"), end("B_GUIDES"), end("B_SURFACES")),
+            (Some(64), Some(64), Some(Guide::BYTES), Some(Surface::BYTES))
         );
     }
 }

@@ -9,7 +9,7 @@ use super::memory::{SharedBuffers, SHOWN_BYTES};
 use super::optics::OpticsLayout;
 use super::passes::{Grid, FIRST_PASSES, PASSES, TABLE};
 use super::plan::{Pipelines, RendererPlan};
-use super::read_back::History;
+use super::read_back::{History, Surface};
 use super::resources::Resources;
 use super::scene_data::{rows, world_bounds, BodyData, Keep, SceneData};
 use super::scene_gpu::SceneGpu;
@@ -23,9 +23,7 @@ use crate::gpu::{
 use crate::pack;
 use bytemuck::Zeroable;
 use dpm_scene::Scene;
-use dpm_shaders::structs::{
-    self as gpu_structs, in_blocks, Counters, Frame, Instance, Mover, Schedule, Surface,
-};
+use dpm_shaders::structs::{self as gpu_structs, in_blocks, Counters, Frame, Instance, Mover, Schedule};
 use dpm_shaders::Reading;
 use glam::{DAffine3, Vec3};
 use std::ops::Range;

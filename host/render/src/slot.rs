@@ -2,12 +2,12 @@
 
 use super::frame_buffers::FrameBuffers;
 use super::passes::{FIRST_PASSES, PASSES};
-use super::read_back::{elements, Guide, History};
+use super::read_back::{elements, Guide, History, Surface};
 use super::resources::Resources;
 use super::tiles::{TileList, TILE};
 use crate::gpu::{BindingSet, CommandList, FrameFence, GpuError, Place};
 use dpm_device::planes::Raster;
-use dpm_shaders::structs::{part, Counters, HistoryLight, Moved, Schedule, Surface, WorkItem};
+use dpm_shaders::structs::{part, Counters, HistoryLight, Moved, Schedule, WorkItem};
 use std::sync::Arc;
 
 /// What a frame cost.
@@ -116,8 +116,10 @@ impl FrameSlot {
     }
 
     /// What each pixel's ray hit. Only with `debug` at creation.
-    pub fn surfaces(&self) -> Option<&[Surface]> {
-        self.buffers.debug_host.as_ref().map(|d| d.surfaces.read(self.raster.pixel_count()))
+    pub fn surfaces(&self) -> Option<Vec<Surface>> {
+        let pixels = self.raster.pixel_count();
+        let debug = self.buffers.debug_host.as_ref()?;
+        Some(Surface::all(debug.surfaces.read(Surface::buffer_bytes(pixels)), pixels))
     }
 
     /// Motion, apparent size, angle and albedo of each lit pixel. Only with `debug` at creation, and for methods that use them.

@@ -173,7 +173,7 @@ fn integrate(
         FrameInputs { animated_at_ns: window.at_ns, ..FrameInputs::new(camera, (other, other), poses) };
     renderer.submit(&mut slot, &inputs)?;
     slot.wait(60_000_000_000)?;
-    let surfaces = slot.surfaces().unwrap_or(&[]);
+    let surfaces = slot.surfaces().unwrap_or_default();
     let width = camera.raster.width();
     let mut out = vec![Vec3::ZERO; surfaces.len()];
     for (i, surface) in surfaces.iter().enumerate() {

@@ -158,7 +158,7 @@ pub(crate) fn exposure(rig: &Rig, gpu: &Arc<Gpu>, poses: &Placed) -> Result<f64,
     let mut renderer = Renderer::new(gpu, &rig.scene, settings)?;
     let mut slot = renderer.create_slot(true)?;
     draw(rig, &mut renderer, &mut slot, poses, 0, EXPOSURE_SPP as f32)?;
-    let (surfaces, radiance) = (slot.surfaces().unwrap_or(&[]), slot.radiance().unwrap_or(&[]));
+    let (surfaces, radiance) = (slot.surfaces().unwrap_or_default(), slot.radiance().unwrap_or(&[]));
     let lit = surfaces.iter().zip(radiance).filter(|(surface, _)| surface.is_lit());
     let mut greatest: Vec<f32> = lit.map(|(_, [r, g, b, _])| r.max(*g).max(*b)).collect();
     greatest.sort_unstable_by(f32::total_cmp);

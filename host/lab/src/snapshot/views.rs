@@ -5,9 +5,9 @@ use super::SnapshotImage;
 use crate::twins::rate_map::{estimate, PixelGuide, RateConstants};
 use dpm_device::planes::Raster;
 use dpm_render::method::Method;
-use dpm_render::{FrameSlot, Guide, History, Renderer};
+use dpm_render::{FrameSlot, Guide, History, Renderer, Surface};
 use dpm_rig::pictures::to_srgb;
-use dpm_shaders::structs::{Surface, NO_HIT};
+use dpm_shaders::structs::NO_HIT;
 use glam::{DAffine3, Vec3};
 
 /// Side of a tile, pixels.
@@ -54,7 +54,7 @@ pub(crate) fn missing(image: SnapshotImage, method: &Method) -> Option<&'static 
 
 impl Views<'_> {
     fn lit<T, U>(&self, of: Option<&[T]>, value: impl Fn(&T) -> U) -> Vec<Option<U>> {
-        let (surfaces, of) = (self.slot.surfaces().unwrap_or(&[]), of.unwrap_or(&[]));
+        let (surfaces, of) = (self.slot.surfaces().unwrap_or_default(), of.unwrap_or(&[]));
         surfaces.iter().zip(of).map(|(s, t)| s.is_lit().then(|| value(t))).collect()
     }
 
@@ -78,7 +78,7 @@ impl Views<'_> {
     pub(crate) fn paint(&self, image: SnapshotImage) -> Canvas {
         use SnapshotImage as I;
         let raster = self.raster;
-        let surfaces = self.slot.surfaces().unwrap_or(&[]);
+        let surfaces = self.slot.surfaces().unwrap_or_default();
         let quantity =
             |values: Vec<Option<f32>>, scale, title| paint::quantity(raster, &values, scale, title);
         match image {
@@ -147,7 +147,7 @@ impl Views<'_> {
 
     /// Index into [`RATES`] of every lit pixel.
     fn rates(&self) -> Vec<Option<usize>> {
-        let (surfaces, rates) = (self.slot.surfaces().unwrap_or(&[]), self.slot.rates().unwrap_or(&[]));
+        let (surfaces, rates) = (self.slot.surfaces().unwrap_or_default(), self.slot.rates().unwrap_or(&[]));
         surfaces
             .iter()
             .enumerate()
@@ -156,7 +156,7 @@ impl Views<'_> {
     }
 
     fn errors(&self) -> Vec<Option<f32>> {
-        let surfaces = self.slot.surfaces().unwrap_or(&[]);
+        let surfaces = self.slot.surfaces().unwrap_or_default();
         // Some pixel of the tile had no history: there is no estimate.
         let tile = |i: usize| self.tile_errors.get(self.tile_of(i)).copied().flatten().or(Some(f32::NAN));
         surfaces.iter().enumerate().map(|(i, s)| if s.is_lit() { tile(i) } else { None }).collect()

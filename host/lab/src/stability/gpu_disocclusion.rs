@@ -7,10 +7,9 @@ use super::gpu_history::{dpm, even, from_one, methods, play};
 use super::gpu_shot::Shot;
 use dpm_render::gpu::Gpu;
 use dpm_render::method::Method;
-use dpm_render::{History, Renderer};
+use dpm_render::{History, Renderer, Surface};
 use dpm_scene::shapes::*;
 use dpm_scene::{Environment, Material, Scene};
-use dpm_shaders::structs::Surface;
 use glam::{DAffine3, DQuat, DVec3, Vec3};
 use std::sync::Arc;
 
@@ -231,7 +230,7 @@ fn sights(gpu: &Arc<Gpu>, shot: &Shot<'_>, poses: impl Fn(u32) -> Vec<DAffine3>)
         let mut renderer = Renderer::new(gpu, shot.scene, shot.settings()).expect("the scene fits the GPU");
         let mut sights = Sights::default();
         shot.play(&mut renderer, 0..shot.frames, &poses, |_, slot, counters| {
-            let surfaces = slot.surfaces().unwrap_or(&[]);
+            let surfaces = slot.surfaces().unwrap_or_default();
             sights.lit.push(surfaces.iter().map(Surface::is_lit).collect());
             sights.hidden += surfaces.iter().filter(|s| s.distance < 0.0).count();
             sights.rays += counters.rays;

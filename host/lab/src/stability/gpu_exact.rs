@@ -4,10 +4,9 @@ use super::gpu_history::{dpm, play};
 use super::gpu_shot::Shot;
 use dpm_render::gpu::Gpu;
 use dpm_render::method::Method;
-use dpm_render::{Keep, Renderer};
+use dpm_render::{Keep, Renderer, Surface};
 use dpm_scene::shapes::*;
 use dpm_scene::{Material, Scene};
-use dpm_shaders::structs::Surface;
 use glam::{DAffine3, DVec3, Vec3};
 use std::sync::Arc;
 
@@ -36,7 +35,7 @@ pub(super) fn noise_free(gpu: &Arc<Gpu>, seed: u64) -> f64 {
         let (mut wanted, mut lit, mut traced) = (Vec::new(), 0u32, 0u32);
         play(gpu, &shot(Method::full(1)), poses, |_, slot| {
             wanted.push(slot.radiance().unwrap_or(&[]).to_vec());
-            let surfaces = slot.surfaces().unwrap_or(&[]).iter();
+            let surfaces = slot.surfaces().unwrap_or_default().into_iter();
             lit += surfaces.filter(|s| s.is_lit()).count() as u32;
         });
         play(gpu, &shot(dpm()), poses, |frame, slot| {
@@ -82,7 +81,7 @@ fn faults_where_chance_comes_in(gpu: &Arc<Gpu>, seed: u64, storage_tables: bool)
     shot.play(&mut renderer, 0..shot.frames, poses, |_, slot, _| {
         let (history, traced) = (slot.history().unwrap_or_default(), slot.traced().unwrap_or(&[]));
         let mirrors = |s: &Surface| s.is_lit() && s.id >> 24 == 0;
-        let lit: Vec<bool> = slot.surfaces().unwrap_or(&[]).iter().map(mirrors).collect();
+        let lit: Vec<bool> = slot.surfaces().unwrap_or_default().iter().map(mirrors).collect();
         let exact: Vec<bool> = history.iter().map(|h| h.is_exact()).collect();
         for (i, was) in before.iter().enumerate().filter(|(i, _)| lit[*i]) {
             match (*was, exact[i]) {

@@ -7,11 +7,10 @@ use super::gpu_shot::Shot;
 use crate::snapshot::views::albedo_of;
 use dpm_render::gpu::Gpu;
 use dpm_render::method::{Method, SamplerKind};
-use dpm_render::FrameSlot;
+use dpm_render::{FrameSlot, Surface};
 use dpm_scene::geometry::projector::ProjectorCamera;
 use dpm_scene::shapes::*;
 use dpm_scene::{Environment, Material, Scene};
-use dpm_shaders::structs::Surface;
 use glam::{DAffine3, DVec2, DVec3, Vec3};
 use std::sync::Arc;
 
@@ -106,7 +105,7 @@ fn mean_shift(gpu: &Arc<Gpu>, shot: &Shot<'_>, body: u32, poses: &dyn Fn(u32) ->
         let shot = Shot { spp, method: Some(method), ..shot.clone() };
         let (mut sum, mut n) = (0f64, 0f64);
         play(gpu, &shot, poses, |frame, slot| {
-            let (shown, surfaces) = (slot.radiance().unwrap_or(&[]), slot.surfaces().unwrap_or(&[]));
+            let (shown, surfaces) = (slot.radiance().unwrap_or(&[]), slot.surfaces().unwrap_or_default());
             for (i, _) in lit(slot).filter(|(i, _)| frame >= 40 && surfaces[*i].id >> 24 == body) {
                 sum += (0..3).map(|c| f64::from(shown[i][c])).sum::<f64>();
                 n += 1.0;
@@ -236,8 +235,8 @@ fn point_of(shot: &Shot<'_>, pixel: usize, distance: f32) -> DVec3 {
 }
 
 /// Lit pixels: index and distance.
-fn lit(slot: &FrameSlot) -> impl Iterator<Item = (usize, f32)> + '_ {
-    let surfaces = slot.surfaces().unwrap_or(&[]).iter().enumerate();
+fn lit(slot: &FrameSlot) -> impl Iterator<Item = (usize, f32)> {
+    let surfaces = slot.surfaces().unwrap_or_default().into_iter().enumerate();
     surfaces.filter(|(_, s)| s.is_lit()).map(|(i, s)| (i, s.distance))
 }
 
@@ -332,7 +331,7 @@ fn good_start(gpu: &Arc<Gpu>, seed: u64) -> f64 {
     play(gpu, &shot, poses, |frame, slot| {
         let (history, traced) = (slot.history().unwrap_or_default(), slot.traced().unwrap_or(&[]));
         let body = |s: &Surface| s.is_lit().then_some(s.id >> 24);
-        let bodies: Vec<_> = slot.surfaces().unwrap_or(&[]).iter().map(body).collect();
+        let bodies: Vec<_> = slot.surfaces().unwrap_or_default().iter().map(body).collect();
         for (i, _) in lit(slot).filter(|_| frame >= 60) {
             let samples = f64::from(traced[i][3]);
             all.add(samples);

@@ -133,7 +133,7 @@ const BESIDE: DVec3 = DVec3::new(-0.5, 3.2, 0.8);
 
 /// Largest difference from 1 of what is shown at lit pixels; infinite when none is lit.
 pub(super) fn from_one(slot: &FrameSlot) -> f64 {
-    let (shown, surfaces) = (slot.radiance().unwrap_or(&[]), slot.surfaces().unwrap_or(&[]));
+    let (shown, surfaces) = (slot.radiance().unwrap_or(&[]), slot.surfaces().unwrap_or_default());
     let lit = shown.iter().zip(surfaces).filter(|(_, s)| s.is_lit());
     let worst = lit.flat_map(|(r, _)| r[..3].iter()).map(|v| f64::from((v - 1.0).abs()));
     worst.fold(-1.0, |a: f64, d| if d.is_nan() { f64::INFINITY } else { a.max(d) })
@@ -173,7 +173,7 @@ fn borders(gpu: &Arc<Gpu>, seed: u64) -> f64 {
             };
             play_at_rest(gpu, &shot, |frame, slot| {
                 let off = from_one(slot);
-                let dark = slot.surfaces().unwrap_or(&[]).iter().filter(|s| s.distance <= 0.0).count();
+                let dark = slot.surfaces().unwrap_or_default().iter().filter(|s| s.distance <= 0.0).count();
                 worst = if off < 0.0 || dark > 0 {
                     f64::INFINITY
                 } else if frame >= 2 {
@@ -409,7 +409,7 @@ fn rate_map(gpu: &Arc<Gpu>, seed: u64) -> f64 {
         if frame % 2 == 1 {
             return;
         }
-        let (surfaces, guides) = (slot.surfaces().unwrap_or(&[]), slot.guides().unwrap_or_default());
+        let (surfaces, guides) = (slot.surfaces().unwrap_or_default(), slot.guides().unwrap_or_default());
         let prior = slot.prior_luminance().unwrap_or_default();
         for (tile, &rate) in slot.rates().unwrap_or(&[]).iter().enumerate() {
             let pixels: [Option<PixelGuide>; 256] = std::array::from_fn(|i| {
@@ -449,7 +449,7 @@ fn longest_wait(gpu: &Arc<Gpu>, seed: u64, step: u32) -> u32 {
     let mut worst = 0;
     drift_by(gpu, &paper(), seed, 24, 0.0, step, |_, slot| {
         let (traced, rates) = (slot.traced().unwrap_or(&[]), slot.rates().unwrap_or(&[]));
-        for (i, s) in slot.surfaces().unwrap_or(&[]).iter().enumerate() {
+        for (i, s) in slot.surfaces().unwrap_or_default().iter().enumerate() {
             if s.id == NO_HIT || s.distance <= 0.0 {
                 continue;
             }
@@ -509,7 +509,7 @@ fn new_points(gpu: &Arc<Gpu>, seed: u64) -> f64 {
     let (mut new, mut waits, mut faults) = (0u32, 0u32, 0u32);
     play(gpu, &shot, poses, |_, slot| {
         let (history, traced) = (slot.history().unwrap_or_default(), slot.traced().unwrap_or(&[]));
-        let surfaces = slot.surfaces().unwrap_or(&[]);
+        let surfaces = slot.surfaces().unwrap_or_default();
         for i in (0..surfaces.len()).filter(|i| surfaces[*i].is_lit()) {
             waits += u32::from(traced[i][3] == 0.0);
             new += u32::from(traced[i][3] > 0.0 && history[i].samples_used() == traced[i][3] as u32);

@@ -6,9 +6,9 @@ use super::gpu_shot::Shot;
 use crate::error::plan::method_of;
 use dpm_render::gpu::Gpu;
 use dpm_render::method::Method;
+use dpm_render::Surface;
 use dpm_rig::config::{RenderConfig, RenderMethod};
 use dpm_scene::shapes::*;
-use dpm_shaders::structs::Surface;
 use glam::{DAffine3, DQuat, DVec2, DVec3, Vec3};
 use std::sync::Arc;
 
@@ -79,8 +79,8 @@ fn angle(shot: &Shot<'_>, pixel: usize) -> f64 {
     (on_floor(shot, pixel) - eye).angle_between(gaze - eye).to_degrees()
 }
 
-fn lit(surfaces: Option<&[Surface]>) -> Vec<usize> {
-    let surfaces = surfaces.unwrap_or(&[]).iter().enumerate();
+fn lit(surfaces: Option<Vec<Surface>>) -> Vec<usize> {
+    let surfaces = surfaces.unwrap_or_default().into_iter().enumerate();
     surfaces.filter(|(_, s)| s.is_lit()).map(|(i, _)| i).collect()
 }
 

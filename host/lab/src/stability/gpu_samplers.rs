@@ -71,7 +71,7 @@ fn traced(gpu: &Arc<Gpu>, scene: &Scene, method: &Method, spp: u32, frames: u32,
     };
     let mut all = Vec::new();
     play_at_rest(gpu, &shot, |_, slot| {
-        let (traced, surfaces) = (slot.traced().unwrap_or(&[]), slot.surfaces().unwrap_or(&[]));
+        let (traced, surfaces) = (slot.traced().unwrap_or(&[]), slot.surfaces().unwrap_or_default());
         let lit = traced.iter().zip(surfaces).filter(|(_, s)| s.is_lit());
         all.push(lit.flat_map(|(r, _)| r[..3].iter().map(|v| f64::from(*v))).collect());
     });

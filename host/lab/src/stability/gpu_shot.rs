@@ -5,10 +5,10 @@ use dpm_render::drive::Drive;
 use dpm_render::gpu::Gpu;
 use dpm_render::method::Method;
 use dpm_render::scene_data::Keep;
-use dpm_render::{FrameInputs, FrameSlot, Output, Overlapping, Renderer, RendererSettings, Tracing};
+use dpm_render::{FrameInputs, FrameSlot, Output, Overlapping, Renderer, RendererSettings, Surface, Tracing};
 use dpm_scene::geometry::projector::ProjectorCamera;
 use dpm_scene::Scene;
-use dpm_shaders::structs::{Counters, Surface, NO_HIT};
+use dpm_shaders::structs::{Counters, NO_HIT};
 use glam::{DAffine3, DVec3};
 use std::ops::Range;
 use std::sync::Arc;
@@ -197,7 +197,7 @@ impl Picture {
 
     /// Keeps what only the last frame tells.
     fn keep(&mut self, slot: &FrameSlot) {
-        self.surfaces = slot.surfaces().unwrap_or(&[]).to_vec();
+        self.surfaces = slot.surfaces().unwrap_or_default();
         self.radiance = slot.radiance().unwrap_or(&[]).to_vec();
         self.codes = slot.codes().to_vec();
     }

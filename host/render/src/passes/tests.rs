@@ -1,6 +1,7 @@
 //! The table of passes against the shaders' own SPIR-V, and the bytes that it says a pixel moves.
 
 use super::*;
+use bytemuck::Zeroable;
 use dpm_shaders::structs::{members_of, BINDINGS, PARTS, TREE_BINDING};
 use std::collections::{BTreeSet, HashMap};
 
@@ -78,7 +79,7 @@ fn loads_and_stores(shader: &Shader) -> [BTreeSet<String>; 2] {
                 }
             }
             // OpTypeInt, OpTypeFloat, OpTypeVector, OpTypeArray, OpTypeRuntimeArray, OpTypeStruct, OpTypePointer.
-            21 => drop(types.insert(a[0], "u".to_owned())),
+            21 => drop(types.insert(a[0], if a[2] == 1 { "i" } else { "u" }.to_owned())),
             22 => drop(types.insert(a[0], "f".to_owned())),
             23 => drop(types.insert(a[0], of(&a[1]).repeat(a[2] as usize))),
             28 | 29 => drop(types.insert(a[0], of(&a[1]))),
@@ -232,22 +233,27 @@ fn a_pixel_moves_no_more_bytes_than_it_did() {
         sampler: crate::method::SamplerKind::Continued,
         ..Method::full(2)
     };
-    let moved = |method| -> Vec<(&str, f64)> {
-        let all = traffic(&settings_of(method), Keep::default());
-        all.iter().map(|t| (t.pass, t.read + t.written)).collect()
+    let moved_by = |settings: &RendererSettings| -> Vec<(&str, f64)> {
+        traffic(settings, Keep::default()).iter().map(|t| (t.pass, t.read + t.written)).collect()
     };
+    let moved = |method| moved_by(&settings_of(method));
     let expected = [
-        ("primary", 40.0),
-        ("reproject", 172.0),
+        ("primary", 32.0),
+        ("reproject", 160.0),
         ("schedule", 16.0),
-        ("trace", 60.0),
-        ("accumulate", 124.0),
+        ("trace", 52.0),
+        ("accumulate", 116.0),
         ("spatial", 76.0),
         ("pack", 7.0),
     ];
-    assert_eq!(moved(dpm), expected);
+    assert_eq!(moved(dpm.clone()), expected);
+    let planes_follow = RendererSettings { plane_groups: vec![Zeroable::zeroed()], ..settings_of(dpm) };
+    let all: Vec<_> = moved_by(&planes_follow).into_iter().filter(|pass| !expected.contains(pass)).collect();
+    assert_eq!(all, [("motion", 24.0), ("warp", 16.0)]);
+    let sum = |passes: &[(&str, f64)]| passes.iter().map(|(_, bytes)| bytes).sum::<f64>();
+    assert!(sum(&expected) + sum(&all) < 500.0);
     // Without a history nothing but the surface, the work list, the radiance and the code values moves.
     let expected =
-        [("primary", 16.0), ("schedule", 40.0), ("trace", 40.0), ("compensate", 36.0), ("pack", 7.0)];
+        [("primary", 16.0), ("schedule", 32.0), ("trace", 40.0), ("compensate", 36.0), ("pack", 7.0)];
     assert_eq!(moved(Method::full(2)), expected);
 }
