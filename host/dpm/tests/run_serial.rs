@@ -39,7 +39,9 @@ fn a_run_lights_whole_frames_reports_what_the_projector_said_and_ends_dark() {
         // The report contains what the projector counted.
         let p = report.projector.as_ref().expect("the link was used");
         let d = p.device.expect("an outside projector reports");
-        assert_eq!((d.lit, report.frames_lit), (u64::from(s.frames_lit), u64::from(s.frames_lit)));
+        assert_eq!(d.lit, u64::from(s.frames_lit));
+        // A report that was merged into a later one may be missing from what the run counts.
+        assert!((d.lit - d.lit_unseen..=d.lit).contains(&report.frames_lit), "{} {d:?}", report.frames_lit);
         assert_eq!(report.frames_lit + report.frames_dropped, FRAMES);
         assert_eq!(monitor.counts().frames_lit, report.frames_lit);
         // A machine that stands still, and tests beside this one, cost frames.
