@@ -22,7 +22,7 @@ bool alpha_present(uint instance, uint triangle, vec2 barycentric);
 #endif
 
 struct Hit {
-    uint id;          // As in Surface: the body, and its triangle in BVH order; NO_HIT: nothing was hit.
+    uint id;          // As in SurfaceHit: the body, and its triangle in BVH order; NO_HIT: nothing was hit.
     vec2 barycentric; // Weights of vertices 1 and 2.
     float t;
 };

@@ -103,7 +103,7 @@ vec3 light_at(uvec2 pixel, uint index);
 
 // Writes the code values of the pixel at `index`. To be called by every invocation that has a pixel.
 void compensate(uvec2 pixel, uint index) {
-    Surface surface = surface_at(index);
+    SurfaceHit surface = surface_at(index);
     uint nans = 0u, clipped = 0u, lit = 0u, code = 0u;
     if (surface.id != NO_HIT && surface.distance > 0.0) {
         uint instance = surface.id >> 24u;

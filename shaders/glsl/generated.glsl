@@ -405,7 +405,7 @@ struct AlbedoCell {
     vec4 corners;
 };
 
-struct Surface {
+struct SurfaceHit {
     uint id;
     float distance;
 };

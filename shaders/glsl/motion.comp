@@ -41,7 +41,7 @@ void main() {
     uvec2 pixel;
     if (!tile_pixel(tiles[gl_WorkGroupID.x >> 2u], pixel)) return;
     uint index = pixel.y * frame.width + pixel.x;
-    Surface surface = surface_at(index);
+    SurfaceHit surface = surface_at(index);
     uint owner = OWNER_NONE, depth = 0u;
     ivec2 motion = ivec2(0);
     if (surface.id != NO_HIT) {

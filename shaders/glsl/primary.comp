@@ -12,7 +12,7 @@
 layout(local_size_x = 8, local_size_y = 8) in;
 
 layout(set = 0, binding = B_TILES, scalar) readonly buffer Tiles { uint tiles[]; };
-layout(set = 0, binding = B_SURFACES, scalar) writeonly buffer Surfaces { Surface surfaces[]; };
+layout(set = 0, binding = B_SURFACES, scalar) writeonly buffer Surfaces { SurfaceHit surfaces[]; };
 layout(set = 0, binding = B_SURFACES, scalar) writeonly buffer Barycentrics { Barycentric barycentrics[]; };
 layout(set = 0, binding = B_GUIDES, scalar) writeonly buffer Sights { Sight sights[]; };
 layout(set = 0, binding = B_GUIDES, scalar) writeonly buffer Tints { Tint tints[]; };
@@ -70,7 +70,7 @@ bool still_seen(uvec2 pixel, uint instance, vec2 before) {
 void main() {
     uvec2 pixel;
     if (!tile_pixel(tiles[gl_WorkGroupID.x >> 2u], pixel)) return;
-    Surface surface = Surface(NO_HIT, 0.0);
+    SurfaceHit surface = SurfaceHit(NO_HIT, 0.0);
     vec3 direction = pixel_direction(pixel);
     bool camera_is_eye = (frame.flags & FRAME_CAMERA_IS_EYE) != 0u;
     uint mask = camera_is_eye ? 0u : INSTANCE_PROJECTED;

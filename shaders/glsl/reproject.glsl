@@ -27,7 +27,7 @@ bool is_known(uint index, uint instance) {
 vec2 place_before(uint instance, vec3 position) { return project(transform_point(instance_at(instance).previous_world_from_object, position)); }
 
 // The surface point of a lit pixel, body space.
-vec3 body_point(uvec2 pixel, Surface surface) {
+vec3 body_point(uvec2 pixel, SurfaceHit surface) {
     return transform_point(instance_at(surface.id >> 24u).object_from_world, pixel_direction(pixel) * surface.distance);
 }
 
@@ -43,7 +43,7 @@ bool tap_valid(uint index, uint instance, vec3 position, vec3 normal, float foot
 
 // The history that a lit pixel starts from: nothing is known of its surface point, and the point's sample sequence begins.
 History begin_history(uvec2 pixel, uint at, out Place place) {
-    Surface surface = surface_at(at);
+    SurfaceHit surface = surface_at(at);
     uint instance = surface.id >> 24u;
     uint triangle = surface.id & 0xffffffu;
     TriangleRef ref = triangle_ref_at(instance_at(instance).triangle_offset + triangle);

@@ -288,7 +288,7 @@ uint hidden_beside(uvec2 pixel) {
     uvec2 other = lit_beside(pixel);
     if (other == pixel) return NO_HIT;
     // The body that is lit there would have shown this pixel in the last frame as far away as it did that one.
-    Surface surface = surface_at(other.y * frame.width + other.x);
+    SurfaceHit surface = surface_at(other.y * frame.width + other.x);
     uint instance = surface.id >> 24u;
     vec2 before = place_before(instance, body_point(other, surface)) + (vec2(pixel) - vec2(other));
     return hidden_in(instance, vec2(pixel) + 0.5, before);

@@ -130,7 +130,7 @@ vec3 albedo_of(Tint t) { return vec3(unpackHalf2x16(t.albedo_rg), unpackHalf2x16
 // Angle at the eye between the gaze point and the surface point, degrees.
 float angle_of(Tint t) { return unpackHalf2x16(t.albedo_b_and_angle).y; }
 
-bool is_lit(Surface s) { return s.id != NO_HIT && s.distance > 0.0; }
+bool is_lit(SurfaceHit s) { return s.id != NO_HIT && s.distance > 0.0; }
 
 // A unit vector into 2 x 16 bits on the octahedron, and back.
 uint encode_normal(vec3 n) {

@@ -207,18 +207,18 @@ AlbedoCell albedo_cell_at(uint i) {
 
 #ifdef TEXEL_TABLES
 layout(set = 0, binding = B_SURFACE_ROWS, rgba32ui) uniform readonly uimageBuffer surface_rows_image;
-Surface surface_at(uint i) {
+SurfaceHit surface_at(uint i) {
     uint at = SURFACES_HIT_AT(i);
     uvec4 row = imageLoad(surface_rows_image, int(at >> 1u));
     uvec4 r0 = (at & 1u) == 0u ? row : row.zwxy;
-    return Surface(r0.x,
+    return SurfaceHit(r0.x,
         uintBitsToFloat(r0.y));
 }
 #else
-layout(set = 0, binding = B_SURFACES, scalar) readonly buffer surface_block { Surface surface_table[]; };
-Surface surface_at(uint i) {
+layout(set = 0, binding = B_SURFACES, scalar) readonly buffer surface_block { SurfaceHit surface_table[]; };
+SurfaceHit surface_at(uint i) {
     uint at = SURFACES_HIT_AT(i);
-    return Surface(surface_table[at].id,
+    return SurfaceHit(surface_table[at].id,
         surface_table[at].distance);
 }
 #endif

@@ -55,7 +55,7 @@ Sampler begin_sampler(uint at, uint spp) {
 
 // Where the paths of the pixel at index `at` begin.
 Hit first_hit(uint at) {
-    Surface surface = surface_at(at);
+    SurfaceHit surface = surface_at(at);
     return Hit(surface.id, barycentric_at(at).weights, abs(surface.distance));
 }
 

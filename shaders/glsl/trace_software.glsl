@@ -7,12 +7,12 @@ void main() {
     uint at = work[min(item, list.items - 1u)].pixel;
     uint spp = first_sample_of(list, item + 1u) - first_sample_of(list, item);
     if (item >= list.items) return;
-    Hit hit_first = first_hit(at);
-    if (hit_first.id == NO_HIT) {
+    Hit met = first_hit(at);
+    if (met.id == NO_HIT) {
         radiance_out[at] = vec4(background(at), 1.0);
         return;
     }
-    Point first = shading_point(hit_first, toward_eye(hit_first));
+    Point first = shading_point(met, toward_eye(met));
     Sampler rng = begin_sampler(at, spp);
     bool dpm = (frame.flags & FRAME_DPM) != 0u;
     Sums sums = NO_SAMPLES;

@@ -86,7 +86,7 @@ const BLOCKS: &[(&str, &str, usize)] = &[
     ("B_TEXTURES", "TextureInfo", size_of::<structs::TextureInfo>()),
     ("B_LIGHTS", "Light", size_of::<structs::Light>()),
     ("B_ALBEDO", "AlbedoCell", size_of::<structs::AlbedoCell>()),
-    ("B_SURFACES", "Surface", size_of::<structs::Surface>()),
+    ("B_SURFACES", "SurfaceHit", size_of::<structs::SurfaceHit>()),
     ("B_SURFACES", "Barycentric", size_of::<structs::Barycentric>()),
     ("B_COUNTERS", "Counters", size_of::<structs::Counters>()),
     ("B_GUIDES", "Sight", size_of::<structs::Sight>()),

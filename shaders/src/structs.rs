@@ -456,7 +456,7 @@ gpu_structs! {
     }
 
     /// What the projector ray of a pixel met.
-    struct Surface {
+    struct SurfaceHit {
         /// Instance in the high 8 bits, triangle of the body in BVH order in the low 24; `NO_HIT`: nothing.
         id: u32,
         /// Distance from the projector along the unit ray; negative: not lit (the eye cannot see it).
@@ -774,7 +774,7 @@ const fn element_name(of: &'static str) -> &'static str {
 
 // The larger elements come first, so that each part begins at a whole element.
 parts! {
-    "B_SURFACES": "hit" Surface, "inside" Barycentric,;
+    "B_SURFACES": "hit" SurfaceHit, "inside" Barycentric,;
     "B_GUIDES": "sight" Sight, "tint" Tint, "shift" Shift, "demand" u32,;
     "B_HISTORY": "light" HistoryLight, "place" HistoryPlace, "noise" HistoryNoise, "tag" HistoryTag, "seed" HistorySeed, "used" HistoryUsed,;
     "B_FORMER": "light" HistoryLight, "place" HistoryPlace, "noise" HistoryNoise, "tag" HistoryTag, "seed" HistorySeed, "used" HistoryUsed,;
@@ -841,7 +841,7 @@ tables! {
     TriangleRef "triangle_ref", "B_TRIANGLE_REFS" or "B_TRIANGLE_REFS";
     Material "material", "B_MATERIALS" or "B_MATERIALS";
     AlbedoCell "albedo_cell", "B_ALBEDO" or "B_ALBEDO";
-    Surface "surface", "B_SURFACES"."hit" or "B_SURFACE_ROWS";
+    SurfaceHit "surface", "B_SURFACES"."hit" or "B_SURFACE_ROWS";
     Barycentric "barycentric", "B_SURFACES"."inside" or "B_SURFACE_ROWS";
     Sight "sight", "B_GUIDES"."sight" or "B_GUIDE_ROWS";
     Tint "tint", "B_GUIDES"."tint" or "B_GUIDE_ROWS";

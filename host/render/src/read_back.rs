@@ -2,8 +2,8 @@
 
 use bytemuck::{Pod, Zeroable};
 use dpm_shaders::structs::{
-    self as gpu, in_blocks, part, Barycentric, HistoryLight, HistoryNoise, HistoryPlace, HistorySeed,
-    HistoryTag, HistoryUsed, Part, Sight, Tint, HISTORY_EXACT, HISTORY_USED, NO_FRAME, NO_HIT, PART_BLOCK,
+    in_blocks, part, Barycentric, HistoryLight, HistoryNoise, HistoryPlace, HistorySeed, HistoryTag,
+    HistoryUsed, Part, Sight, SurfaceHit, Tint, HISTORY_EXACT, HISTORY_USED, NO_FRAME, NO_HIT, PART_BLOCK,
 };
 
 /// What the projector ray of a pixel met.
@@ -61,7 +61,7 @@ impl Surface {
 
     /// Those of all pixels, from the bytes of the buffer.
     pub(crate) fn all(bytes: &[u8], pixels: usize) -> Vec<Self> {
-        let hits = elements::<gpu::Surface>(bytes, part("B_SURFACES", "hit"), pixels);
+        let hits = elements::<SurfaceHit>(bytes, part("B_SURFACES", "hit"), pixels);
         let inside = elements::<Barycentric>(bytes, part("B_SURFACES", "inside"), pixels);
         let both = hits.into_iter().zip(inside);
         both.map(|(hit, b)| Self { id: hit.id, barycentric: b.weights, distance: hit.distance }).collect()
@@ -76,7 +76,7 @@ impl Surface {
     /// The bytes of the buffer that holds `all`.
     pub fn bytes_of(all: &[Self]) -> Vec<u8> {
         let mut bytes = vec![0; Self::buffer_bytes(all.len())];
-        let hits = all.iter().map(|s| gpu::Surface { id: s.id, distance: s.distance });
+        let hits = all.iter().map(|s| SurfaceHit { id: s.id, distance: s.distance });
         place_elements(&mut bytes, part("B_SURFACES", "hit"), hits);
         let inside = all.iter().map(|s| Barycentric { weights: s.barycentric });
         place_elements(&mut bytes, part("B_SURFACES", "inside"), inside);

@@ -305,6 +305,11 @@ fn record(
     recording.and_then(|recording| Ok((recording, Showing::of(&lights, rate)?)))
 }
 
+/// Nobody rests to the instant: so much longer than a place takes is asked for, seconds.
+const SPARE_S: f64 = 0.5;
+/// From one place to the next, seconds.
+const WAY_S: f64 = 1.0;
+
 /// What the operator is told while the wand moves.
 enum Guide {
     /// How much of the raster was seen.
@@ -324,7 +329,7 @@ impl Guide {
                 "For {seconds:.0} s, hold the wand still for {:.1} s at one place of the beam after another, sensor towards \
                  the projector, near and far\nand tilted differently at each, and go slowly from one to the next. \
                  {FEWEST_PLACES} places are needed, twenty are good.",
-                hold_s + 0.5
+                hold_s + SPARE_S
             ),
         }
     }
@@ -333,7 +338,7 @@ impl Guide {
     fn least_s(&self) -> f64 {
         match self {
             Self::Coverage(_) => 0.0,
-            Self::Rests { hold_s, .. } => 1.5 * FEWEST_PLACES as f64 * (hold_s + 1.5),
+            Self::Rests { hold_s, .. } => 1.5 * FEWEST_PLACES as f64 * (hold_s + SPARE_S + WAY_S),
         }
     }
 
@@ -342,7 +347,7 @@ impl Guide {
         match self {
             Self::Coverage(_) => format!("Go on for {seconds:.0} s."),
             Self::Rests { hold_s, .. } => {
-                let hold_s = hold_s + 0.5;
+                let hold_s = hold_s + SPARE_S;
                 format!(
                     "Go on for {seconds:.0} s, and hold the wand still for {hold_s:.1} s at each place now."
                 )
@@ -503,5 +508,18 @@ mod tests {
         assert_eq!(moved.carried_too_few(&short, 0.5, 120.0), None, "the wand did not rest");
         let other = SensorError::LatencyUncertain { us: 2000.0 };
         assert_eq!(rests.carried_too_few(&other, 0.5, 120.0), None);
+    }
+
+    /// Who goes on at a lower rate is told how long a place takes now, and has time for half as many again as are needed.
+    #[test]
+    fn a_lower_rate_asks_for_longer_rests_and_leaves_time_for_them() {
+        let code = InverseCode::new(dpm_device::planes::Raster::new(128, 96).unwrap());
+        for (hz, told) in [(120.0, "1.1 s at each place"), (41.0, "1.6 s at each place")] {
+            let hold_s = code.hold_s(1e9 / hz);
+            let guide = Guide::Rests { hold_s, tip: DVec3::ZERO };
+            assert!(guide.again(30.0).contains(told), "{}", guide.again(30.0));
+            // The way to a place takes a second, and nobody rests to the instant.
+            assert!((guide.least_s() / (hold_s + 1.5) - 1.5 * FEWEST_PLACES as f64).abs() < 1e-9);
+        }
     }
 }
