@@ -83,35 +83,42 @@ struct Plane {
     float level, scatter;
 };
 
-// Adds the history `tap`, whose point is at `e` from the pixel's centre. A history that is not finite is skipped.
-void add_history(inout Around a, uint tap, vec2 e) {
-    vec3 m = former_light_at(tap).mean;
-    float w = former_light_at(tap).weight;
+// Whether the numbers of a history and the place `e` of its point are finite.
+bool is_sound(uint tap, vec2 e) {
+    HistoryLight l = former_light_at(tap);
+    HistoryNoise n = former_noise_at(tap);
+    return finite(n.drift) && finite(n.variance) && finite(n.surprise) && finite3(l.mean) && finite(l.weight) && finite(e.x + e.y);
+}
+
+// Adds the history `tap`, whose point is at `e` from the pixel's centre, if it is `used`. There is no branch, see `WRITTEN_OUT`.
+void add_history(inout Around a, uint tap, vec2 e, bool used) {
+    vec3 m = used ? former_light_at(tap).mean : vec3(0.0);
+    float w = used ? former_light_at(tap).weight : 0.0;
     HistoryNoise noise = former_noise_at(tap);
-    bool sound = finite(noise.drift) && finite(noise.variance) && finite(noise.surprise);
-    if (!sound || !finite3(m) || !finite(w) || !finite(e.x + e.y)) return;
+    e = used ? e : vec2(0.0);
+    float y = luminance(m);
+    vec2 we = w * e;
     a.weight += w;
-    a.count++;
-    a.x += w * e.x;
-    a.y += w * e.y;
-    a.xx += w * e.x * e.x;
-    a.xy += w * e.x * e.y;
-    a.yy += w * e.y * e.y;
+    a.count += used ? 1u : 0u;
+    a.x += we.x;
+    a.y += we.y;
+    a.xx += we.x * e.x;
+    a.xy += we.x * e.y;
+    a.yy += we.y * e.y;
     a.mean += w * m;
-    a.squares += w * luminance(m) * luminance(m);
-    a.mean_x += w * e.x * m;
-    a.mean_y += w * e.y * m;
-    a.lag_power += noise.drift * noise.drift;
-    a.noise_power += noise.surprise;
-    a.variance += noise.variance;
-    a.lower = min(a.lower, m);
-    a.upper = max(a.upper, m);
+    a.squares += w * y * y;
+    a.mean_x += we.x * m;
+    a.mean_y += we.y * m;
+    a.lag_power += used ? noise.drift * noise.drift : 0.0;
+    a.noise_power += used ? noise.surprise : 0.0;
+    a.variance += used ? noise.variance : 0.0;
+    a.lower = min(a.lower, used ? m : vec3(INFINITY));
+    a.upper = max(a.upper, used ? m : vec3(-INFINITY));
     float far = max(abs(e.x), abs(e.y));
-    if (far < a.distance) {
-        a.distance = far;
-        a.nearest = tap;
-        a.apart = e;
-    }
+    bool nearer = used && far < a.distance;
+    a.distance = nearer ? far : a.distance;
+    a.nearest = nearer ? tap : a.nearest;
+    a.apart = nearer ? e : a.apart;
 }
 
 // The valid histories among the nine around the former place of the surface point of `h`.
@@ -119,12 +126,19 @@ Around look_around(History h, Place place, vec2 centre) {
     Around a = Around(0u, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, vec3(0.0), vec3(0.0), vec3(0.0), 0.0, 0.0, 0.0, 0.0,
                       vec3(INFINITY), vec3(-INFINITY), NO_HIT, FARTHEST_PX, vec2(0.0));
     ivec2 corner = ivec2(floor(clamp(place.before, vec2(-MARGIN_PX), vec2(frame.width, frame.height) + MARGIN_PX)));
-    for (int i = 0; i < 9; i++) {
-        ivec2 q = corner + ivec2(i % 3, i / 3) - 1;
-        if (!on_raster(q)) continue;
-        uint tap = uint(q.y) * frame.width + uint(q.x);
-        if (!tap_valid(tap, h.instance, h.position, place.normal, place.footprint, DEPTH)) continue;
-        add_history(a, tap, project(transform_point(instance_at(h.instance).world_from_object, former_place_at(tap).position)) - centre);
+    vec4 world_from_object[3] = instance_at(h.instance).world_from_object;
+    [[dont_unroll]] for (int row = -1; row <= 1; row++) {
+        WRITTEN_OUT for (int column = -1; column <= 1; column++) {
+            uint tap;
+            bool valid = pixel_beside(corner + ivec2(column, row), tap);
+            UNLESS_SKIP(valid)
+            valid = tap_valid(tap, h.instance, h.position, place.normal, place.footprint, DEPTH) && valid;
+            UNLESS_SKIP(valid)
+            vec2 e = project(transform_point(world_from_object, former_place_at(tap).position)) - centre;
+            valid = is_sound(tap, e) && valid;
+            UNLESS_SKIP(valid)
+            add_history(a, tap, e, valid);
+        }
     }
     return a;
 }
@@ -254,11 +268,14 @@ vec3 carry_point(inout History h, Place place, uvec2 pixel, uint at) {
 // One of the eight pixels around that is lit, the pixel itself: none.
 uvec2 lit_beside(uvec2 pixel) {
     const ivec2 beside[8] = ivec2[](ivec2(-1, 0), ivec2(1, 0), ivec2(0, -1), ivec2(0, 1), ivec2(-1, -1), ivec2(1, -1), ivec2(-1, 1), ivec2(1, 1));
-    for (int i = 0; i < 8; i++) {
+    uvec2 found = pixel;
+    WRITTEN_OUT for (int i = 7; i >= 0; i--) {
         ivec2 q = ivec2(pixel) + beside[i];
-        if (on_raster(q) && is_lit(surface_at(uint(q.y) * frame.width + uint(q.x)))) return uvec2(q);
+        uint index;
+        bool there = pixel_beside(q, index);
+        if (is_lit(surface_at(index)) && there) found = uvec2(q);
     }
-    return pixel;
+    return found;
 }
 
 // The history of the body `instance` whose point is now in the pixel and faces the projector, NO_HIT: none.
@@ -266,17 +283,21 @@ uint hidden_in(uint instance, vec2 centre, vec2 before) {
     ivec2 corner = ivec2(floor(clamp(before, vec2(-MARGIN_PX), vec2(frame.width, frame.height) + MARGIN_PX)));
     float nearest = HIDDEN_PX;
     uint owner = NO_HIT;
-    for (int i = 0; i < 9; i++) {
-        ivec2 q = corner + ivec2(i % 3, i / 3) - 1;
-        if (!on_raster(q)) continue;
-        uint tap = uint(q.y) * frame.width + uint(q.x);
-        if (!is_known(tap, instance)) continue;
-        vec3 p = transform_point(instance_at(instance).world_from_object, former_place_at(tap).position);
-        vec2 e = project(p) - centre;
-        float far = max(abs(e.x), abs(e.y));
-        if (far < nearest && dot(transform_vector(instance_at(instance).world_from_object, decode_normal(former_place_at(tap).normal)), p) < 0.0) {
-            nearest = far;
-            owner = tap;
+    vec4 world_from_object[3] = instance_at(instance).world_from_object;
+    [[dont_unroll]] for (int row = -1; row <= 1; row++) {
+        WRITTEN_OUT for (int column = -1; column <= 1; column++) {
+            uint tap;
+            bool known = pixel_beside(corner + ivec2(column, row), tap);
+            UNLESS_SKIP(known)
+            known = is_known(tap, instance) && known;
+            UNLESS_SKIP(known)
+            vec3 p = transform_point(world_from_object, former_place_at(tap).position);
+            vec2 e = project(p) - centre;
+            float far = max(abs(e.x), abs(e.y));
+            bool faces = dot(transform_vector(world_from_object, normal_direction(former_place_at(tap).normal)), p) < 0.0;
+            bool nearer = known && faces && far < nearest;
+            nearest = nearer ? far : nearest;
+            owner = nearer ? tap : owner;
         }
     }
     return owner;

@@ -3,8 +3,19 @@
 #extension GL_GOOGLE_include_directive : require
 #extension GL_KHR_shader_subgroup_basic : require
 #extension GL_KHR_shader_subgroup_arithmetic : require
+#extension GL_EXT_control_flow_attributes : require
 #include "generated.glsl"
 #include "tables.glsl"
+
+// A loop over a few pixels around. On software Vulkan it is written out and has no branch: there a loop keeps in memory what it carries, and an `if`
+// writes that under a mask and skips nothing. On GPUs it stays a loop, because it would take registers, and skips what does not count.
+#ifdef TEXEL_TABLES
+#define WRITTEN_OUT [[unroll]]
+#define UNLESS_SKIP(counts)
+#else
+#define WRITTEN_OUT [[dont_unroll]]
+#define UNLESS_SKIP(counts) if (!(counts)) continue;
+#endif
 
 // A storage block, although it is small. Mesa's software Vulkan compiles a shader again for every value of a uniform block that a branch or loop
 // reads, which took 15 ms of every frame. The block is read once, where every lane is active, because elsewhere software Vulkan reads lane by lane.
@@ -124,6 +135,13 @@ bool tile_pixel(uint tile, out uvec2 pixel) {
 // Whether a raster position is a pixel of the picture.
 bool on_raster(ivec2 q) { return all(greaterThanEqual(q, ivec2(0))) && all(lessThan(q, ivec2(frame.width, frame.height))); }
 
+// The same with the index of that pixel. Off the raster it is the index of the nearest pixel, which may be read without a branch.
+bool pixel_beside(ivec2 q, out uint index) {
+    ivec2 nearest = clamp(q, ivec2(0), ivec2(frame.width, frame.height) - 1);
+    index = uint(nearest.y) * frame.width + uint(nearest.x);
+    return nearest == q;
+}
+
 // Reflectance of the surface. Method dpm divides radiance by it before it is stored and filtered.
 vec3 albedo_of(Tint t) { return vec3(unpackHalf2x16(t.albedo_rg), unpackHalf2x16(t.albedo_b_and_angle).x); }
 
@@ -139,11 +157,18 @@ uint encode_normal(vec3 n) {
     return packSnorm2x16(e);
 }
 
+// The direction of a normal, of any length: software Vulkan divides slowly.
+vec3 normal_direction(uint bits) {
+    const float most = 32767.0;
+    vec2 e = vec2(ivec2(int(bits << 16u), int(bits)) >> 16);
+    vec3 n = vec3(e, most - abs(e.x) - abs(e.y));
+    if (n.z < 0.0) n.xy = (most - abs(n.yx)) * vec2(n.x >= 0.0 ? 1.0 : -1.0, n.y >= 0.0 ? 1.0 : -1.0);
+    return n;
+}
+
 vec3 decode_normal(uint bits) {
-    vec2 e = unpackSnorm2x16(bits);
-    vec3 n = vec3(e, 1.0 - abs(e.x) - abs(e.y));
-    if (n.z < 0.0) n.xy = (1.0 - abs(n.yx)) * vec2(n.x >= 0.0 ? 1.0 : -1.0, n.y >= 0.0 ? 1.0 : -1.0);
-    return normalize(n);
+    vec3 n = normal_direction(bits);
+    return n * inversesqrt(dot(n, n));
 }
 
 uint hash_u32(uint x) {

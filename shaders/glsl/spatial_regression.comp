@@ -26,10 +26,10 @@ const float LAG_RADIUS_PX = 6.0;
 const float LEAST_CORRECTION = 0.5, MOST_CORRECTION = 2.0;
 // Neighbours in the regression have normals with at least this cosine to the pixel's, and lie within so many footprints of its tangent plane.
 const float LIKE_NORMAL = 0.6, DEPTH = 3.0;
-// Unknowns of the regression: constant, x, y, and two components of the normal.
-const int N = 5;
 // Expected squares of the slopes relative to the light: 2 % a pixel over the raster, and a third over the normal's whole range.
 const float RASTER_SLOPES = 4e-4, NORMAL_SLOPES = 0.1;
+// What is left of an unknown is never taken as smaller, so that one can divide by it.
+const float LEAST_PIVOT = 1e-12;
 
 // The regression's weighted sums over the neighbours.
 struct Sums {
@@ -48,10 +48,9 @@ float weight_of(Filtered f) { return unpackHalf2x16(f.weight_and_albedo).x; }
 
 // Whether something is known of the light at raster position `q`, on the body `instance`. The surface itself need not be read.
 bool known_beside(ivec2 q, uint instance, out uint tap) {
-    tap = 0u;
-    if (!on_raster(q)) return false;
-    tap = uint(q.y) * frame.width + uint(q.x);
-    return weight_of(filtered_at(tap)) > 0.0 && ((history_noise_at(tap).body_and_used / (HISTORY_USED + 1u)) & 255u) == instance;
+    bool there = pixel_beside(q, tap);
+    bool weighs = (filtered_at(tap).weight_and_albedo & 0xffffu) != 0u;
+    return there && weighs && ((history_noise_at(tap).body_and_used / (HISTORY_USED + 1u)) & 255u) == instance;
 }
 
 // How far the history lags: a slope of the light over the histories' age is fitted to the drifts around, as far as chance does not explain it.
@@ -59,15 +58,19 @@ float lag_of(uvec2 pixel, uint at) {
     uint instance = surface_at(at).id >> 24u;
     vec3 normal = decode_normal(history_place_at(at).normal);
     mat2 rotation = turn_of(pixel, 0u);
-    float per_frame = samples_a_frame();
-    float age = weight_of(filtered_at(at)) / per_frame, drift = history_noise_at(at).drift;
+    float frames = 1.0 / samples_a_frame();
+    float age = weight_of(filtered_at(at)) * frames, drift = history_noise_at(at).drift;
     float xx = age * age, xy = age * drift, yy = drift * drift, used = 1.0;
     for (int i = 0; i < 12; i++) {
         ivec2 q = ivec2(pixel) + ivec2(round(rotation * DISK[i] * LAG_RADIUS_PX));
         uint tap;
         if (q == ivec2(pixel) || !known_beside(q, instance, tap)) continue;
-        float w = pow(max(dot(decode_normal(history_place_at(tap).normal), normal), 0.0), 8.0);
-        float x = weight_of(filtered_at(tap)) / per_frame, y = history_noise_at(tap).drift;
+        vec3 n = normal_direction(history_place_at(tap).normal);
+        // The eighth power of the cosine.
+        float cosine = max(dot(n, normal), 0.0), w = cosine * cosine / dot(n, n);
+        w *= w;
+        w *= w;
+        float x = weight_of(filtered_at(tap)) * frames, y = history_noise_at(tap).drift;
         xx += w * x * x;
         xy += w * x * y;
         yy += w * y * y;
@@ -81,106 +84,139 @@ float lag_of(uvec2 pixel, uint at) {
     return trust * xy / max(xx, 1e-12) * age;
 }
 
-// Fills the normal equations `a` (lower triangle by rows) and `b` from the 5 x 5 pixels around.
-Sums gather(uvec2 pixel, uint at, vec3 own, float tolerated, out float a[15], out vec3 b[N]) {
+// The normal equations of the regression. The unknowns are two slopes over the raster, two over the normal, and the constant.
+struct Equations {
+    // Diagonal of the matrix.
+    vec4 slopes;
+    float constant;
+    // What lies beside the diagonal: each unknown with those after it.
+    vec4 x;
+    vec3 y;
+    vec2 u;
+    float v;
+    // Right sides, a column for each unknown.
+    vec3 light_x, light_y, light_u, light_v, light;
+};
+
+// Fills the normal equations from the 5 x 5 pixels around.
+Sums gather(uvec2 pixel, uint at, vec3 own, float tolerated, out Equations a) {
     uint instance = surface_at(at).id >> 24u;
     vec3 position = history_place_at(at).position;
     vec3 normal = decode_normal(history_place_at(at).normal);
     vec3 across = normalize(abs(normal.x) < 0.7 ? cross(normal, vec3(1.0, 0.0, 0.0)) : cross(normal, vec3(0.0, 1.0, 0.0)));
     vec3 along = cross(normal, across);
-    float footprint = abs(surface_at(at).distance) * frame.pixel_size;
-    for (int i = 0; i < 15; i++) a[i] = 0.0;
-    for (int i = 0; i < N; i++) b[i] = vec3(0.0);
+    float farthest = DEPTH * abs(surface_at(at).distance) * frame.pixel_size;
+    a = Equations(vec4(0.0), 0.0, vec4(0.0), vec3(0.0), vec2(0.0), 0.0, vec3(0.0), vec3(0.0), vec3(0.0), vec3(0.0), vec3(0.0));
     Sums s = Sums(0.0, 0.0, 0.0, 0.0, 0.0);
-    for (int i = 0; i < 25; i++) {
-        ivec2 d = ivec2(i % 5, i / 5) - 2;
-        uint tap;
-        if (!known_beside(ivec2(pixel) + d, instance, tap)) continue;
-        vec3 n = decode_normal(history_place_at(tap).normal);
-        if (dot(n, normal) < LIKE_NORMAL || abs(dot(history_place_at(tap).position - position, normal)) > DEPTH * footprint) continue;
-        vec2 weight_and_albedo = unpackHalf2x16(filtered_at(tap).weight_and_albedo);
-        float weight = weight_and_albedo.x, light = weight_and_albedo.y;
-        float noise = history_noise_at(tap).variance * sequence_variance(weight) / (weight * light * light);
-        float w = 1.0 / (noise + tolerated);
-        vec3 m = filtered_at(tap).light - own;
-        // Without loops, of which software Vulkan would keep the arrays in memory.
-        vec2 e = vec2(d);
-        vec2 f = vec2(dot(n, across), dot(n, along));
-        vec2 we = w * e, wf = w * f;
-        a[0] += w;
-        a[1] += we.x;
-        a[2] += we.x * e.x;
-        a[3] += we.y;
-        a[4] += we.y * e.x;
-        a[5] += we.y * e.y;
-        a[6] += wf.x;
-        a[7] += wf.x * e.x;
-        a[8] += wf.x * e.y;
-        a[9] += wf.x * f.x;
-        a[10] += wf.y;
-        a[11] += wf.y * e.x;
-        a[12] += wf.y * e.y;
-        a[13] += wf.y * f.x;
-        a[14] += wf.y * f.y;
-        b[0] += w * m;
-        b[1] += we.x * m;
-        b[2] += we.y * m;
-        b[3] += wf.x * m;
-        b[4] += wf.y * m;
-        float y = luminance(m);
-        s.power += w * y * y;
-        s.total += w;
-        s.used += 1.0;
-        s.expected += w * noise;
-        s.single += noise * weight;
+    [[dont_unroll]] for (int row = -2; row <= 2; row++) {
+        WRITTEN_OUT for (int column = -2; column <= 2; column++) {
+            ivec2 d = ivec2(column, row);
+            uint tap;
+            bool like = known_beside(ivec2(pixel) + d, instance, tap);
+            UNLESS_SKIP(like)
+            vec3 n = decode_normal(history_place_at(tap).normal);
+            like = like && dot(n, normal) >= LIKE_NORMAL && abs(dot(history_place_at(tap).position - position, normal)) <= farthest;
+            UNLESS_SKIP(like)
+            vec2 weight_and_albedo = unpackHalf2x16(filtered_at(tap).weight_and_albedo);
+            float weight = weight_and_albedo.x, light = weight_and_albedo.y;
+            float noise = like ? history_noise_at(tap).variance * sequence_variance(weight) / (weight * light * light) : 0.0;
+            float w = like ? 1.0 / (noise + tolerated) : 0.0;
+            vec3 m = like ? filtered_at(tap).light - own : vec3(0.0);
+            vec4 e = vec4(d, dot(n, across), dot(n, along));
+            vec4 we = w * e;
+            a.slopes += we * e;
+            a.constant += w;
+            a.x += we.x * vec4(e.yzw, 1.0);
+            a.y += we.y * vec3(e.zw, 1.0);
+            a.u += we.z * vec2(e.w, 1.0);
+            a.v += we.w;
+            a.light_x += we.x * m;
+            a.light_y += we.y * m;
+            a.light_u += we.z * m;
+            a.light_v += we.w * m;
+            a.light += w * m;
+            float y = luminance(m);
+            s.power += w * y * y;
+            s.total += w;
+            s.used += like ? 1.0 : 0.0;
+            s.expected += w * noise;
+            s.single += like ? noise * weight : 0.0;
+        }
     }
     return s;
 }
 
-// Solves the normal equations by Cholesky's decomposition, with the solution in `b`. Returns the power that the fit explains, which is that of the
-// solution of the first triangle.
-float solve(inout float a[15], inout vec3 b[N]) {
-    float explained = 0.0;
-    for (int r = 0; r < N; r++) {
-        for (int c = 0; c <= r; c++) {
-            float sum = a[r * (r + 1) / 2 + c];
-            for (int k = 0; k < c; k++) sum -= a[r * (r + 1) / 2 + k] * a[c * (c + 1) / 2 + k];
-            a[r * (r + 1) / 2 + c] = r == c ? sqrt(max(sum, 1e-12)) : sum / a[c * (c + 3) / 2];
-        }
-        for (int k = 0; k < r; k++) b[r] -= a[r * (r + 1) / 2 + k] * b[k];
-        b[r] /= a[r * (r + 3) / 2];
-        float e = luminance(b[r]);
-        explained += e * e;
-    }
-    for (int r = N - 1; r >= 0; r--) {
-        for (int k = r + 1; k < N; k++) b[r] -= a[k * (k + 1) / 2 + r] * b[k];
-        b[r] /= a[r * (r + 3) / 2];
-    }
-    return explained;
+// The power that an unknown explains when it is taken out, by its right side and the inverse of its pivot.
+float explained_by(vec3 light, float inverse) {
+    float y = luminance(light);
+    return y * y * inverse;
+}
+
+// Solves the normal equations for the constant, which is the last of the unknowns: the others are taken out one after the other, and need not be
+// known. `explained` is the power that the fit explains. Without arrays, which software Vulkan would keep in memory.
+vec3 solve(Equations a, out float explained) {
+    float inverse = 1.0 / max(a.slopes.x, LEAST_PIVOT);
+    vec4 x = a.x * inverse;
+    a.slopes.yzw -= x.xyz * a.x.xyz;
+    a.constant -= x.w * a.x.w;
+    a.y -= x.x * a.x.yzw;
+    a.u -= x.y * a.x.zw;
+    a.v -= x.z * a.x.w;
+    a.light_y -= x.x * a.light_x;
+    a.light_u -= x.y * a.light_x;
+    a.light_v -= x.z * a.light_x;
+    a.light -= x.w * a.light_x;
+    explained = explained_by(a.light_x, inverse);
+    inverse = 1.0 / max(a.slopes.y, LEAST_PIVOT);
+    vec3 y = a.y * inverse;
+    a.slopes.zw -= y.xy * a.y.xy;
+    a.constant -= y.z * a.y.z;
+    a.u -= y.x * a.y.yz;
+    a.v -= y.y * a.y.z;
+    a.light_u -= y.x * a.light_y;
+    a.light_v -= y.y * a.light_y;
+    a.light -= y.z * a.light_y;
+    explained += explained_by(a.light_y, inverse);
+    inverse = 1.0 / max(a.slopes.z, LEAST_PIVOT);
+    vec2 u = a.u * inverse;
+    a.slopes.w -= u.x * a.u.x;
+    a.constant -= u.y * a.u.y;
+    a.v -= u.x * a.u.y;
+    a.light_v -= u.x * a.light_u;
+    a.light -= u.y * a.light_u;
+    explained += explained_by(a.light_u, inverse);
+    inverse = 1.0 / max(a.slopes.w, LEAST_PIVOT);
+    float v = a.v * inverse;
+    a.constant -= v * a.v;
+    a.light -= v * a.light_v;
+    explained += explained_by(a.light_v, inverse);
+    inverse = 1.0 / max(a.constant, LEAST_PIVOT);
+    explained += explained_by(a.light, inverse);
+    return a.light * inverse;
 }
 
 // The light at the surface by the regression, blended in as far as what the regression misses is noise.
 vec3 regressed(uvec2 pixel, uint at, vec3 own) {
     float level = max(luminance(own), LEAST_LEVEL);
-    float a[15];
-    vec3 b[N];
-    Sums s = gather(pixel, at, own, TOLERANCE * TOLERANCE * level * level, a, b);
+    Equations a;
+    Sums s = gather(pixel, at, own, TOLERANCE * TOLERANCE * level * level, a);
     if (s.used < 4.0) return own;
-    for (int r = 1; r < N; r++) a[r * (r + 3) / 2] += 1.0 / ((r < 3 ? RASTER_SLOPES : NORMAL_SLOPES) * level * level);
-    float explained = solve(a, b);
+    a.slopes += vec4(vec2(1.0 / (RASTER_SLOPES * level * level)), vec2(1.0 / (NORMAL_SLOPES * level * level)));
+    float explained;
+    vec3 step_ = solve(a, explained);
     // The structure that the fit misses, around or at this very pixel, against the noise that the eye's mean leaves [Lee80].
     float structure = max(max(s.power - explained, 0.0) / s.total * s.used / max(s.used - 4.0, 1.0) - s.expected / s.total, 0.0);
     // A single pixel hardly knows the variance of its samples, so that of the neighbourhood is taken. It does know their number.
     float held = weight_of(filtered_at(at));
     float noise = s.single / s.used / max(held, 1e-6);
-    float apart = luminance(b[0]);
+    float apart = luminance(step_);
     // In the periphery the eye sees flicker better than blur.
     float beyond = periphery(angle_of(tint_at(at)));
     structure = max(structure, apart * apart - mix(3.0, 16.0, beyond) * noise);
     // The eye's mean removes what changes from frame to frame. Of a young point that is little, because all its frames share the same samples.
     float changing = min(SEEN_FRAMES * samples_a_frame(), OWN_CHANGING * float(history_noise_at(at).body_and_used & HISTORY_USED));
     noise *= mix(1.0, 5.0, beyond) * held / (held + changing);
-    vec3 result = own + b[0] * (noise / max(structure + noise, 1e-12));
+    vec3 result = own + step_ * (noise / max(structure + noise, 1e-12));
     return finite3(result) ? max(result, vec3(0.0)) : own;
 }
 
