@@ -10,8 +10,6 @@ layout(local_size_x = 8, local_size_y = 8) in;
 
 layout(set = 0, binding = B_TILES, scalar) readonly buffer Tiles { uint tiles[]; };
 layout(set = 0, binding = B_RADIANCE, scalar) readonly buffer Radiance { vec4 radiance_in[]; };
-layout(set = 0, binding = B_HISTORY, scalar) writeonly buffer HistoryLights { HistoryLight history_lights[]; };
-layout(set = 0, binding = B_FILTERED, scalar) writeonly buffer FilteredBlock { Filtered filtered[]; };
 
 // Frames are counted up to here. The weight of a new frame has long been the one by angle then.
 const float MOST_FRAMES = 4096.0;
@@ -46,7 +44,7 @@ void main() {
     if (!tile_pixel(tiles[gl_WorkGroupID.x >> 2u], pixel)) return;
     uint at = pixel.y * frame.width + pixel.x;
     if (!is_lit(surface_at(at))) {
-        filtered[at] = Filtered(vec3(0.0), 0u);
+        set_filtered(at, Filtered(vec3(0.0), 0u));
         return;
     }
     HistoryLight h = history_light_at(at);
@@ -56,6 +54,6 @@ void main() {
     vec4 traced = is_traced_block(pixel, size) ? radiance_in[from] : vec4(0.0);
     if (traced.w > 0.0) add_frame(h, traced.rgb, at);
     else if (!(h.weight > 0.0)) borrow(h, pixel, size);
-    filtered[at] = Filtered(h.mean, 0u);
-    history_lights[HISTORY_LIGHT_AT(at)] = h;
+    set_filtered(at, Filtered(h.mean, 0u));
+    set_history_light(at, h);
 }

@@ -11,9 +11,6 @@ layout(local_size_x = 8, local_size_y = 8) in;
 
 layout(set = 0, binding = B_TILES, scalar) readonly buffer Tiles { uint tiles[]; };
 layout(set = 0, binding = B_RADIANCE, scalar) readonly buffer Radiance { vec4 radiance_in[]; };
-layout(set = 0, binding = B_HISTORY, scalar) writeonly buffer HistoryLights { HistoryLight history_lights[]; };
-layout(set = 0, binding = B_HISTORY, scalar) writeonly buffer HistoryNoises { HistoryNoise history_noises[]; };
-layout(set = 0, binding = B_FILTERED, scalar) writeonly buffer FilteredBlock { Filtered filtered[]; };
 
 // Share of the light by which a frame's noise may stray before a history helps against it.
 const float UNSEEN = 0.002;
@@ -72,7 +69,7 @@ void main() {
     uint at = pixel.y * frame.width + pixel.x;
     uint demand = demand_at(at);
     if (demand == DEMAND_NOT_LIT) {
-        filtered[at] = Filtered(vec3(0.0), 0u);
+        set_filtered(at, Filtered(vec3(0.0), 0u));
         return;
     }
     HistoryLight l = history_light_at(at);
@@ -83,10 +80,10 @@ void main() {
         if (traced.w > 0.0) {
             HistoryNoise n = history_noise_at(at);
             add_samples(l, n, traced, shift, albedo, unpack_moments(demand));
-            history_lights[HISTORY_LIGHT_AT(at)] = l;
-            history_noises[HISTORY_NOISE_AT(at)] = n;
+            set_history_light(at, l);
+            set_history_noise(at, n);
         }
     }
     // A half is finite up to MOST_HALF.
-    filtered[at] = Filtered(max(l.mean + shift, vec3(0.0)), packHalf2x16(vec2(min(l.weight, MOST_HALF), luminance(albedo))));
+    set_filtered(at, Filtered(max(l.mean + shift, vec3(0.0)), packHalf2x16(vec2(min(l.weight, MOST_HALF), luminance(albedo)))));
 }

@@ -12,10 +12,6 @@
 layout(local_size_x = 8, local_size_y = 8) in;
 
 layout(set = 0, binding = B_TILES, scalar) readonly buffer Tiles { uint tiles[]; };
-layout(set = 0, binding = B_SURFACES, scalar) writeonly buffer Surfaces { SurfaceHit surfaces[]; };
-layout(set = 0, binding = B_SURFACES, scalar) writeonly buffer Barycentrics { Barycentric barycentrics[]; };
-layout(set = 0, binding = B_GUIDES, scalar) writeonly buffer Sights { Sight sights[]; };
-layout(set = 0, binding = B_GUIDES, scalar) writeonly buffer Tints { Tint tints[]; };
 
 // Reflectance of the look for uniform white light, approximately. It varies with the texture but not with the light. Light from below the surface
 // itself is lost, whatever the direction of the shading normal: that share of a cosine lobe is (1 - cos) / 2 of the angle between the normals.
@@ -105,17 +101,17 @@ void main() {
                 float angle = degrees(acos(clamp(c, -1.0, 1.0)));
                 if (HAS_DEMODULATION) {
                     vec3 albedo = demodulation(hit, to_eye / max(l_e, 1e-12));
-                    tints[GUIDES_TINT_AT(at)] = Tint(packHalf2x16(albedo.rg), packHalf2x16(vec2(albedo.b, angle)));
+                    set_tint(at, Tint(packHalf2x16(albedo.rg), packHalf2x16(vec2(albedo.b, angle))));
                 }
                 if (!HAS_DEMODULATION || (frame.flags & FRAME_SHOWS_ALL) != 0u) {
                     // [paper] eq. 3, limited where the light falls at a grazing angle.
                     float size = min((abs(eye_side) / max(l_e * l_e, 1e-12)) * (l_p * l_p / max(abs(dot(g, to_projector)), 1e-6)), 1e3);
-                    sights[GUIDES_SIGHT_AT(at)] = Sight(vec2(pixel) + 0.5 - before, size, angle);
+                    set_sight(at, Sight(vec2(pixel) + 0.5 - before, size, angle));
                 }
             }
         }
     }
-    surfaces[SURFACES_HIT_AT(at)] = surface;
-    barycentrics[SURFACES_INSIDE_AT(at)] = Barycentric(hit.barycentric);
+    set_surface(at, surface);
+    set_barycentric(at, Barycentric(hit.barycentric));
     COUNT(rays, closest + shadow)
 }

@@ -12,8 +12,6 @@
 layout(local_size_x = 8, local_size_y = 8) in;
 
 layout(set = 0, binding = B_SCHEDULE, scalar) buffer ScheduleBlock { Schedule schedule; };
-// What accumulate_samples.comp adds to a history's mean to get the light at the pixel's own surface point.
-layout(set = 0, binding = B_GUIDES, scalar) writeonly buffer Shifts { Shift shifts[]; };
 
 // Where histories are looked for.
 // A history may lie this many footprints off the tangent plane of the surface point.
@@ -327,7 +325,7 @@ void main() {
         keeps = true;
         Place place;
         h = begin_history(pixel, at, place);
-        shifts[GUIDES_SHIFT_AT(at)] = pack_shift(carry_point(h, place, pixel, at));
+        set_shift(at, pack_shift(carry_point(h, place, pixel, at)));
         h.flags &= ~HISTORY_HIDDEN;
         importance = importance_of(h);
         demand = importance | ((h.flags & HISTORY_EXACT) != 0u ? DEMAND_EXACT : 0u) | (h.used == 0u ? DEMAND_NEW : 0u);

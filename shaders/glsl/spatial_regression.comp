@@ -34,7 +34,6 @@ const float LEAST_PIVOT = 1e-12;
 // The regression's weighted sums over the neighbours.
 struct Sums {
     float used;     // Number of neighbours.
-    float total;    // Their weights.
     float power;    // Weighted squares of their luminance, relative to the pixel's own.
     float expected; // Weighted variances that chance explains.
     float single;   // Sum of the variances of one sample.
@@ -86,9 +85,8 @@ float lag_of(uvec2 pixel, uint at) {
 
 // The normal equations of the regression. The unknowns are two slopes over the raster, two over the normal, and the constant.
 struct Equations {
-    // Diagonal of the matrix.
-    vec4 slopes;
-    float constant;
+    vec4 slopes;    // Diagonal of the matrix.
+    float constant; // The sum of the weights.
     // What lies beside the diagonal: each unknown with those after it.
     vec4 x;
     vec3 y;
@@ -107,7 +105,7 @@ Sums gather(uvec2 pixel, uint at, vec3 own, float tolerated, out Equations a) {
     vec3 along = cross(normal, across);
     float farthest = DEPTH * abs(surface_at(at).distance) * frame.pixel_size;
     a = Equations(vec4(0.0), 0.0, vec4(0.0), vec3(0.0), vec2(0.0), 0.0, vec3(0.0), vec3(0.0), vec3(0.0), vec3(0.0), vec3(0.0));
-    Sums s = Sums(0.0, 0.0, 0.0, 0.0, 0.0);
+    Sums s = Sums(0.0, 0.0, 0.0, 0.0);
     [[dont_unroll]] for (int row = -2; row <= 2; row++) {
         WRITTEN_OUT for (int column = -2; column <= 2; column++) {
             ivec2 d = ivec2(column, row);
@@ -137,7 +135,6 @@ Sums gather(uvec2 pixel, uint at, vec3 own, float tolerated, out Equations a) {
             a.light += w * m;
             float y = luminance(m);
             s.power += w * y * y;
-            s.total += w;
             s.used += like ? 1.0 : 0.0;
             s.expected += w * noise;
             s.single += like ? noise * weight : 0.0;
@@ -202,10 +199,10 @@ vec3 regressed(uvec2 pixel, uint at, vec3 own) {
     Sums s = gather(pixel, at, own, TOLERANCE * TOLERANCE * level * level, a);
     if (s.used < 4.0) return own;
     a.slopes += vec4(vec2(1.0 / (RASTER_SLOPES * level * level)), vec2(1.0 / (NORMAL_SLOPES * level * level)));
-    float explained;
+    float explained, total = a.constant;
     vec3 step_ = solve(a, explained);
     // The structure that the fit misses, around or at this very pixel, against the noise that the eye's mean leaves [Lee80].
-    float structure = max(max(s.power - explained, 0.0) / s.total * s.used / max(s.used - 4.0, 1.0) - s.expected / s.total, 0.0);
+    float structure = max(max(s.power - explained, 0.0) / total * s.used / max(s.used - 4.0, 1.0) - s.expected / total, 0.0);
     // A single pixel hardly knows the variance of its samples, so that of the neighbourhood is taken. It does know their number.
     float held = weight_of(filtered_at(at));
     float noise = s.single / s.used / max(held, 1e-6);

@@ -1,7 +1,7 @@
 // Written by build-shaders from shaders/src/structs.rs. Do not edit.
 //
 // Tables: storage on GPUs; rows of texel buffers on software Vulkan, which reads storage lane by lane where lanes part. What is
-// not used of an element is not read.
+// not used of an element is not read. Software Vulkan writes lane by lane too, member by member, so there an element is written as one row.
 
 #ifdef TEXEL_TABLES
 layout(set = 0, binding = B_INSTANCES, rgba32ui) uniform readonly uimageBuffer instances_image;
@@ -224,6 +224,14 @@ SurfaceHit surface_at(uint i) {
 #endif
 
 #ifdef TEXEL_TABLES
+layout(set = 0, binding = B_SURFACES, scalar) writeonly buffer surfaces_uvec2s_block { uvec2 surfaces_uvec2s[]; };
+void set_surface(uint i, SurfaceHit v) { surfaces_uvec2s[SURFACES_HIT_AT(i)] = uvec2(v.id, floatBitsToUint(v.distance)); }
+#else
+layout(set = 0, binding = B_SURFACES, scalar) writeonly buffer surface_out_block { SurfaceHit surface_out[]; };
+void set_surface(uint i, SurfaceHit v) { surface_out[SURFACES_HIT_AT(i)] = v; }
+#endif
+
+#ifdef TEXEL_TABLES
 Barycentric barycentric_at(uint i) {
     uint at = SURFACES_INSIDE_AT(i);
     uvec4 row = imageLoad(surface_rows_image, int(at >> 1u));
@@ -236,6 +244,13 @@ Barycentric barycentric_at(uint i) {
     uint at = SURFACES_INSIDE_AT(i);
     return Barycentric(barycentric_table[at].weights);
 }
+#endif
+
+#ifdef TEXEL_TABLES
+void set_barycentric(uint i, Barycentric v) { surfaces_uvec2s[SURFACES_INSIDE_AT(i)] = uvec2(floatBitsToUint(v.weights)); }
+#else
+layout(set = 0, binding = B_SURFACES, scalar) writeonly buffer barycentric_out_block { Barycentric barycentric_out[]; };
+void set_barycentric(uint i, Barycentric v) { barycentric_out[SURFACES_INSIDE_AT(i)] = v; }
 #endif
 
 #ifdef TEXEL_TABLES
@@ -258,6 +273,14 @@ Sight sight_at(uint i) {
 #endif
 
 #ifdef TEXEL_TABLES
+layout(set = 0, binding = B_GUIDES, scalar) writeonly buffer guides_uvec4s_block { uvec4 guides_uvec4s[]; };
+void set_sight(uint i, Sight v) { guides_uvec4s[GUIDES_SIGHT_AT(i)] = uvec4(floatBitsToUint(v.motion), floatBitsToUint(v.size), floatBitsToUint(v.angle)); }
+#else
+layout(set = 0, binding = B_GUIDES, scalar) writeonly buffer sight_out_block { Sight sight_out[]; };
+void set_sight(uint i, Sight v) { sight_out[GUIDES_SIGHT_AT(i)] = v; }
+#endif
+
+#ifdef TEXEL_TABLES
 Tint tint_at(uint i) {
     uint at = GUIDES_TINT_AT(i);
     uvec4 row = imageLoad(guide_rows_image, int(at >> 1u));
@@ -275,6 +298,14 @@ Tint tint_at(uint i) {
 #endif
 
 #ifdef TEXEL_TABLES
+layout(set = 0, binding = B_GUIDES, scalar) writeonly buffer guides_uvec2s_block { uvec2 guides_uvec2s[]; };
+void set_tint(uint i, Tint v) { guides_uvec2s[GUIDES_TINT_AT(i)] = uvec2(v.albedo_rg, v.albedo_b_and_angle); }
+#else
+layout(set = 0, binding = B_GUIDES, scalar) writeonly buffer tint_out_block { Tint tint_out[]; };
+void set_tint(uint i, Tint v) { tint_out[GUIDES_TINT_AT(i)] = v; }
+#endif
+
+#ifdef TEXEL_TABLES
 Shift shift_at(uint i) {
     uint at = GUIDES_SHIFT_AT(i);
     uvec4 row = imageLoad(guide_rows_image, int(at >> 1u));
@@ -287,6 +318,13 @@ Shift shift_at(uint i) {
     uint at = GUIDES_SHIFT_AT(i);
     return Shift(shift_table[at].halves);
 }
+#endif
+
+#ifdef TEXEL_TABLES
+void set_shift(uint i, Shift v) { guides_uvec2s[GUIDES_SHIFT_AT(i)] = uvec2(v.halves); }
+#else
+layout(set = 0, binding = B_GUIDES, scalar) writeonly buffer shift_out_block { Shift shift_out[]; };
+void set_shift(uint i, Shift v) { shift_out[GUIDES_SHIFT_AT(i)] = v; }
 #endif
 
 #ifdef TEXEL_TABLES
@@ -307,6 +345,14 @@ HistoryLight history_light_at(uint i) {
 #endif
 
 #ifdef TEXEL_TABLES
+layout(set = 0, binding = B_HISTORY, scalar) writeonly buffer history_uvec4s_block { uvec4 history_uvec4s[]; };
+void set_history_light(uint i, HistoryLight v) { history_uvec4s[HISTORY_LIGHT_AT(i)] = uvec4(floatBitsToUint(v.mean), floatBitsToUint(v.weight)); }
+#else
+layout(set = 0, binding = B_HISTORY, scalar) writeonly buffer history_light_out_block { HistoryLight history_light_out[]; };
+void set_history_light(uint i, HistoryLight v) { history_light_out[HISTORY_LIGHT_AT(i)] = v; }
+#endif
+
+#ifdef TEXEL_TABLES
 HistoryPlace history_place_at(uint i) {
     uint at = HISTORY_PLACE_AT(i);
     uvec4 r0 = imageLoad(history_rows_image, int(at) * 1 + 0);
@@ -320,6 +366,13 @@ HistoryPlace history_place_at(uint i) {
     return HistoryPlace(history_place_table[at].position,
         history_place_table[at].normal);
 }
+#endif
+
+#ifdef TEXEL_TABLES
+void set_history_place(uint i, HistoryPlace v) { history_uvec4s[HISTORY_PLACE_AT(i)] = uvec4(floatBitsToUint(v.position), v.normal); }
+#else
+layout(set = 0, binding = B_HISTORY, scalar) writeonly buffer history_place_out_block { HistoryPlace history_place_out[]; };
+void set_history_place(uint i, HistoryPlace v) { history_place_out[HISTORY_PLACE_AT(i)] = v; }
 #endif
 
 #ifdef TEXEL_TABLES
@@ -343,6 +396,38 @@ HistoryNoise history_noise_at(uint i) {
 #endif
 
 #ifdef TEXEL_TABLES
+void set_history_noise(uint i, HistoryNoise v) { history_uvec4s[HISTORY_NOISE_AT(i)] = uvec4(floatBitsToUint(v.drift), floatBitsToUint(v.variance), floatBitsToUint(v.surprise), v.body_and_used); }
+#else
+layout(set = 0, binding = B_HISTORY, scalar) writeonly buffer history_noise_out_block { HistoryNoise history_noise_out[]; };
+void set_history_noise(uint i, HistoryNoise v) { history_noise_out[HISTORY_NOISE_AT(i)] = v; }
+#endif
+
+#ifdef TEXEL_TABLES
+HistoryTag history_tag_at(uint i) {
+    uint at = HISTORY_TAG_AT(i);
+    uvec4 row = imageLoad(history_rows_image, int(at >> 1u));
+    uvec4 r0 = (at & 1u) == 0u ? row : row.zwxy;
+    return HistoryTag(r0.x,
+        r0.y);
+}
+#else
+layout(set = 0, binding = B_HISTORY, scalar) readonly buffer history_tag_block { HistoryTag history_tag_table[]; };
+HistoryTag history_tag_at(uint i) {
+    uint at = HISTORY_TAG_AT(i);
+    return HistoryTag(history_tag_table[at].owner,
+        history_tag_table[at].frame);
+}
+#endif
+
+#ifdef TEXEL_TABLES
+layout(set = 0, binding = B_HISTORY, scalar) writeonly buffer history_uvec2s_block { uvec2 history_uvec2s[]; };
+void set_history_tag(uint i, HistoryTag v) { history_uvec2s[HISTORY_TAG_AT(i)] = uvec2(v.owner, v.frame); }
+#else
+layout(set = 0, binding = B_HISTORY, scalar) writeonly buffer history_tag_out_block { HistoryTag history_tag_out[]; };
+void set_history_tag(uint i, HistoryTag v) { history_tag_out[HISTORY_TAG_AT(i)] = v; }
+#endif
+
+#ifdef TEXEL_TABLES
 HistorySeed history_seed_at(uint i) {
     uint at = HISTORY_SEED_AT(i);
     uvec4 r0 = uvec4(imageLoad(history_rows_image, int(at >> 2u))[at & 3u]);
@@ -357,6 +442,14 @@ HistorySeed history_seed_at(uint i) {
 #endif
 
 #ifdef TEXEL_TABLES
+layout(set = 0, binding = B_HISTORY, scalar) writeonly buffer history_uints_block { uint history_uints[]; };
+void set_history_seed(uint i, HistorySeed v) { history_uints[HISTORY_SEED_AT(i)] = uint(v.seed); }
+#else
+layout(set = 0, binding = B_HISTORY, scalar) writeonly buffer history_seed_out_block { HistorySeed history_seed_out[]; };
+void set_history_seed(uint i, HistorySeed v) { history_seed_out[HISTORY_SEED_AT(i)] = v; }
+#endif
+
+#ifdef TEXEL_TABLES
 HistoryUsed history_used_at(uint i) {
     uint at = HISTORY_USED_AT(i);
     uvec4 r0 = uvec4(imageLoad(history_rows_image, int(at >> 2u))[at & 3u]);
@@ -368,6 +461,13 @@ HistoryUsed history_used_at(uint i) {
     uint at = HISTORY_USED_AT(i);
     return HistoryUsed(history_used_table[at].before);
 }
+#endif
+
+#ifdef TEXEL_TABLES
+void set_history_used(uint i, HistoryUsed v) { history_uints[HISTORY_USED_AT(i)] = uint(uint(v.before)); }
+#else
+layout(set = 0, binding = B_HISTORY, scalar) writeonly buffer history_used_out_block { HistoryUsed history_used_out[]; };
+void set_history_used(uint i, HistoryUsed v) { history_used_out[HISTORY_USED_AT(i)] = v; }
 #endif
 
 #ifdef TEXEL_TABLES
@@ -469,4 +569,12 @@ Filtered filtered_at(uint i) {
     return Filtered(filtered_table[at].light,
         filtered_table[at].weight_and_albedo);
 }
+#endif
+
+#ifdef TEXEL_TABLES
+layout(set = 0, binding = B_FILTERED, scalar) writeonly buffer filtered_uvec4s_block { uvec4 filtered_uvec4s[]; };
+void set_filtered(uint i, Filtered v) { filtered_uvec4s[i] = uvec4(floatBitsToUint(v.light), v.weight_and_albedo); }
+#else
+layout(set = 0, binding = B_FILTERED, scalar) writeonly buffer filtered_out_block { Filtered filtered_out[]; };
+void set_filtered(uint i, Filtered v) { filtered_out[i] = v; }
 #endif

@@ -8,6 +8,10 @@ pub trait GlslType {
     fn member(name: &str) -> String;
     /// The value, from the words of the rows r0, r1, ... that begin with `word`, which moves past them.
     fn read(word: &mut usize) -> String;
+    /// The words of the value `of`, as a list for the constructor of a row; empty for anything that no shader writes as a row.
+    fn words(_of: &str) -> String {
+        String::new()
+    }
     /// `f` for each float, `i` for each integer with a sign and `u` for each other one of a number or vector; empty for anything else.
     fn numbers() -> String {
         String::new()
@@ -23,6 +27,14 @@ macro_rules! glsl_types {
             fn read(word: &mut usize) -> String {
                 let words: Vec<_> = (0..$words).map(|_| cast(word, $cast)).collect();
                 if words.len() == 1 { words[0].clone() } else { format!("{}({})", $glsl, words.join(", ")) }
+            }
+            fn words(of: &str) -> String {
+                match ($cast, $words) {
+                    ("uintBitsToFloat", _) => format!("floatBitsToUint({of})"),
+                    ("int", 1) => format!("uint({of})"),
+                    ("int", n) => format!("uvec{n}({of})"),
+                    _ => of.to_owned(),
+                }
             }
             fn numbers() -> String {
                 match $cast {
@@ -136,14 +148,16 @@ fn macro_of(part: &structs::Part) -> String {
     format!("{binding}_{}_AT", part.name.to_uppercase())
 }
 
-/// The text of `glsl/tables.glsl`: how tables are read.
+/// The text of `glsl/tables.glsl`: how tables are read, and written by `set_{reader}`.
 pub fn tables_glsl() -> String {
     let mut out = String::from(
         "// Written by build-shaders from shaders/src/structs.rs. Do not edit.\n//\n// Tables: storage on GPUs; rows of texel buffers on \
-         software Vulkan, which reads storage lane by lane where lanes part. What is\n// not used of an element is not read.\n",
+         software Vulkan, which reads storage lane by lane where lanes part. What is\n// not used of an element is not read. Software Vulkan \
+         writes lane by lane too, member by member, so there an element is written as one row.\n",
     );
     let mut declared = Vec::new();
-    for structs::Table { name, reader, storage, texel, bytes, part, from_rows, from_storage } in
+    let mut written = Vec::new();
+    for structs::Table { name, reader, storage, texel, bytes, part, from_rows, from_storage, to_words } in
         structs::tables()
     {
         // The parts of a buffer share its image.
@@ -173,6 +187,31 @@ pub fn tables_glsl() -> String {
              {name} {reader}_at(uint i) {{\n    uint at = {at};\n    return {from_storage};\n}}\n\
              #endif\n"
         ));
+        // What some shader writes. Of `B_FORMER` the frame before wrote it.
+        let row = match bytes {
+            16 => "uvec4",
+            8 => "uvec2",
+            _ => "uint",
+        };
+        if storage == texel {
+            continue;
+        }
+        let rows = format!("{}_{row}s", storage.trim_start_matches("B_").to_lowercase());
+        let declaration = if written.contains(&rows) {
+            String::new()
+        } else {
+            format!("layout(set = 0, binding = {storage}, scalar) writeonly buffer {rows}_block {{ {row} {rows}[]; }};\n")
+        };
+        out.push_str(&format!(
+            "\n#ifdef TEXEL_TABLES\n\
+             {declaration}\
+             void set_{reader}(uint i, {name} v) {{ {rows}[{at}] = {row}({to_words}); }}\n\
+             #else\n\
+             layout(set = 0, binding = {storage}, scalar) writeonly buffer {reader}_out_block {{ {name} {reader}_out[]; }};\n\
+             void set_{reader}(uint i, {name} v) {{ {reader}_out[{at}] = v; }}\n\
+             #endif\n"
+        ));
+        written.push(rows);
     }
     out
 }

@@ -24,6 +24,12 @@ macro_rules! gpu_structs {
                     format!("{}({})", stringify!($name), members.join(",\n        "))
                 }
 
+                /// The GLSL that makes a row of words of the struct `of`.
+                pub fn words_of(of: &str) -> String {
+                    let words = [$(<$ty as GlslType>::words(&format!("{of}.{}", stringify!($field)))),*];
+                    words.join(", ")
+                }
+
                 /// The GLSL that makes one of the members of `element`, so that what is not used of it is not loaded.
                 pub fn copy_members(element: &str) -> String {
                     let members = [$(format!("{element}.{}", stringify!($field))),*];
@@ -810,6 +816,8 @@ pub(crate) struct Table {
     pub from_rows: String,
     /// GLSL that makes it of the storage `{reader}_table[at]`.
     pub from_storage: String,
+    /// GLSL that makes a row of an element `v`.
+    pub to_words: String,
 }
 
 macro_rules! tables {
@@ -826,6 +834,7 @@ macro_rules! tables {
                 part: [$(Some(part($storage, $part)),)? None][0],
                 from_rows: $name::read_members(&mut 0),
                 from_storage: $name::copy_members(concat!($reader, "_table[at]")),
+                to_words: $name::words_of("v"),
             }),*]
         }
 
@@ -849,6 +858,7 @@ tables! {
     HistoryLight "history_light", "B_HISTORY"."light" or "B_HISTORY_ROWS";
     HistoryPlace "history_place", "B_HISTORY"."place" or "B_HISTORY_ROWS";
     HistoryNoise "history_noise", "B_HISTORY"."noise" or "B_HISTORY_ROWS";
+    HistoryTag "history_tag", "B_HISTORY"."tag" or "B_HISTORY_ROWS";
     HistorySeed "history_seed", "B_HISTORY"."seed" or "B_HISTORY_ROWS";
     HistoryUsed "history_used", "B_HISTORY"."used" or "B_HISTORY_ROWS";
     HistoryLight "former_light", "B_FORMER"."light" or "B_FORMER";
