@@ -99,6 +99,37 @@ fn a_run_and_a_bench_are_pages_with_pictures_and_tables() {
     assert!(tables.iter().any(|path| path.ends_with("bench-methods.csv")), "{tables:?}");
 }
 
+/// Owners of GPUs send files in; a page of a folder of them sets each beside the model.
+#[test]
+fn reports_of_several_machines_stand_beside_the_model() {
+    let folder = Folder::new("sent");
+    let sent = folder.path("sent");
+    let file = |name: &str| sent.join(name).display().to_string();
+    for name in ["bench-mine.json", "bench-of-a-friend.json"] {
+        let args =
+            ["bench", "--raster", "48x32", "--count", "3", "--method", "full", "--report", &file(name)];
+        let output = dpm(&args, &[]);
+        assert_eq!(code(&output), 0, "{}", err(&output));
+    }
+    let (page, tables) = page(&sent);
+    assert!(page.contains("Bench of bench-mine.json: methods") && page.contains("none of them was measured"));
+    let beside =
+        tables.iter().find(|path| path.ends_with("measured-beside-the-model.csv")).expect("the table");
+    let text = std::fs::read_to_string(beside).unwrap();
+    let rows: Vec<&str> = text.lines().skip(1).collect();
+    assert_eq!(rows.len(), 2, "{text}");
+    // Software Vulkan is no card of the model.
+    assert!(rows.iter().all(|row| row.starts_with("Bench of bench-") && row.ends_with(",-")), "{text}");
+
+    let into_a_folder = dpm(&["bench", "--count", "3", "--report", &sent.display().to_string()], &[]);
+    assert_eq!(code(&into_a_folder), 2, "{}", err(&into_a_folder));
+    assert!(
+        err(&into_a_folder).contains("is a folder; name a file in it with --report"),
+        "{}",
+        err(&into_a_folder)
+    );
+}
+
 #[test]
 fn a_folder_without_results_is_refused_with_what_to_do() {
     let folder = Folder::new("report-refused");

@@ -1,7 +1,7 @@
 //! `dpm bench`: what each method costs on this machine's Vulkan device.
 
 use super::rig_args::RigArgs;
-use super::watch::{check_out, print, write_out};
+use super::watch::{check_file, check_out, print, write_json, write_out};
 use dpm_lab::bench::{bench, MethodCost, METHODS};
 use dpm_lab::gpu_model;
 use dpm_rig::config::RenderMethod;
@@ -30,6 +30,10 @@ pub(crate) struct BenchArgs {
     /// estimated rates, term by term
     #[arg(long)]
     model: bool,
+    /// File for all figures as one JSON object, which the owner of a GPU can send in. `dpm report` makes a page of a folder
+    /// with such files bench-*.json, and sets them beside the model
+    #[arg(long, value_name = "FILE")]
+    report: Option<PathBuf>,
     /// Print one JSON object
     #[arg(long)]
     json: bool,
@@ -68,6 +72,9 @@ pub(super) fn execute(args: &BenchArgs) -> Result<(), Failure> {
     args.flags.refuse("dpm bench", &["--frames", "--seconds", "--no-prediction"])?;
     let config = args.flags.rig_at_rest(args.rig.as_deref())?;
     check_out(args.flags.out.as_deref())?;
+    if let Some(file) = &args.report {
+        check_file(file, "--report")?;
+    }
     let gpu = open_gpu(&config)?;
     let rig = Rig::build(&config, None)?;
     if !args.json {
@@ -94,6 +101,9 @@ pub(super) fn execute(args: &BenchArgs) -> Result<(), Failure> {
         print(&(to_json(&report) + "\n"));
     } else if args.model {
         print(&gpu_model::table(&report.modelled_not_measured));
+    }
+    if let Some(file) = &args.report {
+        write_json(file, &report)?;
     }
     write_out(args.flags.out.as_deref(), "bench.json", &report)
 }

@@ -65,10 +65,29 @@ pub(super) fn write_out<T: serde::Serialize>(
     name: &str,
     report: &T,
 ) -> Result<(), Failure> {
-    let Some(folder) = out else { return Ok(()) };
-    let path = folder.join(name);
+    out.map_or(Ok(()), |folder| write_json(&folder.join(name), report))
+}
+
+/// Writes a report as JSON to `path`.
+///
+/// # Errors
+/// The file cannot be written.
+pub(super) fn write_json<T: serde::Serialize>(path: &Path, report: &T) -> Result<(), Failure> {
     let text = to_json(report) + "\n";
-    write_atomically(&path, |file| file.write_all(text.as_bytes())).map_err(|e| cannot_write(&path, &e))
+    write_atomically(path, |file| file.write_all(text.as_bytes())).map_err(|e| cannot_write(path, &e))
+}
+
+/// Checks, before any work is done, that the file that `flag` names can be written.
+///
+/// # Errors
+/// It cannot.
+pub(super) fn check_file(path: &Path, flag: &str) -> Result<(), Failure> {
+    let bad = |told: String| Failure::new(FailureKind::BadInput, format!("{}: {told}", path.display()));
+    if path.is_dir() || path.file_name().is_none() {
+        return Err(bad(format!("is a folder; name a file in it with {flag}")));
+    }
+    let folder = path.parent().filter(|folder| !folder.as_os_str().is_empty()).unwrap_or(Path::new("."));
+    check_output_folder(folder)
 }
 
 /// Checks, before any work is done, that files can be written into the folder that `--out` names.

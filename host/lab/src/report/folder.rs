@@ -11,12 +11,14 @@ use std::time::{SystemTime, UNIX_EPOCH};
 const RESULTS: [(&str, &str, &[&str]); 7] = [
     ("report.json", "Run", &["frames_lit", "missed_slots"]),
     ("profile.json", "Profile", &["intervals_ms", "frames_lit"]),
-    ("bench.json", "Bench", &["stamp", "methods"]),
+    ("bench.json", "Bench", BENCH_KEYS),
     ("plan.json", "Plan", &["method", "entries"]),
     ("error.json", "Error", &["groups"]),
     ("figure3.json", "Figure 3", &["groups"]),
     ("table.json", "Table", &["groups"]),
 ];
+
+const BENCH_KEYS: &[&str] = &["stamp", "methods"];
 
 /// Largest result or text that is read, bytes.
 const MAX_RESULT_BYTES: u64 = 64 << 20;
@@ -30,7 +32,7 @@ const MAX_FILES: usize = 10_000;
 /// A measurement.
 pub(super) struct Found {
     /// What it is called.
-    pub(super) name: &'static str,
+    pub(super) name: String,
     /// Its figures.
     pub(super) figures: Map<String, Value>,
     /// Its tables as text, for those that have them.
@@ -68,8 +70,22 @@ impl Folder {
         let mut folder = Self { files: files(dir)?, ..Self::default() };
         for (file, name, keys) in RESULTS {
             if folder.has(file) {
-                folder.results.push(result(&dir.join(file), name, keys)?);
+                folder.results.push(result(&dir.join(file), name.to_owned(), keys)?);
             }
+        }
+        let sent: Vec<String> =
+            folder.files.iter().map(|(name, _)| name.clone()).filter(|name| is_sent(name)).collect();
+        if sent.len() > MAX_ITEMS {
+            return Err(bad(
+                dir,
+                format!(
+                    "it has {} reports of benches; take some out, a page has at most {MAX_ITEMS}",
+                    sent.len()
+                ),
+            ));
+        }
+        for file in sent {
+            folder.results.push(result(&dir.join(&file), format!("Bench of {file}"), BENCH_KEYS)?);
         }
         if folder.results.is_empty() {
             return Err(bad(dir, folder.why_nothing()));
@@ -117,8 +133,13 @@ impl Folder {
             return "its measured groups have not been joined; run `dpm error merge` with --out and this folder".into();
         }
         let what = if self.files.is_empty() { "it is empty" } else { "no file in it is a result of dpm" };
-        format!("{what}; give the folder that --out of `dpm run`, `profile`, `bench`, `plan` or `error` named ({names})")
+        format!("{what}; give the folder that --out of `dpm run`, `profile`, `bench`, `plan` or `error` named ({names}), or one with bench-*.json")
     }
+}
+
+/// A report that the owner of a GPU has sent in, `dpm bench --report bench-NAME.json`.
+fn is_sent(name: &str) -> bool {
+    name.starts_with("bench-") && name.ends_with(".json")
 }
 
 fn is_flight(name: &str) -> bool {
@@ -147,7 +168,7 @@ fn files(dir: &Path) -> Result<Vec<(String, u64)>, Failure> {
     Ok(files)
 }
 
-fn result(path: &PathBuf, name: &'static str, keys: &[&str]) -> Result<Found, Failure> {
+fn result(path: &PathBuf, name: String, keys: &[&str]) -> Result<Found, Failure> {
     let text = regular_file::read_text(path, MAX_RESULT_BYTES)
         .map_err(|e| bad(path, format!("cannot read it: {e}")))?;
     let value: Value = serde_json::from_str(&text)

@@ -1,5 +1,6 @@
 //! `dpm report DIR`: the folder of a run or a measurement into one HTML file, and a CSV file for each of its tables.
 
+mod against_model;
 mod folder;
 mod html;
 mod markdown;
@@ -8,6 +9,7 @@ mod table;
 pub use table::{Cell, Table};
 
 use crate::profile::civil;
+use against_model::against_model;
 use dpm_common::files::write_atomically;
 use dpm_rig::failure::Failure;
 use dpm_rig::run_rig::cannot_write;
@@ -44,7 +46,7 @@ pub fn report(dir: &Path, out: &Path, title: Option<&str>) -> Result<ReportFiles
     let name =
         dir.canonicalize().ok().and_then(|path| Some(path.file_name()?.to_string_lossy().into_owned()));
     let of_folder = || {
-        let kinds: Vec<&str> = folder.results.iter().map(|found| found.name).collect();
+        let kinds: Vec<&str> = folder.results.iter().map(|found| found.name.as_str()).collect();
         format!("{}: {}", kinds.join(", "), name.unwrap_or_else(|| dir.display().to_string()))
     };
     let title = title.map_or_else(of_folder, str::to_owned);
@@ -75,6 +77,7 @@ fn parts(folder: &Folder) -> Vec<Part> {
     for found in &folder.results {
         parts.extend(missed(found));
     }
+    parts.extend(against_model(&folder.results));
     for text in &folder.flights {
         let first = text.lines().next().unwrap_or("Flight").to_owned();
         parts.push(Part::Folded(first, text.clone()));
@@ -84,12 +87,12 @@ fn parts(folder: &Folder) -> Vec<Part> {
         parts.extend(folder.plots.iter().cloned().map(Part::Plot));
     }
     for found in &folder.results {
-        parts.push(Part::Heading(found.name.into()));
+        parts.push(Part::Heading(found.name.clone()));
         match &found.text {
-            Some(text) => parts.extend(blocks(found.name, text).into_iter().map(Part::from)),
+            Some(text) => parts.extend(blocks(&found.name, text).into_iter().map(Part::from)),
             None => {
                 let told = [&FACTS[..], &TOLD].concat();
-                parts.extend(tables(found.name, &found.figures, &told).into_iter().map(Part::Table));
+                parts.extend(tables(&found.name, &found.figures, &told).into_iter().map(Part::Table));
             }
         }
     }
