@@ -27,9 +27,10 @@ void borrow(inout HistoryLight h, uvec2 pixel, uvec2 size) {
     const ivec2 beside[4] = ivec2[](ivec2(-1, 0), ivec2(1, 0), ivec2(0, -1), ivec2(0, 1));
     for (int i = 0; i < 4; i++) {
         ivec2 q = ivec2(pixel) + beside[i] * ivec2(size);
-        if (!on_raster(q)) continue;
+        uint index;
+        if (!pixel_beside(q, index)) continue;
         uvec2 other_size = block_size(uvec2(q));
-        if (!is_lit(surface_at(uint(q.y) * frame.width + uint(q.x))) || !is_traced_block(uvec2(q), other_size)) continue;
+        if (!is_lit(surface_at(index)) || !is_traced_block(uvec2(q), other_size)) continue;
         uvec2 other = traced_pixel(uvec2(q), other_size);
         vec4 r = radiance_in[other.y * frame.width + other.x];
         if (r.w > 0.0) {

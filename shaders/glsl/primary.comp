@@ -38,8 +38,8 @@ bool still_dark(uvec2 pixel) {
     for (int i = 0; i < 25 && dark; i++) {
         ivec2 q = ivec2(pixel) + ivec2(i % 5, i / 5) - 2;
         // Anything may enter over the border of the raster.
-        bool inside = all(greaterThanEqual(q, ivec2(0))) && all(lessThan(q, ivec2(frame.width, frame.height)));
-        dark = inside && former_tag_at(uint(q.y) * frame.width + uint(q.x)).frame != frame.history_frame;
+        uint tap;
+        dark = pixel_beside(q, tap) && former_tag_at(tap).frame != frame.history_frame;
     }
     return dark;
 }
@@ -56,8 +56,9 @@ bool still_seen(uvec2 pixel, uint instance, vec2 before) {
     bool seen = true;
     for (int i = 0; i < 5; i++) {
         ivec2 q = corner + around[i];
-        bool inside = all(greaterThanEqual(q, ivec2(0))) && all(lessThan(q, ivec2(frame.width, frame.height)));
-        HistoryTag tag = former_tag_at(inside ? uint(q.y) * frame.width + uint(q.x) : 0u);
+        uint tap;
+        bool inside = pixel_beside(q, tap);
+        HistoryTag tag = former_tag_at(tap);
         seen = seen && inside && tag.frame == frame.history_frame && tag.owner >> 24u == instance && (tag.owner & HISTORY_HIDDEN) == 0u;
     }
     return seen;

@@ -38,8 +38,8 @@ Blend blend_around(History h, Place place) {
         ivec2 o = ivec2(i & 1, i >> 1);
         ivec2 q = corner + o;
         float w = (o.x == 1 ? f.x : 1.0 - f.x) * (o.y == 1 ? f.y : 1.0 - f.y);
-        if (w <= 0.0 || !on_raster(q)) continue;
-        uint tap = uint(q.y) * frame.width + uint(q.x);
+        uint tap;
+        if (!pixel_beside(q, tap) || w <= 0.0) continue;
         if (!tap_valid(tap, h.instance, h.position, place.normal, place.footprint, DEPTH)) continue;
         c.mean += w * former_light_at(tap).mean;
         c.weight += w * former_light_at(tap).weight;

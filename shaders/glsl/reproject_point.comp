@@ -129,12 +129,12 @@ Around look_around(History h, Place place, vec2 centre) {
         WRITTEN_OUT for (int column = -1; column <= 1; column++) {
             uint tap;
             bool valid = pixel_beside(corner + ivec2(column, row), tap);
-            UNLESS_SKIP(valid)
+            SKIP_UNLESS(valid)
             valid = tap_valid(tap, h.instance, h.position, place.normal, place.footprint, DEPTH) && valid;
-            UNLESS_SKIP(valid)
+            SKIP_UNLESS(valid)
             vec2 e = project(transform_point(world_from_object, former_place_at(tap).position)) - centre;
             valid = is_sound(tap, e) && valid;
-            UNLESS_SKIP(valid)
+            SKIP_UNLESS(valid)
             add_history(a, tap, e, valid);
         }
     }
@@ -286,9 +286,9 @@ uint hidden_in(uint instance, vec2 centre, vec2 before) {
         WRITTEN_OUT for (int column = -1; column <= 1; column++) {
             uint tap;
             bool known = pixel_beside(corner + ivec2(column, row), tap);
-            UNLESS_SKIP(known)
+            SKIP_UNLESS(known)
             known = is_known(tap, instance) && known;
-            UNLESS_SKIP(known)
+            SKIP_UNLESS(known)
             vec3 p = transform_point(world_from_object, former_place_at(tap).position);
             vec2 e = project(p) - centre;
             float far = max(abs(e.x), abs(e.y));

@@ -11,10 +11,10 @@
 // writes that under a mask and skips nothing. On GPUs it stays a loop, because it would take registers, and skips what does not count.
 #ifdef TEXEL_TABLES
 #define WRITTEN_OUT [[unroll]]
-#define UNLESS_SKIP(counts)
+#define SKIP_UNLESS(counts)
 #else
 #define WRITTEN_OUT [[dont_unroll]]
-#define UNLESS_SKIP(counts) if (!(counts)) continue;
+#define SKIP_UNLESS(counts) if (!(counts)) continue;
 #endif
 
 // A storage block, although it is small. Mesa's software Vulkan compiles a shader again for every value of a uniform block that a branch or loop
@@ -132,10 +132,8 @@ bool tile_pixel(uint tile, out uvec2 pixel) {
     return pixel.x < frame.width && pixel.y < frame.height;
 }
 
-// Whether a raster position is a pixel of the picture.
-bool on_raster(ivec2 q) { return all(greaterThanEqual(q, ivec2(0))) && all(lessThan(q, ivec2(frame.width, frame.height))); }
-
-// The same with the index of that pixel. Off the raster it is the index of the nearest pixel, which may be read without a branch.
+// Whether a raster position is a pixel of the picture, and the index of that pixel. Off the raster it is the index of the nearest pixel, so that it may
+// be read without a branch.
 bool pixel_beside(ivec2 q, out uint index) {
     ivec2 nearest = clamp(q, ivec2(0), ivec2(frame.width, frame.height) - 1);
     index = uint(nearest.y) * frame.width + uint(nearest.x);

@@ -11,9 +11,7 @@ const vec2 DISK[12] = vec2[](vec2(0.03, -0.09), vec2(-0.51, 0.13), vec2(0.47, 0.
 
 // The index of the neighbour at raster position `q`. False if it is not lit, or not of the body `instance`.
 bool neighbour(ivec2 q, uint instance, out uint tap) {
-    tap = 0u;
-    if (!on_raster(q)) return false;
-    tap = uint(q.y) * frame.width + uint(q.x);
+    if (!pixel_beside(q, tap)) return false;
     return is_lit(surface_at(tap)) && surface_at(tap).id >> 24u == instance;
 }
 

@@ -111,10 +111,10 @@ Sums gather(uvec2 pixel, uint at, vec3 own, float tolerated, out Equations a) {
             ivec2 d = ivec2(column, row);
             uint tap;
             bool like = known_beside(ivec2(pixel) + d, instance, tap);
-            UNLESS_SKIP(like)
+            SKIP_UNLESS(like)
             vec3 n = decode_normal(history_place_at(tap).normal);
             like = like && dot(n, normal) >= LIKE_NORMAL && abs(dot(history_place_at(tap).position - position, normal)) <= farthest;
-            UNLESS_SKIP(like)
+            SKIP_UNLESS(like)
             vec2 weight_and_albedo = unpackHalf2x16(filtered_at(tap).weight_and_albedo);
             float weight = weight_and_albedo.x, light = weight_and_albedo.y;
             float noise = like ? history_noise_at(tap).variance * sequence_variance(weight) / (weight * light * light) : 0.0;
