@@ -20,10 +20,7 @@ pub fn write_atomically(
     write: impl FnOnce(&mut BufWriter<&File>) -> io::Result<()>,
 ) -> io::Result<()> {
     let named = |e: io::Error| io::Error::new(e.kind(), format!("cannot write {}: {e}", path.display()));
-    let folder = match path.parent() {
-        Some(p) if !p.as_os_str().is_empty() => p,
-        _ => Path::new("."),
-    };
+    let folder = folder_of(path);
     let Some(name) = path.file_name() else {
         return Err(named(io::Error::new(io::ErrorKind::InvalidInput, "not the name of a file")));
     };
@@ -35,6 +32,14 @@ pub fn write_atomically(
         let _ = fs::remove_file(&temporary);
     }
     result.map_err(named)
+}
+
+/// The folder in which the file `path` lies: the current one for a name alone.
+pub fn folder_of(path: &Path) -> &Path {
+    match path.parent() {
+        Some(folder) if !folder.as_os_str().is_empty() => folder,
+        _ => Path::new("."),
+    }
 }
 
 /// Makes `folder` and checks that files can be written there. Call it before the work whose result will be written

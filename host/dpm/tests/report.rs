@@ -121,6 +121,17 @@ fn reports_of_several_machines_stand_beside_the_model() {
     // Software Vulkan is no card of the model.
     assert!(rows.iter().all(|row| row.starts_with("Bench of bench-") && row.ends_with(",-")), "{text}");
 
+    let many = folder.path("many");
+    std::fs::create_dir(&many).unwrap();
+    for i in 0..65 {
+        std::fs::copy(sent.join("bench-mine.json"), many.join(format!("bench-{i}.json"))).unwrap();
+    }
+    let why = refused(&many);
+    assert!(why.contains("it has 65 reports of benches; take some out"), "{why}");
+
+    let cannot = dpm(&["bench", "--count", "3", "--report", "/proc/nowhere/bench.json"], &[]);
+    assert_eq!(code(&cannot), 2, "{}", err(&cannot));
+    assert!(err(&cannot).contains("choose another file with --report"), "{}", err(&cannot));
     let into_a_folder = dpm(&["bench", "--count", "3", "--report", &sent.display().to_string()], &[]);
     assert_eq!(code(&into_a_folder), 2, "{}", err(&into_a_folder));
     assert!(

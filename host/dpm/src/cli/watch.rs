@@ -13,7 +13,7 @@ use super::tell::{Teller, SHOWN_EVERY};
 use crate::notify::Notifier;
 use crate::signals;
 use crossbeam::channel::{unbounded, Receiver, RecvTimeoutError};
-use dpm_common::files::{write_atomically, InstanceLock, LockError};
+use dpm_common::files::{check_folder, folder_of, write_atomically, InstanceLock, LockError};
 use dpm_common::folder::{Folder, FolderError};
 use dpm_common::stopping;
 use dpm_rig::config::{OutputConfig, RigConfig};
@@ -82,12 +82,11 @@ pub(super) fn write_json<T: serde::Serialize>(path: &Path, report: &T) -> Result
 /// # Errors
 /// It cannot.
 pub(super) fn check_file(path: &Path, flag: &str) -> Result<(), Failure> {
-    let bad = |told: String| Failure::new(FailureKind::BadInput, format!("{}: {told}", path.display()));
+    let bad = |told: String| Err(Failure::new(FailureKind::BadInput, told));
     if path.is_dir() || path.file_name().is_none() {
-        return Err(bad(format!("is a folder; name a file in it with {flag}")));
+        return bad(format!("{}: is a folder; name a file in it with {flag}", path.display()));
     }
-    let folder = path.parent().filter(|folder| !folder.as_os_str().is_empty()).unwrap_or(Path::new("."));
-    check_output_folder(folder)
+    check_folder(folder_of(path)).or_else(|e| bad(format!("{e}; choose another file with {flag}")))
 }
 
 /// Checks, before any work is done, that files can be written into the folder that `--out` names.
