@@ -10,63 +10,60 @@ const float LIKE_NORMAL = 0.9;
 // The footprint of a pixel grows no further where light falls more obliquely than this cosine: at 78 degrees.
 const float LEAST_COSINE = 0.2;
 
-// Where a pixel's surface point is.
+// A pixel's surface point.
 struct Place {
+    uint instance;
+    vec3 position;   // Body space.
     vec3 normal;     // Body space, unit length.
     float footprint; // Side of the area that the pixel lights, metres.
-    vec2 before;     // Raster position in the last frame, pixels.
+    vec2 before;     // Raster position in the last frame, pixels. What deforms counts as rigid.
 };
 
-// Whether something is known at `index` of the body since the last frame.
-bool is_known(uint index, uint instance) {
-    HistoryTag tag = former_tag_at(index);
-    return tag.frame == frame.history_frame && tag.owner >> 24u == instance && former_light_at(index).weight > 0.0;
+// Whether a history, by two of its parts, is of the last frame and of the body `instance`, and holds light.
+bool is_known(HistoryTag tag, HistoryLight light, uint instance) {
+    return tag.frame == frame.history_frame && tag.owner >> 24u == instance && light.weight > 0.0;
 }
 
-// Where the last frame showed a point of a body, pixels. What deforms counts as rigid.
-vec2 place_before(uint instance, vec3 position) { return project(transform_point(instance_at(instance).previous_world_from_object, position)); }
-
-// The surface point of a lit pixel, body space.
-vec3 body_point(uvec2 pixel, SurfaceHit surface) {
-    return transform_point(instance_at(surface.id >> 24u).object_from_world, pixel_direction(pixel) * surface.distance);
-}
-
-// Whether the history at `index` is of the last frame, of the same body, and of a point close to `position` with a like normal. Positions and
-// normals are in body space. `depth` is how far the point may lie off the tangent plane, in footprints.
-bool tap_valid(uint index, uint instance, vec3 position, vec3 normal, float footprint, float depth) {
-    if (!is_known(index, instance)) return false;
-    vec3 apart = former_place_at(index).position - position;
-    vec3 tap_normal = decode_normal(former_place_at(index).normal);
+// Whether a history is of a point close to that of `place` with a like normal. `depth` is how far the point may lie off the tangent plane, in
+// footprints.
+bool is_close(HistoryPlace former, Place place, float depth) {
+    vec3 apart = former.position - place.position;
     // Within four footprints.
-    return dot(tap_normal, normal) > LIKE_NORMAL && abs(dot(apart, normal)) < depth * footprint && dot(apart, apart) < 16.0 * footprint * footprint;
+    return dot(decode_normal(former.normal), place.normal) > LIKE_NORMAL && abs(dot(apart, place.normal)) < depth * place.footprint
+           && dot(apart, apart) < 16.0 * place.footprint * place.footprint;
 }
 
-// The history that a lit pixel starts from: nothing is known of its surface point, and the point's sample sequence begins.
-History begin_history(uvec2 pixel, uint at, out Place place) {
+// The surface point of a lit pixel.
+Place place_of(uvec2 pixel, uint at) {
     SurfaceHit surface = surface_at(at);
-    uint instance = surface.id >> 24u;
-    uint triangle = surface.id & 0xffffffu;
-    TriangleRef ref = triangle_ref_at(instance_at(instance).triangle_offset + triangle);
+    Place place;
+    place.instance = surface.id >> 24u;
+    TriangleRef ref = triangle_ref_at(instance_at(place.instance).triangle_offset + (surface.id & 0xffffffu));
     vec2 b = barycentric_at(at).weights;
     // Only rotations and translations lie between world and body space, so lengths are the same in both.
     vec3 world = pixel_direction(pixel) * surface.distance;
-    vec3 normal = normalize(vertex_at(ref.vertices.x).normal * (1.0 - b.x - b.y) + vertex_at(ref.vertices.y).normal * b.x + vertex_at(ref.vertices.z).normal * b.y);
-    float cosine = abs(dot(transform_vector(instance_at(instance).world_from_object, normal), normalize(world)));
-    place.normal = normal;
+    place.position = transform_point(instance_at(place.instance).object_from_world, world);
+    place.normal = normalize(vertex_at(ref.vertices.x).normal * (1.0 - b.x - b.y) + vertex_at(ref.vertices.y).normal * b.x + vertex_at(ref.vertices.z).normal * b.y);
+    float cosine = abs(dot(transform_vector(instance_at(place.instance).world_from_object, place.normal), normalize(world)));
     place.footprint = surface.distance * frame.pixel_size / max(cosine, LEAST_COSINE);
+    place.before = project(transform_point(instance_at(place.instance).previous_world_from_object, place.position));
+    return place;
+}
+
+// The history that a surface point starts from: nothing is known of it, and its sample sequence begins.
+History begin_history(Place place, uint at) {
     History h;
     h.mean = vec3(0.0);
     h.weight = 0.0;
-    h.position = body_point(pixel, surface);
-    h.normal = encode_normal(normal);
+    h.position = place.position;
+    h.normal = encode_normal(place.normal);
     h.drift = 0.0;
     h.variance = 0.0;
     h.surprise = 0.0;
     h.seed = hash_u32(at + hash_u32(frame.frame + hash_u32(frame.seed)));
     h.used = 0u;
-    h.instance = instance;
+    h.instance = place.instance;
     h.frame = frame.frame;
     h.flags = 0u;
-    place.before = place_before(instance, h.position);
     return h;
 }

@@ -24,8 +24,8 @@ struct Blend {
     float best;
 };
 
-// The four histories around `before`, as far as they are valid for the surface point of `h`.
-Blend blend_around(History h, Place place) {
+// The four histories around `before`, as far as they are valid for the surface point.
+Blend blend_around(Place place) {
     vec2 base = floor(place.before - 0.5);
     vec2 f = place.before - 0.5 - base;
     if (abs(f.x - round(f.x)) < AT_REST_PX && abs(f.y - round(f.y)) < AT_REST_PX) {
@@ -40,9 +40,10 @@ Blend blend_around(History h, Place place) {
         float w = (o.x == 1 ? f.x : 1.0 - f.x) * (o.y == 1 ? f.y : 1.0 - f.y);
         uint tap;
         if (!pixel_beside(q, tap) || w <= 0.0) continue;
-        if (!tap_valid(tap, h.instance, h.position, place.normal, place.footprint, DEPTH)) continue;
-        c.mean += w * former_light_at(tap).mean;
-        c.weight += w * former_light_at(tap).weight;
+        HistoryLight former = former_light_at(tap);
+        if (!is_known(former_tag_at(tap), former, place.instance) || !is_close(former_place_at(tap), place, DEPTH)) continue;
+        c.mean += w * former.mean;
+        c.weight += w * former.weight;
         c.total += w;
         if (w > c.best) {
             c.best = w;
@@ -55,7 +56,7 @@ Blend blend_around(History h, Place place) {
 // Leaves `h` as it is where no history is valid.
 void carry_bilinear(inout History h, Place place) {
     if (!all(greaterThan(place.before, vec2(0.0))) || !all(lessThan(place.before, vec2(frame.width, frame.height)))) return;
-    Blend c = blend_around(h, place);
+    Blend c = blend_around(place);
     if (!(c.total > LEAST_TOTAL) || !finite3(c.mean) || !finite(c.weight)) return;
     float s = 1.0 / c.total;
     h.mean = c.mean * s;
@@ -71,8 +72,8 @@ void main() {
         write_no_history(at);
         return;
     }
-    Place place;
-    History h = begin_history(pixel, at, place);
+    Place place = place_of(pixel, at);
+    History h = begin_history(place, at);
     carry_bilinear(h, place);
     write_history(at, h);
 }

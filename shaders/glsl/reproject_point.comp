@@ -82,17 +82,14 @@ struct Plane {
 };
 
 // Whether the numbers of a history and the place `e` of its point are finite.
-bool is_sound(uint tap, vec2 e) {
-    HistoryLight l = former_light_at(tap);
-    HistoryNoise n = former_noise_at(tap);
+bool is_sound(HistoryLight l, HistoryNoise n, vec2 e) {
     return finite(n.drift) && finite(n.variance) && finite(n.surprise) && finite3(l.mean) && finite(l.weight) && finite(e.x + e.y);
 }
 
 // Adds the history `tap`, whose point is at `e` from the pixel's centre, if it is `used`. There is no branch, see `WRITTEN_OUT`.
-void add_history(inout Around a, uint tap, vec2 e, bool used) {
-    vec3 m = used ? former_light_at(tap).mean : vec3(0.0);
-    float w = used ? former_light_at(tap).weight : 0.0;
-    HistoryNoise noise = former_noise_at(tap);
+void add_history(inout Around a, uint tap, HistoryLight light, HistoryNoise noise, vec2 e, bool used) {
+    vec3 m = used ? light.mean : vec3(0.0);
+    float w = used ? light.weight : 0.0;
     e = used ? e : vec2(0.0);
     float y = luminance(m);
     vec2 we = w * e;
@@ -119,23 +116,35 @@ void add_history(inout Around a, uint tap, vec2 e, bool used) {
     a.apart = nearer ? e : a.apart;
 }
 
-// The valid histories among the nine around the former place of the surface point of `h`.
-Around look_around(History h, Place place, vec2 centre) {
+// Whether a body's point `p` in world space, with a normal in body space, faces the projector.
+bool faces(vec4 world_from_object[3], uint normal, vec3 p) {
+    return dot(transform_vector(world_from_object, normal_direction(normal)), p) < 0.0;
+}
+
+// The valid histories among the nine around the former place of a surface point. At a pixel that is not `lit` those are valid whose points
+// face the projector, wherever on the body they lie.
+Around look_around(Place place, vec2 centre, bool lit) {
     Around a = Around(0u, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, vec3(0.0), vec3(0.0), vec3(0.0), 0.0, 0.0, 0.0, 0.0,
-                      vec3(INFINITY), vec3(-INFINITY), NO_HIT, FARTHEST_PX, vec2(0.0));
+                      vec3(INFINITY), vec3(-INFINITY), NO_HIT, lit ? FARTHEST_PX : HIDDEN_PX, vec2(0.0));
     ivec2 corner = ivec2(floor(clamp(place.before, vec2(-MARGIN_PX), vec2(frame.width, frame.height) + MARGIN_PX)));
-    vec4 world_from_object[3] = instance_at(h.instance).world_from_object;
+    vec4 world_from_object[3] = instance_at(place.instance).world_from_object;
     [[dont_unroll]] for (int row = -1; row <= 1; row++) {
         WRITTEN_OUT for (int column = -1; column <= 1; column++) {
             uint tap;
             bool valid = pixel_beside(corner + ivec2(column, row), tap);
             SKIP_UNLESS(valid)
-            valid = tap_valid(tap, h.instance, h.position, place.normal, place.footprint, DEPTH) && valid;
+            valid = is_known(former_tag_at(tap), former_light_at(tap), place.instance) && valid;
             SKIP_UNLESS(valid)
-            vec2 e = project(transform_point(world_from_object, former_place_at(tap).position)) - centre;
-            valid = is_sound(tap, e) && valid;
+            HistoryPlace former = former_place_at(tap);
+            vec3 p = transform_point(world_from_object, former.position);
+            valid = (lit ? is_close(former, place, DEPTH) : faces(world_from_object, former.normal, p)) && valid;
             SKIP_UNLESS(valid)
-            add_history(a, tap, e, valid);
+            HistoryLight light = former_light_at(tap);
+            HistoryNoise noise = former_noise_at(tap);
+            vec2 e = project(p) - centre;
+            valid = is_sound(light, noise, e) && valid;
+            SKIP_UNLESS(valid)
+            add_history(a, tap, light, noise, e, valid);
         }
     }
     return a;
@@ -235,15 +244,11 @@ float taken_over(History known, Around a, Plane p, float light, float per_frame,
     return min(weight, mix(TAKEN_OVER, TAKEN_OVER_PERIPHERY, periphery(angle)) * per_frame);
 }
 
-// Carries the nearest history into `h`, or begins a new point beside it where no history's point is in the pixel. Returns the shift from the
-// history's point to the pixel's. Leaves `h` as it is where no history is valid.
-vec3 carry_point(inout History h, Place place, uvec2 pixel, uint at) {
+// Carries `known`, the nearest of the histories around, into `h`, or begins a new point beside it where no history's point is in the pixel. Returns
+// the shift from the history's point to the pixel's.
+vec3 carry_point(inout History h, History known, Around a, Place place, uvec2 pixel, uint at) {
     vec2 centre = vec2(pixel) + 0.5;
-    Around a = look_around(h, place, centre);
-    if (a.nearest == NO_HIT) return vec3(0.0);
     Plane p = plane_through(a);
-    History known = former_at(a.nearest);
-    known.frame = h.frame;
     float light = luminance(albedo_of(tint_at(at))), per_frame = samples_a_frame();
     float useful = longest_useful(a, p, light, per_frame, centre - place.before);
     known.weight = min(known.weight, useful * per_frame);
@@ -276,67 +281,41 @@ uvec2 lit_beside(uvec2 pixel) {
     return found;
 }
 
-// The history of the body `instance` whose point is now in the pixel and faces the projector, NO_HIT: none.
-uint hidden_in(uint instance, vec2 centre, vec2 before) {
-    ivec2 corner = ivec2(floor(clamp(before, vec2(-MARGIN_PX), vec2(frame.width, frame.height) + MARGIN_PX)));
-    float nearest = HIDDEN_PX;
-    uint owner = NO_HIT;
-    vec4 world_from_object[3] = instance_at(instance).world_from_object;
-    [[dont_unroll]] for (int row = -1; row <= 1; row++) {
-        WRITTEN_OUT for (int column = -1; column <= 1; column++) {
-            uint tap;
-            bool known = pixel_beside(corner + ivec2(column, row), tap);
-            SKIP_UNLESS(known)
-            known = is_known(tap, instance) && known;
-            SKIP_UNLESS(known)
-            vec3 p = transform_point(world_from_object, former_place_at(tap).position);
-            vec2 e = project(p) - centre;
-            float far = max(abs(e.x), abs(e.y));
-            bool faces = dot(transform_vector(world_from_object, normal_direction(former_place_at(tap).normal)), p) < 0.0;
-            bool nearer = known && faces && far < nearest;
-            nearest = nearer ? far : nearest;
-            owner = nearer ? tap : owner;
-        }
-    }
-    return owner;
-}
-
+// The history of a pixel, and the shift from its point to the pixel's. Returns whether there is one. Lit pixels always have one.
+//
 // A pixel beside a body's edge keeps the history of a point that is in it, although its own ray misses the body. The next frame may bring the pixel
-// back onto the body. NO_HIT: there is none.
-uint hidden_beside(uvec2 pixel) {
-    uvec2 other = lit_beside(pixel);
-    if (other == pixel) return NO_HIT;
-    // The body that is lit there would have shown this pixel in the last frame as far away as it did that one.
-    SurfaceHit surface = surface_at(other.y * frame.width + other.x);
-    uint instance = surface.id >> 24u;
-    vec2 before = place_before(instance, body_point(other, surface)) + (vec2(pixel) - vec2(other));
-    return hidden_in(instance, vec2(pixel) + 0.5, before);
+// back onto the body. The body that is lit beside it would have shown this pixel in the last frame as far away as it did that one.
+bool carry(uvec2 pixel, uint at, bool lit, out History h, out vec3 shift) {
+    shift = vec3(0.0);
+    uvec2 of = lit ? pixel : lit_beside(pixel);
+    if (!lit && of == pixel) return false;
+    Place place = place_of(of, of.y * frame.width + of.x);
+    place.before += vec2(pixel) - vec2(of);
+    Around a = look_around(place, vec2(pixel) + 0.5, lit);
+    h = begin_history(place, at);
+    if (a.nearest != NO_HIT) {
+        History known = former_at(a.nearest);
+        known.frame = frame.frame;
+        if (lit) shift = carry_point(h, known, a, place, pixel, at);
+        else h = known;
+    }
+    h.flags = lit ? h.flags & ~HISTORY_HIDDEN : h.flags | HISTORY_HIDDEN;
+    return lit || a.nearest != NO_HIT;
 }
 
 void main() {
     uvec2 pixel;
     if (!tile_pixel(tiles[gl_WorkGroupID.x >> 2u], pixel)) return;
     uint at = pixel.y * frame.width + pixel.x;
-    uint importance = 0u, lit = 0u, demand = DEMAND_NOT_LIT;
-    bool keeps = false;
+    uint importance = 0u, demand = DEMAND_NOT_LIT;
+    bool lit = is_lit(surface_at(at));
     History h;
-    if (is_lit(surface_at(at))) {
-        lit = 1u;
-        keeps = true;
-        Place place;
-        h = begin_history(pixel, at, place);
-        set_shift(at, pack_shift(carry_point(h, place, pixel, at)));
-        h.flags &= ~HISTORY_HIDDEN;
+    vec3 shift;
+    bool keeps = carry(pixel, at, lit, h, shift);
+    if (lit) {
+        set_shift(at, pack_shift(shift));
         importance = importance_of(h);
         demand = importance | ((h.flags & HISTORY_EXACT) != 0u ? DEMAND_EXACT : 0u) | (h.used == 0u ? DEMAND_NEW : 0u);
-    } else {
-        uint hidden = hidden_beside(pixel);
-        keeps = hidden != NO_HIT;
-        if (keeps) {
-            h = former_at(hidden);
-            h.frame = frame.frame;
-            h.flags |= HISTORY_HIDDEN;
-        }
     }
     set_demand(at, demand);
     // Once for both, because software Vulkan writes lane by lane.
@@ -347,7 +326,7 @@ void main() {
         write_no_history(at);
     }
     uint total = subgroupAdd(importance);
-    uint lit_total = subgroupAdd(lit);
+    uint lit_total = subgroupAdd(lit ? 1u : 0u);
     if (subgroupElect() && lit_total > 0u) {
         atomicAdd(schedule.importance, total);
         atomicAdd(schedule.lit, lit_total);

@@ -45,11 +45,9 @@ float sequence_variance(float held) {
 
 float weight_of(Filtered f) { return unpackHalf2x16(f.weight_and_albedo).x; }
 
-// Whether something is known of the light at raster position `q`, on the body `instance`. The surface itself need not be read.
-bool known_beside(ivec2 q, uint instance, out uint tap) {
-    bool there = pixel_beside(q, tap);
-    bool weighs = (filtered_at(tap).weight_and_albedo & 0xffffu) != 0u;
-    return there && weighs && ((history_noise_at(tap).body_and_used / (HISTORY_USED + 1u)) & 255u) == instance;
+// Whether something is known of the light of a pixel, on the body `instance`. The surface itself need not be read.
+bool is_known(Filtered f, HistoryNoise n, uint instance) {
+    return (f.weight_and_albedo & 0xffffu) != 0u && ((n.body_and_used / (HISTORY_USED + 1u)) & 255u) == instance;
 }
 
 // How far the history lags: a slope of the light over the histories' age is fitted to the drifts around, as far as chance does not explain it.
@@ -63,13 +61,16 @@ float lag_of(uvec2 pixel, uint at) {
     for (int i = 0; i < 12; i++) {
         ivec2 q = ivec2(pixel) + ivec2(round(rotation * DISK[i] * LAG_RADIUS_PX));
         uint tap;
-        if (q == ivec2(pixel) || !known_beside(q, instance, tap)) continue;
+        if (!pixel_beside(q, tap) || q == ivec2(pixel)) continue;
+        Filtered f = filtered_at(tap);
+        HistoryNoise noise = history_noise_at(tap);
+        if (!is_known(f, noise, instance)) continue;
         vec3 n = normal_direction(history_place_at(tap).normal);
         // The eighth power of the cosine.
         float cosine = max(dot(n, normal), 0.0), w = cosine * cosine / dot(n, n);
         w *= w;
         w *= w;
-        float x = weight_of(filtered_at(tap)) * frames, y = history_noise_at(tap).drift;
+        float x = weight_of(f) * frames, y = noise.drift;
         xx += w * x * x;
         xy += w * x * y;
         yy += w * y * y;
@@ -110,16 +111,21 @@ Sums gather(uvec2 pixel, uint at, vec3 own, float tolerated, out Equations a) {
         WRITTEN_OUT for (int column = -2; column <= 2; column++) {
             ivec2 d = ivec2(column, row);
             uint tap;
-            bool like = known_beside(ivec2(pixel) + d, instance, tap);
+            bool like = pixel_beside(ivec2(pixel) + d, tap);
             SKIP_UNLESS(like)
-            vec3 n = decode_normal(history_place_at(tap).normal);
-            like = like && dot(n, normal) >= LIKE_NORMAL && abs(dot(history_place_at(tap).position - position, normal)) <= farthest;
+            Filtered f = filtered_at(tap);
+            HistoryNoise history = history_noise_at(tap);
+            like = is_known(f, history, instance) && like;
             SKIP_UNLESS(like)
-            vec2 weight_and_albedo = unpackHalf2x16(filtered_at(tap).weight_and_albedo);
+            HistoryPlace place = history_place_at(tap);
+            vec3 n = decode_normal(place.normal);
+            like = like && dot(n, normal) >= LIKE_NORMAL && abs(dot(place.position - position, normal)) <= farthest;
+            SKIP_UNLESS(like)
+            vec2 weight_and_albedo = unpackHalf2x16(f.weight_and_albedo);
             float weight = weight_and_albedo.x, light = weight_and_albedo.y;
-            float noise = like ? history_noise_at(tap).variance * sequence_variance(weight) / (weight * light * light) : 0.0;
+            float noise = like ? history.variance * sequence_variance(weight) / (weight * light * light) : 0.0;
             float w = like ? 1.0 / (noise + tolerated) : 0.0;
-            vec3 m = like ? filtered_at(tap).light - own : vec3(0.0);
+            vec3 m = like ? f.light - own : vec3(0.0);
             vec4 e = vec4(d, dot(n, across), dot(n, along));
             vec4 we = w * e;
             a.slopes += we * e;
