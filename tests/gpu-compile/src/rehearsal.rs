@@ -2,6 +2,8 @@
 //!
 //! The process has the driver and the kernel's stand-in already (see [`crate::targets`]).
 
+use dpm_common::clock::{Clock, MonotonicClock};
+use dpm_common::realtime::{enter_frame_path, ThreadRights};
 use dpm_device::planes::Raster;
 use dpm_render::gpu::{validation_messages, CommandList, Gpu, GpuOptions};
 use dpm_render::gpu::{Buffer, MemoryKind, Place};
@@ -25,6 +27,9 @@ pub const METHODS: [RenderMethod; 5] = [
 
 /// Most that the host may take of a slot, 99th percentile, milliseconds.
 pub const MOST_OF_A_SLOT_MS: f64 = 0.25;
+
+/// A slot of the projector, 947 a second.
+const SLOT_NS: i64 = 1_000_000_000 / 947;
 
 /// What the host took of a slot while frames were submitted at the projector's own pace.
 #[derive(Clone, Debug, Serialize, Deserialize)]
@@ -143,6 +148,29 @@ pub fn validated() -> Result<Vec<String>, String> {
     }
     seen.push("poses that lie in the wrong memory on purpose are seen".into());
     Ok(seen)
+}
+
+/// How late this machine wakes a thread that has the frame path's priority and nothing to do, once a slot of 1.056 ms: median and 99th percentile,
+/// milliseconds. A share of a slot that is hardly larger tells of the machine and not of the host's program.
+///
+/// # Errors
+/// No thread can be started.
+pub fn machine_wakes_late_ms(slots: u32) -> Result<[f64; 2], String> {
+    let sleeper = move || {
+        let priority = RigConfig::default().real_time.priority;
+        let _ = enter_frame_path(ThreadRights { priority, core: None });
+        let clock = MonotonicClock::new(0);
+        let start = clock.now();
+        let late = |slot: u32| {
+            let due = start.plus_ns(i64::from(slot) * SLOT_NS);
+            clock.wait_until(due).ns_since(due)
+        };
+        let mut late_ns: Vec<i64> = (1..=slots.max(1)).map(late).collect();
+        late_ns.sort_unstable();
+        [0.5, 0.99].map(|q| late_ns[((late_ns.len() - 1) as f64 * q).round() as usize] as f64 * 1e-6)
+    };
+    let thread = std::thread::Builder::new().spawn(sleeper).map_err(|e| format!("a thread: {e}"))?;
+    thread.join().map_err(|_| "a thread that only sleeps has failed".into())
 }
 
 /// Runs a method at the projector's pace for so many slots. Other programs may keep the threads from their cores in one run, but hardly in each of

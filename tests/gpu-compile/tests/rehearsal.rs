@@ -1,7 +1,7 @@
 //! What the dry run judges, fed with faults.
 
 use dpm_render::gpu::Place;
-use gpu_compile::rehearsal::{misplaced, too_large, Share, MOST_OF_A_SLOT_MS};
+use gpu_compile::rehearsal::{machine_wakes_late_ms, misplaced, too_large, Share, MOST_OF_A_SLOT_MS};
 
 #[test]
 fn each_kind_of_wrong_memory_is_named() {
@@ -34,4 +34,10 @@ fn a_host_that_takes_too_much_of_a_slot_is_named_by_its_method() {
     let over = too_large(&all);
     assert_eq!(over.len(), 2, "{over:?}");
     assert!(over[0].starts_with("dpm:") && over[1].starts_with("paper:"), "{over:?}");
+}
+
+#[test]
+fn a_machine_never_wakes_a_thread_early() {
+    let [median, most] = machine_wakes_late_ms(50).unwrap();
+    assert!(0.0 < median && median <= most && most < 1000.0, "{median} {most}");
 }

@@ -225,7 +225,7 @@ pub(crate) fn albedo_of(g: &Guide) -> [f32; 3] {
 }
 
 /// IEEE 754 binary16.
-fn half_to_f32(bits: u16) -> f32 {
+pub(crate) fn half_to_f32(bits: u16) -> f32 {
     let (exponent, fraction) = (i32::from(bits >> 10 & 31), f32::from(bits & 1023));
     let magnitude = match exponent {
         0 => fraction * 2f32.powi(-24),

@@ -14,6 +14,7 @@ mod gpu_chain;
 pub mod gpu_compare;
 mod gpu_disocclusion;
 mod gpu_exact;
+mod gpu_filter;
 mod gpu_histories_in_motion;
 mod gpu_history;
 mod gpu_paper;

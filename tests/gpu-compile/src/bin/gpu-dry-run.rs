@@ -2,7 +2,7 @@
 //!
 //! `gpu-dry-run [--drivers DIR] [--slots N] [--json]`
 
-use gpu_compile::rehearsal::{paced, too_large, validated, Share, METHODS};
+use gpu_compile::rehearsal::{machine_wakes_late_ms, paced, too_large, validated, Share, METHODS};
 use gpu_compile::targets::DRY_RUN;
 use std::path::{Path, PathBuf};
 use std::process::{Command, ExitCode, Stdio};
@@ -11,6 +11,9 @@ const USAGE: &str = "usage: gpu-dry-run [--drivers DIR] [--slots N] [--json]
   --drivers DIR  where tests/gpu-compile/drivers has unpacked the drivers (target/gpu-drivers)
   --slots N      slots of the run of each method (3000)
   --json         print one JSON object";
+
+/// Slots for which the machine is watched before the runs.
+const MACHINE_SLOTS: u32 = 3000;
 
 struct Arguments {
     drivers: PathBuf,
@@ -89,13 +92,18 @@ fn all(arguments: &Arguments) -> Result<(), String> {
     std::fs::create_dir_all(&manifests).map_err(|e| format!("{}: {e}", manifests.display()))?;
     let drivers = arguments.drivers.canonicalize().map_err(|e| e.to_string())?;
     let seen: Vec<String> = ask("validated", arguments, &drivers)?;
+    let late = machine_wakes_late_ms(MACHINE_SLOTS)?;
     // Each in a process of its own: the kernel's stand-in ends in a fault after some ten thousand submissions.
     let shares = METHODS.map(|method| ask::<Share>(method.word(), arguments, &drivers));
     let shares = shares.into_iter().collect::<Result<Vec<_>, _>>()?;
     if arguments.json {
-        println!("{}", serde_json::json!({ "seen": seen, "shares": shares }));
+        println!("{}", serde_json::json!({ "seen": seen, "machine_wakes_late_ms": late, "shares": shares }));
     } else {
         println!("{}", seen.join("\n"));
+        println!(
+            "\nWith nothing else to do, this machine wakes a thread of the frame path {:.3} ms (p50) and {:.3} ms (p99) late.",
+            late[0], late[1]
+        );
         println!("\n| method | runs | frames | slots missed | latch to submission, ms (p50, p99) | submission to readable, ms (p50, p99) |");
         println!("|---|---:|---:|---:|---:|---:|");
         for Share { method, runs, frames, missed, plan_ms: [p, pp], readable_ms: [r, rr] } in &shares {
