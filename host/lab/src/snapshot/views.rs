@@ -224,8 +224,13 @@ pub(crate) fn albedo_of(g: &Guide) -> [f32; 3] {
     [half(g.tint.albedo_rg), half(g.tint.albedo_rg >> 16), half(g.tint.albedo_b_and_angle)]
 }
 
+/// Angle at the eye between the gaze point and what a pixel shows, degrees.
+pub(crate) fn angle_of(g: &Guide) -> f32 {
+    half_to_f32((g.tint.albedo_b_and_angle >> 16) as u16)
+}
+
 /// IEEE 754 binary16.
-pub(crate) fn half_to_f32(bits: u16) -> f32 {
+fn half_to_f32(bits: u16) -> f32 {
     let (exponent, fraction) = (i32::from(bits >> 10 & 31), f32::from(bits & 1023));
     let magnitude = match exponent {
         0 => fraction * 2f32.powi(-24),

@@ -4,7 +4,8 @@ use super::gpu::GpuCase;
 use super::gpu_history::dpm;
 use super::gpu_paper::gaze_aside;
 use super::gpu_shot::Shot;
-use crate::snapshot::views::{albedo_of, half_to_f32};
+use crate::metrics::luminance;
+use crate::snapshot::views::{albedo_of, angle_of};
 use crate::twins::spatial_regression::{FilterPicture, FilterPixel};
 use dpm_render::gpu::Gpu;
 use dpm_render::scene_data::Keep;
@@ -32,20 +33,20 @@ fn decode_normal(bits: u32) -> DVec3 {
     DVec3::new(fold(x, y), fold(y, x), z).normalize()
 }
 
-fn pixel_of(surface: Surface, guide: &Guide, history: &History) -> FilterPixel {
-    let albedo = Vec3::from(albedo_of(guide)).dot(Vec3::new(0.2126, 0.7152, 0.0722));
-    let angle = half_to_f32((guide.tint.albedo_b_and_angle >> 16) as u16);
+/// `periphery`: the angles from the gaze between which the picture becomes coarse, degrees.
+fn pixel_of(surface: Surface, guide: &Guide, history: &History, periphery: [f64; 2]) -> FilterPixel {
+    let [from, to] = periphery;
     let known = surface.is_lit();
     FilterPixel {
         surface,
         light: Vec3::from(history.light.mean).as_dvec3(),
         weight: if known { f64::from(history.light.weight) } else { 0.0 },
         variance: f64::from(history.noise.variance),
-        albedo: f64::from(albedo),
+        albedo: f64::from(luminance(albedo_of(guide).into())),
         position: Vec3::from(history.place.position).as_dvec3(),
         normal: decode_normal(history.place.normal),
         body_and_used: history.noise.body_and_used,
-        periphery: ((f64::from(angle) - 15.0) / 3.0).clamp(0.0, 1.0),
+        periphery: ((f64::from(angle_of(guide)) - from) / (to - from)).clamp(0.0, 1.0),
     }
 }
 
@@ -54,7 +55,10 @@ fn pixel_of(surface: Surface, guide: &Guide, history: &History) -> FilterPixel {
 fn difference(shot: &Shot<'_>, slot: &FrameSlot) -> (f64, usize, usize) {
     let (surfaces, shown) = (slot.surfaces().unwrap_or_default(), slot.radiance().unwrap_or(&[]));
     let (guides, history) = (slot.guides().unwrap_or_default(), slot.history().unwrap_or_default());
-    let pixels = surfaces.iter().zip(&guides).zip(&history).map(|((s, g), h)| pixel_of(*s, g, h)).collect();
+    let paper = shot.settings().method.paper;
+    let periphery = [paper.filter_from_deg, paper.filter_to_deg];
+    let all = surfaces.iter().zip(&guides).zip(&history);
+    let pixels = all.map(|((s, g), h)| pixel_of(*s, g, h, periphery)).collect();
     let picture = FilterPicture {
         width: shot.camera.raster.width() as usize,
         pixels,
