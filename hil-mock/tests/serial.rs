@@ -10,8 +10,9 @@ use hil_mock::motion::{Motion, MotionSpec};
 use hil_mock::serial_server::{pseudo_terminal, SerialPoseDevice, SerialPoseHost};
 use hil_mock::tracker::{MockTrackerConfig, SampleSource};
 use serialport::SerialPort;
+use std::fs::File;
 use std::io::Write;
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
@@ -77,6 +78,13 @@ fn poses_and_times_come_through_a_noisy_line() {
     assert!(errors[errors.len() / 2] < 3e-4, "{}", errors[errors.len() / 2]);
 }
 
+/// Unplugs the device that is served behind `link`. The name goes first: the kernel gives the number of a closed
+/// pseudo-terminal to the next one, which is another test's, and a name left behind would lead there.
+fn unplug(link: &Path, plugged: (SerialPoseHost, File)) {
+    std::fs::remove_file(link).unwrap();
+    drop(plugged);
+}
+
 #[test]
 fn an_unplugged_port_is_opened_again_within_a_second() {
     let clock = clock();
@@ -91,7 +99,7 @@ fn an_unplugged_port_is_opened_again_within_a_second() {
     let mut tracker = tracker(link.to_str().unwrap(), &clock);
     let samples = run(&mut tracker, &clock, 400);
     assert!(!samples.is_empty() && tracker.is_open(), "{}", tracker.status());
-    drop(plugged);
+    unplug(&link, plugged);
     run(&mut tracker, &clock, 400);
     assert!(!tracker.is_open(), "{}", tracker.status());
     let plugged = plug(&link);
@@ -100,8 +108,7 @@ fn an_unplugged_port_is_opened_again_within_a_second() {
     assert!(tracker.is_open(), "{}", tracker.status());
     let first = samples.first().expect("samples again").received_at.ns_since(back);
     assert!(first < 1_000 * MS, "{first}");
-    drop(plugged);
-    let _ = std::fs::remove_file(&link);
+    unplug(&link, plugged);
 }
 
 /// A packet that tells of body 0.
@@ -235,11 +242,10 @@ fn what_waited_in_the_port_is_not_handed_out() {
         assert!(c.samples.late - before.samples.late <= 10, "opening {opening}: {c}");
         assert!(c.samples.unknown_age > before.samples.unknown_age, "opening {opening}: {c}");
         before = c;
-        drop((host, held));
+        unplug(&link, (host, held));
         run(&mut tracker, &clock, 300);
         assert!(!tracker.is_open(), "{}", tracker.status());
     }
-    let _ = std::fs::remove_file(&link);
 }
 
 /// Found in use, C8: a device that knows no echo is heard all the same, a moment later.

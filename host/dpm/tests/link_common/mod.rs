@@ -184,11 +184,12 @@ impl PtyProjector {
 
     /// Pulls the plug. The projector keeps its power, and its light until the watchdog acts.
     pub(crate) fn unplug(&self) {
+        // The name goes before the terminal, whose number may be that of another test's at once.
+        let _ = std::fs::remove_file(&self.path);
         if let Some((stop, thread)) = self.served.lock().unwrap().take() {
             stop.store(true, Ordering::Relaxed);
             thread.join().unwrap();
         }
-        let _ = std::fs::remove_file(&self.path);
     }
 
     /// Puts another projector there while it is unplugged.

@@ -27,11 +27,12 @@ impl Cable {
 
     /// Pulls the plug: the host's port is gone. The projector keeps its power.
     pub(crate) fn unplug(&mut self) {
+        // The name goes before the terminal, whose number may be that of another program's at once.
+        let _ = std::fs::remove_file(&self.path);
         if let Some((stop, thread)) = self.plugged.take() {
             stop.store(true, Ordering::Relaxed);
             let _ = thread.join();
         }
-        let _ = std::fs::remove_file(&self.path);
     }
 
     /// Plugs it in again.
