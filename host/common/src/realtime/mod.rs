@@ -1,10 +1,11 @@
-//! What the operating system grants to the frame path: priority, cores, locked memory, short sleeps; and how reliably
-//! it does.
+//! What the operating system grants to the frame path: priority, cores, locked memory, short sleeps, cores that wake
+//! at once; and how reliably it does.
 //!
 //! Every right is requested, and none is required. A refusal is one [`Refusal`] with the limit to set, which the
-//! caller shows once; the rig continues to run. [`os`] requests, and [`standstill`] measures when the machine itself
-//! stood still.
+//! caller shows once; the rig continues to run. [`os`] requests for threads and memory, [`awake`] for idle cores, and
+//! [`standstill`] measures when the machine itself stood still.
 
+pub mod awake;
 pub mod os;
 pub mod standstill;
 

@@ -201,6 +201,9 @@ section! {
         affinity: Vec<u32> = Vec::new(), "", Any;
         /// Keep all memory resident, so that no page fault delays a frame.
         lock_memory: bool = false, "", Any;
+        /// Keep idle cores from deep sleep while the rig runs, for all programs of this machine: a stage that waits then
+        /// starts within microseconds. It costs power. If the right is refused, the run warns once.
+        keep_awake: bool = true, "", Any;
         /// How stages wait for each other.
         wait: Wait = Wait::Auto, "", Any;
         /// Assumed cost of each stage at virtual pace.

@@ -2,6 +2,7 @@
 
 use crate::config::RealTimeConfig;
 use crate::telemetry::monitor::RunMonitor;
+use dpm_common::realtime::awake::CoresAwake;
 use dpm_common::realtime::{enter_frame_path, os, Refusal, ThreadRights};
 use dpm_handoff::path::Lock;
 use std::sync::Arc;
@@ -9,34 +10,35 @@ use std::sync::Arc;
 /// The mock projector's index in the list of cores, after the stages.
 const PROJECTOR: usize = 4;
 
-/// Rights of a run's threads. Locked memory is unlocked at the end.
+/// Rights of a run. At the end locked memory is unlocked, and idle cores may sleep again.
 pub(super) struct Rights {
     priority: u32,
     cores: Vec<u32>,
     locked: bool,
+    _awake: Option<CoresAwake>,
     refusals: Lock<Vec<Refusal>>,
     /// Tells the operator of a refusal at once: a service may run for weeks before its report is written.
     monitor: Arc<RunMonitor>,
 }
 
 impl Rights {
-    /// Reads `[real_time]` and locks memory if it says so.
+    /// Reads `[real_time]`, locks memory and keeps cores awake if it says so.
     pub(super) fn new(config: &RealTimeConfig, monitor: &Arc<RunMonitor>) -> Self {
         let mut refusals = Vec::new();
-        let mut locked = false;
-        if config.lock_memory {
-            match os::lock_memory() {
-                Ok(()) => locked = true,
-                Err(refusal) => {
-                    monitor.note(refusal.to_string());
-                    refusals.push(refusal);
-                }
-            }
-        }
+        let mut refused = |refusal: Refusal| {
+            monitor.note(refusal.to_string());
+            refusals.push(refusal);
+        };
+        let locked = config.lock_memory && os::lock_memory().map_err(&mut refused).is_ok();
+        let awake = match config.keep_awake {
+            true => CoresAwake::hold().map_err(&mut refused).ok().flatten(),
+            false => None,
+        };
         Self {
             priority: config.priority,
             cores: config.affinity.clone(),
             locked,
+            _awake: awake,
             refusals: Lock::new(refusals),
             monitor: monitor.clone(),
         }
@@ -97,9 +99,29 @@ impl Drop for Rights {
 mod tests {
     use super::*;
 
+    /// Either cores are held awake, or the operator hears why not; only a system without the device is silent.
+    #[test]
+    fn cores_stay_awake_if_the_rig_file_says_so() {
+        let new = |keep_awake| {
+            let monitor = Arc::new(RunMonitor::default());
+            Rights::new(&RealTimeConfig { keep_awake, ..RealTimeConfig::default() }, &monitor)
+        };
+        let (with, without) = (new(true), new(false));
+        assert!(without._awake.is_none() && without.warnings().is_empty());
+        match CoresAwake::hold() {
+            Ok(held) => assert_eq!((with._awake.is_some(), with.warnings().len()), (held.is_some(), 0)),
+            Err(refusal) => assert_eq!(with.warnings(), [refusal.to_string()]),
+        }
+    }
+
     #[test]
     fn a_right_refused_to_every_stage_is_one_warning() {
-        let config = RealTimeConfig { priority: 0, affinity: vec![1023; 3], ..RealTimeConfig::default() };
+        let config = RealTimeConfig {
+            priority: 0,
+            affinity: vec![1023; 3],
+            keep_awake: false,
+            ..RealTimeConfig::default()
+        };
         let monitor = Arc::new(RunMonitor::default());
         let rights = Rights::new(&config, &monitor);
         std::thread::scope(|scope| {

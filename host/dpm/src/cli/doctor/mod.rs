@@ -9,6 +9,7 @@ use super::display::{self, Seen};
 use super::os;
 use super::rig_args::RigArgs;
 use super::watch::print;
+use dpm_common::realtime::awake::CoresAwake;
 use dpm_common::realtime::{self, Refusal};
 use dpm_display::kms::Connector;
 use dpm_render::gpu::{DeviceSummary, GpuOptions};
@@ -93,6 +94,7 @@ pub(super) fn execute(args: &DoctorArgs) -> Result<(), Failure> {
     let fifo = briefly(|| realtime::os::set_fifo_priority(FRAME_PATH_PRIORITY));
     findings.push(right("real-time priority", "SCHED_FIFO granted", fifo));
     findings.push(right("locked memory", "granted", briefly(lock_and_unlock)));
+    findings.push(idle_cores(CoresAwake::hold().map(|held| held.is_some())));
     findings.extend(system.throttling());
     findings.extend(system.governor());
     findings.extend(system.clock());
@@ -245,6 +247,23 @@ fn right(name: &str, granted: &str, tried: Result<(), Refusal>) -> Finding {
         Err(r) => {
             Finding::new(name, State::Warning, format!("{} was refused ({})", r.what, r.reason), r.remedy)
         }
+    }
+}
+
+/// Whether a run may keep idle cores awake; the result of trying.
+fn idle_cores(tried: Result<bool, Refusal>) -> Finding {
+    let name = "idle cores";
+    match tried {
+        Ok(false) => {
+            let remedy = "in a container: pass /dev/cpu_dma_latency into it, or stages may wake 0.1 ms late";
+            Finding::new(
+                name,
+                State::Info,
+                "this system has no /dev/cpu_dma_latency to keep them awake",
+                remedy,
+            )
+        }
+        tried => right(name, "can be kept awake", tried.map(drop)),
     }
 }
 
@@ -565,6 +584,9 @@ mod tests {
         assert!(finding.found.contains("priority 80 was refused (Operation not permitted)"));
         assert_eq!(finding.remedy, "set rtprio");
         assert_eq!(right("x", "granted", Ok(())).state, State::Ok);
+        let refusal = Refusal { what: "awake".into(), reason: "denied".into(), remedy: "a rule".into() };
+        let states = [Ok(true), Ok(false), Err(refusal)].map(|tried| idle_cores(tried).state);
+        assert_eq!(states, [State::Ok, State::Info, State::Warning]);
     }
 
     #[test]
