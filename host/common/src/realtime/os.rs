@@ -2,13 +2,16 @@
 #![allow(unsafe_code)]
 
 use super::Refusal;
+#[cfg(target_os = "linux")]
+use std::io::Error;
 
 /// Lines for `/etc/security/limits.d`, as shipped in `packaging/99-dpm-limits.conf`.
 const LIMITS_FILE: &str = "/etc/security/limits.d/99-dpm-limits.conf";
 
+/// `reason` is read first of all: whoever looks for a remedy makes system calls that overwrite it.
 #[cfg(target_os = "linux")]
-fn refusal(what: String, remedy: String) -> Refusal {
-    Refusal { what, reason: std::io::Error::last_os_error().to_string(), remedy }
+fn refusal(reason: Error, what: String, remedy: String) -> Refusal {
+    Refusal { what, reason: reason.to_string(), remedy }
 }
 
 #[cfg(target_os = "linux")]
@@ -35,6 +38,7 @@ pub fn set_fifo_priority(priority: u32) -> Result<(), Refusal> {
         return Ok(());
     }
     Err(refusal(
+        Error::last_os_error(),
         format!("SCHED_FIFO priority {wanted}"),
         priority_remedy(wanted, std::path::Path::new(LIMITS_FILE).exists()),
     ))
@@ -93,6 +97,7 @@ pub(crate) fn pin_to_core(core: u32) -> Result<(), Refusal> {
         return Ok(());
     }
     Err(refusal(
+        Error::last_os_error(),
         what,
         format!(
             "set real_time.affinity to cores among those in /proc/thread-self/status, Cpus_allowed_list ({})",
@@ -133,7 +138,7 @@ pub fn lock_memory() -> Result<(), Refusal> {
     if unsafe { libc::mlockall(libc::MCL_CURRENT | libc::MCL_FUTURE) } == 0 {
         return Ok(());
     }
-    Err(refusal("locking memory".into(), remedy()))
+    Err(refusal(Error::last_os_error(), "locking memory".into(), remedy()))
 }
 
 /// Undoes [`lock_memory`].
@@ -152,6 +157,7 @@ pub fn set_timer_slack_ns(slack_ns: u64) -> Result<(), Refusal> {
         return Ok(());
     }
     Err(refusal(
+        Error::last_os_error(),
         "a shorter timer slack".into(),
         "sleeps may end 50 us late; allow prctl in the sandbox".into(),
     ))
@@ -192,7 +198,11 @@ pub(crate) fn set_slice_ns(slice_ns: u64) -> Result<(), Refusal> {
     if rc == 0 {
         return Ok(());
     }
-    Err(refusal("a shorter time slice".into(), "allow sched_setattr in the sandbox".into()))
+    Err(refusal(
+        Error::last_os_error(),
+        "a shorter time slice".into(),
+        "allow sched_setattr in the sandbox".into(),
+    ))
 }
 
 /// The time slice of the calling thread under the normal scheduler, ns; 0 if the kernel has one slice for all
@@ -383,6 +393,19 @@ mod tests {
         });
     }
 
+    /// The file of limits is looked for as well, and that it is not there is no reason of the kernel's.
+    #[test]
+    fn a_refused_priority_has_the_reason_of_the_kernel() {
+        apart(|| {
+            // SAFETY: plain numbers. Unlike the function of the C library, the system call changes this thread alone. Root may do anything,
+            // so it becomes nobody; for anybody else the call is refused, and the priority is refused all the same.
+            unsafe { libc::syscall(libc::SYS_setresuid, 65534, 65534, 65534) };
+            if let Err(refusal) = set_fifo_priority(10) {
+                assert!(refusal.reason.contains("os error 1)"), "{refusal}");
+            }
+        });
+    }
+
     #[test]
     fn pinning_works_for_an_allowed_core_and_names_the_allowed_ones() {
         apart(|| {
@@ -393,6 +416,7 @@ mod tests {
             assert_eq!(usable_cores(), 1);
             let absent = pin_to_core(1023).unwrap_err().to_string();
             assert!(absent.contains("core 1023") && absent.contains("real_time.affinity"), "{absent}");
+            assert!(absent.contains("os error 22"), "{absent}");
             assert!(pin_to_core(1 << 20).is_err());
         });
     }
