@@ -57,6 +57,14 @@ pub(crate) const CASES: &[GpuCase] = &[
         crisp_light,
     ),
     GpuCase(
+        "gpu-slivers-keep-histories",
+        "bars half a pixel wide that lean and glide in a circle by a third of a pixel a frame under an uneven sky, method dpm",
+        "a pixel that a bar leaves and enters again keeps what it knew: histories are at least a quarter as long as those of a plate that glides so",
+        "ratio",
+        1.0,
+        slivers_keep_histories,
+    ),
+    GpuCase(
         "gpu-mean-in-motion",
         "the demo's hare at 1 m/s and its turning bust through a window as dense as the full raster, two samples requested, method dpm",
         "path tracing: mean of the picture; the bound is today's error, not a goal",
@@ -456,6 +464,29 @@ fn crisp_light(gpu: &Arc<Gpu>, seed: u64) -> f64 {
         return f64::NAN;
     }
     ((off / power).sqrt() / 0.06).max(40.0 / still)
+}
+
+fn slivers_keep_histories(gpu: &Arc<Gpu>, seed: u64) -> f64 {
+    let pixel = 1.0 / 17.5;
+    // Of three rows that follow each other at least one meets a bar, so that there is always something lit beside.
+    let up = Vec3::new(8.0, 24.0, 0.0) * pixel;
+    let bar = |x: f32, width: f32| quad((Vec3::X * x * pixel) - up / 2.0, Vec3::X * width * pixel, up);
+    let bars = join((-4..=4).map(|i| bar(4.0 * i as f32, 0.5)));
+    let plate = bar(-12.0, 24.0);
+    let length = |mesh| {
+        let mut scene = scene_of(mesh, diffuse(Vec3::splat(0.8)));
+        scene.environment = image_sky(1.0);
+        let circle = |frame: u32| {
+            let angle = f64::from(frame) / 6.0;
+            DAffine3::from_translation(DVec3::new(angle.cos(), angle.sin(), 0.0) * 2.0 * f64::from(pixel))
+        };
+        watched(gpu, &ball(&scene, seed, 110), 60, circle).1
+    };
+    let (wide, narrow) = (length(plate), length(bars));
+    if wide.is_nan() || narrow.is_nan() {
+        return f64::NAN;
+    }
+    0.25 * wide / narrow
 }
 
 fn lamp_comes_near(gpu: &Arc<Gpu>, seed: u64) -> f64 {
