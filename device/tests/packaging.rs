@@ -91,14 +91,16 @@ fn the_rules_name_every_usb_device_that_is_opened_and_the_service_may_open_them(
     let named: BTreeSet<_> =
         usb.map(|r| (r["ATTR{idVendor}"].clone(), r["ATTR{idProduct}"].clone())).collect();
     assert_eq!(named, opened);
+    assert_eq!(rules.len(), opened.len() + 1, "and one for idle cores");
     let user = value(&unit(), "Service", "User");
     let (made, member) = groups(&user);
     for rule in rules {
         match rule["SUBSYSTEM"].as_str() {
             // Whoever sits at the machine gets projectors, and members of the group get idle cores that stay awake.
             "usb" => assert_eq!(rule["TAG"], "uaccess", "{rule:?}"),
-            _ => {
-                assert_eq!((rule["KERNEL"].as_str(), rule.get("TAG")), ("cpu_dma_latency", None), "{rule:?}")
+            other => {
+                let is = (other, rule["KERNEL"].as_str(), rule.get("TAG"));
+                assert_eq!(is, ("misc", "cpu_dma_latency", None), "{rule:?}");
             }
         }
         let mode = u32::from_str_radix(&rule["MODE"], 8).expect("octal");

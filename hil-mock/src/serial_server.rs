@@ -13,6 +13,7 @@ use serialport::{SerialPort, TTYPort};
 use std::fs::{File, OpenOptions};
 use std::io::{self, Read, Write};
 use std::os::unix::fs::OpenOptionsExt;
+use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::Arc;
 use std::thread::JoinHandle;
@@ -219,6 +220,32 @@ impl Drop for SerialPoseHost {
             // `is_running` shows an error or panic of the thread; nobody is left to inform here.
             let _ = thread.join();
         }
+    }
+}
+
+/// A name for a port that stays the same when the port is plugged in again, as udev gives names: a link to the terminal.
+///
+/// Drop it before the terminal. The kernel gives the number of a closed pseudo-terminal to the next one, which is
+/// somebody else's, and a name left behind would lead there.
+#[derive(Debug)]
+pub struct PortName(PathBuf);
+
+impl PortName {
+    /// Makes `name` lead to `terminal`, wherever it led before.
+    ///
+    /// # Errors
+    /// The link cannot be made.
+    pub fn give(name: &Path, terminal: &str) -> io::Result<Self> {
+        let _ = std::fs::remove_file(name);
+        std::os::unix::fs::symlink(terminal, name)?;
+        Ok(Self(name.to_owned()))
+    }
+}
+
+impl Drop for PortName {
+    fn drop(&mut self) {
+        // Somebody else may have removed its folder; then it leads nowhere either.
+        let _ = std::fs::remove_file(&self.0);
     }
 }
 

@@ -19,6 +19,7 @@ use dpm_device::tty::never_wait;
 use hil_mock::line_port::{Line, LinePort};
 use hil_mock::projector::serial::SerialProjector;
 use hil_mock::projector::{MockConfig, MockProjector};
+use hil_mock::serial_server::PortName;
 use serialport::{SerialPort, TTYPort};
 
 fn raster() -> Raster {
@@ -190,12 +191,10 @@ fn frames_cross_a_serial_line_and_noise_costs_frames_not_the_link() {
     }
 }
 
-/// A new pseudo-terminal behind `path`, as an adapter that is plugged in: its far end.
-fn plug(path: &Path) -> Box<dyn SerialPort> {
+/// A new pseudo-terminal behind `path`, as an adapter that is plugged in: its name and its far end.
+fn plug(path: &Path) -> (PortName, Box<dyn SerialPort>) {
     let (master, slave) = pair();
-    let _ = std::fs::remove_file(path);
-    std::os::unix::fs::symlink(slave.name().unwrap(), path).unwrap();
-    master
+    (PortName::give(path, &slave.name().unwrap()).unwrap(), master)
 }
 
 #[test]
@@ -205,7 +204,7 @@ fn a_line_that_is_cut_is_noticed_and_taken_up_again() {
     let path = folder.join("port");
     let (start, mock) = (Instant::now(), setup());
     // The near end first: a far end without a near one reads as hung up.
-    let master = plug(&path);
+    let (name, master) = plug(&path);
     let line = SerialTransport::open(settings(path.to_str().unwrap())).unwrap();
     let mut far = Far::new(master, mock.clone(), start);
     let second = SerialTransport::open(settings(line.name())).unwrap_err();
@@ -213,12 +212,11 @@ fn a_line_that_is_cut_is_noticed_and_taken_up_again() {
     let mut near = Near::new(line, Codec::Raw.mask());
     near.link.connect();
     near.until(&far, LONG, |_| far.with(|m| m.status().frames_lit) >= 5);
-    // The name goes before the terminal, whose number may be that of another test's at once.
-    std::fs::remove_file(&path).unwrap();
+    drop(name);
     far.hang_up();
     let noticed = near.until(&far, LONG, |n| n.link.state() == LinkState::Lost);
     assert!(noticed < Duration::from_millis(100), "{noticed:?}");
-    let master = plug(&path);
+    let (_name, master) = plug(&path);
     let replug = Instant::now();
     near.until(&far, LONG, |n| n.link.state() == LinkState::Greeting);
     let far = Far::new(master, mock, start);

@@ -7,12 +7,11 @@ use dpm_device::tracker::serial::client::{SerialTracker, SerialTrackerConfig};
 use dpm_device::tracker::serial::wire::{SerialMessage, MAX_PACKET, VERSION};
 use dpm_device::tracker::{BodyIndex, BodyKey, Tracker, TrackerSample};
 use hil_mock::motion::{Motion, MotionSpec};
-use hil_mock::serial_server::{pseudo_terminal, SerialPoseDevice, SerialPoseHost};
+use hil_mock::serial_server::{pseudo_terminal, PortName, SerialPoseDevice, SerialPoseHost};
 use hil_mock::tracker::{MockTrackerConfig, SampleSource};
 use serialport::SerialPort;
-use std::fs::File;
 use std::io::Write;
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
@@ -78,28 +77,22 @@ fn poses_and_times_come_through_a_noisy_line() {
     assert!(errors[errors.len() / 2] < 3e-4, "{}", errors[errors.len() / 2]);
 }
 
-/// Unplugs the device that is served behind `link`. The name goes first: the kernel gives the number of a closed
-/// pseudo-terminal to the next one, which is another test's, and a name left behind would lead there.
-fn unplug(link: &Path, plugged: (SerialPoseHost, File)) {
-    std::fs::remove_file(link).unwrap();
-    drop(plugged);
-}
-
 #[test]
 fn an_unplugged_port_is_opened_again_within_a_second() {
     let clock = clock();
     let link = std::env::temp_dir().join(format!("dpm-tty-{}", std::process::id()));
+    // The name is dropped first.
     let plug = |link: &PathBuf| {
         let (ours, path, held) = pseudo_terminal().unwrap();
-        let _ = std::fs::remove_file(link);
-        std::os::unix::fs::symlink(path, link).unwrap();
-        (SerialPoseHost::start(device(""), ours, clock.clone()).unwrap(), held)
+        let name = PortName::give(link, &path).unwrap();
+        (name, SerialPoseHost::start(device(""), ours, clock.clone()).unwrap(), held)
     };
     let plugged = plug(&link);
     let mut tracker = tracker(link.to_str().unwrap(), &clock);
     let samples = run(&mut tracker, &clock, 400);
     assert!(!samples.is_empty() && tracker.is_open(), "{}", tracker.status());
-    unplug(&link, plugged);
+    drop(plugged);
+    assert!(!link.is_symlink(), "its name is gone as well");
     run(&mut tracker, &clock, 400);
     assert!(!tracker.is_open(), "{}", tracker.status());
     let plugged = plug(&link);
@@ -108,7 +101,7 @@ fn an_unplugged_port_is_opened_again_within_a_second() {
     assert!(tracker.is_open(), "{}", tracker.status());
     let first = samples.first().expect("samples again").received_at.ns_since(back);
     assert!(first < 1_000 * MS, "{first}");
-    unplug(&link, plugged);
+    drop(plugged);
 }
 
 /// A packet that tells of body 0.
@@ -219,11 +212,10 @@ fn what_waited_in_the_port_is_not_handed_out() {
     let mut before = *tracker.counters();
     for opening in 1..=2 {
         let (ours, path, held) = pseudo_terminal().unwrap();
-        let _ = std::fs::remove_file(&link);
         let host = SerialPoseHost::start(device(""), ours, clock.clone()).unwrap();
         // The device streams, and nobody reads: the kernel's buffers and the device's own fill up.
         std::thread::sleep(Duration::from_millis(800));
-        std::os::unix::fs::symlink(&path, &link).unwrap();
+        let name = PortName::give(&link, &path).unwrap();
         let opened = clock.now();
         let samples = run(&mut tracker, &clock, 1000);
         let c = *tracker.counters();
@@ -242,7 +234,7 @@ fn what_waited_in_the_port_is_not_handed_out() {
         assert!(c.samples.late - before.samples.late <= 10, "opening {opening}: {c}");
         assert!(c.samples.unknown_age > before.samples.unknown_age, "opening {opening}: {c}");
         before = c;
-        unplug(&link, (host, held));
+        drop((name, host, held));
         run(&mut tracker, &clock, 300);
         assert!(!tracker.is_open(), "{}", tracker.status());
     }

@@ -6,14 +6,14 @@ use dpm_common::clock::{Clock, MonotonicClock};
 use dpm_common::realtime::awake::CoresAwake;
 use dpm_common::realtime::{enter_frame_path, ThreadRights};
 use dpm_device::planes::Raster;
+use dpm_device::time::HostTime;
 use dpm_render::gpu::{validation_messages, CommandList, Gpu, GpuOptions};
 use dpm_render::gpu::{Buffer, MemoryKind, Place};
 use dpm_render::{Output, Renderer, RendererSettings};
 use dpm_rig::config::{Overrides, RenderMethod, RigConfig};
-use dpm_rig::light::FrameRecord;
+use dpm_rig::frame::FrameTimeline;
 use dpm_rig::pipeline::{self, renderer_settings, RunOptions};
 use dpm_rig::rig::Rig;
-use dpm_rig::telemetry::interval::Interval;
 use dpm_rig::telemetry::monitor::RunMonitor;
 use serde::{Deserialize, Serialize};
 use std::sync::Arc;
@@ -48,8 +48,8 @@ pub struct Share {
     pub plan_ms: [f64; 2],
     /// From the submission to readable results; the GPU itself takes no time here.
     pub readable_ms: [f64; 2],
-    /// Both together, frame by frame: what the host takes of a slot. A 99th percentile of sums is less than the sum of
-    /// two 99th percentiles, because few frames wait twice.
+    /// Both together, frame by frame: what the host takes of a slot. Few frames wait in both parts, so the 99th percentile
+    /// is less than the sum of those of the parts.
     pub taken_ms: [f64; 2],
 }
 
@@ -163,7 +163,8 @@ fn quantiles_ms(mut times_ns: Vec<i64>) -> [f64; 2] {
 }
 
 /// How late this machine wakes a thread that has the frame path's priority and nothing to do, once a slot of 1.056 ms: median and 99th percentile,
-/// milliseconds. `is_awake`: idle cores are kept awake for it, as a rig does. A share of a slot that is hardly larger tells of the machine and not of the host's program.
+/// milliseconds. A share of a slot that is hardly larger tells of the machine and not of the host's program. `is_awake`: idle cores are kept
+/// awake for it, as a rig does.
 ///
 /// # Errors
 /// No thread can be started.
@@ -212,19 +213,18 @@ fn run_at_pace(gpu: &Arc<Gpu>, rig: &Arc<Rig>, method: RenderMethod, slots: u64)
     let options = RunOptions { slots, keep_records: slots as usize, verify: false, ..RunOptions::default() };
     let outcome =
         pipeline::run(rig.clone(), gpu, options, &monitor).map_err(|e| format!("{method:?}: {e}"))?;
-    let of = |interval| {
-        let histogram = outcome.profiler.histogram(interval);
-        [0.5, 0.99].map(|q| histogram.value_at_quantile(q) as f64 * 1e-6)
+    let of = |from: fn(&FrameTimeline) -> HostTime, to: fn(&FrameTimeline) -> HostTime| {
+        let timelines = outcome.recent.iter().map(|frame| &frame.timeline);
+        quantiles_ms(timelines.map(|t| to(t).ns_since(from(t))).collect())
     };
-    let taken = |frame: &FrameRecord| frame.timeline.rendered_at.ns_since(frame.timeline.latched_at);
     Ok(Share {
         method: method.word().to_owned(),
         runs: 1,
         frames: outcome.profiler.frames_lit(),
         missed: outcome.slots.missed.iter().sum(),
-        plan_ms: of(Interval::Plan),
-        readable_ms: of(Interval::Render),
-        taken_ms: quantiles_ms(outcome.recent.iter().map(taken).collect()),
+        plan_ms: of(|t| t.latched_at, |t| t.submitted_at),
+        readable_ms: of(|t| t.submitted_at, |t| t.rendered_at),
+        taken_ms: of(|t| t.latched_at, |t| t.rendered_at),
     })
 }
 

@@ -12,8 +12,8 @@ use dpm_rig::rig::Rig;
 use dpm_rig::telemetry::monitor::RunMonitor;
 use hil_mock::projector::serial::SerialProjector;
 use hil_mock::projector::{MockConfig, MockProjector};
-use serialport::{SerialPort, TTYPort};
-use std::path::{Path, PathBuf};
+use hil_mock::serial_server::{pseudo_terminal, PortName};
+use std::path::PathBuf;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Arc, Mutex};
 use std::thread::JoinHandle;
@@ -161,7 +161,14 @@ pub(crate) struct PtyProjector {
     pub path: PathBuf,
     device: Arc<Mutex<SerialProjector>>,
     start: Instant,
-    served: Mutex<Option<(Arc<AtomicBool>, JoinHandle<()>)>>,
+    served: Mutex<Option<Served>>,
+}
+
+/// A projector that is plugged in.
+struct Served {
+    name: PortName,
+    stop: Arc<AtomicBool>,
+    thread: JoinHandle<()>,
 }
 
 impl PtyProjector {
@@ -184,9 +191,8 @@ impl PtyProjector {
 
     /// Pulls the plug. The projector keeps its power, and its light until the watchdog acts.
     pub(crate) fn unplug(&self) {
-        // The name goes before the terminal, whose number may be that of another test's at once.
-        let _ = std::fs::remove_file(&self.path);
-        if let Some((stop, thread)) = self.served.lock().unwrap().take() {
+        if let Some(Served { name, stop, thread }) = self.served.lock().unwrap().take() {
+            drop(name);
             stop.store(true, Ordering::Relaxed);
             thread.join().unwrap();
         }
@@ -199,13 +205,8 @@ impl PtyProjector {
 
     /// Plugs it in again.
     pub(crate) fn plug_in(&self) {
-        let (master, slave) = TTYPort::pair().expect("a pseudo-terminal");
-        let mut master = dpm_device::tty::never_wait(master).unwrap();
-        let theirs = slave.name().unwrap();
-        // Keeps the line open and raw between hosts, without the lock of the library's own handle.
-        let held = std::fs::OpenOptions::new().read(true).write(true).open(&theirs).unwrap();
-        drop(slave);
-        link(Path::new(&theirs), &self.path);
+        let (mut master, terminal, held) = pseudo_terminal().expect("a pseudo-terminal");
+        let name = PortName::give(&self.path, &terminal).unwrap();
         let stop = Arc::new(AtomicBool::new(false));
         let (stopped, device, start) = (stop.clone(), self.device.clone(), self.start);
         let thread = std::thread::spawn(move || {
@@ -219,13 +220,8 @@ impl PtyProjector {
                 std::thread::sleep(Duration::from_micros(300));
             }
         });
-        *self.served.lock().unwrap() = Some((stop, thread));
+        *self.served.lock().unwrap() = Some(Served { name, stop, thread });
     }
-}
-
-fn link(to: &Path, path: &Path) {
-    let _ = std::fs::remove_file(path);
-    std::os::unix::fs::symlink(to, path).unwrap();
 }
 
 impl Projector for PtyProjector {

@@ -1,9 +1,10 @@
 //! A cable between two pseudo-terminals that can be pulled: bytes from one end to the other, in both directions.
 
-use dpm_device::tty::{self, never_wait};
-use serialport::{SerialPort, TTYPort};
-use std::fs::{File, OpenOptions};
-use std::path::{Path, PathBuf};
+use dpm_device::tty;
+use hil_mock::serial_server::{pseudo_terminal, PortName};
+use serialport::SerialPort;
+use std::fs::File;
+use std::path::PathBuf;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::Arc;
 use std::thread::JoinHandle;
@@ -14,7 +15,7 @@ pub(crate) struct Cable {
     /// What the rig file names.
     pub(crate) path: PathBuf,
     projector: String,
-    plugged: Option<(Arc<AtomicBool>, JoinHandle<()>)>,
+    plugged: Option<(PortName, Arc<AtomicBool>, JoinHandle<()>)>,
 }
 
 impl Cable {
@@ -27,9 +28,8 @@ impl Cable {
 
     /// Pulls the plug: the host's port is gone. The projector keeps its power.
     pub(crate) fn unplug(&mut self) {
-        // The name goes before the terminal, whose number may be that of another program's at once.
-        let _ = std::fs::remove_file(&self.path);
-        if let Some((stop, thread)) = self.plugged.take() {
+        if let Some((name, stop, thread)) = self.plugged.take() {
+            drop(name);
             stop.store(true, Ordering::Relaxed);
             let _ = thread.join();
         }
@@ -37,19 +37,15 @@ impl Cable {
 
     /// Plugs it in again.
     pub(crate) fn plug_in(&mut self) -> Result<(), String> {
-        let (ours, theirs) = TTYPort::pair().map_err(|e| format!("no pseudo-terminal: {e}"))?;
-        let name = theirs.name().ok_or("a pseudo-terminal without a name")?;
-        let host = never_wait(ours).map_err(|e| e.to_string())?;
-        // Keeps the line open and raw between hosts, without the lock of the library's own handle.
-        let held = OpenOptions::new().read(true).write(true).open(&name).map_err(|e| e.to_string())?;
-        drop(theirs);
+        let (host, terminal, held) = pseudo_terminal().map_err(|e| format!("no pseudo-terminal: {e}"))?;
         let projector =
             tty::open(&self.projector, 3_000_000).map_err(|e| format!("{}: {e}", self.projector))?;
-        link(Path::new(&name), &self.path)?;
+        let name =
+            PortName::give(&self.path, &terminal).map_err(|e| format!("{}: {e}", self.path.display()))?;
         let stop = Arc::new(AtomicBool::new(false));
         let stopped = stop.clone();
         let thread = std::thread::spawn(move || carry(host, projector, held, &stopped));
-        self.plugged = Some((stop, thread));
+        self.plugged = Some((name, stop, thread));
         Ok(())
     }
 }
@@ -58,11 +54,6 @@ impl Drop for Cable {
     fn drop(&mut self) {
         self.unplug();
     }
-}
-
-fn link(to: &Path, path: &Path) -> Result<(), String> {
-    let _ = std::fs::remove_file(path);
-    std::os::unix::fs::symlink(to, path).map_err(|e| format!("{}: {e}", path.display()))
 }
 
 /// Bytes on their way in one direction.
