@@ -21,7 +21,7 @@ use crate::kms::Kms;
 use crate::scan_out::DisplayError;
 
 #[cfg(test)]
-#[path = "../tests/common/compositor.rs"]
+#[path = "../tests/laws/common/compositor.rs"]
 mod compositor;
 pub mod names;
 pub mod wayland;

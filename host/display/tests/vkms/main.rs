@@ -4,11 +4,11 @@
 //! `./x hil` runs this in a virtual machine with `DPM_VKMS=1`. The program is also the guardian of its own runs.
 
 mod checksum;
-#[path = "../common/mod.rs"]
+#[path = "../laws/common/mod.rs"]
 mod common;
 // Its bad manners are for the tests of the client (`host/display/src/lease/wayland/tests.rs`).
 #[allow(dead_code)]
-#[path = "../common/compositor.rs"]
+#[path = "../laws/common/compositor.rs"]
 mod compositor;
 mod demo;
 mod lease;

@@ -23,7 +23,6 @@ mod real;
 mod rights;
 mod run;
 mod settings;
-#[cfg(feature = "stepped")]
 pub mod stepped;
 mod supervisor;
 mod threads;

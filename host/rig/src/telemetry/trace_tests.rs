@@ -4,7 +4,7 @@ use super::super::interval::tests::frame;
 use super::*;
 use trace_check::{check, every_frame_can_be_followed};
 
-#[path = "../../../dpm/tests/cli_common/trace_check.rs"]
+#[path = "../../../dpm/tests/laws/cli_common/trace_check.rs"]
 mod trace_check;
 
 fn trace(frames: &[(FrameTimeline, Vec<(&str, u64)>)]) -> String {

@@ -185,13 +185,11 @@ impl TrackingStage {
     }
 
     /// What the tracker says of itself.
-    #[cfg(feature = "stepped")]
     pub(crate) fn status(&self) -> String {
         self.tracker.status()
     }
 
     /// Capture and arrival of the first body's newest sample.
-    #[cfg(feature = "stepped")]
     pub(crate) fn newest(&self) -> Option<(HostTime, HostTime)> {
         Some((self.bank.state(BodyIndex(0))?.captured_at, *self.received_at.first()?))
     }

@@ -1,0 +1,166 @@
+//! Found in use, R1: any thread of a running rig may hang. The projector, which is not part of that process, goes
+//! dark at the instant that its current frame carries, and what hangs is replaced if possible.
+#![cfg(target_os = "linux")]
+#![allow(unsafe_code)]
+
+use crate::cli_common::{code, dpm, err, start, Folder, Running};
+use crate::link_common::{raster, served_time, Projector, PtyProjector};
+use hil_mock::projector::MockConfig;
+use std::time::{Duration, Instant};
+
+const LONG: Duration = Duration::from_secs(60);
+/// The rig's `safety.predict_ms`, which is longer than three slots at 60 frames per second.
+const PREDICT_MS: u64 = 100;
+const SLOT_MS: u64 = 17;
+
+/// A thread of another process that is stopped as long as this lives.
+struct Stopped {
+    thread: i32,
+}
+
+impl Stopped {
+    /// Stops a thread immediately, as a debugger would.
+    fn new(thread: i32) -> Option<Self> {
+        let none = std::ptr::null_mut::<libc::c_void>();
+        // SAFETY: ptrace and waitpid change nothing in this process; the status is written during the call.
+        unsafe {
+            if libc::ptrace(libc::PTRACE_SEIZE, thread, none, none) != 0 {
+                return None;
+            }
+            let stopped = Self { thread };
+            assert_eq!(libc::ptrace(libc::PTRACE_INTERRUPT, thread, none, none), 0);
+            let mut status = 0;
+            assert_eq!(libc::waitpid(thread, &mut status, libc::__WALL), thread);
+            Some(stopped)
+        }
+    }
+}
+
+impl Stopped {
+    /// Acknowledges the thread's end. Until the tracer does, the parent does not see the end of the process.
+    fn reap(&self, process: u32) {
+        // The process's own end is left to its parent.
+        if self.thread as u32 != process {
+            // SAFETY: waitpid changes nothing but the status, which is not requested.
+            unsafe { libc::waitpid(self.thread, std::ptr::null_mut(), libc::__WALL) };
+        }
+    }
+}
+
+impl Drop for Stopped {
+    fn drop(&mut self) {
+        let none = std::ptr::null_mut::<libc::c_void>();
+        // SAFETY: as above; it does no harm if the thread is gone. Nobody sees the end of the process before the tracer has
+        // acknowledged that of the thread.
+        unsafe {
+            if libc::ptrace(libc::PTRACE_DETACH, self.thread, none, none) != 0 {
+                libc::waitpid(self.thread, std::ptr::null_mut(), libc::__WALL | libc::WNOHANG);
+            }
+        }
+    }
+}
+
+/// Threads of a process with their names.
+fn threads(id: u32) -> Vec<(i32, String)> {
+    let tasks = std::fs::read_dir(format!("/proc/{id}/task")).expect("the process runs");
+    let mut all: Vec<_> = tasks
+        .filter_map(|task| {
+            let path = task.ok()?.path();
+            let name = std::fs::read_to_string(path.join("comm")).ok()?;
+            Some((path.file_name()?.to_str()?.parse().ok()?, name.trim().to_owned()))
+        })
+        .collect();
+    all.sort();
+    all
+}
+
+fn rig(name: &str) -> (Folder, String, PtyProjector) {
+    let folder = Folder::new(name);
+    let far = PtyProjector::new(name, MockConfig::new(raster()));
+    let text = format!(
+        "[projector]\nwidth = {}\nheight = {}\nframe_rate = 60\nplanes = 8\nbackend = {}\n\
+         [render]\nspp = 1\nmethod = \"full\"\n[safety]\npredict_ms = {PREDICT_MS}\n[output]\ndir = {:?}\n\
+         [[scene.bodies]]\nname = \"bunny\"\n",
+        raster().width(),
+        raster().height(),
+        far.backend(""),
+        folder.text(),
+    );
+    let path = folder.write("rig.toml", &text);
+    (folder, path, far)
+}
+
+fn lit_run(path: &str, far: &PtyProjector) -> Running {
+    let run = start(&["run", path]);
+    let lit = far.status().frames_lit;
+    far.until(LONG, "light", &mut |s| s.lit && s.frames_lit >= lit.saturating_add(10));
+    run
+}
+
+/// Threads without which no frame is lit. (`stop.rs` tests stopping while any thread hangs.)
+const NEEDED_FOR_LIGHT: [&str; 4] = ["dpm-plan", "dpm-pack", "dpm-link", "llvmpipe-0"];
+
+#[test]
+fn whichever_thread_of_the_frames_way_hangs_light_ends_by_itself() {
+    let (_folder, path, far) = rig("hangs");
+    for name in NEEDED_FOR_LIGHT {
+        let run = lit_run(&path, &far);
+        let all = threads(run.id());
+        let Some((thread, _)) = all.iter().find(|(_, n)| n == name) else { panic!("{name}: {all:?}") };
+        let stopped = Stopped::new(*thread).expect("it may be traced");
+        let dark = served_time(name, || !far.is_lit());
+        // A frame that was already sent may still be lit for its own slot.
+        let bound = Duration::from_millis(4 * SLOT_MS + PREDICT_MS + 20);
+        assert!(dark <= bound, "{name}: dark after {dark:?}");
+        run.signal("KILL");
+        stopped.reap(run.id());
+        drop(stopped);
+    }
+}
+
+/// A stage that hangs is abandoned, named and replaced; when it wakes up it has no effect.
+#[test]
+fn a_stage_that_hangs_is_replaced_and_does_nothing_when_it_wakes_up() {
+    let (_folder, path, far) = rig("replaced");
+    for name in ["dpm-plan", "dpm-pack", "llvmpipe-0"] {
+        let mut run = lit_run(&path, &far);
+        let id = run.id();
+        let (thread, _) = threads(id).into_iter().find(|(_, n)| n == name).expect("it runs");
+        let stopped = Stopped::new(thread).expect("it may be traced");
+        let hung = Instant::now();
+        far.until(LONG, "dark", &mut |s| !s.lit);
+        let lit = far.status().frames_lit;
+        far.until(LONG, "light again", &mut |s| s.lit && s.frames_lit > lit);
+        let back = hung.elapsed();
+        // Making pipelines takes an unknown time on this machine, but must not take minutes.
+        assert!(back < Duration::from_secs(60), "{name}: {back:?}");
+        run.wait_for_line(LONG, |line| line.contains("are restarted"));
+        drop(stopped);
+        let before = far.status();
+        far.until(LONG, "light goes on", &mut |s| s.frames_lit >= before.frames_lit + 20);
+        let after = far.status();
+        assert_eq!(after.frames_incomplete, before.frames_incomplete, "{name}");
+        run.signal("TERM");
+        let status = run.finish().0;
+        assert!(!far.is_lit(), "{name}: {status}");
+    }
+}
+
+/// A frozen picture is held only while something could replace it.
+#[test]
+fn a_frozen_picture_goes_dark_when_a_stage_hangs() {
+    let (_folder, path, far) = rig("frozen");
+    let run = lit_run(&path, &far);
+    let told = dpm(&["freeze", "--pid", &run.id().to_string()], &[]);
+    assert_eq!(code(&told), 0, "{}", err(&told));
+    // Longer than the light of any frame may last.
+    std::thread::sleep(Duration::from_millis(4 * SLOT_MS + 2 * PREDICT_MS));
+    assert!(far.is_lit(), "held");
+    let (thread, _) = threads(run.id()).into_iter().find(|(_, n)| n == "dpm-plan").expect("it runs");
+    let stopped = Stopped::new(thread).expect("it may be traced");
+    let dark = served_time("dark", || !far.is_lit());
+    // The stage's announcement, 0.1 s more, and the supervisor's confirmation that is missing.
+    assert!(dark <= Duration::from_millis(500), "dark after {dark:?}");
+    run.signal("KILL");
+    stopped.reap(run.id());
+}

@@ -1,0 +1,109 @@
+//! The rig's events: state, figures, notes and pictures for those who look, and nothing for nobody.
+
+use crate::common::{Running, PATIENCE};
+use base64::prelude::{Engine, BASE64_STANDARD};
+use std::io::{BufRead, BufReader, Write};
+use std::net::TcpStream;
+use std::time::Instant;
+
+struct Viewer<'a> {
+    rig: &'a Running,
+    lines: BufReader<TcpStream>,
+}
+
+impl<'a> Viewer<'a> {
+    fn new(rig: &'a Running) -> Self {
+        let mut stream = TcpStream::connect(rig.address).unwrap();
+        stream.set_read_timeout(Some(PATIENCE)).unwrap();
+        let request = format!("GET /api/events HTTP/1.1\r\nHost: {}\r\n\r\n", rig.address);
+        stream.write_all(request.as_bytes()).unwrap();
+        Self { rig, lines: BufReader::new(stream) }
+    }
+
+    /// The data of the next event of this name for which `is` holds.
+    fn next(&mut self, name: &str, is: impl Fn(&serde_json::Value) -> bool) -> serde_json::Value {
+        let begin = Instant::now();
+        let mut event = String::new();
+        loop {
+            assert!(begin.elapsed() < PATIENCE, "no such {name}: {:?}", self.rig.monitor.counts());
+            let mut line = String::new();
+            self.lines.read_line(&mut line).unwrap();
+            if let Some(name) = line.trim_end().strip_prefix("event: ") {
+                event = name.to_owned();
+            } else if let Some(data) = line.strip_prefix("data: ").filter(|_| event == name) {
+                let data = serde_json::from_str(data.trim_end()).unwrap();
+                if is(&data) {
+                    return data;
+                }
+            }
+        }
+    }
+
+    /// The mean of the newest picture of the light, 0 to 255.
+    fn brightness(&mut self, is: impl Fn(f64) -> bool) -> f64 {
+        let mean = |pictures: &serde_json::Value| {
+            let png = BASE64_STANDARD.decode(pictures["light"].as_str()?).unwrap();
+            let picture = image::load_from_memory(&png).unwrap().to_luma8();
+            assert!(picture.width() <= 320 && picture.height() <= 240);
+            Some(picture.pixels().map(|p| f64::from(p.0[0])).sum::<f64>() / picture.pixels().len() as f64)
+        };
+        let found = self.next("pictures", |pictures| mean(pictures).is_some_and(&is));
+        mean(&found).unwrap()
+    }
+}
+
+#[test]
+fn a_viewer_sees_the_light_go_and_come_back() {
+    let rig = Running::start("light");
+    assert!(!rig.monitor.live().is_looked_at(), "nobody looks");
+    let mut viewer = Viewer::new(&rig);
+    let bright = viewer.brightness(|mean| mean > 20.0);
+    rig.order("black");
+    let state = viewer.next("state", |now| now["projector"] == "BLACK");
+    assert_eq!((state["is_light"].as_bool(), state["standing"].as_str()), (Some(false), Some("black")));
+    assert_eq!(viewer.brightness(|mean| mean < 1.0), 0.0);
+    rig.order("arm");
+    viewer.next("state", |now| now["projector"] == "up" && now["is_light"] == true);
+    assert!(viewer.brightness(|mean| mean > 20.0) > bright * 0.5);
+    viewer.next("pictures", |p| p["viewer"].is_string() && p["per_s"].as_f64().is_some_and(|n| n <= 10.0));
+    let notes = rig.notes.clone();
+    notes.add("a note <b>with signs</b>");
+    viewer
+        .next("notes", |all| all.as_array().unwrap().iter().any(|n| n["text"] == "a note <b>with signs</b>"));
+    assert!(rig.monitor.live().is_looked_at());
+    drop(viewer);
+    rig.wait("an end of looking", || !rig.monitor.live().is_looked_at());
+}
+
+#[test]
+fn figures_say_what_the_report_says() {
+    let rig = Running::start("figures");
+    let mut viewer = Viewer::new(&rig);
+    let figures = viewer.next("figures", |f| f["report"]["frames_lit"].as_u64() > Some(3));
+    let bounds = figures["setup"]["bounds_ms"].as_array().unwrap().len();
+    let intervals = figures["intervals"].as_array().unwrap();
+    assert!(intervals.iter().all(|i| i["up_to"].as_array().unwrap().len() == bounds));
+    assert!(intervals.iter().any(|i| i["name"] == "motion_to_centre" && i["count"].as_u64() > Some(0)));
+    let names: Vec<_> = figures["bodies"].as_array().unwrap().iter().map(|b| b["name"].clone()).collect();
+    assert_eq!(names.len(), 2, "{names:?}");
+    assert!(figures["bodies"].as_array().unwrap().iter().all(|b| b["dark"].is_null() && b["seen"] == true));
+    assert!(
+        figures["link"]["sessions"].as_u64() == Some(1) && figures["link"]["sent_mb"].as_f64() > Some(0.0)
+    );
+    assert!(figures["report"]["missed_by_cause"].as_object().unwrap().len() > 3);
+    let later = viewer
+        .next("figures", |f| f["report"]["frames_lit"].as_u64() > figures["report"]["frames_lit"].as_u64());
+    assert_eq!(later["setup"], figures["setup"]);
+}
+
+#[test]
+fn a_dark_body_says_why() {
+    let flags = ["real_time.pace=\"real\"", "projector.frame_rate=\"100/1\"", "tracker.drop_out=1.0"];
+    let rig = Running::with("dark", &flags);
+    let mut viewer = Viewer::new(&rig);
+    let figures = viewer.next("figures", |f| {
+        f["bodies"].as_array().is_some_and(|all| !all.is_empty() && all.iter().all(|b| !b["dark"].is_null()))
+    });
+    assert_eq!(figures["bodies"][0]["dark"], "never_seen", "{figures}");
+    assert!(figures["bodies"][0]["told"].as_str().unwrap().contains("never seen"));
+}

@@ -1,0 +1,90 @@
+//! Parameters over HTTP: from a request to the frame that uses the change, and who may not change them.
+
+use crate::common::{ask, Running};
+
+impl Running {
+    fn change(&self, path: &str) -> (u16, String) {
+        let answer = self.ask("POST", path, &[("X-Dpm-Token", self.token.as_str())]);
+        (answer.status, answer.body)
+    }
+
+    /// The numbers of a parameter, and whether planning uses the newest version.
+    fn value(&self, name: &str) -> (Vec<f64>, bool) {
+        let told: serde_json::Value =
+            serde_json::from_str(&self.ask("GET", "/api/parameters", &[]).body).unwrap();
+        let all = told["all"].as_array().unwrap();
+        let one = all.iter().find(|p| p["name"] == name).unwrap_or_else(|| panic!("no {name}: {told}"));
+        let numbers = one["numbers"].as_array().unwrap().iter().map(|n| n.as_f64().unwrap()).collect();
+        (numbers, told["used"] == told["version"])
+    }
+}
+
+#[test]
+fn a_change_is_answered_when_a_frame_uses_it_and_is_taken_back() {
+    let rig = Running::start("change");
+    let (status, body) = rig.change("/api/parameters/set?name=exposure&value=1.5");
+    assert!(status == 200 && body.contains("ok: exposure is 1.5, from frame "), "{body}");
+    // The answer is the state: planning uses it already.
+    assert_eq!(rig.value("exposure"), (vec![1.5], true));
+    let (status, body) = rig.change("/api/parameters/set?name=body.bunny&value=1,0,0,0,0,0.5");
+    assert!(status == 200 && body.contains("\"done\":true"), "{body}");
+    assert_eq!(rig.value("body.bunny").0, [1.0, 0.0, 0.0, 0.0, 0.0, 0.5]);
+    let used = || rig.monitor.live().snapshot().map_or(0, |s| s.frame.parameters);
+    rig.wait("a frame that says so", || {
+        rig.monitor.live().look();
+        used() == 2
+    });
+    for _ in 0..2 {
+        assert_eq!(rig.change("/api/parameters/undo").0, 200);
+    }
+    assert_eq!((rig.value("exposure"), rig.value("body.bunny").0), ((vec![1.0], true), vec![0.0; 6]));
+    let (status, body) = rig.change("/api/parameters/undo");
+    assert!(status == 400 && body.contains("nothing to take back"), "{body}");
+    // This run has no rig file.
+    rig.change("/api/parameters/set?name=exposure&value=2");
+    let (status, body) = rig.change("/api/parameters/save");
+    assert!(status == 400 && body.contains("no rig file"), "{body}");
+    // BLACK holds whatever is changed.
+    rig.order("black");
+    assert_eq!(rig.change("/api/parameters/set?name=exposure&value=3").0, 200);
+    assert_eq!(rig.monitor.projector().word(), "BLACK");
+}
+
+#[test]
+fn nonsense_is_refused_and_changes_nothing() {
+    let rig = Running::start("nonsense");
+    for (path, status, word) in [
+        ("/api/parameters/set?name=exposure&value=NaN", 400, "NaN is not allowed"),
+        ("/api/parameters/set?name=exposure&value=1e99", 400, "must be 0.000001 to 1000000"),
+        ("/api/parameters/set?name=exposure&value=", 400, "takes one number"),
+        ("/api/parameters/set?name=brightness&value=1", 400, "there are: exposure"),
+        ("/api/parameters/set?name=%ff&value=1", 400, "write ?name"),
+        ("/api/parameters/set", 400, "write ?name"),
+        ("/api/parameters/arm", 404, "set, undo and save"),
+    ] {
+        let (got, body) = rig.change(path);
+        assert!(got == status && body.contains(word), "{path}: {got} {body}");
+    }
+    assert_eq!(rig.value("exposure"), (vec![1.0], true));
+}
+
+#[test]
+fn nobody_changes_anything_without_the_token_under_another_name_or_from_another_site() {
+    let rig = Running::start("stranger");
+    let path = "/api/parameters/set?name=exposure&value=9";
+    let (host, token) = (rig.address.to_string(), rig.token.as_str());
+    let wrong = "0".repeat(64);
+    for (headers, status) in [
+        (vec![("Host", host.as_str())], 401),
+        (vec![("Host", host.as_str()), ("X-Dpm-Token", wrong.as_str())], 403),
+        (vec![("Host", "evil.example"), ("X-Dpm-Token", token)], 421),
+        (vec![("Host", host.as_str()), ("X-Dpm-Token", token), ("Origin", "https://evil.example")], 403),
+        (vec![("Host", host.as_str()), ("X-Dpm-Token", token), ("Sec-Fetch-Site", "cross-site")], 403),
+    ] {
+        let answer = ask(rig.address, "POST", path, &headers);
+        assert_eq!(answer.status, status, "{headers:?}: {}", answer.body);
+    }
+    // A link or a picture of another page is a GET.
+    assert_eq!(rig.ask("GET", path, &[("X-Dpm-Token", token)]).status, 405);
+    assert_eq!(rig.value("exposure"), (vec![1.0], true));
+}

@@ -1,0 +1,5 @@
+//! The integration tests of this crate, in one program: one link, one row of costs.
+
+#[path = "../../../scene/tests/laws/common/mod.rs"]
+mod common;
+mod hostile_gltf;

@@ -1,0 +1,13 @@
+//! The integration tests of this crate, in one program: one link, one row of costs.
+
+mod animation;
+mod body_picture;
+mod common;
+mod compressed_gltf;
+mod deform;
+mod deforming;
+mod gltf_scenes;
+mod ktx2_formats;
+mod ktx2_textures;
+mod mutated_gltf;
+mod opencv_lens;

@@ -1,0 +1,5 @@
+//! The integration tests of this crate, in one program: one link, one row of costs.
+
+mod driver;
+mod projector;
+mod rules;

@@ -1,0 +1,51 @@
+//! The integration tests of this crate, in one program: one link, one row of costs.
+
+mod albedo_on_gpu;
+mod animation;
+mod calibration;
+mod calibration_display;
+mod clips;
+#[path = "../../../host/scene/tests/laws/common/mod.rs"]
+mod common;
+mod compensation_on_gpu;
+mod corpora;
+mod deforming;
+mod dlpc900_light;
+mod dlpc900_motion;
+mod doctor;
+mod documents;
+mod end_to_end;
+mod equal_work;
+mod error_runs;
+mod frame_law;
+mod frame_path;
+mod frame_path_calls;
+mod frame_path_sockets;
+mod frame_path_usb;
+mod frame_path_vulkan;
+mod full_raster;
+mod gaze;
+mod gpu_against_reference;
+mod halftone_on_gpu;
+mod large_rasters;
+mod leaving_out;
+mod lens_on_gpu;
+#[path = "../../../host/dpm/tests/laws/link_common/mod.rs"]
+mod link_common;
+mod live_pictures;
+mod many_bodies;
+mod methods;
+mod packing_on_gpu;
+mod rates;
+mod ray_query;
+mod references;
+mod rig_files;
+mod scene_files;
+mod soak;
+mod structure;
+mod subgroup_widths;
+mod tracer_extremes;
+mod tracks;
+mod turns;
+mod tutorial;
+mod warp_on_gpu;

@@ -1,0 +1,9 @@
+//! The integration tests of this crate, in one program: one link, one row of costs.
+
+mod barriers;
+mod common;
+mod control;
+mod failing_calls;
+mod other_device;
+mod renderer;
+mod whole_rig;
