@@ -67,7 +67,7 @@ pub fn is_rough(here: u32, [left, right, above, below]: [u32; 4]) -> bool {
 
 /// What a frame adds to places of group `group` before their fraction is cut off, 0 to 63 in 1/64 pixel: multiples of the
 /// golden ratio and of the root of 2, which take all values evenly over the frames.
-pub(super) fn turn_of(before: u32, group: u32) -> [i32; 2] {
+fn turn_of(before: u32, group: u32) -> [i32; 2] {
     let of = |step: u32, apart: u32| before.wrapping_mul(step).wrapping_add(group.wrapping_mul(apart)) >> 26;
     [of(0x9E37_79B9, 0x61C8_8647), of(0x6A09_E667, 0x3C6E_F372)].map(|turn| turn as i32)
 }
@@ -190,7 +190,7 @@ pub fn within(mover: &Mover, pixel: [i32; 2]) -> bool {
 }
 
 /// How the body moves at a pixel, about: all that is known where the pixel does not show it.
-pub(super) fn start_of(mover: &Mover, pixel: [i32; 2]) -> [i32; 2] {
+fn start_of(mover: &Mover, pixel: [i32; 2]) -> [i32; 2] {
     let [x, y] = [0, 1].map(|c| pixel[c] - mover.centre[c]);
     let of = |c: usize| {
         let slope = [mover.slope[2 * c], mover.slope[2 * c + 1]];
@@ -230,6 +230,130 @@ mod tests {
         assert!(!is_rough(grey(100), [grey(100), grey(148), grey(100), grey(100)]));
         assert!(is_rough(grey(100), [grey(100), grey(149), grey(100), grey(100)]));
         assert!(is_rough(grey(100), [grey(60), grey(140), grey(100), grey(100) - (49 << 16)]));
+    }
+
+    /// All pixels of a raster, row by row.
+    fn places(raster: Raster) -> impl Iterator<Item = [i32; 2]> {
+        let [width, height] = [raster.width(), raster.height()].map(|c| c as i32);
+        (0..height).flat_map(move |y| (0..width).map(move |x| [x, y]))
+    }
+
+    /// A mover whose area is all of `raster`.
+    fn mover_of_all(raster: Raster, start: [i32; 2], instant: i32) -> Mover {
+        let upper = [raster.width(), raster.height()].map(|c| c as i32);
+        Mover { upper, start, instant, ..bytemuck::Zeroable::zeroed() }
+    }
+
+    fn moved(word: u32, [x, y]: [i32; 2], owner: u32, depth: u32) -> Moved {
+        Moved { word, motion: (x as u32 & 0xffff) | (y as u32) << 16, owner_and_depth: owner << 24 | depth }
+    }
+
+    const BODY: u32 = OWNER_STILL + 1;
+
+    /// The picture of a body is a slope in every channel, and the body moves evenly by any fraction of a pixel along columns and
+    /// rows. A mirror shows what the slope is at the place that is there by then: groups of whole codes to half a code and what
+    /// rounding the place adds, groups of single bits the bits of the same codes.
+    #[test]
+    fn every_fraction_of_a_pixel_is_interpolated() {
+        let raster = Raster::new(40, 24).unwrap();
+        let slope = |[x, y]: [f64; 2]| [20.0 + 2.0 * x + y, 250.0 - 3.0 * x - 2.0 * y, 20.0 + 5.0 * y];
+        let steepest = 5.0;
+        for turn in 0..64 {
+            let motion = [turn * 5 % 64 - 32, 3 * (turn - 32)];
+            let codes = places(raster).map(|at| slope(at.map(f64::from)).map(|code| code as u32));
+            let pixels: Vec<Moved> =
+                codes.map(|[r, g, b]| moved(r | g << 8 | b << 16, motion, BODY, 0)).collect();
+            for (drawn_at, apart) in [(0, 16000), (19000, -9000)] {
+                let movers = [mover_of_all(raster, motion, drawn_at)];
+                let drawn = Drawn { raster, pixels: &pixels, movers: &movers, are_codes: true, before: 0 };
+                let groups: Vec<PlaneGroup> = (0..8)
+                    .map(|bit| PlaneGroup { mask: 0x01_0101 << bit, instant: (bit - 4) * apart })
+                    .collect();
+                // No place is farther off than a pixel and a half.
+                let inner = |[x, y]: &[i32; 2]| (3..37).contains(x) && (3..21).contains(y);
+                for at in places(raster).filter(inner) {
+                    let bits = drawn.word(at, &groups);
+                    for group in &groups {
+                        let whole = drawn.word(at, &[PlaneGroup { mask: 0xff_ffff, ..*group }]);
+                        assert_eq!(bits & group.mask, whole & group.mask, "{motion:?} at {at:?}");
+                        let share = f64::from(group.instant - drawn_at) / 65536.0;
+                        let from = [0, 1].map(|c| f64::from(at[c]) - f64::from(motion[c]) / 64.0 * share);
+                        for (code, wanted) in [whole, whole >> 8, whole >> 16].into_iter().zip(slope(from)) {
+                            let off = (f64::from(code & 0xff) - wanted).abs();
+                            assert!(off <= 0.5 + steepest / 64.0, "{motion:?} at {at:?}: off by {off}");
+                        }
+                    }
+                }
+            }
+        }
+    }
+
+    /// The words of halftones are taken whole from the nearest pixel, with all their bits.
+    #[test]
+    fn halftones_are_not_interpolated() {
+        let raster = Raster::new(16, 9).unwrap();
+        let motion = [96, -40];
+        let word = |[x, y]: [i32; 2]| ((16 * y + x + 1) as u32).wrapping_mul(2_654_435_761);
+        let pixels: Vec<Moved> = places(raster).map(|at| moved(word(at), motion, BODY, 0)).collect();
+        let movers = [mover_of_all(raster, motion, 0)];
+        let drawn = Drawn { raster, pixels: &pixels, movers: &movers, are_codes: false, before: 0 };
+        let groups = [PlaneGroup { mask: 0xff_ffff, instant: 65535 }];
+        // The place is 1.5 pixels to the left, which is nearest to the right one of two, and 0.6 pixels below.
+        let from = word([8 - 1, 4 + 1]);
+        assert_eq!(drawn.word([8, 4], &groups), from & 0xff_ffff | word([8, 4]) & 0xff00_0000);
+    }
+
+    /// A body that is fast comes from far away over what is farther, another body, a wall or nothing, and not over what is nearer.
+    /// Where it has left mirrors, they show what is seen behind its edge.
+    #[test]
+    fn a_body_comes_from_far_away() {
+        let raster = Raster::new(200, 70).unwrap();
+        let is_in = |[x, y]: [i32; 2]| (0..200).contains(&x) && (0..70).contains(&y);
+        let is_fast = |at: [i32; 2]| is_in(at) && (at[0] > 110 || at[1] > 40);
+        for (fast, behind, is_nearer) in [
+            ([-4096, 0], OWNER_STILL + 1, true),
+            ([0, -2048], OWNER_STILL, true),
+            ([-4096, 2048], OWNER_NONE, true),
+            ([-4096, -2048], OWNER_STILL, false),
+            ([4096, 2048], OWNER_STILL + 1, false),
+        ] {
+            let depth = if is_nearer { 5 } else { 2000 };
+            let of = |at| match is_fast(at) {
+                true => moved(0, fast, OWNER_STILL + 2, depth),
+                false => moved(0, [0, 0], behind, 900),
+            };
+            let pixels: Vec<Moved> = places(raster).map(of).collect();
+            let movers = [[0, 0], fast].map(|start| mover_of_all(raster, start, 0));
+            let drawn = Drawn { raster, pixels: &pixels, movers: &movers, are_codes: true, before: 0 };
+            let shows = |at: [i32; 2]| is_in(at) && (is_fast(at) || behind != OWNER_NONE);
+            // By a 32nd of the exposure the body has moved by one or two pixels.
+            for instant in (-16..=16).map(|step| 2048 * step) {
+                for at in places(raster) {
+                    let from = [0, 1].map(|c| at[c] - ((fast[c] * instant) >> 22));
+                    let comes = is_fast(from) && (is_nearer || behind == OWNER_NONE);
+                    let source = if is_fast(at) || comes { from } else { at };
+                    let wanted = shows(source).then_some(source);
+                    assert_eq!(drawn.source_at(at, instant), wanted, "{fast:?}, {instant} at {at:?}");
+                }
+            }
+        }
+    }
+
+    /// What a mover's slopes tell far from its middle is cut off at what a pixel can hold.
+    #[test]
+    fn a_body_is_looked_for_no_farther_than_pixels_can_tell() {
+        let start = [32000, -32000];
+        let mover = Mover {
+            centre: [10, 5],
+            start,
+            slope: [131_072, 0, 0, -131_072],
+            ..bytemuck::Zeroable::zeroed()
+        };
+        assert_eq!(start_of(&mover, [10, 5]), start);
+        assert_eq!(start_of(&mover, [10 - 60, 5 - 3]), [32000 - 32 * 60, -32000 + 32 * 3]);
+        assert_eq!(start_of(&mover, [10 + 23, 5 + 23]), [32000 + 32 * 23, -32000 - 32 * 23]);
+        assert_eq!(start_of(&mover, [10 + 24, 5 + 24]), [32767, -32767]);
+        assert_eq!(start_of(&mover, [10 - 2100, 5 - 2100]), [-32767, 32767]);
     }
 
     #[test]

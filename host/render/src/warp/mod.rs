@@ -11,17 +11,12 @@
 
 pub mod gather;
 mod movers;
-#[cfg(target_arch = "x86_64")]
-mod simd;
-#[cfg(test)]
-mod tests;
 
 pub(crate) use movers::Movers;
 
-use crate::pack::{source_bits, Kernel};
+use crate::pack::source_bits;
 use dpm_device::planes::PlaneSchedule;
 use dpm_shaders::structs::PlaneGroup;
-use gather::{within, Drawn};
 use glam::DAffine3;
 
 /// How far on the way from the frame's instant to its own each bit of a code value is shown, unless the configuration says
@@ -75,55 +70,8 @@ fn share_of_exposure(share: f64) -> i32 {
     (share * 65536.0).round().clamp(-65535.0, 65535.0) as i32
 }
 
-/// The CPU twin of the pass `warp`: whole frames at once, by the kernel that packs. Every kernel gives the bits of
-/// [`Drawn::word`]. Made once; what it needs of memory it keeps.
-pub struct Warper {
-    kernel: Kernel,
-    #[cfg(target_arch = "x86_64")]
-    vectors: simd::Vectors,
-}
-
-impl Warper {
-    /// One that warps by `kernel`, or by [`Kernel::best`] if this CPU cannot run it.
-    pub fn new(kernel: Kernel) -> Self {
-        Self {
-            kernel: if Kernel::available().contains(&kernel) { kernel } else { Kernel::best() },
-            #[cfg(target_arch = "x86_64")]
-            vectors: simd::Vectors::default(),
-        }
-    }
-
-    /// Warps a frame: `words` of mirrors in the area of a mover become those of [`Drawn::word`], the others stay as they are.
-    ///
-    /// # Panics
-    /// When `words` or `drawn.pixels` does not hold exactly one value per pixel of the raster, or a mover's area or a pixel's
-    /// owner is not there.
-    pub fn warp(&mut self, drawn: &Drawn<'_>, groups: &[PlaneGroup], words: &mut [u32]) {
-        let count = drawn.raster.pixel_count();
-        assert_eq!((words.len(), drawn.pixels.len()), (count, count), "words and pixels of a raster");
-        #[cfg(target_arch = "x86_64")]
-        {
-            let done = match self.kernel {
-                Kernel::Scalar => false,
-                Kernel::Avx2 => self.vectors.warp_avx2(drawn, groups, words),
-                Kernel::Avx512 => self.vectors.warp_avx512(drawn, groups, words),
-            };
-            if done {
-                return;
-            }
-        }
-        for (row, y) in words.chunks_exact_mut(drawn.raster.width() as usize).zip(0..) {
-            for (word, x) in row.iter_mut().zip(0..) {
-                if drawn.movers.iter().any(|mover| within(mover, [x, y])) {
-                    *word = drawn.word([x, y], groups);
-                }
-            }
-        }
-    }
-}
-
 #[cfg(test)]
-mod group_tests {
+mod tests {
     use super::*;
 
     /// Every bit that a plane shows belongs to one group, and the groups follow one another in time.
