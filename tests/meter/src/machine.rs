@@ -12,11 +12,21 @@ const STANDSTILL: Duration = Duration::from_millis(5);
 const TICKS_PER_S: f64 = 100.0;
 
 /// Seconds of the processor that all children took that this process has waited for, and theirs.
-pub(crate) fn core_seconds_of_children() -> f64 {
+pub fn core_seconds_of_children() -> f64 {
+    core_seconds_of(libc::RUSAGE_CHILDREN)
+}
+
+/// Seconds of the processor that all threads of this process took so far. A test that bounds the cost of a call measures it
+/// by this: cargo-nextest runs one test a process, and other work on the machine does not count.
+pub fn core_seconds() -> f64 {
+    core_seconds_of(libc::RUSAGE_SELF)
+}
+
+fn core_seconds_of(whom: libc::c_int) -> f64 {
     // SAFETY: all bits zero are a valid `rusage`, which holds numbers only.
     let mut usage: libc::rusage = unsafe { std::mem::zeroed() };
     // SAFETY: the kernel writes one `rusage` into memory of ours that holds one.
-    if unsafe { libc::getrusage(libc::RUSAGE_CHILDREN, &mut usage) } != 0 {
+    if unsafe { libc::getrusage(whom, &mut usage) } != 0 {
         return f64::NAN;
     }
     let seconds = |time: libc::timeval| time.tv_sec as f64 + time.tv_usec as f64 * 1e-6;
@@ -25,7 +35,7 @@ pub(crate) fn core_seconds_of_children() -> f64 {
 
 /// Counters of the whole machine at one instant.
 #[derive(Clone, Debug, Default, PartialEq)]
-pub(crate) struct Sample {
+pub struct Sample {
     /// Seconds that all processors were busy, those of `steal` not included.
     busy_s: f64,
     /// Seconds in which a processor had work and the host of the virtual machine ran something else.
@@ -36,7 +46,7 @@ pub(crate) struct Sample {
 
 impl Sample {
     /// Reads `/proc`; what is not there counts as nothing.
-    pub(crate) fn now() -> Self {
+    pub fn now() -> Self {
         let read = |path: &str| std::fs::read_to_string(path).unwrap_or_default();
         Self::of(&read("/proc/stat"), &read("/proc/loadavg"))
     }
@@ -58,14 +68,14 @@ impl Sample {
 }
 
 /// A thread that notices when the machine stands still.
-pub(crate) struct Watch {
+pub struct Watch {
     ends: Arc<AtomicBool>,
     thread: JoinHandle<Vec<Duration>>,
 }
 
 impl Watch {
     /// Begins to watch.
-    pub(crate) fn begin() -> Self {
+    pub fn begin() -> Self {
         let ends = Arc::new(AtomicBool::new(false));
         let seen = ends.clone();
         let thread = std::thread::spawn(move || {
@@ -84,14 +94,14 @@ impl Watch {
     }
 
     /// The lengths of all standstills since the beginning.
-    pub(crate) fn end(self) -> Vec<Duration> {
+    pub fn end(self) -> Vec<Duration> {
         self.ends.store(true, Ordering::Relaxed);
         self.thread.join().unwrap_or_default()
     }
 }
 
 /// A sentence on what the machine did between two samples, while a test of `core_seconds` ran for `seconds`.
-pub(crate) fn account(
+pub fn account(
     before: &Sample,
     after: &Sample,
     seconds: f64,

@@ -10,14 +10,12 @@
 //! A test whose path has the module `real_pace` may fail because the machine was busy. If it fails, what the machine did
 //! meanwhile is printed below its own message, so that nobody has to guess.
 
-mod machine;
-
-use machine::{Sample, Watch};
 use std::ffi::OsString;
 use std::io::Write;
 use std::os::unix::process::{CommandExt, ExitStatusExt};
 use std::process::{Command, ExitCode};
 use std::time::Instant;
+use test_meter::machine::{self, Sample, Watch};
 
 /// The module whose tests run at real pace; `.config/nextest.toml` runs them alone.
 const REAL_PACE: &str = "real_pace::";

@@ -1,0 +1,3 @@
+//! The second tier: more of what the commit tier holds once.
+
+mod hours;
