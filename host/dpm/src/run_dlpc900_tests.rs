@@ -399,66 +399,6 @@ fn until_told(monitor: &RunMonitor, wanted: ProjectorHealth) {
     }
 }
 
-/// Found in use, R2 on this device: a stop, SAFE, BLACK and an opening interlock are obeyed within 50 ms even while
-/// the run's own thread hangs inside the cable, and no later command of that thread brings the light back.
-#[test]
-fn a_hanging_run_is_made_dark_within_50_ms() {
-    let [show, _] = shows();
-    let causes =
-        [Cause::Stop, Cause::Ordered(Order::Safe), Cause::Ordered(Order::Black), Cause::InterlockOpens];
-    for cause in causes {
-        // A busy machine may be late, so one of three tries must be in time.
-        let mut took = Vec::new();
-        for _ in 0..3 {
-            let (model, stuck) = (model(), Arc::new(AtomicBool::new(false)));
-            let is_inside = Arc::new(AtomicBool::new(false));
-            let (monitor, closed) = with_interlock(true);
-            let (seen, watched, hold, held) =
-                (model.clone(), monitor.clone(), stuck.clone(), is_inside.clone());
-            let observer = std::thread::spawn(move || {
-                let (_ends, _goes_on) = (StopOnExit(watched.clone()), ReleaseOnExit(hold.clone()));
-                until(&seen, "running", is_running);
-                // Waits for Up first: the start is acknowledged.
-                until_told(&watched, ProjectorHealth::Up);
-                hold.store(true, Ordering::Relaxed);
-                while !held.load(Ordering::Relaxed) {
-                    std::thread::sleep(Duration::from_millis(1));
-                }
-                let watch = Stopwatch::start();
-                cause.happen(&watched, &closed);
-                until(&seen, "dark", |m| m.dark_because().is_some());
-                let took_ms = watch.elapsed_ns() / 1_000_000;
-                hold.store(false, Ordering::Relaxed);
-                // The run continues where it was. It must neither take the stopped sequence for a failure nor start
-                // it again.
-                for _ in 0..60 {
-                    assert!(seen.lock().unwrap().dark_because().is_some(), "{cause:?}: lit again");
-                    std::thread::sleep(Duration::from_millis(5));
-                }
-                if cause == Cause::InterlockOpens {
-                    assert_eq!(watched.projector(), ProjectorHealth::InterlockOpen);
-                    closed.store(true, Ordering::Relaxed);
-                    until(&seen, "running again", is_running);
-                }
-                took_ms
-            });
-            let mut open = || {
-                let (stuck, is_inside) = (stuck.clone(), is_inside.clone());
-                let hid = VirtualHid::new(model.clone());
-                Dlpc900::new(Sticky { hid, stuck, is_inside, report_time: Duration::ZERO })
-            };
-            let result = present(&mut open, &show, None, &monitor);
-            took.push(observer.join().unwrap());
-            assert!(result.is_ok(), "{cause:?}: {:?}", result.err().map(|e| e.to_string()));
-            assert_eq!(model.lock().unwrap().dark_because(), Some("mirrors exercised"));
-            if took.last().is_some_and(|ms| *ms <= 50) {
-                break;
-            }
-        }
-        assert!(took.iter().any(|ms| *ms <= 50), "{cause:?}: dark after {took:?} ms");
-    }
-}
-
 /// A cable that holds back one start of the sequence until the dark order caused by `cause` has overtaken it. The
 /// answer to that start comes when `stuck` is cleared.
 struct LateStart {
@@ -511,58 +451,6 @@ impl HidPort for LateStart {
     }
     fn second_line(&self) -> Option<Box<dyn dpm_device::dlpc900::driver::SecondLine>> {
         self.hid.second_line()
-    }
-}
-
-/// The worst case: the dark order overtakes a start that is in progress, and the run hangs after that start has
-/// arrived. The light that it causes ends within 50 ms.
-#[test]
-fn a_start_that_arrives_after_the_order_to_be_dark_lights_for_50_ms_at_most() {
-    let [show, _] = shows();
-    for cause in [Cause::InterlockOpens, Cause::Ordered(Order::Safe), Cause::Ordered(Order::Black)] {
-        let mut took = Vec::new();
-        for _ in 0..3 {
-            let (model, stuck, is_due) =
-                (model(), Arc::<AtomicBool>::default(), Arc::<AtomicBool>::default());
-            let (monitor, closed) = with_interlock(true);
-            let (seen, watched, hold, due) = (model.clone(), monitor.clone(), stuck.clone(), is_due.clone());
-            let observer = std::thread::spawn(move || {
-                let (_ends, _goes_on) = (StopOnExit(watched.clone()), ReleaseOnExit(hold.clone()));
-                until_told(&watched, ProjectorHealth::Up);
-                watched.give_order(Order::Black);
-                until_told(&watched, ProjectorHealth::Black);
-                due.store(true, Ordering::Relaxed);
-                watched.give_order(Order::Arm);
-                let begin = Stopwatch::start();
-                while !hold.load(Ordering::SeqCst) {
-                    assert!(begin.elapsed_ns() < 20_000_000_000, "{cause:?}: no start");
-                    std::thread::sleep(Duration::from_millis(1));
-                }
-                let watch = Stopwatch::start();
-                until(&seen, "dark", |m| m.dark_because().is_some());
-                let took_ms = watch.elapsed_ns() / 1_000_000;
-                hold.store(false, Ordering::SeqCst);
-                for _ in 0..60 {
-                    assert!(seen.lock().unwrap().dark_because().is_some(), "{cause:?}: lit again");
-                    std::thread::sleep(Duration::from_millis(5));
-                }
-                took_ms
-            });
-            let (heard, switch) = (monitor.clone(), closed.clone());
-            let happens: Arc<dyn Fn() + Send + Sync> = Arc::new(move || cause.happen(&heard, &switch));
-            let mut open = || {
-                let (hid, model) = (VirtualHid::new(model.clone()), model.clone());
-                let (is_due, stuck, cause) = (is_due.clone(), stuck.clone(), happens.clone());
-                Dlpc900::new(LateStart { hid, model, is_due, stuck, cause })
-            };
-            let result = present(&mut open, &show, None, &monitor);
-            took.push(observer.join().unwrap());
-            assert!(result.is_ok(), "{cause:?}: {:?}", result.err().map(|e| e.to_string()));
-            if took.last().is_some_and(|ms| *ms <= 50) {
-                break;
-            }
-        }
-        assert!(took.iter().any(|ms| *ms <= 50), "{cause:?}: dark after {took:?} ms");
     }
 }
 
@@ -651,40 +539,6 @@ fn nothing_is_started_while_the_interlock_is_open() {
     }
 }
 
-/// A stop in the middle of an upload, or of the three seconds of mirror exercise, ends the run at once and lights
-/// nothing.
-#[test]
-fn a_stop_is_heard_during_the_set_up() {
-    let [show, _] = shows();
-    for exercised in [false, true] {
-        let model = model();
-        if exercised {
-            Dlpc900::new(VirtualHid::new(model.clone())).unwrap().idle().unwrap();
-        }
-        let monitor = Arc::new(RunMonitor::default());
-        let (seen, watched) = (model.clone(), monitor.clone());
-        let observer = std::thread::spawn(move || {
-            let _ends = StopOnExit(watched.clone());
-            until(&seen, "begun", |m| m.commands() > if exercised { 10 } else { 30 });
-            watched.request_stop();
-            Stopwatch::start()
-        });
-        let mut open = || {
-            let hid = VirtualHid::new(model.clone());
-            let (stuck, is_inside) = (Arc::default(), Arc::default());
-            // The whole upload takes some seconds.
-            Dlpc900::new(Sticky { hid, stuck, is_inside, report_time: Duration::from_millis(1) })
-        };
-        let report = present(&mut open, &show, None, &monitor).unwrap();
-        let took = observer.join().unwrap().elapsed_ns();
-        assert!(took < 1_000_000_000, "{took} ns");
-        assert_eq!(report.shown_s, 0.0);
-        let m = model.lock().unwrap();
-        assert_eq!(m.dark_because(), Some("mirrors exercised"));
-        assert_eq!(starts(&m), 0, "never lit");
-    }
-}
-
 /// Only ARM takes SAFE back, FREEZE does not bring back light that was ordered off, and neither ends the run.
 #[test]
 fn orders_outweigh_one_another() {
@@ -730,4 +584,155 @@ fn orders_outweigh_one_another() {
     let report = present(&mut || Dlpc900::new(VirtualHid::new(model.clone())), &show, None, &monitor);
     assert!(report.is_ok(), "{:?}", report.err().map(|e| e.to_string()));
     observer.join().unwrap();
+}
+
+/// How soon it is dark, on a machine with nothing else to do.
+mod real_pace {
+    use super::*;
+
+    /// Found in use, R2 on this device: a stop, SAFE, BLACK and an opening interlock are obeyed within 50 ms even while
+    /// the run's own thread hangs inside the cable, and no later command of that thread brings the light back.
+    #[test]
+    fn a_hanging_run_is_made_dark_within_50_ms() {
+        let [show, _] = shows();
+        let causes =
+            [Cause::Stop, Cause::Ordered(Order::Safe), Cause::Ordered(Order::Black), Cause::InterlockOpens];
+        for cause in causes {
+            // A busy machine may be late, so one of three tries must be in time.
+            let mut took = Vec::new();
+            for _ in 0..3 {
+                let (model, stuck) = (model(), Arc::new(AtomicBool::new(false)));
+                let is_inside = Arc::new(AtomicBool::new(false));
+                let (monitor, closed) = with_interlock(true);
+                let (seen, watched, hold, held) =
+                    (model.clone(), monitor.clone(), stuck.clone(), is_inside.clone());
+                let observer = std::thread::spawn(move || {
+                    let (_ends, _goes_on) = (StopOnExit(watched.clone()), ReleaseOnExit(hold.clone()));
+                    until(&seen, "running", is_running);
+                    // Waits for Up first: the start is acknowledged.
+                    until_told(&watched, ProjectorHealth::Up);
+                    hold.store(true, Ordering::Relaxed);
+                    while !held.load(Ordering::Relaxed) {
+                        std::thread::sleep(Duration::from_millis(1));
+                    }
+                    let watch = Stopwatch::start();
+                    cause.happen(&watched, &closed);
+                    until(&seen, "dark", |m| m.dark_because().is_some());
+                    let took_ms = watch.elapsed_ns() / 1_000_000;
+                    hold.store(false, Ordering::Relaxed);
+                    // The run continues where it was. It must neither take the stopped sequence for a failure nor start
+                    // it again.
+                    for _ in 0..60 {
+                        assert!(seen.lock().unwrap().dark_because().is_some(), "{cause:?}: lit again");
+                        std::thread::sleep(Duration::from_millis(5));
+                    }
+                    if cause == Cause::InterlockOpens {
+                        assert_eq!(watched.projector(), ProjectorHealth::InterlockOpen);
+                        closed.store(true, Ordering::Relaxed);
+                        until(&seen, "running again", is_running);
+                    }
+                    took_ms
+                });
+                let mut open = || {
+                    let (stuck, is_inside) = (stuck.clone(), is_inside.clone());
+                    let hid = VirtualHid::new(model.clone());
+                    Dlpc900::new(Sticky { hid, stuck, is_inside, report_time: Duration::ZERO })
+                };
+                let result = present(&mut open, &show, None, &monitor);
+                took.push(observer.join().unwrap());
+                assert!(result.is_ok(), "{cause:?}: {:?}", result.err().map(|e| e.to_string()));
+                assert_eq!(model.lock().unwrap().dark_because(), Some("mirrors exercised"));
+                if took.last().is_some_and(|ms| *ms <= 50) {
+                    break;
+                }
+            }
+            assert!(took.iter().any(|ms| *ms <= 50), "{cause:?}: dark after {took:?} ms");
+        }
+    }
+
+    /// The worst case: the dark order overtakes a start that is in progress, and the run hangs after that start has
+    /// arrived. The light that it causes ends within 50 ms.
+    #[test]
+    fn a_start_that_arrives_after_the_order_to_be_dark_lights_for_50_ms_at_most() {
+        let [show, _] = shows();
+        for cause in [Cause::InterlockOpens, Cause::Ordered(Order::Safe), Cause::Ordered(Order::Black)] {
+            let mut took = Vec::new();
+            for _ in 0..3 {
+                let (model, stuck, is_due) =
+                    (model(), Arc::<AtomicBool>::default(), Arc::<AtomicBool>::default());
+                let (monitor, closed) = with_interlock(true);
+                let (seen, watched, hold, due) = (model.clone(), monitor.clone(), stuck.clone(), is_due.clone());
+                let observer = std::thread::spawn(move || {
+                    let (_ends, _goes_on) = (StopOnExit(watched.clone()), ReleaseOnExit(hold.clone()));
+                    until_told(&watched, ProjectorHealth::Up);
+                    watched.give_order(Order::Black);
+                    until_told(&watched, ProjectorHealth::Black);
+                    due.store(true, Ordering::Relaxed);
+                    watched.give_order(Order::Arm);
+                    let begin = Stopwatch::start();
+                    while !hold.load(Ordering::SeqCst) {
+                        assert!(begin.elapsed_ns() < 20_000_000_000, "{cause:?}: no start");
+                        std::thread::sleep(Duration::from_millis(1));
+                    }
+                    let watch = Stopwatch::start();
+                    until(&seen, "dark", |m| m.dark_because().is_some());
+                    let took_ms = watch.elapsed_ns() / 1_000_000;
+                    hold.store(false, Ordering::SeqCst);
+                    for _ in 0..60 {
+                        assert!(seen.lock().unwrap().dark_because().is_some(), "{cause:?}: lit again");
+                        std::thread::sleep(Duration::from_millis(5));
+                    }
+                    took_ms
+                });
+                let (heard, switch) = (monitor.clone(), closed.clone());
+                let happens: Arc<dyn Fn() + Send + Sync> = Arc::new(move || cause.happen(&heard, &switch));
+                let mut open = || {
+                    let (hid, model) = (VirtualHid::new(model.clone()), model.clone());
+                    let (is_due, stuck, cause) = (is_due.clone(), stuck.clone(), happens.clone());
+                    Dlpc900::new(LateStart { hid, model, is_due, stuck, cause })
+                };
+                let result = present(&mut open, &show, None, &monitor);
+                took.push(observer.join().unwrap());
+                assert!(result.is_ok(), "{cause:?}: {:?}", result.err().map(|e| e.to_string()));
+                if took.last().is_some_and(|ms| *ms <= 50) {
+                    break;
+                }
+            }
+            assert!(took.iter().any(|ms| *ms <= 50), "{cause:?}: dark after {took:?} ms");
+        }
+    }
+
+    /// A stop in the middle of an upload, or of the three seconds of mirror exercise, ends the run at once and lights
+    /// nothing.
+    #[test]
+    fn a_stop_is_heard_during_the_set_up() {
+        let [show, _] = shows();
+        for exercised in [false, true] {
+            let model = model();
+            if exercised {
+                Dlpc900::new(VirtualHid::new(model.clone())).unwrap().idle().unwrap();
+            }
+            let monitor = Arc::new(RunMonitor::default());
+            let (seen, watched) = (model.clone(), monitor.clone());
+            let observer = std::thread::spawn(move || {
+                let _ends = StopOnExit(watched.clone());
+                until(&seen, "begun", |m| m.commands() > if exercised { 10 } else { 30 });
+                watched.request_stop();
+                Stopwatch::start()
+            });
+            let mut open = || {
+                let hid = VirtualHid::new(model.clone());
+                let (stuck, is_inside) = (Arc::default(), Arc::default());
+                // The whole upload takes some seconds.
+                Dlpc900::new(Sticky { hid, stuck, is_inside, report_time: Duration::from_millis(1) })
+            };
+            let report = present(&mut open, &show, None, &monitor).unwrap();
+            let took = observer.join().unwrap().elapsed_ns();
+            assert!(took < 1_000_000_000, "{took} ns");
+            assert_eq!(report.shown_s, 0.0);
+            let m = model.lock().unwrap();
+            assert_eq!(m.dark_because(), Some("mirrors exercised"));
+            assert_eq!(starts(&m), 0, "never lit");
+        }
+    }
 }

@@ -36,6 +36,15 @@ pub(crate) fn surface_nets(field: &dyn Fn(Vec3) -> f32, min: Vec3, max: Vec3, ce
     for z in 0..nz - 1 {
         for y in 0..ny - 1 {
             for x in 0..nx - 1 {
+                // Nearly all cells lie on one side, and all eight corners say so at once.
+                let row = at(x, y, z);
+                let corners =
+                    [0, 1].map(|dz| [0, 1].map(|dy| &value[row + (nx * (dy + ny * dz)) as usize..][..2]));
+                let inside =
+                    corners.as_flattened().iter().flat_map(|pair| *pair).filter(|v| **v < 0.0).count();
+                if inside == 0 || inside == 8 {
+                    continue;
+                }
                 let Some(start) = mean_crossing(|dx, dy, dz| value[at(x + dx, y + dy, z + dz)]) else {
                     continue;
                 };

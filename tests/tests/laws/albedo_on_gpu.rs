@@ -138,23 +138,28 @@ fn a_printed_body_shows_the_eye_what_an_even_one_shows_up_to_the_gamut() {
     });
 }
 
-#[test]
-fn a_run_with_a_printed_body_looks_as_one_with_an_even_body() {
-    let picture = Picture::new("run");
-    with_gpu(|gpu| {
-        let seen = [picture.rig(128, 96), demo_rig(128, 96, &ROOM)].map(|rig| {
-            let (outcome, _) = run(gpu, &rig, 6, 1);
-            let made = pictures(&rig, gpu, &outcome.light, &outcome.recent).unwrap();
-            (made.light, made.viewer.unwrap())
+/// Whole runs.
+mod breadth {
+    use super::*;
+
+    #[test]
+    fn a_run_with_a_printed_body_looks_as_one_with_an_even_body() {
+        let picture = Picture::new("run");
+        with_gpu(|gpu| {
+            let seen = [picture.rig(128, 96), demo_rig(128, 96, &ROOM)].map(|rig| {
+                let (outcome, _) = run(gpu, &rig, 6, 1);
+                let made = pictures(&rig, gpu, &outcome.light, &outcome.recent).unwrap();
+                (made.light, made.viewer.unwrap())
+            });
+            let [(printed_light, printed), (even_light, even)] = seen;
+            let mean = |of: &[glam::Vec3], with: &[glam::Vec3]| {
+                of.iter().zip(with).map(|(a, b)| (*a - *b).abs().element_sum()).sum::<f32>()
+                    / with.iter().map(|v| v.abs().element_sum()).sum::<f32>()
+            };
+            let (light, eye) = (mean(&printed_light, &even_light), mean(&printed, &even));
+            println!("the light differs by {:.1} %, what the eye sees by {:.1} %", 100.0 * light, 100.0 * eye);
+            // Half a texel of the picture is smeared by pixels of this raster; the light itself has all of the picture.
+            assert!(light > 0.3 && eye < 0.25 * light, "light {light}, eye {eye}");
         });
-        let [(printed_light, printed), (even_light, even)] = seen;
-        let mean = |of: &[glam::Vec3], with: &[glam::Vec3]| {
-            of.iter().zip(with).map(|(a, b)| (*a - *b).abs().element_sum()).sum::<f32>()
-                / with.iter().map(|v| v.abs().element_sum()).sum::<f32>()
-        };
-        let (light, eye) = (mean(&printed_light, &even_light), mean(&printed, &even));
-        println!("the light differs by {:.1} %, what the eye sees by {:.1} %", 100.0 * light, 100.0 * eye);
-        // Half a texel of the picture is smeared by pixels of this raster; the light itself has all of the picture.
-        assert!(light > 0.3 && eye < 0.25 * light, "light {light}, eye {eye}");
-    });
+    }
 }

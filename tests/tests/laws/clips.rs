@@ -115,40 +115,6 @@ fn a_clip_is_read_with_its_times_and_repeats() {
     }
 }
 
-#[test]
-fn the_light_shows_the_picture_of_its_centre() {
-    let clip = played("light");
-    with_gpu(|gpu| {
-        let rig = rig_with(&clip, &["render.method=\"full\"", "projector.plane_poses=\"frame\""]);
-        let (outcome, _) = run(gpu, &rig, 60, 40);
-        assert_eq!((outcome.light_mismatches, outcome.light.len()), (0, 40));
-        let alone = |scene: &Scene, bodies: &Placed, frame: u32| {
-            let mut renderer = Renderer::new(gpu, scene, renderer_settings(&rig)).unwrap();
-            let mut slot = renderer.create_slot(false).unwrap();
-            draw(&rig, &mut renderer, &mut slot, bodies, frame, rig.config.render.spp as f32).unwrap();
-            slot.codes().to_vec()
-        };
-        let mut seen = [0; 3];
-        for (light, record) in outcome.light.iter().zip(&outcome.recent).step_by(4) {
-            let at = record.drawn_for.0;
-            let k = rig.scene.textures.iter().map(|t| t.picture_at(at)).max().unwrap();
-            seen[k] += 1;
-            let mut bodies = Placed { animated_at_ns: at, ..Placed::default() };
-            rig.scene_poses(&record.tracked_poses, at, &mut bodies.poses);
-            let fell: Vec<u32> =
-                light.codes.iter().map(|c| u32::from_le_bytes([c[0], c[1], c[2], 0])).collect();
-            assert!(fell == alone(&rig.scene.still_at(at), &bodies, light.frame), "frame {}", light.frame);
-            let other = alone(&rig.scene.still_at(at + 8_000_000), &bodies, light.frame);
-            let differ = fell.iter().zip(&other).filter(|(a, b)| a != b).count();
-            assert!(
-                differ > 100 || k == rig.scene.textures.last().unwrap().picture_at(at + 8_000_000),
-                "{differ}"
-            );
-        }
-        assert!(seen[0] > 0 && seen[2] > 0, "{seen:?}");
-    });
-}
-
 /// Damage is refused by name or shown as a picture; nothing is taken beyond the limits.
 #[test]
 fn damaged_clips_never_panic() {
@@ -167,4 +133,43 @@ fn damaged_clips_never_panic() {
         }
     }
     assert!(refused > 10, "{shown} {refused}");
+}
+
+/// Whole runs.
+mod breadth {
+    use super::*;
+
+    #[test]
+    fn the_light_shows_the_picture_of_its_centre() {
+        let clip = played("light");
+        with_gpu(|gpu| {
+            let rig = rig_with(&clip, &["render.method=\"full\"", "projector.plane_poses=\"frame\""]);
+            let (outcome, _) = run(gpu, &rig, 60, 40);
+            assert_eq!((outcome.light_mismatches, outcome.light.len()), (0, 40));
+            let alone = |scene: &Scene, bodies: &Placed, frame: u32| {
+                let mut renderer = Renderer::new(gpu, scene, renderer_settings(&rig)).unwrap();
+                let mut slot = renderer.create_slot(false).unwrap();
+                draw(&rig, &mut renderer, &mut slot, bodies, frame, rig.config.render.spp as f32).unwrap();
+                slot.codes().to_vec()
+            };
+            let mut seen = [0; 3];
+            for (light, record) in outcome.light.iter().zip(&outcome.recent).step_by(4) {
+                let at = record.drawn_for.0;
+                let k = rig.scene.textures.iter().map(|t| t.picture_at(at)).max().unwrap();
+                seen[k] += 1;
+                let mut bodies = Placed { animated_at_ns: at, ..Placed::default() };
+                rig.scene_poses(&record.tracked_poses, at, &mut bodies.poses);
+                let fell: Vec<u32> =
+                    light.codes.iter().map(|c| u32::from_le_bytes([c[0], c[1], c[2], 0])).collect();
+                assert!(fell == alone(&rig.scene.still_at(at), &bodies, light.frame), "frame {}", light.frame);
+                let other = alone(&rig.scene.still_at(at + 8_000_000), &bodies, light.frame);
+                let differ = fell.iter().zip(&other).filter(|(a, b)| a != b).count();
+                assert!(
+                    differ > 100 || k == rig.scene.textures.last().unwrap().picture_at(at + 8_000_000),
+                    "{differ}"
+                );
+            }
+            assert!(seen[0] > 0 && seen[2] > 0, "{seen:?}");
+        });
+    }
 }

@@ -59,28 +59,33 @@ fn a_rig_that_can_run_is_told_from_one_that_cannot() {
     assert!(!told.contains("Armed"), "{told}");
 }
 
-#[test]
-fn a_projector_in_use_and_a_missing_one_are_named() {
-    let (_mock, folder) = bench("use", 15770);
-    let mut run = folder.command(program("dpm"));
-    let run = run
-        .args(["pattern", "grid", "rig.toml"])
-        .stdin(Stdio::piped())
-        .stderr(Stdio::piped())
-        .spawn()
-        .unwrap();
-    let mut run = Talk::with(run);
-    run.until("projector: up");
-    let (code, json, _) = doctor(&folder, &[]);
-    let [state, found, _] = part(&json, "projector");
-    assert!(code == Some(1) && state == "missing" && found.contains("in use"), "{found}");
-    drop(run);
-    let none = ["--set", "projector.backend.port=\"/dev/pts/none\""];
-    let (code, json, _) = doctor(&folder, &none);
-    let [state, found, _] = part(&json, "projector");
-    assert!(code == Some(1) && state == "missing" && found.contains("/dev/pts/none: not found"), "{found}");
-    let scene = ["doctor", "rig.toml", "--set", "scene.file=\"gone.glb\""];
-    let bad = folder.command(program("dpm")).args(scene).output().unwrap();
-    let told = String::from_utf8_lossy(&bad.stderr);
-    assert!(bad.status.code() == Some(2) && told.contains("gone.glb"), "{told}");
+/// What else `dpm doctor` finds.
+mod breadth {
+    use super::*;
+
+    #[test]
+    fn a_projector_in_use_and_a_missing_one_are_named() {
+        let (_mock, folder) = bench("use", 15770);
+        let mut run = folder.command(program("dpm"));
+        let run = run
+            .args(["pattern", "grid", "rig.toml"])
+            .stdin(Stdio::piped())
+            .stderr(Stdio::piped())
+            .spawn()
+            .unwrap();
+        let mut run = Talk::with(run);
+        run.until("projector: up");
+        let (code, json, _) = doctor(&folder, &[]);
+        let [state, found, _] = part(&json, "projector");
+        assert!(code == Some(1) && state == "missing" && found.contains("in use"), "{found}");
+        drop(run);
+        let none = ["--set", "projector.backend.port=\"/dev/pts/none\""];
+        let (code, json, _) = doctor(&folder, &none);
+        let [state, found, _] = part(&json, "projector");
+        assert!(code == Some(1) && state == "missing" && found.contains("/dev/pts/none: not found"), "{found}");
+        let scene = ["doctor", "rig.toml", "--set", "scene.file=\"gone.glb\""];
+        let bad = folder.command(program("dpm")).args(scene).output().unwrap();
+        let told = String::from_utf8_lossy(&bad.stderr);
+        assert!(bad.status.code() == Some(2) && told.contains("gone.glb"), "{told}");
+    }
 }

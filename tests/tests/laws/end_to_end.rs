@@ -63,25 +63,6 @@ fn the_light_is_the_rendered_picture_in_all_24_planes() {
     });
 }
 
-#[test]
-fn a_run_repeats_to_the_bit() {
-    with_gpu(|gpu| {
-        let hash = |method: &str, seed: &str| {
-            let rig = demo_rig(32, 24, &[method, seed, "tracker.noise_m=0.0002"]);
-            let (outcome, _) = run(gpu, &rig, 24, 0);
-            assert_eq!((outcome.light_mismatches, outcome.report.frames_lit), (0, 24), "{method}");
-            outcome.report.light_hash
-        };
-        // Both methods keep histories, in which a race would be visible.
-        let (dpm, paper) = ("render.method=\"dpm\"", "render.method=\"paper\"");
-        let first = hash(dpm, "render.seed=7");
-        assert_ne!(first, "0000000000000000");
-        assert_eq!(first, hash(dpm, "render.seed=7"));
-        assert_ne!(first, hash(dpm, "render.seed=8"), "the seed has no effect");
-        assert_eq!(hash(paper, "render.seed=7"), hash(paper, "render.seed=7"));
-    });
-}
-
 /// The content of a report except wall times, which depend on the machine.
 fn told(report: &Report) -> serde_json::Value {
     let mut json: serde_json::Value = serde_json::from_str(&report.to_json()).unwrap();
@@ -110,38 +91,6 @@ fn beside_others<T>(work: impl FnOnce() -> T) -> T {
     })
 }
 
-/// Everything that a run at virtual pace reports, not only the light, with samples and packets lost on the way, is
-/// the same on an idle machine and on a busy one.
-#[test]
-fn a_whole_report_repeats_on_a_busy_machine() {
-    with_gpu(|gpu| {
-        let lossy = ["tracker.drop_out=0.1", "projector.backend={kind=\"mock\",faults=\"loss=0.05\"}"];
-        for method in ["dpm", "paper"] {
-            let method = format!("render.method=\"{method}\"");
-            let settings = [lossy[0], lossy[1], &method, "render.spp=1"];
-            let rig = demo_rig(64, 48, &settings);
-            let once = || told(&run(gpu, &rig, 60, 0).0.report);
-            let first = once();
-            assert!(first["frames_dropped"].as_u64() > Some(0), "nothing was lost: {first}");
-            assert_eq!(first, once());
-            assert_eq!(first, beside_others(once));
-        }
-    });
-    // More frames than the collector can hold at once, faster than it reads them.
-    let rig =
-        demo_rig(16, 12, &["tracker.drop_out=0.1", "projector.backend={kind=\"mock\",faults=\"loss=0.02\"}"]);
-    let once = || {
-        let options = RunOptions { frames: 3000, ..RunOptions::default() };
-        let outcome = pipeline::run_prepared(rig.clone(), options, &Arc::new(RunMonitor::default()));
-        told(&outcome.unwrap_or_else(|e| panic!("{e}")).report)
-    };
-    let first = once();
-    assert!(first["missed_slots"].as_u64() > Some(0), "{first}");
-    for _ in 0..3 {
-        assert_eq!(first, beside_others(once));
-    }
-}
-
 #[test]
 fn light_falls_where_the_object_is() {
     with_gpu(|gpu| {
@@ -160,62 +109,6 @@ fn light_falls_where_the_object_is() {
         let error = outcome.report.registration_error_px.expect("the mock tells the truth");
         assert!(!outcome.report.prediction && error.p99 * full_size > 2.0, "{}", error.p99 * full_size);
     });
-}
-
-/// Bodies that pass at 1 m/s, without noise: whatever the order and the number of the planes, the light of a frame lies
-/// on the point that it belongs to as an eye sees it that follows the point. If all planes show the bodies at one instant,
-/// the light is spread around the point as far as the point moves while the planes last, which is a closed form. If planes
-/// follow by a share of their way, the rest of it is left, and what the point moves between the three planes of a bit. Aiming at the middle of the exposure would miss by
-/// 0.6 px.
-#[test]
-fn light_of_passing_bodies_is_centred_on_them_whatever_the_order_of_the_planes() {
-    let moving = |i: usize| {
-        format!("scene.bodies.{i}.motion={{kind=\"translate\",speed_m_s=1.0,amplitude_m=2.0,acceleration_m_s2=50.0}}")
-    };
-    let orders = ["7 6 5 4 3 2 1 0", "0 1 2 3 4 5 6 7", "0 2 4 6 7 5 3 1", "5 0 7 2 4 6 1 3"];
-    let rigs = orders.iter().flat_map(|order| [(24, "binary", *order), (8, "binary", *order)]);
-    let rigs = rigs.chain([(24, "equal", orders[0]), (8, "equal", orders[0])]);
-    let ways = [("frame", 1.0), ("own", 1.0), ("own", 0.8)];
-    for ((planes, weights, order), (poses, follow)) in rigs.flat_map(|rig| ways.map(|way| (rig, way))) {
-        let flags = [
-            format!("projector.plane_poses=\"{poses}\""),
-            format!("projector.plane_follow={follow}"),
-            format!("projector.planes={planes}"),
-            format!("projector.plane_order=\"{order}\""),
-            format!("projector.weights=\"{weights}\""),
-            moving(0),
-            moving(1),
-        ];
-        // Planes follow a body that moves by a quarter of a pixel at least.
-        let (width, height, frames) = if poses == "own" { (512, 384, 160) } else { (128, 96, 600) };
-        let rig = demo_rig(width, height, &flags.each_ref().map(String::as_str));
-        let options = RunOptions { frames, ..RunOptions::default() };
-        let outcome = pipeline::run_prepared(rig.clone(), options, &Arc::new(RunMonitor::default()));
-        let report = outcome.unwrap_or_else(|e| panic!("{e}")).report;
-        let full_size = 1024.0 / f64::from(width);
-        let offset = report.followed_offset_px.expect("the mock tells the truth").p99 * full_size;
-        let smear = report.followed_smear_px.expect("the mock tells the truth").p50 * full_size;
-        assert!(offset < 0.03, "{planes} {weights} {order} {poses}: {offset} px off at 1024 x 768");
-        // 1 m/s is about 1.75 px a millisecond in the middle of the room; the bodies are some tenths nearer or further.
-        let speed_px_s = 1024.0 / (2.0 * 1.1 * (15f64).to_radians().tan());
-        let spread = spread_of_light_s(&rig) * speed_px_s;
-        if poses == "own" {
-            // Red and blue are lit one plane before and after green.
-            let apart = if (planes, weights) == (24, "binary") { (2f64 / 3.0).sqrt() / 24.0 } else { 0.0 };
-            let apart = apart * rig.rate().slot_len_ns(0) as f64 * 1e-9 * speed_px_s;
-            // Planes of equal weights always follow wholly.
-            let rest = if weights == "equal" { 0.0 } else { (1.0 - follow) * spread };
-            let expected = apart.hypot(rest);
-            println!("{planes} {weights} {order}, follow {follow}: {smear:.3} of {expected:.3} px");
-            assert!(smear < 1.25 * expected + 0.02, "{planes} {weights} {order}: {smear} of {expected} px");
-            assert!(smear >= 0.75 * rest, "{planes} {weights} {order}, follow {follow}: only {smear} px");
-            continue;
-        }
-        assert!(
-            (0.8..1.25).contains(&(smear / spread)),
-            "{planes} {weights} {order}: {smear} of {spread} px"
-        );
-    }
 }
 
 /// In a rendered run every plane shows each body where that body is at the plane's own instant, or as much of the way there as
@@ -338,45 +231,162 @@ fn a_fifth_of_the_samples_lost_costs_little() {
     });
 }
 
-#[test]
-fn at_real_pace_every_planned_frame_is_accounted_for() {
-    with_gpu(|gpu| {
-        let rig = demo_rig(32, 24, &[REAL, "render.spp=1", "projector.frame_rate=\"100\""]);
-        let (outcome, monitor) = run(gpu, &rig, 60, 4);
-        let counts = monitor.counts();
-        assert_eq!(counts.frames_planned, 60);
-        assert_eq!(counts.frames_planned, counts.frames_done());
-        let r = &outcome.report;
-        assert_eq!((r.frames_lit, r.frames_dropped), (counts.frames_lit, counts.frames_dropped));
-        assert_eq!(r.pace, "real");
-        assert!(r.frames_lit > 0, "not one frame in time at 100 Hz");
-        assert!(r.motion_to_light_ms.as_ref().is_some_and(|m| m.p50 > 2.0), "the tracker alone takes 2 ms");
-    });
+/// Longer runs.
+mod breadth {
+    use super::*;
+
+    #[test]
+    fn a_run_repeats_to_the_bit() {
+        with_gpu(|gpu| {
+            let hash = |method: &str, seed: &str| {
+                let rig = demo_rig(32, 24, &[method, seed, "tracker.noise_m=0.0002"]);
+                let (outcome, _) = run(gpu, &rig, 24, 0);
+                assert_eq!((outcome.light_mismatches, outcome.report.frames_lit), (0, 24), "{method}");
+                outcome.report.light_hash
+            };
+            // Both methods keep histories, in which a race would be visible.
+            let (dpm, paper) = ("render.method=\"dpm\"", "render.method=\"paper\"");
+            let first = hash(dpm, "render.seed=7");
+            assert_ne!(first, "0000000000000000");
+            assert_eq!(first, hash(dpm, "render.seed=7"));
+            assert_ne!(first, hash(dpm, "render.seed=8"), "the seed has no effect");
+            assert_eq!(hash(paper, "render.seed=7"), hash(paper, "render.seed=7"));
+        });
+    }
+
+    /// Everything that a run at virtual pace reports, not only the light, with samples and packets lost on the way, is
+    /// the same on an idle machine and on a busy one.
+    #[test]
+    fn a_whole_report_repeats_on_a_busy_machine() {
+        with_gpu(|gpu| {
+            let lossy = ["tracker.drop_out=0.1", "projector.backend={kind=\"mock\",faults=\"loss=0.05\"}"];
+            for method in ["dpm", "paper"] {
+                let method = format!("render.method=\"{method}\"");
+                let settings = [lossy[0], lossy[1], &method, "render.spp=1"];
+                let rig = demo_rig(64, 48, &settings);
+                let once = || told(&run(gpu, &rig, 60, 0).0.report);
+                let first = once();
+                assert!(first["frames_dropped"].as_u64() > Some(0), "nothing was lost: {first}");
+                assert_eq!(first, once());
+                assert_eq!(first, beside_others(once));
+            }
+        });
+        // More frames than the collector can hold at once, faster than it reads them.
+        let rig =
+            demo_rig(16, 12, &["tracker.drop_out=0.1", "projector.backend={kind=\"mock\",faults=\"loss=0.02\"}"]);
+        let once = || {
+            let options = RunOptions { frames: 3000, ..RunOptions::default() };
+            let outcome = pipeline::run_prepared(rig.clone(), options, &Arc::new(RunMonitor::default()));
+            told(&outcome.unwrap_or_else(|e| panic!("{e}")).report)
+        };
+        let first = once();
+        assert!(first["missed_slots"].as_u64() > Some(0), "{first}");
+        for _ in 0..3 {
+            assert_eq!(first, beside_others(once));
+        }
+    }
+
+    /// Bodies that pass at 1 m/s, without noise: whatever the order and the number of the planes, the light of a frame lies
+    /// on the point that it belongs to as an eye sees it that follows the point. If all planes show the bodies at one instant,
+    /// the light is spread around the point as far as the point moves while the planes last, which is a closed form. If planes
+    /// follow by a share of their way, the rest of it is left, and what the point moves between the three planes of a bit. Aiming at the middle of the exposure would miss by
+    /// 0.6 px.
+    #[test]
+    fn light_of_passing_bodies_is_centred_on_them_whatever_the_order_of_the_planes() {
+        let moving = |i: usize| {
+            format!("scene.bodies.{i}.motion={{kind=\"translate\",speed_m_s=1.0,amplitude_m=2.0,acceleration_m_s2=50.0}}")
+        };
+        let orders = ["7 6 5 4 3 2 1 0", "0 1 2 3 4 5 6 7", "0 2 4 6 7 5 3 1", "5 0 7 2 4 6 1 3"];
+        let rigs = orders.iter().flat_map(|order| [(24, "binary", *order), (8, "binary", *order)]);
+        let rigs = rigs.chain([(24, "equal", orders[0]), (8, "equal", orders[0])]);
+        let ways = [("frame", 1.0), ("own", 1.0), ("own", 0.8)];
+        for ((planes, weights, order), (poses, follow)) in rigs.flat_map(|rig| ways.map(|way| (rig, way))) {
+            let flags = [
+                format!("projector.plane_poses=\"{poses}\""),
+                format!("projector.plane_follow={follow}"),
+                format!("projector.planes={planes}"),
+                format!("projector.plane_order=\"{order}\""),
+                format!("projector.weights=\"{weights}\""),
+                moving(0),
+                moving(1),
+            ];
+            // Planes follow a body that moves by a quarter of a pixel at least.
+            let (width, height, frames) = if poses == "own" { (512, 384, 160) } else { (128, 96, 600) };
+            let rig = demo_rig(width, height, &flags.each_ref().map(String::as_str));
+            let options = RunOptions { frames, ..RunOptions::default() };
+            let outcome = pipeline::run_prepared(rig.clone(), options, &Arc::new(RunMonitor::default()));
+            let report = outcome.unwrap_or_else(|e| panic!("{e}")).report;
+            let full_size = 1024.0 / f64::from(width);
+            let offset = report.followed_offset_px.expect("the mock tells the truth").p99 * full_size;
+            let smear = report.followed_smear_px.expect("the mock tells the truth").p50 * full_size;
+            assert!(offset < 0.03, "{planes} {weights} {order} {poses}: {offset} px off at 1024 x 768");
+            // 1 m/s is about 1.75 px a millisecond in the middle of the room; the bodies are some tenths nearer or further.
+            let speed_px_s = 1024.0 / (2.0 * 1.1 * (15f64).to_radians().tan());
+            let spread = spread_of_light_s(&rig) * speed_px_s;
+            if poses == "own" {
+                // Red and blue are lit one plane before and after green.
+                let apart = if (planes, weights) == (24, "binary") { (2f64 / 3.0).sqrt() / 24.0 } else { 0.0 };
+                let apart = apart * rig.rate().slot_len_ns(0) as f64 * 1e-9 * speed_px_s;
+                // Planes of equal weights always follow wholly.
+                let rest = if weights == "equal" { 0.0 } else { (1.0 - follow) * spread };
+                let expected = apart.hypot(rest);
+                println!("{planes} {weights} {order}, follow {follow}: {smear:.3} of {expected:.3} px");
+                assert!(smear < 1.25 * expected + 0.02, "{planes} {weights} {order}: {smear} of {expected} px");
+                assert!(smear >= 0.75 * rest, "{planes} {weights} {order}, follow {follow}: only {smear} px");
+                continue;
+            }
+            assert!(
+                (0.8..1.25).contains(&(smear / spread)),
+                "{planes} {weights} {order}: {smear} of {spread} px"
+            );
+        }
+    }
 }
 
-#[test]
-fn a_stop_request_ends_the_run_at_once() {
-    with_gpu(|gpu| {
-        for pace in [REAL, "real_time.pace=\"virtual\""] {
-            let rig = demo_rig(32, 24, &[pace, "render.spp=1"]);
-            let monitor = Arc::new(RunMonitor::default());
-            let options = RunOptions::default();
-            let took = std::thread::scope(|scope| {
-                let stopper = scope.spawn(|| {
-                    let limit = Instant::now() + Duration::from_secs(60);
-                    while monitor.counts().frames_planned < 20 && Instant::now() < limit {
-                        std::thread::sleep(Duration::from_millis(1));
-                    }
-                    monitor.request_stop();
-                    Instant::now()
+/// Runs at real pace.
+mod real_pace {
+    use super::*;
+
+    #[test]
+    fn a_stop_request_ends_the_run_at_once() {
+        with_gpu(|gpu| {
+            for pace in [REAL, "real_time.pace=\"virtual\""] {
+                let rig = demo_rig(32, 24, &[pace, "render.spp=1"]);
+                let monitor = Arc::new(RunMonitor::default());
+                let options = RunOptions::default();
+                let took = std::thread::scope(|scope| {
+                    let stopper = scope.spawn(|| {
+                        let limit = Instant::now() + Duration::from_secs(60);
+                        while monitor.counts().frames_planned < 20 && Instant::now() < limit {
+                            std::thread::sleep(Duration::from_millis(1));
+                        }
+                        monitor.request_stop();
+                        Instant::now()
+                    });
+                    let outcome = pipeline::run(rig.clone(), gpu, options, &monitor).unwrap();
+                    assert!(monitor.counts().frames_done() >= 20 && outcome.report.slots > 0);
+                    Instant::now().duration_since(stopper.join().unwrap())
                 });
-                let outcome = pipeline::run(rig.clone(), gpu, options, &monitor).unwrap();
-                assert!(monitor.counts().frames_done() >= 20 && outcome.report.slots > 0);
-                Instant::now().duration_since(stopper.join().unwrap())
-            });
-            assert!(took < Duration::from_millis(500), "{pace}: {took:?}");
+                assert!(took < Duration::from_millis(500), "{pace}: {took:?}");
+                let counts = monitor.counts();
+                assert_eq!(counts.frames_planned, counts.frames_done(), "{pace}");
+            }
+        });
+    }
+
+    #[test]
+    fn at_real_pace_every_planned_frame_is_accounted_for() {
+        with_gpu(|gpu| {
+            let rig = demo_rig(32, 24, &[REAL, "render.spp=1", "projector.frame_rate=\"100\""]);
+            let (outcome, monitor) = run(gpu, &rig, 60, 4);
             let counts = monitor.counts();
-            assert_eq!(counts.frames_planned, counts.frames_done(), "{pace}");
-        }
-    });
+            assert_eq!(counts.frames_planned, 60);
+            assert_eq!(counts.frames_planned, counts.frames_done());
+            let r = &outcome.report;
+            assert_eq!((r.frames_lit, r.frames_dropped), (counts.frames_lit, counts.frames_dropped));
+            assert_eq!(r.pace, "real");
+            assert!(r.frames_lit > 0, "not one frame in time at 100 Hz");
+            assert!(r.motion_to_light_ms.as_ref().is_some_and(|m| m.p50 > 2.0), "the tracker alone takes 2 ms");
+        });
+    }
 }

@@ -48,134 +48,139 @@ fn independent_samples_fall_by_half_an_order_an_order() {
     assert!(noise(&theatre, &Method::full(2), [5, 6]).0 > 0.5 * few);
 }
 
-#[test]
-fn a_sampler_that_loses_light_is_told_from_one_that_does_not() {
-    let seen = |settings: &[&str], seed: u32| {
-        let (rig, gpu) = stage(settings);
-        let theatre =
-            Theatre::frozen(Arc::new(rig), gpu, Span { last_slot: 60, warm_up: 0, kept: EYE_FRAMES as u32 })
-                .unwrap();
-        let cache = std::env::temp_dir().join(format!("dpm-bias-{}", std::process::id()));
-        let eyes = [seed, seed + 1].map(|s| {
-            let seen = theatre.play(&Method::full(32), 32.0, s, &mut |_, _| ()).unwrap();
-            eye_mean(&seen.frames, EYE_FRAMES)
-        });
-        // The reference of the unchanged rig, under one name; the second time it is read from the cache.
-        let reference = Reference::new(&theatre, 128, "as it is", &cache, &mut |_| ()).unwrap();
-        (reference.bias(&eyes), reference.perceived(&eyes, &|_| true).1, cache)
-    };
-    let ((bias, chance), _, cache) = seen(&[], 1);
-    // Paths that end at the first surface lose indirect light.
-    let ((biased, _), error, _) = seen(&["render.depth=2"], 3);
-    std::fs::remove_dir_all(cache).unwrap();
-    println!("bias {bias:.5} of chance {chance:.5}; with less light {biased:.5}");
-    // Squares are measured, and twice the chance level corresponds to four of their standard deviations.
-    assert!(bias < 2.0 * chance, "independent samples have no bias: {bias}, chance {chance}");
-    assert!(biased > 2.0 * chance, "{biased}, chance {chance}");
-    assert!(biased > 0.5 * error, "what is lost is bias, not noise: {biased} of {error}");
-}
+/// Whole groups.
+mod breadth {
+    use super::*;
 
-#[test]
-fn a_group_is_measured_at_equal_rays_and_tells_bias_from_noise() {
-    let (rig, gpu) = stage(&[]);
-    let cache = std::env::temp_dir().join(format!("dpm-error-{}", std::process::id()));
-    let extent = Extent { warm_up: 8, kept: 48, reference_spp: 16 };
-    let options = ErrorOptions { extent, ablation: false, cache: cache.clone() };
-    let runs = ErrorRuns::new(rig, gpu, Setting::plain(false, 4.0), options);
-    let mut drawn = Vec::new();
-    let measured = runs.measure(&mut |what| drawn.push(what.to_owned())).unwrap();
-    let result = measured.result.clone();
-    assert_eq!(drawn.iter().filter(|d| *d == "reference").count(), 2);
-    for r in &result.rows {
-        assert!((r.rays_to_paper - 1.0).abs() < 0.05, "{}: {} of paper's rays", r.method, r.rays_to_paper);
-        // The squares of bias and noise add up to that of the error, within three standard deviations of the bias (a
-        // negative one is cut off).
-        let parts = r.bias.powi(2) + r.noise.powi(2);
-        let slack = (0.4 * r.perceived_rmse.powi(2)).max(3.0 * r.bias_floor.powi(2));
-        assert!(
-            (parts - r.perceived_rmse.powi(2)).abs() < slack,
-            "{}: {} against {}, chance {}",
-            r.method,
-            parts.sqrt(),
-            r.perceived_rmse,
-            r.bias_floor
-        );
-        assert!(r.perceived_rmse < r.single_rmse, "{}: the eye sees less noise than a frame has", r.method);
-        assert!(r.gpu_ms > 0.0 || r.wall_ms > 0.0);
+    #[test]
+    fn a_sampler_that_loses_light_is_told_from_one_that_does_not() {
+        let seen = |settings: &[&str], seed: u32| {
+            let (rig, gpu) = stage(settings);
+            let theatre =
+                Theatre::frozen(Arc::new(rig), gpu, Span { last_slot: 60, warm_up: 0, kept: EYE_FRAMES as u32 })
+                    .unwrap();
+            let cache = std::env::temp_dir().join(format!("dpm-bias-{}", std::process::id()));
+            let eyes = [seed, seed + 1].map(|s| {
+                let seen = theatre.play(&Method::full(32), 32.0, s, &mut |_, _| ()).unwrap();
+                eye_mean(&seen.frames, EYE_FRAMES)
+            });
+            // The reference of the unchanged rig, under one name; the second time it is read from the cache.
+            let reference = Reference::new(&theatre, 128, "as it is", &cache, &mut |_| ()).unwrap();
+            (reference.bias(&eyes), reference.perceived(&eyes, &|_| true).1, cache)
+        };
+        let ((bias, chance), _, cache) = seen(&[], 1);
+        // Paths that end at the first surface lose indirect light.
+        let ((biased, _), error, _) = seen(&["render.depth=2"], 3);
+        std::fs::remove_dir_all(cache).unwrap();
+        println!("bias {bias:.5} of chance {chance:.5}; with less light {biased:.5}");
+        // Squares are measured, and twice the chance level corresponds to four of their standard deviations.
+        assert!(bias < 2.0 * chance, "independent samples have no bias: {bias}, chance {chance}");
+        assert!(biased > 2.0 * chance, "{biased}, chance {chance}");
+        assert!(biased > 0.5 * error, "what is lost is bias, not noise: {biased} of {error}");
     }
-    let full = result.rows.iter().find(|r| r.method == "full").unwrap();
-    // A continuing sequence spreads the samples of a frame, and of the frames that the eye integrates, more evenly
-    // than chance.
-    let sequence = result.rows.iter().find(|r| r.method == "sequence").unwrap();
-    println!("full {:.5}, sequence {:.5}", full.perceived_rmse, sequence.perceived_rmse);
-    assert!(sequence.noise < 0.97 * full.noise, "{} beside {}", sequence.noise, full.noise);
-    assert!(sequence.bias < 0.5 * sequence.noise, "{} beside {}", sequence.bias, sequence.noise);
-    // All the others, and only they, are also drawn at dpm's time; more samples give less noise.
-    for r in &result.rows {
-        assert_eq!(r.equal_time.is_some(), is_other(&r.method), "{}", r.method);
-        let [a, b] = r.runs_raw;
-        assert!((0.5 * (a * a + b * b) - r.perceived_rmse_raw.powi(2)).abs() < 1e-12, "{}", r.method);
-        assert!(r.middle_half_ms[0] <= r.middle_half_ms[1]);
-        let Some(t) = r.equal_time else { continue };
-        println!(
-            "{}: {:.1} samples, {:.2} of the time, {:.5}",
-            r.method, t.spp, t.time_to_dpm, t.perceived_rmse
-        );
-        assert!(t.time_to_dpm > 0.2 && t.time_to_dpm < 5.0, "{}: {}", r.method, t.time_to_dpm);
-        if r.bias < 0.5 * r.noise && t.spp > 2.0 * r.spp {
-            assert!(t.perceived_rmse_raw < r.perceived_rmse_raw, "{}", r.method);
-        }
-    }
-    assert!(full.bias < 0.5 * full.noise, "full is unbiased: {} beside {}", full.bias, full.noise);
-    // Stopped before the group was kept: reference and methods come from the cache, and only the times are measured
-    // again.
-    drawn.clear();
-    let again = runs.measure(&mut |what| drawn.push(what.to_owned())).unwrap();
-    let is_time = |what: &String| what == "times" || what.ends_with(AT_EQUAL_TIME);
-    assert!(drawn.iter().all(is_time), "{drawn:?}");
-    assert!((1..=1 + RACES).contains(&drawn.iter().filter(|what| *what == "times").count()), "{drawn:?}");
-    assert_eq!(again.result.rows[1].perceived_rmse, full.perceived_rmse);
-    // When the group is kept as a whole, its parts are not.
-    let parts = || {
-        let entries = std::fs::read_dir(&cache).unwrap();
-        entries.filter(|e| e.as_ref().unwrap().file_name().to_string_lossy().starts_with("part-")).count()
-    };
-    assert_eq!(parts(), result.rows.len());
-    measured.is_kept();
-    assert_eq!(parts(), 0);
-    // The frames on disk are those that were measured: the eye sees the mean of the last 31 of them.
-    let dir = cache.join("frames");
-    runs.export(&result, &dir, &mut |_| ()).unwrap();
-    let index: FrameIndex =
-        serde_json::from_slice(&std::fs::read(dir.join("sequence.json")).unwrap()).unwrap();
-    assert!((index.frame_rate_hz - 947.0).abs() < 1.0 && index.pixels_per_degree > 0.1);
-    assert_eq!((index.frames, index.lead_in), (49, 1));
-    let frame = |folder: &str, k: usize| -> Vec<f32> {
-        let bytes = std::fs::read(dir.join(folder).join(format!("{k:04}.pfm"))).unwrap();
-        let body = bytes.strip_prefix(b"PF\n40 30\n-1.0\n").unwrap();
-        body.chunks_exact(4).map(|c| f32::from_le_bytes(c.try_into().unwrap())).collect()
-    };
-    for (method, (name, eye)) in index.methods.iter().zip(&again.eyes) {
-        assert_eq!(method.method, *name);
-        let mut mean = vec![0.0f64; 40 * 30 * 3];
-        for k in 49 - EYE_FRAMES..49 {
-            mean.iter_mut()
-                .zip(frame(&method.folder, k))
-                .for_each(|(m, v)| *m += f64::from(v) / EYE_FRAMES as f64);
-        }
-        for (&pixel, v) in again.pixels.iter().zip(eye) {
-            // The rows of the file begin at the bottom.
-            let (x, y) = (pixel as usize % 40, 29 - pixel as usize / 40);
-            let at = &mean[(y * 40 + x) * 3..][..3];
+
+    #[test]
+    fn a_group_is_measured_at_equal_rays_and_tells_bias_from_noise() {
+        let (rig, gpu) = stage(&[]);
+        let cache = std::env::temp_dir().join(format!("dpm-error-{}", std::process::id()));
+        let extent = Extent { warm_up: 8, kept: 48, reference_spp: 16 };
+        let options = ErrorOptions { extent, ablation: false, cache: cache.clone() };
+        let runs = ErrorRuns::new(rig, gpu, Setting::plain(false, 4.0), options);
+        let mut drawn = Vec::new();
+        let measured = runs.measure(&mut |what| drawn.push(what.to_owned())).unwrap();
+        let result = measured.result.clone();
+        assert_eq!(drawn.iter().filter(|d| *d == "reference").count(), 2);
+        for r in &result.rows {
+            assert!((r.rays_to_paper - 1.0).abs() < 0.05, "{}: {} of paper's rays", r.method, r.rays_to_paper);
+            // The squares of bias and noise add up to that of the error, within three standard deviations of the bias (a
+            // negative one is cut off).
+            let parts = r.bias.powi(2) + r.noise.powi(2);
+            let slack = (0.4 * r.perceived_rmse.powi(2)).max(3.0 * r.bias_floor.powi(2));
             assert!(
-                v.to_array().iter().zip(at).all(|(a, b)| (f64::from(*a) - b).abs() < 1e-5),
-                "{name} {pixel}"
+                (parts - r.perceived_rmse.powi(2)).abs() < slack,
+                "{}: {} against {}, chance {}",
+                r.method,
+                parts.sqrt(),
+                r.perceived_rmse,
+                r.bias_floor
             );
+            assert!(r.perceived_rmse < r.single_rmse, "{}: the eye sees less noise than a frame has", r.method);
+            assert!(r.gpu_ms > 0.0 || r.wall_ms > 0.0);
         }
+        let full = result.rows.iter().find(|r| r.method == "full").unwrap();
+        // A continuing sequence spreads the samples of a frame, and of the frames that the eye integrates, more evenly
+        // than chance.
+        let sequence = result.rows.iter().find(|r| r.method == "sequence").unwrap();
+        println!("full {:.5}, sequence {:.5}", full.perceived_rmse, sequence.perceived_rmse);
+        assert!(sequence.noise < 0.97 * full.noise, "{} beside {}", sequence.noise, full.noise);
+        assert!(sequence.bias < 0.5 * sequence.noise, "{} beside {}", sequence.bias, sequence.noise);
+        // All the others, and only they, are also drawn at dpm's time; more samples give less noise.
+        for r in &result.rows {
+            assert_eq!(r.equal_time.is_some(), is_other(&r.method), "{}", r.method);
+            let [a, b] = r.runs_raw;
+            assert!((0.5 * (a * a + b * b) - r.perceived_rmse_raw.powi(2)).abs() < 1e-12, "{}", r.method);
+            assert!(r.middle_half_ms[0] <= r.middle_half_ms[1]);
+            let Some(t) = r.equal_time else { continue };
+            println!(
+                "{}: {:.1} samples, {:.2} of the time, {:.5}",
+                r.method, t.spp, t.time_to_dpm, t.perceived_rmse
+            );
+            assert!(t.time_to_dpm > 0.2 && t.time_to_dpm < 5.0, "{}: {}", r.method, t.time_to_dpm);
+            if r.bias < 0.5 * r.noise && t.spp > 2.0 * r.spp {
+                assert!(t.perceived_rmse_raw < r.perceived_rmse_raw, "{}", r.method);
+            }
+        }
+        assert!(full.bias < 0.5 * full.noise, "full is unbiased: {} beside {}", full.bias, full.noise);
+        // Stopped before the group was kept: reference and methods come from the cache, and only the times are measured
+        // again.
+        drawn.clear();
+        let again = runs.measure(&mut |what| drawn.push(what.to_owned())).unwrap();
+        let is_time = |what: &String| what == "times" || what.ends_with(AT_EQUAL_TIME);
+        assert!(drawn.iter().all(is_time), "{drawn:?}");
+        assert!((1..=1 + RACES).contains(&drawn.iter().filter(|what| *what == "times").count()), "{drawn:?}");
+        assert_eq!(again.result.rows[1].perceived_rmse, full.perceived_rmse);
+        // When the group is kept as a whole, its parts are not.
+        let parts = || {
+            let entries = std::fs::read_dir(&cache).unwrap();
+            entries.filter(|e| e.as_ref().unwrap().file_name().to_string_lossy().starts_with("part-")).count()
+        };
+        assert_eq!(parts(), result.rows.len());
+        measured.is_kept();
+        assert_eq!(parts(), 0);
+        // The frames on disk are those that were measured: the eye sees the mean of the last 31 of them.
+        let dir = cache.join("frames");
+        runs.export(&result, &dir, &mut |_| ()).unwrap();
+        let index: FrameIndex =
+            serde_json::from_slice(&std::fs::read(dir.join("sequence.json")).unwrap()).unwrap();
+        assert!((index.frame_rate_hz - 947.0).abs() < 1.0 && index.pixels_per_degree > 0.1);
+        assert_eq!((index.frames, index.lead_in), (49, 1));
+        let frame = |folder: &str, k: usize| -> Vec<f32> {
+            let bytes = std::fs::read(dir.join(folder).join(format!("{k:04}.pfm"))).unwrap();
+            let body = bytes.strip_prefix(b"PF\n40 30\n-1.0\n").unwrap();
+            body.chunks_exact(4).map(|c| f32::from_le_bytes(c.try_into().unwrap())).collect()
+        };
+        for (method, (name, eye)) in index.methods.iter().zip(&again.eyes) {
+            assert_eq!(method.method, *name);
+            let mut mean = vec![0.0f64; 40 * 30 * 3];
+            for k in 49 - EYE_FRAMES..49 {
+                mean.iter_mut()
+                    .zip(frame(&method.folder, k))
+                    .for_each(|(m, v)| *m += f64::from(v) / EYE_FRAMES as f64);
+            }
+            for (&pixel, v) in again.pixels.iter().zip(eye) {
+                // The rows of the file begin at the bottom.
+                let (x, y) = (pixel as usize % 40, 29 - pixel as usize / 40);
+                let at = &mean[(y * 40 + x) * 3..][..3];
+                assert!(
+                    v.to_array().iter().zip(at).all(|(a, b)| (f64::from(*a) - b).abs() < 1e-5),
+                    "{name} {pixel}"
+                );
+            }
+        }
+        assert_eq!(frame("reference", 0), frame("reference", 48), "nothing moves");
+        // For the time before the beginning, metrics use the truth, whatever the method.
+        assert!(index.methods.iter().all(|m| frame(&m.folder, 0) == frame("reference", 0)));
+        assert!(index.methods.iter().all(|m| frame(&m.folder, 1) != frame("reference", 1)));
+        std::fs::remove_dir_all(cache).unwrap();
     }
-    assert_eq!(frame("reference", 0), frame("reference", 48), "nothing moves");
-    // For the time before the beginning, metrics use the truth, whatever the method.
-    assert!(index.methods.iter().all(|m| frame(&m.folder, 0) == frame("reference", 0)));
-    assert!(index.methods.iter().all(|m| frame(&m.folder, 1) != frame("reference", 1)));
-    std::fs::remove_dir_all(cache).unwrap();
 }

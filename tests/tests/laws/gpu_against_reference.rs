@@ -96,78 +96,6 @@ fn glossy_with_a_normal_map_and_punctual_lights() {
     });
 }
 
-#[test]
-fn transmissive_solid_and_thin_under_an_environment_map() {
-    with_gpu(|gpu| {
-        let mut scene = Scene::default();
-        add(&mut scene, floor(1.2, 0.0), diffuse(Vec3::new(0.7, 0.6, 0.5)));
-        let glass = Material { metallic: 0.0, transmission: 1.0, thin_walled: false, ..Material::default() };
-        add(
-            &mut scene,
-            sphere(Vec3::ZERO, 0.3, 3, true),
-            Material { roughness: 0.0, base_color: Vec3::new(0.9, 1.0, 0.9), ..glass.clone() },
-        );
-        add(
-            &mut scene,
-            sphere(Vec3::ZERO, 0.3, 3, true),
-            Material { roughness: 0.55, transmission: 0.8, ..glass.clone() },
-        );
-        let stained = use_texture(&mut scene, noise_texture(4, 9, 60, 220, false));
-        let sheet = Material {
-            thin_walled: true,
-            roughness: 0.4,
-            transmission_texture: stained,
-            base_color: Vec3::new(1.0, 0.6, 0.5),
-            ..glass
-        };
-        add(&mut scene, quad(Vec3::new(0.2, 0.0, 0.6), Vec3::new(0.6, 0.0, 0.1), Vec3::Y * 0.6), sheet);
-        scene.environment = image_sky(0.5);
-        let poses =
-            vec![DAffine3::IDENTITY, tilted(-0.45, 0.31, 0.1), tilted(0.3, 0.31, -0.2), DAffine3::IDENTITY];
-        judge(gpu, "transmissive", &Shot { poses, depth: 6, ..shot(&scene) }, 768, 1e-2);
-    });
-}
-
-#[test]
-fn holes_sides_and_a_thousand_lamps() {
-    with_gpu(|gpu| {
-        let mut scene = Scene::default();
-        add(&mut scene, floor(1.2, 0.0), diffuse(Vec3::splat(0.7)));
-        // A sheet with holes, seen from both sides; its shadow has holes too.
-        let mut lace = noise_texture(8, 21, 100, 255, true);
-        lace.texels
-            .iter_mut()
-            .enumerate()
-            .for_each(|(i, t)| t[3] = if (i * 7 + i / 8) % 3 == 0 { 0 } else { 255 });
-        lace.nearest = true;
-        let lace = use_texture(&mut scene, lace);
-        let sheet = Material {
-            base_color_texture: lace,
-            alpha_cutoff: Some(0.5),
-            double_sided: true,
-            ..diffuse(Vec3::ONE)
-        };
-        add(
-            &mut scene,
-            quad(Vec3::new(-0.8, 0.1, 0.5), Vec3::X * 0.8, Vec3::new(0.0, 0.7, -0.2)),
-            sheet.clone(),
-        );
-        // The same, facing away from the projector: its back is visible.
-        add(&mut scene, quad(Vec3::new(0.8, 0.1, 0.5), Vec3::X * -0.7, Vec3::new(0.0, 0.6, -0.2)), sheet);
-        // Single-sided and facing away: black, and it blocks light.
-        add(&mut scene, quad(Vec3::new(0.35, 0.05, -0.4), Vec3::X * -0.7, Vec3::Y * 0.5), diffuse(Vec3::ONE));
-        // 20,480 emissive triangles; the alias table must contain them all.
-        add(
-            &mut scene,
-            sphere(Vec3::ZERO, 0.25, 5, true),
-            Material { double_sided: true, ..emitter(Vec3::new(3.0, 3.5, 4.0)) },
-        );
-        let mut poses = vec![DAffine3::IDENTITY; 5];
-        poses[4] = tilted(0.2, 1.3, 0.6);
-        judge(gpu, "holes", &Shot { poses, ..shot(&scene) }, 512, 1e-2);
-    });
-}
-
 /// Spheres and quads of any material in any pose under any light, from a seed.
 fn random_scene(seed: u64) -> (Scene, Vec<DAffine3>) {
     let mut random = Sampler::new(seed, 1);
@@ -204,24 +132,101 @@ fn random_scene(seed: u64) -> (Scene, Vec<DAffine3>) {
     (scene, poses)
 }
 
-#[test]
-fn random_scenes() {
-    with_gpu(|gpu| {
-        let mut runner = proptest::test_runner::TestRunner::new_with_rng(
-            ProptestConfig {
-                cases: 4,
-                max_shrink_iters: 0,
-                failure_persistence: None,
-                ..ProptestConfig::default()
-            },
-            proptest::test_runner::TestRng::deterministic_rng(proptest::test_runner::RngAlgorithm::ChaCha),
-        );
-        runner
-            .run(&any::<u64>(), |seed| {
-                let (scene, poses) = random_scene(seed);
-                judge(gpu, &format!("seed {seed}"), &Shot { poses, spp: 12, ..shot(&scene) }, 256, 2e-2);
-                Ok(())
-            })
-            .unwrap();
-    });
+/// Scenes of every other kind.
+mod breadth {
+    use super::*;
+
+    #[test]
+    fn transmissive_solid_and_thin_under_an_environment_map() {
+        with_gpu(|gpu| {
+            let mut scene = Scene::default();
+            add(&mut scene, floor(1.2, 0.0), diffuse(Vec3::new(0.7, 0.6, 0.5)));
+            let glass = Material { metallic: 0.0, transmission: 1.0, thin_walled: false, ..Material::default() };
+            add(
+                &mut scene,
+                sphere(Vec3::ZERO, 0.3, 3, true),
+                Material { roughness: 0.0, base_color: Vec3::new(0.9, 1.0, 0.9), ..glass.clone() },
+            );
+            add(
+                &mut scene,
+                sphere(Vec3::ZERO, 0.3, 3, true),
+                Material { roughness: 0.55, transmission: 0.8, ..glass.clone() },
+            );
+            let stained = use_texture(&mut scene, noise_texture(4, 9, 60, 220, false));
+            let sheet = Material {
+                thin_walled: true,
+                roughness: 0.4,
+                transmission_texture: stained,
+                base_color: Vec3::new(1.0, 0.6, 0.5),
+                ..glass
+            };
+            add(&mut scene, quad(Vec3::new(0.2, 0.0, 0.6), Vec3::new(0.6, 0.0, 0.1), Vec3::Y * 0.6), sheet);
+            scene.environment = image_sky(0.5);
+            let poses =
+                vec![DAffine3::IDENTITY, tilted(-0.45, 0.31, 0.1), tilted(0.3, 0.31, -0.2), DAffine3::IDENTITY];
+            judge(gpu, "transmissive", &Shot { poses, depth: 6, ..shot(&scene) }, 768, 1e-2);
+        });
+    }
+
+    #[test]
+    fn holes_sides_and_a_thousand_lamps() {
+        with_gpu(|gpu| {
+            let mut scene = Scene::default();
+            add(&mut scene, floor(1.2, 0.0), diffuse(Vec3::splat(0.7)));
+            // A sheet with holes, seen from both sides; its shadow has holes too.
+            let mut lace = noise_texture(8, 21, 100, 255, true);
+            lace.texels
+                .iter_mut()
+                .enumerate()
+                .for_each(|(i, t)| t[3] = if (i * 7 + i / 8) % 3 == 0 { 0 } else { 255 });
+            lace.nearest = true;
+            let lace = use_texture(&mut scene, lace);
+            let sheet = Material {
+                base_color_texture: lace,
+                alpha_cutoff: Some(0.5),
+                double_sided: true,
+                ..diffuse(Vec3::ONE)
+            };
+            add(
+                &mut scene,
+                quad(Vec3::new(-0.8, 0.1, 0.5), Vec3::X * 0.8, Vec3::new(0.0, 0.7, -0.2)),
+                sheet.clone(),
+            );
+            // The same, facing away from the projector: its back is visible.
+            add(&mut scene, quad(Vec3::new(0.8, 0.1, 0.5), Vec3::X * -0.7, Vec3::new(0.0, 0.6, -0.2)), sheet);
+            // Single-sided and facing away: black, and it blocks light.
+            add(&mut scene, quad(Vec3::new(0.35, 0.05, -0.4), Vec3::X * -0.7, Vec3::Y * 0.5), diffuse(Vec3::ONE));
+            // 20,480 emissive triangles; the alias table must contain them all.
+            add(
+                &mut scene,
+                sphere(Vec3::ZERO, 0.25, 5, true),
+                Material { double_sided: true, ..emitter(Vec3::new(3.0, 3.5, 4.0)) },
+            );
+            let mut poses = vec![DAffine3::IDENTITY; 5];
+            poses[4] = tilted(0.2, 1.3, 0.6);
+            judge(gpu, "holes", &Shot { poses, ..shot(&scene) }, 512, 1e-2);
+        });
+    }
+
+    #[test]
+    fn random_scenes() {
+        with_gpu(|gpu| {
+            let mut runner = proptest::test_runner::TestRunner::new_with_rng(
+                ProptestConfig {
+                    cases: 4,
+                    max_shrink_iters: 0,
+                    failure_persistence: None,
+                    ..ProptestConfig::default()
+                },
+                proptest::test_runner::TestRng::deterministic_rng(proptest::test_runner::RngAlgorithm::ChaCha),
+            );
+            runner
+                .run(&any::<u64>(), |seed| {
+                    let (scene, poses) = random_scene(seed);
+                    judge(gpu, &format!("seed {seed}"), &Shot { poses, spp: 12, ..shot(&scene) }, 256, 2e-2);
+                    Ok(())
+                })
+                .unwrap();
+        });
+    }
 }

@@ -81,92 +81,6 @@ trait Tap: Sized {
 
 impl Tap for Material {}
 
-#[test]
-fn leaving_out_changes_no_bit() {
-    with_gpu(|gpu| {
-        for (name, scene) in scenes() {
-            let camera = camera(40, 30, DVec3::new(0.3, 1.4, 2.4), DVec3::new(0.0, 0.3, 0.0));
-            let shot = Shot {
-                eye: Some(DVec3::new(-0.6, 1.5, 2.2)),
-                spp: 4,
-                depth: 4,
-                drive_gain: 0.2,
-                ..Shot::new(&scene, camera)
-            };
-            let lean = shot.draw(gpu);
-            let full = Shot { leave_nothing_out: true, ..shot.clone() }.draw(gpu);
-            let lit = lean.lit_estimates().count();
-            assert!(lit > 200, "{name}: {lit}");
-            assert!(lean.radiance.iter().any(|r| r[0] > 0.0), "{name} is black");
-            assert_same_picture(gpu, &lean.radiance, &full.radiance, name);
-            if gpu.summary().software {
-                assert_eq!(lean.surfaces, full.surfaces, "{name}");
-                assert_eq!(lean.codes, full.codes, "{name}");
-                assert_eq!(lean.counters, full.counters, "{name}");
-            }
-            let stored = shot.draw_keeping(gpu, Keep { storage_tables: true, ..Keep::default() });
-            assert_eq!(bits(&lean.radiance), bits(&stored.radiance), "{name}: tables in storage");
-            assert_eq!(lean.codes, stored.codes, "{name}: tables in storage");
-        }
-    });
-}
-
-#[test]
-fn neither_changes_a_bit_of_a_method_with_histories() {
-    let flags = vec!["render.software_raster=[64,48]".to_owned()];
-    let config = RigConfig::demo(&Overrides { variables: vec![], flags }).unwrap_or_else(|e| panic!("{e}"));
-    let rig = Rig::build(&config, dpm_device::planes::Raster::new(64, 48)).unwrap_or_else(|e| panic!("{e}"));
-    with_gpu(|gpu| {
-        for which in [RenderMethod::Paper, RenderMethod::Dpm] {
-            let mut render = rig.config.render.clone();
-            render.method = which;
-            render.paper.zone_spp = [2, 2, 1];
-            let shown = |leave_nothing_out: bool, storage_tables: bool| {
-                let settings = RendererSettings {
-                    method: render.to_method(),
-                    leave_nothing_out,
-                    ..renderer_settings(&rig)
-                };
-                let keep = Keep { storage_tables, ..Keep::default() };
-                let mut renderer =
-                    Renderer::keeping(gpu, &rig.scene, settings, keep).expect("the demo fits the GPU");
-                let mut slot = renderer.create_slot(true).expect("memory for a small frame");
-                let mut frames = Vec::new();
-                for frame in 0..6 {
-                    let poses = poses_at(&rig, u64::from(frame));
-                    draw(&rig, &mut renderer, &mut slot, &poses, frame, 2.0).expect("the frame ends");
-                    frames.push((slot.radiance().expect("a debug slot").to_vec(), slot.codes().to_vec()));
-                }
-                frames
-            };
-            let lean = shown(false, false);
-            let (full, stored) = (shown(true, false), shown(false, true));
-            for (frame, (lean, full)) in lean.iter().zip(&full).enumerate() {
-                let what = format!("{which:?}, frame {frame}");
-                assert_eq!(bits(&lean.0), bits(&stored[frame].0), "{what}: tables in storage");
-                assert_eq!(lean.1, stored[frame].1, "{what}: tables in storage");
-                let lit = lean.1.iter().filter(|c| **c != 0).count();
-                assert!(lit > 50, "{what}: {lit} pixels are lit");
-                assert_same_picture(gpu, &lean.0, &full.0, &what);
-                if gpu.summary().software {
-                    assert_eq!(lean.1, full.1, "{what}");
-                }
-            }
-        }
-    });
-}
-
-/// Two tests, because one of them keeps little more than one core busy.
-#[test]
-fn a_plan_of_paper_tells_spare_code_from_parts_of_the_picture() {
-    check_plan("paper");
-}
-
-#[test]
-fn a_plan_of_dpm_tells_spare_code_from_parts_of_the_picture() {
-    check_plan("dpm");
-}
-
 fn check_plan(method: &str) {
     let flags = ["render.software_raster=[48,36]", &format!("render.method=\"{method}\"")];
     let overrides = Overrides { variables: vec![], flags: flags.map(str::to_owned).to_vec() };
@@ -212,4 +126,95 @@ fn check_plan(method: &str) {
     let taps = of("spatial filter taps");
     assert!((taps.with_rays / taps.without_rays - 1.0).abs() < 0.02, "{taps:?}");
     assert!(plan.together.is_some_and(|s| s.pixels_identical));
+}
+
+/// Every part of a scene, taken out.
+mod breadth {
+    use super::*;
+
+    #[test]
+    fn leaving_out_changes_no_bit() {
+        with_gpu(|gpu| {
+            for (name, scene) in scenes() {
+                let camera = camera(40, 30, DVec3::new(0.3, 1.4, 2.4), DVec3::new(0.0, 0.3, 0.0));
+                let shot = Shot {
+                    eye: Some(DVec3::new(-0.6, 1.5, 2.2)),
+                    spp: 4,
+                    depth: 4,
+                    drive_gain: 0.2,
+                    ..Shot::new(&scene, camera)
+                };
+                let lean = shot.draw(gpu);
+                let full = Shot { leave_nothing_out: true, ..shot.clone() }.draw(gpu);
+                let lit = lean.lit_estimates().count();
+                assert!(lit > 200, "{name}: {lit}");
+                assert!(lean.radiance.iter().any(|r| r[0] > 0.0), "{name} is black");
+                assert_same_picture(gpu, &lean.radiance, &full.radiance, name);
+                if gpu.summary().software {
+                    assert_eq!(lean.surfaces, full.surfaces, "{name}");
+                    assert_eq!(lean.codes, full.codes, "{name}");
+                    assert_eq!(lean.counters, full.counters, "{name}");
+                }
+                let stored = shot.draw_keeping(gpu, Keep { storage_tables: true, ..Keep::default() });
+                assert_eq!(bits(&lean.radiance), bits(&stored.radiance), "{name}: tables in storage");
+                assert_eq!(lean.codes, stored.codes, "{name}: tables in storage");
+            }
+        });
+    }
+
+    #[test]
+    fn neither_changes_a_bit_of_a_method_with_histories() {
+        let flags = vec!["render.software_raster=[64,48]".to_owned()];
+        let config = RigConfig::demo(&Overrides { variables: vec![], flags }).unwrap_or_else(|e| panic!("{e}"));
+        let rig = Rig::build(&config, dpm_device::planes::Raster::new(64, 48)).unwrap_or_else(|e| panic!("{e}"));
+        with_gpu(|gpu| {
+            for which in [RenderMethod::Paper, RenderMethod::Dpm] {
+                let mut render = rig.config.render.clone();
+                render.method = which;
+                render.paper.zone_spp = [2, 2, 1];
+                let shown = |leave_nothing_out: bool, storage_tables: bool| {
+                    let settings = RendererSettings {
+                        method: render.to_method(),
+                        leave_nothing_out,
+                        ..renderer_settings(&rig)
+                    };
+                    let keep = Keep { storage_tables, ..Keep::default() };
+                    let mut renderer =
+                        Renderer::keeping(gpu, &rig.scene, settings, keep).expect("the demo fits the GPU");
+                    let mut slot = renderer.create_slot(true).expect("memory for a small frame");
+                    let mut frames = Vec::new();
+                    for frame in 0..6 {
+                        let poses = poses_at(&rig, u64::from(frame));
+                        draw(&rig, &mut renderer, &mut slot, &poses, frame, 2.0).expect("the frame ends");
+                        frames.push((slot.radiance().expect("a debug slot").to_vec(), slot.codes().to_vec()));
+                    }
+                    frames
+                };
+                let lean = shown(false, false);
+                let (full, stored) = (shown(true, false), shown(false, true));
+                for (frame, (lean, full)) in lean.iter().zip(&full).enumerate() {
+                    let what = format!("{which:?}, frame {frame}");
+                    assert_eq!(bits(&lean.0), bits(&stored[frame].0), "{what}: tables in storage");
+                    assert_eq!(lean.1, stored[frame].1, "{what}: tables in storage");
+                    let lit = lean.1.iter().filter(|c| **c != 0).count();
+                    assert!(lit > 50, "{what}: {lit} pixels are lit");
+                    assert_same_picture(gpu, &lean.0, &full.0, &what);
+                    if gpu.summary().software {
+                        assert_eq!(lean.1, full.1, "{what}");
+                    }
+                }
+            }
+        });
+    }
+
+    /// Two tests, because one of them keeps little more than one core busy.
+    #[test]
+    fn a_plan_of_paper_tells_spare_code_from_parts_of_the_picture() {
+        check_plan("paper");
+    }
+
+    #[test]
+    fn a_plan_of_dpm_tells_spare_code_from_parts_of_the_picture() {
+        check_plan("dpm");
+    }
 }

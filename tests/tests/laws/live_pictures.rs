@@ -45,50 +45,6 @@ fn alone(gpu: &Arc<Gpu>, rig: &Rig, scene: &Scene, frame: u32) -> Vec<u32> {
     slot.codes().to_vec()
 }
 
-/// A picture goes to the GPU in pieces of ten texels, seven for the picture. The frames before the last piece show the picture before,
-/// and those from it on the new one. Newer pictures that come meanwhile wait, and the newest of them is next.
-#[test]
-fn a_frame_shows_one_whole_picture() {
-    with_gpu(|gpu| {
-        let rig = rig_with("pipe:/nowhere", &[]);
-        let settings = RendererSettings { most_live_texels: 10, ..renderer_settings(&rig) };
-        let mut renderer = Renderer::new(gpu, &rig.scene, settings).unwrap();
-        let mut slot = renderer.create_slot(false).unwrap();
-        let pictures = &rig.scene.live[0].pictures;
-        let black = rig.scene.still_at(0);
-        let shown = |k: usize| {
-            pictures.show(&picture(k));
-            rig.scene.still_at(0)
-        };
-        let mut scenes = vec![];
-        for frame in 0..24u32 {
-            match frame {
-                2 => scenes.push(shown(0)),
-                // Of these two the first is never shown: the second has come before it could begin.
-                4 | 5 => scenes.push(shown(frame as usize - 3)),
-                _ => {}
-            }
-            draw(&rig, &mut renderer, &mut slot, &poses_at(&rig, u64::from(frame)), frame, 1.0).unwrap();
-            let expected = match frame {
-                0..8 => &black,
-                8..15 => &scenes[0],
-                _ => &scenes[2],
-            };
-            assert!(slot.codes() == alone(gpu, &rig, expected, frame), "frame {frame}");
-        }
-        let [first, last] = [&scenes[0], &scenes[2]].map(|scene| alone(gpu, &rig, scene, 9));
-        assert!(
-            first.iter().zip(&last).filter(|(a, b)| a != b).count() > 100,
-            "the pictures differ in the light"
-        );
-        // A renderer that is made now, as after a lost GPU, begins with the newest picture.
-        let mut late = Renderer::new(gpu, &rig.scene, renderer_settings(&rig)).unwrap();
-        let mut slot = late.create_slot(false).unwrap();
-        draw(&rig, &mut late, &mut slot, &poses_at(&rig, 9), 9, 1.0).unwrap();
-        assert!(slot.codes() == alone(gpu, &rig, &scenes[2], 9));
-    });
-}
-
 /// Three frames in flight, two queues, and a new picture before every frame: each frame shows one picture as a whole, and no older one
 /// than the frame before.
 #[test]
@@ -126,54 +82,108 @@ fn frames_in_flight_show_whole_pictures() {
     });
 }
 
-/// A whole rig, and another program that writes into a named pipe: the light is black on the bunny at first, and shows the picture in
-/// the end.
-#[test]
-fn a_rig_shows_what_another_program_writes_into_a_pipe() {
-    let path = std::env::temp_dir().join(format!("dpm-live-{}", std::process::id()));
-    let _ = std::fs::remove_file(&path);
-    assert!(Command::new("mkfifo").arg(&path).status().unwrap().success());
-    let rgb: Vec<u8> = picture(1).iter().flat_map(|texel| [texel[0], texel[1], texel[2]]).collect();
-    let image = [format!("P6 {SIDE} {SIDE} 255\n").into_bytes(), rgb].concat();
-    with_gpu(|gpu| {
-        let pace = ["real_time.pace=\"real\"", "projector.frame_rate=\"120\"", "output.images=true"];
-        let rig = rig_with(&format!("pipe:{}", path.display()), &pace);
-        let is_over = Arc::new(AtomicBool::new(false));
-        let writer = {
-            let (path, image, is_over) = (path.clone(), image.clone(), is_over.clone());
-            std::thread::spawn(move || {
-                // Opens when the rig does.
-                let mut pipe = File::options().write(true).open(path).unwrap();
-                while !is_over.load(Ordering::Relaxed) {
-                    // The rig has closed its end.
-                    if pipe.write_all(&image).is_err() {
-                        return;
-                    }
-                    std::thread::sleep(std::time::Duration::from_millis(10));
+/// Many pictures.
+mod breadth {
+    use super::*;
+
+    /// A picture goes to the GPU in pieces of ten texels, seven for the picture. The frames before the last piece show the picture before,
+    /// and those from it on the new one. Newer pictures that come meanwhile wait, and the newest of them is next.
+    #[test]
+    fn a_frame_shows_one_whole_picture() {
+        with_gpu(|gpu| {
+            let rig = rig_with("pipe:/nowhere", &[]);
+            let settings = RendererSettings { most_live_texels: 10, ..renderer_settings(&rig) };
+            let mut renderer = Renderer::new(gpu, &rig.scene, settings).unwrap();
+            let mut slot = renderer.create_slot(false).unwrap();
+            let pictures = &rig.scene.live[0].pictures;
+            let black = rig.scene.still_at(0);
+            let shown = |k: usize| {
+                pictures.show(&picture(k));
+                rig.scene.still_at(0)
+            };
+            let mut scenes = vec![];
+            for frame in 0..24u32 {
+                match frame {
+                    2 => scenes.push(shown(0)),
+                    // Of these two the first is never shown: the second has come before it could begin.
+                    4 | 5 => scenes.push(shown(frame as usize - 3)),
+                    _ => {}
                 }
-            })
-        };
-        let (outcome, monitor) = run(gpu, &rig, 240, 8);
-        is_over.store(true, Ordering::Relaxed);
-        writer.join().unwrap();
-        let notes = monitor.take_notes();
-        assert!(notes.iter().any(|note| note.contains("pictures of 8 x 8 have begun")), "{notes:?}");
-        let pictures = &rig.scene.live[0].pictures;
-        assert!(pictures.count() > 2, "{} pictures", pictures.count());
-        assert_eq!(pictures.newest(), picture(1));
-        // The newest light of which the poses are known: on a busy machine not every frame is lit.
-        let drawn = |frame: u32| outcome.recent.iter().find(|record| record.id.0 as u32 == frame);
-        let mut newest = outcome.light.iter().rev();
-        let (light, record) =
-            newest.find_map(|light| Some((light, drawn(light.frame)?))).expect("a lit frame with its record");
-        let mut bodies = dpm_lab::sequence::Placed::default();
-        rig.scene_poses(&record.tracked_poses, record.drawn_for.0, &mut bodies.poses);
-        let fell: Vec<u32> = light.codes.iter().map(|c| u32::from_le_bytes([c[0], c[1], c[2], 0])).collect();
-        let mut renderer = Renderer::new(gpu, &rig.scene.still_at(0), renderer_settings(&rig)).unwrap();
-        let mut slot = renderer.create_slot(false).unwrap();
-        let spp = rig.config.render.spp as f32;
-        draw(&rig, &mut renderer, &mut slot, &bodies, light.frame, spp).unwrap();
-        assert!(fell == slot.codes(), "the light of the last frame shows the picture");
-    });
-    let _ = std::fs::remove_file(&path);
+                draw(&rig, &mut renderer, &mut slot, &poses_at(&rig, u64::from(frame)), frame, 1.0).unwrap();
+                let expected = match frame {
+                    0..8 => &black,
+                    8..15 => &scenes[0],
+                    _ => &scenes[2],
+                };
+                assert!(slot.codes() == alone(gpu, &rig, expected, frame), "frame {frame}");
+            }
+            let [first, last] = [&scenes[0], &scenes[2]].map(|scene| alone(gpu, &rig, scene, 9));
+            assert!(
+                first.iter().zip(&last).filter(|(a, b)| a != b).count() > 100,
+                "the pictures differ in the light"
+            );
+            // A renderer that is made now, as after a lost GPU, begins with the newest picture.
+            let mut late = Renderer::new(gpu, &rig.scene, renderer_settings(&rig)).unwrap();
+            let mut slot = late.create_slot(false).unwrap();
+            draw(&rig, &mut late, &mut slot, &poses_at(&rig, 9), 9, 1.0).unwrap();
+            assert!(slot.codes() == alone(gpu, &rig, &scenes[2], 9));
+        });
+    }
+}
+
+/// A program that writes as fast as a clock says.
+mod real_pace {
+    use super::*;
+
+    /// A whole rig, and another program that writes into a named pipe: the light is black on the bunny at first, and shows the picture in
+    /// the end.
+    #[test]
+    fn a_rig_shows_what_another_program_writes_into_a_pipe() {
+        let path = std::env::temp_dir().join(format!("dpm-live-{}", std::process::id()));
+        let _ = std::fs::remove_file(&path);
+        assert!(Command::new("mkfifo").arg(&path).status().unwrap().success());
+        let rgb: Vec<u8> = picture(1).iter().flat_map(|texel| [texel[0], texel[1], texel[2]]).collect();
+        let image = [format!("P6 {SIDE} {SIDE} 255\n").into_bytes(), rgb].concat();
+        with_gpu(|gpu| {
+            let pace = ["real_time.pace=\"real\"", "projector.frame_rate=\"120\"", "output.images=true"];
+            let rig = rig_with(&format!("pipe:{}", path.display()), &pace);
+            let is_over = Arc::new(AtomicBool::new(false));
+            let writer = {
+                let (path, image, is_over) = (path.clone(), image.clone(), is_over.clone());
+                std::thread::spawn(move || {
+                    // Opens when the rig does.
+                    let mut pipe = File::options().write(true).open(path).unwrap();
+                    while !is_over.load(Ordering::Relaxed) {
+                        // The rig has closed its end.
+                        if pipe.write_all(&image).is_err() {
+                            return;
+                        }
+                        std::thread::sleep(std::time::Duration::from_millis(10));
+                    }
+                })
+            };
+            let (outcome, monitor) = run(gpu, &rig, 240, 8);
+            is_over.store(true, Ordering::Relaxed);
+            writer.join().unwrap();
+            let notes = monitor.take_notes();
+            assert!(notes.iter().any(|note| note.contains("pictures of 8 x 8 have begun")), "{notes:?}");
+            let pictures = &rig.scene.live[0].pictures;
+            assert!(pictures.count() > 2, "{} pictures", pictures.count());
+            assert_eq!(pictures.newest(), picture(1));
+            // The newest light of which the poses are known: on a busy machine not every frame is lit.
+            let drawn = |frame: u32| outcome.recent.iter().find(|record| record.id.0 as u32 == frame);
+            let mut newest = outcome.light.iter().rev();
+            let (light, record) =
+                newest.find_map(|light| Some((light, drawn(light.frame)?))).expect("a lit frame with its record");
+            let mut bodies = dpm_lab::sequence::Placed::default();
+            rig.scene_poses(&record.tracked_poses, record.drawn_for.0, &mut bodies.poses);
+            let fell: Vec<u32> = light.codes.iter().map(|c| u32::from_le_bytes([c[0], c[1], c[2], 0])).collect();
+            let mut renderer = Renderer::new(gpu, &rig.scene.still_at(0), renderer_settings(&rig)).unwrap();
+            let mut slot = renderer.create_slot(false).unwrap();
+            let spp = rig.config.render.spp as f32;
+            draw(&rig, &mut renderer, &mut slot, &bodies, light.frame, spp).unwrap();
+            assert!(fell == slot.codes(), "the light of the last frame shows the picture");
+        });
+        let _ = std::fs::remove_file(&path);
+    }
 }

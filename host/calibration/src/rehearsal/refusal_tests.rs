@@ -60,64 +60,6 @@ impl Sweep {
 }
 
 #[test]
-fn sweeps_with_a_fault_are_refused_by_name() {
-    let sweep = sweep(5, 10.0);
-    sweep.with(|_, _| {}).unwrap();
-    // A left-handed tracker: places, turns and the wand's own frame are mirrored.
-    let tip = sweep.truth.tip * DVec3::new(-1.0, 1.0, 1.0);
-    let mirrored = sweep.with_tip(tip, |_, p| {
-        p.position.x = -p.position.x;
-        p.rotation = DQuat::from_xyzw(p.rotation.x, -p.rotation.y, -p.rotation.z, p.rotation.w);
-    });
-    assert_eq!(mirrored.unwrap_err(), SensorError::Projector(Refusal::Mirrored));
-    let z_up = sweep.with(|_, p| {
-        let turn = DQuat::from_rotation_x(std::f64::consts::FRAC_PI_2);
-        (p.position, p.rotation) = (turn * p.position, turn * p.rotation);
-    });
-    assert_eq!(
-        z_up.unwrap_err(),
-        SensorError::Projector(Refusal::AxesExchanged { found: "Z", expected: "Y" })
-    );
-    let late = sweep.with(|_, p| p.stamp_ns += 300_000_000).unwrap_err();
-    assert!(matches!(late, SensorError::LatencyAtBound { ms } if (250.0..350.0).contains(&ms)), "{late}");
-    let half = sweep.poses.len() / 2;
-    let moved = sweep.with(|i, p| p.position.x += if i > half { 0.02 } else { 0.0 }).unwrap_err();
-    assert!(matches!(moved, SensorError::Projector(Refusal::Moved { .. })), "{moved}");
-    let flat = sweep.with(|_, p| p.position.z = 0.0).unwrap_err();
-    assert!(matches!(flat, SensorError::Projector(_) | SensorError::DoesNotFit { .. }), "{flat}");
-    let unit = sweep.with_tip(1000.0 * sweep.truth.tip, |_, p| p.position *= 1000.0).unwrap_err();
-    assert!(matches!(unit, SensorError::Projector(Refusal::WrongUnit { factor: 1000.0, .. })), "{unit}");
-    let gone = sweep.with(|_, p| p.stamp_ns += 1_000_000_000_000).unwrap_err();
-    assert!(matches!(gone, SensorError::TooFew { frames: 0, .. }), "{gone}");
-}
-
-/// Steps that the pixels of the bits do not show: the levels must tell of them, or the prediction must cover them.
-#[test]
-fn small_steps_of_the_tracker_are_told_or_predicted() {
-    for seed in [6, 7] {
-        let sweep = sweep(seed, 15.0);
-        let Truth { raster, projector, volume, .. } = &sweep.truth;
-        let half = sweep.poses.len() / 2;
-        for moved_mm in [0.0, 1.0, 2.0, 8.0] {
-            let solved = sweep.with(|i, p| p.position.x += if i > half { 1e-3 * moved_mm } else { 0.0 });
-            match solved {
-                Ok(s) => {
-                    let (off, predicted) =
-                        (moved_px(*raster, &s.model, projector, volume), s.predicted.p99_px);
-                    println!("{seed}, {moved_mm} mm: {off:.3} px, predicted {predicted:.3} px");
-                    // Twice, because after a step no projector is near the light of both parts.
-                    assert!(off < 2.0 * predicted && moved_mm < 3.0, "{seed}: {moved_mm} mm, {off} px");
-                }
-                Err(SensorError::Changed { .. } | SensorError::Projector(Refusal::Moved { .. })) => {
-                    assert!(moved_mm > 0.0);
-                }
-                Err(other) => panic!("{seed}, {moved_mm} mm: {other}"),
-            }
-        }
-    }
-}
-
-#[test]
 fn a_sweep_says_what_it_has_not_seen() {
     let short = sweep(6, 3.0);
     let mut coverage = Coverage::new(short.code.clone());
@@ -165,4 +107,67 @@ fn decoded_frames_are_those_that_were_shown() {
         }
     }
     assert!(all > 10_000 && f64::from(right) > 0.99 * f64::from(all), "{right} of {all}");
+}
+
+/// Whole sweeps, from simulated seconds.
+mod breadth {
+    use super::*;
+
+    #[test]
+    fn sweeps_with_a_fault_are_refused_by_name() {
+        let sweep = sweep(5, 10.0);
+        sweep.with(|_, _| {}).unwrap();
+        // A left-handed tracker: places, turns and the wand's own frame are mirrored.
+        let tip = sweep.truth.tip * DVec3::new(-1.0, 1.0, 1.0);
+        let mirrored = sweep.with_tip(tip, |_, p| {
+            p.position.x = -p.position.x;
+            p.rotation = DQuat::from_xyzw(p.rotation.x, -p.rotation.y, -p.rotation.z, p.rotation.w);
+        });
+        assert_eq!(mirrored.unwrap_err(), SensorError::Projector(Refusal::Mirrored));
+        let z_up = sweep.with(|_, p| {
+            let turn = DQuat::from_rotation_x(std::f64::consts::FRAC_PI_2);
+            (p.position, p.rotation) = (turn * p.position, turn * p.rotation);
+        });
+        assert_eq!(
+            z_up.unwrap_err(),
+            SensorError::Projector(Refusal::AxesExchanged { found: "Z", expected: "Y" })
+        );
+        let late = sweep.with(|_, p| p.stamp_ns += 300_000_000).unwrap_err();
+        assert!(matches!(late, SensorError::LatencyAtBound { ms } if (250.0..350.0).contains(&ms)), "{late}");
+        let half = sweep.poses.len() / 2;
+        let moved = sweep.with(|i, p| p.position.x += if i > half { 0.02 } else { 0.0 }).unwrap_err();
+        assert!(matches!(moved, SensorError::Projector(Refusal::Moved { .. })), "{moved}");
+        let flat = sweep.with(|_, p| p.position.z = 0.0).unwrap_err();
+        assert!(matches!(flat, SensorError::Projector(_) | SensorError::DoesNotFit { .. }), "{flat}");
+        let unit = sweep.with_tip(1000.0 * sweep.truth.tip, |_, p| p.position *= 1000.0).unwrap_err();
+        assert!(matches!(unit, SensorError::Projector(Refusal::WrongUnit { factor: 1000.0, .. })), "{unit}");
+        let gone = sweep.with(|_, p| p.stamp_ns += 1_000_000_000_000).unwrap_err();
+        assert!(matches!(gone, SensorError::TooFew { frames: 0, .. }), "{gone}");
+    }
+
+    /// Steps that the pixels of the bits do not show: the levels must tell of them, or the prediction must cover them.
+    #[test]
+    fn small_steps_of_the_tracker_are_told_or_predicted() {
+        for seed in [6, 7] {
+            let sweep = sweep(seed, 15.0);
+            let Truth { raster, projector, volume, .. } = &sweep.truth;
+            let half = sweep.poses.len() / 2;
+            for moved_mm in [0.0, 1.0, 2.0, 8.0] {
+                let solved = sweep.with(|i, p| p.position.x += if i > half { 1e-3 * moved_mm } else { 0.0 });
+                match solved {
+                    Ok(s) => {
+                        let (off, predicted) =
+                            (moved_px(*raster, &s.model, projector, volume), s.predicted.p99_px);
+                        println!("{seed}, {moved_mm} mm: {off:.3} px, predicted {predicted:.3} px");
+                        // Twice, because after a step no projector is near the light of both parts.
+                        assert!(off < 2.0 * predicted && moved_mm < 3.0, "{seed}: {moved_mm} mm, {off} px");
+                    }
+                    Err(SensorError::Changed { .. } | SensorError::Projector(Refusal::Moved { .. })) => {
+                        assert!(moved_mm > 0.0);
+                    }
+                    Err(other) => panic!("{seed}, {moved_mm} mm: {other}"),
+                }
+            }
+        }
+    }
 }

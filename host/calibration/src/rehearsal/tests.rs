@@ -31,29 +31,6 @@ fn draws(count: u64, bias: Bias) -> Rehearsal {
     got
 }
 
-#[test]
-fn with_white_noise_the_light_is_within_a_quarter_of_a_pixel() {
-    let got = draws(20, Bias::None);
-    assert_eq!(got.draws, 20);
-    assert!(got.error_px.p50 <= 0.1 && got.error_px.p99 <= 0.25, "{:?}", got.error_px);
-    assert!(got.latency_error_us.max <= 50.0, "{:?}", got.latency_error_us);
-    // Motion adds what the error of the latency moves a body, at about 1.6 pixels a millimetre, and no more.
-    let by_latency = 1.7 * SPEED_M_S * 1e-3 * got.latency_error_us.max;
-    assert!(got.moving_px.p99 <= 0.25 && got.moving_px.p99 <= got.error_px.p99 + by_latency, "{got:?}");
-    assert!(got.moving_px != got.error_px, "the latency is not known exactly");
-    assert!(got.level_error.max <= 0.01, "{:?}", got.level_error);
-    assert!(got.covered >= 0.98 && got.predicted_over_true <= 3.0, "{got:?}");
-}
-
-#[test]
-fn with_a_biased_tracker_the_light_is_within_half_a_pixel() {
-    for bias in [Bias::Wandering(5e-5), Bias::Fixed(5e-5)] {
-        let got = draws(6, bias);
-        assert!(got.error_px.p50 <= 0.25 && got.error_px.p99 <= 0.5, "{:?}", got.error_px);
-        assert!(got.latency_error_us.max <= 50.0, "{:?}", got.latency_error_us);
-    }
-}
-
 /// Reports that wander by a tenth of a millimetre make the parts of this sweep differ by half a pixel, beyond doubt. Nobody
 /// can fasten that: it is predicted, and not refused.
 #[test]
@@ -62,9 +39,37 @@ fn a_tracker_that_wanders_is_predicted_and_not_refused() {
     assert!(draw.p99_px < 1.5 * draw.predicted_p99_px, "{draw:?}");
 }
 
-#[test]
-fn a_rehearsal_repeats() {
-    let (a, b) = (rehearse(1, 77).unwrap(), rehearse(1, 77).unwrap());
-    assert_eq!(a, b);
-    assert_ne!(a, rehearse(1, 78).unwrap());
+/// Whole rehearsals, from thirty simulated seconds each.
+mod breadth {
+    use super::*;
+
+    #[test]
+    fn with_white_noise_the_light_is_within_a_quarter_of_a_pixel() {
+        let got = draws(20, Bias::None);
+        assert_eq!(got.draws, 20);
+        assert!(got.error_px.p50 <= 0.1 && got.error_px.p99 <= 0.25, "{:?}", got.error_px);
+        assert!(got.latency_error_us.max <= 50.0, "{:?}", got.latency_error_us);
+        // Motion adds what the error of the latency moves a body, at about 1.6 pixels a millimetre, and no more.
+        let by_latency = 1.7 * SPEED_M_S * 1e-3 * got.latency_error_us.max;
+        assert!(got.moving_px.p99 <= 0.25 && got.moving_px.p99 <= got.error_px.p99 + by_latency, "{got:?}");
+        assert!(got.moving_px != got.error_px, "the latency is not known exactly");
+        assert!(got.level_error.max <= 0.01, "{:?}", got.level_error);
+        assert!(got.covered >= 0.98 && got.predicted_over_true <= 3.0, "{got:?}");
+    }
+
+    #[test]
+    fn with_a_biased_tracker_the_light_is_within_half_a_pixel() {
+        for bias in [Bias::Wandering(5e-5), Bias::Fixed(5e-5)] {
+            let got = draws(6, bias);
+            assert!(got.error_px.p50 <= 0.25 && got.error_px.p99 <= 0.5, "{:?}", got.error_px);
+            assert!(got.latency_error_us.max <= 50.0, "{:?}", got.latency_error_us);
+        }
+    }
+
+    #[test]
+    fn a_rehearsal_repeats() {
+        let (a, b) = (rehearse(1, 77).unwrap(), rehearse(1, 77).unwrap());
+        assert_eq!(a, b);
+        assert_ne!(a, rehearse(1, 78).unwrap());
+    }
 }

@@ -64,25 +64,6 @@ fn every_level_stands_between_two_of_full_white() {
     assert!((0..3).all(|c| codes.contains(&(255 << (8 * c)))));
 }
 
-#[test]
-fn the_limit_of_flashes_is_kept_by_the_limiter_itself() {
-    let schedule = PlaneSchedule::rgb24();
-    let mut holds = Vec::new();
-    for limit in [None, Some(3), Some(2), Some(1)] {
-        let levels = Levels::new(&schedule, rate(), Field::Full(limit), CODES).unwrap();
-        holds.push(levels.hold);
-        let Some(limit) = limit else { continue };
-        // The averages of the limiter begin at other slots than the levels.
-        for first in 12_345..12_361 {
-            let mut limiter = FlashLimiter::new(rate(), limit);
-            let mut slots = first..first + 2 * levels.steps.len() as u64 * levels.hold;
-            let light = |slot| luminance(&schedule, levels.steps[source_step(&levels, slot)].code);
-            assert!(!slots.any(|s| limiter.observe(s, light(s))), "limit {limit} from slot {first}");
-        }
-    }
-    assert!(holds.is_sorted() && holds[3] > holds[0], "{holds:?}");
-}
-
 fn source_step(levels: &Levels, slot: u64) -> usize {
     levels.picture(0, slot) as usize
 }
@@ -293,4 +274,28 @@ fn levels_in_tiles_are_those_of_the_mock_wherever_the_sensor_lies() {
         assert!((half - truth(config, 128)).abs() < 5e-3, "channel {channel}: {half}");
     }
     assert_eq!(levels.full_white_s(), 0.0);
+}
+
+/// Simulated minutes.
+mod breadth {
+    use super::*;
+
+    #[test]
+    fn the_limit_of_flashes_is_kept_by_the_limiter_itself() {
+        let schedule = PlaneSchedule::rgb24();
+        let mut holds = Vec::new();
+        for limit in [None, Some(3), Some(2), Some(1)] {
+            let levels = Levels::new(&schedule, rate(), Field::Full(limit), CODES).unwrap();
+            holds.push(levels.hold);
+            let Some(limit) = limit else { continue };
+            // The averages of the limiter begin at other slots than the levels.
+            for first in 12_345..12_361 {
+                let mut limiter = FlashLimiter::new(rate(), limit);
+                let mut slots = first..first + 2 * levels.steps.len() as u64 * levels.hold;
+                let light = |slot| luminance(&schedule, levels.steps[source_step(&levels, slot)].code);
+                assert!(!slots.any(|s| limiter.observe(s, light(s))), "limit {limit} from slot {first}");
+            }
+        }
+        assert!(holds.is_sorted() && holds[3] > holds[0], "{holds:?}");
+    }
 }

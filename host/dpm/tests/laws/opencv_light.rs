@@ -182,32 +182,6 @@ fn a_pinhole_of_opencv_lights_what_opencv_projects() {
     check("none", "xml", "full");
 }
 
-#[test]
-fn a_lens_of_brown_lights_what_opencv_projects() {
-    check("brown4", "yml", "full");
-    check("brown5", "json", "dpm");
-}
-
-#[test]
-fn a_rational_lens_lights_what_opencv_projects() {
-    check("rational8", "xml", "dpm");
-}
-
-#[test]
-fn a_thin_prism_lights_what_opencv_projects() {
-    check("prism12", "yml", "full");
-}
-
-#[test]
-fn a_tilted_panel_lights_what_opencv_projects() {
-    check("tilted14", "json", "dpm");
-}
-
-#[test]
-fn a_fisheye_lens_lights_what_opencv_projects() {
-    check("fisheye", "xml", "full");
-}
-
 /// The rays of such a lens cross inside the raster, so no single ray belongs to a mirror there.
 #[test]
 fn a_lens_that_folds_is_refused_before_there_is_light() {
@@ -224,5 +198,36 @@ fn a_lens_that_folds_is_refused_before_there_is_light() {
         assert_eq!(code(&output), 2, "{command:?}: {}", err(&output));
         let told = err(&output);
         assert!(told.contains("cannot be inverted") && told.contains("projector.calibration"), "{told}");
+    }
+}
+
+/// Every model of a lens.
+mod breadth {
+    use super::*;
+
+    #[test]
+    fn a_lens_of_brown_lights_what_opencv_projects() {
+        check("brown4", "yml", "full");
+        check("brown5", "json", "dpm");
+    }
+
+    #[test]
+    fn a_fisheye_lens_lights_what_opencv_projects() {
+        check("fisheye", "xml", "full");
+    }
+
+    #[test]
+    fn a_tilted_panel_lights_what_opencv_projects() {
+        check("tilted14", "json", "dpm");
+    }
+
+    #[test]
+    fn a_rational_lens_lights_what_opencv_projects() {
+        check("rational8", "xml", "dpm");
+    }
+
+    #[test]
+    fn a_thin_prism_lights_what_opencv_projects() {
+        check("prism12", "yml", "full");
     }
 }

@@ -57,42 +57,6 @@ fn shows_all(folder: &Folder, report: &serde_json::Value) {
 }
 
 #[test]
-fn an_asset_of_any_size_and_place_is_shown_whole_and_lit() {
-    let folder = Folder::new("snapshot-any");
-    let assets = [
-        ("tiny", cuboid([0.0; 3], [1e-4, 2e-4, 1e-4])),
-        ("huge", cuboid([-1e5, 0.0, -1e5], [1e5, 2e5, 1e5])),
-        ("far", cuboid([4e3, 20.0, -3e3], [4e3 + 0.5, 20.5, -3e3 + 0.5])),
-        ("floor", cuboid([0.0; 3], [3.0, 1e-3, 2.0])),
-        ("wall", cuboid([0.0; 3], [1e-3, 2.0, 3.0])),
-    ];
-    for (name, text) in assets {
-        let asset = folder.write(&format!("{name}.obj"), &text);
-        let report = snapshot(&folder, &[&asset, "--set", "scene.scale=1", "--what", "radiance,light"]);
-        shows_all(&folder, &report);
-        // Nothing was said of how it moves.
-        let again =
-            snapshot_at(60, &folder, &["--scene", &asset, "--set", "scene.scale=1", "--what", "light"]);
-        assert_eq!(report["view"]["position"], again["view"]["position"], "{name}");
-    }
-}
-
-#[test]
-fn a_rig_file_that_places_its_projector_keeps_its_view() {
-    let folder = Folder::new("snapshot-rig");
-    let asset = folder.write("box.obj", &cuboid([7.0, 0.0, 0.0], [8.0, 1.0, 1.0]));
-    let body = "[[scene.bodies]]\nname = \"thing\"\nmotion = { kind = \"translate\", speed_m_s = 1.0, amplitude_m = 0.5 }\n";
-    let scene = format!("[scene]\nfile = {asset:?}\n{body}");
-    let open = folder.write("open.toml", &scene);
-    let placed = folder.write("placed.toml", &format!("[projector]\nposition = [0.0, 0.0, 9.0]\n{scene}"));
-    shows_all(&folder, &snapshot(&folder, &[&open]));
-    assert!(snapshot(&folder, &[&placed])["view"].is_null());
-    assert!(snapshot(&folder, &[&open, "--view", "rig"])["view"].is_null());
-    shows_all(&folder, &snapshot(&folder, &[&placed, "--view", "fit"]));
-    assert!(snapshot(&folder, &[])["view"].is_null(), "the demo has its own view");
-}
-
-#[test]
 fn what_cannot_be_shown_is_told() {
     let folder = Folder::new("snapshot-told");
     let lamp = "mtllib lamp.mtl\nusemtl lamp\n".to_owned() + &cuboid([0.0; 3], [1.0; 3]);
@@ -107,39 +71,6 @@ fn what_cannot_be_shown_is_told() {
         assert_eq!(code(&output), 2, "{args:?}");
         assert!(err(&output).contains(told), "{}", err(&output));
     }
-}
-
-/// A snapshot keeps the first picture of another program; without one the body is black, which is told.
-#[test]
-fn a_picture_of_another_program_is_waited_for_and_kept() {
-    let folder = Folder::new("snapshot-live");
-    let pipe = Path::new(folder.text()).join("pictures");
-    assert!(std::process::Command::new("mkfifo").arg(&pipe).status().expect("mkfifo").success());
-    let bodies = format!(
-        "scene.bodies=[{{ name = \"bunny\", texture = \"pipe:{}\", texture_size = [2, 2], motion = {{ kind = \"still\" }} }}, \
-         {{ name = \"venus\", motion = {{ kind = \"still\" }} }}]",
-        pipe.display()
-    );
-    let args = ["--set", &bodies, "--set", "render.exposure=2"];
-    let shown = |report: &serde_json::Value| -> (f32, String) {
-        let pixels = radiance(&Path::new(folder.text()).join("radiance.pfm"));
-        (pixels.iter().sum(), report["warnings"].to_string())
-    };
-    let (black, told) = shown(&snapshot(&folder, &args));
-    assert!(told.contains("not every picture of another program has come within 3 s"), "{told}");
-    let writer = std::thread::spawn({
-        let pipe = pipe.clone();
-        move || {
-            let mut pipe = std::fs::File::options().write(true).open(pipe).expect("the pipe");
-            std::io::Write::write_all(&mut pipe, b"P6 2 2 255 aaaabbbbcccc").expect("a reader");
-            // It is closed when the snapshot has been made.
-            std::thread::sleep(std::time::Duration::from_secs(2));
-        }
-    });
-    let (red, told) = shown(&snapshot(&folder, &args));
-    writer.join().expect("it wrote");
-    assert!(told.contains("pictures of 2 x 2 have begun") && !told.contains("not every picture"), "{told}");
-    assert!(red > 1.1 * black, "{red} of light, and {black} without a picture");
 }
 
 /// A scene that is too dark is shown brighter, and how much is told.
@@ -172,4 +103,83 @@ fn a_far_greater_exposure_is_told() {
     let (dark, usual) = (told("0.01"), told("0.7"));
     assert!(dark.contains("the scene is dark, so its pictures are "), "{dark}");
     assert!(!usual.contains("the scene is dark"), "{usual}");
+}
+
+/// Scenes and rig files of other kinds.
+mod breadth {
+    use super::*;
+
+    #[test]
+    fn an_asset_of_any_size_and_place_is_shown_whole_and_lit() {
+        let folder = Folder::new("snapshot-any");
+        let assets = [
+            ("tiny", cuboid([0.0; 3], [1e-4, 2e-4, 1e-4])),
+            ("huge", cuboid([-1e5, 0.0, -1e5], [1e5, 2e5, 1e5])),
+            ("far", cuboid([4e3, 20.0, -3e3], [4e3 + 0.5, 20.5, -3e3 + 0.5])),
+            ("floor", cuboid([0.0; 3], [3.0, 1e-3, 2.0])),
+            ("wall", cuboid([0.0; 3], [1e-3, 2.0, 3.0])),
+        ];
+        for (name, text) in assets {
+            let asset = folder.write(&format!("{name}.obj"), &text);
+            let report = snapshot(&folder, &[&asset, "--set", "scene.scale=1", "--what", "radiance,light"]);
+            shows_all(&folder, &report);
+            // Nothing was said of how it moves.
+            let again =
+                snapshot_at(60, &folder, &["--scene", &asset, "--set", "scene.scale=1", "--what", "light"]);
+            assert_eq!(report["view"]["position"], again["view"]["position"], "{name}");
+        }
+    }
+
+    #[test]
+    fn a_rig_file_that_places_its_projector_keeps_its_view() {
+        let folder = Folder::new("snapshot-rig");
+        let asset = folder.write("box.obj", &cuboid([7.0, 0.0, 0.0], [8.0, 1.0, 1.0]));
+        let body = "[[scene.bodies]]\nname = \"thing\"\nmotion = { kind = \"translate\", speed_m_s = 1.0, amplitude_m = 0.5 }\n";
+        let scene = format!("[scene]\nfile = {asset:?}\n{body}");
+        let open = folder.write("open.toml", &scene);
+        let placed = folder.write("placed.toml", &format!("[projector]\nposition = [0.0, 0.0, 9.0]\n{scene}"));
+        shows_all(&folder, &snapshot(&folder, &[&open]));
+        assert!(snapshot(&folder, &[&placed])["view"].is_null());
+        assert!(snapshot(&folder, &[&open, "--view", "rig"])["view"].is_null());
+        shows_all(&folder, &snapshot(&folder, &[&placed, "--view", "fit"]));
+        assert!(snapshot(&folder, &[])["view"].is_null(), "the demo has its own view");
+    }
+}
+
+/// What another program takes time for.
+mod real_pace {
+    use super::*;
+
+    /// A snapshot keeps the first picture of another program; without one the body is black, which is told.
+    #[test]
+    fn a_picture_of_another_program_is_waited_for_and_kept() {
+        let folder = Folder::new("snapshot-live");
+        let pipe = Path::new(folder.text()).join("pictures");
+        assert!(std::process::Command::new("mkfifo").arg(&pipe).status().expect("mkfifo").success());
+        let bodies = format!(
+            "scene.bodies=[{{ name = \"bunny\", texture = \"pipe:{}\", texture_size = [2, 2], motion = {{ kind = \"still\" }} }}, \
+             {{ name = \"venus\", motion = {{ kind = \"still\" }} }}]",
+            pipe.display()
+        );
+        let args = ["--set", &bodies, "--set", "render.exposure=2"];
+        let shown = |report: &serde_json::Value| -> (f32, String) {
+            let pixels = radiance(&Path::new(folder.text()).join("radiance.pfm"));
+            (pixels.iter().sum(), report["warnings"].to_string())
+        };
+        let (black, told) = shown(&snapshot(&folder, &args));
+        assert!(told.contains("not every picture of another program has come within 3 s"), "{told}");
+        let writer = std::thread::spawn({
+            let pipe = pipe.clone();
+            move || {
+                let mut pipe = std::fs::File::options().write(true).open(pipe).expect("the pipe");
+                std::io::Write::write_all(&mut pipe, b"P6 2 2 255 aaaabbbbcccc").expect("a reader");
+                // It is closed when the snapshot has been made.
+                std::thread::sleep(std::time::Duration::from_secs(2));
+            }
+        });
+        let (red, told) = shown(&snapshot(&folder, &args));
+        writer.join().expect("it wrote");
+        assert!(told.contains("pictures of 2 x 2 have begun") && !told.contains("not every picture"), "{told}");
+        assert!(red > 1.1 * black, "{red} of light, and {black} without a picture");
+    }
 }

@@ -65,75 +65,6 @@ fn wait_for_note(monitor: &RunMonitor, notes: &mut Vec<String>, part: &str) {
     }
 }
 
-/// Black at first; then what a program writes; black again when it has ended; and what the next one writes. A program that writes
-/// something else is told of, and does not stop the one after it.
-#[test]
-fn a_pipe_shows_one_program_after_another() {
-    let folder = Folder::new("pipe");
-    let pipe = folder.pipe("pictures");
-    let rig = rig_of(&format!("pipe:{}", pipe.display()));
-    assert_eq!(rig.scene.live.len(), 1);
-    let monitor = Arc::new(RunMonitor::default());
-    let streams = PictureStreams::start(&rig, &monitor);
-    assert!(!streams.wait_for_first(Duration::from_millis(30)));
-    let without: Vec<_> = streams.without_pictures().collect();
-    assert!(without.len() == 1 && without[0].starts_with("bunny: pipe:"), "{without:?}");
-    wait_for(&rig, 0);
-    let open = || File::options().write(true).open(&pipe).unwrap();
-    let mut notes = vec![];
-    let mut writer = open();
-    // It has opened the pipe, and says nothing for long.
-    wait_for_note(&monitor, &mut notes, "no picture has come for 3 s; it is black");
-    for value in [10, 200] {
-        // In two parts, of which the second comes later.
-        let picture = even(value);
-        writer.write_all(&picture[..9]).unwrap();
-        sleep(Duration::from_millis(20));
-        writer.write_all(&picture[9..]).unwrap();
-        wait_for(&rig, value);
-    }
-    assert!(streams.wait_for_first(Duration::ZERO) && streams.without_pictures().next().is_none());
-    wait_for_note(&monitor, &mut notes, "pictures of 3 x 2 have begun");
-    assert!(notes.iter().all(|note| note.starts_with("bunny: pipe:")), "{notes:?}");
-    // The last one stays while its program is there.
-    wait_for_note(&monitor, &mut notes, "no picture has come for 3 s; the last one stays");
-    wait_for(&rig, 200);
-    drop(writer);
-    wait_for(&rig, 0);
-    while !notes.iter().any(|note: &String| note.contains("neither PPM (P6) nor PAM (P7)")) {
-        // It is closed as soon as it is seen to be something else, which the writer need not live to see.
-        let _ = open().write_all(b"YUV4MPEG2 W3 H2");
-        sleep(STEP);
-        notes.extend(monitor.take_notes());
-    }
-    let mut last = open();
-    last.write_all(&even(77)).unwrap();
-    wait_for(&rig, 77);
-    let begin = Instant::now();
-    drop(streams);
-    assert!(begin.elapsed() < Duration::from_secs(2), "the threads end soon");
-}
-
-/// A program that sends one picture and ends at once: in the end the operator knows that the body is black.
-#[test]
-fn the_last_of_quick_changes_is_told() {
-    let folder = Folder::new("quick");
-    let pipe = folder.pipe("pictures");
-    let rig = rig_of(&format!("pipe:{}", pipe.display()));
-    let monitor = Arc::new(RunMonitor::default());
-    let _streams = PictureStreams::start(&rig, &monitor);
-    let mut notes = vec![];
-    let mut writer = File::options().write(true).open(&pipe).unwrap();
-    writer.write_all(&even(9)).unwrap();
-    wait_for_note(&monitor, &mut notes, "have begun");
-    drop(writer);
-    wait_for_note(&monitor, &mut notes, "has closed the pipe; it is black until pictures come again");
-    // Nothing else is said while nothing changes.
-    sleep(SILENT + NOTE_EVERY);
-    notes.extend(monitor.take_notes());
-    assert_eq!(notes.len(), 2, "{notes:?}");
-}
-
 /// What cannot be opened is told once, and tried again.
 #[test]
 fn a_pipe_that_is_made_later_is_found() {
@@ -244,4 +175,78 @@ fn sources_are_read_and_shown_alike() {
         assert!(told.contains("scene.bodies.0.texture") && told.contains(reason), "{told}");
     }
     assert_eq!(PictureSource::File("a.png".into()).to_string(), "a.png");
+}
+
+/// Programs that write as fast as a clock says.
+mod real_pace {
+    use super::*;
+
+    /// Black at first; then what a program writes; black again when it has ended; and what the next one writes. A program that writes
+    /// something else is told of, and does not stop the one after it.
+    #[test]
+    fn a_pipe_shows_one_program_after_another() {
+        let folder = Folder::new("pipe");
+        let pipe = folder.pipe("pictures");
+        let rig = rig_of(&format!("pipe:{}", pipe.display()));
+        assert_eq!(rig.scene.live.len(), 1);
+        let monitor = Arc::new(RunMonitor::default());
+        let streams = PictureStreams::start(&rig, &monitor);
+        assert!(!streams.wait_for_first(Duration::from_millis(30)));
+        let without: Vec<_> = streams.without_pictures().collect();
+        assert!(without.len() == 1 && without[0].starts_with("bunny: pipe:"), "{without:?}");
+        wait_for(&rig, 0);
+        let open = || File::options().write(true).open(&pipe).unwrap();
+        let mut notes = vec![];
+        let mut writer = open();
+        // It has opened the pipe, and says nothing for long.
+        wait_for_note(&monitor, &mut notes, "no picture has come for 3 s; it is black");
+        for value in [10, 200] {
+            // In two parts, of which the second comes later.
+            let picture = even(value);
+            writer.write_all(&picture[..9]).unwrap();
+            sleep(Duration::from_millis(20));
+            writer.write_all(&picture[9..]).unwrap();
+            wait_for(&rig, value);
+        }
+        assert!(streams.wait_for_first(Duration::ZERO) && streams.without_pictures().next().is_none());
+        wait_for_note(&monitor, &mut notes, "pictures of 3 x 2 have begun");
+        assert!(notes.iter().all(|note| note.starts_with("bunny: pipe:")), "{notes:?}");
+        // The last one stays while its program is there.
+        wait_for_note(&monitor, &mut notes, "no picture has come for 3 s; the last one stays");
+        wait_for(&rig, 200);
+        drop(writer);
+        wait_for(&rig, 0);
+        while !notes.iter().any(|note: &String| note.contains("neither PPM (P6) nor PAM (P7)")) {
+            // It is closed as soon as it is seen to be something else, which the writer need not live to see.
+            let _ = open().write_all(b"YUV4MPEG2 W3 H2");
+            sleep(STEP);
+            notes.extend(monitor.take_notes());
+        }
+        let mut last = open();
+        last.write_all(&even(77)).unwrap();
+        wait_for(&rig, 77);
+        let begin = Instant::now();
+        drop(streams);
+        assert!(begin.elapsed() < Duration::from_secs(2), "the threads end soon");
+    }
+
+    /// A program that sends one picture and ends at once: in the end the operator knows that the body is black.
+    #[test]
+    fn the_last_of_quick_changes_is_told() {
+        let folder = Folder::new("quick");
+        let pipe = folder.pipe("pictures");
+        let rig = rig_of(&format!("pipe:{}", pipe.display()));
+        let monitor = Arc::new(RunMonitor::default());
+        let _streams = PictureStreams::start(&rig, &monitor);
+        let mut notes = vec![];
+        let mut writer = File::options().write(true).open(&pipe).unwrap();
+        writer.write_all(&even(9)).unwrap();
+        wait_for_note(&monitor, &mut notes, "have begun");
+        drop(writer);
+        wait_for_note(&monitor, &mut notes, "has closed the pipe; it is black until pictures come again");
+        // Nothing else is said while nothing changes.
+        sleep(SILENT + NOTE_EVERY);
+        notes.extend(monitor.take_notes());
+        assert_eq!(notes.len(), 2, "{notes:?}");
+    }
 }

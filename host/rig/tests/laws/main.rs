@@ -1,4 +1,4 @@
 //! The integration tests of this crate, in one program: one link, one row of costs.
 
 mod frame_path_allocates_nothing;
-mod stall;
+mod real_pace;

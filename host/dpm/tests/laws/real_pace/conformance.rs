@@ -97,7 +97,7 @@ fn the_mock_projector_keeps_every_rule() {
 
 #[test]
 fn every_rule_has_a_name_of_its_own_and_a_section_of_the_document() {
-    let text = include_str!("../../../../docs/PROTOCOL.md");
+    let text = include_str!("../../../../../docs/PROTOCOL.md");
     let mut seen = Vec::new();
     for rule in rules() {
         assert!(!seen.contains(&rule.id), "{} stands twice", rule.id);

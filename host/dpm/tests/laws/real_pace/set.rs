@@ -10,7 +10,7 @@ const LONG: Duration = Duration::from_secs(120);
 fn parameters_change_a_running_rig_and_no_value_voids_a_limit_on_light() {
     let folder = Folder::new("set");
     // The picture is nearly black, so the limit is far.
-    let text = include_str!("../../../../rigs/demo.toml");
+    let text = include_str!("../../../../../rigs/demo.toml");
     let path = folder.write("rig.toml", text);
     let mut args = vec!["run", path.as_str(), "--raster", "160x120", "--pace", "real"];
     for key in [

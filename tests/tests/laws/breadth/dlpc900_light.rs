@@ -22,7 +22,7 @@ const ENCODINGS: [&str; 11] = [
 
 /// The template of a rig behind a controller, with another encoding.
 fn rig(encoding: &str) -> RigConfig {
-    const RIG: &str = include_str!("../../../rigs/dlpc900-live.toml");
+    const RIG: &str = include_str!("../../../../rigs/dlpc900-live.toml");
     let flags = vec![format!("projector.backend.encoding={encoding:?}")];
     let overrides = Overrides { variables: vec![], flags };
     RigConfig::parse("rigs/dlpc900-live.toml", RIG, Path::new(""), &overrides)

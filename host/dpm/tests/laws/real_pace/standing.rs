@@ -295,7 +295,7 @@ fn r8_another_users_word_is_not_taken_for_a_rigs() {
     fs::copy(std::env::current_exe().unwrap(), &program).unwrap();
     let theirs = folder.path("dpm-0");
     let mut child = Command::new(&program)
-        .args(["--ignored", "--exact", "impostor", "--nocapture"])
+        .args(["--ignored", "--exact", "real_pace::standing::impostor", "--nocapture"])
         .env("IMPOSTOR", &theirs)
         .uid(NOBODY)
         .stdout(Stdio::piped())

@@ -1,0 +1,5 @@
+//! The second tier: at real pace, with nothing beside it.
+
+mod dlpc900;
+mod transport;
+mod windows;

@@ -1,0 +1,3 @@
+//! The second tier: at real pace, with nothing beside it.
+
+mod stall;
