@@ -74,20 +74,20 @@ fn libusb_and_serialport_are_explained() {
                 || text.contains(&format!("**{package}** {version}"))
         );
     }
-    for words in [
-        "LGPL-2.1",
-        "MPL-2.0",
-        "--no-default-features",
-        "libusb-1.0-0-dev",
-        "target/release/build/libusb1-sys-",
-    ] {
+    for words in ["LGPL-2.1", "MPL-2.0", "libusb-1.0-0-dev", "target/release/build/libusb1-sys-"] {
         assert!(text.contains(words), "{words}");
     }
     // The command that the text tells must mean what it says.
     let host = read("host/dpm/Cargo.toml");
-    assert!(
-        host.contains("default = [\"vendored-libusb\"]")
-            && host.contains("vendored-libusb = [\"dpm-device/vendored-libusb\"]")
-    );
+    assert!(host.contains("vendored-libusb = [\"dpm-device/vendored-libusb\"]"));
+    let default = host.lines().find_map(|l| l.strip_prefix("default = [")?.strip_suffix(']'));
+    let default: Vec<&str> = default.expect("defaults").split(", ").map(|f| f.trim_matches('"')).collect();
+    let (vendored, others): (Vec<&str>, Vec<&str>) =
+        default.into_iter().partition(|feature| *feature == "vendored-libusb");
+    assert_eq!(vendored.len(), 1, "statically by default");
+    let without = format!("--no-default-features --features {}", others.join(","));
+    for file in ["THIRD-PARTY.md", "packaging/make"] {
+        assert!(read(file).contains(&without), "{file} builds with {without}");
+    }
     assert!(!read("Cargo.toml").contains("\"vendored\""), "the workspace must not choose for everybody");
 }

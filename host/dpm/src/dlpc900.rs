@@ -6,6 +6,7 @@ use dpm_device::dlpc900::lut::Dmd;
 use dpm_device::dlpc900::sequence::{Pattern, PatternSequence, Repeat, SequenceBuilder, SequenceError};
 use dpm_device::planes::Raster;
 use dpm_device::regular_file;
+use image::ImageFormat;
 use std::fmt::Write as _;
 use std::path::{Path, PathBuf};
 
@@ -62,6 +63,10 @@ pub(crate) struct ShowAs {
     pub compression: Option<Compression>,
 }
 
+/// What to tell of OpenEXR in a program without it.
+const NO_OPENEXR: &str =
+    "this is OpenEXR, and this program was built without its feature \"exr\"; convert the picture to PNG, or build the program with that feature";
+
 /// Largest picture file that is read, bytes.
 const MAX_PICTURE_BYTES: u64 = 256 << 20;
 
@@ -71,7 +76,13 @@ pub(crate) fn read_grey(path: &Path, dmd: Dmd) -> Result<Vec<u8>, PatternFileErr
     let bytes = regular_file::read(path, MAX_PICTURE_BYTES).map_err(|e| fail(e.to_string()))?;
     let open = || {
         let reader = image::ImageReader::new(std::io::Cursor::new(&bytes));
-        reader.with_guessed_format().map_err(|e| fail(e.to_string()))
+        let reader = reader.with_guessed_format().map_err(|e| fail(e.to_string()))?;
+        let is_left_out =
+            reader.format() == Some(ImageFormat::OpenExr) && !ImageFormat::OpenExr.reading_enabled();
+        match is_left_out {
+            true => Err(fail(NO_OPENEXR.into())),
+            false => Ok(reader),
+        }
     };
     let (width, height) = open()?.into_dimensions().map_err(|e| fail(e.to_string()))?;
     let raster = dmd.raster();
@@ -186,6 +197,11 @@ mod tests {
         );
         std::fs::write(&file, b"not a picture").unwrap();
         assert!(matches!(read_grey(&file, Dmd::Dlp6500), Err(PatternFileError::Read { .. })));
+        // The first bytes of OpenEXR.
+        std::fs::write(&file, [0x76, 0x2f, 0x31, 0x01, 2, 0, 0, 0]).unwrap();
+        let told = read_grey(&file, Dmd::Dlp6500).unwrap_err().to_string();
+        assert!(told.contains("small.png"), "{told}");
+        assert_eq!(told.ends_with(NO_OPENEXR), !ImageFormat::OpenExr.reading_enabled(), "{told}");
         std::fs::remove_dir_all(&folder).unwrap();
     }
 }

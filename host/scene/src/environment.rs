@@ -1,5 +1,6 @@
 //! Reads a latitude-longitude image file (PFM, Radiance RGBE, OpenEXR, PNG, JPEG) as an [`Environment`].
 
+#[cfg(feature = "exr")]
 mod exr_picture;
 
 use std::path::Path;
@@ -12,7 +13,15 @@ use super::limits::Limits;
 use super::load::contained;
 use super::srgb::to_linear;
 use super::{Environment, SceneError};
+#[cfg(feature = "exr")]
 use exr_picture::read_exr;
+
+/// The formats that this program reads.
+const FORMATS: &str = if cfg!(feature = "exr") {
+    "give a .pfm, a Radiance .hdr, an .exr, a .png or a .jpg"
+} else {
+    "give a .pfm, a Radiance .hdr, a .png or a .jpg (this program was built without its feature \"exr\", which reads an .exr)"
+};
 
 /// Maximum number of texels of an environment: 8192 x 4096.
 const MAX_TEXELS: u64 = 1 << 25;
@@ -129,12 +138,7 @@ pub fn decode_environment(bytes: &[u8], rotation_rad: f32, scale: f32) -> Result
         [0x76, 0x2f, 0x31, 0x01, ..] => read_exr(bytes)?,
         [0x89, b'P', b'N', b'G', ..] => read_srgb(bytes, ImageFormat::Png)?,
         [0xff, 0xd8, ..] => read_srgb(bytes, ImageFormat::Jpeg)?,
-        _ => {
-            return Err(SceneError::unsupported(
-                "this image format",
-                "give a .pfm, a Radiance .hdr, an .exr, a .png or a .jpg",
-            ))
-        }
+        _ => return Err(SceneError::unsupported("this image format", FORMATS)),
     };
     for (i, texel) in texels.iter_mut().enumerate() {
         if !(texel.is_finite()
@@ -335,6 +339,15 @@ fn read_rgbe_row(rest: &mut &[u8], row: &mut [[u8; 4]]) -> Option<()> {
     Some(())
 }
 
+/// Refuses OpenEXR in a program that was built without it.
+#[cfg(not(feature = "exr"))]
+fn read_exr(_: &[u8]) -> Result<Pixels, SceneError> {
+    Err(SceneError::unsupported(
+        "OpenEXR",
+        "this program was built without its feature \"exr\"; convert the picture to Radiance .hdr, or build the program with that feature",
+    ))
+}
+
 /// Decodes a picture with the sides that its header gives, which are checked first, in at most `texel_bytes` for each texel.
 fn decode_bounded(
     bytes: &[u8],
@@ -456,6 +469,22 @@ mod tests {
             .unwrap_err()
             .to_string()
             .contains("sky.pfm"));
+    }
+
+    #[cfg(not(feature = "exr"))]
+    #[test]
+    fn openexr_is_refused_by_name_in_a_program_without_it() {
+        let folder = std::env::temp_dir().join(format!("dpm-no-exr-{}", std::process::id()));
+        std::fs::create_dir_all(&folder).unwrap();
+        let file = folder.join("sky.exr");
+        for bytes in [&[0x76, 0x2f, 0x31, 0x01, 2, 0, 0, 0][..], b"no picture"] {
+            std::fs::write(&file, bytes).unwrap();
+            let told = load_environment(&file, 0.0, 1.0).unwrap_err().to_string();
+            for word in ["sky.exr", "built without its feature \"exr\"", ".hdr"] {
+                assert!(told.contains(word), "{told}");
+            }
+        }
+        std::fs::remove_dir_all(&folder).unwrap();
     }
 
     /// The total light, and the light on an upward-facing plane: both are weighted by solid angle.

@@ -318,10 +318,15 @@ fn files() -> Vec<(&'static str, &'static str, Vec<u8>)> {
         .write_to(&mut jpeg, ::image::ImageFormat::Jpeg)
         .unwrap();
     seeds.push(("environment", "jpeg", jpeg.into_inner()));
-    let mut exr = std::io::Cursor::new(Vec::new());
-    let picture = ::image::Rgb32FImage::from_pixel(2, 1, ::image::Rgb([0.5, 1.0, 2.0]));
-    ::image::DynamicImage::ImageRgb32F(picture).write_to(&mut exr, ::image::ImageFormat::OpenExr).unwrap();
-    seeds.push(("environment", "exr", exr.into_inner()));
+    // Where the tests are built without OpenEXR, its seed stays as it is, and the decoder refuses it.
+    if ::image::ImageFormat::OpenExr.writing_enabled() {
+        let mut exr = std::io::Cursor::new(Vec::new());
+        let picture = ::image::Rgb32FImage::from_pixel(2, 1, ::image::Rgb([0.5, 1.0, 2.0]));
+        ::image::DynamicImage::ImageRgb32F(picture)
+            .write_to(&mut exr, ::image::ImageFormat::OpenExr)
+            .unwrap();
+        seeds.push(("environment", "exr", exr.into_inner()));
+    }
     seeds
 }
 

@@ -162,13 +162,12 @@ pub fn main(commit: &'static str) -> ExitCode {
     ExitCode::from(code)
 }
 
-/// What this program was built with: features of Cargo, and those of `dpm-device` that it always asks for.
-fn features() -> &'static str {
-    if cfg!(feature = "vendored-libusb") {
-        "usb, serial, net, alp, display, vendored-libusb"
-    } else {
-        "usb, serial, net, alp, display"
-    }
+/// What this program was built with: what it always has, and the features of Cargo that were asked for.
+fn features() -> String {
+    let chosen = [("exr", cfg!(feature = "exr")), ("vendored-libusb", cfg!(feature = "vendored-libusb"))];
+    let always = ["usb", "serial", "net", "alp", "display"];
+    let chosen = chosen.into_iter().filter(|(_, is_there)| *is_there).map(|(name, _)| name);
+    always.into_iter().chain(chosen).collect::<Vec<_>>().join(", ")
 }
 
 /// The command line. `-V` tells version and commit; `--version` adds the features.
