@@ -1,30 +1,35 @@
 //! A display that a desktop lends: from what a rig file says and what runs on this machine to a card with one connector.
 //!
 //! The kernel lets the program that drives a graphics card lend a connector, and what drives it, to another program, as a
-//! descriptor. An X server lends by RandR 1.6 ([`x11`]), a Wayland compositor by wp_drm_lease_device_v1 ([`wayland`]). With the
-//! descriptor everything is as with a card of one's own.
+//! descriptor. An X server lends by RandR 1.6 (`x11`), a Wayland compositor by wp_drm_lease_device_v1 (`wayland`). With the
+//! descriptor everything is as with a card of one's own. A program that was built without the feature of that name says so
+//! when it should ask.
 //!
 //! What was lent is kept while a display is unplugged, so that the desktop does not take it meanwhile. It is given back when
 //! the opener is dropped.
 
 use std::os::fd::OwnedFd;
-use std::os::unix::net::UnixStream;
 use std::path::{Path, PathBuf};
 use std::time::{Duration, Instant};
 
 use dpm_handoff::path::Lock;
-use rustix::io::Errno;
-use rustix::net::{AddressFamily, SocketAddrUnix, SocketFlags, SocketType};
 
 use crate::card::{let_go, open_for, Card};
 use crate::kms::Kms;
 use crate::scan_out::DisplayError;
 
-#[cfg(test)]
+// The X server of the tests borrows how it sends a descriptor.
+#[cfg(all(test, any(feature = "wayland", feature = "x11")))]
+#[cfg_attr(not(feature = "wayland"), allow(dead_code))]
 #[path = "../tests/laws/common/compositor.rs"]
 mod compositor;
+#[cfg(feature = "x11")]
 pub mod names;
+#[cfg(any(feature = "wayland", feature = "x11"))]
+mod socket;
+#[cfg(feature = "wayland")]
 pub mod wayland;
+#[cfg(feature = "x11")]
 pub mod x11;
 
 /// How long a desktop may need for all of its answers.
@@ -75,6 +80,7 @@ pub struct Refusal {
     pub is_lent: bool,
 }
 
+#[cfg(any(feature = "wayland", feature = "x11"))]
 impl Refusal {
     fn new(what: impl Into<String>) -> Self {
         Self { what: what.into(), is_lent: false }
@@ -169,20 +175,44 @@ fn taken(lease: &Lease, wanted: Option<&Path>) -> Result<Card, DisplayError> {
     }
 }
 
+/// How a desktop is called in messages, and how it is asked.
+struct Desktop {
+    name: fn() -> String,
+    lease: fn(Option<&str>, String, Instant) -> Result<Lease, Refusal>,
+}
+
+/// The desktops that this program can ask.
+fn desktop(lender: Lender) -> Result<Desktop, DisplayError> {
+    match lender {
+        #[cfg(feature = "x11")]
+        Lender::X11 => Ok(Desktop { name: x11::name, lease: x11::lease }),
+        #[cfg(not(feature = "x11"))]
+        Lender::X11 => Err(left_out("the X server", "x11")),
+        #[cfg(feature = "wayland")]
+        Lender::Wayland => Ok(Desktop { name: wayland::name, lease: wayland::lease }),
+        #[cfg(not(feature = "wayland"))]
+        Lender::Wayland => Err(left_out("the Wayland compositor", "wayland")),
+    }
+}
+
+/// Why a desktop is not asked by a program without the `feature` for it.
+#[cfg(not(all(feature = "wayland", feature = "x11")))]
+fn left_out(lender: &str, feature: &str) -> DisplayError {
+    let what = format!(
+        "this program was built without its feature \"{feature}\", which asks for one; build it with that feature, or switch \
+         to a bare console (Ctrl+Alt+F3) and write projector.backend.lease = \"off\""
+    );
+    DisplayError::Unlent { lender: lender.into(), what }
+}
+
 /// Asks a desktop for `connector`, and the guardian of a dead run before that, which may have it.
 fn ask(lender: Lender, connector: Option<&str>) -> Result<Lease, DisplayError> {
-    let name = match lender {
-        Lender::X11 => x11::name(),
-        Lender::Wayland => wayland::name(),
-    };
+    let desktop = desktop(lender)?;
+    let name = (desktop.name)();
     let limit = Instant::now() + if let_go(connector) { RETURN_PATIENCE } else { Duration::ZERO };
     loop {
         let until = Instant::now() + PATIENCE;
-        let lent = match lender {
-            Lender::X11 => x11::lease(connector, name.clone(), until),
-            Lender::Wayland => wayland::lease(connector, name.clone(), until),
-        };
-        match lent {
+        match (desktop.lease)(connector, name.clone(), until) {
             Ok(lease) => return Ok(lease),
             Err(refusal) if refusal.is_lent && Instant::now() < limit => std::thread::sleep(STEP),
             Err(refusal) => return Err(DisplayError::Unlent { lender: name, what: refusal.what }),
@@ -190,54 +220,10 @@ fn ask(lender: Lender, connector: Option<&str>) -> Result<Lease, DisplayError> {
     }
 }
 
-/// Connects to the socket `address` of a server that may have stopped to answer.
-fn connect_to(address: &SocketAddrUnix, until: Instant) -> Result<UnixStream, Errno> {
-    let flags = SocketFlags::CLOEXEC | SocketFlags::NONBLOCK;
-    let socket = rustix::net::socket_with(AddressFamily::UNIX, SocketType::STREAM, flags, None)?;
-    loop {
-        match rustix::net::connect(&socket, address) {
-            Ok(()) => return Ok(UnixStream::from(socket)),
-            // Too many wait for the server already.
-            Err(Errno::AGAIN) if Instant::now() < until => std::thread::sleep(STEP / 10),
-            Err(e) => return Err(e),
-        }
-    }
-}
-
-/// What is left until `until`, in the form of a system call; `None` if it is over.
-fn left(until: Instant) -> Option<rustix::event::Timespec> {
-    let left = until.checked_duration_since(Instant::now()).filter(|left| !left.is_zero())?;
-    rustix::event::Timespec::try_from(left).ok()
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
     use std::fs::File;
-    use std::io::Read;
-
-    /// A descriptor that a fake server hands out, and what tells whether another one is the same.
-    pub(super) struct Handed {
-        pub(super) given: OwnedFd,
-        heard: std::io::PipeReader,
-    }
-
-    impl Handed {
-        pub(super) fn new() -> Self {
-            let (heard, given) = std::io::pipe().unwrap();
-            Self { given: given.into(), heard }
-        }
-
-        /// Reads what is written to `descriptor`.
-        pub(super) fn is(self, descriptor: OwnedFd) -> bool {
-            rustix::io::write(&descriptor, b"same").unwrap();
-            drop((descriptor, self.given));
-            let mut heard = String::new();
-            let mut pipe = self.heard;
-            pipe.read_to_string(&mut heard).unwrap();
-            heard == "same"
-        }
-    }
 
     #[test]
     fn the_environment_names_the_compositor_before_the_x_server() {
@@ -258,27 +244,18 @@ mod tests {
         assert!(told.contains("null") && told.contains("atomic mode setting"), "{told}");
     }
 
+    #[cfg(not(all(feature = "wayland", feature = "x11")))]
     #[test]
-    fn a_server_that_takes_nobody_is_given_up_in_time() {
-        let folder = std::env::temp_dir().join(format!("dpm-lease-{}", std::process::id()));
-        std::fs::create_dir_all(&folder).unwrap();
-        let path = folder.join("full");
-        let server = rustix::net::socket(AddressFamily::UNIX, SocketType::STREAM, None).unwrap();
-        let address = SocketAddrUnix::new(&path).unwrap();
-        rustix::net::bind(&server, &address).unwrap();
-        rustix::net::listen(&server, 0).unwrap();
-        let start = Instant::now();
-        let until = start + Duration::from_millis(300);
-        let mut kept = Vec::new();
-        let refused = loop {
-            match connect_to(&address, until) {
-                Ok(stream) => kept.push(stream),
-                Err(e) => break e,
+    fn a_desktop_that_the_program_was_built_without_is_refused_by_name() {
+        for (lender, feature, is_there) in [
+            (Lender::Wayland, "wayland", cfg!(feature = "wayland")),
+            (Lender::X11, "x11", cfg!(feature = "x11")),
+        ] {
+            if is_there {
+                continue;
             }
-            assert!(kept.len() < 100, "the queue ends");
-        };
-        assert_eq!(refused, Errno::AGAIN);
-        assert!(start.elapsed() < Duration::from_secs(5), "{:?}", start.elapsed());
-        std::fs::remove_dir_all(&folder).unwrap();
+            let told = opener(None, None, Access::Lent(lender))().err().expect("refused").to_string();
+            assert!(told.contains(&format!("built without its feature \"{feature}\"")), "{told}");
+        }
     }
 }

@@ -1,5 +1,5 @@
 //! What a panel needs of what shows its pictures: pictures in turn, and when each was taken. A graphics card is one
-//! ([`crate::card::Card`]), a window is another ([`crate::window::Window`]), and tests have [`crate::fake::FakeKms`].
+//! ([`crate::card::Card`]), a window is another ([`crate::window`]), and tests have [`crate::fake::FakeKms`].
 
 use std::ffi::OsString;
 use std::io;

@@ -22,7 +22,8 @@ use wayland_protocols::wp::drm_lease::v1::client::wp_drm_lease_device_v1::{
 use wayland_protocols::wp::drm_lease::v1::client::wp_drm_lease_request_v1::WpDrmLeaseRequestV1;
 use wayland_protocols::wp::drm_lease::v1::client::wp_drm_lease_v1::{self, WpDrmLeaseV1};
 
-use super::{connect_to, left, Lease, Refusal};
+use super::socket::{connect_to, left};
+use super::{Lease, Refusal};
 use crate::card::connector_names_of;
 
 #[cfg(test)]

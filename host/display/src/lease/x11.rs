@@ -22,7 +22,8 @@ use x11rb::utils::RawFdContainer;
 use x11rb::x11_utils::TryParse;
 
 use super::names::{find, Output};
-use super::{connect_to, left, Lease, Refusal};
+use super::socket::{connect_to, left};
+use super::{Lease, Refusal};
 use crate::card::connector_names;
 
 #[cfg(test)]

@@ -1,7 +1,5 @@
 //! The X server that a window is opened on: what it must be able to do, its monitors, and the window's properties.
 
-use dpm_device::planes::{PlaneSchedule, Raster};
-use dpm_device::time::FrameRate;
 use x11rb::connection::{Connection as _, RequestConnection as _};
 use x11rb::errors::ReplyOrIdError;
 use x11rb::properties::{WmSizeHints, WmSizeHintsSpecification};
@@ -11,6 +9,7 @@ use x11rb::protocol::xproto::{self, ConnectionExt as _, ImageOrder, Visualid};
 use x11rb::rust_connection::RustConnection;
 use x11rb::wrapper::ConnectionExt as _;
 
+use super::WindowSettings;
 use crate::scan_out::DisplayError;
 
 /// Bits of a pixel that mean colour: eight for each.
@@ -19,23 +18,6 @@ pub(super) const DEPTH: u8 = 24;
 const SAME_RATE: f64 = 0.01;
 /// The window's title and its class.
 const TITLE: &str = "dpm";
-
-/// What a rig file says of its window.
-#[derive(Clone, Debug)]
-pub struct WindowSettings {
-    /// The X server, as in `DISPLAY`; that variable if `None`.
-    pub server: Option<String>,
-    /// The monitor that the window fills; an ordinary window if `None`.
-    pub monitor: Option<String>,
-    /// From the choice of a frame to its vertical blank, nanoseconds.
-    pub commit_ns: i64,
-    /// The rig's raster: the window's pixels.
-    pub raster: Raster,
-    /// The rig's planes.
-    pub schedule: PlaneSchedule,
-    /// The rig's frame rate, within one percent that of the monitor.
-    pub rate: FrameRate,
-}
 
 x11rb::atom_manager! {
     /// Names that the server numbers.
@@ -300,6 +282,8 @@ fn hidden_cursor(server: &RustConnection, root: xproto::Window) -> Result<xproto
 #[cfg(test)]
 mod tests {
     use super::*;
+    use dpm_device::planes::{PlaneSchedule, Raster};
+    use dpm_device::time::FrameRate;
 
     fn settings(monitor: Option<&str>, (width, height): (u32, u32), hz: u32) -> WindowSettings {
         WindowSettings {

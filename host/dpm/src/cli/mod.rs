@@ -164,7 +164,12 @@ pub fn main(commit: &'static str) -> ExitCode {
 
 /// What this program was built with: what it always has, and the features of Cargo that were asked for.
 fn features() -> String {
-    let chosen = [("exr", cfg!(feature = "exr")), ("vendored-libusb", cfg!(feature = "vendored-libusb"))];
+    let chosen = [
+        ("exr", cfg!(feature = "exr")),
+        ("wayland", cfg!(feature = "wayland")),
+        ("x11", cfg!(feature = "x11")),
+        ("vendored-libusb", cfg!(feature = "vendored-libusb")),
+    ];
     let always = ["usb", "serial", "net", "alp", "display"];
     let chosen = chosen.into_iter().filter(|(_, is_there)| *is_there).map(|(name, _)| name);
     always.into_iter().chain(chosen).collect::<Vec<_>>().join(", ")

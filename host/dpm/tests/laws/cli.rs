@@ -13,9 +13,12 @@ fn version_and_help_go_to_standard_output() {
     let features = long.strip_prefix(&told).unwrap_or_else(|| panic!("{long} begins otherwise than {told}"));
     assert!(features.starts_with("features: usb, "), "{long}");
     let features: Vec<&str> = features.trim_end().split(", ").collect();
-    for (name, is_asked_for) in
-        [("exr", cfg!(feature = "exr")), ("vendored-libusb", cfg!(feature = "vendored-libusb"))]
-    {
+    for (name, is_asked_for) in [
+        ("exr", cfg!(feature = "exr")),
+        ("wayland", cfg!(feature = "wayland")),
+        ("x11", cfg!(feature = "x11")),
+        ("vendored-libusb", cfg!(feature = "vendored-libusb")),
+    ] {
         assert_eq!(features.contains(&name), is_asked_for, "{name}: {long}");
     }
     let help = dpm(&["--help"], &[]);

@@ -6,7 +6,7 @@ use std::thread::JoinHandle;
 use std::time::{Duration, Instant};
 
 use super::super::compositor::{Compositor, Manner, Request, Seen, FIRST};
-use super::super::tests::Handed;
+use super::super::socket::tests::Handed;
 use super::{lease_over, socket_of, Lease, Refusal};
 
 const OFFERS: [(&str, u32); 2] = [("DP-1", 33), ("HDMI-A-1", 44)];

@@ -13,7 +13,7 @@ use x11rb::rust_connection::{DefaultStream, RustConnection};
 use x11rb::x11_utils::Serialize;
 
 use super::super::compositor::send;
-use super::super::tests::Handed;
+use super::super::socket::tests::Handed;
 use super::{lease_of, Bounded, Lease, Refusal};
 
 /// Its number of the extension's requests.

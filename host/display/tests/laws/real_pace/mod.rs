@@ -2,4 +2,5 @@
 
 mod dlpc900;
 mod transport;
+#[cfg(feature = "x11")]
 mod windows;
