@@ -661,7 +661,8 @@ mod real_pace {
                 let (model, stuck, is_due) =
                     (model(), Arc::<AtomicBool>::default(), Arc::<AtomicBool>::default());
                 let (monitor, closed) = with_interlock(true);
-                let (seen, watched, hold, due) = (model.clone(), monitor.clone(), stuck.clone(), is_due.clone());
+                let (seen, watched, hold, due) =
+                    (model.clone(), monitor.clone(), stuck.clone(), is_due.clone());
                 let observer = std::thread::spawn(move || {
                     let (_ends, _goes_on) = (StopOnExit(watched.clone()), ReleaseOnExit(hold.clone()));
                     until_told(&watched, ProjectorHealth::Up);

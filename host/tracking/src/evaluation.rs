@@ -263,28 +263,37 @@ pub(crate) fn prediction_table(rows: &[PredictionRow]) -> String {
 mod tests {
     use super::*;
 
-    /// `cargo test -p dpm-tracking --lib prediction_table -- --nocapture` prints the table.
-    #[test]
-    fn prediction_table_keeps_its_bounds() {
-        let rows = prediction_rows().unwrap();
-        println!("{}", prediction_table(&rows));
-        for row in &rows {
-            let PredictionRow { case, noisy, fine, quiet, .. } = row;
-            for (e, allowed) in [noisy, quiet].into_iter().zip(case.p99_allowed) {
-                let p99 = case.p99(e);
-                assert!(p99 <= allowed, "{}: {p99} > {allowed}", case.name);
+    /// Every motion and every predictor.
+    mod breadth {
+        use super::*;
+
+        /// `cargo test -p dpm-tracking --lib prediction_table -- --nocapture` prints the table.
+        #[test]
+        fn prediction_table_keeps_its_bounds() {
+            let rows = prediction_rows().unwrap();
+            println!("{}", prediction_table(&rows));
+            for row in &rows {
+                let PredictionRow { case, noisy, fine, quiet, .. } = row;
+                for (e, allowed) in [noisy, quiet].into_iter().zip(case.p99_allowed) {
+                    let p99 = case.p99(e);
+                    assert!(p99 <= allowed, "{}: {p99} > {allowed}", case.name);
+                }
+                for e in [noisy, fine, quiet] {
+                    assert_eq!(e.frames_without_pose, 0);
+                    // Between two samples lie 2 ms, and everything is predicted to the frame's own light.
+                    assert!(e.horizon_ns.0 >= 4_800_000 && e.horizon_ns.1 <= 6_800_000, "{:?}", e.horizon_ns);
+                }
+                // At the noise for which the models were optimised, recall does no harm; below it, the past's own error
+                // becomes visible.
+                let (with, without) = (case.p99(noisy), case.p99(&row.noisy_unrecalled));
+                assert!(with <= without, "{}: {with} with, {without} without what is recalled", case.name);
+                let (with, without) = (case.p99(fine), case.p99(&row.fine_unrecalled));
+                assert!(
+                    with <= 1.7 * without,
+                    "{}: {with} with, {without} without what is recalled",
+                    case.name
+                );
             }
-            for e in [noisy, fine, quiet] {
-                assert_eq!(e.frames_without_pose, 0);
-                // Between two samples lie 2 ms, and everything is predicted to the frame's own light.
-                assert!(e.horizon_ns.0 >= 4_800_000 && e.horizon_ns.1 <= 6_800_000, "{:?}", e.horizon_ns);
-            }
-            // At the noise for which the models were optimised, recall does no harm; below it, the past's own error
-            // becomes visible.
-            let (with, without) = (case.p99(noisy), case.p99(&row.noisy_unrecalled));
-            assert!(with <= without, "{}: {with} with, {without} without what is recalled", case.name);
-            let (with, without) = (case.p99(fine), case.p99(&row.fine_unrecalled));
-            assert!(with <= 1.7 * without, "{}: {with} with, {without} without what is recalled", case.name);
         }
     }
 }

@@ -32,6 +32,11 @@ impl Table {
         self.counts.iter().flatten().sum()
     }
 
+    /// Faults of one kind, in all states.
+    pub fn of(&self, kind: Kind) -> u64 {
+        self.counts[kind as usize].iter().sum()
+    }
+
     /// Possible cells with fewer than `most` faults.
     pub fn cells_below(&self, most: u64) -> usize {
         let cells = Kind::ALL.iter().flat_map(|kind| State::ALL.map(|state| (*kind, state)));

@@ -62,7 +62,7 @@ impl HostClock for Moved {
 }
 
 /// Conversations as scripts of the entries, with the target and a name of each: what real ends say to each other, or
-/// what leads through the states of one end. `tests/tests/corpora.rs` writes them down as seeds.
+/// what leads through the states of one end. `tests/tests/laws/corpora.rs` writes them down as seeds.
 pub fn recorded() -> Vec<(&'static str, &'static str, Vec<u8>)> {
     [trackers::recorded(), usb::recorded(), link::recorded(), sensor::recorded()].concat()
 }

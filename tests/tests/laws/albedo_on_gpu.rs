@@ -157,7 +157,11 @@ mod breadth {
                     / with.iter().map(|v| v.abs().element_sum()).sum::<f32>()
             };
             let (light, eye) = (mean(&printed_light, &even_light), mean(&printed, &even));
-            println!("the light differs by {:.1} %, what the eye sees by {:.1} %", 100.0 * light, 100.0 * eye);
+            println!(
+                "the light differs by {:.1} %, what the eye sees by {:.1} %",
+                100.0 * light,
+                100.0 * eye
+            );
             // Half a texel of the picture is smeared by pixels of this raster; the light itself has all of the picture.
             assert!(light > 0.3 && eye < 0.25 * light, "light {light}, eye {eye}");
         });

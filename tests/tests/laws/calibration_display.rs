@@ -392,9 +392,12 @@ mod breadth {
     /// ever: the first of these sweeps was refused for clocks that were said to be 100 ms apart.
     #[test]
     fn pixels_that_leave_the_lens_open_are_a_start_all_the_same() {
-        for (seed, lost, before_ns) in [(125, 0.15, 34_320_986_375), (126, 0.0, 0), (127, 0.1, 20_000_000_000)] {
+        for (seed, lost, before_ns) in
+            [(125, 0.15, 34_320_986_375), (126, 0.0, 0), (127, 0.1, 20_000_000_000)]
+        {
             let (rig, hand) = begun(seed, lost, before_ns);
-            let solution = by_ruler(&rig, &hand, 42.0, |_, _| ()).unwrap_or_else(|why| panic!("{seed}: {why}"));
+            let solution =
+                by_ruler(&rig, &hand, 42.0, |_, _| ()).unwrap_or_else(|why| panic!("{seed}: {why}"));
             let ([_, p99], predicted) = (rig.errors(&solution), solution.predicted.p99_px);
             assert!(p99 < predicted, "{seed}: {p99} px, predicted {predicted} px");
             assert!(solution.latency_ns.abs() < 600_000, "{seed}: {} ns", solution.latency_ns);
@@ -412,7 +415,8 @@ mod breadth {
                 let moved = |i: usize, pose: &mut Stamped| {
                     pose.position.x += if i > 5500 { 1e-3 * moved_mm } else { 0.0 };
                 };
-                let told = by_ruler(&rig, &hand, 42.0, moved).map(|s| (rig.errors(&s)[1], s.predicted.p99_px));
+                let told =
+                    by_ruler(&rig, &hand, 42.0, moved).map(|s| (rig.errors(&s)[1], s.predicted.p99_px));
                 println!("{} px, {moved_mm} mm: {told:?}", rig.raster.width());
                 match told {
                     Ok((p99, predicted)) => assert!(p99 < predicted, "{p99} px, predicted {predicted} px"),

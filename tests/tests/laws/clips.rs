@@ -161,7 +161,11 @@ mod breadth {
                 rig.scene_poses(&record.tracked_poses, at, &mut bodies.poses);
                 let fell: Vec<u32> =
                     light.codes.iter().map(|c| u32::from_le_bytes([c[0], c[1], c[2], 0])).collect();
-                assert!(fell == alone(&rig.scene.still_at(at), &bodies, light.frame), "frame {}", light.frame);
+                assert!(
+                    fell == alone(&rig.scene.still_at(at), &bodies, light.frame),
+                    "frame {}",
+                    light.frame
+                );
                 let other = alone(&rig.scene.still_at(at + 8_000_000), &bodies, light.frame);
                 let differ = fell.iter().zip(&other).filter(|(a, b)| a != b).count();
                 assert!(

@@ -1,7 +1,7 @@
 //! Runs every decoder on its committed seeds, on every prefix of each, and on each with flipped bits and repeated
 //! bytes.
 //!
-//! The encoders make the seeds (`DPM_UPDATE_SEEDS=1 cargo test -p dpm-tests --test corpora` writes them); others are
+//! The encoders make the seeds (`DPM_UPDATE_SEEDS=1 cargo test -p dpm-tests --test laws corpora` writes them); others are
 //! added by hand. Put anything that a fuzzer finds into the folder of its target.
 
 use crate::common::{png, tetrahedra, with_image, Glb};

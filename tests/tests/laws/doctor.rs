@@ -82,7 +82,10 @@ mod breadth {
         let none = ["--set", "projector.backend.port=\"/dev/pts/none\""];
         let (code, json, _) = doctor(&folder, &none);
         let [state, found, _] = part(&json, "projector");
-        assert!(code == Some(1) && state == "missing" && found.contains("/dev/pts/none: not found"), "{found}");
+        assert!(
+            code == Some(1) && state == "missing" && found.contains("/dev/pts/none: not found"),
+            "{found}"
+        );
         let scene = ["doctor", "rig.toml", "--set", "scene.file=\"gone.glb\""];
         let bad = folder.command(program("dpm")).args(scene).output().unwrap();
         let told = String::from_utf8_lossy(&bad.stderr);

@@ -272,8 +272,11 @@ mod breadth {
             }
         });
         // More frames than the collector can hold at once, faster than it reads them.
-        let rig =
-            demo_rig(16, 12, &["tracker.drop_out=0.1", "projector.backend={kind=\"mock\",faults=\"loss=0.02\"}"]);
+        let rig = demo_rig(
+            16,
+            12,
+            &["tracker.drop_out=0.1", "projector.backend={kind=\"mock\",faults=\"loss=0.02\"}"],
+        );
         let once = || {
             let options = RunOptions { frames: 3000, ..RunOptions::default() };
             let outcome = pipeline::run_prepared(rig.clone(), options, &Arc::new(RunMonitor::default()));
@@ -325,13 +328,17 @@ mod breadth {
             let spread = spread_of_light_s(&rig) * speed_px_s;
             if poses == "own" {
                 // Red and blue are lit one plane before and after green.
-                let apart = if (planes, weights) == (24, "binary") { (2f64 / 3.0).sqrt() / 24.0 } else { 0.0 };
+                let apart =
+                    if (planes, weights) == (24, "binary") { (2f64 / 3.0).sqrt() / 24.0 } else { 0.0 };
                 let apart = apart * rig.rate().slot_len_ns(0) as f64 * 1e-9 * speed_px_s;
                 // Planes of equal weights always follow wholly.
                 let rest = if weights == "equal" { 0.0 } else { (1.0 - follow) * spread };
                 let expected = apart.hypot(rest);
                 println!("{planes} {weights} {order}, follow {follow}: {smear:.3} of {expected:.3} px");
-                assert!(smear < 1.25 * expected + 0.02, "{planes} {weights} {order}: {smear} of {expected} px");
+                assert!(
+                    smear < 1.25 * expected + 0.02,
+                    "{planes} {weights} {order}: {smear} of {expected} px"
+                );
                 assert!(smear >= 0.75 * rest, "{planes} {weights} {order}, follow {follow}: only {smear} px");
                 continue;
             }
@@ -386,7 +393,10 @@ mod real_pace {
             assert_eq!((r.frames_lit, r.frames_dropped), (counts.frames_lit, counts.frames_dropped));
             assert_eq!(r.pace, "real");
             assert!(r.frames_lit > 0, "not one frame in time at 100 Hz");
-            assert!(r.motion_to_light_ms.as_ref().is_some_and(|m| m.p50 > 2.0), "the tracker alone takes 2 ms");
+            assert!(
+                r.motion_to_light_ms.as_ref().is_some_and(|m| m.p50 > 2.0),
+                "the tracker alone takes 2 ms"
+            );
         });
     }
 }

@@ -56,9 +56,12 @@ mod breadth {
     fn a_sampler_that_loses_light_is_told_from_one_that_does_not() {
         let seen = |settings: &[&str], seed: u32| {
             let (rig, gpu) = stage(settings);
-            let theatre =
-                Theatre::frozen(Arc::new(rig), gpu, Span { last_slot: 60, warm_up: 0, kept: EYE_FRAMES as u32 })
-                    .unwrap();
+            let theatre = Theatre::frozen(
+                Arc::new(rig),
+                gpu,
+                Span { last_slot: 60, warm_up: 0, kept: EYE_FRAMES as u32 },
+            )
+            .unwrap();
             let cache = std::env::temp_dir().join(format!("dpm-bias-{}", std::process::id()));
             let eyes = [seed, seed + 1].map(|s| {
                 let seen = theatre.play(&Method::full(32), 32.0, s, &mut |_, _| ()).unwrap();
@@ -91,7 +94,12 @@ mod breadth {
         let result = measured.result.clone();
         assert_eq!(drawn.iter().filter(|d| *d == "reference").count(), 2);
         for r in &result.rows {
-            assert!((r.rays_to_paper - 1.0).abs() < 0.05, "{}: {} of paper's rays", r.method, r.rays_to_paper);
+            assert!(
+                (r.rays_to_paper - 1.0).abs() < 0.05,
+                "{}: {} of paper's rays",
+                r.method,
+                r.rays_to_paper
+            );
             // The squares of bias and noise add up to that of the error, within three standard deviations of the bias (a
             // negative one is cut off).
             let parts = r.bias.powi(2) + r.noise.powi(2);
@@ -104,7 +112,11 @@ mod breadth {
                 r.perceived_rmse,
                 r.bias_floor
             );
-            assert!(r.perceived_rmse < r.single_rmse, "{}: the eye sees less noise than a frame has", r.method);
+            assert!(
+                r.perceived_rmse < r.single_rmse,
+                "{}: the eye sees less noise than a frame has",
+                r.method
+            );
             assert!(r.gpu_ms > 0.0 || r.wall_ms > 0.0);
         }
         let full = result.rows.iter().find(|r| r.method == "full").unwrap();

@@ -141,7 +141,8 @@ mod breadth {
         with_gpu(|gpu| {
             let mut scene = Scene::default();
             add(&mut scene, floor(1.2, 0.0), diffuse(Vec3::new(0.7, 0.6, 0.5)));
-            let glass = Material { metallic: 0.0, transmission: 1.0, thin_walled: false, ..Material::default() };
+            let glass =
+                Material { metallic: 0.0, transmission: 1.0, thin_walled: false, ..Material::default() };
             add(
                 &mut scene,
                 sphere(Vec3::ZERO, 0.3, 3, true),
@@ -162,8 +163,12 @@ mod breadth {
             };
             add(&mut scene, quad(Vec3::new(0.2, 0.0, 0.6), Vec3::new(0.6, 0.0, 0.1), Vec3::Y * 0.6), sheet);
             scene.environment = image_sky(0.5);
-            let poses =
-                vec![DAffine3::IDENTITY, tilted(-0.45, 0.31, 0.1), tilted(0.3, 0.31, -0.2), DAffine3::IDENTITY];
+            let poses = vec![
+                DAffine3::IDENTITY,
+                tilted(-0.45, 0.31, 0.1),
+                tilted(0.3, 0.31, -0.2),
+                DAffine3::IDENTITY,
+            ];
             judge(gpu, "transmissive", &Shot { poses, depth: 6, ..shot(&scene) }, 768, 1e-2);
         });
     }
@@ -195,7 +200,11 @@ mod breadth {
             // The same, facing away from the projector: its back is visible.
             add(&mut scene, quad(Vec3::new(0.8, 0.1, 0.5), Vec3::X * -0.7, Vec3::new(0.0, 0.6, -0.2)), sheet);
             // Single-sided and facing away: black, and it blocks light.
-            add(&mut scene, quad(Vec3::new(0.35, 0.05, -0.4), Vec3::X * -0.7, Vec3::Y * 0.5), diffuse(Vec3::ONE));
+            add(
+                &mut scene,
+                quad(Vec3::new(0.35, 0.05, -0.4), Vec3::X * -0.7, Vec3::Y * 0.5),
+                diffuse(Vec3::ONE),
+            );
             // 20,480 emissive triangles; the alias table must contain them all.
             add(
                 &mut scene,
@@ -218,7 +227,9 @@ mod breadth {
                     failure_persistence: None,
                     ..ProptestConfig::default()
                 },
-                proptest::test_runner::TestRng::deterministic_rng(proptest::test_runner::RngAlgorithm::ChaCha),
+                proptest::test_runner::TestRng::deterministic_rng(
+                    proptest::test_runner::RngAlgorithm::ChaCha,
+                ),
             );
             runner
                 .run(&any::<u64>(), |seed| {

@@ -1,5 +1,5 @@
 //! The light of a projector with a lens: every pixel's ray, every motion vector and every tile, against the lens in f64, which is itself held
-//! to pixels that OpenCV computed (`host/scene/tests/opencv_lens.rs`).
+//! to pixels that OpenCV computed (`host/scene/tests/laws/opencv_lens.rs`).
 
 use dpm_device::planes::Raster;
 use dpm_lab::stability::gpu_shot::Shot;

@@ -45,46 +45,50 @@ fn alone(gpu: &Arc<Gpu>, rig: &Rig, scene: &Scene, frame: u32) -> Vec<u32> {
     slot.codes().to_vec()
 }
 
-/// Three frames in flight, two queues, and a new picture before every frame: each frame shows one picture as a whole, and no older one
-/// than the frame before.
-#[test]
-fn frames_in_flight_show_whole_pictures() {
-    with_gpu(|gpu| {
-        for (overlap, most) in
-            [(Overlapping::Always, 64), (Overlapping::Never, 64), (Overlapping::Always, 40)]
-        {
-            let rig = rig_with("pipe:/nowhere", &[]);
-            let settings = RendererSettings { most_live_texels: most, overlap, ..renderer_settings(&rig) };
-            let mut renderer = Renderer::new(gpu, &rig.scene, settings).unwrap();
-            let mut slots: Vec<_> = (0..3).map(|_| renderer.create_slot(false).unwrap()).collect();
-            let (mut scenes, mut newest) = (vec![rig.scene.still_at(0)], 0);
-            let frames = 12u32;
-            for frame in 0..frames + 3 {
-                let slot = &mut slots[frame as usize % 3];
-                if let Some(before) = frame.checked_sub(3) {
-                    slot.wait(FRAME_WAIT_NS).unwrap();
-                    let known = newest..scenes.len();
-                    let is_shown = |k: &usize| slot.codes() == alone(gpu, &rig, &scenes[*k], before);
-                    newest =
-                        known.into_iter().find(is_shown).expect("a whole picture, no older than the last");
-                }
-                if frame < frames {
-                    rig.scene.live[0].pictures.show(&picture(frame as usize));
-                    scenes.push(rig.scene.still_at(0));
-                    submit(&rig, &mut renderer, slot, &poses_at(&rig, u64::from(frame)), frame, 1.0).unwrap();
-                }
-            }
-            assert!(
-                newest >= 6,
-                "{overlap:?}, {most} texels a frame: the last picture seen is {newest} of {frames}"
-            );
-        }
-    });
-}
-
 /// Many pictures.
 mod breadth {
     use super::*;
+
+    /// Three frames in flight, two queues, and a new picture before every frame: each frame shows one picture as a whole, and no older one
+    /// than the frame before.
+    #[test]
+    fn frames_in_flight_show_whole_pictures() {
+        with_gpu(|gpu| {
+            for (overlap, most) in
+                [(Overlapping::Always, 64), (Overlapping::Never, 64), (Overlapping::Always, 40)]
+            {
+                let rig = rig_with("pipe:/nowhere", &[]);
+                let settings =
+                    RendererSettings { most_live_texels: most, overlap, ..renderer_settings(&rig) };
+                let mut renderer = Renderer::new(gpu, &rig.scene, settings).unwrap();
+                let mut slots: Vec<_> = (0..3).map(|_| renderer.create_slot(false).unwrap()).collect();
+                let (mut scenes, mut newest) = (vec![rig.scene.still_at(0)], 0);
+                let frames = 12u32;
+                for frame in 0..frames + 3 {
+                    let slot = &mut slots[frame as usize % 3];
+                    if let Some(before) = frame.checked_sub(3) {
+                        slot.wait(FRAME_WAIT_NS).unwrap();
+                        let known = newest..scenes.len();
+                        let is_shown = |k: &usize| slot.codes() == alone(gpu, &rig, &scenes[*k], before);
+                        newest = known
+                            .into_iter()
+                            .find(is_shown)
+                            .expect("a whole picture, no older than the last");
+                    }
+                    if frame < frames {
+                        rig.scene.live[0].pictures.show(&picture(frame as usize));
+                        scenes.push(rig.scene.still_at(0));
+                        submit(&rig, &mut renderer, slot, &poses_at(&rig, u64::from(frame)), frame, 1.0)
+                            .unwrap();
+                    }
+                }
+                assert!(
+                    newest >= 6,
+                    "{overlap:?}, {most} texels a frame: the last picture seen is {newest} of {frames}"
+                );
+            }
+        });
+    }
 
     /// A picture goes to the GPU in pieces of ten texels, seven for the picture. The frames before the last piece show the picture before,
     /// and those from it on the new one. Newer pictures that come meanwhile wait, and the newest of them is next.
@@ -173,11 +177,13 @@ mod real_pace {
             // The newest light of which the poses are known: on a busy machine not every frame is lit.
             let drawn = |frame: u32| outcome.recent.iter().find(|record| record.id.0 as u32 == frame);
             let mut newest = outcome.light.iter().rev();
-            let (light, record) =
-                newest.find_map(|light| Some((light, drawn(light.frame)?))).expect("a lit frame with its record");
+            let (light, record) = newest
+                .find_map(|light| Some((light, drawn(light.frame)?)))
+                .expect("a lit frame with its record");
             let mut bodies = dpm_lab::sequence::Placed::default();
             rig.scene_poses(&record.tracked_poses, record.drawn_for.0, &mut bodies.poses);
-            let fell: Vec<u32> = light.codes.iter().map(|c| u32::from_le_bytes([c[0], c[1], c[2], 0])).collect();
+            let fell: Vec<u32> =
+                light.codes.iter().map(|c| u32::from_le_bytes([c[0], c[1], c[2], 0])).collect();
             let mut renderer = Renderer::new(gpu, &rig.scene.still_at(0), renderer_settings(&rig)).unwrap();
             let mut slot = renderer.create_slot(false).unwrap();
             let spp = rig.config.render.spp as f32;

@@ -2,6 +2,7 @@
 
 mod albedo_on_gpu;
 mod animation;
+mod breadth;
 mod calibration_display;
 mod clips;
 #[path = "../../../host/scene/tests/laws/common/mod.rs"]
@@ -14,6 +15,7 @@ mod documents;
 mod end_to_end;
 mod error_runs;
 mod frame_law;
+mod frame_path_calls;
 mod gaze;
 mod gpu_against_reference;
 mod halftone_on_gpu;
@@ -25,14 +27,11 @@ mod live_pictures;
 mod many_bodies;
 mod methods;
 mod packing_on_gpu;
+mod real_pace;
 mod references;
 mod rig_files;
 mod scene_files;
-mod structure;
-mod subgroup_widths;
 mod stability_on_gpu;
+mod structure;
 mod tracks;
-mod turns;
 mod warp_on_gpu;
-mod real_pace;
-mod breadth;

@@ -110,50 +110,55 @@ fn fastest_ms(gpu: &Arc<Gpu>, scene: &Scene, keep: Keep, frames: u32) -> (f64, u
     (best, lit)
 }
 
-/// As many balls cost at most twice as much as bodies of their own as they do as one body, and less than if a ray asked each of very many.
-#[test]
-fn many_bodies_cost_at_most_twice_as_much_as_one() {
-    let walking = |body_tree: bool| {
-        let mut keep = Keep { body_list: !body_tree, ..Keep::default() };
-        keep.needs.body_tree = body_tree;
-        keep
-    };
-    with_gpu(|gpu| {
-        for side in [4, 8, 15] {
-            let (one, many) = (balls(side, 3, false), balls(side, 3, true));
-            let mut ms = [f64::INFINITY; 3];
-            let mut lit = [0; 3];
-            // In turns, so that what else runs on the machine slows all of them alike.
-            for round in 0..12 {
-                // A busy machine may slow some of them more. So few rounds are enough if they show what is to be shown.
-                let [as_one, in_list, in_tree] = ms;
-                if round >= 2
-                    && (side < 8 || in_tree < 2.0 * as_one)
-                    && (side < 15 || in_tree < 0.7 * in_list)
-                {
-                    break;
+/// What many bodies cost.
+mod breadth {
+    use super::*;
+
+    /// As many balls cost at most twice as much as bodies of their own as they do as one body, and less than if a ray asked each of very many.
+    #[test]
+    fn many_bodies_cost_at_most_twice_as_much_as_one() {
+        let walking = |body_tree: bool| {
+            let mut keep = Keep { body_list: !body_tree, ..Keep::default() };
+            keep.needs.body_tree = body_tree;
+            keep
+        };
+        with_gpu(|gpu| {
+            for side in [4, 8, 15] {
+                let (one, many) = (balls(side, 3, false), balls(side, 3, true));
+                let mut ms = [f64::INFINITY; 3];
+                let mut lit = [0; 3];
+                // In turns, so that what else runs on the machine slows all of them alike.
+                for round in 0..12 {
+                    // A busy machine may slow some of them more. So few rounds are enough if they show what is to be shown.
+                    let [as_one, in_list, in_tree] = ms;
+                    if round >= 2
+                        && (side < 8 || in_tree < 2.0 * as_one)
+                        && (side < 15 || in_tree < 0.7 * in_list)
+                    {
+                        break;
+                    }
+                    for (k, (scene, tree)) in
+                        [(&one, false), (&many, false), (&many, true)].into_iter().enumerate()
+                    {
+                        let (fastest, pixels) = fastest_ms(gpu, scene, walking(tree), 3);
+                        ms[k] = ms[k].min(fastest);
+                        lit[k] = pixels;
+                    }
                 }
-                for (k, (scene, tree)) in
-                    [(&one, false), (&many, false), (&many, true)].into_iter().enumerate()
-                {
-                    let (fastest, pixels) = fastest_ms(gpu, scene, walking(tree), 3);
-                    ms[k] = ms[k].min(fastest);
-                    lit[k] = pixels;
+                let bodies = side * side + 1;
+                println!(
+                    "{bodies} bodies, {} pixels lit: as one {:.1} ms, in a list {:.1} ms, in a tree {:.1} ms",
+                    lit[0], ms[0], ms[1], ms[2]
+                );
+                assert_eq!(lit[1], lit[2], "{bodies} bodies");
+                assert!(lit[0].abs_diff(lit[2]) < lit[0] / 100, "{bodies} bodies: {lit:?}");
+                if bodies == 65 {
+                    assert!(ms[2] < 2.0 * ms[0], "{bodies} bodies: {ms:?} ms");
+                }
+                if bodies > 200 {
+                    assert!(ms[2] < 0.7 * ms[1], "{bodies} bodies: {ms:?} ms");
                 }
             }
-            let bodies = side * side + 1;
-            println!(
-                "{bodies} bodies, {} pixels lit: as one {:.1} ms, in a list {:.1} ms, in a tree {:.1} ms",
-                lit[0], ms[0], ms[1], ms[2]
-            );
-            assert_eq!(lit[1], lit[2], "{bodies} bodies");
-            assert!(lit[0].abs_diff(lit[2]) < lit[0] / 100, "{bodies} bodies: {lit:?}");
-            if bodies == 65 {
-                assert!(ms[2] < 2.0 * ms[0], "{bodies} bodies: {ms:?} ms");
-            }
-            if bodies > 200 {
-                assert!(ms[2] < 0.7 * ms[1], "{bodies} bodies: {ms:?} ms");
-            }
-        }
-    });
+        });
+    }
 }

@@ -65,28 +65,6 @@ fn no_validation_messages() {
 }
 
 #[test]
-fn filters_and_rates_keep_the_energy() {
-    let (rig, _gpu, theatre) = stage(Span { last_slot: 80, warm_up: 32, kept: 48 }, false);
-    let reference = theatre
-        .play(&Method { sampler: SamplerKind::BlueNoise, ..Method::full(16) }, 16.0, 9, &mut |_, _| ())
-        .unwrap();
-    let total = |seen: &dpm_lab::sequence::Seen| -> f64 {
-        let mean = eye_mean(&seen.frames, 48);
-        mean.iter().map(|v| v.as_dvec3().element_sum()).filter(|v| v.is_finite()).sum()
-    };
-    let wanted = total(&reference);
-    for which in [RenderMethod::Paper, RenderMethod::Miyamoto, RenderMethod::Dpm] {
-        let mut method = method(&rig, which);
-        method.paper.zone_spp = [16, 16, 16];
-        let seen = theatre.play(&method, 16.0, 2, &mut |_, _| ()).unwrap();
-        let error = total(&seen) / wanted - 1.0;
-        println!("{which:?}: {:+.4} %", error * 100.0);
-        assert!(error.abs() < 0.005, "{which:?} changes the mean by {:+.3} %", error * 100.0);
-    }
-    no_validation_messages();
-}
-
-#[test]
 fn dpm_lowers_the_perceived_error_of_independent_samples() {
     let (rig, _gpu, theatre) = stage(Span { last_slot: 120, warm_up: 40, kept: 31 }, false);
     let blue = Method { sampler: SamplerKind::BlueNoise, ..Method::full(32) };
@@ -101,94 +79,6 @@ fn dpm_lowers_the_perceived_error_of_independent_samples() {
     println!("full {full:.5} ({full_rays} rays), dpm {ours:.5} ({our_rays} rays)");
     assert!(our_rays as f64 <= full_rays as f64 * 1.1);
     assert!(ours < 0.75 * full, "{ours} against {full}");
-    no_validation_messages();
-}
-
-#[test]
-fn dpm_shows_a_body_at_one_metre_a_second_where_it_is() {
-    let (rig, _gpu, theatre) = stage(Span { last_slot: 150, warm_up: 64, kept: 31 }, true);
-    let centre = |slot| dpm_lab::sequence::poses_at(&rig, slot)[0].translation;
-    let speed = (centre(150) - centre(119)).length() / 31.0 * rig.rate().hz();
-    assert!((0.9..1.1).contains(&speed), "the body moves at {speed} m/s while it is looked at");
-    let seen = |m: &Method, spp: f32| eye_mean(&theatre.play(m, spp, 1, &mut |_, _| ()).unwrap().frames, 31);
-    let blue = Method { sampler: SamplerKind::BlueNoise, ..Method::full(32) };
-    let truth = seen(&blue, 32.0);
-    let shown = seen(&method(&rig, RenderMethod::Dpm), 4.0);
-    let width = theatre.raster().width();
-    let probes = theatre.probes();
-    let at = |pixel: u32, body: usize| probes.iter().position(|p| p.pixel == pixel && p.body == body);
-    // [Lucas81]: the displacement along the motion that explains most of the difference, using the reference's own
-    // slopes.
-    let displacement = |picture: &[glam::Vec3]| {
-        let (mut product, mut square) = (0.0f64, 0.0f64);
-        for (i, p) in probes.iter().enumerate().filter(|(_, p)| p.body == 0 && p.pixel % width > 0) {
-            let (Some(left), Some(right)) = (at(p.pixel - 1, 0), at(p.pixel + 1, 0)) else { continue };
-            let slope = (0.5 * (truth[right] - truth[left])).as_dvec3();
-            let apart = (truth[i] - picture[i]).as_dvec3();
-            if slope.is_finite() && apart.is_finite() {
-                product += slope.dot(apart);
-                square += slope.length_squared();
-            }
-        }
-        assert!(square > 0.0, "the body has edges or highlights");
-        product / square
-    };
-    // Check of the measure itself: the reference moved by one pixel is found one pixel away.
-    let moved: Vec<glam::Vec3> = probes
-        .iter()
-        .map(|p| at(p.pixel.wrapping_sub(1), p.body).map_or(glam::Vec3::NAN, |i| truth[i]))
-        .collect();
-    let (one, ours) = (displacement(&moved), displacement(&shown));
-    println!("moved by a pixel: {one:.3}, dpm {ours:+.3} px");
-    assert!((0.5..1.5).contains(&one), "the measure sees {one} px in place of 1");
-    assert!(ours.abs() < 0.25, "dpm is {ours:+.3} px from where the body is");
-    no_validation_messages();
-}
-
-/// Found in use: a run was not repeatable. Which of the slots in flight draws a frame is arbitrary, but its picture
-/// must not be, also where a body leaves tiles and returns to them.
-#[test]
-fn what_a_frame_shows_does_not_depend_on_the_slot_that_draws_it() {
-    let (rig, gpu, _) = stage(Span { last_slot: 2, warm_up: 1, kept: 1 }, false);
-    let raster = Raster::new(160, 96).unwrap();
-    let scale = 160.0 / f64::from(rig.camera.raster.width());
-    let c = &rig.camera;
-    let camera =
-        ProjectorCamera::new(raster, c.world_from_projector, c.fx * scale, c.fy * scale, 80.0, 48.0).unwrap();
-    let rest: Vec<DAffine3> = rig.bodies.iter().map(|b| affine(&b.rest)).collect();
-    let codes = |which: RenderMethod, order: &dyn Fn(usize) -> usize| -> Vec<Vec<u32>> {
-        let settings = RendererSettings { raster, method: method(&rig, which), ..renderer_settings(&rig) };
-        let mut renderer = Renderer::new(&gpu, &rig.scene, settings).unwrap();
-        let mut slots: Vec<_> = (0..4).map(|_| renderer.create_slot(false).unwrap()).collect();
-        let mut poses = Vec::new();
-        let frame = |k: usize| {
-            // Back and forth by about four tiles, at rest for three frames at a time.
-            let x = 0.16 * ((k / 3) as f64 * 1.9).sin();
-            let moved: Vec<_> = rest.iter().map(|m| DAffine3::from_translation(DVec3::X * x) * *m).collect();
-            rig.scene_poses(&moved, 0, &mut poses);
-            let still = FrameInputs::new(&camera, rig.observer.eye_and_gaze(&moved), &poses);
-            let inputs = FrameInputs { frame: k as u32, spp: 2, budget_spp: 2.0, ..still };
-            let slot = &mut slots[order(k)];
-            renderer.submit(slot, &inputs).unwrap();
-            slot.wait(60_000_000_000).unwrap();
-            slot.codes().to_vec()
-        };
-        (0..30).map(frame).collect()
-    };
-    for which in [RenderMethod::Paper, RenderMethod::Miyamoto, RenderMethod::Dpm] {
-        let one = codes(which, &|_| 0);
-        assert!(one.iter().all(|frame| frame.iter().any(|&c| c != 0)), "{which:?}: a frame without light");
-        assert!(one.windows(2).any(|pair| pair[0] != pair[1]));
-        for (name, other) in [
-            ("in turns", codes(which, &|k| k % 4)),
-            ("as they come", codes(which, &|k| [0, 1, 0, 2, 1, 3, 3, 0, 2][k % 9])),
-        ] {
-            for (k, (a, b)) in one.iter().zip(&other).enumerate() {
-                let apart = a.iter().zip(b).filter(|(a, b)| a != b).count();
-                assert_eq!(apart, 0, "{which:?}, slots {name}: pixels of frame {k} that differ");
-            }
-        }
-    }
     no_validation_messages();
 }
 
@@ -217,19 +107,6 @@ fn codes_in_line(gpu: &Arc<Gpu>, which: RenderMethod, overlap: Overlapping) -> V
         }
     }
     codes
-}
-
-/// Also where the device has one queue, to which the parts of frames then go in the order that semaphores give them.
-#[test]
-fn frames_that_overlap_show_what_frames_one_after_the_other_show() {
-    with_gpu(|gpu| {
-        for which in [RenderMethod::Dpm, RenderMethod::Paper, RenderMethod::Full] {
-            let [alone, together] =
-                [Overlapping::Never, Overlapping::Always].map(|overlap| codes_in_line(gpu, which, overlap));
-            assert!(alone.len() == 10 && alone[9].iter().any(|&code| code != 0), "{which:?}");
-            assert!(alone == together, "{which:?}: the pictures differ");
-        }
-    });
 }
 
 /// Two squares in one plane, each a body of its own. Neither sees the other, so the light of one is the same whether the other is there; its
@@ -273,4 +150,139 @@ fn the_filter_keeps_to_the_body() {
             }
         }
     });
+}
+
+/// Every method, and frames in every order.
+mod breadth {
+    use super::*;
+
+    #[test]
+    fn filters_and_rates_keep_the_energy() {
+        let (rig, _gpu, theatre) = stage(Span { last_slot: 80, warm_up: 32, kept: 48 }, false);
+        let reference = theatre
+            .play(&Method { sampler: SamplerKind::BlueNoise, ..Method::full(16) }, 16.0, 9, &mut |_, _| ())
+            .unwrap();
+        let total = |seen: &dpm_lab::sequence::Seen| -> f64 {
+            let mean = eye_mean(&seen.frames, 48);
+            mean.iter().map(|v| v.as_dvec3().element_sum()).filter(|v| v.is_finite()).sum()
+        };
+        let wanted = total(&reference);
+        for which in [RenderMethod::Paper, RenderMethod::Miyamoto, RenderMethod::Dpm] {
+            let mut method = method(&rig, which);
+            method.paper.zone_spp = [16, 16, 16];
+            let seen = theatre.play(&method, 16.0, 2, &mut |_, _| ()).unwrap();
+            let error = total(&seen) / wanted - 1.0;
+            println!("{which:?}: {:+.4} %", error * 100.0);
+            assert!(error.abs() < 0.005, "{which:?} changes the mean by {:+.3} %", error * 100.0);
+        }
+        no_validation_messages();
+    }
+
+    #[test]
+    fn dpm_shows_a_body_at_one_metre_a_second_where_it_is() {
+        let (rig, _gpu, theatre) = stage(Span { last_slot: 150, warm_up: 64, kept: 31 }, true);
+        let centre = |slot| dpm_lab::sequence::poses_at(&rig, slot)[0].translation;
+        let speed = (centre(150) - centre(119)).length() / 31.0 * rig.rate().hz();
+        assert!((0.9..1.1).contains(&speed), "the body moves at {speed} m/s while it is looked at");
+        let seen =
+            |m: &Method, spp: f32| eye_mean(&theatre.play(m, spp, 1, &mut |_, _| ()).unwrap().frames, 31);
+        let blue = Method { sampler: SamplerKind::BlueNoise, ..Method::full(32) };
+        let truth = seen(&blue, 32.0);
+        let shown = seen(&method(&rig, RenderMethod::Dpm), 4.0);
+        let width = theatre.raster().width();
+        let probes = theatre.probes();
+        let at = |pixel: u32, body: usize| probes.iter().position(|p| p.pixel == pixel && p.body == body);
+        // [Lucas81]: the displacement along the motion that explains most of the difference, using the reference's own
+        // slopes.
+        let displacement = |picture: &[glam::Vec3]| {
+            let (mut product, mut square) = (0.0f64, 0.0f64);
+            for (i, p) in probes.iter().enumerate().filter(|(_, p)| p.body == 0 && p.pixel % width > 0) {
+                let (Some(left), Some(right)) = (at(p.pixel - 1, 0), at(p.pixel + 1, 0)) else { continue };
+                let slope = (0.5 * (truth[right] - truth[left])).as_dvec3();
+                let apart = (truth[i] - picture[i]).as_dvec3();
+                if slope.is_finite() && apart.is_finite() {
+                    product += slope.dot(apart);
+                    square += slope.length_squared();
+                }
+            }
+            assert!(square > 0.0, "the body has edges or highlights");
+            product / square
+        };
+        // Check of the measure itself: the reference moved by one pixel is found one pixel away.
+        let moved: Vec<glam::Vec3> = probes
+            .iter()
+            .map(|p| at(p.pixel.wrapping_sub(1), p.body).map_or(glam::Vec3::NAN, |i| truth[i]))
+            .collect();
+        let (one, ours) = (displacement(&moved), displacement(&shown));
+        println!("moved by a pixel: {one:.3}, dpm {ours:+.3} px");
+        assert!((0.5..1.5).contains(&one), "the measure sees {one} px in place of 1");
+        assert!(ours.abs() < 0.25, "dpm is {ours:+.3} px from where the body is");
+        no_validation_messages();
+    }
+
+    /// Found in use: a run was not repeatable. Which of the slots in flight draws a frame is arbitrary, but its picture
+    /// must not be, also where a body leaves tiles and returns to them.
+    #[test]
+    fn what_a_frame_shows_does_not_depend_on_the_slot_that_draws_it() {
+        let (rig, gpu, _) = stage(Span { last_slot: 2, warm_up: 1, kept: 1 }, false);
+        let raster = Raster::new(160, 96).unwrap();
+        let scale = 160.0 / f64::from(rig.camera.raster.width());
+        let c = &rig.camera;
+        let camera =
+            ProjectorCamera::new(raster, c.world_from_projector, c.fx * scale, c.fy * scale, 80.0, 48.0)
+                .unwrap();
+        let rest: Vec<DAffine3> = rig.bodies.iter().map(|b| affine(&b.rest)).collect();
+        let codes = |which: RenderMethod, order: &dyn Fn(usize) -> usize| -> Vec<Vec<u32>> {
+            let settings =
+                RendererSettings { raster, method: method(&rig, which), ..renderer_settings(&rig) };
+            let mut renderer = Renderer::new(&gpu, &rig.scene, settings).unwrap();
+            let mut slots: Vec<_> = (0..4).map(|_| renderer.create_slot(false).unwrap()).collect();
+            let mut poses = Vec::new();
+            let frame = |k: usize| {
+                // Back and forth by about four tiles, at rest for three frames at a time.
+                let x = 0.16 * ((k / 3) as f64 * 1.9).sin();
+                let moved: Vec<_> =
+                    rest.iter().map(|m| DAffine3::from_translation(DVec3::X * x) * *m).collect();
+                rig.scene_poses(&moved, 0, &mut poses);
+                let still = FrameInputs::new(&camera, rig.observer.eye_and_gaze(&moved), &poses);
+                let inputs = FrameInputs { frame: k as u32, spp: 2, budget_spp: 2.0, ..still };
+                let slot = &mut slots[order(k)];
+                renderer.submit(slot, &inputs).unwrap();
+                slot.wait(60_000_000_000).unwrap();
+                slot.codes().to_vec()
+            };
+            (0..30).map(frame).collect()
+        };
+        for which in [RenderMethod::Paper, RenderMethod::Miyamoto, RenderMethod::Dpm] {
+            let one = codes(which, &|_| 0);
+            assert!(
+                one.iter().all(|frame| frame.iter().any(|&c| c != 0)),
+                "{which:?}: a frame without light"
+            );
+            assert!(one.windows(2).any(|pair| pair[0] != pair[1]));
+            for (name, other) in [
+                ("in turns", codes(which, &|k| k % 4)),
+                ("as they come", codes(which, &|k| [0, 1, 0, 2, 1, 3, 3, 0, 2][k % 9])),
+            ] {
+                for (k, (a, b)) in one.iter().zip(&other).enumerate() {
+                    let apart = a.iter().zip(b).filter(|(a, b)| a != b).count();
+                    assert_eq!(apart, 0, "{which:?}, slots {name}: pixels of frame {k} that differ");
+                }
+            }
+        }
+        no_validation_messages();
+    }
+
+    /// Also where the device has one queue, to which the parts of frames then go in the order that semaphores give them.
+    #[test]
+    fn frames_that_overlap_show_what_frames_one_after_the_other_show() {
+        with_gpu(|gpu| {
+            for which in [RenderMethod::Dpm, RenderMethod::Paper, RenderMethod::Full] {
+                let [alone, together] = [Overlapping::Never, Overlapping::Always]
+                    .map(|overlap| codes_in_line(gpu, which, overlap));
+                assert!(alone.len() == 10 && alone[9].iter().any(|&code| code != 0), "{which:?}");
+                assert!(alone == together, "{which:?}: the pictures differ");
+            }
+        });
+    }
 }

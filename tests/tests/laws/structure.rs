@@ -131,7 +131,7 @@ const ON_THE_WAY: [&str; 7] =
     ["device", "host/handoff", "host/common", "host/display", "host/tracking", "host/render", "host/rig"];
 /// The files in them that name a lock of the standard library, and why no frame waits for it. All others use
 /// `dpm_handoff::path::Lock`, which counts where it is locked on the frame path; the tests of the frame path
-/// (`tests/tests/frame_law/`) demand that it never is.
+/// (`tests/tests/laws/frame_law/`) demand that it never is.
 const LOCKS: [(&str, &str); 6] = [
     ("device/src/dlpc900/driver.rs", "a projector that takes no frames of this path"),
     ("device/src/dlpc900/port.rs", "a projector that takes no frames of this path"),

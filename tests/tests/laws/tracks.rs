@@ -154,32 +154,6 @@ fn told(what: &str, setting: Setting, light: &mut Light) -> [[f64; 2]; 2] {
     [drawn, lit]
 }
 
-/// Turns of 50 m/s2 that nothing foretells: with tracks the light lies within the limits, and without them it does not.
-/// The tracks in the light are young.
-#[test]
-fn tracks_keep_light_on_bodies_that_turn() {
-    let motions: Vec<String> = (0..4).map(turning).collect();
-    for (setting, limit_px) in SETTINGS {
-        let mut light = light_of(&motions, setting);
-        let [drawn, lit] = told("turns", setting, &mut light);
-        assert!(lit[1] <= limit_px, "p99 {} px, at most {limit_px}", lit[1]);
-        assert!(drawn[1] > 1.25 * lit[1], "p99 {} px as drawn, {} px as lit", drawn[1], lit[1]);
-        assert!(lit[0] <= 1.02 * drawn[0], "p50 {} px as drawn, {} px as lit", drawn[0], lit[0]);
-        assert!(quantile(&mut light.ages_ms, 0.99) <= 0.6);
-    }
-}
-
-/// Motion without surprises is at most 15 % worse.
-#[test]
-fn tracks_leave_quiet_motion_alone() {
-    for (setting, _) in SETTINGS {
-        for (what, motion) in [("steady", STEADY), ("human", HUMAN)] {
-            let [drawn, lit] = told(what, setting, &mut light_of(&[motion.into()], setting));
-            assert!(lit[1] <= 1.15 * drawn[1], "{what}: p99 {} px as drawn, {} px as lit", drawn[1], lit[1]);
-        }
-    }
-}
-
 /// A run repeats, shifts included. "off" sends none, and changes nothing else.
 #[test]
 fn tracks_repeat_and_can_be_switched_off() {
@@ -259,4 +233,40 @@ fn moved_light(rig: &Rig, sent: &[[u8; 3]], moves: &SlotMoves) -> Vec<[u8; 3]> {
         }
     }
     light
+}
+
+/// Seconds of motion.
+mod breadth {
+    use super::*;
+
+    /// Turns of 50 m/s2 that nothing foretells: with tracks the light lies within the limits, and without them it does not.
+    /// The tracks in the light are young.
+    #[test]
+    fn tracks_keep_light_on_bodies_that_turn() {
+        let motions: Vec<String> = (0..4).map(turning).collect();
+        for (setting, limit_px) in SETTINGS {
+            let mut light = light_of(&motions, setting);
+            let [drawn, lit] = told("turns", setting, &mut light);
+            assert!(lit[1] <= limit_px, "p99 {} px, at most {limit_px}", lit[1]);
+            assert!(drawn[1] > 1.25 * lit[1], "p99 {} px as drawn, {} px as lit", drawn[1], lit[1]);
+            assert!(lit[0] <= 1.02 * drawn[0], "p50 {} px as drawn, {} px as lit", drawn[0], lit[0]);
+            assert!(quantile(&mut light.ages_ms, 0.99) <= 0.6);
+        }
+    }
+
+    /// Motion without surprises is at most 15 % worse.
+    #[test]
+    fn tracks_leave_quiet_motion_alone() {
+        for (setting, _) in SETTINGS {
+            for (what, motion) in [("steady", STEADY), ("human", HUMAN)] {
+                let [drawn, lit] = told(what, setting, &mut light_of(&[motion.into()], setting));
+                assert!(
+                    lit[1] <= 1.15 * drawn[1],
+                    "{what}: p99 {} px as drawn, {} px as lit",
+                    drawn[1],
+                    lit[1]
+                );
+            }
+        }
+    }
 }

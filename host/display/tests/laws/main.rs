@@ -2,5 +2,5 @@
 
 mod common;
 mod panel;
-mod set_up;
 mod real_pace;
+mod set_up;

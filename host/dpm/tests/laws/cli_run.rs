@@ -462,7 +462,8 @@ mod real_pace {
     fn a_run_that_lights_nothing_ends_with_1_and_names_the_key() {
         let folder = Folder::new("nothing");
         // The latency from the tracker to the light is at least 5 ms.
-        let args = [&["demo"][..], &SMALL, &["--out", folder.text(), "--set", "safety.predict_ms=4"]].concat();
+        let args =
+            [&["demo"][..], &SMALL, &["--out", folder.text(), "--set", "safety.predict_ms=4"]].concat();
         let output = dpm(&args, &[]);
         assert_eq!(code(&output), 1, "{}", err(&output));
         let json: serde_json::Value = serde_json::from_str(&out(&output)).expect("the report all the same");
@@ -505,7 +506,8 @@ mod real_pace {
         let args = ["demo", "--json", "--raster", "48x32", "--frames", "10000000", "--out", folder.text()];
         let mut running = start(&args);
         running.wait_for_line(Duration::from_secs(60), |line| {
-            let progress: serde_json::Value = serde_json::from_str(line).expect("each line of progress is JSON");
+            let progress: serde_json::Value =
+                serde_json::from_str(line).expect("each line of progress is JSON");
             progress["frames_lit"].as_u64() > Some(0)
         });
         let second = dpm(&args, &[]);

@@ -9,9 +9,9 @@ mod manual;
 mod opencv_light;
 mod pattern;
 mod peer;
+mod real_pace;
 mod report;
 mod rig_file;
 mod snapshot;
 #[path = "cli_common/trace_check.rs"]
 mod trace_check;
-mod real_pace;

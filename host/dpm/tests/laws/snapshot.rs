@@ -137,7 +137,8 @@ mod breadth {
         let body = "[[scene.bodies]]\nname = \"thing\"\nmotion = { kind = \"translate\", speed_m_s = 1.0, amplitude_m = 0.5 }\n";
         let scene = format!("[scene]\nfile = {asset:?}\n{body}");
         let open = folder.write("open.toml", &scene);
-        let placed = folder.write("placed.toml", &format!("[projector]\nposition = [0.0, 0.0, 9.0]\n{scene}"));
+        let placed =
+            folder.write("placed.toml", &format!("[projector]\nposition = [0.0, 0.0, 9.0]\n{scene}"));
         shows_all(&folder, &snapshot(&folder, &[&open]));
         assert!(snapshot(&folder, &[&placed])["view"].is_null());
         assert!(snapshot(&folder, &[&open, "--view", "rig"])["view"].is_null());
@@ -179,7 +180,10 @@ mod real_pace {
         });
         let (red, told) = shown(&snapshot(&folder, &args));
         writer.join().expect("it wrote");
-        assert!(told.contains("pictures of 2 x 2 have begun") && !told.contains("not every picture"), "{told}");
+        assert!(
+            told.contains("pictures of 2 x 2 have begun") && !told.contains("not every picture"),
+            "{told}"
+        );
         assert!(red > 1.1 * black, "{red} of light, and {black} without a picture");
     }
 }

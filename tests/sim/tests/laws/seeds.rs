@@ -274,6 +274,20 @@ fn other_trackers_are_struck_by_faults_of_their_own() {
     }
 }
 
+/// The laws of light hold while a stage stalls (H4), panics (H5), never returns (X1), never returns while a stop is asked for
+/// (X2), or the GPU never finishes a frame (G5): nothing is lit beyond the instant that its frame carries.
+#[test]
+fn whichever_stage_hangs_light_ends_by_itself() {
+    let first = vec![Kind::H4, Kind::H5, Kind::X1, Kind::X2, Kind::G5];
+    let mut struck = BTreeSet::new();
+    for seed in 1..=6 {
+        let lived = lived(&Order { first: first.clone(), ..order(seed, None, 30) });
+        assert_eq!(lived.broken, None, "seed {seed}");
+        struck.extend(first.iter().copied().filter(|kind| lived.table.of(*kind) > 0));
+    }
+    assert_eq!(struck, first.into_iter().collect(), "all of them struck");
+}
+
 /// Kinds that are asked for come first in every episode, where they can strike.
 #[test]
 fn kinds_that_are_asked_for_begin_every_episode() {

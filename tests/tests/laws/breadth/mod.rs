@@ -8,3 +8,5 @@ mod every_case;
 mod frame_path;
 mod large_rasters;
 mod ray_query;
+mod subgroup_widths;
+mod turns;

@@ -1,6 +1,5 @@
 //! The second tier: at real pace, with nothing beside it.
 
-mod frame_path_calls;
 mod frame_path_sockets;
 mod frame_path_usb;
 mod frame_path_vulkan;

@@ -4,6 +4,5 @@ mod barriers;
 mod common;
 mod control;
 mod failing_calls;
-mod other_device;
+mod real_pace;
 mod renderer;
-mod whole_rig;

@@ -109,57 +109,6 @@ fn after_a_loss_nothing_more_is_asked_of_the_device_and_another_one_goes_on() {
 }
 
 #[test]
-fn a_submission_that_never_ends_is_waited_for_in_pieces_then_left_without_waiting() {
-    let session = layer("");
-    clean();
-    let mut bench = Bench::open();
-    session.set("submit-hang@frame=3");
-    for i in 0..2 {
-        bench.frame(i).unwrap();
-    }
-    bench.submit(2).unwrap();
-    // Short waits are no losses and change nothing.
-    for _ in 0..30 {
-        let begin = Instant::now();
-        assert!(matches!(bench.slot.poll_done(5_000_000), Ok(None)));
-        assert!(begin.elapsed() >= Duration::from_millis(5));
-    }
-    let error = bench.slot.wait(5_000_000).expect_err("still running");
-    assert!(matches!(error, GpuError::Timeout { waited_ms: 5, .. }) && !error.is_loss(), "{error}");
-    assert!(!bench.gpu.is_lost(), "a timeout is no loss");
-    assert!(matches!(bench.submit(3), Err(GpuError::InFlight { .. })), "its memory is still written");
-    let before = memory_given_up();
-    bench.gpu.give_up();
-    assert!(bench.gpu.is_lost());
-    let after = memory_given_up();
-    assert_eq!(after.devices, before.devices + 1);
-    let history = 2 * u64::from(common::WIDTH * common::HEIGHT) * History::BYTES as u64;
-    assert!(after.bytes - before.bytes >= history, "{} bytes were held", after.bytes - before.bytes);
-    assert!(bench.submit(3).expect_err("given up").is_loss());
-    let next = goes_on(&bench.gpu);
-    within(Duration::from_millis(500) + SLACK, "leaving it", || drop(bench));
-    drop(next);
-    assert_no_validation_messages();
-}
-
-/// Nobody gave the device up: dropping finds out, in the time that it allows itself, once.
-#[test]
-fn dropping_what_hangs_takes_two_seconds_at_most_and_gives_the_device_up() {
-    let session = layer("");
-    let mut bench = Bench::open();
-    let mut other = bench.renderer.create_slot(false).unwrap();
-    bench.frame(0).unwrap();
-    session.set("submit-hang@frame=1");
-    submit(&mut bench.renderer, &mut other, 1).unwrap();
-    bench.submit(2).unwrap();
-    let gpu = bench.gpu.clone();
-    within(Duration::from_secs(2) + SLACK, "dropping", || drop((bench, other)));
-    assert!(gpu.is_lost());
-    drop(goes_on(&gpu));
-    assert_no_validation_messages();
-}
-
-#[test]
 fn a_late_gpu_is_no_loss_and_its_pictures_are_right() {
     let session = layer("");
     clean();
@@ -179,73 +128,6 @@ fn a_late_gpu_is_no_loss_and_its_pictures_are_right() {
     }
     assert!(!bench.gpu.is_lost());
     drop(bench);
-    assert_no_validation_messages();
-}
-
-/// The call itself does not come back: only its thread can be left, with the renderer that it owns.
-#[test]
-fn a_renderer_whose_thread_is_stuck_in_the_driver_is_left_and_another_one_goes_on() {
-    let session = layer("");
-    clean();
-    let mut bench = Bench::open();
-    bench.frame(0).unwrap();
-    session.set("submit-block@frame=1,ms=6000");
-    let gpu = bench.gpu.clone();
-    let (told, heard) = channel();
-    let stuck = std::thread::spawn(move || {
-        let submitted = bench.submit(1);
-        let _ = told.send(());
-        // What comes of it is of no use to anybody.
-        (submitted.is_ok(), bench.slot.poll_done(0).is_err())
-    });
-    // It is in the driver now, as far as one can see from outside.
-    while session.count(Call::Frame) == 0 {
-        std::thread::sleep(Duration::from_millis(1));
-    }
-    let begin = Instant::now();
-    gpu.give_up();
-    let next = goes_on(&gpu);
-    // Where the machine is too slow for that the test says nothing, but does not fail either.
-    if begin.elapsed() < Duration::from_secs(5) {
-        assert!(heard.try_recv().is_err(), "the thread is still stuck");
-    }
-    drop(next);
-    let (_, refused) = stuck.join().unwrap();
-    assert!(refused, "what was given up stays so");
-    assert_no_validation_messages();
-}
-
-/// A driver that needs a moment to reset its device is waited for; one that does not come back ends in a clear error, in bounded time.
-#[test]
-fn a_device_that_needs_a_moment_comes_back_and_one_that_is_gone_is_named() {
-    let session = layer("");
-    clean();
-    let mut bench = Bench::open();
-    session.set("lost@frame=1; init-failed@device=1..3");
-    assert!(bench.frame(0).is_err_and(|e| e.is_loss()));
-    let again = reopened(&bench.gpu);
-    assert_eq!(session.count(Call::Device), 4);
-    bench = Bench::on(again).unwrap_or_else(|e| panic!("{e}"));
-    for gone in [
-        "init-failed@device=1..",
-        "oom-host@instance=1..",
-        "submit-hang@submit=1..",
-        "submit-block@submit=1..,ms=5000",
-    ] {
-        session.set("lost@frame=1");
-        assert!(bench.frame(0).is_err_and(|e| e.is_loss()));
-        session.set(gone);
-        let error = within(Duration::from_secs(4) + SLACK, gone, || bench.gpu.reopen()).expect_err(gone);
-        assert!(matches!(error, GpuError::NoneLeft { .. }), "{gone}: {error}");
-        assert!(error.to_string().contains(&bench.gpu.summary().name), "{error}");
-        session.set("");
-        // When it is back at last, nothing stands in the way.
-        let again = reopened(&bench.gpu);
-        bench = Bench::on(again).unwrap_or_else(|e| panic!("{e}"));
-    }
-    drop(shows_the_right_pictures(bench));
-    // Of those that were stuck.
-    std::thread::sleep(Duration::from_secs(5));
     assert_no_validation_messages();
 }
 
@@ -327,4 +209,127 @@ fn renderers_and_slots_own_what_they_need() {
     assert_eq!(slot.codes(), clean()[0]);
     drop(slot);
     assert_no_validation_messages();
+}
+
+/// How long anything waits for a device, on a machine with nothing else to do.
+mod real_pace {
+    use super::*;
+
+    /// A driver that needs a moment to reset its device is waited for; one that does not come back ends in a clear error, in bounded time.
+    #[test]
+    fn a_device_that_needs_a_moment_comes_back_and_one_that_is_gone_is_named() {
+        let session = layer("");
+        clean();
+        let mut bench = Bench::open();
+        session.set("lost@frame=1; init-failed@device=1..3");
+        assert!(bench.frame(0).is_err_and(|e| e.is_loss()));
+        let again = reopened(&bench.gpu);
+        assert_eq!(session.count(Call::Device), 4);
+        bench = Bench::on(again).unwrap_or_else(|e| panic!("{e}"));
+        for gone in [
+            "init-failed@device=1..",
+            "oom-host@instance=1..",
+            "submit-hang@submit=1..",
+            "submit-block@submit=1..,ms=5000",
+        ] {
+            session.set("lost@frame=1");
+            assert!(bench.frame(0).is_err_and(|e| e.is_loss()));
+            session.set(gone);
+            let error = within(Duration::from_secs(4) + SLACK, gone, || bench.gpu.reopen()).expect_err(gone);
+            assert!(matches!(error, GpuError::NoneLeft { .. }), "{gone}: {error}");
+            assert!(error.to_string().contains(&bench.gpu.summary().name), "{error}");
+            session.set("");
+            // When it is back at last, nothing stands in the way.
+            let again = reopened(&bench.gpu);
+            bench = Bench::on(again).unwrap_or_else(|e| panic!("{e}"));
+        }
+        drop(shows_the_right_pictures(bench));
+        // Of those that were stuck.
+        std::thread::sleep(Duration::from_secs(5));
+        assert_no_validation_messages();
+    }
+
+    /// Nobody gave the device up: dropping finds out, in the time that it allows itself, once.
+    #[test]
+    fn dropping_what_hangs_takes_two_seconds_at_most_and_gives_the_device_up() {
+        let session = layer("");
+        let mut bench = Bench::open();
+        let mut other = bench.renderer.create_slot(false).unwrap();
+        bench.frame(0).unwrap();
+        session.set("submit-hang@frame=1");
+        submit(&mut bench.renderer, &mut other, 1).unwrap();
+        bench.submit(2).unwrap();
+        let gpu = bench.gpu.clone();
+        within(Duration::from_secs(2) + SLACK, "dropping", || drop((bench, other)));
+        assert!(gpu.is_lost());
+        drop(goes_on(&gpu));
+        assert_no_validation_messages();
+    }
+
+    #[test]
+    fn a_submission_that_never_ends_is_waited_for_in_pieces_then_left_without_waiting() {
+        let session = layer("");
+        clean();
+        let mut bench = Bench::open();
+        session.set("submit-hang@frame=3");
+        for i in 0..2 {
+            bench.frame(i).unwrap();
+        }
+        bench.submit(2).unwrap();
+        // Short waits are no losses and change nothing.
+        for _ in 0..30 {
+            let begin = Instant::now();
+            assert!(matches!(bench.slot.poll_done(5_000_000), Ok(None)));
+            assert!(begin.elapsed() >= Duration::from_millis(5));
+        }
+        let error = bench.slot.wait(5_000_000).expect_err("still running");
+        assert!(matches!(error, GpuError::Timeout { waited_ms: 5, .. }) && !error.is_loss(), "{error}");
+        assert!(!bench.gpu.is_lost(), "a timeout is no loss");
+        assert!(matches!(bench.submit(3), Err(GpuError::InFlight { .. })), "its memory is still written");
+        let before = memory_given_up();
+        bench.gpu.give_up();
+        assert!(bench.gpu.is_lost());
+        let after = memory_given_up();
+        assert_eq!(after.devices, before.devices + 1);
+        let history = 2 * u64::from(common::WIDTH * common::HEIGHT) * History::BYTES as u64;
+        assert!(after.bytes - before.bytes >= history, "{} bytes were held", after.bytes - before.bytes);
+        assert!(bench.submit(3).expect_err("given up").is_loss());
+        let next = goes_on(&bench.gpu);
+        within(Duration::from_millis(500) + SLACK, "leaving it", || drop(bench));
+        drop(next);
+        assert_no_validation_messages();
+    }
+
+    /// The call itself does not come back: only its thread can be left, with the renderer that it owns.
+    #[test]
+    fn a_renderer_whose_thread_is_stuck_in_the_driver_is_left_and_another_one_goes_on() {
+        let session = layer("");
+        clean();
+        let mut bench = Bench::open();
+        bench.frame(0).unwrap();
+        session.set("submit-block@frame=1,ms=6000");
+        let gpu = bench.gpu.clone();
+        let (told, heard) = channel();
+        let stuck = std::thread::spawn(move || {
+            let submitted = bench.submit(1);
+            let _ = told.send(());
+            // What comes of it is of no use to anybody.
+            (submitted.is_ok(), bench.slot.poll_done(0).is_err())
+        });
+        // It is in the driver now, as far as one can see from outside.
+        while session.count(Call::Frame) == 0 {
+            std::thread::sleep(Duration::from_millis(1));
+        }
+        let begin = Instant::now();
+        gpu.give_up();
+        let next = goes_on(&gpu);
+        // Where the machine is too slow for that the test says nothing, but does not fail either.
+        if begin.elapsed() < Duration::from_secs(5) {
+            assert!(heard.try_recv().is_err(), "the thread is still stuck");
+        }
+        drop(next);
+        let (_, refused) = stuck.join().unwrap();
+        assert!(refused, "what was given up stays so");
+        assert_no_validation_messages();
+    }
 }

@@ -75,7 +75,7 @@ fn a_late_gpu_changes_no_light() {
     assert!(layer.events().iter().any(|e| e.what == "late"));
 }
 
-/// One of each kind of call that a start makes. (`tests/vulkan-faults/tests/failing_calls.rs` has every single call.)
+/// One of each kind of call that a start makes. (`tests/vulkan-faults/tests/laws/failing_calls.rs` has every single call.)
 #[test]
 fn a_start_that_finds_no_memory_or_no_device_is_refused_clearly() {
     let (layer, folder) = (FaultLayer::new("start").unwrap(), Folder::new("gpu-start"));

@@ -227,7 +227,13 @@ fn panics_and_hangs() {
 #[test]
 fn r2_a_panic_in_any_thread_is_a_stop() {
     let mut command = Command::new(std::env::current_exe().unwrap());
-    command.args(["--ignored", "--exact", "real_pace::stop::panics_and_hangs", "--nocapture", "--test-threads=1"]);
+    command.args([
+        "--ignored",
+        "--exact",
+        "real_pace::stop::panics_and_hangs",
+        "--nocapture",
+        "--test-threads=1",
+    ]);
     let begin = Instant::now();
     let output = command.env("PANICS", "1").env("RUST_BACKTRACE", "0").output().unwrap();
     assert!(begin.elapsed() < Duration::from_secs(10), "{:?}", begin.elapsed());

@@ -1,6 +1,6 @@
-//! A hundred thousand frames through the whole pipeline at real pace: on the frame path nothing is allocated, and the
+//! Frames through the whole pipeline at real pace, a hundred thousand in the second tier: on the frame path nothing is allocated, and the
 //! only system calls are those that wait, wake and read the time. The frames are prepared, and the mock projector is in
-//! this process; tests/tests/frame_path_vulkan.rs and its neighbours hold the law with drivers, cables and sockets.
+//! this process; tests/tests/laws/real_pace/frame_path_vulkan.rs and its neighbours hold the law with drivers, cables and sockets.
 #![cfg(all(target_os = "linux", target_arch = "x86_64"))]
 #![allow(unsafe_code)]
 
@@ -15,15 +15,29 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::Arc;
 use std::time::Duration;
 
-/// Several rigs in parallel, so that the test takes seconds: a panel of eight planes can show 2800 frames per second.
-const RIGS: u64 = 4;
-const FRAMES: u64 = 25_000;
+/// Frames whose number counts. A few show what is called on the frame path; how many of them were lit in time, and how many
+/// changes reached them, is judged where many run with nothing beside them.
+const MANY: u64 = 25_000;
 
 #[test]
-fn a_hundred_thousand_frames_only_wait_and_wake() {
+fn frames_only_wait_and_wake() {
+    frames_of_rigs_only_wait_and_wake(2, 500);
+}
+
+mod real_pace {
+    use super::*;
+
+    /// Several rigs in parallel, so that the test takes seconds: a panel of eight planes can show 2800 frames per second.
+    #[test]
+    fn a_hundred_thousand_frames_only_wait_and_wake() {
+        frames_of_rigs_only_wait_and_wake(4, MANY);
+    }
+}
+
+fn frames_of_rigs_only_wait_and_wake(rigs: u64, frames: u64) {
     frame_law::watch();
     let planned: u64 = std::thread::scope(|scope| {
-        let runs: Vec<_> = (0..RIGS)
+        let runs: Vec<_> = (0..rigs)
             .map(|k| {
                 scope.spawn(move || {
                     // Every other rig also tells its projector of the bodies between frames.
@@ -37,7 +51,7 @@ fn a_hundred_thousand_frames_only_wait_and_wake() {
                     ];
                     let rig = demo_rig(32, 16, &settings);
                     let monitor = Arc::new(RunMonitor::default());
-                    let options = RunOptions { frames: FRAMES, ..RunOptions::default() };
+                    let options = RunOptions { frames, ..RunOptions::default() };
                     let is_over = AtomicBool::new(false);
                     let (outcome, changes) = std::thread::scope(|scope| {
                         // Meanwhile an operator draws a slider.
@@ -46,18 +60,21 @@ fn a_hundred_thousand_frames_only_wait_and_wake() {
                         is_over.store(true, Ordering::Relaxed);
                         (outcome, slider.join().expect("it only asks"))
                     });
-                    assert!(changes > 100, "{changes} changes");
-                    let sent = outcome.report.projector.map_or(0, |projector| projector.tracks_sent);
-                    assert_eq!(sent > 100, k % 2 == 0, "{sent} TRACKS");
                     assert_eq!((outcome.frames_torn, outcome.frames_reordered), (0, 0));
-                    assert!(outcome.report.frames_lit > FRAMES / 50, "{} lit", outcome.report.frames_lit);
+                    let sent = outcome.report.projector.map_or(0, |projector| projector.tracks_sent);
+                    assert!(sent == 0 || k % 2 == 0, "{sent} TRACKS");
+                    if frames >= MANY {
+                        assert!(changes > 100, "{changes} changes");
+                        assert_eq!(sent > 100, k % 2 == 0, "{sent} TRACKS");
+                        assert!(outcome.report.frames_lit > frames / 50, "{} lit", outcome.report.frames_lit);
+                    }
                     monitor.counts().frames_planned
                 })
             })
             .collect();
         runs.into_iter().map(|run| run.join().expect("the run ended")).sum()
     });
-    assert_eq!(planned, RIGS * FRAMES);
+    assert_eq!(planned, rigs * frames);
     frame_law::seen().check(&[], &[]);
     what_breaks_the_law_is_seen();
 }

@@ -60,7 +60,7 @@ fn drawn(bits: u32) -> (u32, Vec<Vec<u32>>) {
     let cache = caches.join(format!("vectors-of-{bits}"));
     let program = std::env::current_exe().expect("the path of this test");
     let out = Command::new(program)
-        .args(["--exact", "subgroup_widths::frames_of_this_width", "--ignored", "--nocapture"])
+        .args(["--exact", "breadth::subgroup_widths::frames_of_this_width", "--ignored", "--nocapture"])
         .env("LP_NATIVE_VECTOR_WIDTH", bits.to_string())
         // Compiled shaders of one width must not serve another.
         .env("MESA_SHADER_CACHE_DIR", cache)
