@@ -300,33 +300,6 @@ mod tests {
     }
 
     #[test]
-    fn each_part_of_a_scene_is_taken_out_and_nothing_else() {
-        let (features, rig) = demo();
-        let (scene, needs) = (&rig.scene, |s: &Scene| SceneData::build(s).unwrap().needs);
-        let own = needs(scene);
-        let changes: Vec<_> = features.iter().filter_map(|f| Some((*f, changed(f, scene)?))).collect();
-        assert_eq!(
-            changes.len(),
-            12 - 2,
-            "all parts of scenes but the clamp, which is a setting, and the tree"
-        );
-        for (feature, other) in changes {
-            let other = needs(&other);
-            let gone = match feature {
-                "textures" => own.textures && !other.textures,
-                "normal maps" => own.normal_maps && !other.normal_maps && other.textures,
-                "specular" => own.specular && !other.specular && other.diffuse,
-                "diffuse" => own.diffuse && !other.diffuse && other.specular,
-                "emissive" => own.emissive && !other.emissive,
-                "environment" => own.environment_kind == 1 && other.environment_kind == 0,
-                "environment image" => other.environment_kind == 2,
-                _ => other == own,
-            };
-            assert!(gone, "{feature}: {own:?} becomes {other:?}");
-        }
-    }
-
-    #[test]
     fn an_even_sky_becomes_an_image_of_as_much_light_and_back() {
         let even = Environment::Constant(Vec3::new(0.2, 0.5, 1.0));
         let image = other_sky(&even).unwrap();
@@ -357,5 +330,37 @@ mod tests {
         // Black pixels of both do not thin the difference out.
         let some = |v: f32| [plain(v), plain(0.0)].concat();
         assert!((relative_rms(&some(1.0), &some(3.0)) - 1.0).abs() < 1e-12);
+    }
+
+    /// Every part of a scene.
+    mod breadth {
+        use super::*;
+
+        #[test]
+        fn each_part_of_a_scene_is_taken_out_and_nothing_else() {
+            let (features, rig) = demo();
+            let (scene, needs) = (&rig.scene, |s: &Scene| SceneData::build(s).unwrap().needs);
+            let own = needs(scene);
+            let changes: Vec<_> = features.iter().filter_map(|f| Some((*f, changed(f, scene)?))).collect();
+            assert_eq!(
+                changes.len(),
+                12 - 2,
+                "all parts of scenes but the clamp, which is a setting, and the tree"
+            );
+            for (feature, other) in changes {
+                let other = needs(&other);
+                let gone = match feature {
+                    "textures" => own.textures && !other.textures,
+                    "normal maps" => own.normal_maps && !other.normal_maps && other.textures,
+                    "specular" => own.specular && !other.specular && other.diffuse,
+                    "diffuse" => own.diffuse && !other.diffuse && other.specular,
+                    "emissive" => own.emissive && !other.emissive,
+                    "environment" => own.environment_kind == 1 && other.environment_kind == 0,
+                    "environment image" => other.environment_kind == 2,
+                    _ => other == own,
+                };
+                assert!(gone, "{feature}: {own:?} becomes {other:?}");
+            }
+        }
     }
 }

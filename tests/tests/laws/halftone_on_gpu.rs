@@ -166,34 +166,39 @@ fn block_sums(raster: Raster, codes: &[[u8; 3]]) -> Vec<[u32; 3]> {
     sums
 }
 
-/// In the light of the whole chain the mean level of 8 x 8 mirrors is that of binary planes, to 0.38 levels of 255 in
-/// every frame. Equal planes give 128 / 255 of full white, so their projector is that much brighter here. The bodies stand
-/// still, because the centres of the two kinds of light are not at the same instant.
-#[test]
-fn light_of_equal_planes_is_that_of_binary_ones() {
-    with_gpu(|gpu| {
-        let light = |flags: &[&str]| {
-            let still = [0, 1].map(|i| format!("scene.bodies.{i}.motion={{kind=\"still\"}}"));
-            let flags = [&still.each_ref().map(String::as_str)[..], flags].concat();
-            let rig = demo_rig(128, 96, &flags);
-            let (outcome, _) = run(gpu, &rig, 24, 24);
-            assert_eq!((outcome.light_mismatches, outcome.report.frames_lit), (0, 24));
-            let sums = |frame: &LightFrame| block_sums(rig.camera.raster, &frame.codes);
-            outcome.light.iter().map(sums).collect::<Vec<_>>()
-        };
-        let binary = light(&["projector.max_intensity=8"]);
-        let bright = format!("projector.max_intensity={}", 8.0 * 255.0 / 128.0);
-        let equal = light(&["projector.weights=\"equal\"", &bright]);
-        let (mut worst, mut lit) = (0.0f64, 0);
-        for (a, b) in binary.iter().flatten().zip(equal.iter().flatten()) {
-            for c in 0..3 {
-                let [a, b] = [f64::from(a[c]), f64::from(b[c]) * 255.0 / 128.0].map(|sum| sum / 64.0);
-                worst = worst.max((a - b).abs());
-                lit += u32::from(a > 0.0);
+/// The light of the whole chain.
+mod breadth {
+    use super::*;
+
+    /// In the light of the whole chain the mean level of 8 x 8 mirrors is that of binary planes, to 0.38 levels of 255 in
+    /// every frame. Equal planes give 128 / 255 of full white, so their projector is that much brighter here. The bodies stand
+    /// still, because the centres of the two kinds of light are not at the same instant.
+    #[test]
+    fn light_of_equal_planes_is_that_of_binary_ones() {
+        with_gpu(|gpu| {
+            let light = |flags: &[&str]| {
+                let still = [0, 1].map(|i| format!("scene.bodies.{i}.motion={{kind=\"still\"}}"));
+                let flags = [&still.each_ref().map(String::as_str)[..], flags].concat();
+                let rig = demo_rig(128, 96, &flags);
+                let (outcome, _) = run(gpu, &rig, 24, 24);
+                assert_eq!((outcome.light_mismatches, outcome.report.frames_lit), (0, 24));
+                let sums = |frame: &LightFrame| block_sums(rig.camera.raster, &frame.codes);
+                outcome.light.iter().map(sums).collect::<Vec<_>>()
+            };
+            let binary = light(&["projector.max_intensity=8"]);
+            let bright = format!("projector.max_intensity={}", 8.0 * 255.0 / 128.0);
+            let equal = light(&["projector.weights=\"equal\"", &bright]);
+            let (mut worst, mut lit) = (0.0f64, 0);
+            for (a, b) in binary.iter().flatten().zip(equal.iter().flatten()) {
+                for c in 0..3 {
+                    let [a, b] = [f64::from(a[c]), f64::from(b[c]) * 255.0 / 128.0].map(|sum| sum / 64.0);
+                    worst = worst.max((a - b).abs());
+                    lit += u32::from(a > 0.0);
+                }
             }
-        }
-        assert!(lit > 1_000, "{lit} blocks are lit");
-        // A projector's brightness that is not exactly twice another's may round single code values otherwise.
-        assert!(worst <= 0.40, "{worst} levels");
-    });
+            assert!(lit > 1_000, "{lit} blocks are lit");
+            // A projector's brightness that is not exactly twice another's may round single code values otherwise.
+            assert!(worst <= 0.40, "{worst} levels");
+        });
+    }
 }

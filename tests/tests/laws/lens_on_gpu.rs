@@ -116,35 +116,40 @@ fn light_falls_where_the_lens_projects_and_moves_as_it_does() {
     });
 }
 
-#[test]
-fn no_tile_that_a_body_touches_is_left_out() {
-    with_gpu(|gpu| {
-        let scene = square(0.25);
-        for (name, lens) in lenses() {
-            let camera = projector(lens);
-            let poses: Vec<DAffine3> = (0..12)
-                .map(|k| {
-                    let t = f64::from(k);
-                    let at = DVec2::from_angle(2.4 * t) * (0.08 * t);
-                    let turn = DQuat::from_euler(glam::EulerRot::XYZ, 0.2 * t, 0.3, 0.1 * t);
-                    DAffine3::from_rotation_translation(turn, DVec3::new(at.x, 0.3 * at.y, 0.3))
-                })
-                .collect();
-            let ids = |keep| {
-                let mut ids: Vec<Vec<u32>> = vec![];
-                draw(gpu, &scene, &camera, &poses, keep, |slot| {
-                    ids.push(slot.surfaces().unwrap().iter().map(|s| s.id).collect());
-                });
-                ids
-            };
-            let lean = ids(Keep::default());
-            let all = ids(Keep { every_tile: true, ..Keep::default() });
-            for (k, (lean, all)) in lean.iter().zip(&all).enumerate() {
-                let hit = all.iter().filter(|id| **id != NO_HIT).count();
-                assert!(hit > 500 && hit < 40_000, "{name}, pose {k}: {hit} pixels");
-                let different = lean.iter().zip(all).filter(|(a, b)| a != b).count();
-                assert_eq!(different, 0, "{name}, pose {k}: pixels that only all tiles light");
+/// Every tile, under every lens.
+mod breadth {
+    use super::*;
+
+    #[test]
+    fn no_tile_that_a_body_touches_is_left_out() {
+        with_gpu(|gpu| {
+            let scene = square(0.25);
+            for (name, lens) in lenses() {
+                let camera = projector(lens);
+                let poses: Vec<DAffine3> = (0..12)
+                    .map(|k| {
+                        let t = f64::from(k);
+                        let at = DVec2::from_angle(2.4 * t) * (0.08 * t);
+                        let turn = DQuat::from_euler(glam::EulerRot::XYZ, 0.2 * t, 0.3, 0.1 * t);
+                        DAffine3::from_rotation_translation(turn, DVec3::new(at.x, 0.3 * at.y, 0.3))
+                    })
+                    .collect();
+                let ids = |keep| {
+                    let mut ids: Vec<Vec<u32>> = vec![];
+                    draw(gpu, &scene, &camera, &poses, keep, |slot| {
+                        ids.push(slot.surfaces().unwrap().iter().map(|s| s.id).collect());
+                    });
+                    ids
+                };
+                let lean = ids(Keep::default());
+                let all = ids(Keep { every_tile: true, ..Keep::default() });
+                for (k, (lean, all)) in lean.iter().zip(&all).enumerate() {
+                    let hit = all.iter().filter(|id| **id != NO_HIT).count();
+                    assert!(hit > 500 && hit < 40_000, "{name}, pose {k}: {hit} pixels");
+                    let different = lean.iter().zip(all).filter(|(a, b)| a != b).count();
+                    assert_eq!(different, 0, "{name}, pose {k}: pixels that only all tiles light");
+                }
             }
-        }
-    });
+        });
+    }
 }

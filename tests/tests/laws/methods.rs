@@ -64,24 +64,6 @@ fn no_validation_messages() {
     assert_eq!(count, 0, "{texts:#?}");
 }
 
-#[test]
-fn dpm_lowers_the_perceived_error_of_independent_samples() {
-    let (rig, _gpu, theatre) = stage(Span { last_slot: 120, warm_up: 40, kept: 31 }, false);
-    let blue = Method { sampler: SamplerKind::BlueNoise, ..Method::full(32) };
-    let reference = theatre.play(&blue, 32.0, 9, &mut |_, _| ()).unwrap();
-    let reference = eye_mean(&reference.frames, 31);
-    let error = |m: &Method| {
-        let seen = theatre.play(m, 2.0, 1, &mut |_, _| ()).unwrap();
-        (rmse(&eye_mean(&seen.frames, 31), &reference, |_| true), seen.rays)
-    };
-    let (full, full_rays) = error(&Method::full(2));
-    let (ours, our_rays) = error(&method(&rig, RenderMethod::Dpm));
-    println!("full {full:.5} ({full_rays} rays), dpm {ours:.5} ({our_rays} rays)");
-    assert!(our_rays as f64 <= full_rays as f64 * 1.1);
-    assert!(ours < 0.75 * full, "{ours} against {full}");
-    no_validation_messages();
-}
-
 /// The codes of ten frames of bodies that move, of which three are on their way at any time.
 fn codes_in_line(gpu: &Arc<Gpu>, which: RenderMethod, overlap: Overlapping) -> Vec<Vec<u32>> {
     let rig = demo_rig(96, 72, &[]);
@@ -155,6 +137,24 @@ fn the_filter_keeps_to_the_body() {
 /// Every method, and frames in every order.
 mod breadth {
     use super::*;
+
+    #[test]
+    fn dpm_lowers_the_perceived_error_of_independent_samples() {
+        let (rig, _gpu, theatre) = stage(Span { last_slot: 120, warm_up: 40, kept: 31 }, false);
+        let blue = Method { sampler: SamplerKind::BlueNoise, ..Method::full(32) };
+        let reference = theatre.play(&blue, 32.0, 9, &mut |_, _| ()).unwrap();
+        let reference = eye_mean(&reference.frames, 31);
+        let error = |m: &Method| {
+            let seen = theatre.play(m, 2.0, 1, &mut |_, _| ()).unwrap();
+            (rmse(&eye_mean(&seen.frames, 31), &reference, |_| true), seen.rays)
+        };
+        let (full, full_rays) = error(&Method::full(2));
+        let (ours, our_rays) = error(&method(&rig, RenderMethod::Dpm));
+        println!("full {full:.5} ({full_rays} rays), dpm {ours:.5} ({our_rays} rays)");
+        assert!(our_rays as f64 <= full_rays as f64 * 1.1);
+        assert!(ours < 0.75 * full, "{ours} against {full}");
+        no_validation_messages();
+    }
 
     #[test]
     fn filters_and_rates_keep_the_energy() {

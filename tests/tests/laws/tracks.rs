@@ -154,28 +154,6 @@ fn told(what: &str, setting: Setting, light: &mut Light) -> [[f64; 2]; 2] {
     [drawn, lit]
 }
 
-/// A run repeats, shifts included. "off" sends none, and changes nothing else.
-#[test]
-fn tracks_repeat_and_can_be_switched_off() {
-    let run = |tracks: &str| {
-        let outcome = lit(&rig(&turning(1), SETTINGS[1].0, tracks), 300);
-        let moves: Vec<String> = outcome.moves.iter().map(|m| format!("{m:?}")).collect();
-        let poses: Vec<_> = outcome.recent.iter().map(|r| r.tracked_poses.clone()).collect();
-        let projector = outcome.report.projector.expect("the mock was used");
-        let [moved, clamped, stale] = projector.planes_by_tracks;
-        assert_eq!(moved > 0, tracks == "auto", "{moved} planes moved");
-        assert_eq!((clamped, stale), (0, 0));
-        // Four messages a millisecond, and those of the next frame beside them.
-        let sent = 300..3000;
-        assert_eq!(sent.contains(&projector.tracks_sent), tracks == "auto", "{}", projector.tracks_sent);
-        (moves, poses, outcome.report.frames_lit)
-    };
-    let (on, again, off) = (run("auto"), run("auto"), run("off"));
-    assert!(on.0.len() > 250 && on == again);
-    assert!(off.0.is_empty());
-    assert_eq!((on.1, on.2), (off.1, off.2));
-}
-
 /// What a run keeps of its light and what its report says of it have the shifts in them: every mirror of every plane shows
 /// what docs/PROTOCOL.md says, and an eye that follows the bodies sees less error than without tracks.
 #[test]
@@ -238,6 +216,28 @@ fn moved_light(rig: &Rig, sent: &[[u8; 3]], moves: &SlotMoves) -> Vec<[u8; 3]> {
 /// Seconds of motion.
 mod breadth {
     use super::*;
+
+    /// A run repeats, shifts included. "off" sends none, and changes nothing else.
+    #[test]
+    fn tracks_repeat_and_can_be_switched_off() {
+        let run = |tracks: &str| {
+            let outcome = lit(&rig(&turning(1), SETTINGS[1].0, tracks), 300);
+            let moves: Vec<String> = outcome.moves.iter().map(|m| format!("{m:?}")).collect();
+            let poses: Vec<_> = outcome.recent.iter().map(|r| r.tracked_poses.clone()).collect();
+            let projector = outcome.report.projector.expect("the mock was used");
+            let [moved, clamped, stale] = projector.planes_by_tracks;
+            assert_eq!(moved > 0, tracks == "auto", "{moved} planes moved");
+            assert_eq!((clamped, stale), (0, 0));
+            // Four messages a millisecond, and those of the next frame beside them.
+            let sent = 300..3000;
+            assert_eq!(sent.contains(&projector.tracks_sent), tracks == "auto", "{}", projector.tracks_sent);
+            (moves, poses, outcome.report.frames_lit)
+        };
+        let (on, again, off) = (run("auto"), run("auto"), run("off"));
+        assert!(on.0.len() > 250 && on == again);
+        assert!(off.0.is_empty());
+        assert_eq!((on.1, on.2), (off.1, off.2));
+    }
 
     /// Turns of 50 m/s2 that nothing foretells: with tracks the light lies within the limits, and without them it does not.
     /// The tracks in the light are young.

@@ -293,44 +293,46 @@ fn natnet_rig(folder: &Folder, server: &NatNetHost, frame_rate: u32, safety: &st
     folder.write("rig.toml", &text)
 }
 
-/// Lanes share the samples of their workgroup, so that they are busy whether all pixels have as many samples or not.
-#[test]
-fn bench_counts_how_busy_lanes_are_and_marks_what_is_only_computed() {
-    let args = ["bench", "--json", "--count", "3", "--raster", "96x64", "--set", "render.spp=4"];
-    let output =
-        dpm(&[&args[..], &["--method", "full", "--method", "dpm"]].concat(), &[("DPM_VALIDATION", "1")]);
-    assert_eq!(code(&output), 0, "{}", err(&output));
-    let json: serde_json::Value = serde_json::from_str(&out(&output)).expect("one JSON object");
-    let lanes = |method: usize, width: usize| {
-        let of = &json["methods"][method]["lanes"][width];
-        (of["busy"].as_f64().expect("a share"), of["longest"].as_u64().expect("samples"))
-    };
-    for width in [0, 1] {
-        let (full, dpm) = (lanes(0, width), lanes(1, width));
-        for (busy, longest) in [full, dpm] {
-            // A workgroup of this raster has few samples a lane, so that the last of them weigh.
-            assert!(busy > 0.85 && busy <= 1.0, "{json:#}");
-            assert!((2..=6).contains(&longest), "{json:#}");
-        }
-    }
-    let rows = json["modelled_not_measured"].as_array().expect("a list");
-    assert_eq!(rows.len(), 8, "four cards, two methods");
-    for row in rows {
-        let of = |name: &str| row[name].as_f64().expect("milliseconds");
-        let sum =
-            row["trace_ms"][0].as_f64().unwrap() + of("screen_ms") + of("barriers_ms") + of("readback_ms");
-        assert!((row["frame_ms"][0].as_f64().unwrap() - sum).abs() < 1e-9, "{row}");
-    }
-    let text = dpm(
-        &[&["bench", "--model", "--count", "3", "--raster", "48x32", "--method", "full"][..]].concat(),
-        &[],
-    );
-    assert!(out(&text).contains("computed, not measured"), "{}", out(&text));
-}
-
 /// Every plane of a longer run, and every fault of the mock.
 mod breadth {
     use super::*;
+
+    /// Lanes share the samples of their workgroup, so that they are busy whether all pixels have as many samples or not.
+    #[test]
+    fn bench_counts_how_busy_lanes_are_and_marks_what_is_only_computed() {
+        let args = ["bench", "--json", "--count", "3", "--raster", "96x64", "--set", "render.spp=4"];
+        let output =
+            dpm(&[&args[..], &["--method", "full", "--method", "dpm"]].concat(), &[("DPM_VALIDATION", "1")]);
+        assert_eq!(code(&output), 0, "{}", err(&output));
+        let json: serde_json::Value = serde_json::from_str(&out(&output)).expect("one JSON object");
+        let lanes = |method: usize, width: usize| {
+            let of = &json["methods"][method]["lanes"][width];
+            (of["busy"].as_f64().expect("a share"), of["longest"].as_u64().expect("samples"))
+        };
+        for width in [0, 1] {
+            let (full, dpm) = (lanes(0, width), lanes(1, width));
+            for (busy, longest) in [full, dpm] {
+                // A workgroup of this raster has few samples a lane, so that the last of them weigh.
+                assert!(busy > 0.85 && busy <= 1.0, "{json:#}");
+                assert!((2..=6).contains(&longest), "{json:#}");
+            }
+        }
+        let rows = json["modelled_not_measured"].as_array().expect("a list");
+        assert_eq!(rows.len(), 8, "four cards, two methods");
+        for row in rows {
+            let of = |name: &str| row[name].as_f64().expect("milliseconds");
+            let sum = row["trace_ms"][0].as_f64().unwrap()
+                + of("screen_ms")
+                + of("barriers_ms")
+                + of("readback_ms");
+            assert!((row["frame_ms"][0].as_f64().unwrap() - sum).abs() < 1e-9, "{row}");
+        }
+        let text = dpm(
+            &[&["bench", "--model", "--count", "3", "--raster", "48x32", "--method", "full"][..]].concat(),
+            &[],
+        );
+        assert!(out(&text).contains("computed, not measured"), "{}", out(&text));
+    }
 
     /// Found in use, R11: with 8 planes every run at virtual pace ended with "frames of light differ from what was
     /// rendered"; R20: faults of the mock projector had no effect.

@@ -356,40 +356,50 @@ fn heat_is_a_fault_until_it_is_gone() {
     world.end();
 }
 
-/// A day at four frames a second, with a fault, an order or a new session now and then.
-#[test]
-fn a_day_leaks_nothing() {
-    let case =
-        Case { schedule: PlaneSchedule::mono8(), weights: Weights::Equal, hz: 4, runs: 1, panel: "ppm=40" };
-    let mut world = World::streaming(case);
-    let day = 24 * 3600 * S;
-    let (mut frames, mut lit, mut opened) = (0u64, 0u64, 0);
-    while world.now < day {
-        for _ in 0..2000 {
-            if world.frame() == SendOutcome::Sent {
-                frames += 1;
+/// A simulated day.
+mod breadth {
+    use super::*;
+
+    /// A day at four frames a second, with a fault, an order or a new session now and then.
+    #[test]
+    fn a_day_leaks_nothing() {
+        let case = Case {
+            schedule: PlaneSchedule::mono8(),
+            weights: Weights::Equal,
+            hz: 4,
+            runs: 1,
+            panel: "ppm=40",
+        };
+        let mut world = World::streaming(case);
+        let day = 24 * 3600 * S;
+        let (mut frames, mut lit, mut opened) = (0u64, 0u64, 0);
+        while world.now < day {
+            for _ in 0..2000 {
+                if world.frame() == SendOutcome::Sent {
+                    frames += 1;
+                }
             }
+            lit += world.light().iter().filter(|shown| whose(shown, 8).1 == 7).count() as u64;
+            assert_eq!(world.fake.witness().sequences as usize, 3 + MEMORY_SPARE + 1);
+            let w = world.fake.witness();
+            assert_eq!((w.refusals, w.shown_lost), (0, 0), "{w:?}");
+            // The device fails and is opened again: a new session on the same panel.
+            opened += 1;
+            world.fake.plan(["comm@put=2", "removed@start=1", "halted@progress=3"][opened % 3]);
+            for _ in 0..4 {
+                world.frame();
+            }
+            assert!(world.cable.device().error().is_some());
+            world.go_to(world.now + S);
+            lit += world.light().iter().filter(|shown| whose(shown, 8).1 == 7).count() as u64;
+            let World { fake, cable, .. } = world;
+            drop(cable);
+            fake.plan("");
+            assert_eq!((fake.witness().leaked, fake.witness().sequences), (0, 0));
+            world = World::on(fake, case);
+            world.come_up();
         }
-        lit += world.light().iter().filter(|shown| whose(shown, 8).1 == 7).count() as u64;
-        assert_eq!(world.fake.witness().sequences as usize, 3 + MEMORY_SPARE + 1);
-        let w = world.fake.witness();
-        assert_eq!((w.refusals, w.shown_lost), (0, 0), "{w:?}");
-        // The device fails and is opened again: a new session on the same panel.
-        opened += 1;
-        world.fake.plan(["comm@put=2", "removed@start=1", "halted@progress=3"][opened % 3]);
-        for _ in 0..4 {
-            world.frame();
-        }
-        assert!(world.cable.device().error().is_some());
-        world.go_to(world.now + S);
-        lit += world.light().iter().filter(|shown| whose(shown, 8).1 == 7).count() as u64;
-        let World { fake, cable, .. } = world;
-        drop(cable);
-        fake.plan("");
-        assert_eq!((fake.witness().leaked, fake.witness().sequences), (0, 0));
-        world = World::on(fake, case);
-        world.come_up();
+        assert!(frames > 340_000 && lit > frames * 99 / 100, "{lit} of {frames} frames lit");
+        world.end();
     }
-    assert!(frames > 340_000 && lit > frames * 99 / 100, "{lit} of {frames} frames lit");
-    world.end();
 }

@@ -75,35 +75,6 @@ fn opening_a_device_fails_clearly_at_every_call_and_leaves_nothing() {
     assert_no_validation_messages();
 }
 
-/// Memory is returned to the last byte: validation counts every object when the device is closed.
-#[test]
-fn making_a_renderer_or_a_slot_fails_clearly_at_every_call_and_the_next_attempt_works() {
-    let session = layer("");
-    clean();
-    let gpu = Gpu::open(&options()).unwrap();
-    let plan = Renderer::new(&gpu, &rig().scene, renderer_settings(rig())).map_err(gpu_error).unwrap().plan();
-    let before = threads();
-    // All of making one but looking at the scene, which asks nothing of Vulkan.
-    let make = || Renderer::from_plan(&gpu, &plan).map_err(gpu_error);
-    // Every call with one kind of memory, every seventh with the other.
-    let calls = every_call(&session, "oom-device", 1, 1, make);
-    assert!(calls > 100, "{calls}");
-    every_call(&session, "oom-host", 3, 7, make);
-    session.set("");
-    let renderer = make().unwrap();
-    let calls = every_call(&session, "oom-host", 1, 1, || renderer.create_slot(true));
-    assert!(calls > 50, "{calls}");
-    session.set("");
-    drop(renderer);
-    assert_eq!(threads(), before, "threads stay behind");
-    let mut bench = Bench::on(gpu).unwrap();
-    for (i, wanted) in clean().iter().take(3).enumerate() {
-        assert_eq!(&bench.frame(i as u32).unwrap(), wanted);
-    }
-    drop(bench);
-    assert_no_validation_messages();
-}
-
 /// A device that is lost or hangs while a scene is loaded: the copies are waited for with a bound.
 #[test]
 fn a_loss_while_a_scene_is_loaded_is_told_at_once() {
@@ -135,4 +106,39 @@ fn a_loss_while_a_scene_is_loaded_is_told_at_once() {
     assert!(second.is_lost(), "and was given up");
     assert!(begin.elapsed() < std::time::Duration::from_secs(2) + common::SLACK, "{:?}", begin.elapsed());
     assert_no_validation_messages();
+}
+
+/// Every single call that a start makes.
+mod breadth {
+    use super::*;
+
+    /// Memory is returned to the last byte: validation counts every object when the device is closed.
+    #[test]
+    fn making_a_renderer_or_a_slot_fails_clearly_at_every_call_and_the_next_attempt_works() {
+        let session = layer("");
+        clean();
+        let gpu = Gpu::open(&options()).unwrap();
+        let plan =
+            Renderer::new(&gpu, &rig().scene, renderer_settings(rig())).map_err(gpu_error).unwrap().plan();
+        let before = threads();
+        // All of making one but looking at the scene, which asks nothing of Vulkan.
+        let make = || Renderer::from_plan(&gpu, &plan).map_err(gpu_error);
+        // Every call with one kind of memory, every seventh with the other.
+        let calls = every_call(&session, "oom-device", 1, 1, make);
+        assert!(calls > 100, "{calls}");
+        every_call(&session, "oom-host", 3, 7, make);
+        session.set("");
+        let renderer = make().unwrap();
+        let calls = every_call(&session, "oom-host", 1, 1, || renderer.create_slot(true));
+        assert!(calls > 50, "{calls}");
+        session.set("");
+        drop(renderer);
+        assert_eq!(threads(), before, "threads stay behind");
+        let mut bench = Bench::on(gpu).unwrap();
+        for (i, wanted) in clean().iter().take(3).enumerate() {
+            assert_eq!(&bench.frame(i as u32).unwrap(), wanted);
+        }
+        drop(bench);
+        assert_no_validation_messages();
+    }
 }
