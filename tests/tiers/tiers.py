@@ -115,7 +115,7 @@ def draw(commit, seconds):
     for unit in chosen:
         crate, _, module = unit.partition("::laws::")
         name = crate.split("::")[0]
-        of_file = f"binary(=laws) & test(/(^|::)breadth::{module}::/)" if module else "not binary(=laws) & test(/(^|::)breadth::/)"
+        of_file = f"binary(=laws) & test(/^(breadth::{module}|{module}::breadth)::/)" if module else "not binary(=laws) & test(/(^|::)breadth::/)"
         filters.append(f"(package(={name}) & {of_file})")
     print(" | ".join(filters) or "none()")
 

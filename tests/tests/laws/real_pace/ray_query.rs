@@ -288,7 +288,7 @@ fn a_device_that_traces_rays_itself_finds_what_the_walk_finds() {
     }
     // All of them are made before the first one runs, because they share the driver's manifest.
     let commands: Result<Vec<_>, _> =
-        ["breadth::ray_query::hits_in_a_room", "breadth::ray_query::hits_in_the_demo"]
+        ["real_pace::ray_query::hits_in_a_room", "real_pace::ray_query::hits_in_the_demo"]
             .into_iter()
             .map(on_unpacked_driver)
             .collect();
