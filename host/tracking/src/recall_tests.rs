@@ -323,29 +323,6 @@ fn wandering(seed: u64, [lasts, strength, damping, pull]: [f64; 4]) -> Vec<f64> 
     })
 }
 
-/// Turns anywhere, or half of the time where they were before, starts at any time, and accelerations that wander: at
-/// most 3 % worse than without. `cargo test -p dpm-tracking --lib bodies_that_do_not_repeat -- --nocapture` prints the
-/// table of `docs/lab/PREDICTION.md`.
-#[test]
-fn bodies_that_do_not_repeat_themselves_are_no_worse_off() {
-    type Draw = dyn Fn(u64) -> Vec<f64>;
-    let cases: [(&str, &Draw); 5] = [
-        ("to and fro, each turn anywhere within 0.15 m", &|seed| turns(seed, 1.0)),
-        ("to and fro, every other turn elsewhere", &|seed| turns(seed, 0.5)),
-        ("start and stop at the same places, at rest for 0.1 to 0.5 s", &rests),
-        ("acceleration wandering, 5 m/s2 over 0.1 s", &|seed| wandering(seed, [0.1, 5.0, 10.0, 100.0])),
-        ("acceleration wandering, 3 m/s2 over 0.3 s", &|seed| wandering(seed, [0.3, 3.0, 4.0, 20.0])),
-    ];
-    println!(
-        "| motion, 0.5 m/s and 5 m/s2 where it turns | without the fifth filter | with |\n|---|---|---|"
-    );
-    for (name, path) in cases {
-        let [with, without] = mean(|seed| with_and_without(&path(seed)));
-        println!("| {name} | {:.3} mm | {:.3} mm |", 1e3 * without, 1e3 * with);
-        assert!(with < 1.03 * without, "{with} against {without}: {name}");
-    }
-}
-
 /// The accuracy target at half a metre a second, for every motion at that pace: 0.25 mm at the 99th percentile, from
 /// the first frame on, and so including the passes for which there is no past yet.
 #[test]
@@ -358,5 +335,33 @@ fn misplacement_at_half_a_metre_a_second() {
     {
         let e = evaluate(&spec, PoseFilterConfig::default(), &rig).unwrap();
         assert!(e.position_m.p99 <= 0.25e-3, "{spec:?}: {:?}", e.position_m);
+    }
+}
+
+/// Minutes of motion.
+mod breadth {
+    use super::*;
+
+    /// Turns anywhere, or half of the time where they were before, starts at any time, and accelerations that wander: at
+    /// most 3 % worse than without. `cargo test -p dpm-tracking --lib bodies_that_do_not_repeat -- --nocapture` prints the
+    /// table of `docs/lab/PREDICTION.md`.
+    #[test]
+    fn bodies_that_do_not_repeat_themselves_are_no_worse_off() {
+        type Draw = dyn Fn(u64) -> Vec<f64>;
+        let cases: [(&str, &Draw); 5] = [
+            ("to and fro, each turn anywhere within 0.15 m", &|seed| turns(seed, 1.0)),
+            ("to and fro, every other turn elsewhere", &|seed| turns(seed, 0.5)),
+            ("start and stop at the same places, at rest for 0.1 to 0.5 s", &rests),
+            ("acceleration wandering, 5 m/s2 over 0.1 s", &|seed| wandering(seed, [0.1, 5.0, 10.0, 100.0])),
+            ("acceleration wandering, 3 m/s2 over 0.3 s", &|seed| wandering(seed, [0.3, 3.0, 4.0, 20.0])),
+        ];
+        println!(
+            "| motion, 0.5 m/s and 5 m/s2 where it turns | without the fifth filter | with |\n|---|---|---|"
+        );
+        for (name, path) in cases {
+            let [with, without] = mean(|seed| with_and_without(&path(seed)));
+            println!("| {name} | {:.3} mm | {:.3} mm |", 1e3 * without, 1e3 * with);
+            assert!(with < 1.03 * without, "{with} against {without}: {name}");
+        }
     }
 }

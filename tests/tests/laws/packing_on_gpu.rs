@@ -65,16 +65,21 @@ fn planes_of_gpu_and_cpu_are_the_same_bytes() {
     });
 }
 
-#[test]
-fn light_is_the_same_whoever_packs() {
-    with_gpu(|gpu| {
-        let light = |packer: &str| {
-            // 70 is not a multiple of 8, so rows end within a byte.
-            let rig = demo_rig(70, 48, &[&format!("render.packer=\"{packer}\"")]);
-            let (outcome, _) = run(gpu, &rig, 20, 0);
-            assert_eq!((outcome.light_mismatches, outcome.report.frames_lit), (0, 20));
-            outcome.report.light_hash
-        };
-        assert_eq!(light("gpu"), light("cpu"));
-    });
+/// Whole runs.
+mod breadth {
+    use super::*;
+
+    #[test]
+    fn light_is_the_same_whoever_packs() {
+        with_gpu(|gpu| {
+            let light = |packer: &str| {
+                // 70 is not a multiple of 8, so rows end within a byte.
+                let rig = demo_rig(70, 48, &[&format!("render.packer=\"{packer}\"")]);
+                let (outcome, _) = run(gpu, &rig, 20, 0);
+                assert_eq!((outcome.light_mismatches, outcome.report.frames_lit), (0, 20));
+                outcome.report.light_hash
+            };
+            assert_eq!(light("gpu"), light("cpu"));
+        });
+    }
 }

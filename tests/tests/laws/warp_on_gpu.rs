@@ -314,19 +314,19 @@ fn an_eye_that_follows_sees_noise_sharp_and_one_that_rests_loses_nothing_by_the_
     });
 }
 
-/// The same with hard edges. If bits of rough places came from codes between those of the pixels, patches would err by 0.41
-/// of what they err by if all planes show the middle of the exposure, and if every frame were drawn for the centre of its
-/// light, by 0.29.
-#[test]
-fn an_eye_that_follows_sees_patches_sharp_and_one_that_rests_loses_nothing_by_the_warp() {
-    with_gpu(|gpu| {
-        check_texture(&Card::new(gpu, Pattern::Patches).unwrap(), 0.25, 0.01);
-    });
-}
-
 /// Other motions, and planes that are drawn by themselves for their own instants.
 mod breadth {
     use super::*;
+
+    /// The same with hard edges. If bits of rough places came from codes between those of the pixels, patches would err by 0.41
+    /// of what they err by if all planes show the middle of the exposure, and if every frame were drawn for the centre of its
+    /// light, by 0.29.
+    #[test]
+    fn an_eye_that_follows_sees_patches_sharp_and_one_that_rests_loses_nothing_by_the_warp() {
+        with_gpu(|gpu| {
+            check_texture(&Card::new(gpu, Pattern::Patches).unwrap(), 0.25, 0.01);
+        });
+    }
 
     /// Planes drawn by themselves for their own instants do not do better than warped ones for an eye that rests, but they do
     /// for one that follows. A body that turns is as sharp; at rest nothing changes.

@@ -252,18 +252,6 @@ fn a_shift_in_time_is_corrected_or_refused() {
 }
 
 #[test]
-fn data_from_before_and_after_a_motion_are_refused_by_name() {
-    for (shift, first) in [(0.004, 15), (0.03, 10), (0.1, 15), (0.02, 20)] {
-        let mut sights = aimed(&truth(12), 30, 0.3, 12);
-        sights[first..].iter_mut().for_each(|s| s.world.x += shift);
-        let got = solved(&sights);
-        let Err(Refusal::Moved { last_before, moved_mm, .. }) = got else { panic!("{shift}: {got:?}") };
-        assert!(last_before.abs_diff(first - 1) <= 3, "{last_before} {first}");
-        assert!(moved_mm > 500.0 * shift && moved_mm < 4000.0 * shift + 10.0, "{shift}: {moved_mm}");
-    }
-}
-
-#[test]
 fn numbers_that_are_none_and_pixels_outside_are_refused() {
     let sights = aimed(&truth(13), 12, 0.3, 13);
     assert_eq!(solved(&sights[..5]).unwrap_err(), Refusal::TooFew { have: 5, need: 6 });
@@ -323,5 +311,22 @@ fn a_tilted_lens_needs_terms_that_a_narrow_one_does_not_tell() {
         let told = with_lens(terms, &aimed(&narrow, 400, 0.05, 1)).unwrap_err();
         assert!(matches!(told, Refusal::LensUndetermined { .. }), "{told}");
         assert!(told.to_string().contains("--lens"), "{told}");
+    }
+}
+
+/// Whole sweeps.
+mod breadth {
+    use super::*;
+
+    #[test]
+    fn data_from_before_and_after_a_motion_are_refused_by_name() {
+        for (shift, first) in [(0.004, 15), (0.03, 10), (0.1, 15), (0.02, 20)] {
+            let mut sights = aimed(&truth(12), 30, 0.3, 12);
+            sights[first..].iter_mut().for_each(|s| s.world.x += shift);
+            let got = solved(&sights);
+            let Err(Refusal::Moved { last_before, moved_mm, .. }) = got else { panic!("{shift}: {got:?}") };
+            assert!(last_before.abs_diff(first - 1) <= 3, "{last_before} {first}");
+            assert!(moved_mm > 500.0 * shift && moved_mm < 4000.0 * shift + 10.0, "{shift}: {moved_mm}");
+        }
     }
 }

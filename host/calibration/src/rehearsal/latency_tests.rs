@@ -37,17 +37,6 @@ fn latency(truth: &Truth, known: &ProjectorModel, seed: u64, late_ns: i64) -> Re
 }
 
 #[test]
-fn ten_seconds_tell_the_latency_of_a_known_projector() {
-    for seed in 0..4 {
-        let truth = Truth::draw(seed);
-        let got = latency(&truth, &truth.projector, seed, 0).unwrap();
-        let off = got.latency_ns as f64 - truth.latency_ns;
-        assert!(off.abs() < 50e3 && off.abs() < 4.5 * got.sigma_ns, "{seed}: off by {off} ns, {got:?}");
-        assert!(got.sigma_ns < 50e3, "{got:?}");
-    }
-}
-
-#[test]
 fn a_moved_projector_and_far_clocks_are_refused_by_name() {
     let truth = Truth::draw(5);
     let mut moved = truth.projector;
@@ -57,4 +46,20 @@ fn a_moved_projector_and_far_clocks_are_refused_by_name() {
     assert!(matches!(told, SensorError::OtherProjector { .. }), "{told}");
     let told = latency(&truth, &truth.projector, 5, 70_000_000).unwrap_err();
     assert!(matches!(told, SensorError::LatencyAtBound { .. }), "{told}");
+}
+
+/// Simulated seconds.
+mod breadth {
+    use super::*;
+
+    #[test]
+    fn ten_seconds_tell_the_latency_of_a_known_projector() {
+        for seed in 0..4 {
+            let truth = Truth::draw(seed);
+            let got = latency(&truth, &truth.projector, seed, 0).unwrap();
+            let off = got.latency_ns as f64 - truth.latency_ns;
+            assert!(off.abs() < 50e3 && off.abs() < 4.5 * got.sigma_ns, "{seed}: off by {off} ns, {got:?}");
+            assert!(got.sigma_ns < 50e3, "{got:?}");
+        }
+    }
 }

@@ -244,41 +244,41 @@ fn a_light_that_fades_slowly_is_divided_out_and_a_sudden_change_is_named() {
     assert!(told.contains("changes by") || told.contains("changed by"), "{told}");
 }
 
-/// The light of the whole never changes among tiles, and each tile's level is that of the full field.
-#[test]
-fn levels_in_tiles_are_those_of_the_mock_wherever_the_sensor_lies() {
-    let schedule = PlaneSchedule::rgb24();
-    let at = |x: f64, y: f64| SensorWandConfig { tip_m: [x, y, 0.12], ..bench_config() };
-    let probe = |config: &SensorWandConfig| {
-        let bench = show(Levels::two(&schedule, rate()).unwrap(), config, |_| 1.0);
-        bench.levels.is_on_complement(&bench.showing, &bench.samples, bench.room)
-    };
-    // A tile has 8 x 8 pixels of 10.8 mm; in the middle of the raster four of them meet.
-    assert!(probe(&at(0.0, 0.0)).unwrap_err().contains("neighbouring tiles"));
-    let (one, other) = (at(-0.043, 0.043), at(0.043, 0.043));
-    assert_eq!([probe(&one), probe(&other)], [Ok(true), Ok(false)]);
-    let levels = Levels::new(&schedule, rate(), Field::Tiles { is_exchanged: true }, 4).unwrap();
-    let source = Arc::new(levels.clone());
-    let raster = Raster::new(64, 48).unwrap();
-    let mut painter = PatternPainter::new(source, raster);
-    let mut planes = BitPlaneFrame::new(raster, schedule);
-    for picture in 0..levels.steps.len() as u64 {
-        painter.draw(Kernel::Scalar, picture, &mut planes);
-        assert_eq!(mean_luminance(raster, &schedule, planes.bytes()), FULL_LUMINANCE / 2, "{picture}");
-    }
-    let Bench { levels, showing, samples, room, config, .. } = &show(levels, &one, |_| 1.0);
-    let got = solve(levels, showing, samples, *room).unwrap();
-    for (channel, colour) in config.colours.into_iter().enumerate() {
-        assert!((got.intensity[channel] - colour).abs() < 3e-3, "{:?}", got.intensity);
-        let half = got.level(channel, 128.0 / 255.0) / got.level(channel, 1.0);
-        assert!((half - truth(config, 128)).abs() < 5e-3, "channel {channel}: {half}");
-    }
-    assert_eq!(levels.full_white_s(), 0.0);
-}
-
 /// Simulated minutes.
 mod breadth {
     use super::*;
+
+    /// The light of the whole never changes among tiles, and each tile's level is that of the full field.
+    #[test]
+    fn levels_in_tiles_are_those_of_the_mock_wherever_the_sensor_lies() {
+        let schedule = PlaneSchedule::rgb24();
+        let at = |x: f64, y: f64| SensorWandConfig { tip_m: [x, y, 0.12], ..bench_config() };
+        let probe = |config: &SensorWandConfig| {
+            let bench = show(Levels::two(&schedule, rate()).unwrap(), config, |_| 1.0);
+            bench.levels.is_on_complement(&bench.showing, &bench.samples, bench.room)
+        };
+        // A tile has 8 x 8 pixels of 10.8 mm; in the middle of the raster four of them meet.
+        assert!(probe(&at(0.0, 0.0)).unwrap_err().contains("neighbouring tiles"));
+        let (one, other) = (at(-0.043, 0.043), at(0.043, 0.043));
+        assert_eq!([probe(&one), probe(&other)], [Ok(true), Ok(false)]);
+        let levels = Levels::new(&schedule, rate(), Field::Tiles { is_exchanged: true }, 4).unwrap();
+        let source = Arc::new(levels.clone());
+        let raster = Raster::new(64, 48).unwrap();
+        let mut painter = PatternPainter::new(source, raster);
+        let mut planes = BitPlaneFrame::new(raster, schedule);
+        for picture in 0..levels.steps.len() as u64 {
+            painter.draw(Kernel::Scalar, picture, &mut planes);
+            assert_eq!(mean_luminance(raster, &schedule, planes.bytes()), FULL_LUMINANCE / 2, "{picture}");
+        }
+        let Bench { levels, showing, samples, room, config, .. } = &show(levels, &one, |_| 1.0);
+        let got = solve(levels, showing, samples, *room).unwrap();
+        for (channel, colour) in config.colours.into_iter().enumerate() {
+            assert!((got.intensity[channel] - colour).abs() < 3e-3, "{:?}", got.intensity);
+            let half = got.level(channel, 128.0 / 255.0) / got.level(channel, 1.0);
+            assert!((half - truth(config, 128)).abs() < 5e-3, "channel {channel}: {half}");
+        }
+        assert_eq!(levels.full_white_s(), 0.0);
+    }
 
     #[test]
     fn the_limit_of_flashes_is_kept_by_the_limiter_itself() {

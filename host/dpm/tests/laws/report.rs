@@ -76,27 +76,6 @@ fn a_profile_is_a_page_with_its_latencies_and_missed_slots() {
     assert_eq!(self::page(&dir).0.matches("<svg").count(), 4);
 }
 
-#[test]
-fn a_run_and_a_bench_are_pages_with_pictures_and_tables() {
-    let folder = Folder::new("report-run");
-    let run = measured(&folder, "run", &["demo", "--raster", "48x32", "--frames", "6"]);
-    let (page_of_run, _) = page(&run);
-    for part in [
-        "data:image/png;base64,",
-        "light.png",
-        "registration error, px",
-        "0 of 6 slots were missed",
-        "gpu trace",
-    ] {
-        assert!(page_of_run.contains(part), "{part}");
-    }
-    let bench =
-        measured(&folder, "bench", &["bench", "--raster", "48x32", "--count", "3", "--method", "full"]);
-    let (page_of_bench, tables) = page(&bench);
-    assert!(page_of_bench.contains("Bench: methods") && page_of_bench.contains("config hash"));
-    assert!(tables.iter().any(|path| path.ends_with("bench-methods.csv")), "{tables:?}");
-}
-
 /// Owners of GPUs send files in; a page of a folder of them sets each beside the model.
 #[test]
 fn reports_of_several_machines_stand_beside_the_model() {
@@ -173,4 +152,30 @@ fn what_others_put_beside_a_result_is_left_out_by_name() {
     assert!(out(&output).contains("evil.svg is not on this page"), "{}", out(&output));
     let page = std::fs::read_to_string(dir.join("report.html")).expect("a page");
     assert!(page.contains("evil.svg is not on this page") && !page.contains("<script"));
+}
+
+/// Whole reports.
+mod breadth {
+    use super::*;
+
+    #[test]
+    fn a_run_and_a_bench_are_pages_with_pictures_and_tables() {
+        let folder = Folder::new("report-run");
+        let run = measured(&folder, "run", &["demo", "--raster", "48x32", "--frames", "6"]);
+        let (page_of_run, _) = page(&run);
+        for part in [
+            "data:image/png;base64,",
+            "light.png",
+            "registration error, px",
+            "0 of 6 slots were missed",
+            "gpu trace",
+        ] {
+            assert!(page_of_run.contains(part), "{part}");
+        }
+        let bench =
+            measured(&folder, "bench", &["bench", "--raster", "48x32", "--count", "3", "--method", "full"]);
+        let (page_of_bench, tables) = page(&bench);
+        assert!(page_of_bench.contains("Bench: methods") && page_of_bench.contains("config hash"));
+        assert!(tables.iter().any(|path| path.ends_with("bench-methods.csv")), "{tables:?}");
+    }
 }

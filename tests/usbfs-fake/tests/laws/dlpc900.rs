@@ -40,32 +40,6 @@ fn projector() -> Projector {
 }
 
 #[test]
-fn an_upload_through_libusb_ends_up_on_the_mirrors() {
-    // As on a desktop: the kernel's HID driver holds the device and must be detached; two interfaces enumerate.
-    let options = Options { kernel_driver: Some("usbhid".into()), ..Options::default() };
-    let b = bench(Projector { interfaces: 2, ..projector() }, options);
-    let mut d = Dlpc900::new(b.open().unwrap()).unwrap();
-    let raster = Dmd::Dlp5500.raster();
-    let planes: Vec<Vec<u8>> = (0..26usize)
-        .map(|p| (0..raster.plane_bytes()).map(|i| ((i * (2 * p + 1)) >> (i % 5)) as u8).collect())
-        .collect();
-    let mut s = SequenceBuilder::new(Dmd::Dlp5500);
-    planes.iter().for_each(|p| s.push(&Pattern::white(vec![p], 500)));
-    let s = s.finish(Repeat::Forever, PlaneOrder::default(), None).unwrap();
-    let start = Instant::now();
-    d.upload(&s, LedSetup::default(), &mut |_| ()).unwrap();
-    let rate = s.image_bytes() as f64 / start.elapsed().as_secs_f64() / 1e6;
-    println!("{} image bytes through libusb: {rate:.1} MB/s", s.image_bytes());
-    d.start().unwrap();
-    let m = b.model.lock().unwrap();
-    for (i, p) in planes.iter().enumerate() {
-        assert!(m.projected_plane(i).unwrap() == *p, "plane {i}");
-    }
-    assert_eq!(m.warnings(), [] as [String; 0]);
-    assert_eq!(m.dropped_reports(), 0);
-}
-
-#[test]
 fn every_controller_on_the_bus_is_listed_and_the_right_one_opened() {
     let (a, b) = (bench(projector(), Options::default()), bench(projector(), Options::default()));
     let places = usb::list().unwrap();
@@ -165,4 +139,35 @@ fn round_trips_are_quick_enough_for_uploads() {
     took.sort();
     println!("64 bytes out and back: median {:?}, worst {:?}", took[250], took[499]);
     assert!(took[250] < Duration::from_millis(5));
+}
+
+/// Whole uploads.
+mod breadth {
+    use super::*;
+
+    #[test]
+    fn an_upload_through_libusb_ends_up_on_the_mirrors() {
+        // As on a desktop: the kernel's HID driver holds the device and must be detached; two interfaces enumerate.
+        let options = Options { kernel_driver: Some("usbhid".into()), ..Options::default() };
+        let b = bench(Projector { interfaces: 2, ..projector() }, options);
+        let mut d = Dlpc900::new(b.open().unwrap()).unwrap();
+        let raster = Dmd::Dlp5500.raster();
+        let planes: Vec<Vec<u8>> = (0..26usize)
+            .map(|p| (0..raster.plane_bytes()).map(|i| ((i * (2 * p + 1)) >> (i % 5)) as u8).collect())
+            .collect();
+        let mut s = SequenceBuilder::new(Dmd::Dlp5500);
+        planes.iter().for_each(|p| s.push(&Pattern::white(vec![p], 500)));
+        let s = s.finish(Repeat::Forever, PlaneOrder::default(), None).unwrap();
+        let start = Instant::now();
+        d.upload(&s, LedSetup::default(), &mut |_| ()).unwrap();
+        let rate = s.image_bytes() as f64 / start.elapsed().as_secs_f64() / 1e6;
+        println!("{} image bytes through libusb: {rate:.1} MB/s", s.image_bytes());
+        d.start().unwrap();
+        let m = b.model.lock().unwrap();
+        for (i, p) in planes.iter().enumerate() {
+            assert!(m.projected_plane(i).unwrap() == *p, "plane {i}");
+        }
+        assert_eq!(m.warnings(), [] as [String; 0]);
+        assert_eq!(m.dropped_reports(), 0);
+    }
 }

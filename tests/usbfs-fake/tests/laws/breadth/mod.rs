@@ -1,0 +1,3 @@
+//! The second tier: breadth and repetition of what the commit tier holds once.
+
+mod plug_cycles;
