@@ -3,7 +3,7 @@
 
     python3 packaging/third-party.py
 
-Run it after every change of Cargo.lock; `cargo test -p dpm-device --test laws third_party` fails until it was.
+Run it after every change of Cargo.lock; `./x test third_party` fails until it was.
 """
 
 import json
