@@ -448,6 +448,7 @@ impl HostLink {
             late_slots: s.late_slots,
             limits: s.limits,
             tracks: self.greatest_shift().is_some(),
+            timing: self.measures_timing(),
             epoch: self.slots.map_or(DeviceTicks(0), |c| c.epoch()),
         }
     }
@@ -460,6 +461,11 @@ impl HostLink {
     /// By how many mirrors the device moves regions at most; `None` if it follows no tracks, or is not asked to.
     pub fn greatest_shift(&self) -> Option<u8> {
         self.inbox.hello?.greatest_shift.filter(|_| self.wants_tracks)
+    }
+
+    /// True if the device reports how early frames are whole.
+    pub fn measures_timing(&self) -> bool {
+        self.inbox.hello.is_some_and(|hello| hello.measures_timing)
     }
 
     /// Sends `tracks` under the next number of this session. They are only sent while frames are, and never repeated:

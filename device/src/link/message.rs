@@ -13,8 +13,8 @@ use crate::packet::{u16_at, u32_at, u64_at, Header, MessageType, MAX_CONTROL_BYT
 use crate::planes::{PlaneSchedule, PlaneSpec, Raster, MAX_PLANES};
 use crate::time::{DeviceTicks, FrameRate};
 pub use types::{
-    faults, Commit, Config, ConfigRefusal, DeviceHello, DeviceState, Echo, Fault, FaultCode, HostHello,
-    Status, TrackCounts, Underrun, MAX_WATCHDOG_US,
+    faults, Commit, Config, ConfigRefusal, DeviceHello, DeviceState, Echo, Fault, FaultCode, FrameTiming,
+    HostHello, Status, TrackCounts, Underrun, MAX_WATCHDOG_US,
 };
 
 /// Length of a CONFIG's payload before the LED codes of its planes.
@@ -143,12 +143,18 @@ fn write_echo(w: &mut Writer<'_>, e: &Echo) {
 const CODES_REPEAT: u8 = 1;
 /// Flag of CONFIG: the host sends TRACKS, and the device follows them and says so in STATUS.
 const FOLLOWS: u8 = 2;
+/// Flag of CONFIG: STATUS reports how early frames are whole.
+const TIMES: u8 = 8;
 /// Flag of CONFIG: the planes share the full light of a frame among them.
 const FILLS: u8 = 4;
 /// Feature of a device in HELLO: it follows TRACKS.
 const FEATURE_TRACKS: u8 = 1;
-/// Length of a STATUS, and of one of a device that follows tracks.
-const STATUS_BYTES: [usize; 2] = [96, 120];
+/// The same: it measures how early frames are whole.
+const FEATURE_TIMING: u8 = 2;
+/// Length of a STATUS without the parts that CONFIG may ask for, and of each of them, in the order in which they follow.
+const STATUS_BYTES: usize = 96;
+const TRACKS_BYTES: usize = 24;
+const TIMING_BYTES: usize = 16;
 
 /// The planes of a CONFIG with `flags`; `None` if codes stand there that the flags do not allow.
 fn schedule(planes: &[PlaneSpec], flags: u8) -> Option<PlaneSchedule> {
@@ -176,7 +182,7 @@ impl Config {
         for (spec, &code) in specs.iter_mut().zip(&p[CONFIG_BYTES..]) {
             *spec = PlaneSpec::from_led_code(code).ok_or(field("led codes"))?;
         }
-        if p[19] & !(CODES_REPEAT | FOLLOWS | FILLS) != 0 {
+        if p[19] & !(CODES_REPEAT | FOLLOWS | FILLS | TIMES) != 0 {
             return Err(field("flags"));
         }
         let watchdog_us = u32_at(p, 12);
@@ -205,6 +211,7 @@ impl Config {
             epoch: DeviceTicks(u64_at(p, 24)),
             limits,
             tracks: p[19] & FOLLOWS != 0,
+            timing: p[19] & TIMES != 0,
         })
     }
 
@@ -215,6 +222,7 @@ impl Config {
         let flag = |is_set: bool, flag: u8| if is_set { flag } else { 0 };
         w.u8(flag(self.schedule.has_repeats(), CODES_REPEAT)
             | flag(self.tracks, FOLLOWS)
+            | flag(self.timing, TIMES)
             | flag(self.schedule.fills(), FILLS));
         w.u16(self.limits.mean_permille).u16(0).u64(self.epoch.0);
         w.u32(self.limits.window_ms).u32(self.limits.full_white_ms);
@@ -239,6 +247,16 @@ impl TrackCounts {
     fn write(&self, w: &mut Writer<'_>) {
         w.u32(self.taken).u32(self.refused).u32(self.planes_moved);
         w.u32(self.planes_clamped).u32(self.planes_stale).u32(self.greatest_age);
+    }
+}
+
+impl FrameTiming {
+    fn parse(p: &[u8]) -> Self {
+        Self { frame: u32_at(p, 0), slack_ns: u32_at(p, 4) as i32, transfer_ns: u32_at(p, 8) }
+    }
+
+    fn write(&self, w: &mut Writer<'_>) {
+        w.u32(self.frame).u32(self.slack_ns as u32).u32(self.transfer_ns).u32(0);
     }
 }
 
@@ -351,6 +369,7 @@ impl DeviceMessage {
                     max_planes: p[12],
                     frame_buffers: p[13],
                     greatest_shift: (p[14] & FEATURE_TRACKS != 0).then_some(p[15]),
+                    measures_timing: p[14] & FEATURE_TIMING != 0,
                     tick_hz: u32_at(p, 16),
                     min_plane_ns: u32_at(p, 20),
                     serial: u64_at(p, 24),
@@ -358,9 +377,12 @@ impl DeviceMessage {
                 })
             }
             MessageType::Status => {
-                let [short, long] = STATUS_BYTES;
-                let follows = p.len() == long;
-                expect_len(kind, p, if follows { long } else { short })?;
+                // No two combinations of parts are equally long.
+                let more = p.len().saturating_sub(STATUS_BYTES);
+                let follows = more == TRACKS_BYTES || more == TRACKS_BYTES + TIMING_BYTES;
+                let times = more == TIMING_BYTES || more == TRACKS_BYTES + TIMING_BYTES;
+                let tracks_end = STATUS_BYTES + if follows { TRACKS_BYTES } else { 0 };
+                expect_len(kind, p, tracks_end + if times { TIMING_BYTES } else { 0 })?;
                 Self::Status(Status {
                     state: DeviceState::from_code(p[0]).ok_or(field("state"))?,
                     lit: p[1] & 1 != 0,
@@ -387,7 +409,8 @@ impl DeviceMessage {
                     payload_errors: u32_at(p, 84),
                     packets_ignored: u32_at(p, 88),
                     bytes_skipped: u32_at(p, 92),
-                    tracks: follows.then(|| TrackCounts::parse(&p[short..])),
+                    tracks: follows.then(|| TrackCounts::parse(&p[STATUS_BYTES..])),
+                    timing: times.then(|| FrameTiming::parse(&p[tracks_end..])),
                 })
             }
             MessageType::Echo => Self::Echo(echo(p)?),
@@ -418,7 +441,9 @@ impl DeviceMessage {
                 w.u16(h.version).u16(h.firmware).u32(h.codecs);
                 w.u16(h.raster.width() as u16).u16(h.raster.height() as u16);
                 w.u8(h.max_planes).u8(h.frame_buffers);
-                w.u8(h.greatest_shift.map_or(0, |_| FEATURE_TRACKS)).u8(h.greatest_shift.unwrap_or(0));
+                let follows = h.greatest_shift.map_or(0, |_| FEATURE_TRACKS);
+                let measures = if h.measures_timing { FEATURE_TIMING } else { 0 };
+                w.u8(follows | measures).u8(h.greatest_shift.unwrap_or(0));
                 w.u32(h.tick_hz).u32(h.min_plane_ns).u64(h.serial).u64(h.now.0);
                 MessageType::Hello
             }
@@ -446,6 +471,9 @@ impl DeviceMessage {
                 }
                 if let Some(counts) = &s.tracks {
                     counts.write(&mut w);
+                }
+                if let Some(timing) = &s.timing {
+                    timing.write(&mut w);
                 }
                 MessageType::Status
             }

@@ -41,8 +41,8 @@ pub use limits::{
 pub use measure::{measure, LinkMeasurement};
 pub use message::{
     faults, Assembly, Commit, Config, ConfigRefusal, DeviceHello, DeviceMessage, DeviceState, Echo, Fault,
-    FaultCode, HostHello, HostMessage, PayloadError, Status, TrackCounts, Underrun, COMMIT_BYTES,
-    MAX_WATCHDOG_US,
+    FaultCode, FrameTiming, HostHello, HostMessage, PayloadError, Status, TrackCounts, Underrun,
+    COMMIT_BYTES, MAX_WATCHDOG_US,
 };
 #[cfg(feature = "std")]
 pub use session::SessionNumbers;

@@ -43,6 +43,8 @@ pub struct FirmwareConfig {
     /// By how many mirrors it moves regions of planes at most as TRACKS say, at most [`crate::link::MAX_SHIFT`]; `None` if
     /// it follows no tracks.
     pub greatest_shift: Option<u8>,
+    /// It measures how early frames are whole. Firmware 1.0 did not.
+    pub measures_timing: bool,
     /// Lit slots of which the shifts are kept for [`super::ProjectorFirmware::next_moves`]; when full, the oldest are
     /// dropped and counted with the light events.
     pub moves_kept: usize,
@@ -76,13 +78,14 @@ impl FirmwareConfig {
             settle_ns: 0,
             codecs: Codec::ALL,
             serial: 1,
-            firmware: 0x0100,
+            firmware: 0x0101,
             version: u16::from(VERSION),
             flash_limit: Some(MAX_FLASHES_PER_S),
             limits: LightLimits::OFF,
             events_kept: 4096,
             shown_kept: 0,
             greatest_shift: None,
+            measures_timing: true,
             moves_kept: 0,
         }
     }

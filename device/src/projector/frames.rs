@@ -7,6 +7,8 @@ use crate::time::DeviceTicks;
 pub(super) struct Assembling {
     pub frame: u32,
     pub target_at: DeviceTicks,
+    /// When its first packet arrived.
+    pub begun_at: DeviceTicks,
     /// Bit k: plane k arrived intact.
     pub received: u32,
     /// A plane was decoded against the base frame.

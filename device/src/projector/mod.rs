@@ -23,8 +23,8 @@ mod thread;
 use std::collections::VecDeque;
 
 use crate::link::{
-    faults, Codec, Config, Decoder, DecoderCounters, DeviceMessage, DeviceState, Echo, Fault, FaultCode,
-    FlashLimiter, Header, Packet, SlotClock, Status, MAX_CONTROL_BYTES,
+    faults, packet_bytes, Codec, Config, Decoder, DecoderCounters, DeviceMessage, DeviceState, Echo, Fault,
+    FaultCode, FlashLimiter, Header, Packet, SlotClock, Status, MAX_CONTROL_BYTES,
 };
 use crate::planes::{Raster, MAX_PLANES};
 use crate::time::{DeviceTicks, HostTime};
@@ -131,35 +131,6 @@ struct Core {
     counted_before: DecoderCounters,
 }
 
-const NO_STATUS: Status = Status {
-    state: DeviceState::Idle,
-    lit: false,
-    last_plane: 0,
-    buffers_free: 0,
-    faults: 0,
-    frame_limit: 0,
-    frames_accounted: 0,
-    last_whole_frame: 0,
-    last_lit_frame: 0,
-    last_lit_at: DeviceTicks(0),
-    now: DeviceTicks(0),
-    slots: 0,
-    frames_seen: 0,
-    frames_lit: 0,
-    slots_repeated: 0,
-    slots_blank: 0,
-    frames_incomplete: 0,
-    frames_late: 0,
-    frames_superseded: 0,
-    frames_refused: 0,
-    packets: 0,
-    header_errors: 0,
-    payload_errors: 0,
-    packets_ignored: 0,
-    bytes_skipped: 0,
-    tracks: None,
-};
-
 impl ProjectorFirmware {
     /// A projector that was just powered on. It allocates all its buffers here.
     ///
@@ -196,7 +167,7 @@ impl ProjectorFirmware {
                 panel_busy: false,
                 untaken: None,
                 last_seen_frame: None,
-                status: NO_STATUS,
+                status: Status::default(),
                 credit_violations: 0,
                 incoming: Default::default(),
                 events: VecDeque::with_capacity(setup.events_kept),
@@ -460,7 +431,7 @@ impl LinkDevice for ProjectorFirmware {
             let mut payload = [0u8; MAX_CONTROL_BYTES];
             let (kind, n) = message.write(&mut payload);
             let packet = Packet::new(Header::control(kind, session, 0), &payload[..n]);
-            let mut wire = [0u8; 160];
+            let mut wire = [0u8; packet_bytes(MAX_CONTROL_BYTES)];
             let mut at = 0;
             for part in packet.parts() {
                 wire[at..at + part.len()].copy_from_slice(part);

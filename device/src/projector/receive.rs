@@ -1,8 +1,8 @@
 //! Applies packets to the projector's state, with every check between a byte and light.
 
 use crate::link::{
-    frame_newer, Assembly, Codec, Commit, ConfigRefusal, Echo, FaultCode, Header, HostMessage, MessageType,
-    PacketSink, RleDecoder,
+    frame_newer, Assembly, Codec, Commit, ConfigRefusal, Echo, FaultCode, FrameTiming, Header, HostMessage,
+    MessageType, PacketSink, RleDecoder, SlotClock,
 };
 use crate::time::DeviceTicks;
 use crate::transport::Lane;
@@ -210,6 +210,7 @@ impl Core {
         self.store.assembling = Some(Assembling {
             frame: header.frame,
             target_at: header.target_at,
+            begun_at: self.ticks(),
             received: 0,
             uses_base: false,
             buffer: if refused { None } else { Some(self.store.free_buffer()) },
@@ -380,6 +381,18 @@ impl Core {
         true
     }
 
+    /// Notes for STATUS how early the frame is whole.
+    fn time(&mut self, frame: &Assembling, slots: &SlotClock) {
+        let (now, tick_hz) = (self.ticks(), i128::from(self.setup.clock.tick_hz));
+        let begin = slots.start(slots.slot_at(frame.target_at).unwrap_or(0));
+        let ns = |from: DeviceTicks, to: DeviceTicks| {
+            (i128::from(to.0) - i128::from(from.0)) * 1_000_000_000 / tick_hz
+        };
+        let slack_ns = ns(now, begin).clamp(i32::MIN.into(), i32::MAX.into()) as i32;
+        let transfer_ns = ns(frame.begun_at, now).clamp(0, u32::MAX.into()) as u32;
+        self.status.timing = Some(FrameTiming { frame: frame.frame, slack_ns, transfer_ns });
+    }
+
     /// Queues a whole frame for its slot, or drops it as too late or too early.
     fn schedule(&mut self, frame: &Assembling, dark_from: DeviceTicks, buffer: usize) {
         let Some((config, slots)) = self.config else { return };
@@ -387,6 +400,7 @@ impl Core {
         if frame.target_at > DeviceTicks(self.ticks().0.saturating_add(lead)) {
             return self.refuse();
         }
+        self.time(frame, &slots);
         let target = slots.slot_at(frame.target_at).unwrap_or(0);
         let late = self.next_slot.saturating_sub(target);
         if late > u64::from(config.late_slots) || dark_from <= self.ticks() {

@@ -1,7 +1,7 @@
 //! A session from HELLO over CONFIG to ARM, and what ends its light.
 
-use super::{Core, Mode, CHECKSUM_STORM, NO_STATUS};
-use crate::link::{faults, Config, ConfigRefusal, Fault, FaultCode, FlashLimiter, SlotClock};
+use super::{Core, Mode, CHECKSUM_STORM};
+use crate::link::{faults, Config, ConfigRefusal, Fault, FaultCode, FlashLimiter, SlotClock, Status};
 
 impl Core {
     /// Goes dark and drops every frame in flight.
@@ -49,7 +49,7 @@ impl Core {
         self.session = session;
         self.config = None;
         self.last_seen_frame = None;
-        self.status = NO_STATUS;
+        self.status = Status::default();
         self.following.new_session();
         self.counters_due = true;
     }

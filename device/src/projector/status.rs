@@ -28,6 +28,7 @@ impl Core {
             max_planes: self.setup.max_planes,
             frame_buffers: self.setup.frame_buffers,
             greatest_shift: self.setup.greatest_shift,
+            measures_timing: self.setup.measures_timing,
             tick_hz: self.setup.clock.tick_hz,
             min_plane_ns: self.setup.min_plane_ns,
             serial: self.setup.serial,
@@ -67,8 +68,14 @@ impl Core {
                 .wrapping_add(all.foreign.wrapping_sub(before.foreign)),
             bytes_skipped: all.bytes_skipped.wrapping_sub(before.bytes_skipped),
             tracks: self.track_counts(),
+            timing: self.times().then(|| self.status.timing.unwrap_or_default()),
             ..self.status
         }
+    }
+
+    /// True if CONFIG asked for timing and this projector measures it.
+    fn times(&self) -> bool {
+        self.setup.measures_timing && self.config.as_ref().is_some_and(|(config, _)| config.timing)
     }
 
     /// The frame up to which the host has credit.

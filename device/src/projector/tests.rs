@@ -8,6 +8,7 @@ mod limits;
 mod panel;
 mod protocol;
 mod safety;
+mod timing;
 
 use super::*;
 use crate::link::{

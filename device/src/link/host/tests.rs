@@ -77,6 +77,7 @@ fn hello() -> DeviceMessage {
         max_planes: 8,
         frame_buffers: 2,
         greatest_shift: None,
+        measures_timing: false,
         tick_hz: 1_000_000,
         min_plane_ns: 1000,
         serial: 0,

@@ -44,6 +44,7 @@ fn golden_messages_of_the_host() {
             epoch: DeviceTicks(0x0102_0304_0506_0708),
             limits: LightLimits { mean_permille: 300, window_ms: 10_000, full_white_ms: 70_000 },
             tracks: false,
+            timing: false,
         }),
         MessageType::Config,
         "0004 0003 60ea0000 e9030000 50c30000 03 01 02 00 2c01 0000 0807060504030201 10270000 70110100 07 10 33",
@@ -167,6 +168,7 @@ fn an_led_code_may_repeat_only_where_the_flag_says_so() {
         epoch: DeviceTicks(0),
         limits: LightLimits::OFF,
         tracks: false,
+        timing: false,
     };
     let mut out = [0; MAX_CONTROL_BYTES];
     let (kind, n) = HostMessage::Config(config).write(&mut out);
@@ -185,7 +187,7 @@ fn an_led_code_may_repeat_only_where_the_flag_says_so() {
     assert_eq!(again[..n], out[..n]);
     out[19] = 4;
     assert!(HostMessage::parse(kind, &out[..n]).is_err(), "a code twice without its flag");
-    out[19] = 9;
+    out[19] = 17;
     assert!(HostMessage::parse(kind, &out[..n]).is_err(), "a flag without a meaning");
     assert!(PlaneSchedule::with_repeats(&[equal[0]; 4]).is_none());
     assert!(PlaneSchedule::equal24().has_repeats() && !PlaneSchedule::rgb24().has_repeats());
@@ -203,6 +205,7 @@ fn golden_messages_of_the_device() {
             max_planes: 24,
             frame_buffers: 4,
             greatest_shift: None,
+            measures_timing: false,
             tick_hz: 1_000_000_000,
             min_plane_ns: 44_000,
             serial: 0x1122_3344_5566_7788,
@@ -239,12 +242,33 @@ fn golden_messages_of_the_device() {
             packets_ignored: 13,
             bytes_skipped: 14,
             tracks: None,
+            timing: None,
         }),
         MessageType::Status,
         "06 01 17 02 05000000 04000000 03000000 0d0c0b0a 0c0c0b0a 0101010101010101 0202020202020202
          01000000 02000000 03000000 04000000 05000000 06000000 07000000 08000000 09000000 0a000000 0b000000
          0c000000 0d000000 0e000000",
     );
+    let timing = FrameTiming { frame: 0x0a0b_0c0d, slack_ns: -2, transfer_ns: 0x0102_0304 };
+    let tracks = TrackCounts {
+        taken: 1,
+        refused: 2,
+        planes_moved: 3,
+        planes_clamped: 4,
+        planes_stale: 5,
+        greatest_age: 6,
+    };
+    let moved = "01000000 02000000 03000000 04000000 05000000 06000000";
+    let timed = "0d0c0b0a feffffff 04030201 00000000";
+    for (tracks, timing, more) in [
+        (Some(tracks), None, moved.to_owned()),
+        (None, Some(timing), timed.to_owned()),
+        (Some(tracks), Some(timing), format!("{moved} {timed}")),
+    ] {
+        let status = Status { tracks, timing, ..Status::default() };
+        let nothing = "00 00 00 00".repeat(24);
+        device(DeviceMessage::Status(status), MessageType::Status, &format!("{nothing} {more}"));
+    }
     device(
         DeviceMessage::Echo(Echo {
             host_sent_ns: 1,

@@ -29,6 +29,8 @@ pub mod faults {
     /// Those that say something about a host or a cable alone. Light may come back after them without the operator; heat, lamp,
     /// emergency stop and flashes have to be acknowledged.
     pub const PASSING: u32 = WATCHDOG | CHECKSUM_STORM;
+    /// Those that frames cause: what they showed exceeded a limit.
+    pub const OF_FRAMES: u32 = FLASH_LIMIT | LIGHT_LIMIT;
 
     /// Names of the faults in `mask`, for messages: `"watchdog, lamp"`; `"none"` when empty.
     #[cfg(feature = "std")]
@@ -88,6 +90,8 @@ pub struct DeviceHello {
     pub frame_buffers: u8,
     /// By how many mirrors it moves regions of planes at most as TRACKS say; `None` if it follows no TRACKS.
     pub greatest_shift: Option<u8>,
+    /// It measures how early frames are whole, and reports it if CONFIG asks.
+    pub measures_timing: bool,
     /// Nominal ticks a second of the device's clock.
     pub tick_hz: u32,
     /// Shortest time one plane can be shown, nanoseconds.
@@ -129,6 +133,8 @@ pub struct Config {
     pub limits: LightLimits,
     /// The host sends TRACKS. Only for a device that follows them.
     pub tracks: bool,
+    /// STATUS reports how early frames are whole. Only for a device that measures it.
+    pub timing: bool,
 }
 
 /// FRAME_COMMIT: the end of a frame and how it is composed.
@@ -156,10 +162,11 @@ impl Commit {
 }
 
 /// State of the device as STATUS reports it.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 #[repr(u8)]
 pub enum DeviceState {
     /// No session. Dark.
+    #[default]
     Idle = 0,
     /// Session open, not configured. Dark.
     Greeted = 1,
@@ -191,7 +198,7 @@ impl DeviceState {
 }
 
 /// STATUS: counters are absolute since the session opened and wrap at 2^32, so a lost STATUS costs nothing.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct Status {
     /// State.
     pub state: DeviceState,
@@ -246,6 +253,21 @@ pub struct Status {
     pub bytes_skipped: u32,
     /// What became of TRACKS; `None` unless CONFIG asked for them.
     pub tracks: Option<TrackCounts>,
+    /// How early the newest frame was whole; `None` unless CONFIG asked for it.
+    pub timing: Option<FrameTiming>,
+}
+
+/// How early a frame was whole, in STATUS of a device that measures it. Zeros before the first frame of a session.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct FrameTiming {
+    /// The newest frame that was whole and whose slot was in reach. A frame that came too late for its slot counts.
+    pub frame: u32,
+    /// From the instant at which it was whole to the beginning of its slot, nanoseconds; negative for a frame that came
+    /// late. Limited to the range of the type.
+    pub slack_ns: i32,
+    /// From the arrival of its first packet to the instant at which it was whole, nanoseconds. Limited to the range of
+    /// the type.
+    pub transfer_ns: u32,
 }
 
 /// Counters of a device that follows TRACKS, in STATUS.

@@ -16,6 +16,7 @@ mod safety;
 mod session;
 mod shot;
 mod time;
+mod timing;
 mod tracks;
 mod watchdog;
 
@@ -76,6 +77,7 @@ pub fn rules() -> impl Iterator<Item = &'static Rule> {
         codecs::RULES,
         packets::RULES,
         safety::RULES,
+        timing::RULES,
         tracks::RULES,
         time::RULES,
     ]

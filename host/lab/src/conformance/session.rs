@@ -56,6 +56,7 @@ impl Bench<'_> {
             epoch: DeviceTicks(hello.now.0 + ahead),
             limits: LightLimits::OFF,
             tracks: false,
+            timing: false,
         })
     }
 
