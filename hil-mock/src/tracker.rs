@@ -444,6 +444,10 @@ impl Tracker for MockTracker {
         }
         text
     }
+
+    fn gate(&self) -> Option<&SampleGate> {
+        Some(&self.gate)
+    }
 }
 
 #[cfg(test)]

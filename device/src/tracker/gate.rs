@@ -124,8 +124,22 @@ impl core::fmt::Display for TrackerCounters {
     }
 }
 
+/// Counts of the samples of one body since the gate was made. Counters only grow.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct BodyCounters {
+    /// Passed on.
+    pub used: u64,
+    /// Missing according to their sequence numbers, including those that came late.
+    pub lost: u64,
+    /// Captured before a sample that was already passed on: overtaken on the way.
+    pub late: u64,
+    /// Already seen.
+    pub duplicate: u64,
+}
+
 #[derive(Clone, Copy)]
 struct BodyState {
+    counters: BodyCounters,
     last: Option<TrackerSample>,
     /// Consecutive samples captured before `last`, each newer than the previous one: the sign of a clock that was set
     /// back.
@@ -162,6 +176,7 @@ impl SampleGate {
     /// A gate for bodies `0..bodies`.
     pub fn new(bodies: usize) -> Self {
         let fresh = BodyState {
+            counters: BodyCounters::default(),
             last: None,
             late_run: 0,
             late_first: (HostTime(i64::MIN), HostTime(i64::MIN)),
@@ -175,6 +190,11 @@ impl SampleGate {
     /// The counters so far.
     pub fn counters(&self) -> &TrackerCounters {
         &self.counters
+    }
+
+    /// The counters of `body`; zeros for one that the gate does not have.
+    pub fn body_counters(&self, body: BodyIndex) -> BodyCounters {
+        self.bodies.get(usize::from(body.0)).map_or(BodyCounters::default(), |state| state.counters)
     }
 
     /// The packet counters, for the client in front of this gate.
@@ -241,6 +261,7 @@ impl SampleGate {
             if sample.captured_at <= last.captured_at {
                 if sample.sequence == last.sequence && sample.captured_at == last.captured_at {
                     counters.samples.duplicate += 1;
+                    state.counters.duplicate += 1;
                     return None;
                 }
                 if state.late_run > 0 && sample.captured_at > state.late_newest {
@@ -260,6 +281,7 @@ impl SampleGate {
                 }
                 if state.late_run < Self::RESTART_RUN || quiet_ns < Self::RESTART_QUIET_NS {
                     counters.samples.late += 1;
+                    state.counters.late += 1;
                     return None;
                 }
                 counters.restarts += 1;
@@ -268,7 +290,10 @@ impl SampleGate {
                     // Equal numbers with a newer capture: a source without sequence numbers (VRPN), or one that
                     // restarted at the same number.
                     0 | 1 => {}
-                    gap if gap - 1 <= Self::MAX_GAP => counters.lost += u64::from(gap - 1),
+                    gap if gap - 1 <= Self::MAX_GAP => {
+                        counters.lost += u64::from(gap - 1);
+                        state.counters.lost += u64::from(gap - 1);
+                    }
                     _ => counters.restarts += 1,
                 }
             }
@@ -278,6 +303,7 @@ impl SampleGate {
         state.late_newest = HostTime(i64::MIN);
         state.last = Some(sample);
         counters.samples.used += 1;
+        state.counters.used += 1;
         counters.untracked += u64::from(!sample.tracked);
         Some(sample)
     }

@@ -8,11 +8,12 @@ pub mod serial;
 pub mod udp;
 pub mod vrpn;
 
-pub use gate::{PacketCounters, SampleCounters, SampleGate, TrackerCounters};
+pub use gate::{BodyCounters, PacketCounters, SampleCounters, SampleGate, TrackerCounters};
 
 use crate::pose::Pose;
 pub use crate::stream::{Opener, Stream};
 use crate::time::HostTime;
+use std::time::Duration;
 
 /// Index of a tracked body in the order the rig file names them.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash)]
@@ -82,6 +83,17 @@ pub trait Tracker: Send {
     fn warning(&self) -> Option<String> {
         None
     }
+
+    /// Waits until something may have arrived, at most for `timeout`. False, at once, if it has nothing to wait for; the
+    /// caller then polls again after a rest.
+    fn wait(&self, _timeout: Duration) -> bool {
+        false
+    }
+
+    /// The gate through which its samples pass, which has counted them; `None` for a tracker without one.
+    fn gate(&self) -> Option<&SampleGate> {
+        None
+    }
 }
 
 impl<T: Tracker + ?Sized> Tracker for Box<T> {
@@ -99,5 +111,13 @@ impl<T: Tracker + ?Sized> Tracker for Box<T> {
 
     fn warning(&self) -> Option<String> {
         (**self).warning()
+    }
+
+    fn wait(&self, timeout: Duration) -> bool {
+        (**self).wait(timeout)
+    }
+
+    fn gate(&self) -> Option<&SampleGate> {
+        (**self).gate()
     }
 }

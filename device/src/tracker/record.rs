@@ -184,6 +184,14 @@ impl<T: Tracker> Tracker for Recorder<T> {
             self.unrecorded
         )
     }
+
+    fn wait(&self, timeout: Duration) -> bool {
+        self.inner.wait(timeout)
+    }
+
+    fn gate(&self) -> Option<&SampleGate> {
+        self.inner.gate()
+    }
 }
 
 fn write_all(mut file: File, samples: &Receiver<TrackerSample>, shared: &Shared) -> std::io::Result<()> {
@@ -461,6 +469,10 @@ impl Tracker for Replay {
 
     fn status(&self) -> String {
         format!("{}; {}", self.status, self.gate.counters())
+    }
+
+    fn gate(&self) -> Option<&SampleGate> {
+        Some(&self.gate)
     }
 }
 

@@ -6,7 +6,8 @@ use crate::time::HostClock;
 use std::io;
 use std::mem::{size_of, zeroed};
 use std::net::{Ipv4Addr, SocketAddrV4, UdpSocket};
-use std::os::fd::{AsRawFd, FromRawFd};
+use std::os::fd::{AsRawFd, FromRawFd, RawFd};
+use std::time::Duration;
 
 /// A received datagram; the bytes lie in the caller's buffer.
 #[derive(Clone, Copy, Debug)]
@@ -54,6 +55,11 @@ pub trait Datagrams: Send {
     /// Those of the operating system.
     fn local(&self) -> io::Result<SocketAddrV4>;
 
+    /// The descriptor whose readability announces a datagram; `None` if there is none to wait for.
+    fn descriptor(&self) -> Option<RawFd> {
+        None
+    }
+
     /// What `clock` shows now minus the clock of [`Arrival::kernel_ns`], nanoseconds.
     fn realtime_offset_ns(&self, clock: &dyn HostClock) -> i64 {
         realtime_offset_ns(clock)
@@ -79,6 +85,31 @@ impl Datagrams for UdpPort {
 
     fn local(&self) -> io::Result<SocketAddrV4> {
         Self::local(self)
+    }
+
+    fn descriptor(&self) -> Option<RawFd> {
+        Some(self.socket.as_raw_fd())
+    }
+}
+
+/// Waits until one of the descriptors has something to read or `timeout` is over; true if one has.
+///
+/// # Errors
+/// Those of the operating system.
+pub fn wait_for_any(descriptors: [Option<RawFd>; 2], timeout: Duration) -> io::Result<bool> {
+    // A negative descriptor is passed over.
+    let mut waiting =
+        descriptors.map(|fd| libc::pollfd { fd: fd.unwrap_or(-1), events: libc::POLLIN, revents: 0 });
+    let limit = libc::timespec {
+        tv_sec: timeout.as_secs().min(3600) as libc::time_t,
+        tv_nsec: i64::from(timeout.subsec_nanos()),
+    };
+    // SAFETY: two live pollfds and their count, a live timespec, and no signal mask.
+    let n = unsafe { libc::ppoll(waiting.as_mut_ptr(), 2, &limit, std::ptr::null()) };
+    match n {
+        0.. => Ok(n > 0),
+        _ if io::Error::last_os_error().kind() == io::ErrorKind::Interrupted => Ok(false),
+        _ => Err(io::Error::last_os_error()),
     }
 }
 
@@ -148,19 +179,8 @@ impl UdpPort {
     }
 
     /// Waits until a datagram has arrived or `timeout` is over; true if one has arrived.
-    pub fn wait(&self, timeout: std::time::Duration) -> io::Result<bool> {
-        let mut waiting = libc::pollfd { fd: self.socket.as_raw_fd(), events: libc::POLLIN, revents: 0 };
-        let limit = libc::timespec {
-            tv_sec: timeout.as_secs().min(3600) as libc::time_t,
-            tv_nsec: i64::from(timeout.subsec_nanos()),
-        };
-        // SAFETY: one live pollfd and its count, a live timespec, and no signal mask.
-        let n = unsafe { libc::ppoll(&mut waiting, 1, &limit, std::ptr::null()) };
-        match n {
-            0.. => Ok(n > 0),
-            _ if io::Error::last_os_error().kind() == io::ErrorKind::Interrupted => Ok(false),
-            _ => Err(io::Error::last_os_error()),
-        }
+    pub fn wait(&self, timeout: Duration) -> io::Result<bool> {
+        wait_for_any([Some(self.socket.as_raw_fd()), None], timeout)
     }
 
     /// Lets the kernel drop, before they are queued, all datagrams that are not from `source`, and, if `ports` is not

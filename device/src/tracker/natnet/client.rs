@@ -10,10 +10,11 @@ use super::wire::{id, split, Version, MAX_DATAGRAM};
 use crate::clock_map::ClockMap;
 use crate::pose::Pose;
 use crate::time::{HostClock, HostTime};
-use crate::tracker::udp::{Arrival, Datagrams, UdpPort};
+use crate::tracker::udp::{wait_for_any, Arrival, Datagrams, UdpPort};
 use crate::tracker::{BodyIndex, BodyKey, SampleGate, Tracker, TrackerCounters, TrackerError, TrackerSample};
 use std::net::{Ipv4Addr, SocketAddrV4};
 use std::sync::Arc;
+use std::time::Duration;
 
 const MS: i64 = 1_000_000;
 /// A client that was not polled for this long does not know when unstamped datagrams arrived.
@@ -711,6 +712,16 @@ impl Tracker for NatNetClient {
 
     fn warning(&self) -> Option<String> {
         super::report::warning(self)
+    }
+
+    fn wait(&self, timeout: Duration) -> bool {
+        let Some(command) = self.command.descriptor() else { return false };
+        let data = self.data.as_ref().and_then(|data| data.descriptor());
+        wait_for_any([Some(command), data], timeout).is_ok()
+    }
+
+    fn gate(&self) -> Option<&SampleGate> {
+        Some(&self.gate)
     }
 }
 

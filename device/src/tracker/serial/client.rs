@@ -333,6 +333,10 @@ impl Tracker for SerialTracker {
         text.push_str(&format!("; opened {} times; {c}", self.opened));
         text
     }
+
+    fn gate(&self) -> Option<&SampleGate> {
+        Some(&self.gate)
+    }
 }
 
 #[cfg(test)]

@@ -612,6 +612,10 @@ impl Tracker for VrpnClient {
         text.push_str(&format!("; connections {}, pongs {}, {c}", self.connections, self.pongs));
         text
     }
+
+    fn gate(&self) -> Option<&SampleGate> {
+        Some(&self.gate)
+    }
 }
 
 #[cfg(test)]
