@@ -9,6 +9,7 @@ use dpm_rig::telemetry::histogram_steps::UPPER_NS;
 use dpm_rig::telemetry::live::LiveSnapshot;
 use dpm_rig::telemetry::monitor::ProjectorHealth;
 use dpm_rig::telemetry::projector::{DeviceCounts, ProjectorReport};
+use dpm_rig::telemetry::tracker_gauges::TrackerReport;
 use std::fmt::Write;
 
 /// A metric: its name, its type, and what it is.
@@ -29,7 +30,7 @@ families! {
     STANDING = "dpm_order_standing", "gauge", "1 for the order that stands and is kept over restarts, 0 for the others";
     INTERLOCK = "dpm_interlock_closed", "gauge", "1 while the interlock permits light; absent without an interlock";
     PLANNED = "dpm_frames_planned_total", "counter", "Frames planned";
-    FRAMES = "dpm_frames_total", "counter", "Frames whose fate is known: lit, dark on every body, dropped, or not wanted";
+    FRAMES = "dpm_frames_total", "counter", "Frames whose fate is known: lit, dark on every body, dropped, not wanted, or not recorded";
     LATE = "dpm_frames_late_total", "counter", "Frames lit after the slot that they were planned for";
     REPEATED = "dpm_frames_repeated_total", "counter", "Slots in which the previous frame was shown again";
     TOO_OLD = "dpm_frames_too_old_total", "counter", "Frames not sent because their poses would have been too old";
@@ -46,6 +47,7 @@ families! {
     RAYS = "dpm_rays_total", "counter", "Rays traced";
     REGISTRATION = "dpm_registration_error_pixels", "gauge", "Distance of light from its place in projector pixels; only with a mock tracker";
     PICTURES = "dpm_live_pictures_total", "counter", "Pictures of another program that the body was given (scene.bodies[].texture)";
+    TRACKER = "dpm_tracker_samples_total", "counter", "Samples of the tracker by what became of them; lost ones never came";
     SESSIONS = "dpm_link_sessions_total", "counter", "Sessions opened with the projector";
     REARMED = "dpm_link_rearmed_total", "counter", "Times that light came back after the watchdog or damaged packets";
     SENT = "dpm_link_sent_bytes_total", "counter", "Bytes handed to the medium";
@@ -68,6 +70,7 @@ pub(crate) fn text(state: &State) -> String {
     for (body, count) in &state.pictures {
         out.value(&[("body", body)], *count as f64);
     }
+    tracker(&mut out, state.tracker.as_ref());
     link(&mut out, &state.carried);
     out.family(CELSIUS);
     if let Some(celsius) = state.carried.celsius {
@@ -105,18 +108,34 @@ fn rig(out: &mut Out, state: &State) {
     }
 }
 
+fn tracker(out: &mut Out, told: Option<&TrackerReport>) {
+    out.family(TRACKER);
+    let Some(t) = told else { return };
+    for (fate, n) in [
+        ("used", t.used),
+        ("lost", t.lost),
+        ("reordered", t.reordered),
+        ("doubled", t.doubled),
+        ("unlabelled", t.unlabelled),
+        ("impossible", t.impossible),
+        ("contradictory", t.contradictory),
+    ] {
+        out.value(&[("fate", fate)], n as f64);
+    }
+}
+
 /// What is known of a run without a collector, or before its first figures.
 fn counted(out: &mut Out, state: &State) {
     let c = &state.now.counts;
     out.family(PLANNED).value(&[], c.frames_planned as f64);
-    frames(out, [c.frames_lit, c.frames_dark, c.frames_dropped, c.frames_withheld]);
+    frames(out, [c.frames_lit, c.frames_dark, c.frames_dropped, c.frames_withheld, c.frames_unrecorded]);
     out.family(LATE).value(&[], c.frames_late as f64);
     out.family(SLOTS).value(&[], c.slots as f64);
 }
 
-fn frames(out: &mut Out, counts: [u64; 4]) {
+fn frames(out: &mut Out, counts: [u64; 5]) {
     out.family(FRAMES);
-    for (fate, n) in ["lit", "dark", "dropped", "withheld"].into_iter().zip(counts) {
+    for (fate, n) in ["lit", "dark", "dropped", "withheld", "unrecorded"].into_iter().zip(counts) {
         out.value(&[("fate", fate)], n as f64);
     }
 }
@@ -124,7 +143,7 @@ fn frames(out: &mut Out, counts: [u64; 4]) {
 fn run(out: &mut Out, figures: &LiveSnapshot) {
     let r = &figures.report;
     out.family(PLANNED).value(&[], figures.planned as f64);
-    frames(out, [r.frames_lit, r.frames_dark, r.frames_dropped, r.frames_withheld]);
+    frames(out, [r.frames_lit, r.frames_dark, r.frames_dropped, r.frames_withheld, r.frames_unrecorded]);
     out.family(LATE).value(&[], r.frames_late as f64);
     out.family(REPEATED).value(&[], r.frames_repeated as f64);
     out.family(TOO_OLD).value(&[], r.frames_too_old as f64);

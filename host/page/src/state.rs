@@ -7,6 +7,7 @@ use dpm_rig::telemetry::histogram_steps::UPPER_NS;
 use dpm_rig::telemetry::live::LiveSnapshot;
 use dpm_rig::telemetry::monitor::{ProjectorHealth, RunCounts};
 use dpm_rig::telemetry::projector::ProjectorReport;
+use dpm_rig::telemetry::tracker_gauges::TrackerReport;
 use serde_json::{json, Value};
 use std::sync::Arc;
 
@@ -43,6 +44,8 @@ pub(crate) struct State {
     pub figures: Option<Arc<LiveSnapshot>>,
     /// What the link has carried.
     pub carried: ProjectorReport,
+    /// What became of the tracker's samples; `None` before the first ones.
+    pub tracker: Option<TrackerReport>,
     /// The bodies that show another program's pictures, and how many of them have come.
     pub pictures: Vec<(String, u64)>,
     setup: Value,
@@ -80,13 +83,15 @@ impl State {
         let pictures = monitor.live().rig().map_or(Vec::new(), |rig| {
             rig.live_pictures().map(|(body, _, pictures)| (body.to_owned(), pictures.count())).collect()
         });
-        Self { now, health, figures, carried: monitor.carried(), pictures, setup: setup(shared) }
+        let tracker = monitor.sample_counts();
+        Self { now, health, figures, carried: monitor.carried(), tracker, pictures, setup: setup(shared) }
     }
 
     pub(crate) fn to_json(&self) -> StateJson<'_> {
         let mut figures = self.figures.as_ref().map_or(json!({}), |f| told_of(f));
         figures["setup"] = self.setup.clone();
         figures["link"] = json!(self.carried);
+        figures["tracker"] = json!(self.tracker);
         StateJson { now: &self.now, figures }
     }
 }

@@ -5,20 +5,22 @@ use crate::disk::Disk;
 use crate::kinds::{Kind, State};
 use crate::laws::{Laws, BEGINS_WITHIN_NS};
 use crate::line::SerialLine;
-use crate::machine::{Beneath, SimMachine};
+use crate::machine::{Beneath, SimMachine, Trap};
 use crate::net::{Net, ServerKind};
 use crate::plan::{Episode, Setup, TrackerSetup};
 use crate::process::{Exit, Process};
 use crate::table::Table;
 use crate::tracks::TrackLaws;
-use dpm_device::link::faults;
+use dpm_device::link::{faults, Status};
 use dpm_device::planes::Raster;
 use dpm_device::time::HostTime;
 use dpm_device::transport::{Lane, LinkDevice};
 use dpm_rig::config::{Overrides, RigConfig};
 use dpm_rig::order::Order;
+use dpm_rig::pipeline::stepped::Part;
 use dpm_rig::rig::Rig;
 use dpm_rig::telemetry::monitor::ProjectorHealth;
+use dpm_rig::telemetry::projector::ProjectorReport;
 use hil_mock::projector::serial::SerialEnd;
 use hil_mock::projector::{DeviceClock, MockConfig, MockProjector, GREATEST_SHIFT};
 use std::cmp::Reverse;
@@ -806,6 +808,21 @@ impl World {
         }
         self.episode = Some((episode, false));
         self.plan(self.t + 4 * S, Action::Overdue(number));
+    }
+
+    /// The next step of `part` meets `trap`.
+    pub fn set_trap(&self, part: Part, trap: Trap) {
+        lock(&self.beneath).traps.push((part, trap));
+    }
+
+    /// What the link carried, as the program sees it; `None` while no link is up.
+    pub fn carried(&self) -> Option<ProjectorReport> {
+        self.process.as_ref()?.run.carried()
+    }
+
+    /// What the projector reports.
+    pub fn status(&self) -> Status {
+        self.projector.status()
     }
 
     /// True when the next episode may begin.

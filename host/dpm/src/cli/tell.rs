@@ -252,6 +252,7 @@ impl Progress {
                         "frames_dark": counts.frames_dark,
                         "frames_dropped": counts.frames_dropped,
                         "frames_withheld": counts.frames_withheld,
+                        "frames_unrecorded": counts.frames_unrecorded,
                         "frames_late": counts.frames_late,
                         "slots": counts.slots,
                         "slots_missed": counts.slots_missed,

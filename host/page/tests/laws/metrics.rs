@@ -81,6 +81,7 @@ fn counters_equal_the_report_and_histograms_add_up() {
         ("dpm_frames_total{fate=\"dark\"}", report.frames_dark),
         ("dpm_frames_total{fate=\"dropped\"}", report.frames_dropped),
         ("dpm_frames_total{fate=\"withheld\"}", report.frames_withheld),
+        ("dpm_frames_total{fate=\"unrecorded\"}", report.frames_unrecorded),
         ("dpm_frames_late_total", report.frames_late),
         ("dpm_frames_repeated_total", report.frames_repeated),
         ("dpm_frames_too_old_total", report.frames_too_old),
@@ -103,7 +104,11 @@ fn counters_equal_the_report_and_histograms_add_up() {
     }
     assert!(report.frames_lit > 0 && report.ordered_dark["black"] > 0, "the run says something");
     // Every frame that was planned has one fate.
-    let fates = report.frames_lit + report.frames_dark + report.frames_dropped + report.frames_withheld;
+    let fates = report.frames_lit
+        + report.frames_dark
+        + report.frames_dropped
+        + report.frames_withheld
+        + report.frames_unrecorded;
     assert_eq!(told["dpm_frames_planned_total"], fates as f64);
     histograms(&told, &outcome.profiler);
     // Every metric is told of, and no other.

@@ -14,8 +14,8 @@ use dpm_handoff::path::Lock;
 use std::sync::atomic::{AtomicBool, AtomicI64, AtomicU64, Ordering};
 use std::sync::Arc;
 
-/// Time that a projector outside this process needs to receive and check a frame after the medium has accepted all of
-/// it, nanoseconds. The host cannot measure it.
+/// Time that a projector needs to receive and check a frame after the medium has accepted all of it, nanoseconds, for one
+/// that does not report how early frames are whole.
 pub(crate) const RECEIPT_NS: i64 = 500_000;
 
 /// Facts of a whole run.
@@ -31,7 +31,8 @@ pub(crate) struct Facts {
     pub lead_ns: AtomicI64,
     /// Time that most frames need from latch to sent, nanoseconds.
     pub typical_ns: AtomicI64,
-    /// Learned time from sent to light, nanoseconds (for projectors outside this process).
+    /// Time from sent to whole in the device, nanoseconds, that the lead must add to what it has learned: 0 where the
+    /// device reports slack, because what was learned from slack contains it.
     pub travel_ns: AtomicI64,
     /// When all stages were last found alive.
     pub alive_at_ns: AtomicI64,
@@ -41,6 +42,8 @@ pub(crate) struct Facts {
     pub end_slot: AtomicU64,
     /// Slots from one planned frame to the next, in thousandths, averaged over the last frames.
     pub stride_milli: AtomicU64,
+    /// Frames wait for busy stages, and none has found a stage idle for long.
+    pub queue_stands: AtomicBool,
     /// The GPU needs about a slot or more for a frame.
     pub gpu_is_slow: AtomicBool,
     /// The longest time for which prediction may extend a body's track, nanoseconds.
@@ -61,6 +64,7 @@ impl Facts {
         lead: &LeadEstimator,
         now: HostTime,
     ) -> Self {
+        monitor.samples().begin(rig.bodies.len());
         let predict_ns = Horizon::of_rig(&rig.config).predict_ns(lead.lead_ns() + RECEIPT_NS, 0);
         Self {
             rig,
@@ -68,11 +72,12 @@ impl Facts {
             options,
             lead_ns: AtomicI64::new(lead.lead_ns()),
             typical_ns: AtomicI64::new(lead.typical_ns()),
-            travel_ns: AtomicI64::new(0),
+            travel_ns: AtomicI64::new(RECEIPT_NS),
             alive_at_ns: AtomicI64::new(now.0),
             next_frame: AtomicU64::new(0),
             end_slot: AtomicU64::new(0),
             stride_milli: AtomicU64::new(1000),
+            queue_stands: AtomicBool::new(false),
             gpu_is_slow: AtomicBool::new(false),
             predict_ns: AtomicI64::new(predict_ns),
             gpu_since_ns: AtomicI64::new(i64::MAX),

@@ -39,6 +39,8 @@ pub(crate) struct LinkKeeper {
     retimed_at: HostTime,
     map: Option<ClockMap>,
     clock_bound_ns: Option<i64>,
+    /// How often the map of the projector's clock was found wrong.
+    clock_steps: u64,
     session: u64,
     /// `time` belongs to this session.
     is_timed: bool,
@@ -63,6 +65,7 @@ impl LinkKeeper {
             retimed_at: HostTime(i64::MIN),
             map: None,
             clock_bound_ns: None,
+            clock_steps: 0,
             session: link.counters().sessions,
             is_timed: true,
             reports: lights.map(|(lights, delay_ns)| StatusLight::new(lights, delay_ns)),
@@ -151,6 +154,11 @@ impl LinkKeeper {
             }
         });
         result
+    }
+
+    /// How often the map of the projector's clock was found wrong. What was learned by it is wrong then, too.
+    pub(crate) fn clock_steps(&self) -> u64 {
+        self.clock_steps
     }
 
     /// Records that the frame of `plan` was sent at `now`.
@@ -291,8 +299,11 @@ impl LinkKeeper {
                 return;
             }
             let stepped_ns = mapped.at.ns_since(self.time.host_of(ticks)).abs();
-            if let Some(reports) = self.reports.as_mut().filter(|_| stepped_ns > STEP_NS) {
-                reports.clock_was_wrong();
+            if stepped_ns > STEP_NS {
+                self.clock_steps += 1;
+                if let Some(reports) = &mut self.reports {
+                    reports.clock_was_wrong();
+                }
             }
             (self.time.anchor, self.time.bound_ns) = ((ticks, mapped.at), mapped.uncertainty_ns);
         } else {
@@ -348,8 +359,10 @@ fn ordered_dark(
         Some(OrderedDark::Rest)
     } else if link.state() == LinkState::Faulted && latched & faults::HOST_SAFE != 0 {
         Some(OrderedDark::Safe)
-    } else if link.state() == LinkState::Faulted && latched & !faults::PASSING != 0 {
+    } else if link.state() == LinkState::Faulted && latched & !(faults::PASSING | faults::OF_FRAMES) != 0 {
         Some(OrderedDark::Fault)
+    } else if link.state() == LinkState::Faulted && latched & faults::OF_FRAMES != 0 {
+        Some(OrderedDark::Exceeded)
     } else {
         None
     }

@@ -1,10 +1,12 @@
 //! Decides when a packed frame is sent or left out, does what is due between frames, and ends the light.
 
-use super::facts::Facts;
+use super::facts::{Facts, RECEIPT_NS};
 use super::follow::Follower;
 use super::keeper::{is_dark, LinkKeeper};
 use super::pace::Pace;
 use super::pack::is_overtaken;
+use super::queue::QueueWatch;
+use super::slack::{SentFrame, SlackMeter};
 use crate::frame::job::{Fate, FrameNote};
 use crate::plan::lead::LeadEstimator;
 use crate::telemetry::projector::ProjectorReport;
@@ -60,6 +62,10 @@ pub(crate) struct LinkStage<P> {
     link: HostLink,
     keeper: LinkKeeper,
     lead: LeadEstimator,
+    slack: SlackMeter,
+    queue: QueueWatch,
+    /// Sessions of the link, and steps of the projector's clock, so far.
+    seen: [u64; 2],
     /// `None` if no tracks are sent.
     follower: Option<Follower>,
     slot_ns: i64,
@@ -85,6 +91,9 @@ impl<P: Pace> LinkStage<P> {
             link,
             keeper,
             lead,
+            slack: SlackMeter::new(),
+            queue: QueueWatch::new(slot_ns),
+            seen: [0; 2],
             follower: None,
             slot_ns,
             ready_at: None,
@@ -132,10 +141,21 @@ impl<P: Pace> LinkStage<P> {
 
     /// Polls the link and does what is due between frames.
     pub(crate) fn poll(&mut self, now: HostTime, transport: &mut dyn Transport) {
-        let Self { facts, link, keeper, follower, .. } = self;
+        let Self { facts, link, keeper, follower, lead, slack, seen, .. } = self;
         let alive = now.ns_since(HostTime(facts.alive_at_ns.load(Ordering::Relaxed))) <= ALIVE_WITHIN_NS;
         let result = keeper.poll(now, link, transport, !P::FOLLOWS_CLOCK, alive, &facts.monitor);
-        facts.travel_ns.store(keeper.travel_ns(), Ordering::Relaxed);
+        let now_seen = [link.counters().sessions, keeper.clock_steps()];
+        if std::mem::replace(seen, now_seen) != now_seen {
+            slack.forget();
+        }
+        let timing = link.status().and_then(|status| status.timing);
+        if let Some(needed_ns) = timing.and_then(|timing| slack.observe(timing, now)) {
+            lead.measured(needed_ns);
+            facts.lead_ns.store(lead.lead_ns(), Ordering::Relaxed);
+            facts.typical_ns.store(lead.typical_ns(), Ordering::Relaxed);
+        }
+        let beyond_ns = if link.measures_timing() { 0 } else { keeper.travel_ns() + RECEIPT_NS };
+        facts.travel_ns.store(beyond_ns, Ordering::Relaxed);
         if let Err(e) = result {
             facts.fail(e.into());
         }
@@ -175,11 +195,15 @@ impl<P: Pace> LinkStage<P> {
             self.credit_until = now;
         }
         self.waited_ns = Some(now.ns_since(ready_at) + queued_ns);
+        let stamps = &note.timeline;
+        let idle_ns = stamps.packing_at.ns_since(stamps.rendered_at) + now.ns_since(stamps.packed_at);
+        self.facts.queue_stands.store(self.queue.observe(idle_ns, now), Ordering::Relaxed);
         // Where the projector's clock is not well known, light may come later than it seems.
         let latest = self.lit_at(note, now).plus_ns(self.keeper.time().bound_ns);
         if is_too_old(note, latest, self.slot_ns) {
             // The lead learns from this frame too: the next one should begin earlier.
             note.fate = Fate::TooOld;
+            self.slack.doubts_travel();
             return Offer::Settled;
         }
         let plan = &note.plan;
@@ -196,12 +220,22 @@ impl<P: Pace> LinkStage<P> {
         Offer::Settled
     }
 
-    /// A settled frame left the stage at `now`; the lead learns the time that it needed. Time spent waiting for room
-    /// in the device does not count: an earlier start would only fill the device more.
+    /// A settled frame left the stage at `now`; the lead learns the time that it needed, here or when the device reports
+    /// its slack. Time spent waiting for room in the device does not count: an earlier start would only fill the device
+    /// more.
     pub(crate) fn taken(&mut self, note: &mut FrameNote, now: HostTime) {
         note.timeline.sent_at = now;
-        if let Some(waited_ns) = self.waited_ns.take() {
-            self.lead.measured(now.ns_since(note.latch_due_at) - waited_ns);
+        let Some(waited_ns) = self.waited_ns.take() else { return };
+        if self.link.measures_timing() && note.is_sent() {
+            self.slack.sent(SentFrame {
+                frame: note.plan.id.0 as u32,
+                latch_due_at: note.latch_due_at,
+                due_at: note.timeline.due_at,
+                sent_at: now,
+                waited_ns,
+            });
+        } else {
+            self.lead.measured(now.ns_since(note.latch_due_at) - waited_ns + self.slack.travel_ns());
             self.facts.lead_ns.store(self.lead.lead_ns(), Ordering::Relaxed);
             self.facts.typical_ns.store(self.lead.typical_ns(), Ordering::Relaxed);
         }
@@ -214,10 +248,19 @@ impl<P: Pace> LinkStage<P> {
         meant_at.ns_since(note.plan.due_at).abs() > self.slot_ns
     }
 
+    /// From sent to whole in the device, nanoseconds.
+    fn travel_ns(&self) -> i64 {
+        if self.link.measures_timing() {
+            self.slack.travel_ns()
+        } else {
+            self.keeper.travel_ns() + RECEIPT_NS
+        }
+    }
+
     /// When a frame that is sent at `now` will be lit: in its slot, or in the first one that begins after it arrives.
     fn lit_at(&self, note: &FrameNote, now: HostTime) -> HostTime {
         let due_at = note.timeline.due_at;
-        let arrives_at = now.plus_ns(self.keeper.travel_ns() + P::RECEIPT_NS);
+        let arrives_at = now.plus_ns(if P::FOLLOWS_CLOCK { self.travel_ns() } else { 0 });
         if arrives_at <= due_at {
             return due_at;
         }
@@ -243,7 +286,7 @@ impl<P: Pace> LinkStage<P> {
         transport: &mut dyn Transport,
     ) -> Option<HostTime> {
         let ending = self.ending.unwrap_or_else(|| {
-            let until = last.plus_ns(P::last_light_ns(&self.facts, self.keeper.travel_ns()));
+            let until = last.plus_ns(P::last_light_ns(&self.facts, self.travel_ns()));
             Ending::LastLight { until }
         });
         let next = match ending {
@@ -275,7 +318,7 @@ impl<P: Pace> LinkStage<P> {
 
     /// What the link carried over the medium `name`.
     pub(crate) fn report(&self, name: &str) -> ProjectorReport {
-        self.keeper.report(&self.link, name)
+        ProjectorReport { slack: self.slack.report(), ..self.keeper.report(&self.link, name) }
     }
 }
 

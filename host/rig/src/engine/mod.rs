@@ -23,6 +23,8 @@ pub(crate) mod pace;
 pub(crate) mod pack;
 pub(crate) mod plan;
 pub(crate) mod pulse;
+mod queue;
+mod slack;
 mod slowness;
 pub(crate) mod supervision;
 

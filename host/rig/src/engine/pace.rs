@@ -1,6 +1,6 @@
 //! The kinds of time in a run, as types: the wall clock, or a clock that the run itself moves.
 
-use super::facts::{Facts, RECEIPT_NS};
+use super::facts::Facts;
 use std::sync::atomic::Ordering;
 
 /// Virtual pace: time between the last byte of a frame and its slot, nanoseconds.
@@ -24,8 +24,6 @@ pub(crate) trait Pace: Send + 'static {
     const LISTEN_NS: i64;
     /// Whether the projector's clock is followed during the run. Otherwise it stays as the handshake found it.
     const FOLLOWS_CLOCK: bool;
-    /// From the last byte of a frame that the medium has carried until the projector can light it, nanoseconds.
-    const RECEIPT_NS: i64;
 
     /// How early frames begin. `is_slow`: the GPU needs about a slot or more for each.
     fn leads(facts: &Facts, is_slow: bool) -> Leads;
@@ -46,13 +44,12 @@ pub(crate) enum Real {}
 impl Pace for Real {
     const LISTEN_NS: i64 = super::plan::LISTEN_NS;
     const FOLLOWS_CLOCK: bool = true;
-    const RECEIPT_NS: i64 = RECEIPT_NS;
 
     /// Frames begin early enough to survive a bad moment, so there is time to catch up afterwards. A slot is given up
     /// only when a frame of typical duration would miss it. A renderer that is slower than its slots cannot catch up;
     /// its frames are planned for slots that they can meet.
     fn leads(facts: &Facts, is_slow: bool) -> Leads {
-        let travel_ns = facts.travel_ns.load(Ordering::Relaxed) + RECEIPT_NS;
+        let travel_ns = facts.travel_ns.load(Ordering::Relaxed);
         let lead_ns = facts.lead_ns.load(Ordering::Relaxed) + travel_ns;
         let typical_ns = facts.typical_ns.load(Ordering::Relaxed) + travel_ns;
         Leads { lead_ns, needed_ns: if is_slow { lead_ns } else { typical_ns } }
@@ -69,7 +66,6 @@ pub(crate) enum Virtual {}
 impl Pace for Virtual {
     const LISTEN_NS: i64 = 0;
     const FOLLOWS_CLOCK: bool = false;
-    const RECEIPT_NS: i64 = 0;
 
     fn leads(facts: &Facts, _: bool) -> Leads {
         let lead_ns = modelled_ns(facts);

@@ -86,6 +86,12 @@ impl<P: Pace> PlanStage<P> {
         !self.crew.gpu.is_slow() || self.crew.gpu.in_flight() == 0
     }
 
+    /// True while no frame may be begun before all earlier ones are sent: a queue stands between the stages, and leaving
+    /// frames out ends it at once.
+    pub(crate) fn sheds(&self) -> bool {
+        self.facts.queue_stands.load(Ordering::Relaxed)
+    }
+
     /// Chooses the slot of the next frame at `now`. `None` if that slot lies beyond the end of the run.
     pub(crate) fn choose_slot(&mut self, time: &LinkTime, now: HostTime) -> Option<Latch> {
         let leads = P::leads(&self.facts, self.crew.gpu.is_slow());

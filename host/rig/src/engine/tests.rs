@@ -2,7 +2,7 @@
 
 use super::connect::Connecting;
 use super::error::PipelineError;
-use super::facts::{CrewFacts, Facts, RECEIPT_NS};
+use super::facts::{CrewFacts, Facts};
 use super::keeper::LinkKeeper;
 use super::link::{LinkStage, Offer};
 use super::options::RunOptions;
@@ -66,7 +66,7 @@ fn bench(flags: &[&str], options: RunOptions) -> Bench {
         }
     };
     let slot_ns = rig.rate().slot_len_ns(0);
-    let lead = LeadEstimator::new(slot_ns, 3 * MS, slot_ns / 2, 2 * slot_ns);
+    let lead = LeadEstimator::new(slot_ns, 3 * MS, 2 * slot_ns);
     let facts = Arc::new(Facts::new(rig.clone(), monitor, options, &lead, now));
     let keeper = LinkKeeper::new(time, &link, None);
     let crew = Arc::new(CrewFacts::new(0, slot_ns));
@@ -101,7 +101,8 @@ fn every_slot_gets_a_frame_that_is_latched_its_lead_before() {
     let mut stage = bench.plan::<Real>();
     let mut slots = Vec::new();
     while let Some(note) = bench.planned(&mut stage) {
-        let lead_ns = bench.facts.lead_ns.load(Ordering::Relaxed) + RECEIPT_NS;
+        let lead_ns =
+            bench.facts.lead_ns.load(Ordering::Relaxed) + bench.facts.travel_ns.load(Ordering::Relaxed);
         assert_eq!(note.timeline.due_at.ns_since(note.timeline.latched_at), lead_ns);
         slots.push(note.plan.slot);
     }
@@ -116,7 +117,8 @@ fn a_planner_that_stood_still_goes_on_with_the_first_slot_that_a_usual_frame_can
     let mut stage = bench.plan::<Real>();
     let before = bench.planned(&mut stage).expect("no end");
     bench.now = bench.now.plus_ns(500 * MS);
-    let needed_ns = bench.facts.typical_ns.load(Ordering::Relaxed) + RECEIPT_NS;
+    let needed_ns =
+        bench.facts.typical_ns.load(Ordering::Relaxed) + bench.facts.travel_ns.load(Ordering::Relaxed);
     let earliest = bench.now.plus_ns(needed_ns);
     let after = bench.planned(&mut stage).expect("no end");
     assert!(after.timeline.due_at >= earliest, "the slot can still be reached");

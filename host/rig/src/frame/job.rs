@@ -1,9 +1,10 @@
 //! A frame in progress: what travels from thread to thread. It is boxed once and recycled.
 //!
-//! A frame consists of a large block of memory and a small note. The memory returns to planning as soon as the link
-//! has finished with it, so that a few blocks circulate and stay in the caches. The note goes on to the collector,
-//! which may be slow.
+//! A frame consists of a large block of memory and a small note. Both return to planning as soon as the link has
+//! finished with them, so that a few blocks circulate and stay in the caches. What the note says goes on to the
+//! collector, for which nobody on the way waits (`light/notes.rs`).
 
+use crate::frame::slots::MissCause;
 use crate::frame::FrameTimeline;
 use crate::plan::frame::FramePlan;
 use crate::rig::Rig;
@@ -33,8 +34,10 @@ pub(crate) enum Fate {
 pub(crate) struct FrameNote {
     /// What it shows, where and when.
     pub plan: FramePlan,
-    /// Planning waited for memory, because a later stage held all of it.
-    pub waited_for_memory: bool,
+    /// The collector did not get the notes of frames just before this one.
+    pub is_after_gap: bool,
+    /// What kept planning from beginning the frame earlier; `None` if nothing did.
+    pub held_up_by: Option<MissCause>,
     /// When it should have been latched.
     pub latch_due_at: HostTime,
     /// Its stamps.
@@ -52,7 +55,8 @@ impl FrameNote {
     pub(crate) fn new(rig: &Rig) -> Self {
         Self {
             plan: FramePlan::empty(rig),
-            waited_for_memory: false,
+            is_after_gap: false,
+            held_up_by: None,
             latch_due_at: HostTime(0),
             timeline: FrameTimeline::default(),
             cost: None,

@@ -17,14 +17,27 @@ pub(crate) enum MissCause {
     Link,
     /// There was no memory for another frame, because a later stage held all buffers.
     Buffers,
+    /// It was left out to end a standing queue: none was begun before all earlier ones were sent.
+    Queue,
+    /// The projector was dark with a latched fault that frames of this rig had caused: the limit on flashes, or one on
+    /// light.
+    Fault,
     /// The machine itself stood still.
     Standstill,
 }
 
 impl MissCause {
     /// All causes, in the order of their counters.
-    pub(crate) const ALL: [Self; 6] =
-        [Self::Plan, Self::Render, Self::Pack, Self::Link, Self::Buffers, Self::Standstill];
+    pub(crate) const ALL: [Self; 8] = [
+        Self::Plan,
+        Self::Render,
+        Self::Pack,
+        Self::Link,
+        Self::Buffers,
+        Self::Queue,
+        Self::Fault,
+        Self::Standstill,
+    ];
 
     /// As printed.
     pub(crate) const fn name(self) -> &'static str {
@@ -34,6 +47,8 @@ impl MissCause {
             Self::Pack => "pack",
             Self::Link => "link",
             Self::Buffers => "buffers",
+            Self::Queue => "queue",
+            Self::Fault => "fault",
             Self::Standstill => "standstill",
         }
     }
@@ -53,16 +68,26 @@ pub(crate) enum OrderedDark {
     Rest,
     /// The interlock is open, so light is not allowed.
     Interlock,
-    /// The projector has a fault that requires the operator: heat, lamp, emergency stop, flashes.
+    /// The projector has a fault that requires the operator and that came from without: heat, lamp, emergency stop.
     Fault,
     /// The run was asked to end.
     Stop,
+    /// The projector latched a limit that frames of this rig exceeded. Nobody ordered that: its slots count as missed.
+    Exceeded,
 }
 
 impl OrderedDark {
     /// All reasons, in the order of their counters.
-    pub(crate) const ALL: [Self; 7] =
-        [Self::Black, Self::Frozen, Self::Safe, Self::Rest, Self::Interlock, Self::Fault, Self::Stop];
+    pub(crate) const ALL: [Self; 8] = [
+        Self::Black,
+        Self::Frozen,
+        Self::Safe,
+        Self::Rest,
+        Self::Interlock,
+        Self::Fault,
+        Self::Stop,
+        Self::Exceeded,
+    ];
 
     /// As printed.
     pub(crate) const fn name(self) -> &'static str {
@@ -74,6 +99,7 @@ impl OrderedDark {
             Self::Interlock => "interlock",
             Self::Fault => "fault",
             Self::Stop => "stop",
+            Self::Exceeded => "exceeded",
         }
     }
 }

@@ -8,6 +8,7 @@ use crate::frame::{FrameTimeline, Stage, STAGES};
 use crate::light::dark_bodies::DarkBodies;
 use crate::light::live_view::bodies_of;
 use crate::light::measures::{histogram, RegistrationMeasures};
+use crate::light::notes::NoteReceiver;
 use crate::light::placement::Placement;
 use crate::light::record::FrameRecord;
 use crate::light::recorder::{LightNote, LightReceiver};
@@ -27,7 +28,6 @@ use dpm_common::realtime::standstill::SeenStandstills;
 use dpm_device::light::LightKind;
 use dpm_device::link::frame_newer;
 use dpm_device::time::HostTime;
-use dpm_handoff::channel::Receiver;
 use dpm_render::PASSES;
 use hdrhistogram::Histogram;
 use std::collections::VecDeque;
@@ -40,7 +40,7 @@ const MAX_PENDING: usize = 256;
 /// The inputs of the collector.
 pub(crate) struct Inbox {
     /// Frames that the link has finished with.
-    pub done: Receiver<Box<FrameNote>>,
+    pub notes: NoteReceiver,
     /// What the projector did in each slot.
     pub lights: LightReceiver,
 }
@@ -68,6 +68,10 @@ pub(crate) struct Collector {
     dropped: u64,
     /// Frames that were not lit because no new picture was wanted.
     withheld: u64,
+    /// Frames of which this learnt nothing, at the end of the run.
+    unrecorded: u64,
+    /// First and last number of frames whose notes are missing, oldest first.
+    gaps: VecDeque<(u32, u32)>,
     late: u64,
     repeated: u64,
     too_old: u64,
@@ -148,6 +152,8 @@ impl Collector {
             dark: 0,
             dropped: 0,
             withheld: 0,
+            unrecorded: 0,
+            gaps: VecDeque::new(),
             late: 0,
             repeated: 0,
             too_old: 0,
@@ -211,6 +217,7 @@ impl Collector {
             self.flights_told = flights.finish(self.standstills.as_deref());
         }
         monitor.set_slots(counts.wanted(), counts.missed_total());
+        self.unrecorded = monitor.counts().frames_unrecorded;
         self.tell_live(monitor, true);
         counts
     }
@@ -228,30 +235,27 @@ impl Collector {
         }
     }
 
-    /// Reads the frames that the link has finished with, and their light, as far as both have arrived. Returns the
-    /// notes to `free`. Calls `alive` for every note, because a long backlog takes seconds on a busy machine. True
-    /// when both inputs have ended.
-    pub(crate) fn look(
-        &mut self,
-        inbox: &mut Inbox,
-        free: &dyn Fn(Box<FrameNote>),
-        monitor: &RunMonitor,
-        alive: &mut dyn FnMut(),
-    ) -> bool {
+    /// Reads the frames that the link has finished with, and their light, as far as both have arrived. Calls `alive`
+    /// for every note, because a long backlog takes seconds on a busy machine. True when both inputs have ended.
+    pub(crate) fn look(&mut self, inbox: &mut Inbox, monitor: &RunMonitor, alive: &mut dyn FnMut()) -> bool {
         // Checked before reading: what arrived before the end must be read first.
-        let over = inbox.done.is_finished() && inbox.lights.notes.is_finished();
+        let no_more_notes = inbox.notes.is_finished();
+        let over = no_more_notes && inbox.lights.notes.is_finished();
         self.slots.read_orders(monitor.dark());
         loop {
             let light = self.held.take().or_else(|| inbox.lights.notes.try_pop());
             // Read after the light: all frames before that light have been reported by then.
-            self.take_finished(&mut inbox.done, free, monitor, alive);
+            self.take_finished(&mut inbox.notes, monitor, alive);
             // The frame was lit, but the link's thread has not reported it as sent yet.
             let unknown = |f: u32| self.newest.is_none_or(|n| frame_newer(f, n));
             // Or its slot is later than the slots of frames that are still to be read.
             let ahead =
-                |slot: u64| !inbox.done.is_empty() && self.last_planned.is_none_or(|last| last < slot);
+                |slot: u64| !inbox.notes.is_empty() && self.last_planned.is_none_or(|last| last < slot);
             match light {
-                Some(note) if !ahead(note.event.slot) && (over || !note.event.frame.is_some_and(unknown)) => {
+                Some(note)
+                    if !ahead(note.event.slot)
+                        && (no_more_notes || !note.event.frame.is_some_and(unknown)) =>
+                {
                     while let Some(moves) = inbox.lights.moves_before(note.event.slot) {
                         self.registration.moved(&moves);
                     }
@@ -259,7 +263,7 @@ impl Collector {
                 }
                 light => {
                     self.held = light;
-                    if self.pending.len() < MAX_PENDING || inbox.done.is_empty() {
+                    if self.pending.len() < MAX_PENDING || inbox.notes.is_empty() {
                         break;
                     }
                     // More frames are waiting than may wait, and there is no light for the oldest.
@@ -279,18 +283,12 @@ impl Collector {
 
     /// Reads finished frames until no more may wait for their light. Light is checked before more frames are read,
     /// however long this thread stood still.
-    fn take_finished(
-        &mut self,
-        done: &mut Receiver<Box<FrameNote>>,
-        free: &dyn Fn(Box<FrameNote>),
-        monitor: &RunMonitor,
-        alive: &mut dyn FnMut(),
-    ) {
+    fn take_finished(&mut self, notes: &mut NoteReceiver, monitor: &RunMonitor, alive: &mut dyn FnMut()) {
         while self.pending.len() < MAX_PENDING {
-            let Some(note) = done.try_pop() else { break };
+            let Some(note) = notes.try_pop() else { break };
             alive();
             self.finished(&note, monitor);
-            free(note);
+            notes.give_back(note);
         }
     }
 
@@ -304,7 +302,7 @@ impl Collector {
     /// the run count as dropped.
     fn count_unlit(&mut self, timeline: &FrameTimeline, monitor: &RunMonitor) {
         match self.slots.ordered_dark(timeline.due_at) {
-            None | Some(OrderedDark::Stop) => {
+            None | Some(OrderedDark::Stop | OrderedDark::Exceeded) => {
                 self.dropped += 1;
                 monitor.count_dropped();
             }
@@ -337,7 +335,14 @@ impl Collector {
     }
 
     fn finished(&mut self, job: &FrameNote, monitor: &RunMonitor) {
-        self.newest = Some(job.plan.id.0 as u32);
+        let id = job.plan.id.0 as u32;
+        if job.is_after_gap {
+            self.gaps.push_back((self.newest.map_or(0, |newest| newest.wrapping_add(1)), id.wrapping_sub(1)));
+            if self.gaps.len() > MAX_PENDING {
+                self.gaps.pop_front();
+            }
+        }
+        self.newest = Some(id);
         self.look_at(job, monitor.live());
         if let Some(flights) = &mut self.flights {
             flights.frame(job);
@@ -373,7 +378,7 @@ impl Collector {
         );
         let sent = job.is_sent();
         let refused = !sent && !matches!(job.fate, Fate::Overtaken | Fate::Stopped);
-        self.slots.planned(job.plan.slot, &job.timeline, refused, job.waited_for_memory);
+        self.slots.planned(job.plan.slot, &job.timeline, refused, job.held_up_by);
         self.last_planned = self.last_planned.max(Some(job.plan.slot));
         while self.repeats.front().is_some_and(|&slot| slot < job.plan.slot) {
             self.repeats.pop_front();
@@ -400,6 +405,12 @@ impl Collector {
         }
     }
 
+    /// True for a frame whose note is missing.
+    fn is_unrecorded(&self, frame: u32) -> bool {
+        let within = |(first, last): &(u32, u32)| !frame_newer(*first, frame) && !frame_newer(frame, *last);
+        self.newest.is_none_or(|newest| frame_newer(frame, newest)) || self.gaps.iter().any(within)
+    }
+
     fn light(&mut self, note: &LightNote, monitor: &RunMonitor) {
         if note.wall_ns > 0 {
             self.stages[Stage::Light as usize].saturating_record(note.wall_ns);
@@ -423,6 +434,10 @@ impl Collector {
                 self.reordered += u64::from(self.last_lit.is_some_and(|last| !frame_newer(frame, last)));
                 self.last_lit = Some(frame);
                 let Some(at) = self.pending.iter().position(|r| r.id.0 as u32 == frame) else {
+                    if self.is_unrecorded(frame) {
+                        // It is in no other count, but its slot showed a frame.
+                        return self.slots.own(slot, begin, note.unseen);
+                    }
                     // The frame was counted as dropped long ago, so this slot does not count as its own.
                     self.slots.nothing_new(slot, begin, note.unseen);
                     return;
@@ -509,6 +524,7 @@ impl Collector {
         report.frames_dark = self.dark;
         report.dark_by_body = self.dark_bodies.report(self.rig.bodies.iter().map(|b| b.name.as_str()));
         report.frames_withheld = self.withheld;
+        report.frames_unrecorded = self.unrecorded;
         report.frames_dropped = self.dropped;
         report.frames_late = self.late;
         report.frames_repeated = self.repeated;
@@ -552,39 +568,41 @@ impl Collector {
 mod tests {
     use super::*;
     use crate::config::{Overrides, RigConfig};
+    use crate::light::notes::note_channel;
     use crate::light::recorder::light_channel;
     use crate::plan::frame::FrameId;
     use dpm_device::light::LightEvent;
     use dpm_device::link::SendOutcome;
     use dpm_device::planes::Raster;
     use dpm_device::time::DeviceTicks;
-    use dpm_handoff::channel::channel;
-    use dpm_handoff::wake::WaitPolicy;
 
     const SLOT_NS: i64 = 1_000_000;
+    /// As many notes as wait at most.
+    const READ: u64 = 256;
 
-    /// Frames lit, dropped and missed, and slots with a repeated frame, when all frames were sent, `lit` says which
-    /// of them were lit, and the collector finds them all at once.
-    fn counted(frames: u64, lit: impl Fn(u64) -> bool) -> [u64; 4] {
-        collected(frames, lit, &mut || ())
+    /// Frames lit, dropped and missed, slots with a repeated frame, and frames that are not recorded, when all frames
+    /// were sent, `lit` says which of them were lit, and the collector finds them `READ` at a time.
+    fn counted(frames: u64, lit: impl Fn(u64) -> bool) -> [u64; 5] {
+        collected(frames, lit, READ, &mut || ())
     }
 
-    /// The same; calls `alive` for every sign of life of the collector.
-    fn collected(frames: u64, lit: impl Fn(u64) -> bool, alive: &mut dyn FnMut()) -> [u64; 4] {
+    /// The same for a collector that reads after every `read_every` frames. Calls `alive` for every sign of life.
+    fn collected(
+        frames: u64,
+        lit: impl Fn(u64) -> bool,
+        read_every: u64,
+        alive: &mut dyn FnMut(),
+    ) -> [u64; 5] {
         let config = RigConfig::demo(&Overrides::default()).unwrap_or_else(|e| panic!("{e}"));
         let rig = Arc::new(Rig::build(&config, Raster::new(16, 16)).unwrap_or_else(|e| panic!("{e}")));
-        let (mut done_in, done) = channel(frames as usize, WaitPolicy::Park);
         assert!(frames <= 8192, "more than there is room for");
+        let monitor = Arc::new(RunMonitor::default());
+        let (mut link, notes) = note_channel(&rig, &monitor);
         let (mut lights_in, lights) = light_channel();
+        let mut collector = Collector::new(rig.clone(), 0, false);
+        let mut inbox = Inbox { notes, lights };
         for k in 0..frames {
             let begin = HostTime(k as i64 * SLOT_NS);
-            let mut note = FrameNote::new(&rig);
-            (note.plan.id, note.plan.slot, note.fate) = (FrameId(k), k, Fate::Offered(SendOutcome::Sent));
-            note.timeline.due_at = begin;
-            let poses = rig.true_poses(begin.0).expect("the mock tells");
-            (note.plan.tracked_poses, note.plan.sampled_poses) = (poses.clone(), poses);
-            note.plan.dark = vec![None; rig.bodies.len()];
-            assert!(done_in.push(Box::new(note)).is_ok());
             let (kind, frame) =
                 if lit(k) { (LightKind::Lit, Some(k as u32)) } else { (LightKind::Repeated, None) };
             let event = LightEvent {
@@ -597,14 +615,21 @@ mod tests {
             };
             let note = LightNote { event, hash: 0, torn: false, wall_ns: 0, unseen: 0 };
             assert!(lights_in.notes.push(note).is_ok());
+            let mut note = Box::new(FrameNote::new(&rig));
+            (note.plan.id, note.plan.slot, note.fate) = (FrameId(k), k, Fate::Offered(SendOutcome::Sent));
+            note.timeline.due_at = begin;
+            let poses = rig.true_poses(begin.0).expect("the mock tells");
+            (note.plan.tracked_poses, note.plan.sampled_poses) = (poses.clone(), poses);
+            note.plan.dark = vec![None; rig.bodies.len()];
+            link.exchange(note);
+            if (k + 1) % read_every == 0 {
+                collector.look(&mut inbox, &monitor, alive);
+            }
         }
-        drop((done_in, lights_in));
-        let mut collector = Collector::new(rig, 0, false);
-        let monitor = RunMonitor::default();
-        let mut inbox = Inbox { done, lights };
-        while !collector.look(&mut inbox, &|_| (), &monitor, alive) {}
+        drop((link, lights_in));
+        while !collector.look(&mut inbox, &monitor, alive) {}
         let missed = collector.finish(&monitor).missed_total();
-        [collector.lit, collector.dropped, missed, collector.repeated]
+        [collector.lit, collector.dropped, missed, collector.repeated, collector.unrecorded]
     }
 
     /// Found by reading: of frames that were finished while the collector had no core, those beyond 256 counted as
@@ -613,14 +638,22 @@ mod tests {
     #[test]
     fn a_collector_that_stood_still_counts_what_it_would_have_counted() {
         let many = 3 * MAX_PENDING as u64 + 7;
-        assert_eq!(counted(many, |_| true), [many, 0, 0, 0]);
+        assert_eq!(counted(many, |_| true), [many, 0, 0, 0, 0]);
         // The picture in the last slot may be shown until the projector is ordered to stop.
-        assert_eq!(counted(many, |_| false), [0, many, many, many - 1]);
+        assert_eq!(counted(many, |_| false), [0, many, many, many - 1, 0]);
         let (odd, even) = (many / 2, many - many / 2);
-        assert_eq!(counted(many, |k| k % 2 == 1), [odd, even, even, even - 1]);
+        assert_eq!(counted(many, |k| k % 2 == 1), [odd, even, even, even - 1, 0]);
         // Only late light, behind more frames than may wait.
         let late = many - MAX_PENDING as u64 - 10;
-        assert_eq!(counted(many, |k| k >= late), [many - late, late, late, late]);
+        assert_eq!(counted(many, |k| k >= late), [many - late, late, late, late, 0]);
+    }
+
+    /// What a starved collector does not learn of is counted as that: as no frame that was lit, dropped or missed.
+    #[test]
+    fn frames_without_a_note_are_counted_by_that_name() {
+        let (frames, unread) = (2000, 744);
+        let counts = collected(frames, |_| true, 1000, &mut || ());
+        assert_eq!(counts, [frames - 2 * unread, 0, 0, 0, 2 * unread]);
     }
 
     /// Found in use: on a busy machine a backlog of thousands of notes takes seconds, in which the collector is
@@ -628,7 +661,7 @@ mod tests {
     #[test]
     fn every_note_of_a_backlog_is_a_sign_of_life() {
         let mut signs = 0;
-        assert_eq!(collected(5_000, |_| true, &mut || signs += 1)[0], 5_000);
+        assert_eq!(collected(5_000, |_| true, READ, &mut || signs += 1)[0], 5_000);
         assert!(signs >= 5_000, "{signs}");
     }
 }

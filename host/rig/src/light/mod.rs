@@ -5,6 +5,7 @@ pub(crate) mod collector;
 mod dark_bodies;
 mod live_view;
 mod measures;
+pub(crate) mod notes;
 mod placement;
 pub mod planes;
 mod record;

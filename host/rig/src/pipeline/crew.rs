@@ -6,15 +6,13 @@
 //! cannot reach the light.
 
 use super::parts::CrewParts;
-use super::threads::{
-    pack_thread, plan_thread, policy, tracking_thread, PackInbox, PlanInbox, Shared, NOTES,
-};
+use super::threads::{pack_thread, plan_thread, policy, tracking_thread, PackInbox, PlanInbox, Shared};
 use crate::engine::error::PipelineError;
 use crate::engine::facts::CrewFacts;
 use crate::engine::pack::PackStage;
 use crate::engine::pulse::{Pulse, Silence};
 use crate::engine::supervision::Trouble;
-use crate::frame::job::{FrameJob, FrameMemory, FrameNote};
+use crate::frame::job::{FrameJob, FrameNote};
 use crate::plan::link_time::LinkTime;
 use crate::tracks::TrackSnapshot;
 use dpm_common::realtime::os::standing_of;
@@ -22,7 +20,7 @@ use dpm_device::time::HostTime;
 use dpm_handoff::channel::{channel, Receiver, Sender};
 use dpm_handoff::latest::{latest, Publisher, Reader};
 use dpm_handoff::path::Lock;
-use dpm_handoff::wake::{WaitPolicy, Waiter};
+use dpm_handoff::wake::Waiter;
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 use std::sync::Arc;
 use std::thread::JoinHandle;
@@ -34,35 +32,14 @@ pub(super) const PLAN: usize = 1;
 /// See [`TRACKING`].
 pub(super) const PACK: usize = 2;
 
-/// Where the link's thread receives the frames of a crew and returns their memory.
+/// Where the link's thread receives the frames of a crew and returns them.
 pub(super) struct Port {
     pub(super) jobs: Receiver<FrameJob>,
-    pub(super) free: Sender<Box<FrameMemory>>,
+    pub(super) free: Sender<FrameJob>,
     /// Publishes the projector's clock to the crew.
     pub(super) times: Publisher<LinkTime>,
     /// The newest tracks; `None` if the projector is told of none.
     pub(super) tracks: Option<Reader<TrackSnapshot>>,
-}
-
-/// The way by which the collector returns notes to the current crew. Not for the frame path: it may lock.
-#[derive(Clone, Default)]
-pub(crate) struct NotesBack(Arc<Lock<Option<Sender<Box<FrameNote>>>>>);
-
-impl NotesBack {
-    /// Returns a note. A note of a former crew may go to the current one.
-    pub(super) fn push(&self, note: Box<FrameNote>) {
-        if let Ok(mut to) = self.0.lock() {
-            if let Some(to) = to.as_mut() {
-                let _ = to.push(note);
-            }
-        }
-    }
-
-    fn lead_to(&self, to: Sender<Box<FrameNote>>) {
-        if let Ok(mut place) = self.0.lock() {
-            *place = Some(to);
-        }
-    }
 }
 
 /// What the threads of one crew share.
@@ -104,16 +81,11 @@ pub(super) struct Crew {
 }
 
 impl Crew {
-    /// Starts the threads. Frames come out of the port. Notes travel from here to the collector and back through
-    /// `notes_back`.
+    /// Starts the threads. Frames come out of the port and return through it.
     ///
     /// # Errors
     /// The system cannot start a thread.
-    pub(super) fn start(
-        shared: &Arc<Shared>,
-        parts: CrewParts,
-        notes_back: &NotesBack,
-    ) -> Result<(Self, Port), PipelineError> {
+    pub(super) fn start(shared: &Arc<Shared>, parts: CrewParts) -> Result<(Self, Port), PipelineError> {
         let CrewParts { tracking, renderer, pictures, kernel, budget, memory, first, budget_milli } = parts;
         let rig = &shared.facts.rig;
         let policy = policy(rig);
@@ -126,14 +98,9 @@ impl Crew {
         let (mut free_in, free) = channel(jobs, policy);
         let (to_pack_in, to_pack_out) = channel(jobs, policy);
         let (to_link_in, to_link_out) = channel(jobs, policy);
-        let (mut notes_in, notes) = channel(NOTES, WaitPolicy::Park);
         for memory in memory {
-            let _ = free_in.push(Box::new(memory));
+            let _ = free_in.push(FrameJob { note: Box::new(FrameNote::new(rig)), memory: Box::new(memory) });
         }
-        for _ in 0..NOTES {
-            let _ = notes_in.push(Box::new(FrameNote::new(rig)));
-        }
-        notes_back.lead_to(notes_in);
         let state = Arc::new(CrewState {
             is_abandoned: AtomicBool::new(false),
             tracking_over: AtomicBool::new(false),
@@ -167,7 +134,7 @@ impl Crew {
             named("plan")
                 .spawn(move || {
                     let _close = OnExit(|| state.tracking_over.store(true, Ordering::Release));
-                    let inbox = PlanInbox { latest: reader, time, free, notes, gpu_free };
+                    let inbox = PlanInbox { latest: reader, time, free, gpu_free };
                     plan_thread(&shared, &state, renderer, inbox, to_pack_in);
                     state.returned[PLAN].store(true, Ordering::Release);
                 })

@@ -8,8 +8,9 @@ use crate::engine::error::PipelineError;
 use crate::engine::link::{LinkStage, Offer};
 use crate::engine::options::StallIn;
 use crate::engine::pace::Real;
-use crate::frame::job::{Fate, FrameJob, FrameMemory, FrameNote};
+use crate::frame::job::{Fate, FrameJob};
 use crate::frame::Stage;
+use crate::light::notes::NoteSender;
 use crate::light::recorder::LightRecorder;
 use crate::mock::{serve_cable, EmulatedProjector};
 use crate::telemetry::projector::ProjectorReport;
@@ -39,11 +40,11 @@ pub(super) fn link_thread(
     shared: &Shared,
     mut line: Line,
     ports: Receiver<Port>,
-    done: Sender<Box<FrameNote>>,
+    notes: NoteSender,
 ) -> ProjectorReport {
     shared.rights.enter(3);
     shared.link_pulse.begin(thread_id());
-    let mut desk = Desk { ports, crew: None, done };
+    let mut desk = Desk { ports, crew: None, notes };
     let served = catch_unwind(AssertUnwindSafe(|| line.serve(shared, &mut desk)));
     enter_frame_path(false);
     if served.is_err() {
@@ -59,12 +60,12 @@ pub(super) fn link_thread(
     report
 }
 
-/// Where the link's thread receives its frames and returns their parts.
+/// Where the link's thread receives its frames and returns them.
 struct Desk {
     ports: Receiver<Port>,
-    /// Frames of the current crew, and the way back for their memory.
-    crew: Option<(Receiver<FrameJob>, Sender<Box<FrameMemory>>)>,
-    done: Sender<Box<FrameNote>>,
+    /// Frames of the current crew, and the way back for them.
+    crew: Option<(Receiver<FrameJob>, Sender<FrameJob>)>,
+    notes: NoteSender,
 }
 
 impl Desk {
@@ -89,14 +90,13 @@ impl Desk {
         }
     }
 
-    /// Returns the frame's memory to the crew and passes its note to the collector. False if there is no collector.
-    fn finish(&mut self, job: FrameJob) -> bool {
-        let FrameJob { note, memory } = job;
+    /// Passes what the frame's note says to the collector, and returns its memory with a note to the crew.
+    fn finish(&mut self, mut job: FrameJob) {
+        job.note = self.notes.exchange(job.note);
         if let Some((_, free)) = &mut self.crew {
             // A crew that is gone needs no memory.
-            let _ = free.push(memory);
+            let _ = free.push(job);
         }
-        self.done.push(note).is_ok()
     }
 
     /// The projector is dark. Counts frames that are still in flight as not sent. Waits briefly for the crew's end.
@@ -131,9 +131,7 @@ impl Line {
                 Some(mut job) => {
                     let is_newest = desk.is_empty();
                     self.take(shared, &mut job, is_newest);
-                    if !desk.finish(job) {
-                        return;
-                    }
+                    desk.finish(job);
                 }
                 None if desk.is_finished() && shared.facts.is_complete.load(Ordering::Acquire) => return,
                 // Polling feeds the device's watchdog while there is nothing to send.

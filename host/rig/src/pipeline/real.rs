@@ -1,7 +1,7 @@
 //! A run at real pace: a thread each for the stages, the link, the supervisor and the mock projector. The caller's
 //! thread collects.
 
-use super::crew::{Crew, NotesBack, OnExit, Port};
+use super::crew::{Crew, OnExit, Port};
 use super::link::{device_thread, link_thread, Line};
 use super::parts::{bring_up, mock_projector, CrewParts, Origin};
 use super::projector::{self, OpenMedium};
@@ -9,7 +9,7 @@ use super::rights::Rights;
 use super::run::Ran;
 use super::settings::lead_estimator;
 use super::supervisor::{join_within, Maker, Supervisor};
-use super::threads::{policy, Shared, NOTES, STAGE_THREADS};
+use super::threads::{policy, Shared, STAGE_THREADS};
 use crate::config::ProjectorBackend;
 use crate::engine::error::PipelineError;
 use crate::engine::facts::Facts;
@@ -19,6 +19,7 @@ use crate::engine::options::RunOptions;
 use crate::engine::pulse::Pulse;
 use crate::engine::supervision::{Remake, Supervision};
 use crate::light::collector::{Collector, Inbox};
+use crate::light::notes::note_channel;
 use crate::light::recorder::{light_channel, LightNote, LightReceiver, LightRecorder, LightSender};
 use crate::rig::{Rig, RigError};
 use crate::telemetry::monitor::RunMonitor;
@@ -46,8 +47,8 @@ const STANDSTILL_NS: i64 = 1_000_000;
 /// Time between two polls of a link that is coming up, nanoseconds.
 const CONNECT_STEP_NS: i64 = 200_000;
 /// Time that the collector may take for one pass, and for one note, nanoseconds. It is the only thread here with a
-/// lower rank than all others, it allocates, and no light depends on it: without it frames run out of notes, and the
-/// light ends by itself.
+/// lower rank than all others, it allocates, and no light depends on it: frames of which it reads nothing are counted
+/// as not recorded.
 const LOOK_NS: i64 = 5_000_000_000;
 /// Time between two passes of the collector. It is not woken for every frame, which would cost the frame path two
 /// system calls per frame.
@@ -100,14 +101,14 @@ pub(super) fn run_at_real_pace(
             .about(origin.gpu().is_none(), standstill.as_ref().map(StandstillMonitor::seen));
 
     let maker = maker(rig, origin.clone(), options, clock, seen);
-    let (threads, mut inbox, notes_back) = Threads::start(&shared, parts, line, maker, lights)?;
+    let (threads, mut inbox) = Threads::start(&shared, parts, line, maker, lights)?;
     // A panic before the end of this function ends the light.
     let stop_on_panic = OnExit(|| {
         if std::thread::panicking() {
             monitor.request_stop();
         }
     });
-    collect(&shared, &mut collector, &mut inbox, &notes_back);
+    collect(&shared, &mut collector, &mut inbox);
     let ended = threads.end();
     let slots = collector.finish(monitor);
     drop(stop_on_panic);
@@ -254,19 +255,17 @@ impl Threads {
         line: Line,
         maker: Maker,
         lights: LightReceiver,
-    ) -> Result<(Self, Inbox, NotesBack), PipelineError> {
-        let notes_back = NotesBack::default();
-        let (crew, port) = Crew::start(shared, parts, &notes_back)?;
+    ) -> Result<(Self, Inbox), PipelineError> {
+        let (crew, port) = Crew::start(shared, parts)?;
         let (mut ports_in, ports) = channel::<Port>(4, WaitPolicy::Park);
         let _ = ports_in.push(port);
-        let (done_in, done) = channel(NOTES, WaitPolicy::Park);
+        let (notes_in, notes) = note_channel(&shared.facts.rig, &shared.facts.monitor);
         let on_link = shared.clone();
-        let link = spawn("link", move || link_thread(&on_link, line, ports, done_in))?;
+        let link = spawn("link", move || link_thread(&on_link, line, ports, notes_in))?;
         let supervisor = Supervisor {
             shared: shared.clone(),
             mind: Supervision::new(shared.facts.clone(), standing_of),
             ports: ports_in,
-            notes_back: notes_back.clone(),
             maker,
         };
         let rights = shared.rights.clone();
@@ -278,7 +277,7 @@ impl Threads {
             // Nobody would supervise the link, so it ends, and with it the light.
             shared.facts.monitor.request_stop();
         })?;
-        Ok((Self { link, supervisor }, Inbox { done, lights }, notes_back))
+        Ok((Self { link, supervisor }, Inbox { notes, lights }))
     }
 
     fn end(self) -> Ended {
@@ -289,14 +288,13 @@ impl Threads {
 }
 
 /// Collects until the run is over, or until nothing can end it any more.
-fn collect(shared: &Shared, collector: &mut Collector, inbox: &mut Inbox, notes_back: &NotesBack) {
+fn collect(shared: &Shared, collector: &mut Collector, inbox: &mut Inbox) {
     let pulse = &shared.collector_pulse;
     pulse.begin(thread_id());
     let mut alive = || pulse.beat(shared.clock.now(), LOOK_NS);
     while !shared.is_broken.load(Ordering::Acquire) {
         alive();
-        let free = |note| notes_back.push(note);
-        if collector.look(inbox, &free, &shared.facts.monitor, &mut alive) {
+        if collector.look(inbox, &shared.facts.monitor, &mut alive) {
             break;
         }
         std::thread::sleep(REST);

@@ -18,6 +18,7 @@ use crate::telemetry::monitor::RunMonitor;
 use crate::telemetry::projector::ProjectorReport;
 use crate::telemetry::report::Report;
 use crate::telemetry::slots::SlotCounts;
+use crate::telemetry::tracker_gauges::TrackerReport;
 use dpm_common::clock::MonotonicClock;
 use dpm_common::realtime::standstill::Standstills;
 use dpm_render::gpu::Gpu;
@@ -150,6 +151,8 @@ impl Ran {
             ..Report::default()
         };
         collector.fill(&mut report);
+        report.tracker = facts.monitor.sample_counts();
+        report.warnings.extend(report.tracker.as_ref().and_then(TrackerReport::warning));
         report.stopped = facts.monitor.stop_requested();
         report.frames_per_wall_second = report.frames_lit as f64 / wall_s.max(1e-9);
         report.warnings.extend(warnings);

@@ -2,7 +2,6 @@
 //! budget.
 
 use crate::config::{self, Packer};
-use crate::engine::facts::RECEIPT_NS;
 use crate::plan::budget::{BudgetConfig, BudgetController, FEWEST_OF_MOST};
 use crate::plan::lead::LeadEstimator;
 use crate::plan::light_centre::groups_that_follow;
@@ -12,8 +11,6 @@ use dpm_render::gpu::Gpu;
 use dpm_render::pack::Halftone;
 use dpm_render::{Output, Overlapping, RendererSettings, Tracing};
 
-/// Longest reserve in the lead, nanoseconds.
-const RESERVE_NS: i64 = 528_000;
 /// Spare time in the first guess of the lead, as a divisor of the time of an undisturbed frame: a quarter.
 const GUESS_SPARE: i64 = 4;
 
@@ -29,11 +26,9 @@ pub(super) fn lead_estimator(rig: &Rig, link: &HostLink, frame_ns: i64) -> LeadE
     // Sending earlier is useless: the device has no free buffer, and its credit message takes part of a slot to
     // arrive.
     let held = link.device().map_or(1, |hello| i64::from(hello.frame_buffers));
-    let longest_wait_ns = (held * slot_ns - slot_ns / 2 - RECEIPT_NS).max(0);
-    // The reserve: interruptions of a core by other work are mostly shorter than half a millisecond.
-    let reserve_ns = (slot_ns / 2).min(RESERVE_NS);
+    let longest_wait_ns = held * slot_ns - slot_ns / 2;
     let rendered_ns = frame_ns + frame_ns / GUESS_SPARE;
-    LeadEstimator::new(slot_ns, modelled_ns(rig).max(rendered_ns), reserve_ns, longest_wait_ns)
+    LeadEstimator::new(slot_ns, modelled_ns(rig).max(rendered_ns), longest_wait_ns)
 }
 
 /// Keeps the GPU's time inside the slot by reducing samples. The unit is thousandths of a sample per pixel; the range

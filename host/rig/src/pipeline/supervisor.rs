@@ -1,7 +1,7 @@
 //! The supervisor's thread, which no stage can delay. It checks every other thread and carries out what
 //! [`Supervision`] decides.
 
-use super::crew::{Crew, NotesBack, Port};
+use super::crew::{Crew, Port};
 use super::parts::CrewParts;
 use super::threads::Shared;
 use crate::engine::error::PipelineError;
@@ -42,7 +42,6 @@ pub(super) struct Supervisor {
     pub(super) mind: Supervision,
     /// Informs the link of a new crew.
     pub(super) ports: Sender<Port>,
-    pub(super) notes_back: NotesBack,
     pub(super) maker: Maker,
 }
 
@@ -120,7 +119,7 @@ impl Supervisor {
     }
 
     fn begin(&mut self, parts: CrewParts) -> Shift {
-        match Crew::start(&self.shared, parts, &self.notes_back) {
+        match Crew::start(&self.shared, parts) {
             Ok((crew, port)) => {
                 // There is room: the link takes ports within a millisecond, and crews are seconds apart.
                 let _ = self.ports.push(port);

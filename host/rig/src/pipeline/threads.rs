@@ -10,7 +10,8 @@ use crate::engine::pace::Real;
 use crate::engine::pack::PackStage;
 use crate::engine::plan::{Latch, PlanStage};
 use crate::engine::pulse::Pulse;
-use crate::frame::job::{FrameJob, FrameMemory, FrameNote};
+use crate::frame::job::FrameJob;
+use crate::frame::slots::MissCause;
 use crate::frame::Stage;
 use crate::pack::source::Pictures;
 use crate::plan::link_time::LinkTime;
@@ -44,8 +45,6 @@ pub(super) fn enter_frame_path(inside: bool) {
 pub(super) const WARM_UP_FRAMES: u64 = 16;
 /// Reads of the tracker until its buffers have grown to their final size.
 pub(super) const WARM_UP_STEPS: u32 = 64;
-/// Frames that may be between planning and the collector: a quarter of a second at 947 Hz.
-pub(super) const NOTES: usize = 256;
 /// Tracking, plan, pack, link, and the mock projector.
 pub(super) const STAGE_THREADS: usize = 5;
 /// How long a stage waits for another one before it checks whether the run continues, nanoseconds.
@@ -54,7 +53,11 @@ pub(super) const WAIT_NS: i64 = 20_000_000;
 pub(super) const STEP_NS: i64 = 20_000_000;
 /// Time that a poll of a tracker may take, nanoseconds: some trackers must be reopened or reconnected.
 pub(super) const POLL_WITHIN_NS: i64 = 200_000_000;
-/// Time between two polls of a tracker.
+/// A frame whose memory came this long after its latch is planned anew, nanoseconds.
+const REPLAN_NS: i64 = 100_000;
+/// Longest wait for a tracker, which must also be polled to keep its connection and its clock.
+const WAIT_FOR_TRACKER: Duration = Duration::from_millis(2);
+/// Time between two polls of a tracker that cannot be waited for.
 const POLL_REST: Duration = Duration::from_micros(200);
 /// At the end, how long to wait for frames that the GPU still works on, nanoseconds.
 const RELEASED_WITHIN_NS: u64 = 30_000_000_000;
@@ -129,9 +132,13 @@ pub(super) fn tracking_thread(
         if let Some(to_link) = &mut to_link {
             stage.publish_lively(now, to_link);
         }
-        std::thread::sleep(POLL_REST);
+        // A tracker that can be waited for is read as soon as something arrives, and costs nothing while nothing does.
+        if !stage.wait(WAIT_FOR_TRACKER) {
+            std::thread::sleep(POLL_REST);
+        }
     }
     enter_frame_path(false);
+    stage.add_counts(clock.now(), facts.monitor.samples(), true);
     pulse.end();
     stage.never_seen(&facts.rig)
 }
@@ -145,6 +152,7 @@ pub(super) fn read_tracker(
     now: HostTime,
 ) {
     let _ = stage.step(now, latest);
+    stage.add_counts(now, facts.monitor.samples(), false);
     if stage.is_silence_due(now) {
         // Leaves the frame path once: a body is dark for lack of samples, and the operator should not have to wait
         // for the report.
@@ -159,8 +167,7 @@ pub(super) fn read_tracker(
 pub(super) struct PlanInbox {
     pub(super) latest: Reader<TrackSnapshot>,
     pub(super) time: Reader<LinkTime>,
-    pub(super) free: Receiver<Box<FrameMemory>>,
-    pub(super) notes: Receiver<Box<FrameNote>>,
+    pub(super) free: Receiver<FrameJob>,
     /// Woken when the GPU has finished a frame.
     pub(super) gpu_free: Waiter,
 }
@@ -211,35 +218,41 @@ struct PlanDesk<'a> {
     inbox: PlanInbox,
     to_pack: Sender<FrameJob>,
     /// The memory that came back last is taken first, because most of it is still in the caches.
-    #[allow(clippy::vec_box)] // The box is what travels between the threads.
-    hottest: Vec<Box<FrameMemory>>,
-    /// No memory had come back at the last check.
-    waited: bool,
+    hottest: Vec<FrameJob>,
+    /// All memory of the crew.
+    circulating: usize,
+    /// What has kept the next frame from being begun.
+    held_up_by: Option<MissCause>,
 }
 
 impl<'a> PlanDesk<'a> {
     fn new(shared: &'a Shared, crew: &'a CrewState, mut inbox: PlanInbox, to_pack: Sender<FrameJob>) -> Self {
         let time = inbox.time.latest().0;
         let stage = PlanStage::new(shared.facts.clone(), crew.facts.clone(), time, shared.clock.now());
-        let hottest = Vec::with_capacity(shared.facts.options.in_flight.max(2));
-        Self { shared, crew, stage, inbox, to_pack, hottest, waited: false }
+        // All of it is there before the first frame.
+        let circulating = inbox.free.len();
+        let hottest = Vec::with_capacity(circulating);
+        Self { shared, crew, stage, inbox, to_pack, hottest, circulating, held_up_by: None }
     }
 
-    /// Memory and a note for the next frame; waits at most [`WAIT_NS`] for each.
-    fn memory(&mut self) -> Option<FrameJob> {
-        while let Some(memory) = self.inbox.free.try_pop() {
-            self.hottest.push(memory);
+    /// Takes back what the link has returned.
+    fn take_back(&mut self) {
+        while let Some(job) = self.inbox.free.try_pop() {
+            self.hottest.push(job);
         }
-        self.waited |= self.hottest.is_empty();
-        if self.hottest.is_empty() {
-            self.hottest.extend(pop_within(&mut self.inbox.free, WAIT_NS));
+    }
+
+    /// Waits at most [`WAIT_NS`] for `enough` frames to have come back. False if they have not; `cause` then holds up the
+    /// next frame.
+    fn are_back(&mut self, enough: usize, cause: MissCause) -> bool {
+        self.take_back();
+        if self.hottest.len() >= enough {
+            return true;
         }
-        if self.hottest.is_empty() {
-            return None;
-        }
-        let mut note = pop_within(&mut self.inbox.notes, WAIT_NS)?;
-        note.waited_for_memory = std::mem::take(&mut self.waited);
-        Some(FrameJob { note, memory: self.hottest.pop()? })
+        self.held_up_by = Some(cause);
+        self.hottest.extend(pop_within(&mut self.inbox.free, WAIT_NS));
+        self.take_back();
+        self.hottest.len() >= enough
     }
 
     /// Waits at most [`WAIT_NS`] for a GPU that gets its frames one at a time. False while it is busy.
@@ -256,18 +269,27 @@ impl<'a> PlanDesk<'a> {
         if !self.gpu_is_free() {
             return Some(());
         }
-        let Some(mut job) = self.memory() else { return Some(()) };
+        if self.stage.sheds() && !self.are_back(self.circulating, MissCause::Queue) {
+            return Some(());
+        }
         let (shared, crew) = (self.shared, self.crew);
         let id = self.stage.next_frame();
         enter_frame_path(id >= WARM_UP_FRAMES);
         crew.planning.store(id, Ordering::Relaxed);
         may_stall(&shared.facts, StallIn::Plan, id);
         let time = *self.inbox.time.latest().0;
-        let Some(latch) = self.stage.choose_slot(&time, shared.clock.now()) else {
-            self.hottest.push(job.memory);
-            return Some(());
-        };
+        let Some(latch) = self.stage.choose_slot(&time, shared.clock.now()) else { return Some(()) };
         let now = self.wait_for(&latch);
+        // Memory is taken now and not before the wait, so that as little of it circulates as the stages need. After a
+        // wait for memory another slot may be the first that can be met.
+        if self.hottest.is_empty() && !self.are_back(1, MissCause::Buffers) {
+            return Some(());
+        }
+        if shared.clock.now().ns_since(now) > REPLAN_NS {
+            return Some(());
+        }
+        let Some(mut job) = self.hottest.pop() else { return Some(()) };
+        job.note.held_up_by = self.held_up_by.take();
         let watch = Stopwatch::start();
         let snapshot = self.inbox.latest.latest().0;
         self.stage.plan(&latch, &mut job.note, &time, snapshot, now);

@@ -5,7 +5,7 @@ use super::parts::{bring_up, mock_projector, CrewParts, Origin, FIRST_FRAME_TIME
 use super::run::Ran;
 use super::settings::lead_estimator;
 use super::supervisor::leave_behind;
-use super::threads::{enter_frame_path, may_stall, read_tracker, rendered, NOTES, WARM_UP_FRAMES};
+use super::threads::{enter_frame_path, may_stall, read_tracker, rendered, WARM_UP_FRAMES};
 use crate::config::ProjectorBackend;
 use crate::engine::error::PipelineError;
 use crate::engine::facts::{CrewFacts, Facts};
@@ -15,9 +15,10 @@ use crate::engine::options::{RunOptions, StallIn};
 use crate::engine::pace::Virtual;
 use crate::engine::pack::PackStage;
 use crate::engine::plan::{PlanStage, LISTEN_NS};
-use crate::frame::job::{Fate, FrameJob, FrameMemory, FrameNote};
+use crate::frame::job::{Fate, FrameJob, FrameNote};
 use crate::frame::Stage;
 use crate::light::collector::{Collector, Inbox};
+use crate::light::notes::{note_channel, NoteSender};
 use crate::light::recorder::{light_channel, LightRecorder};
 use crate::mock::EmulatedProjector;
 use crate::plan::link_time::LinkTime;
@@ -29,10 +30,7 @@ use dpm_common::realtime::standstill::Standstills;
 use dpm_device::time::HostTime;
 use dpm_device::transport::inproc::Direct;
 use dpm_device::transport::Transport;
-use dpm_handoff::channel::{channel, Sender};
 use dpm_handoff::latest::{latest, Publisher, Reader};
-use dpm_handoff::wake::WaitPolicy;
-use std::cell::RefCell;
 use std::collections::VecDeque;
 use std::panic::{catch_unwind, AssertUnwindSafe};
 use std::sync::atomic::Ordering;
@@ -69,8 +67,11 @@ pub(super) fn run_at_virtual_pace(
     let facts = Arc::new(Facts::new(rig.clone(), monitor.clone(), options, &lead, now));
     let crew = Arc::new(CrewFacts::new(0, rig.rate().slot_len_ns(0)));
     let keeper = LinkKeeper::new(time, &link, None);
-    let (done, finished) = channel(NOTES, WaitPolicy::Park);
-    let free: Vec<_> = std::mem::take(&mut parts.memory).into_iter().map(Box::new).collect();
+    let (notes_in, notes) = note_channel(rig, monitor);
+    let free: Vec<_> = std::mem::take(&mut parts.memory)
+        .into_iter()
+        .map(|memory| FrameJob { note: Box::new(FrameNote::new(rig)), memory: Box::new(memory) })
+        .collect();
     let frames = free.len();
     let mut late = LateTracks::of(rig, origin)?;
     let mut stage = LinkStage::new(facts.clone(), link, keeper, lead);
@@ -91,12 +92,11 @@ pub(super) fn run_at_virtual_pace(
         cable,
         recorder: recorder.seen_by(monitor),
         free,
-        notes: RefCell::new((0..frames).map(|_| Box::new(FrameNote::new(rig))).collect()),
         under_way: VecDeque::with_capacity(frames),
-        done: Some(done),
+        notes: Some(notes_in),
         collector: Collector::new(rig.clone(), options.keep_frames.max(options.keep_records), options.verify)
             .about(origin.gpu().is_none(), None),
-        inbox: Inbox { done: finished, lights },
+        inbox: Inbox { notes, lights },
         at_work: "plan",
         parts,
         facts: facts.clone(),
@@ -171,14 +171,11 @@ struct World {
     parts: CrewParts,
     cable: Direct<EmulatedProjector>,
     recorder: LightRecorder,
-    #[allow(clippy::vec_box)] // The boxes travel with the frames.
-    free: Vec<Box<FrameMemory>>,
-    #[allow(clippy::vec_box)]
-    notes: RefCell<Vec<Box<FrameNote>>>,
+    free: Vec<FrameJob>,
     /// Frames in progress on the GPU, oldest first.
     under_way: VecDeque<FrameJob>,
     /// `None` when no frame will be finished any more.
-    done: Option<Sender<Box<FrameNote>>>,
+    notes: Option<NoteSender>,
     collector: Collector,
     inbox: Inbox,
     /// The stage that is working, for the message about a panic.
@@ -198,7 +195,8 @@ impl World {
         }
         self.go_dark();
         self.clear();
-        self.done = None;
+        self.notes = None;
+        self.parts.tracking.add_counts(self.now, self.facts.monitor.samples(), true);
         self.recorder.close();
         while !self.collect() {}
     }
@@ -206,7 +204,7 @@ impl World {
     fn serve(&mut self) -> Result<(), PipelineError> {
         while !self.facts.monitor.stop_requested() {
             let begun = match self.free.pop() {
-                Some(memory) => self.begin(memory)?,
+                Some(job) => self.begin(job)?,
                 None => false,
             };
             if begun {
@@ -226,18 +224,16 @@ impl World {
     }
 
     /// Latches the next frame and starts the GPU on it. False when all frames of the run are planned.
-    fn begin(&mut self, memory: Box<FrameMemory>) -> Result<bool, PipelineError> {
+    fn begin(&mut self, mut job: FrameJob) -> Result<bool, PipelineError> {
         self.at_work = "plan";
         let id = self.plan.next_frame();
         may_stall(&self.facts, StallIn::Plan, id);
         let latch = if self.plan.is_complete() { None } else { self.plan.choose_slot(&self.time, self.now) };
-        let note = self.notes.get_mut().pop();
-        let (Some(latch), Some(note)) = (latch, note) else {
-            self.free.push(memory);
+        let Some(latch) = latch else {
+            self.free.push(job);
             return Ok(false);
         };
         enter_frame_path(id >= WARM_UP_FRAMES);
-        let mut job = FrameJob { note, memory };
         self.now = latch.at;
         self.at_work = "tracking";
         may_stall(&self.facts, StallIn::Tracking, id);
@@ -311,14 +307,13 @@ impl World {
         }
     }
 
-    /// The link has finished with a frame: returns its memory, and passes its note to the collector.
-    fn release(&mut self, job: FrameJob) {
+    /// The link has finished with a frame: passes what its note says to the collector, and keeps it for another one.
+    fn release(&mut self, mut job: FrameJob) {
         enter_frame_path(false);
-        self.free.push(job.memory);
-        if let Some(done) = &mut self.done {
-            // There are fewer notes than places.
-            let _ = done.push(job.note);
+        if let Some(notes) = &mut self.notes {
+            job.note = notes.exchange(job.note);
         }
+        self.free.push(job);
         self.collect();
     }
 
@@ -359,7 +354,6 @@ impl World {
 
     /// True when everything is collected.
     fn collect(&mut self) -> bool {
-        let Self { collector, inbox, notes, facts, .. } = self;
-        collector.look(inbox, &|note| notes.borrow_mut().push(note), &facts.monitor, &mut || ())
+        self.collector.look(&mut self.inbox, &self.facts.monitor, &mut || ())
     }
 }

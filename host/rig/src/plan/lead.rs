@@ -1,66 +1,73 @@
-//! Learns from the measured times between latch and sent how early a frame must begin, and when its slot must be
-//! given up.
+//! Learns from measured times how early a frame must begin, and when its slot must be given up.
 //!
-//! The estimator keeps a histogram whose counts are halved from time to time: quantiles over the last seconds. One
-//! long stall moves a quantile by one frame in thousands and is forgotten; a maximum or a mean would carry it into
-//! every later frame. A reserve covers events that are rarer than the histogram's memory (an interrupt, a core lent
-//! to another machine).
+//! The measured time is that from the instant at which a frame should have been latched to the instant at which the
+//! device had it whole. The lead is chosen so that one frame in two hundred has at least [`MARGIN_NS`] of slack left,
+//! and one in a thousand at least some, without a frame having to be late first.
 //!
-//! Bins are a 32nd of a slot wide up to four slots. From there on each is a twelfth wider than the one before: a
+//! The estimator keeps histograms of the last two spans of time: quantiles over the last seconds. Where the frames are
+//! too few for a quantile, it is not replaced by their longest time, which would make an outlier the rule: the tail
+//! beyond the quantile that they do determine is continued as an exponential one, with a scale that the frames
+//! determine, widened by its own uncertainty, and no further than the share that so many frames can show.
+//!
+//! Bins are a 64th of a slot wide up to four slots. From there on each is a 33rd wider than the one before: a
 //! renderer that needs many slots for a frame also needs a lead, and its frames are planned for slots that they can
 //! meet.
 
-/// Bins of equal width, each a 32nd of a slot.
-const EVEN_BINS: usize = 128;
+/// Bins of equal width, each a 64th of a slot.
+const EVEN_BINS: usize = 256;
 /// Slots that the even bins span.
 const EVEN_SLOTS: i64 = 4;
-/// Bins beyond them, each longer by [`GROWTH`]: 4 slots times 1.08^128 are about 76,000 slots.
-const WIDE_BINS: usize = 128;
+/// Bins beyond them, each longer by [`GROWTH`]: 4 slots times 1.03^256 are about 7,700 slots.
+const WIDE_BINS: usize = 256;
 /// All bins.
 const BINS: usize = EVEN_BINS + WIDE_BINS;
 /// Upper edge of a wide bin divided by its lower edge.
-const GROWTH: f64 = 1.08;
+const GROWTH: f64 = 1.03;
 /// A time longer than this many typical times (and than [`EVEN_SLOTS`]) was not work but a stall, and no lead helps
 /// against a stall ...
 const STALL_TIMES: i64 = 4;
 /// ... unless this many occur in a row: then the work itself has become that long.
 const STALLS_IN_A_ROW: u32 = 8;
-/// Counts are halved after about this many nanoseconds, so that the past weighs as much as the last two seconds ...
-const MEMORY_NS: i64 = 2_163_000_000;
-/// ... but never after more frames than this, and never after fewer than [`FEW`].
-const HALVE_AFTER: u32 = 2048;
-/// Share of frames that must be sent before their slot, in 1/10,000.
-const IN_TIME: u64 = 9_995;
-/// Share of frames, in 1/10,000, whose time decides when a slot is given up.
-const TYPICAL: u64 = 9_000;
+/// A span lasts for about this many nanoseconds ...
+const SPAN_NS: i64 = 8_000_000_000;
+/// ... but has no more frames than this, and no fewer than [`FEWEST_IN_A_SPAN`].
+const MOST_IN_A_SPAN: u32 = 2048;
+const FEWEST_IN_A_SPAN: u32 = 64;
+/// Slack that is left to the frame of [`LATE_SHARE`], nanoseconds.
+const MARGIN_NS: i64 = 150_000;
+/// Share of frames that may have less slack than [`MARGIN_NS`].
+const LATE_SHARE: f64 = 0.005;
+/// Share of frames that may have none.
+const LOST_SHARE: f64 = 0.001;
+/// Share of frames that take longer than what decides when a slot is given up.
+const UNUSUAL_SHARE: f64 = 0.1;
+/// A quantile counts as determined by the frames if so many of them lie beyond it.
+const BEYOND: f64 = 8.0;
+/// The quantile from which the tail begins at the latest, as the share beyond it.
+const TAIL_SHARE: f64 = 0.2;
 /// With fewer frames than this the first guess also counts.
-const FEW: u32 = 256;
-/// The same for frames that take longer than a slot: at a few frames per second the first guess would otherwise last
-/// too long.
-const FEW_SLOW: u32 = 32;
+const FEW: u32 = 16;
 
-/// Quantiles of the time from latch to sent.
+/// Quantiles of the time that frames need.
 #[derive(Clone, Debug)]
 pub struct LeadEstimator {
-    bins: [u32; BINS],
+    /// Frames by time, of this span and of the one before.
+    bins: [[u32; BINS]; 2],
     /// Upper edges of the bins, nanoseconds.
     edges: [i64; BINS],
-    total: u32,
-    since_halved: u32,
+    /// Frames of both.
+    totals: [u32; 2],
     slot_ns: i64,
-    bin_ns: i64,
     first_guess_ns: i64,
-    reserve_ns: i64,
     longest_wait_ns: i64,
     stalls: u64,
     stalls_in_a_row: u32,
 }
 
 impl LeadEstimator {
-    /// For slots of `slot_ns` > 0. `first_guess_ns` is the lead until enough frames are measured. `reserve_ns` >= 0
-    /// is added to the measured time. The lead exceeds the time of a typical frame by at most `longest_wait_ns`; a
-    /// frame sent earlier would find no room in the device.
-    pub fn new(slot_ns: i64, first_guess_ns: i64, reserve_ns: i64, longest_wait_ns: i64) -> Self {
+    /// For slots of `slot_ns` > 0. `first_guess_ns` is the lead until enough frames are measured. The lead exceeds the
+    /// time of a typical frame by at most `longest_wait_ns`; a frame sent earlier would find no room in the device.
+    pub fn new(slot_ns: i64, first_guess_ns: i64, longest_wait_ns: i64) -> Self {
         let slot_ns = slot_ns.max(1);
         let bin_ns = (slot_ns * EVEN_SLOTS / EVEN_BINS as i64).max(1);
         let mut edges = [0; BINS];
@@ -71,22 +78,19 @@ impl LeadEstimator {
             };
         }
         Self {
-            bins: [0; BINS],
+            bins: [[0; BINS]; 2],
             edges,
-            total: 0,
-            since_halved: 0,
+            totals: [0; 2],
             slot_ns,
-            bin_ns,
             first_guess_ns: first_guess_ns.max(0),
-            reserve_ns: reserve_ns.max(0),
             longest_wait_ns: longest_wait_ns.max(0),
             stalls: 0,
             stalls_in_a_row: 0,
         }
     }
 
-    /// Records the time of one frame from the instant at which it should have been latched until it was sent,
-    /// nanoseconds.
+    /// Records the time of one frame from the instant at which it should have been latched until the device had it
+    /// whole, nanoseconds.
     pub fn measured(&mut self, needed_ns: i64) {
         let needed_ns = needed_ns.max(0);
         let usual = (self.slot_ns * EVEN_SLOTS).max(self.typical_ns().saturating_mul(STALL_TIMES));
@@ -100,35 +104,36 @@ impl LeadEstimator {
             self.stalls_in_a_row = 0;
         }
         let bin = self.edges.partition_point(|&edge| edge <= needed_ns);
-        let Some(bin) = self.bins.get_mut(bin) else { return };
+        let Some(bin) = self.bins[0].get_mut(bin) else { return };
         *bin += 1;
-        self.total += 1;
-        self.since_halved += 1;
-        let remembered =
-            (MEMORY_NS / self.typical_ns().max(self.slot_ns)).clamp(i64::from(FEW), i64::from(HALVE_AFTER));
-        if i64::from(self.since_halved) >= remembered {
-            self.since_halved = 0;
-            // Rounded down, so that a single event is forgotten.
-            self.bins.iter_mut().for_each(|n| *n /= 2);
-            self.total = self.bins.iter().sum();
+        self.totals[0] += 1;
+        let frame_ns = self.typical_ns().max(self.slot_ns);
+        let most = (SPAN_NS / frame_ns).clamp(FEWEST_IN_A_SPAN.into(), MOST_IN_A_SPAN.into());
+        if i64::from(self.totals[0]) >= most {
+            // Whole spans are forgotten. Counts that are halved lose their single events first, and these are the tail.
+            self.bins[1] = std::mem::replace(&mut self.bins[0], [0; BINS]);
+            self.totals[1] = std::mem::take(&mut self.totals[0]);
         }
     }
 
-    /// How long before its slot a frame is latched so that nearly all are sent in time.
+    /// Frames that are remembered.
+    fn total(&self) -> u32 {
+        self.totals[0] + self.totals[1]
+    }
+
+    /// How long before its slot a frame is latched so that nearly all are whole in time.
     pub fn lead_ns(&self) -> i64 {
-        let quantile = self.quantile(IN_TIME);
-        let measured = (quantile + self.bin_ns).saturating_add(self.reserve_ns);
-        let few = if quantile > self.slot_ns { FEW_SLOW } else { FEW };
-        let lead = if self.total < few { measured.max(self.first_guess_ns) } else { measured };
+        let measured = self.beyond(LOST_SHARE).max(self.beyond(LATE_SHARE).saturating_add(MARGIN_NS));
+        let lead = if self.total() < FEW { measured.max(self.first_guess_ns) } else { measured };
         lead.min(self.needed_ns().saturating_add(self.longest_wait_ns))
     }
 
     /// The time that most frames need; the first guess while nothing has been measured.
     fn needed_ns(&self) -> i64 {
-        if self.total == 0 {
+        if self.total() == 0 {
             self.first_guess_ns
         } else {
-            self.quantile(TYPICAL)
+            self.quantile(UNUSUAL_SHARE)
         }
     }
 
@@ -143,13 +148,35 @@ impl LeadEstimator {
         self.stalls
     }
 
-    /// Upper edge of the bin in which the quantile lies; 0 without measurements.
-    fn quantile(&self, ten_thousandths: u64) -> i64 {
-        let wanted = (u64::from(self.total) * ten_thousandths).div_ceil(10_000);
-        let mut seen = 0;
-        for (edge, &n) in self.edges.iter().zip(&self.bins) {
-            seen += u64::from(n);
-            if n > 0 && seen >= wanted {
+    /// The time that a frame exceeds with probability `share`, nanoseconds: a quantile where the frames determine it,
+    /// else by an exponential tail; 0 without measurements.
+    fn beyond(&self, share: f64) -> i64 {
+        let frames = f64::from(self.total());
+        // So many frames can show no smaller share.
+        let share = share.max(1.0 / frames.max(1.0));
+        if frames * share >= BEYOND {
+            return self.quantile(share);
+        }
+        // The median of few frames and what a fifth of them exceed are known well enough; of more frames also what
+        // fewer of them exceed.
+        let from = (BEYOND / frames.max(1.0)).min(TAIL_SHARE);
+        let (median, known) = (self.quantile(0.5), self.quantile(from));
+        // An exponential tail falls by this much from the half to `from`. Its scale is measured by the frames beyond
+        // the median, and is wrong by one over the square root of their number.
+        let scale = (known - median) as f64 / (0.5 / from).ln();
+        let widened = scale * (1.0 + 1.0 / (frames * 0.5).max(1.0).sqrt());
+        known.saturating_add((widened * (from / share).ln()).max(0.0) as i64)
+    }
+
+    /// The least upper edge of a bin that at most the share `beyond` of all frames exceeds, nanoseconds; 0 without
+    /// measurements.
+    fn quantile(&self, beyond: f64) -> i64 {
+        let most = (f64::from(self.total()) * beyond).floor() as u32;
+        let mut rest = self.total();
+        for (edge, (new, old)) in self.edges.iter().zip(self.bins[0].iter().zip(&self.bins[1])) {
+            let n = new + old;
+            rest -= n;
+            if n > 0 && rest <= most {
                 return *edge;
             }
         }
@@ -165,7 +192,7 @@ mod tests {
     const SLOT: i64 = 1_055_966;
 
     fn estimator() -> LeadEstimator {
-        LeadEstimator::new(SLOT, 2 * SLOT, 0, 2 * SLOT)
+        LeadEstimator::new(SLOT, 2 * SLOT, 4 * SLOT)
     }
 
     /// A reproducible number between 0 and 1.
@@ -180,43 +207,86 @@ mod tests {
         for i in 0..FEW {
             e.measured(300_000 + i64::from(i));
         }
-        assert!((300_000..400_000).contains(&e.lead_ns()), "{}", e.lead_ns());
+        assert!((450_000..500_000).contains(&e.lead_ns()), "{}", e.lead_ns());
         assert!(e.typical_ns() <= e.lead_ns() && e.typical_ns() >= 300_000);
     }
 
-    /// At any steady load, the lead covers all of the last frames except one in two thousand.
-    #[test]
-    fn the_lead_covers_what_it_promises() {
-        let mut e = estimator();
-        let needs = |i: u64| (200_000.0 + 600_000.0 * noise(i).powi(4)) as i64;
-        for i in 0..20_000 {
-            e.measured(needs(i));
+    /// A time that exceeds 0.3 ms by an exponential amount of a mean of 0.1 ms.
+    fn exponential(i: u64) -> i64 {
+        300_000 + (-100_000.0 * (1.0 - noise(i)).ln()) as i64
+    }
+
+    /// A time around 0.4 ms with few that are far longer: one in a hundred takes up to three times as long.
+    fn with_outliers(i: u64) -> i64 {
+        let usual = 350_000 + (100_000.0 * noise(i)) as i64;
+        if noise(i ^ 0x5555_0000) < 0.01 {
+            usual + (800_000.0 * noise(i ^ 0x3333_0000)) as i64
+        } else {
+            usual
         }
-        let lead = e.lead_ns();
-        let late = (20_000..40_000).filter(|&i| needs(i) > lead).count();
-        assert!(late <= 20, "{late} of 20000 beyond a lead of {lead} ns");
-        assert!(lead < 800_000 + 3 * e.bin_ns, "{lead} ns for needs of at most 0.8 ms");
-        let slow = (20_000..40_000).filter(|&i| needs(i) > e.typical_ns()).count();
-        assert!(slow <= 2_200, "{slow} of 20000 beyond the typical {} ns", e.typical_ns());
+    }
+
+    /// At any steady load one frame in two hundred has at least the margin left, and one in a thousand something; and
+    /// the lead is no longer than that needs.
+    #[test]
+    fn the_lead_leaves_what_it_promises() {
+        for needs in [exponential, with_outliers, |i| (200_000.0 + 600_000.0 * noise(i).powi(4)) as i64] {
+            let mut e = estimator();
+            (0..20_000).for_each(|i| e.measured(needs(i)));
+            let lead = e.lead_ns();
+            let mut all: Vec<i64> = (20_000..60_000).map(needs).collect();
+            all.sort_unstable();
+            let [q995, q999] = [0.995, 0.999].map(|q| all[(q * all.len() as f64) as usize]);
+            let ideal = q999.max(q995 + MARGIN_NS);
+            let off = lead - ideal;
+            assert!((-60_000..160_000).contains(&off), "{lead} ns, where {ideal} ns would do");
+            let slow = all.iter().filter(|&&ns| ns > e.typical_ns()).count();
+            assert!(
+                slow <= all.len() / 9,
+                "{slow} of {} beyond the typical {} ns",
+                all.len(),
+                e.typical_ns()
+            );
+        }
+    }
+
+    /// Few frames widen the lead by what they leave open, and no single one makes it its own: the longest of 32 frames
+    /// may be ten times as long as all others without moving the lead by as much.
+    #[test]
+    fn few_frames_are_judged_by_their_spread_and_not_by_the_longest() {
+        for frames in [16u64, 32, 64, 128, 256] {
+            // What one frame in so many exceeds, and the margin: less cannot be known of them.
+            let ideal = 450_000 + (100_000.0 * (frames as f64).ln()) as i64;
+            let leads: Vec<i64> = (0..200)
+                .map(|run| {
+                    let mut e = estimator();
+                    (0..frames).for_each(|i| e.measured(exponential(7_919 * run + i)));
+                    e.lead_ns()
+                })
+                .collect();
+            let short = leads.iter().filter(|&&lead| lead < ideal - 250_000).count();
+            let mean = leads.iter().sum::<i64>() / leads.len() as i64;
+            assert!(short <= 40, "{frames} frames: {short} of 200 leads are far too short");
+            assert!(
+                (ideal - 150_000..ideal + 450_000).contains(&mean),
+                "{frames} frames: {mean}, not {ideal}"
+            );
+        }
+        let mut e = estimator();
+        (0..32).for_each(|i| e.measured(exponential(i)));
+        let before = e.lead_ns();
+        e.measured(3_900_000);
+        assert!(e.lead_ns() < before + 300_000, "{before} ns, then {} ns", e.lead_ns());
     }
 
     #[test]
-    fn the_reserve_comes_on_top_of_what_is_measured_and_ends_where_the_device_has_no_room() {
-        let (mut with, mut without) = (LeadEstimator::new(SLOT, 0, SLOT / 2, SLOT / 4), estimator());
-        for ns in [400_000, 1_900_000] {
-            for _ in 0..10_000 {
-                with.measured(ns);
-                without.measured(ns);
-            }
-            let (lead, bare) = (with.lead_ns(), without.lead_ns());
-            // No frame waits in the device for longer than the device has room for it.
-            assert!(bare >= ns && (bare..=bare + SLOT / 4).contains(&lead), "{lead}, {bare}");
-            assert_eq!(
-                with.typical_ns(),
-                without.typical_ns(),
-                "when a slot is given up is not what is kept in reserve"
-            );
+    fn the_lead_ends_where_the_device_has_no_room() {
+        let mut e = LeadEstimator::new(SLOT, 0, SLOT / 4);
+        for i in 0..10_000u64 {
+            e.measured(if i % 50 == 0 { 3_000_000 } else { 400_000 });
         }
+        let lead = e.lead_ns();
+        assert!((400_000 + SLOT / 4..450_000 + SLOT / 4).contains(&lead), "{lead}");
     }
 
     #[test]
@@ -239,11 +309,11 @@ mod tests {
         let mut e = estimator();
         let feed = |e: &mut LeadEstimator, n: u64, ns: i64| (0..n).for_each(|_| e.measured(ns));
         feed(&mut e, 10_000, 300_000);
-        assert!(e.lead_ns() < 400_000);
+        assert!(e.lead_ns() < 550_000);
         feed(&mut e, 10, 1_500_000);
         assert!(e.lead_ns() >= 1_500_000, "{}", e.lead_ns());
         feed(&mut e, 15_000, 300_000);
-        assert!(e.lead_ns() < 400_000, "{}", e.lead_ns());
+        assert!(e.lead_ns() < 550_000, "{}", e.lead_ns());
     }
 
     /// Found in use, R21: a renderer that needs many slots for a frame gets a lead that it can keep, from its first
@@ -251,7 +321,7 @@ mod tests {
     #[test]
     fn a_renderer_slower_than_its_slots_has_a_lead_that_it_can_keep() {
         let slot = 16_666_667;
-        let mut e = LeadEstimator::new(slot, 2_270_000, 500_000, 2 * slot);
+        let mut e = LeadEstimator::new(slot, 2_270_000, 2 * slot);
         let needs = |i: u64| 60_000_000 + (noise(i) * 12e6) as i64;
         for i in 0..STALLS_IN_A_ROW as u64 + 32 {
             e.measured(needs(i));

@@ -58,7 +58,7 @@ pub(super) struct Flown {
     pub(super) pass_ns: [u64; PASSES.len()],
     pub(super) fate: Fate,
     /// Planning had waited for memory.
-    pub(super) waited_for_memory: bool,
+    pub(super) held_up_by: Option<MissCause>,
 }
 
 impl Flown {
@@ -165,7 +165,7 @@ impl FlightRecorder {
             timeline: note.timeline,
             pass_ns: note.cost.map_or([0; PASSES.len()], |cost| cost.pass_ns),
             fate: note.fate,
-            waited_for_memory: note.waited_for_memory,
+            held_up_by: note.held_up_by,
         });
     }
 

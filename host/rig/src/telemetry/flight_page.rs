@@ -92,6 +92,6 @@ fn row(text: &mut String, frame: &Flown, zero: HostTime, is_missed: bool) {
         between(t.packed_at, t.sent_at),
         between(t.sent_at, if t.sent_at == HostTime(0) { t.sent_at } else { t.due_at }),
         frame.fate_word(),
-        if frame.waited_for_memory { ", waited for memory" } else { "" },
+        frame.held_up_by.map_or(String::new(), |cause| format!(", begun late: {}", cause.name())),
     );
 }

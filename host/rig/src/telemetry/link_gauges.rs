@@ -126,6 +126,7 @@ impl LinkGauges {
             device: (self.has_device.load(Ordering::Relaxed) != 0).then_some(device),
             clock_bound_ns,
             travel_ms: travel_ns.map(|ns| ns as f64 / 1e6),
+            slack: None,
             celsius: Some(self.milli_celsius.0.load(Ordering::Relaxed))
                 .filter(|c| *c != NONE)
                 .map(|c| c as f64 / 1e3),
@@ -182,6 +183,7 @@ mod tests {
                 device: Some(device),
                 clock_bound_ns: Some(-13),
                 travel_ms: Some(14.0),
+                slack: None,
                 celsius: Some(41.5),
             }
         );

@@ -5,6 +5,7 @@ use super::link_gauges::LinkGauges;
 use super::live::Live;
 use super::ordered::DarkLog;
 use super::projector::ProjectorReport;
+use super::tracker_gauges::{TrackerGauges, TrackerReport};
 use crate::interlock::Interlock;
 use crate::order::Order;
 use crate::parameters::ParameterDesk;
@@ -178,6 +179,7 @@ pub struct RunMonitor {
     frames_dark: AtomicU64,
     frames_dropped: AtomicU64,
     frames_withheld: AtomicU64,
+    frames_unrecorded: AtomicU64,
     frames_late: AtomicU64,
     slots: AtomicU64,
     slots_missed: AtomicU64,
@@ -188,6 +190,8 @@ pub struct RunMonitor {
     notes: Lock<Notes>,
     /// What the link carries: written by its thread.
     link: LinkGauges,
+    /// What became of the tracker's samples: written by its thread.
+    samples: TrackerGauges,
     /// What observers see of the run.
     live: Live,
     /// What operators may change while it goes on.
@@ -213,6 +217,8 @@ pub struct RunCounts {
     pub frames_dropped: u64,
     /// Frames that were not lit because no new picture was wanted.
     pub frames_withheld: u64,
+    /// Frames of which the collector learnt nothing, because it had no time: lit or not, they are in no other count.
+    pub frames_unrecorded: u64,
     /// Frames lit late.
     pub frames_late: u64,
     /// Slots in which a frame of their own was wanted.
@@ -224,7 +230,11 @@ pub struct RunCounts {
 impl RunCounts {
     /// Planned frames whose result is known.
     pub fn frames_done(&self) -> u64 {
-        self.frames_lit + self.frames_dark + self.frames_dropped + self.frames_withheld
+        self.frames_lit
+            + self.frames_dark
+            + self.frames_dropped
+            + self.frames_withheld
+            + self.frames_unrecorded
     }
 }
 
@@ -422,6 +432,22 @@ impl RunMonitor {
         self.frames_withheld.fetch_add(1, Ordering::Relaxed);
     }
 
+    /// What has become of the tracker's samples so far; `None` before the first ones.
+    pub fn sample_counts(&self) -> Option<TrackerReport> {
+        let rig = self.live.rig();
+        self.samples.report(rig.into_iter().flat_map(|rig| rig.bodies.iter().map(|body| body.name.as_str())))
+    }
+
+    /// What became of the tracker's samples.
+    pub(crate) fn samples(&self) -> &TrackerGauges {
+        &self.samples
+    }
+
+    /// Counts a frame of which the collector learns nothing.
+    pub(crate) fn count_unrecorded(&self) {
+        self.frames_unrecorded.fetch_add(1, Ordering::Relaxed);
+    }
+
     /// The counters now. Each is exact, but they are not read at the same instant.
     pub fn counts(&self) -> RunCounts {
         RunCounts {
@@ -429,6 +455,7 @@ impl RunMonitor {
             frames_lit: self.frames_lit.load(Ordering::Relaxed),
             frames_dark: self.frames_dark.load(Ordering::Relaxed),
             frames_withheld: self.frames_withheld.load(Ordering::Relaxed),
+            frames_unrecorded: self.frames_unrecorded.load(Ordering::Relaxed),
             slots: self.slots.load(Ordering::Relaxed),
             slots_missed: self.slots_missed.load(Ordering::Relaxed),
             frames_dropped: self.frames_dropped.load(Ordering::Relaxed),

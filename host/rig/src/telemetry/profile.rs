@@ -309,7 +309,8 @@ pub(crate) fn missed_by_cause(slots: &SlotCounts) -> BTreeMap<String, u64> {
 
 /// Slots in which no new picture was wanted, by the name of the reason, for all reasons.
 pub(crate) fn ordered_dark(slots: &SlotCounts) -> BTreeMap<String, u64> {
-    OrderedDark::ALL.iter().map(|r| (r.name().to_owned(), slots.ordered[*r as usize])).collect()
+    let ordered = OrderedDark::ALL.iter().filter(|reason| **reason != OrderedDark::Exceeded);
+    ordered.map(|r| (r.name().to_owned(), slots.ordered[*r as usize])).collect()
 }
 
 #[cfg(test)]

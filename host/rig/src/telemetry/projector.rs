@@ -29,8 +29,23 @@ pub struct ProjectorReport {
     pub clock_bound_ns: Option<i64>,
     /// Learned time from sent to light, milliseconds; null for the mock in this process.
     pub travel_ms: Option<f64>,
+    /// How early frames were whole in the device; null for one that does not measure it.
+    pub slack: Option<SlackReport>,
     /// The device's hottest sensor, degrees Celsius; null for a device that tells none.
     pub celsius: Option<f64>,
+}
+
+/// How early frames were whole in the device, by its own clock, and how long they took to arrive there.
+#[derive(Clone, Copy, Debug, PartialEq, serde::Serialize)]
+pub struct SlackReport {
+    /// Slack from the whole frame to its slot that one frame in a thousand had less of, milliseconds; negative: too late.
+    pub least_0_1_percent_ms: f64,
+    /// The same of one frame in two hundred.
+    pub least_0_5_percent_ms: f64,
+    /// The same of every other frame.
+    pub median_ms: f64,
+    /// From the first packet of a frame to the whole frame, the median, milliseconds.
+    pub transfer_median_ms: f64,
 }
 
 /// What the projector counted over all sessions of a run.

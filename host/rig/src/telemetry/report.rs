@@ -2,7 +2,9 @@
 
 use super::projector::ProjectorReport;
 use super::signed::SignedHistogram;
+use super::tracker_gauges::TrackerReport;
 use crate::failure::{Failure, FailureKind};
+use crate::frame::slots::MissCause;
 use crate::plan::dark::DarkCause;
 use hdrhistogram::Histogram;
 use serde::ser::{Serialize, SerializeMap, Serializer};
@@ -170,12 +172,16 @@ pub struct Report {
     pub frames_dropped: u64,
     /// Frames that were not lit because no new picture was wanted.
     pub frames_withheld: u64,
+    /// Frames of which the collector learnt nothing, because it had no time: lit or not, they are in no other count.
+    pub frames_unrecorded: u64,
     /// Frames lit after the slot that they were planned for.
     pub frames_late: u64,
     /// Slots in which the previous frame was shown again.
     pub frames_repeated: u64,
     /// Frames not sent because their poses would have been older than `safety.predict_ms` plus one slot when lit.
     pub frames_too_old: u64,
+    /// What became of the tracker's samples; null for a rig without a tracker that counts them.
+    pub tracker: Option<TrackerReport>,
     /// Average number of slots from one planned frame to the next, at the end: 1 if the renderer keeps up.
     pub slots_per_frame: f64,
     /// The longest time for which prediction may extend a body's track, at the end, milliseconds.
@@ -285,6 +291,8 @@ impl Default for Report {
             stopped: false,
             frames_dropped: 0,
             frames_withheld: 0,
+            frames_unrecorded: 0,
+            tracker: None,
             frames_late: 0,
             frames_repeated: 0,
             frames_too_old: 0,
@@ -334,12 +342,23 @@ impl Report {
 }
 
 impl Report {
-    /// Refuses a run that lit nothing.
+    /// Refuses a run that lit nothing, or whose frames made the projector latch a fault.
     ///
     /// # Errors
-    /// A failed check that says why, see [`Report::nothing_lit`].
+    /// A failed check that says why.
     pub fn check_lit(&self) -> Result<(), Failure> {
-        self.nothing_lit().map_or(Ok(()), |told| Err(Failure::new(FailureKind::CheckFailed, told)))
+        let told = self.nothing_lit().or_else(|| self.exceeded());
+        told.map_or(Ok(()), |told| Err(Failure::new(FailureKind::CheckFailed, told)))
+    }
+
+    /// What frames of this run made the projector latch, and what to do; `None` if nothing.
+    fn exceeded(&self) -> Option<String> {
+        let slots = self.missed_by_cause.get(MissCause::Fault.name()).copied().filter(|slots| *slots > 0)?;
+        Some(format!(
+            "frames of this run made the projector latch a limit on flashes or on light, and {slots} slots were dark until \
+             a person acknowledged it, or the run ended; the notes name the fault. Light that flickers because the link \
+             does not carry the frame rate does that: `dpm link-test` measures it"
+        ))
     }
 
     /// Why the run lit nothing, with the largest cause first, and what to do. `None` if it lit something, if it was
@@ -347,7 +366,7 @@ impl Report {
     pub(crate) fn nothing_lit(&self) -> Option<String> {
         let planned = self.frames_dark + self.frames_dropped;
         let ordered: u64 = self.ordered_dark.values().sum();
-        if self.frames_lit > 0 || self.slots == 0 && ordered > 0 {
+        if self.frames_lit + self.frames_unrecorded > 0 || self.slots == 0 && ordered > 0 {
             return None;
         }
         if planned == 0 {
@@ -520,6 +539,11 @@ mod tests {
         let ordered_dark: BTreeMap<String, u64> = [("safe".into(), 300)].into();
         assert_eq!(Report { frames_dropped: 4, ordered_dark, ..Report::default() }.nothing_lit(), None);
         assert_eq!(Report { stopped: true, ..Report::default() }.nothing_lit(), None);
+        // Light before it excuses no limit that the frames themselves exceeded.
+        let missed_by_cause: BTreeMap<String, u64> = [("fault".into(), 300)].into();
+        let exceeded = Report { frames_lit: 900, missed_by_cause, ..Report::default() };
+        assert!(exceeded.check_lit().unwrap_err().to_string().contains("300 slots were dark"));
+        assert!(Report { frames_lit: 900, ..Report::default() }.check_lit().is_ok());
         // If the machine stood still for the whole run, nothing was lit either.
         assert!(Report::default().nothing_lit().unwrap().starts_with("no frame was planned"));
     }

@@ -45,14 +45,27 @@ impl Report {
     fn frame_rows(&self, table: &mut Table) {
         let some = |n: u64, text: String| if n > 0 { text } else { String::new() };
         let dark = some(self.frames_dark, format!("{} dark on every body, ", self.frames_dark));
+        let unrecorded = some(self.frames_unrecorded, format!(", {} not recorded", self.frames_unrecorded));
         let withheld = some(self.frames_withheld, format!(", {} not wanted", self.frames_withheld));
         table.row(
             "frames",
             format!(
-                "{} lit, {dark}{} dropped, {} late, {} repeated{withheld}",
+                "{} lit, {dark}{} dropped, {} late, {} repeated{withheld}{unrecorded}",
                 self.frames_lit, self.frames_dropped, self.frames_late, self.frames_repeated
             ),
         );
+        if let Some(t) = &self.tracker {
+            let lost = [
+                ("lost", t.lost),
+                ("reordered", t.reordered),
+                ("doubled", t.doubled),
+                ("unlabelled", t.unlabelled),
+                ("impossible", t.impossible),
+                ("contradictory", t.contradictory),
+            ];
+            let lost = lost.into_iter().filter(|(_, n)| *n > 0).map(|(what, n)| format!(", {n} {what}"));
+            table.row("samples", format!("{} used{}", t.used, lost.collect::<String>()));
+        }
         for body in self.dark_by_body.iter().filter(|b| b.total() > 0) {
             let causes = DarkCause::ALL.iter().filter(|c| body.of(**c) > 0);
             let causes: Vec<String> =

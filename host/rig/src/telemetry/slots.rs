@@ -90,6 +90,16 @@ enum Judgement {
     Ordered(OrderedDark),
 }
 
+impl Judgement {
+    /// Of a slot in which no new picture could be shown for this reason.
+    fn of(reason: OrderedDark) -> Self {
+        match reason {
+            OrderedDark::Exceeded => Self::Missed(MissCause::Fault),
+            reason => Self::Ordered(reason),
+        }
+    }
+}
+
 impl SlotCounts {
     fn add(&mut self, judgement: Judgement, slots: u64) {
         *match judgement {
@@ -211,13 +221,13 @@ impl SlotLedger {
     }
 
     /// A frame for `slot` reached the end of the host's part of its path. `refused`: the link did not accept it.
-    /// `waited_for_memory`: planning could not begin earlier because a later stage held all buffers.
+    /// `held_up_by`: what kept planning from beginning earlier.
     pub(crate) fn planned(
         &mut self,
         slot: u64,
         timeline: &FrameTimeline,
         refused: bool,
-        waited_for_memory: bool,
+        held_up_by: Option<MissCause>,
     ) {
         self.reference = (slot, timeline.due_at);
         if self.first_planned.is_none() {
@@ -225,7 +235,7 @@ impl SlotLedger {
             self.begin_at(slot);
         }
         let skipped = self.last_planned.map_or(slot, |last| last.saturating_add(1));
-        let cause = if waited_for_memory { MissCause::Buffers } else { MissCause::Plan };
+        let cause = held_up_by.unwrap_or(MissCause::Plan);
         self.last_planned = Some(self.last_planned.map_or(slot, |last| last.max(slot)));
         let between = Some((cause, timeline.latched_at));
         for known in skipped.max(self.base)..slot.min(self.end()) {
@@ -394,7 +404,7 @@ impl SlotLedger {
         }
         let begin = self.begin_of(slot);
         if let Some(reason) = self.spans.reason_at(begin) {
-            return Judgement::Ordered(reason);
+            return Judgement::of(reason);
         }
         // If a frame was sent in time and not lit, the link is the cause; the same holds for a slot about which
         // nothing is known.
@@ -408,7 +418,7 @@ impl SlotLedger {
     fn judged_together(&self, end: u64, trouble: Option<(MissCause, HostTime)>) -> Judgement {
         let (from, to) = (self.begin_of(self.base), self.begin_of(end));
         if let Some(reason) = self.spans.reason_throughout(from, to) {
-            return Judgement::Ordered(reason);
+            return Judgement::of(reason);
         }
         let stood_still = self.seen.as_ref().is_some_and(|seen| seen.with(|s| s.covers(from, to)));
         Judgement::Missed(if stood_still {

@@ -46,7 +46,7 @@ fn ten_slots(mut ledger: SlotLedger) -> SlotCounts {
     ledger.nothing_new(9, begin(9), 0);
     for slot in [10, 11, 13, 14, 15, 16, 17, 18, 19] {
         let after = if slot == 15 { 2 * SLOT } else { -100 };
-        ledger.planned(slot, &frame(slot, after), slot == 13, slot == 13);
+        ledger.planned(slot, &frame(slot, after), slot == 13, (slot == 13).then_some(MissCause::Buffers));
     }
     for slot in 10..22 {
         match slot {
@@ -81,9 +81,9 @@ fn slots_of_which_nothing_good_is_known_are_missed() {
     let mut late = ledger(&[]);
     let mut silent = ledger(&[]);
     for slot in 5..105 {
-        late.planned(slot, &frame(slot, 3 * SLOT), false, false);
+        late.planned(slot, &frame(slot, 3 * SLOT), false, None);
         late.nothing_new(slot, begin(slot), 0);
-        silent.planned(slot, &frame(slot, -100), true, false);
+        silent.planned(slot, &frame(slot, -100), true, None);
     }
     assert_eq!((late.finish().missed_total(), late.counts().own), (100, 0));
     assert_eq!((silent.finish().missed[MissCause::Link as usize], silent.counts().wanted()), (100, 100));
@@ -95,7 +95,7 @@ fn slots_of_which_nothing_good_is_known_are_missed() {
 fn a_merged_report_covers_the_slots_before_it() {
     let mut ledger = ledger(&[]);
     for slot in 0..8 {
-        ledger.planned(slot, &frame(slot, -100), false, false);
+        ledger.planned(slot, &frame(slot, -100), false, None);
     }
     ledger.own(0, begin(0), 0);
     ledger.own(4, begin(4), 2);
@@ -118,7 +118,7 @@ fn ordered_dark_is_neither_missed_nor_lit() {
         }
         ledger.read_orders(&log);
         let dark = (500..1_203).contains(&slot);
-        ledger.planned(slot, &frame(slot, -100), dark, false);
+        ledger.planned(slot, &frame(slot, -100), dark, None);
         // While it is latched, the projector reports no slot.
         match slot {
             900..1_200 => ordered += 1,
@@ -140,6 +140,27 @@ fn ordered_dark_is_neither_missed_nor_lit() {
     // The slot in which SAFE was ordered no longer belongs to BLACK.
     assert_eq!((of(OrderedDark::Black), of(OrderedDark::Safe)), (400, 303));
     assert_eq!((counts.wanted(), counts.missed_share()), (own + 1, 1.0 / (own + 1) as f64));
+}
+
+/// A limit that our own frames exceeded was ordered by nobody: its slots are missed, and the cause is the fault.
+#[test]
+fn a_fault_that_frames_caused_is_missed_and_not_ordered() {
+    let log = DarkLog::default();
+    let mut ledger = ledger(&[]);
+    for slot in 0..300u64 {
+        let exceeded = (100..200).contains(&slot);
+        log.tell(begin(slot), exceeded.then_some(OrderedDark::Exceeded));
+        ledger.read_orders(&log);
+        ledger.planned(slot, &frame(slot, -100), exceeded, None);
+        if exceeded {
+            ledger.nothing_new(slot, begin(slot), 0);
+        } else {
+            ledger.own(slot, begin(slot), 0);
+        }
+        ledger.settle();
+    }
+    let counts = ledger.finish();
+    assert_eq!((counts.own, counts.missed[MissCause::Fault as usize], counts.ordered_total()), (200, 100, 0));
 }
 
 /// A week at 15 slots per second with ten misses and five standstills per second: memory stays bounded, and every
@@ -175,7 +196,7 @@ fn a_week_of_misses_is_counted_exactly_in_bounded_memory() {
             t.packed_at = due.plus_ns(SLOT);
             t.sent_at = due.plus_ns(SLOT + 1);
         }
-        ledger.planned(slot, &t, kind == 1, false);
+        ledger.planned(slot, &t, kind == 1, None);
         let dark = hour == 3;
         if kind == 0 && !dark {
             ledger.own(slot, due, 0);
@@ -210,14 +231,14 @@ fn a_week_of_misses_is_counted_exactly_in_bounded_memory() {
 #[test]
 fn jumps_are_counted_without_being_walked() {
     let mut ledger = ledger(&[]);
-    ledger.planned(0, &frame(0, -100), false, false);
+    ledger.planned(0, &frame(0, -100), false, None);
     ledger.own(0, begin(0), 0);
     ledger.nothing_new(u64::MAX, HostTime(i64::MAX), u32::MAX);
     ledger.nothing_new(3 * WINDOW as u64, begin(3 * WINDOW as u64), 0);
     let day = 24 * 3600 * 1000;
-    ledger.planned(day, &frame(day, -100), false, false);
+    ledger.planned(day, &frame(day, -100), false, None);
     ledger.own(day, begin(day), 0);
-    ledger.planned(1 << 60, &frame(day + 1, -100), false, true);
+    ledger.planned(1 << 60, &frame(day + 1, -100), false, Some(MissCause::Buffers));
     ledger.settle();
     let counts = ledger.finish();
     assert_eq!(counts.own, 2);
@@ -232,7 +253,7 @@ fn a_standstill_that_is_told_late_still_excuses_its_slot() {
     let mut ledger = SlotLedger::new(rate(), 0);
     ledger.excuse_by(seen.clone());
     for slot in 0..50 {
-        ledger.planned(slot, &frame(slot, -100), false, false);
+        ledger.planned(slot, &frame(slot, -100), false, None);
         if slot == 20 {
             ledger.nothing_new(slot, begin(slot), 0);
         } else {

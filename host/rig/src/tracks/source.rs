@@ -9,9 +9,10 @@ use dpm_device::tracker::natnet::client::{NatNetClient, NatNetConfig};
 use dpm_device::tracker::record::{RecordError, Replay};
 use dpm_device::tracker::serial::client::{SerialTracker, SerialTrackerConfig};
 use dpm_device::tracker::vrpn::client::{VrpnClient, VrpnConfig};
-use dpm_device::tracker::{BodyKey, Tracker, TrackerError, TrackerSample};
+use dpm_device::tracker::{BodyKey, SampleGate, Tracker, TrackerError, TrackerSample};
 use std::net::Ipv4Addr;
 use std::sync::Arc;
+use std::time::Duration;
 
 /// Why the tracker cannot be opened.
 #[derive(Debug, thiserror::Error)]
@@ -106,6 +107,14 @@ impl Tracker for InWorld {
 
     fn status(&self) -> String {
         self.tracker.status()
+    }
+
+    fn wait(&self, timeout: Duration) -> bool {
+        self.tracker.wait(timeout)
+    }
+
+    fn gate(&self) -> Option<&SampleGate> {
+        self.tracker.gate()
     }
 }
 

@@ -4,11 +4,13 @@ use super::seen::{SeenBodies, Unseen};
 use super::tracker_frame::TrackerFrame;
 use crate::config::{PredictionConfig, TrackerConfig, MAX_TRACKED};
 use crate::rig::Rig;
+use crate::telemetry::tracker_gauges::{AddedCounts, TrackerGauges};
 use dpm_device::time::HostTime;
 use dpm_device::tracker::{BodyIndex, Tracker, TrackerError};
 use dpm_handoff::latest::Publisher;
 use dpm_tracking::{PoseFilterBank, TrackState};
 use std::sync::Arc;
+use std::time::Duration;
 
 /// The tracking stage's result, for the latest-wins slot.
 #[derive(Clone, Debug)]
@@ -44,6 +46,11 @@ pub struct TrackingStage {
     /// Filters of the same bodies that follow faster; `None` if nobody asks for them.
     lively: Option<PoseFilterBank>,
     received_at: Vec<HostTime>,
+    /// Samples by body that the filters did not accept.
+    contradictory: Vec<u64>,
+    /// What was added to the gauges of the run, and when it is due again.
+    added: AddedCounts,
+    add_at: HostTime,
     bodies: usize,
     seen: Arc<SeenBodies>,
     /// From the tracker's coordinates to the world's; `None` if they are the same.
@@ -59,6 +66,8 @@ pub struct TrackingStage {
 /// The longest time for which any rig may extend a body's track by prediction, milliseconds.
 pub(crate) const MAX_PREDICT_MS: u32 = 1_000;
 
+/// How often the counts of samples are added to those of the run, nanoseconds.
+const ADD_EVERY_NS: i64 = 50_000_000;
 /// Time within which every body should have been seen once. A working tracker reports within milliseconds, and one
 /// that must be reconnected within half a second.
 const SEEN_WITHIN_NS: i64 = 1_000_000_000;
@@ -108,6 +117,9 @@ impl TrackingStage {
             bank: bank(rig, 1.0),
             lively: None,
             received_at: vec![HostTime(0); bodies],
+            contradictory: vec![0; bodies],
+            added: AddedCounts::new(bodies),
+            add_at: HostTime(i64::MIN),
             bodies,
             seen: Arc::new(SeenBodies::new(bodies)),
             frame: TrackerFrame::of(&rig.config.tracker, rig.latency_ns),
@@ -133,7 +145,7 @@ impl TrackingStage {
     /// The tracker is gone; the tracks that are known stay published.
     pub fn step(&mut self, now: HostTime, latest: &mut Publisher<TrackSnapshot>) -> Result<(), TrackerError> {
         self.began_at.get_or_insert(now);
-        let Self { tracker, bank, lively, received_at, latency_ns, frame, .. } = self;
+        let Self { tracker, bank, lively, received_at, contradictory, latency_ns, frame, .. } = self;
         let result = tracker.poll(now, &mut |sample| {
             let in_world;
             let sample = match frame {
@@ -153,6 +165,8 @@ impl TrackingStage {
                     }
                     let latency = sample.received_at.ns_since(sample.captured_at);
                     *latency_ns = latency.max(*latency_ns - *latency_ns / 1024);
+                } else if let Some(count) = contradictory.get_mut(usize::from(sample.body.0)) {
+                    *count += 1;
                 }
             }
         });
@@ -182,6 +196,22 @@ impl TrackingStage {
                 *ever = self.seen.has(i);
             }
         });
+    }
+
+    /// See [`Tracker::wait`].
+    pub(crate) fn wait(&self, timeout: Duration) -> bool {
+        self.tracker.wait(timeout)
+    }
+
+    /// Adds to `gauges` what became of the samples, if `now` is late enough for it, or `always`.
+    pub(crate) fn add_counts(&mut self, now: HostTime, gauges: &TrackerGauges, always: bool) {
+        if now < self.add_at && !always {
+            return;
+        }
+        self.add_at = now.plus_ns(ADD_EVERY_NS);
+        if let Some(gate) = self.tracker.gate() {
+            gauges.add(gate, &self.contradictory, &mut self.added);
+        }
     }
 
     /// What the tracker says of itself.

@@ -27,7 +27,7 @@ fn a_hundred_thousand_frames_allocate_nothing() {
     let (mut events_in, mut events_out) = ring::<u64>(16);
     let waiter = Waiter::new(WaitPolicy::SpinThenPark { spin_ns: 1_000 });
     let waker = waiter.waker();
-    let mut lead = LeadEstimator::new(1_055_966, 2_000_000, 500_000, 3_000_000);
+    let mut lead = LeadEstimator::new(1_055_966, 2_000_000, 3_000_000);
     let mut budget = BudgetController::new(BudgetConfig {
         slot_ns: 1_055_966,
         aim: 0.8,

@@ -1,9 +1,12 @@
 //! Seeds that once broke a law, shrunk to what they need, and what a life has to be besides lawful: the same every time.
 
+use dpm_rig::pipeline::stepped::Part;
 use dpm_sim::kinds::Kind;
 use dpm_sim::life::{live, Lived, Order};
+use dpm_sim::machine::Trap;
 use dpm_sim::plan::{Episodes, Setup, TrackerKind};
 use dpm_sim::tracks::Placed;
+use dpm_sim::world::{World, MS, S};
 use std::collections::BTreeSet;
 
 fn order(seed: u64, rate_hz: Option<u32>, seconds: i64) -> Order {
@@ -288,6 +291,76 @@ fn whichever_stage_hangs_light_ends_by_itself() {
     assert_eq!(struck, first.into_iter().collect(), "all of them struck");
 }
 
+/// The frame path waits for no thread of lower priority: while the collector gets no time for four seconds, nearly every
+/// slot shows a frame of its own. (Planning once took its notes from what the collector returned.)
+#[test]
+fn a_collector_that_gets_no_time_changes_nothing_about_the_light() {
+    for rate_hz in [240, 947] {
+        let mut world = world(rate_hz);
+        let begin = shown(&mut world, 3 * S);
+        let end = shown(&mut world, 6 * S);
+        world.set_trap(Part::Collector, Trap::Stalls(4 * S));
+        let before = shown(&mut world, 6 * S + S / 10);
+        let after = shown(&mut world, 10 * S);
+        let (usual, later) = (missed(begin, end), missed(before, after));
+        assert!(later <= usual + 0.01, "{rate_hz} frames/s: {later} of the slots missed, {usual} before");
+        shown(&mut world, 12 * S);
+        assert_eq!(world.laws.broken, None, "{rate_hz} frames/s");
+    }
+}
+
+/// Runs `world` to the instant `t`. Slots that have begun, and frames lit.
+fn shown(world: &mut World, t: i64) -> (u32, u32) {
+    while world.t < t && world.step() {}
+    let status = world.status();
+    (status.slots, status.frames_lit)
+}
+
+/// Share of the slots from one count to another that showed no frame of their own.
+fn missed(from: (u32, u32), to: (u32, u32)) -> f64 {
+    let (slots, lit) = (to.0 - from.0, to.1 - from.1);
+    assert!(slots > 300, "{slots} slots");
+    f64::from(slots - lit) / f64::from(slots)
+}
+
+fn world(rate_hz: u32) -> World {
+    let setup = Setup::of(3, Some(rate_hz), Some(false), Some(false), Some(TrackerKind::NatNet));
+    World::new(setup).unwrap_or_else(|e| panic!("{e}"))
+}
+
+/// Whatever stage stalls, for as long as it does not count as hung and no watchdog bites: half a second later nearly every slot shows a frame of its
+/// own again.
+#[test]
+fn half_a_second_after_a_stall_every_slot_is_lit_again() {
+    for part in [Part::Tracking, Part::Plan, Part::Pack, Part::Link, Part::Collector] {
+        let mut world = world(947);
+        // A stall of the link must not let the projector's watchdog bite, which is another law.
+        let stall_ns = if part == Part::Link { 40 * MS } else { 90 * MS };
+        let begin = shown(&mut world, 3 * S);
+        let end = shown(&mut world, 6 * S);
+        world.set_trap(part, Trap::Stalls(stall_ns));
+        let before = shown(&mut world, 6 * S + stall_ns + S / 2);
+        let after = shown(&mut world, 9 * S);
+        let (usual, later) = (missed(begin, end), missed(before, after));
+        assert!(later <= usual + 0.01, "{part:?}: {later} of the slots missed, {usual} before the stall");
+        assert_eq!(world.laws.broken, None, "{part:?}");
+    }
+}
+
+/// The lead leaves the slack that it promises, and not much more, by the projector's own clock and whatever the cable
+/// takes.
+#[test]
+fn frames_come_with_the_slack_that_the_lead_promises() {
+    for (rate_hz, serial, most_ms) in [(947, false, 0.6), (240, false, 0.6), (60, true, 2.0)] {
+        let setup = Setup::of(3, Some(rate_hz), Some(false), Some(serial), Some(TrackerKind::NatNet));
+        let mut world = World::new(setup).unwrap_or_else(|e| panic!("{e}"));
+        while world.t < 30 * S && world.step() {}
+        let slack = world.carried().and_then(|carried| carried.slack).expect("the projector reports slack");
+        let what = format!("{rate_hz} frames/s, serial line {serial}: {slack:?}");
+        assert!((0.0..most_ms).contains(&slack.least_0_5_percent_ms), "{what}");
+    }
+}
+
 /// Kinds that are asked for come first in every episode, where they can strike.
 #[test]
 fn kinds_that_are_asked_for_begin_every_episode() {
@@ -334,7 +407,7 @@ fn tracks_move_light_nearer_to_its_body() {
         assert_eq!(lived.broken, None, "seed {seed}");
         sum.add(&lived.placed);
     }
-    assert!(sum.moved > 300 && sum.with < 0.5 * sum.without, "{sum:?}");
+    assert!(sum.moved > 100 && sum.with < 0.5 * sum.without, "{sum:?}");
 }
 
 #[test]

@@ -1,7 +1,7 @@
 //! Tracking, plan and pack, and the GPU between them.
 
 use super::line::Line;
-use super::{Machine, Notes, Part, Rendered, Takes, NEVER};
+use super::{Machine, Part, Rendered, Takes, NEVER};
 use crate::engine::error::PipelineError;
 use crate::engine::facts::{CrewFacts, Facts};
 use crate::engine::pace::Real;
@@ -9,7 +9,8 @@ use crate::engine::pack::PackStage;
 use crate::engine::plan::{Latch, PlanStage};
 use crate::engine::pulse::{Pulse, Silence};
 use crate::engine::supervision::Trouble;
-use crate::frame::job::{FrameJob, FrameMemory};
+use crate::frame::job::{FrameJob, FrameMemory, FrameNote};
+use crate::frame::slots::MissCause;
 use crate::pack::prepared::PreparedFrames;
 use crate::pipeline::parts::CrewParts;
 use crate::pipeline::threads::{POLL_WITHIN_NS, STEP_NS, WAIT_NS};
@@ -67,7 +68,7 @@ enum Planning {
     /// It looks for memory, and for a slot.
     Free { at: HostTime },
     /// It waits for the instant at which poses are read.
-    Latched { at: HostTime, latch: Latch, job: FrameJob },
+    Latched { at: HostTime, latch: Latch },
     /// It plans and submits.
     Submits { at: HostTime, job: FrameJob },
     /// It never returns, or has ended.
@@ -108,9 +109,8 @@ pub(super) struct Crew {
     times: Reader<LinkTime>,
     plan: PlanStage<Real>,
     planning: Planning,
-    waited: bool,
-    #[allow(clippy::vec_box)] // The boxes travel with the frames.
-    free: Vec<Box<FrameMemory>>,
+    held_up_by: Option<MissCause>,
+    free: Vec<FrameJob>,
     gpu: VecDeque<OnGpu>,
     gpu_free_at: HostTime,
     pack: PackStage,
@@ -157,8 +157,15 @@ impl Crew {
             to_link,
             times,
             planning: Planning::Free { at: now },
-            waited: false,
-            free: parts.memory.into_iter().map(Box::new).collect(),
+            held_up_by: None,
+            free: parts
+                .memory
+                .into_iter()
+                .map(|memory| FrameJob {
+                    note: Box::new(FrameNote::new(&facts.rig)),
+                    memory: Box::new(memory),
+                })
+                .collect(),
             gpu: VecDeque::new(),
             gpu_free_at: now,
             packing: Packing::Waits { until: None, limit_ns: 0 },
@@ -178,7 +185,7 @@ impl Crew {
         let time = self.tracking.newest();
         let plan = match &self.planning {
             Planning::Free { at } => format!("free at {}", at.0),
-            Planning::Latched { at, latch, .. } => format!("latched {latch:?} at {}", at.0),
+            Planning::Latched { at, latch } => format!("latched {latch:?} at {}", at.0),
             Planning::Submits { at, .. } => format!("submits at {}", at.0),
             Planning::Gone => "gone".into(),
         };
@@ -207,9 +214,9 @@ impl Crew {
         self.tracking_at.min(plan).min(pack)
     }
 
-    /// Memory of a frame that the link has finished with.
-    pub(super) fn returned(&mut self, memory: Box<FrameMemory>, now: HostTime) {
-        self.free.push(memory);
+    /// A frame that the link has finished with.
+    pub(super) fn returned(&mut self, job: FrameJob, now: HostTime) {
+        self.free.push(job);
         self.wake_plan(now);
     }
 
@@ -268,13 +275,12 @@ impl Crew {
         now: HostTime,
         facts: &Arc<Facts>,
         machine: &mut M,
-        notes: &Notes,
         line: &mut Line,
     ) {
         if self.tracking_at <= now {
             self.track(now, facts, machine);
         }
-        self.plan(now, facts, machine, notes);
+        self.plan(now, facts, machine);
         self.pack(now, facts, machine, line);
     }
 
@@ -298,11 +304,11 @@ impl Crew {
         }
     }
 
-    fn plan<M: Machine>(&mut self, now: HostTime, facts: &Arc<Facts>, machine: &mut M, notes: &Notes) {
+    fn plan<M: Machine>(&mut self, now: HostTime, facts: &Arc<Facts>, machine: &mut M) {
         match std::mem::replace(&mut self.planning, Planning::Gone) {
-            Planning::Free { at } if at <= now => self.planning = self.choose(now, facts, notes),
-            Planning::Latched { at, latch, job } if at <= now => {
-                self.planning = self.latch(now, machine, &latch, job);
+            Planning::Free { at } if at <= now => self.planning = self.choose(now, facts),
+            Planning::Latched { at, latch } if at <= now => {
+                self.planning = self.latch(now, machine, &latch);
             }
             Planning::Submits { at, mut job } if at <= now => {
                 self.facts.gpu.submit();
@@ -326,7 +332,7 @@ impl Crew {
     }
 
     /// Looks for memory and chooses the next frame's slot.
-    fn choose(&mut self, now: HostTime, facts: &Arc<Facts>, notes: &Notes) -> Planning {
+    fn choose(&mut self, now: HostTime, facts: &Arc<Facts>) -> Planning {
         if facts.monitor.stop_requested() || self.plan.is_complete() {
             if self.plan.is_complete() {
                 facts.is_complete.store(true, Ordering::Release);
@@ -339,32 +345,26 @@ impl Crew {
         if !self.plan.may_begin() {
             return later;
         }
-        self.waited |= self.free.is_empty();
-        let Some(memory) = self.free.pop() else { return later };
-        let Some(mut note) = notes.borrow_mut().pop() else {
-            self.free.push(memory);
+        if self.plan.sheds() && self.free.len() < self.in_flight {
+            self.held_up_by = Some(MissCause::Queue);
             return later;
-        };
-        note.waited_for_memory = std::mem::take(&mut self.waited);
+        }
         let time = *self.times.latest().0;
-        let Some(latch) = self.plan.choose_slot(&time, now) else {
-            self.free.push(memory);
-            notes.borrow_mut().push(note);
-            return later;
-        };
+        let Some(latch) = self.plan.choose_slot(&time, now) else { return later };
         let at = latch.at.max(now);
         self.pulses[1].beat(at, WAIT_NS + STEP_NS);
-        Planning::Latched { at, latch, job: FrameJob { note, memory } }
+        Planning::Latched { at, latch }
     }
 
     /// Reads the poses and plans the frame.
-    fn latch<M: Machine>(
-        &mut self,
-        now: HostTime,
-        machine: &mut M,
-        latch: &Latch,
-        mut job: FrameJob,
-    ) -> Planning {
+    fn latch<M: Machine>(&mut self, now: HostTime, machine: &mut M, latch: &Latch) -> Planning {
+        let Some(mut job) = self.free.pop() else {
+            // With the memory that comes back another slot may be the first that can be met.
+            self.held_up_by = Some(MissCause::Buffers);
+            self.pulses[1].beat(now, WAIT_NS + STEP_NS);
+            return Planning::Free { at: now.plus_ns(WAIT_NS) };
+        };
+        job.note.held_up_by = self.held_up_by.take();
         self.pulses[1].beat(now, STEP_NS);
         match machine.takes(Part::Plan, latch.id, now) {
             Takes::Ns(ns) => {

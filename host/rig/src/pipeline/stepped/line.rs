@@ -7,11 +7,11 @@ use crate::engine::facts::Facts;
 use crate::engine::link::{LinkStage, Offer};
 use crate::engine::pace::Real;
 use crate::engine::pulse::Pulse;
-use crate::frame::job::{Fate, FrameJob, FrameNote};
+use crate::frame::job::{Fate, FrameJob};
+use crate::light::notes::NoteSender;
 use crate::pipeline::threads::STEP_NS;
 use dpm_device::time::HostTime;
 use dpm_device::transport::Transport;
-use dpm_handoff::channel::Sender;
 use std::collections::VecDeque;
 use std::sync::atomic::Ordering;
 
@@ -46,19 +46,19 @@ pub(super) struct Line {
     pub(super) pulse: Pulse,
     jobs: VecDeque<FrameJob>,
     /// `None` when no note will come any more.
-    done: Option<Sender<Box<FrameNote>>>,
+    notes: Option<NoteSender>,
     doing: Doing,
     /// Per body: lit in the frame that is being sent.
     lit: Vec<bool>,
 }
 
 impl Line {
-    pub(super) fn new(stage: LinkStage<Real>, done: Sender<Box<FrameNote>>, now: HostTime) -> Self {
+    pub(super) fn new(stage: LinkStage<Real>, notes: NoteSender, now: HostTime) -> Self {
         Self {
             stage,
             pulse: Pulse::new("link"),
             jobs: VecDeque::new(),
-            done: Some(done),
+            notes: Some(notes),
             doing: Doing::Waits { at: now },
             lit: Vec::new(),
         }
@@ -182,13 +182,12 @@ impl Line {
         self.doing = Doing::Waits { at: now };
     }
 
-    fn settle(&mut self, job: FrameJob, now: HostTime, crew: Option<&mut Crew>) {
-        let FrameJob { note, memory } = job;
-        if let Some(crew) = crew {
-            crew.returned(memory, now);
+    fn settle(&mut self, mut job: FrameJob, now: HostTime, crew: Option<&mut Crew>) {
+        if let Some(notes) = &mut self.notes {
+            job.note = notes.exchange(job.note);
         }
-        if let Some(done) = &mut self.done {
-            let _ = done.push(note);
+        if let Some(crew) = crew {
+            crew.returned(job, now);
         }
     }
 
@@ -206,7 +205,7 @@ impl Line {
             self.settle(job, now, None);
         }
         self.pulse.end();
-        self.done = None;
+        self.notes = None;
         self.doing = Doing::Over;
     }
 }

@@ -20,8 +20,8 @@ use crate::engine::link::LinkStage;
 use crate::engine::options::RunOptions;
 use crate::engine::pulse::Pulse;
 use crate::engine::supervision::{Irreplaceable, Making, Remake, Supervision, Verdict};
-use crate::frame::job::FrameNote;
 use crate::light::collector::{Collector, Inbox};
+use crate::light::notes::note_channel;
 use crate::light::recorder::light_channel;
 use crate::plan::dark::DarkCause;
 use crate::plan::link_time::LinkTime;
@@ -35,13 +35,10 @@ use dpm_device::link::HostLink;
 use dpm_device::time::{DeviceTicks, HostTime};
 use dpm_device::tracker::Tracker;
 use dpm_device::transport::Transport;
-use dpm_handoff::channel::channel;
-use dpm_handoff::wake::WaitPolicy;
 use dpm_render::gpu::GpuError;
 use glam::DAffine3;
 use line::Line;
 pub use orders::{SteppedOrders, StoredOrder};
-use std::cell::RefCell;
 use std::sync::Arc;
 
 /// Later than any instant of a run.
@@ -54,8 +51,6 @@ const LOOK_NS: i64 = 2_000_000;
 const COLLECT_NS: i64 = 2_000_000;
 /// Time that one pass of the collector may take, nanoseconds.
 const COLLECT_WITHIN_NS: i64 = 5_000_000_000;
-/// Notes that circulate between planning and the collector.
-const NOTES: usize = 256;
 
 /// The parts of a run that a [`Machine`] gives time to.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash)]
@@ -173,10 +168,6 @@ enum Phase {
     Over(Option<Box<SteppedEnd>>),
 }
 
-/// Notes that wait for a frame.
-#[allow(clippy::vec_box)] // The boxes travel with the frames.
-type Notes = RefCell<Vec<Box<FrameNote>>>;
-
 /// See the module's documentation.
 pub struct SteppedRun<M> {
     machine: M,
@@ -206,7 +197,6 @@ struct Running {
     /// Everything is collected.
     is_collected: bool,
     inbox: Inbox,
-    notes: Notes,
     /// Nothing can end the run in order any more.
     is_broken: bool,
 }
@@ -375,11 +365,11 @@ impl Running {
         let options = RunOptions { verify: false, ..RunOptions::default() };
         let facts = Arc::new(Facts::new(rig.clone(), monitor, options, &lead, now));
         let (lights_in, lights) = light_channel();
-        let (done_in, done) = channel(2 * NOTES, WaitPolicy::Park);
+        let (notes_in, notes) = note_channel(&rig, &run.monitor);
         let keeper =
             LinkKeeper::new(time, &link, Some((lights_in.notes, rig.config.projector.light_delay_ns())));
         let stage = LinkStage::new(facts.clone(), link, keeper, lead);
-        let mut line = Line::new(stage, done_in, now);
+        let mut line = Line::new(stage, notes_in, now);
         let tracker = run.machine.opens_tracker(now);
         let seen = Arc::new(SeenBodies::new(rig.bodies.len()));
         let parts = CrewParts::stepped(&rig, tracker, options.in_flight, frame_ns).remembering(&seen);
@@ -392,8 +382,7 @@ impl Running {
             collector_pulse: Pulse::new("collector"),
             collect_at: now.plus_ns(COLLECT_NS),
             is_collected: false,
-            inbox: Inbox { done, lights },
-            notes: RefCell::new((0..NOTES).map(|_| Box::new(FrameNote::new(&rig))).collect()),
+            inbox: Inbox { notes, lights },
             is_broken: false,
             facts,
             time,
@@ -411,7 +400,7 @@ impl Running {
 
     fn advance<M: Machine>(&mut self, now: HostTime, machine: &mut M, medium: &mut dyn Transport) {
         if let Some(crew) = &mut self.crew {
-            crew.advance(now, &self.facts, machine, &self.notes, &mut self.line);
+            crew.advance(now, &self.facts, machine, &mut self.line);
         }
         if self.line.due() <= now {
             self.line.advance(now, &self.facts, machine, medium, self.crew.as_mut());
@@ -435,15 +424,14 @@ impl Running {
                 NEVER
             }
         };
-        let Self { collector, collector_pulse: pulse, inbox, notes, facts, .. } = self;
+        let Self { collector, collector_pulse: pulse, inbox, facts, .. } = self;
         pulse.beat(now, COLLECT_WITHIN_NS);
         if self.collect_at == NEVER {
             return;
         }
-        let free = |note| notes.borrow_mut().push(note);
         // What the link has not told by now, it will not tell.
         let is_last = self.line.is_over();
-        if collector.look(inbox, &free, &facts.monitor, &mut || ()) || is_last {
+        if collector.look(inbox, &facts.monitor, &mut || ()) || is_last {
             (self.collect_at, self.is_collected) = (NEVER, true);
             pulse.end();
         }

@@ -1,0 +1,174 @@
+//! What the projector's reports of slack say about the frames that were sent: the time that each needed from latch to
+//! whole, and from sent to whole.
+//!
+//! The device measures slack on its own clock, from the whole frame to the beginning of its slot. So the time that a
+//! frame needed follows without a constant for what the host cannot see: it is the lead with which the frame was
+//! latched, minus its slack. Where the frame was planned by a wrong map of the clocks, after the machine was suspended
+//! for example, its slot was not where the host believed. Two instants of the host's own clock bound the error: the frame
+//! was whole after it was sent, and before its report was read.
+
+use crate::telemetry::projector::SlackReport;
+use crate::telemetry::signed::SignedHistogram;
+use dpm_device::link::FrameTiming;
+use dpm_device::time::HostTime;
+
+/// Sent frames whose report may be outstanding: more than any projector holds.
+const REMEMBERED: usize = 64;
+/// Slack beyond this is counted as this, nanoseconds.
+const LONGEST_NS: i64 = 1_000_000_000;
+
+/// A frame that was sent.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct SentFrame {
+    /// Low 32 bits of its number.
+    pub frame: u32,
+    /// When it should have been latched.
+    pub latch_due_at: HostTime,
+    /// When its slot begins.
+    pub due_at: HostTime,
+    /// When the medium had accepted it.
+    pub sent_at: HostTime,
+    /// How long it waited for room in the device, nanoseconds. An earlier start would only fill the device more.
+    pub waited_ns: i64,
+}
+
+/// See the module's documentation.
+pub(crate) struct SlackMeter {
+    sent: [Option<SentFrame>; REMEMBERED],
+    next: usize,
+    /// The newest report that was read.
+    read: Option<FrameTiming>,
+    /// Mean and mean deviation of the time from sent to whole, nanoseconds.
+    travel_ns: Option<(i64, i64)>,
+    slack: SignedHistogram,
+    transfer: SignedHistogram,
+}
+
+impl SlackMeter {
+    pub(crate) fn new() -> Self {
+        Self {
+            sent: [None; REMEMBERED],
+            next: 0,
+            read: None,
+            travel_ns: None,
+            slack: SignedHistogram::new(LONGEST_NS as u64),
+            transfer: SignedHistogram::new(LONGEST_NS as u64),
+        }
+    }
+
+    /// A frame was sent.
+    pub(crate) fn sent(&mut self, frame: SentFrame) {
+        self.sent[self.next] = Some(frame);
+        self.next = (self.next + 1) % REMEMBERED;
+    }
+
+    /// Frames that were sent to a former session, or planned by a wrong map of the clock, are not judged any more.
+    pub(crate) fn forget(&mut self) {
+        (self.sent, self.read, self.travel_ns) = ([None; REMEMBERED], None, None);
+    }
+
+    /// A frame was not sent because it would have come too late. If the travel is believed to be longer than it is, no
+    /// report would ever say so: each such frame takes some of the belief.
+    pub(crate) fn doubts_travel(&mut self) {
+        if let Some((mean, deviation)) = &mut self.travel_ns {
+            (*mean, *deviation) = (*mean - *mean / 8, *deviation - *deviation / 8);
+        }
+    }
+
+    /// Reads the timing of a report at `now`. Returns the time that the frame needed from the instant at which it should have
+    /// been latched until it was whole in the device, without the time that it waited for room, nanoseconds; `None` if
+    /// the report says nothing new.
+    pub(crate) fn observe(&mut self, timing: FrameTiming, now: HostTime) -> Option<i64> {
+        if self.read == Some(timing) {
+            return None;
+        }
+        let place = self.sent.iter_mut().find(|sent| sent.is_some_and(|sent| sent.frame == timing.frame))?;
+        let sent = place.take()?;
+        self.read = Some(timing);
+        let slack_ns = i64::from(timing.slack_ns);
+        let whole_at = sent.due_at.plus_ns(-slack_ns).max(sent.sent_at).min(now.max(sent.sent_at));
+        let travel_ns = whole_at.ns_since(sent.sent_at);
+        self.travel_ns = Some(self.travel_ns.map_or((travel_ns, travel_ns / 2), |(mean, deviation)| {
+            let error = travel_ns - mean;
+            (mean + error / 16, deviation + (error.abs() - deviation) / 16)
+        }));
+        self.slack.record(slack_ns);
+        self.transfer.record(i64::from(timing.transfer_ns));
+        Some(whole_at.ns_since(sent.latch_due_at) - sent.waited_ns)
+    }
+
+    /// From sent to whole, as most frames need it, nanoseconds; 0 while nothing is known.
+    pub(crate) fn travel_ns(&self) -> i64 {
+        self.travel_ns.map_or(0, |(mean, deviation)| mean + 2 * deviation)
+    }
+
+    /// For the report; `None` if the device has reported nothing.
+    pub(crate) fn report(&self) -> Option<SlackReport> {
+        let ms = |histogram: &SignedHistogram, share: f64| {
+            (!histogram.is_empty()).then(|| histogram.value_at_quantile(share) as f64 / 1e6)
+        };
+        Some(SlackReport {
+            least_0_1_percent_ms: ms(&self.slack, 0.001)?,
+            least_0_5_percent_ms: ms(&self.slack, 0.005)?,
+            median_ms: ms(&self.slack, 0.5)?,
+            transfer_median_ms: ms(&self.transfer, 0.5)?,
+        })
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const MS: i64 = 1_000_000;
+
+    fn frame(frame: u32) -> SentFrame {
+        let latch_due_at = HostTime(100 * MS + i64::from(frame) * MS);
+        let (due_at, sent_at) = (latch_due_at.plus_ns(3 * MS), latch_due_at.plus_ns(MS));
+        SentFrame { frame, latch_due_at, due_at, sent_at, waited_ns: 0 }
+    }
+
+    fn timing(frame: u32, slack_ns: i64) -> FrameTiming {
+        FrameTiming { frame, slack_ns: slack_ns as i32, transfer_ns: 7 }
+    }
+
+    #[test]
+    fn what_a_frame_needed_is_its_lead_without_its_slack() {
+        let mut meter = SlackMeter::new();
+        for k in 0..200 {
+            meter.sent(SentFrame { waited_ns: i64::from(k % 3), ..frame(k) });
+            let read_at = frame(k).due_at;
+            let needed = meter.observe(timing(k, MS / 2), read_at);
+            assert_eq!(needed, Some(5 * MS / 2 - i64::from(k % 3)));
+            assert_eq!(meter.observe(timing(k, MS / 2), read_at), None, "a report that was read");
+            assert_eq!(meter.observe(timing(k + 1000, MS / 2), read_at), None, "a frame that was never sent");
+        }
+        assert!((3 * MS / 2..2 * MS).contains(&meter.travel_ns()), "{}", meter.travel_ns());
+        let report = meter.report().expect("there were reports");
+        assert!((report.median_ms - 0.5).abs() < 1e-3, "{report:?}");
+    }
+
+    /// Found by the simulator: a machine was suspended, the map of the clock was wrong by as much for a moment, and a
+    /// lead of that length kept everything dark.
+    #[test]
+    fn a_wrong_map_of_the_clock_adds_no_more_than_the_report_took() {
+        for wrong_ms in [-344, 344] {
+            let mut meter = SlackMeter::new();
+            meter.sent(frame(1));
+            let read_at = frame(1).sent_at.plus_ns(MS / 4);
+            let needed = meter.observe(timing(1, 3 * MS / 2 + wrong_ms * MS), read_at).expect("it is new");
+            assert!((MS..=5 * MS / 4).contains(&needed), "{needed}");
+            assert!(meter.travel_ns() <= MS / 2 + 1, "{}", meter.travel_ns());
+        }
+    }
+
+    #[test]
+    fn a_travel_that_lets_no_frame_be_sent_is_doubted() {
+        let mut meter = SlackMeter::new();
+        meter.sent(frame(1));
+        meter.observe(timing(1, -900 * MS), HostTime(10_000 * MS));
+        assert!(meter.travel_ns() > 900 * MS);
+        (0..100).for_each(|_| meter.doubts_travel());
+        assert!(meter.travel_ns() < MS, "{}", meter.travel_ns());
+    }
+}
