@@ -70,8 +70,9 @@ pub(super) fn tracker(rig: &Rig) -> Finding {
     }
 }
 
-/// Whether the projector answers, and whether it can show the rig's frames.
-pub(super) fn projector(config: &RigConfig) -> Finding {
+/// Whether the projector answers, and whether it can show the rig's frames. `loads`: the code of a library that the rig
+/// file names may run.
+pub(super) fn projector(config: &RigConfig, loads: bool) -> Finding {
     let identity = Identity::of(&config.projector.backend).to_string();
     let failed = |why: String| Finding::new("projector", State::Missing, why, "see docs/PROJECTORS.md");
     // A projector that another run lights is left alone.
@@ -83,6 +84,7 @@ pub(super) fn projector(config: &RigConfig) -> Finding {
         ProjectorBackend::Mock(_) => {
             return Finding::new("projector", State::Info, "the mock in this process", "");
         }
+        ProjectorBackend::Alp(alp) if !loads => return super::alp::library(alp.library.as_deref()),
         ProjectorBackend::Dlpc900(dlpc900) => controller(dlpc900),
         _ => linked(config),
     };

@@ -27,6 +27,10 @@ pub(crate) struct DoctorArgs {
     rig: Option<PathBuf>,
     #[command(flatten)]
     flags: RigArgs,
+    /// Load the library that the rig file names for an ALP, which runs its code, and ask the device; without this the
+    /// library is only looked at
+    #[arg(long)]
+    load_libraries: bool,
     /// Print one JSON object
     #[arg(long)]
     json: bool,
@@ -102,7 +106,7 @@ pub(super) fn execute(args: &DoctorArgs) -> Result<(), Failure> {
     findings.push(system.serial_ports());
     findings.extend(displays(&display::look()));
     findings.push(alp::libraries(&system.root));
-    let of_rig = config.as_ref().map(rig::findings);
+    let of_rig = config.as_ref().map(|config| rig::findings(config, args.load_libraries));
     let missing = |of: &[Finding]| {
         of.iter().filter(|f| f.state == State::Missing).map(|f| f.name.clone()).collect::<Vec<_>>()
     };

@@ -20,8 +20,8 @@ const LITTLE_SPACE: u64 = 1 << 30;
 /// Most warnings of a scene that are told.
 const MOST_WARNINGS: usize = 4;
 
-/// Everything that can be said of the rig of `config`.
-pub(super) fn findings(config: &RigConfig) -> Vec<Finding> {
+/// Everything that can be said of the rig of `config`. `loads`: the code of libraries that it names may run.
+pub(super) fn findings(config: &RigConfig, loads: bool) -> Vec<Finding> {
     let mut all = vec![set_up(config)];
     match Rig::build(config, None) {
         Err(e) => all.push(Finding::new("scene", State::Missing, e.to_string(), "correct the rig file")),
@@ -32,7 +32,7 @@ pub(super) fn findings(config: &RigConfig) -> Vec<Finding> {
     }
     all.push(calibration(config));
     all.extend(standing_order(config));
-    all.push(devices::projector(config));
+    all.push(devices::projector(config, loads));
     all.extend(page(config));
     all.push(output(&config.output.dir));
     all

@@ -200,7 +200,7 @@ fn what_cannot_be_is_refused_with_figures_and_doctor_says_so() {
         dpm(&of_example(&["--set", "projector.backend.library=\"/no/libalp44.so\""], &library), &NO_DRIVER);
     assert!(code(&output) == 3 && err(&output).contains("/no/libalp44.so"), "{}", err(&output));
     let doctor = |more: &[&str]| {
-        let args = [&["doctor", RIG, "--json", "--set", &library], more].concat();
+        let args = [&["doctor", RIG, "--load-libraries", "--json", "--set", &library], more].concat();
         out(&dpm(&args, &NO_DRIVER))
     };
     let good = doctor(&[]);
@@ -208,6 +208,11 @@ fn what_cannot_be_is_refused_with_figures_and_doctor_says_so() {
         good.contains("light begins") && good.contains("80 frames/s of 8 planes are within its limits"),
         "{good}"
     );
+    // Nobody has asked for the code that a rig file names.
+    let args = ["doctor", RIG, "--json", "--set", &library];
+    let looked_at = out(&dpm(&args, &NO_DRIVER));
+    assert!(looked_at.contains("is a library for this machine"), "{looked_at}");
+    assert!(!looked_at.contains("light begins"), "{looked_at}");
     let bad = doctor(&["--set", "projector.frame_rate=120"]);
     assert!(bad.contains("at most 88.8 frames/s") && bad.contains("\"missing\""), "{bad}");
 }
