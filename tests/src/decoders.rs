@@ -434,7 +434,7 @@ pub fn control_words(bytes: &[u8]) {
     if let Some(said) = status_file::parse(&String::from_utf8_lossy(bytes)) {
         assert!(said.rig.len() <= 3 * bytes.len() && !said.health.to_string().is_empty());
     }
-    let stands = standing::stands_in(Ok(bytes.to_vec()), "a file");
+    let stands = standing::stands_in_bytes(bytes);
     assert!(matches!(stands.order, Order::Black | Order::Safe), "{stands:?}");
     assert!(stands.order == Order::Safe || bytes.trim_ascii().ends_with(b"}"), "{stands:?}");
     assert!(!stands.told.contains('\n') || stands.told.starts_with("counts as SAFE"));

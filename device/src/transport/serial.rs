@@ -74,11 +74,18 @@ pub trait Arrivals: Send {
     fn take(&mut self, now: HostTime, sink: &mut dyn FnMut(HostTime, &[u8])) -> Option<usize>;
 }
 
-/// The operating system's ports, each read by a thread of its own.
-struct SystemPorts;
+/// The operating system's ports, each read by a thread of its own. A path behind which the function finds another device
+/// counts as absent.
+struct SystemPorts(Box<dyn Fn() -> bool + Send>);
 
 impl Ports for SystemPorts {
     fn open(&mut self, settings: &SerialSettings) -> serialport::Result<Box<dyn SerialPort>> {
+        if (self.0)() {
+            return Err(serialport::Error::new(
+                serialport::ErrorKind::NoDevice,
+                "another device has its name",
+            ));
+        }
         tty::open(&settings.path, settings.baud)
     }
 
@@ -115,7 +122,19 @@ impl SerialTransport {
     /// # Errors
     /// Not found; no permission (with the group to join); in use by another program.
     pub fn open(settings: SerialSettings) -> Result<Self, TransportError> {
-        Self::open_from(settings, Box::new(SystemPorts))
+        Self::open_unless(settings, || false)
+    }
+
+    /// The same, but as long as there `is_another` device at the path, now and after every loss, the port counts as
+    /// absent.
+    ///
+    /// # Errors
+    /// As [`SerialTransport::open`].
+    pub fn open_unless(
+        settings: SerialSettings,
+        is_another: impl Fn() -> bool + Send + 'static,
+    ) -> Result<Self, TransportError> {
+        Self::open_from(settings, Box::new(SystemPorts(Box::new(is_another))))
     }
 
     /// Opens a port of `ports`, now and after every loss.
@@ -130,7 +149,7 @@ impl SerialTransport {
 
     /// Uses a port that is already open (a pseudo-terminal) and never blocks, see [`tty::never_wait`].
     pub fn with_port(settings: SerialSettings, port: Box<dyn SerialPort>) -> Self {
-        let mut serial = Self::closed(settings, Box::new(SystemPorts));
+        let mut serial = Self::closed(settings, Box::new(SystemPorts(Box::new(|| false))));
         serial.reader = serial.ports.arrivals(&*port, &serial.clock);
         serial.port = Some(port);
         serial

@@ -4,6 +4,8 @@ use crate::folder::{open_own_file, Folder, FolderError};
 use dpm_device::regular_file;
 use std::fs::{self, File};
 use std::io::{self, BufWriter, Read, Seek, Write};
+use std::os::linux::net::SocketAddrExt;
+use std::os::unix::net::{SocketAddr, UnixDatagram};
 use std::path::{Path, PathBuf};
 
 /// Most old files of one name that are kept.
@@ -118,7 +120,7 @@ fn write_and_rename(
 #[derive(Debug, thiserror::Error)]
 pub enum LockError {
     /// Another process, or another lock in this one, holds it.
-    #[error("{what} is in use by another dpm{}; stop that one first (lock file {})", .holder.map_or(String::new(), |p| format!(" (process {p})")), .path.display())]
+    #[error("{what} is in use by another dpm{}; stop that one first (lock {})", .holder.map_or(String::new(), |p| format!(" (process {p})")), .path.display())]
     Held {
         /// What the lock protects.
         what: String,
@@ -139,8 +141,11 @@ pub enum LockError {
 
 /// An exclusive lock. It is released when it is dropped, or when the process ends in any way.
 #[derive(Debug)]
-pub struct InstanceLock {
-    _file: File,
+pub enum InstanceLock {
+    /// Of those who use the same folder.
+    File(File),
+    /// Of all users of this machine.
+    Name(UnixDatagram),
 }
 
 impl InstanceLock {
@@ -167,6 +172,22 @@ impl InstanceLock {
         Self::lock(folder.open_file(name, true).map_err(failed)?, &folder.path().join(name), what)
     }
 
+    /// As [`InstanceLock::take`], but for all users of this machine, in whatever folders they keep their locks: an
+    /// abstract address of a socket, which exists as long as its owner does, and through which nobody can write
+    /// anywhere. Containers with a network of their own have addresses of their own.
+    ///
+    /// # Errors
+    /// [`LockError::Held`] when another process has it.
+    pub fn take_on_machine(name: &str, what: &str) -> Result<Self, LockError> {
+        let path = PathBuf::from(format!("@dpm/{name}"));
+        let bound = SocketAddr::from_abstract_name(format!("dpm/{name}"))
+            .and_then(|address| UnixDatagram::bind_addr(&address));
+        bound.map(Self::Name).map_err(|source| match source.kind() {
+            io::ErrorKind::AddrInUse => LockError::Held { what: what.into(), path, holder: None },
+            _ => LockError::Io { what: what.into(), source: FolderError::Io { path, source } },
+        })
+    }
+
     fn lock(mut file: File, path: &Path, what: &str) -> Result<Self, LockError> {
         let io = |source| LockError::Io {
             what: what.into(),
@@ -188,7 +209,7 @@ impl InstanceLock {
             writeln!(file, "{}", std::process::id())
         };
         say().map_err(io)?;
-        Ok(Self { _file: file })
+        Ok(Self::File(file))
     }
 }
 
@@ -229,6 +250,16 @@ mod tests {
         assert!(error.to_string().contains("out/light.png"), "{error}");
         assert!(write_atomically(Path::new(".."), |_| Ok(())).is_err());
         fs::remove_dir_all(dir).unwrap();
+    }
+
+    #[test]
+    fn a_lock_of_the_machine_needs_no_folder() {
+        let name = format!("test-{}.lock", std::process::id());
+        let first = InstanceLock::take_on_machine(&name, "projector X").unwrap();
+        let told = InstanceLock::take_on_machine(&name, "projector X").unwrap_err().to_string();
+        assert!(told.contains("projector X is in use by another dpm") && told.contains(&name), "{told}");
+        drop(first);
+        InstanceLock::take_on_machine(&name, "projector X").unwrap();
     }
 
     #[test]

@@ -187,6 +187,29 @@ impl Folder {
         })
     }
 
+    /// Writes `bytes` over the content of `name`, which exists; they are on the disk when this returns. Needs no room on
+    /// the disk where the content was as long, on file systems that write in place.
+    ///
+    /// # Errors
+    /// As [`check_file`]; those of the operating system. The content may then be a mixture.
+    pub fn overwrite(&self, name: &str, bytes: &[u8]) -> Result<(), FolderError> {
+        let mut file = self.open_file(name, false)?;
+        let mut write = || {
+            file.write_all(bytes)?;
+            file.set_len(bytes.len() as u64)?;
+            file.sync_all()
+        };
+        write().map_err(self.named(name))
+    }
+
+    /// Renames `from` to `to`, which is replaced; that is on the disk when this returns.
+    ///
+    /// # Errors
+    /// Those of the operating system.
+    pub fn rename(&self, from: &str, to: &str) -> Result<(), FolderError> {
+        rename_at(&self.handle, from, to).and_then(|()| self.handle.sync_all()).map_err(self.named(to))
+    }
+
     /// Removes `name`, which may be missing; it is gone from the disk when this returns.
     ///
     /// # Errors

@@ -109,3 +109,27 @@ fn a_file_is_replaced_whole_read_with_a_limit_and_removed() {
     folder.replace("c", b"mine").unwrap();
     assert_eq!(fs::read(&victim).unwrap(), b"precious");
 }
+
+/// Found in use, R4: an order needs no room where its bytes were allocated before.
+#[test]
+fn a_file_is_written_over_and_renamed_in_its_own_blocks() {
+    let place = Place::new("over");
+    let folder = Folder::make(&place.0.join("ours"), Owner::Own).unwrap();
+    let number = |name: &str| fs::metadata(folder.path().join(name)).unwrap().ino();
+    folder.replace("reserve", b"00000000").unwrap();
+    let before = number("reserve");
+    folder.overwrite("reserve", b"12345678").unwrap();
+    folder.replace("order", b"old").unwrap();
+    folder.rename("reserve", "order").unwrap();
+    assert_eq!((folder.read("order", 8).unwrap(), number("order")), (b"12345678".to_vec(), before));
+    assert!(folder.read("reserve", 8).unwrap_err().is_missing());
+    // Shorter content leaves no end of the old one.
+    folder.overwrite("order", b"abc").unwrap();
+    assert_eq!(folder.read("order", 8).unwrap(), b"abc");
+    assert!(folder.overwrite("none", b"x").unwrap_err().is_missing());
+    let victim = place.0.join("victim");
+    fs::write(&victim, b"precious").unwrap();
+    symlink(&victim, folder.path().join("link")).unwrap();
+    assert!(folder.overwrite("link", b"x").unwrap_err().to_string().contains("is a link"));
+    assert_eq!(fs::read(&victim).unwrap(), b"precious");
+}

@@ -3,9 +3,10 @@
 #![allow(unsafe_code)]
 
 use std::ffi::CString;
-use std::fs::File;
+use std::fs::{File, Metadata};
 use std::io;
 use std::os::fd::{AsRawFd, FromRawFd, RawFd};
+use std::os::unix::fs::MetadataExt;
 use std::os::unix::net::UnixStream;
 
 /// The user that this process acts for.
@@ -23,6 +24,12 @@ pub fn user_name(uid: u32) -> String {
         (fields.nth(1)?.parse() == Ok(uid)).then(|| name.to_owned())
     });
     entry.unwrap_or_else(|| format!("uid {uid}"))
+}
+
+/// Major and minor number of the device behind a device file.
+pub fn device_number(file: &Metadata) -> [u32; 2] {
+    let number = file.rdev();
+    [libc::major(number), libc::minor(number)]
 }
 
 fn text(name: &str) -> io::Result<CString> {

@@ -5,125 +5,38 @@
 //! the machine. BLACK and FREEZE stand as long as the run that they were given to. If that run died without an
 //! orderly end, they stand as BLACK, because there is no frame left to hold. `docs/ORDERS.md` describes this for
 //! operators.
+//!
+//! An order is kept even where the disk has filled up since the start: its bytes
+//! were allocated before the first light, in the reserve.
 
-use crate::config::ProjectorBackend;
+mod identity;
+mod port;
+
+pub use identity::Identity;
+
 use crate::order::Order;
 use dpm_common::folder::{Folder, FolderError, Owner};
 use dpm_common::unix::{user, user_name};
+use identity::Match;
+use port::Port;
 use std::fmt;
 use std::io;
 use std::net::IpAddr;
 use std::path::{Path, PathBuf};
 use std::time::{SystemTime, UNIX_EPOCH};
 
-/// Version of the files' content.
-const VERSION: u32 = 1;
-/// A longer file is damaged.
-const MAX_BYTES: u64 = 4096;
-/// File name extension.
+/// Version of the files' content. Version 1 had neither `port` nor `lifted`.
+const VERSION: u32 = 2;
+/// Size of a file. A longer one is damaged, and a shorter one is of version 1.
+const BYTES: usize = 4096;
+/// File name extension of an order.
 const ENDING: &str = ".order";
-/// The longest file name without its extension. A longer one is cut and made unique by a hash.
-const MAX_STEM: usize = 160;
-
-/// Identifies a projector: its name in locks, standing orders and messages.
-#[derive(Clone, Debug, PartialEq, Eq)]
-pub struct Identity {
-    what: String,
-    /// The part of the file names that all projectors of this kind share.
-    family: String,
-    /// What distinguishes it from others of the kind; `None` if the rig file accepts any.
-    serial: Option<String>,
-    is_mock: bool,
-}
-
-impl Identity {
-    /// The identity of the projector of a rig file.
-    pub fn of(backend: &ProjectorBackend) -> Self {
-        let or_any = |s: &Option<String>| s.clone().unwrap_or_else(|| "any".into());
-        let (what, family, serial) = match backend {
-            ProjectorBackend::Mock(_) => ("mock projector".into(), "mock projector".into(), None),
-            ProjectorBackend::Usb(usb) => {
-                let family = format!("USB projector {:04x}:{:04x}", usb.vendor_id, usb.product_id);
-                (format!("{family} {}", or_any(&usb.serial_number)), family, usb.serial_number.clone())
-            }
-            ProjectorBackend::Serial(port) => {
-                ("projector on ".to_owned() + &port.port, "projector on".into(), Some(port.port.clone()))
-            }
-            ProjectorBackend::Display(display) => {
-                let name = or_any(&display.connector);
-                (format!("display {name}"), "display".into(), display.connector.clone())
-            }
-            ProjectorBackend::Window(_) => ("window".into(), "window".into(), None),
-            ProjectorBackend::Alp(alp) => {
-                let number = Some(alp.device_number).filter(|n| *n > 0).map(|n| n.to_string());
-                (format!("ALP {}", or_any(&number)), "ALP".into(), number)
-            }
-            // It is identified by its place on the bus, which changes with every re-plug, so an order for one applies
-            // to all.
-            ProjectorBackend::Dlpc900(dlpc) => {
-                (format!("DLPC900 {}", or_any(&dlpc.device)), "DLPC900".into(), None)
-            }
-        };
-        Self {
-            what,
-            family: plain(&family),
-            serial: serial.as_deref().map(plain),
-            is_mock: matches!(backend, ProjectorBackend::Mock(_)),
-        }
-    }
-
-    /// Its name in messages.
-    pub fn what(&self) -> &str {
-        &self.what
-    }
-
-    /// True for the projector inside this process, which emits no light.
-    pub fn is_mock(&self) -> bool {
-        self.is_mock
-    }
-
-    /// Name of its lock file.
-    pub fn lock_name(&self) -> String {
-        short(&plain(&self.what)) + ".lock"
-    }
-
-    /// Name of the file of its standing order.
-    pub(crate) fn order_name(&self) -> String {
-        short(&format!("{}-{}", self.family, self.serial.as_deref().unwrap_or("any"))) + ENDING
-    }
-
-    /// True if an order in the file `name` applies to this projector: its own file; the file for any projector of the
-    /// kind; and, if the rig file accepts any projector of the kind, the file of each of them.
-    fn is_meant_by(&self, name: &str) -> bool {
-        let any = short(&format!("{}-any", self.family)) + ENDING;
-        name == self.order_name()
-            || name == any
-            || self.serial.is_none()
-                && name.ends_with(ENDING)
-                && name.starts_with(&(self.family.clone() + "-"))
-    }
-}
-
-impl fmt::Display for Identity {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        f.write_str(&self.what)
-    }
-}
-
-/// The letters and digits of `text`, with dashes in place of everything else.
-fn plain(text: &str) -> String {
-    text.chars().map(|c| if c.is_ascii_alphanumeric() { c } else { '-' }).collect()
-}
-
-/// Returns `stem` if it can be a file name, else its beginning and a hash of the whole (FNV-1a).
-fn short(stem: &str) -> String {
-    if stem.len() <= MAX_STEM {
-        return stem.to_owned();
-    }
-    let hash =
-        stem.bytes().fold(0xcbf2_9ce4_8422_2325u64, |h, b| (h ^ u64::from(b)).wrapping_mul(0x100_0000_01b3));
-    format!("{}-{hash:016x}", &stem[..MAX_STEM])
-}
+/// File name extension of the file that becomes the next order.
+const RESERVE: &str = ".reserve";
+/// Other projectors for which an order is lifted, at most; for the oldest it then holds again.
+const MOST_LIFTED: usize = 6;
+/// Characters of a name in a file, at most.
+const MAX_NAME: usize = 100;
 
 /// Who gave an order.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -162,7 +75,7 @@ impl fmt::Display for By {
 }
 
 /// Content of the file.
-#[derive(serde::Serialize, serde::Deserialize)]
+#[derive(Debug, serde::Serialize, serde::Deserialize)]
 struct Content {
     version: u32,
     order: String,
@@ -170,6 +83,39 @@ struct Content {
     by: String,
     process: u32,
     projector: String,
+    /// The port behind the projector.
+    #[serde(default)]
+    port: Option<Port>,
+    /// Other projectors that a person has armed although this order might have been for them.
+    #[serde(default)]
+    lifted: Vec<String>,
+}
+
+impl Content {
+    fn new(order: Order, by: &str, projector: &str, port: Option<Port>) -> Self {
+        let cut = |text: &str| text.chars().take(MAX_NAME).collect();
+        Self {
+            version: VERSION,
+            order: order.word().into(),
+            at: utc(SystemTime::now()),
+            by: cut(by),
+            process: std::process::id(),
+            projector: cut(projector),
+            port,
+            lifted: Vec::new(),
+        }
+    }
+
+    /// Exactly [`BYTES`] bytes.
+    fn to_bytes(&self) -> io::Result<Vec<u8>> {
+        let mut bytes = serde_json::to_vec(self)?;
+        if bytes.len() >= BYTES {
+            return Err(io::Error::other("the names of the projector's port are too long"));
+        }
+        bytes.resize(BYTES - 1, b' ');
+        bytes.push(b'\n');
+        Ok(bytes)
+    }
 }
 
 /// An order that stands when a run starts: the rig comes up and does not arm.
@@ -179,6 +125,8 @@ pub struct Stands {
     pub order: Order,
     /// Since when, and by whom; or why it counts as SAFE.
     pub told: String,
+    /// The file of this projector holds it.
+    pub is_on_disk: bool,
 }
 
 /// The folder of the files: `$DPM_STATE_DIR`, else systemd's `$STATE_DIRECTORY`, else `/var/lib/dpm` for root, else
@@ -224,6 +172,19 @@ pub trait StateFolder: fmt::Debug + Send + Sync {
     /// Those of the operating system; the old content is then unchanged.
     fn replace(&self, name: &str, bytes: &[u8]) -> Result<(), FolderError>;
 
+    /// Writes `bytes` over the content of `name`, which exists; they are on the disk when this returns. Needs no room on
+    /// the disk where the content was as long.
+    ///
+    /// # Errors
+    /// Those of the operating system; the content may then be a mixture.
+    fn overwrite(&self, name: &str, bytes: &[u8]) -> Result<(), FolderError>;
+
+    /// Renames `from` to `to`, which is replaced; that is on the disk when this returns.
+    ///
+    /// # Errors
+    /// Those of the operating system.
+    fn rename(&self, from: &str, to: &str) -> Result<(), FolderError>;
+
     /// Removes `name`, which may be missing; it is gone from the disk when this returns.
     ///
     /// # Errors
@@ -246,6 +207,14 @@ impl StateFolder for Folder {
 
     fn replace(&self, name: &str, bytes: &[u8]) -> Result<(), FolderError> {
         Self::replace(self, name, bytes)
+    }
+
+    fn overwrite(&self, name: &str, bytes: &[u8]) -> Result<(), FolderError> {
+        Self::overwrite(self, name, bytes)
+    }
+
+    fn rename(&self, from: &str, to: &str) -> Result<(), FolderError> {
+        Self::rename(self, from, to)
     }
 
     fn remove(&self, name: &str) -> Result<(), FolderError> {
@@ -281,11 +250,10 @@ impl OrderFile {
         }
     }
 
-    /// The file in `folder`, if a trial shows that files can be written there.
+    /// The file in `folder`, if an order can be kept there whatever else fills the disk.
     pub(crate) fn in_folder(folder: Box<dyn StateFolder>, identity: Identity) -> (Self, Option<FolderError>) {
         let path = folder.path().to_owned();
-        let trial = format!(".trial-{}", std::process::id());
-        match folder.replace(&trial, b"").and_then(|()| folder.remove(&trial)) {
+        match reserve(&*folder, &identity) {
             Ok(()) => (Self { identity, folder: Some(folder), path }, None),
             Err(e) => (Self { identity, folder: None, path }, Some(e)),
         }
@@ -306,35 +274,102 @@ impl OrderFile {
             let source = io::Error::other("could not be used when the run began");
             return Err(FolderError::Io { path: self.path.clone(), source });
         };
-        let name = self.identity.order_name();
-        let content = Content {
-            version: VERSION,
-            order: order.word().into(),
-            at: utc(SystemTime::now()),
-            by: by.to_string(),
-            process: std::process::id(),
-            projector: self.identity.what.clone(),
-        };
-        let text = serde_json::to_string(&content)
-            .map_err(|e| FolderError::Io { path: folder.path().join(&name), source: e.into() })?;
-        folder.replace(&name, (text + "\n").as_bytes())?;
-        Ok(folder.path().join(name))
+        let (identity, name) = (&self.identity, self.identity.order_name());
+        let content = Content::new(order, &by.to_string(), identity.what(), identity.port().cloned());
+        let bytes = content.to_bytes().map_err(|source| FolderError::Io { path: self.path(), source })?;
+        let reserve = identity.stem() + RESERVE;
+        folder
+            .overwrite(&reserve, &bytes)
+            .and_then(|()| folder.rename(&reserve, &name))
+            // The reserve has become this file with an earlier order. A power failure that leaves a mixture leaves a
+            // damaged file, which counts as SAFE.
+            .or_else(|_| folder.overwrite(&name, &bytes))
+            .or_else(|_| folder.replace(&name, &bytes))?;
+        Ok(self.path())
     }
 
-    /// Forgets every order for this projector; that is on the disk when this returns. If nothing can be kept, there
-    /// is nothing to forget.
+    /// Lifts every order that holds this projector; that is on the disk when this returns. An order that may be for
+    /// another projector stays in force for that one. If nothing can be kept, there is nothing to lift.
     ///
     /// # Errors
     /// An error of the operating system; an order then still stands.
     pub(crate) fn forget(&self) -> Result<(), FolderError> {
         let Some(folder) = &self.folder else { return Ok(()) };
-        for name in folder.names()? {
-            if self.identity.is_meant_by(&name) {
+        for Held { name, is_same, stands, content } in holding(&**folder, &self.identity)? {
+            let failed = |source| FolderError::Io { path: folder.path().join(&name), source };
+            if !is_same {
+                let mut content = content
+                    .unwrap_or_else(|| Content::new(Order::Safe, &stands.told, "an unknown projector", None));
+                content.version = VERSION;
+                content.lifted.push(self.identity.instance());
+                content.lifted.drain(..content.lifted.len().saturating_sub(MOST_LIFTED));
+                folder.replace(&name, &content.to_bytes().map_err(failed)?)?;
+            } else if name == self.identity.order_name()
+                && folder.read(&name, BYTES as u64).is_ok_and(is_whole)
+            {
+                folder.rename(&name, &(self.identity.stem() + RESERVE))?;
+            } else {
                 folder.remove(&name)?;
             }
         }
         Ok(())
     }
+}
+
+fn is_whole(bytes: Vec<u8>) -> bool {
+    bytes.len() == BYTES
+}
+
+/// Allocates the bytes of the next order, and tries all that keeping it takes: a file that is written over, and a new
+/// name in the folder, as long as that of an order.
+fn reserve(folder: &dyn StateFolder, identity: &Identity) -> Result<(), FolderError> {
+    let longest = "x".repeat(MAX_NAME);
+    let content = Content::new(Order::Safe, &longest, &longest, identity.port().cloned());
+    let (reserve, trial) = (identity.stem() + RESERVE, identity.stem() + ".trial");
+    let bytes = content
+        .to_bytes()
+        .map_err(|source| FolderError::Io { path: folder.path().join(&reserve), source })?;
+    if !folder.read(&reserve, BYTES as u64).is_ok_and(is_whole) {
+        folder.replace(&reserve, &bytes)?;
+    }
+    folder.overwrite(&reserve, &bytes)?;
+    folder.rename(&reserve, &trial)?;
+    folder.rename(&trial, &reserve)
+}
+
+/// A file that holds a projector.
+struct Held {
+    name: String,
+    /// Its order was given to this projector, as far as can be told.
+    is_same: bool,
+    stands: Stands,
+    /// `None` for a damaged file.
+    content: Option<Content>,
+}
+
+/// The files that hold the projector of `identity`.
+fn holding(folder: &dyn StateFolder, identity: &Identity) -> Result<Vec<Held>, FolderError> {
+    let mut all = Vec::new();
+    for name in folder.names()?.into_iter().filter(|name| name.ends_with(ENDING)) {
+        let path = folder.path().join(&name).display().to_string();
+        let bytes = folder.read(&name, BYTES as u64).map_err(|e| e.to_string());
+        let (mut stands, content) = stands_in(bytes, &path);
+        let (projector, port) =
+            content.as_ref().map_or(("", None), |c| (c.projector.as_str(), c.port.as_ref()));
+        let meant = identity.is_meant_by(&name, projector, port);
+        let is_same = meant == Match::Same;
+        let is_lifted = content.as_ref().is_some_and(|c| c.lifted.contains(&identity.instance()));
+        if meant == Match::Other || is_lifted && !is_same {
+            continue;
+        }
+        stands.is_on_disk = is_same;
+        if content.is_some() && projector != identity.what() {
+            let maybe = if is_same { "" } else { ", which may be this one" };
+            stands.told += &format!(", for {}{maybe}", clean(projector));
+        }
+        all.push(Held { name, is_same, stands, content });
+    }
+    Ok(all)
 }
 
 /// What stands for `identity` in the state folder `path`. A missing folder contains nothing. A folder that cannot be
@@ -349,33 +384,33 @@ pub fn standing_in(path: &Path, identity: &Identity) -> Option<Stands> {
 
 /// The same for a folder that is open.
 pub(crate) fn standing_in_folder(folder: &dyn StateFolder, identity: &Identity) -> Option<Stands> {
-    let names = match folder.names() {
-        Ok(names) => names,
-        Err(e) => return Some(unreadable(&e)),
-    };
-    let mine = names.iter().filter(|name| identity.is_meant_by(name));
-    mine.map(|name| read(folder, name)).max_by_key(|stands| stands.order.strength())
+    match holding(folder, identity) {
+        Ok(all) => {
+            let stands = all.into_iter().map(|held| held.stands);
+            stands.max_by_key(|stands| (stands.order.strength(), stands.is_on_disk))
+        }
+        Err(e) => Some(unreadable(&e)),
+    }
 }
 
 fn unreadable(e: &FolderError) -> Stands {
     let told = format!("counts as SAFE, because the state folder cannot be read: {e}");
-    Stands { order: Order::Safe, told }
+    Stands { order: Order::Safe, told, is_on_disk: true }
 }
 
-fn read(folder: &dyn StateFolder, name: &str) -> Stands {
-    stands_in(
-        folder.read(name, MAX_BYTES).map_err(|e| e.to_string()),
-        &folder.path().join(name).display().to_string(),
-    )
+fn clean(text: &str) -> String {
+    text.chars().filter(|c| !c.is_control()).take(200).collect()
 }
 
-/// What the bytes of a file say, or why there are none. `path` is its name in messages.
-#[doc(hidden)]
-pub fn stands_in(bytes: Result<Vec<u8>, String>, path: &str) -> Stands {
+/// Reads the content of a file. `path` is its name in messages.
+fn stands_in(bytes: Result<Vec<u8>, String>, path: &str) -> (Stands, Option<Content>) {
     let parsed = bytes.and_then(|bytes| {
         let content: Content = serde_json::from_slice(&bytes).map_err(|e| format!("damaged: {e}"))?;
-        if content.version != VERSION {
+        if !(1..=VERSION).contains(&content.version) {
             return Err(format!("version {} is not known", content.version));
+        }
+        if content.version > 1 && bytes.len() != BYTES {
+            return Err(format!("damaged: {} bytes", bytes.len()));
         }
         match Order::from_word(&content.order) {
             Some(Order::Arm) | None => Err(format!("damaged: {:?} is not a standing order", content.order)),
@@ -385,21 +420,28 @@ pub fn stands_in(bytes: Result<Vec<u8>, String>, path: &str) -> Stands {
     match parsed {
         Ok((order, content)) => {
             let held = if order == Order::Freeze {
-                " (FREEZE of a run that died: no frame is left to hold)"
+                " (FREEZE of a run that is over: no frame is left to hold)"
             } else {
                 ""
             };
-            let clean = |text: &str| text.chars().filter(|c| !c.is_control()).take(200).collect::<String>();
-            Stands {
+            let stands = Stands {
                 order: if order == Order::Safe { Order::Safe } else { Order::Black },
                 told: format!("since {}, ordered by {}{held}", clean(&content.at), clean(&content.by)),
-            }
+                is_on_disk: true,
+            };
+            (stands, Some(content))
         }
-        Err(reason) => Stands {
-            order: Order::Safe,
-            told: format!("counts as SAFE, because {path} cannot be read: {reason}"),
-        },
+        Err(reason) => {
+            let told = format!("counts as SAFE, because {path} cannot be read: {reason}");
+            (Stands { order: Order::Safe, told, is_on_disk: true }, None)
+        }
     }
+}
+
+/// What the bytes of a file say, for a test with any bytes.
+#[doc(hidden)]
+pub fn stands_in_bytes(bytes: &[u8]) -> Stands {
+    stands_in(Ok(bytes.to_vec()), "a file").0
 }
 
 /// `at` in the form 2026-03-01T12:00:00Z (proleptic Gregorian calendar, without leap seconds). Times before 1970 are
@@ -438,5 +480,8 @@ pub fn seconds_of_utc(text: &str) -> Option<u64> {
 }
 
 #[cfg(test)]
-#[path = "standing_tests.rs"]
+mod identity_tests;
+#[cfg(test)]
+mod room_tests;
+#[cfg(test)]
 mod tests;

@@ -12,8 +12,12 @@ use std::sync::{Arc, Mutex};
 #[derive(Debug, Default)]
 pub struct Disk {
     files: BTreeMap<String, Vec<u8>>,
-    /// Writing fails: the disk is full, or was mounted read-only.
+    /// Writing fails: the disk was mounted read-only.
     pub refuses: bool,
+    /// Nothing that takes more bytes is written: the disk is full.
+    pub is_full: bool,
+    /// An order was refused because the disk is full.
+    pub lost_order: bool,
     /// How much longer a write takes, nanoseconds.
     pub late_ns: i64,
 }
@@ -36,6 +40,10 @@ fn refused(name: &str) -> FolderError {
     FolderError::Io { path: Path::new(PATH).join(name), source: io::Error::other("no space left on device") }
 }
 
+fn missing(name: &str) -> FolderError {
+    FolderError::Io { path: Path::new(PATH).join(name), source: io::ErrorKind::NotFound.into() }
+}
+
 impl StateFolder for SimFolder {
     fn path(&self) -> &Path {
         Path::new(PATH)
@@ -53,10 +61,32 @@ impl StateFolder for SimFolder {
 
     fn replace(&self, name: &str, bytes: &[u8]) -> Result<(), FolderError> {
         let mut disk = lock(&self.0);
-        if disk.refuses {
+        if disk.refuses || disk.is_full {
+            disk.lost_order |= !disk.refuses && name.ends_with(".order");
             return Err(refused(name));
         }
         disk.files.insert(name.into(), bytes.into());
+        Ok(())
+    }
+
+    fn overwrite(&self, name: &str, bytes: &[u8]) -> Result<(), FolderError> {
+        let mut disk = lock(&self.0);
+        let (refuses, is_full) = (disk.refuses, disk.is_full);
+        let file = disk.files.get_mut(name).ok_or_else(|| missing(name))?;
+        if refuses || is_full && bytes.len() > file.len() {
+            return Err(refused(name));
+        }
+        *file = bytes.into();
+        Ok(())
+    }
+
+    fn rename(&self, from: &str, to: &str) -> Result<(), FolderError> {
+        let mut disk = lock(&self.0);
+        if disk.refuses {
+            return Err(refused(from));
+        }
+        let file = disk.files.remove(from).ok_or_else(|| missing(from))?;
+        disk.files.insert(to.into(), file);
         Ok(())
     }
 

@@ -420,6 +420,9 @@ impl World {
                 let mut disk = lock(&self.disk);
                 disk.refuses = dice.happens(0.6);
                 disk.late_ns = if disk.refuses { 0 } else { dice.decades(10, 2_000) * MS };
+                // Half of those that refuse are only full.
+                disk.is_full = disk.refuses && dice.happens(0.5);
+                disk.refuses &= !disk.is_full;
                 // An order that waits, one that is written, and the ARM after them.
                 let busy_ns = lasts_ns + 3 * disk.late_ns;
                 drop(disk);
@@ -522,7 +525,7 @@ impl World {
             }
             Undo::Disk => {
                 let mut disk = lock(&self.disk);
-                (disk.refuses, disk.late_ns) = (false, 0);
+                (disk.refuses, disk.is_full, disk.late_ns) = (false, false, 0);
             }
             Undo::Load => lock(&self.beneath).load_milli = 1000,
             Undo::Traps => {

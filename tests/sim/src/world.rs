@@ -723,6 +723,9 @@ impl World {
 
     fn tick(&mut self) {
         self.tick_at = self.t + TICK_NS;
+        if lock(&self.disk).lost_order {
+            self.laws.fail(self.t, "an order was not kept because the disk is full".into());
+        }
         let calm_for = if self.is_calm() && self.episode.is_none() { self.t - self.calm_since } else { -1 };
         if calm_for < 0 {
             self.calm_since = self.calm_since.max(self.t);

@@ -337,8 +337,9 @@ fn stand_by(rig: &RigConfig, monitor: &Arc<RunMonitor>, teller: &Teller) -> Resu
     let identity = Identity::of(&rig.projector.backend);
     let (file, error, stands) = OrderFile::open(state_folder(), identity.clone());
     if let Some(e) = &error {
-        let told =
-            format!("SAFE could not be kept over a restart: {e}; name another state folder by DPM_STATE_DIR");
+        let told = format!(
+            "SAFE could not be kept over a restart: {e}; make room there, or name another state folder by DPM_STATE_DIR"
+        );
         if !identity.is_mock() {
             return Err(Failure::new(FailureKind::BadInput, told));
         }
@@ -405,7 +406,11 @@ pub(super) fn take_locks(rig: &RigConfig) -> Result<Locks, Failure> {
                 format!("cannot lock {identity}: the runtime folder {e}; {advice}"),
             )
         })?;
-        held.push(InstanceLock::take_in(folder, &identity.lock_name(), identity.what()).map_err(or(advice))?);
+        let name = identity.lock_name();
+        held.push(InstanceLock::take_in(folder, &name, identity.what()).map_err(or(advice))?);
+        if identity.is_one_device() {
+            held.push(InstanceLock::take_on_machine(&name, identity.what()).map_err(or(advice))?);
+        }
     }
     let OutputConfig { dir, images, trace, .. } = &rig.output;
     if *images || *trace {

@@ -195,7 +195,8 @@ pub(super) fn check(rig: &RigConfig, reader: &mut Reader) {
                 refuse("safety.interlock.file", "is a relative path", "write an absolute path");
             }
             if let (Some(ours), ProjectorBackend::Serial(serial)) = (&l.port, &rig.projector.backend) {
-                if *ours == serial.port {
+                let device = |path: &str| std::fs::canonicalize(path).unwrap_or_else(|_| path.into());
+                if device(ours) == device(&serial.port) {
                     let remedy = "a port can be opened once; use another";
                     refuse("safety.interlock.port", "is the projector's own port", remedy);
                 }

@@ -5,6 +5,7 @@ use crate::config::{
     Pace, ProjectorBackend, ResponseConfig, RigConfig, WindowConfig,
 };
 use crate::engine::connect::ConnectError;
+use crate::standing::Identity;
 use dpm_common::stopping;
 use dpm_device::alp::{AlpSettings, AlpTransport, Showing};
 use dpm_device::dlpc900::usb::{self, UsbPlace};
@@ -99,7 +100,11 @@ pub fn open(
         }
         ProjectorBackend::Serial(serial) => {
             let settings = SerialSettings { path: serial.port.clone(), baud: serial.baud, frame_bytes };
-            let transport = Box::new(SerialTransport::open(settings).map_err(failed)?);
+            // The locks and the standing orders of this run are those of the device that it has found.
+            let (first, backend) =
+                (Identity::of(&config.projector.backend), config.projector.backend.clone());
+            let is_another = move || first.is_certainly_not(&Identity::of(&backend));
+            let transport = Box::new(SerialTransport::open_unless(settings, is_another).map_err(failed)?);
             Some(Medium { transport, warnings: Vec::new() })
         }
         ProjectorBackend::Display(display) => {

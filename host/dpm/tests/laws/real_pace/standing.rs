@@ -178,6 +178,33 @@ fn r4_black_outlives_a_run_that_died_and_not_one_that_ended() {
     bench.comes_up_dark_until_armed("SAFE stands since");
 }
 
+/// Found in use, R1 and R6: SAFE by a link of the port did not hold a run by the port itself, and a second program by
+/// the other name came as far as the port.
+#[test]
+fn r1_a_link_of_the_port_is_the_same_projector() {
+    let bench = Bench::new("link");
+    let link = bench._folder.path("port");
+    symlink(&bench.far.path, &link).unwrap();
+    let by_link = bench._folder.path("link.toml");
+    let text = fs::read_to_string(&bench.path).unwrap();
+    let [real, linked] = [&bench.far.path, &link].map(|path| path.display().to_string());
+    assert!(text.contains(&real));
+    fs::write(&by_link, text.replace(&real, &linked)).unwrap();
+    let state = [("DPM_STATE_DIR", bench.state.to_str().unwrap())];
+    let run = start_with(&run_words(by_link.to_str().unwrap()), &state);
+    bench.far.until(LONG, "light", &mut |s| s.lit);
+    // Another folder of locks, as another user has.
+    let elsewhere = bench._folder.path("locks");
+    let told = dpm(&["run", &bench.path], &[state[0], ("DPM_RUNTIME_DIR", elsewhere.to_str().unwrap())]);
+    assert_eq!(code(&told), 3, "{}", err(&told));
+    assert!(err(&told).contains("is in use by another dpm"), "{}", err(&told));
+    bench.order("safe", &run, 0);
+    run.signal("KILL");
+    run.finish();
+    bench.power_cycle();
+    bench.comes_up_dark_until_armed("SAFE stands since");
+}
+
 /// Found in use, R4: without a folder in which SAFE can be kept, a real projector is not run.
 #[test]
 fn r4_a_real_projector_without_a_state_folder_is_refused() {
@@ -239,12 +266,8 @@ fn r7_a_lock_folder_of_others_and_planted_links_are_refused() {
         assert_eq!(fs::read(&victim).unwrap(), b"precious");
         assert_eq!(bench.far.status().state, DeviceState::Idle, "the projector was not even opened");
     };
-    let port = bench.far.path.display().to_string();
-    let name: String = format!("projector on {port}")
-        .chars()
-        .map(|c| if c.is_ascii_alphanumeric() { c } else { '-' })
-        .collect();
-    let lock = runtime.join(name + ".lock");
+    let [major, minor] = dpm_common::unix::device_number(&fs::metadata(&bench.far.path).unwrap());
+    let lock = runtime.join(format!("projector-on-device-{major}-{minor}.lock"));
     symlink(&victim, &lock).unwrap();
     run("is a link");
     fs::remove_file(&lock).unwrap();

@@ -1,0 +1,258 @@
+//! What a projector on a serial port is, in a machine made of files: a device file holds its number and when it was made.
+
+use super::room_tests::Disk;
+use super::*;
+use crate::config::{DisplayConfig, Dlpc900Config, ProjectorBackend, SerialProjectorConfig, WindowConfig};
+use port::{Node, System};
+use std::fs;
+use std::os::unix::fs::symlink;
+
+/// A machine with nothing in it, and a state folder.
+struct Machine {
+    root: &'static str,
+    disk: Disk,
+}
+
+fn node(file: &Path) -> Option<Node> {
+    let text = fs::read_to_string(file).ok()?;
+    let mut numbers = text.split_whitespace().map(|n| n.parse::<u32>().unwrap());
+    let mut next = || numbers.next();
+    Some(Node { number: [next()?, next()?], since: [next()?.into(), 0] })
+}
+
+impl Machine {
+    fn new(name: &str) -> Self {
+        let root = std::env::temp_dir().join(format!("dpm-machine-{}-{name}", std::process::id()));
+        let _ = fs::remove_dir_all(&root);
+        for folder in ["dev/pts", "dev/serial/by-id", "sys/dev/char"] {
+            fs::create_dir_all(root.join(folder)).unwrap();
+        }
+        let root = Box::leak(root.to_str().unwrap().to_owned().into_boxed_str());
+        Self { root, disk: Disk::default() }
+    }
+
+    fn at(&self, path: &str) -> PathBuf {
+        Path::new(self.root).join(path)
+    }
+
+    /// A device file that was made at an instant, where sysfs has `folder` for it.
+    fn made(&self, file: &str, number: [u32; 2], since: u32, folder: Option<&str>) {
+        let [major, minor] = number;
+        fs::write(self.at(&format!("dev/{file}")), format!("{major} {minor} {since}")).unwrap();
+        let link = self.at(&format!("sys/dev/char/{major}:{minor}"));
+        let _ = fs::remove_file(&link);
+        if let Some(folder) = folder {
+            fs::create_dir_all(self.at(folder)).unwrap();
+            symlink(self.at(folder), link).unwrap();
+        }
+    }
+
+    /// An adapter in a socket, as `/dev/ttyUSBn`.
+    fn plugged(&self, n: u32, since: u32, socket: &str, serial: Option<&str>) {
+        let device = format!("sys/devices/pci0000:00/0000:00:14.0/usb1/{socket}");
+        let folder = format!("{device}/{socket}:1.0/ttyUSB{n}/tty/ttyUSB{n}");
+        self.made(&format!("ttyUSB{n}"), [188, n], since, Some(&folder));
+        for (name, text) in [("idVendor", Some("0403")), ("idProduct", Some("6001")), ("serial", serial)] {
+            let file = self.at(&format!("{device}/{name}"));
+            let _ = fs::remove_file(&file);
+            text.into_iter().for_each(|text| fs::write(&file, format!("{text}\n")).unwrap());
+        }
+    }
+
+    fn unplugged(&self, n: u32) {
+        fs::remove_file(self.at(&format!("dev/ttyUSB{n}"))).unwrap();
+        fs::remove_file(self.at(&format!("sys/dev/char/188:{n}"))).unwrap();
+    }
+
+    fn link(&self, file: &str, to: &str) {
+        symlink(to, self.at(&format!("dev/{file}"))).unwrap();
+    }
+
+    /// The projector at a path, as a program that starts now sees it.
+    fn projector(&self, path: &str) -> Identity {
+        let port = SerialProjectorConfig { port: format!("/dev/{path}"), ..Default::default() };
+        Identity::on(System { root: self.root, node }, &ProjectorBackend::Serial(port))
+    }
+
+    fn safe_at(&self, path: &str) {
+        self.file(path).keep(Order::Safe, By::Key).unwrap();
+    }
+
+    fn file(&self, path: &str) -> OrderFile {
+        let (file, error) = OrderFile::in_folder(Box::new(self.disk.clone()), self.projector(path));
+        assert!(error.is_none(), "{error:?}");
+        file
+    }
+
+    fn holds(&self, path: &str) -> bool {
+        standing_in_folder(&self.disk, &self.projector(path)).is_some()
+    }
+}
+
+impl Drop for Machine {
+    fn drop(&mut self) {
+        let _ = fs::remove_dir_all(self.root);
+    }
+}
+
+/// Found in use, R1 and R6: SAFE by a link of the port, and a run by the port itself was lit; two programs by two names
+/// of one port both came as far as the port.
+#[test]
+fn every_name_of_a_port_is_one_projector() {
+    let machine = Machine::new("names");
+    machine.plugged(0, 5, "1-2", Some("AB12"));
+    machine.made("pts/5", [136, 5], 1, None);
+    machine.link("projector", "pts/5");
+    machine.link("serial/by-id/usb-FTDI_AB12-if00", "../../ttyUSB0");
+    for (link, path) in [("projector", "pts/5"), ("serial/by-id/usb-FTDI_AB12-if00", "ttyUSB0")] {
+        let [one, other] = [link, path].map(|path| machine.projector(path));
+        assert_eq!((one.order_name(), one.lock_name()), (other.order_name(), other.lock_name()), "{path}");
+        assert!(one.is_one_device());
+        machine.safe_at(link);
+        assert!(machine.holds(path), "SAFE by {link} does not hold {path}");
+        machine.file(path).forget().unwrap();
+        assert!(!machine.holds(link), "ARM by {path} does not lift SAFE by {link}");
+    }
+    assert_ne!(machine.projector("pts/5").lock_name(), machine.projector("ttyUSB0").lock_name());
+}
+
+#[test]
+fn an_adapter_is_known_by_its_serial_number_whatever_the_kernel_calls_it() {
+    let machine = Machine::new("numbers");
+    machine.plugged(0, 5, "1-2", Some("AB12"));
+    machine.safe_at("ttyUSB0");
+    machine.unplugged(0);
+    machine.plugged(1, 9, "1-3", Some("AB12"));
+    assert!(machine.holds("ttyUSB1"), "it came back under another number, in another socket");
+    // Another adapter has got the name.
+    let of_run = machine.projector("ttyUSB1");
+    machine.plugged(0, 10, "1-2", Some("CD34"));
+    assert!(
+        of_run.is_certainly_not(&machine.projector("ttyUSB0")),
+        "a run does not go on with another adapter"
+    );
+    assert!(!of_run.is_certainly_not(&of_run) && !of_run.is_certainly_not(&machine.projector("ttyUSB7")));
+    assert!(!machine.holds("ttyUSB0"), "a different serial number is proof");
+    assert_ne!(machine.projector("ttyUSB0").lock_name(), machine.projector("ttyUSB1").lock_name());
+    machine.file("ttyUSB0").forget().unwrap();
+    assert!(machine.holds("ttyUSB1"), "whoever arms another projector lifts nothing");
+}
+
+#[test]
+fn without_serial_numbers_only_a_port_that_is_still_there_is_another_one() {
+    let machine = Machine::new("doubt");
+    machine.plugged(0, 5, "1-2", None);
+    machine.plugged(1, 6, "1-3", None);
+    machine.safe_at("ttyUSB0");
+    assert!(machine.holds("ttyUSB0") && !machine.holds("ttyUSB1"));
+    assert!(machine.holds("ttyUSB7"), "a port that does not exist proves nothing");
+    // The adapter may have come back in the socket of the other one.
+    machine.unplugged(0);
+    assert!(machine.holds("ttyUSB1"));
+    // Another boot: the kernel has made both files anew, and may have numbered them the other way round.
+    machine.plugged(0, 50, "1-3", None);
+    machine.plugged(1, 50, "1-2", None);
+    assert!(machine.holds("ttyUSB0") && machine.holds("ttyUSB1"));
+}
+
+#[test]
+fn a_pseudo_terminal_is_another_one_while_that_of_the_order_lives() {
+    let machine = Machine::new("pts");
+    machine.made("pts/5", [136, 5], 1, None);
+    machine.made("pts/7", [136, 7], 2, None);
+    machine.safe_at("pts/5");
+    assert!(machine.holds("pts/5") && !machine.holds("pts/7"));
+    // The program behind it has ended, and a shell has got its number.
+    machine.made("pts/5", [136, 5], 3, None);
+    assert!(machine.holds("pts/7"));
+}
+
+#[test]
+fn ports_of_the_board_and_ports_of_one_adapter_stay_apart() {
+    let machine = Machine::new("board");
+    let boot = |since| {
+        machine.made("ttyS0", [4, 64], since, Some("sys/devices/pnp0/00:00/tty/ttyS0"));
+        machine.made("ttyS1", [4, 65], since, Some("sys/devices/pnp0/00:01/tty/ttyS1"));
+    };
+    boot(1);
+    machine.safe_at("ttyS0");
+    boot(2);
+    assert!(machine.holds("ttyS0") && !machine.holds("ttyS1"));
+    machine.plugged(0, 5, "1-2", Some("AB12"));
+    let second = "sys/devices/pci0000:00/0000:00:14.0/usb1/1-2/1-2:1.1/ttyUSB1/tty/ttyUSB1";
+    machine.made("ttyUSB1", [188, 1], 5, Some(second));
+    machine.file("ttyUSB0").forget().unwrap();
+    machine.safe_at("ttyUSB0");
+    assert!(machine.holds("ttyUSB0") && !machine.holds("ttyUSB1"));
+    assert_ne!(machine.projector("ttyUSB0").lock_name(), machine.projector("ttyUSB1").lock_name());
+}
+
+#[test]
+fn who_arms_in_doubt_lifts_the_order_for_that_projector_alone() {
+    let machine = Machine::new("lifted");
+    machine.plugged(0, 5, "1-2", None);
+    machine.safe_at("ttyUSB0");
+    machine.unplugged(0);
+    machine.plugged(1, 9, "1-3", None);
+    let told = standing_in_folder(&machine.disk, &machine.projector("ttyUSB1")).unwrap().told;
+    assert!(told.contains("for projector on /dev/ttyUSB0, which may be this one"), "{told}");
+    machine.file("ttyUSB1").forget().unwrap();
+    assert!(!machine.holds("ttyUSB1"));
+    machine.plugged(0, 11, "1-2", None);
+    assert!(machine.holds("ttyUSB0"), "nobody has armed the projector of the order");
+    // Re-plugged, it may be another device again.
+    machine.plugged(1, 12, "1-3", None);
+    machine.unplugged(0);
+    assert!(machine.holds("ttyUSB1"));
+    for n in 0..20 {
+        machine.plugged(1, 20 + n, "1-3", None);
+        machine.file("ttyUSB1").forget().unwrap();
+        assert!(!machine.holds("ttyUSB1"), "the list of a file is bounded, and its newest entry counts");
+    }
+}
+
+/// The files of the version before, with their names.
+#[test]
+fn an_order_of_version_1_holds_every_port_and_goes_when_its_own_is_armed() {
+    let old = br#"{"version":1,"order":"safe","at":"2026-03-01T12:00:00Z","by":"a key","process":7,"projector":"projector on /dev/ttyUSB0"}"#;
+    let machine = Machine::new("old");
+    machine.plugged(0, 5, "1-2", Some("AB12"));
+    machine.plugged(1, 5, "1-3", Some("CD34"));
+    machine.disk.replace("projector-on--dev-ttyUSB0.order", old).unwrap();
+    assert!(machine.holds("ttyUSB0") && machine.holds("ttyUSB1"));
+    machine.file("ttyUSB1").forget().unwrap();
+    assert!(machine.holds("ttyUSB0") && !machine.holds("ttyUSB1"));
+    machine.disk.replace("projector-on--dev-ttyUSB0.order", old).unwrap();
+    machine.file("ttyUSB0").forget().unwrap();
+    assert!(!machine.holds("ttyUSB0") && !machine.holds("ttyUSB1"));
+    // A damaged one does not say for which it was.
+    machine.disk.replace("projector-on--dev-ttyUSB0.order", &old[..40]).unwrap();
+    machine.file("ttyUSB1").forget().unwrap();
+    assert!(machine.holds("ttyUSB0") && !machine.holds("ttyUSB1"));
+}
+
+#[test]
+fn an_order_for_one_display_holds_all_and_windows_and_a_dlpc900_too() {
+    let display = |name: &str| DisplayConfig { connector: Some(name.into()), ..Default::default() };
+    let [hdmi, dp, window, dlpc900] = [
+        ProjectorBackend::Display(display("HDMI-A-1")),
+        ProjectorBackend::Display(display("DP-1")),
+        ProjectorBackend::Window(WindowConfig::default()),
+        ProjectorBackend::Dlpc900(Dlpc900Config::default()),
+    ]
+    .map(|backend| Identity::of(&backend));
+    let disk = Disk::default();
+    let of = |identity: &Identity| OrderFile::in_folder(Box::new(disk.clone()), identity.clone()).0;
+    let all = [&hdmi, &dp, &window, &dlpc900];
+    for order_of in all {
+        of(order_of).keep(Order::Black, By::Key).unwrap();
+        for other in all {
+            assert!(standing_in_folder(&disk, other).is_some(), "{order_of} does not hold {other}");
+        }
+        of(order_of).forget().unwrap();
+    }
+    of(&hdmi).keep(Order::Black, By::Key).unwrap();
+    of(&window).forget().unwrap();
+    let held = all.map(|identity| standing_in_folder(&disk, identity).is_some());
+    assert_eq!(held, [true, true, false, true]);
+}
