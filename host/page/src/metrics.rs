@@ -9,7 +9,7 @@ use dpm_rig::telemetry::histogram_steps::UPPER_NS;
 use dpm_rig::telemetry::live::LiveSnapshot;
 use dpm_rig::telemetry::monitor::ProjectorHealth;
 use dpm_rig::telemetry::projector::{DeviceCounts, ProjectorReport};
-use dpm_rig::telemetry::tracker_gauges::TrackerReport;
+use dpm_rig::tracks::gauges::TrackerReport;
 use std::fmt::Write;
 
 /// A metric: its name, its type, and what it is.

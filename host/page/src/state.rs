@@ -7,7 +7,7 @@ use dpm_rig::telemetry::histogram_steps::UPPER_NS;
 use dpm_rig::telemetry::live::LiveSnapshot;
 use dpm_rig::telemetry::monitor::{ProjectorHealth, RunCounts};
 use dpm_rig::telemetry::projector::ProjectorReport;
-use dpm_rig::telemetry::tracker_gauges::TrackerReport;
+use dpm_rig::tracks::gauges::TrackerReport;
 use serde_json::{json, Value};
 use std::sync::Arc;
 

@@ -18,7 +18,7 @@ use crate::telemetry::monitor::RunMonitor;
 use crate::telemetry::projector::ProjectorReport;
 use crate::telemetry::report::Report;
 use crate::telemetry::slots::SlotCounts;
-use crate::telemetry::tracker_gauges::TrackerReport;
+use crate::tracks::gauges::TrackerReport;
 use dpm_common::clock::MonotonicClock;
 use dpm_common::realtime::standstill::Standstills;
 use dpm_render::gpu::Gpu;

@@ -16,4 +16,3 @@ mod report_table;
 pub mod signed;
 pub mod slots;
 pub mod trace;
-pub mod tracker_gauges;

@@ -2,10 +2,10 @@
 
 use super::projector::ProjectorReport;
 use super::signed::SignedHistogram;
-use super::tracker_gauges::TrackerReport;
 use crate::failure::{Failure, FailureKind};
 use crate::frame::slots::MissCause;
 use crate::plan::dark::DarkCause;
+use crate::tracks::gauges::TrackerReport;
 use hdrhistogram::Histogram;
 use serde::ser::{Serialize, SerializeMap, Serializer};
 use std::collections::BTreeMap;

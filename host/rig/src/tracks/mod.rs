@@ -1,5 +1,6 @@
 //! From the tracker's samples to the tracks of all bodies.
 
+pub mod gauges;
 mod seen;
 mod source;
 mod stage;

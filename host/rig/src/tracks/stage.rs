@@ -4,7 +4,7 @@ use super::seen::{SeenBodies, Unseen};
 use super::tracker_frame::TrackerFrame;
 use crate::config::{PredictionConfig, TrackerConfig, MAX_TRACKED};
 use crate::rig::Rig;
-use crate::telemetry::tracker_gauges::{AddedCounts, TrackerGauges};
+use crate::tracks::gauges::{AddedCounts, TrackerGauges};
 use dpm_device::time::HostTime;
 use dpm_device::tracker::{BodyIndex, Tracker, TrackerError};
 use dpm_handoff::latest::Publisher;
