@@ -22,7 +22,7 @@ use std::time::{Duration, Instant};
 /// whether there is room: that may wait for a worker of the kernel.
 const LINK: [&str; 2] = ["ioctl", "write"];
 /// What tracking may do with sockets: read a datagram, and answer the server.
-const TRACKING: [&str; 2] = ["recvmsg", "sendto"];
+const TRACKING: [&str; 3] = ["ppoll", "recvmsg", "sendto"];
 
 /// A server of the demo's bodies at 500 Hz.
 fn natnet() -> NatNetHost {
