@@ -3,11 +3,12 @@
 //! A thread of its own asks every few milliseconds and records when it last got a "yes". Light depends on
 //! [`Interlock::is_closed`], which costs one atomic read and the clock. The interlock is open after a "no", and
 //! equally when its thread hangs, fails or ends. When it opens, the projector goes BLACK at once. When it closes,
-//! light returns unless the operator ordered otherwise. docs/SAFETY.md says what it is good for.
+//! light returns unless the operator ordered otherwise; where it is reset by hand, not before ARM. docs/SAFETY.md says
+//! what it is good for.
 
 mod contacts;
 
-use crate::config::InterlockConfig;
+use crate::config::{InterlockConfig, Restart};
 use crate::failure::{Failure, FailureKind};
 use dpm_common::clock::{Clock, MonotonicClock};
 use std::sync::atomic::{AtomicBool, AtomicI64, Ordering};
@@ -35,6 +36,8 @@ struct Shared {
     clock: MonotonicClock,
     /// When the contact was last found closed; [`NEVER`] since it was found open.
     closed_at: AtomicI64,
+    /// It was found open since it was reset.
+    has_opened: AtomicBool,
     keys: HeldKey,
     stop: AtomicBool,
 }
@@ -66,6 +69,7 @@ pub struct Interlock {
     shared: Arc<Shared>,
     key: Option<u8>,
     what: String,
+    reset: Restart,
     thread: Option<JoinHandle<()>>,
 }
 
@@ -101,7 +105,14 @@ impl Interlock {
             }
         };
         let interlock = Self::start(what, key, release_ms, |shared| contacts::of(config, shared))?;
-        Ok(Some(interlock))
+        Ok(Some(interlock.reset_by(config.reset())))
+    }
+
+    /// The same interlock, which lets light return as `reset` says after it has opened.
+    #[must_use]
+    pub fn reset_by(mut self, reset: Restart) -> Self {
+        self.reset = reset;
+        self
     }
 
     /// An interlock that asks `contact`; `what` is its name in messages.
@@ -121,6 +132,7 @@ impl Interlock {
         let shared = Arc::new(Shared {
             clock: MonotonicClock::new(0),
             closed_at: AtomicI64::new(NEVER),
+            has_opened: AtomicBool::new(false),
             keys: HeldKey {
                 at: AtomicI64::new(NEVER),
                 repeats: AtomicBool::new(false),
@@ -139,7 +151,10 @@ impl Interlock {
                     let before = asking.clock.now().0;
                     // The time before asking counts: an answer that took long is already old.
                     let at = if contact.is_closed() { before } else { NEVER };
-                    asking.closed_at.store(at, Ordering::Release);
+                    asking.closed_at.store(at, Ordering::SeqCst);
+                    if at == NEVER {
+                        asking.has_opened.store(true, Ordering::SeqCst);
+                    }
                     let _ = asked.send(());
                     std::thread::sleep(ASK_EVERY);
                 }
@@ -148,12 +163,35 @@ impl Interlock {
                 Failure::new(FailureKind::Device, format!("cannot start the interlock's thread: {e}"))
             })?;
         let _ = first.recv_timeout(Duration::from_millis(200));
-        Ok(Self { shared, key, what, thread: Some(thread) })
+        Ok(Self { shared, key, what, reset: Restart::ByItself, thread: Some(thread) })
     }
 
-    /// True while light is permitted: the contact was found closed within the last [`SILENCE_NS`]. Never waits.
+    /// True while light is permitted: the contact was found closed within the last [`SILENCE_NS`], and it needs no
+    /// reset. Never waits.
     pub fn is_closed(&self) -> bool {
-        self.shared.clock.now().0 - self.shared.closed_at.load(Ordering::Acquire) <= SILENCE_NS
+        let is_closed = self.contact_is_closed();
+        if !is_closed {
+            self.shared.has_opened.store(true, Ordering::SeqCst);
+        }
+        is_closed && !self.awaits_reset()
+    }
+
+    fn contact_is_closed(&self) -> bool {
+        self.shared.clock.now().0 - self.shared.closed_at.load(Ordering::SeqCst) <= SILENCE_NS
+    }
+
+    /// True if it has opened, and permits no light until it is reset by hand.
+    pub fn awaits_reset(&self) -> bool {
+        self.reset == Restart::ByHand && self.shared.has_opened.load(Ordering::SeqCst)
+    }
+
+    /// A person wants light again. While the contact is open this resets nothing.
+    pub fn reset(&self) {
+        // In this order, an opening meanwhile is not lost.
+        self.shared.has_opened.store(false, Ordering::SeqCst);
+        if !self.contact_is_closed() {
+            self.shared.has_opened.store(true, Ordering::SeqCst);
+        }
     }
 
     /// The condition for light, for messages: `process "laser-guard"`.

@@ -1,12 +1,12 @@
 //! Orders that outlive the program: one small file per projector, in a state folder. A file that cannot be read
 //! counts as SAFE.
 //!
-//! SAFE stands until a person gives `dpm arm` to a running rig; it survives restarts of the program, the service and
-//! the machine. BLACK and FREEZE stand as long as the run that they were given to. If that run died without an
-//! orderly end, they stand as BLACK, because there is no frame left to hold. `docs/ORDERS.md` describes this for
-//! operators.
+//! SAFE and BLACK stand until a person gives `dpm arm` to a running rig; they survive restarts of the program, the
+//! service and the machine. FREEZE stands as BLACK after its run, because there is no frame left to hold. Only for the
+//! mock in this process, which emits no light, BLACK and FREEZE end with an orderly end of their run.
+//! `docs/ORDERS.md` describes this for operators.
 //!
-//! An order is kept even where the disk has filled up since the start: its bytes
+//! Nothing but ARM lets light through, so an order is kept even where the disk has filled up since the start: its bytes
 //! were allocated before the first light, in the reserve.
 
 mod identity;
@@ -14,6 +14,7 @@ mod port;
 
 pub use identity::Identity;
 
+use crate::config::Restart;
 use crate::order::Order;
 use dpm_common::folder::{Folder, FolderError, Owner};
 use dpm_common::unix::{user, user_name};
@@ -59,6 +60,8 @@ pub enum By {
     Signal,
     /// The projector itself, which had it latched when the link came up.
     Projector,
+    /// The interlock, which has opened and is reset by hand.
+    Interlock,
 }
 
 impl fmt::Display for By {
@@ -70,6 +73,7 @@ impl fmt::Display for By {
             Self::Key => write!(f, "a key"),
             Self::Signal => write!(f, "a signal"),
             Self::Projector => write!(f, "the projector, which had it latched"),
+            Self::Interlock => write!(f, "safety.interlock, which opened"),
         }
     }
 }
@@ -127,6 +131,18 @@ pub struct Stands {
     pub told: String,
     /// The file of this projector holds it.
     pub is_on_disk: bool,
+}
+
+impl Stands {
+    /// What stands when a run starts: what the disk has kept, or else what `start` demands.
+    pub fn at_start(kept: Option<Self>, start: Restart) -> Option<Self> {
+        let by_hand = || Self {
+            order: Order::Black,
+            told: "from the start, which is \"by hand\" (safety.start)".into(),
+            is_on_disk: false,
+        };
+        kept.or_else(|| (start == Restart::ByHand).then(by_hand))
+    }
 }
 
 /// The folder of the files: `$DPM_STATE_DIR`, else systemd's `$STATE_DIRECTORY`, else `/var/lib/dpm` for root, else
@@ -262,6 +278,11 @@ impl OrderFile {
     /// The file in which orders for this projector are kept.
     pub(crate) fn path(&self) -> PathBuf {
         self.path.join(self.identity.order_name())
+    }
+
+    /// BLACK and FREEZE end with an orderly end of the run.
+    pub(crate) fn ends_with_the_run(&self) -> bool {
+        self.identity.is_mock()
     }
 
     /// Keeps `order`; it is on the disk when this returns. The caller must not replace a stronger order by a weaker

@@ -298,6 +298,10 @@ impl Laws {
         let Some(standing) = &mut self.standing else { return };
         standing.kept |= process.orders.outcome(standing.ticket) == Some(StoredOrder::Kept);
         standing.is_orphan = true;
+        if standing.order == Order::Freeze {
+            // No frame is left to hold: it stands as BLACK once the projector has noticed the end of the program.
+            (standing.order, standing.since) = (Order::Black, t + self.watchdog_ns);
+        }
         if !standing.kept {
             // Nobody promised that it outlives the program.
             self.standing = None;
@@ -307,12 +311,6 @@ impl Laws {
     /// The program has ended by itself.
     pub fn exited(&mut self, exit: &Exit, counts: &RunCounts, end: Option<&SteppedEnd>, t: i64) {
         self.died_at = Some(t);
-        if let (Exit::InOrder, Some(standing)) = (exit, self.standing) {
-            if standing.order != Order::Safe {
-                // BLACK and FREEZE stand as long as the run.
-                self.standing = None;
-            }
-        }
         if let (Exit::InOrder, Some(_)) = (exit, end) {
             // A frame that was begun is in one of the results, or was still being made.
             let open = counts.frames_planned.abs_diff(counts.frames_done());

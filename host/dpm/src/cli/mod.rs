@@ -62,8 +62,7 @@ enum Command {
     LinkTest(link_test::LinkTestArgs),
     /// Make the projectors of all running rigs dark, or of one; the rigs continue to run
     ///
-    /// The projectors stay dark until `dpm arm` or the orderly end of the run. If a run dies, the order stands for
-    /// the next run. Prints the rigs that were reached and the state of each projector. Exit code 0 only if every
+    /// The projectors stay dark until `dpm arm`. The order stands for the next run too, however this one ends. Prints the rigs that were reached and the state of each projector. Exit code 0 only if every
     /// projector confirmed. If a rig does not answer within 20 ms, the order is sent to it as the signal USR1, which
     /// needs only its link's thread.
     Black(order::OrderArgs),

@@ -335,7 +335,7 @@ impl Watcher<'_> {
 /// The projector is real and the state folder cannot be used, so an order could not be kept (exit code 2).
 fn stand_by(rig: &RigConfig, monitor: &Arc<RunMonitor>, teller: &Teller) -> Result<Orders, Failure> {
     let identity = Identity::of(&rig.projector.backend);
-    let (file, error, stands) = OrderFile::open(state_folder(), identity.clone());
+    let (file, error, kept) = OrderFile::open(state_folder(), identity.clone());
     if let Some(e) = &error {
         let told = format!(
             "SAFE could not be kept over a restart: {e}; make room there, or name another state folder by DPM_STATE_DIR"
@@ -345,6 +345,7 @@ fn stand_by(rig: &RigConfig, monitor: &Arc<RunMonitor>, teller: &Teller) -> Resu
         }
         teller.note(&format!("warning: {told}"));
     }
+    let stands = Stands::at_start(kept, rig.safety.start);
     if let Some(stands) = &stands {
         teller.note(&told_of(stands));
     }

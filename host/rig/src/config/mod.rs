@@ -33,7 +33,7 @@ pub use projector::*;
 pub use run::*;
 pub use safety::{
     InterlockConfig, InterlockSignal, KeyInterlockConfig, LimitsConfig, LineInterlockConfig,
-    NoInterlockConfig, ProcessInterlockConfig, SafetyConfig,
+    NoInterlockConfig, ProcessInterlockConfig, Restart, SafetyConfig,
 };
 pub use values::{Axes, BitOrder, LiveSource, PerChannel, PictureSource};
 pub use world::*;

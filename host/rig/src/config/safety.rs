@@ -31,10 +31,24 @@ section! {
         /// Otherwise the run refuses to start and names them. Set it once, on the command line, when the cause is
         /// gone.
         acknowledge_faults: bool = false, "", Any;
+        /// Whether a run makes light as soon as it can, or stays dark until somebody gives ARM. "by hand" holds for
+        /// every start of the program, also that after a failure. The packaged service starts by hand
+        /// (docs/ORDERS.md).
+        start: Restart = Restart::ByItself, "", Any;
         /// How much light is permitted; docs/SAFETY.md says what that does for people and what it does not.
         limits: LimitsConfig = LimitsConfig::default(), "", Any;
         /// What else must permit light.
         interlock: InterlockConfig = InterlockConfig::default(), "", Any;
+    }
+}
+
+words! {
+    /// Who lets light return.
+    pub enum Restart {
+        /// The program.
+        ByItself = "by itself",
+        /// A person, who gives ARM.
+        ByHand = "by hand",
     }
 }
 
@@ -96,6 +110,8 @@ section! {
         /// File that contains the id of the process, as services write it; an absolute path. Only the process that
         /// was alive when the file was first read counts, until the file is rewritten.
         pid_file: Option<PathBuf> = None, "", NotEmpty;
+        /// Whether light returns when the process is back, or when somebody gives ARM after that.
+        reset: Restart = Restart::ByItself, "", Any;
     }
 }
 
@@ -109,6 +125,19 @@ section! {
         signal: InterlockSignal = InterlockSignal::Cts, "", Any;
         /// File whose content must be "1", for example the `value` of a GPIO line; an absolute path.
         file: Option<PathBuf> = None, "", NotEmpty;
+        /// Whether light returns when the contact closes, or when somebody gives ARM after that.
+        reset: Restart = Restart::ByItself, "", Any;
+    }
+}
+
+impl InterlockConfig {
+    /// Who lets light return after the interlock has opened. A key that is held down is by hand already.
+    pub fn reset(&self) -> Restart {
+        match self {
+            Self::Process(process) => process.reset,
+            Self::Line(line) => line.reset,
+            Self::None(_) | Self::Key(_) => Restart::ByItself,
+        }
     }
 }
 

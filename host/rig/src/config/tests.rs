@@ -106,6 +106,16 @@ const BAD: &[(&str, usize, usize, &str, &str)] = &[
     ("[real_time]\npriority = 100", 2, 12, "real_time.priority", "must be 0 to 99"),
     ("[real_time.stage_costs_us]\nrender = 2_000_000", 2, 10, "real_time.stage_costs_us.render", "us"),
     ("[safety]\nwatchdog_ms = 0", 2, 15, "safety.watchdog_ms", "must be 1 to 10000 ms"),
+    ("[safety]\nstart = \"by magic\"", 2, 9, "safety.start", "must be one of"),
+    ("[safety.interlock]\nkind = \"key\"\nreset = \"by hand\"", 3, 1, "safety.interlock.reset", "does not belong to kind"),
+    // Two names of one device.
+    (
+        "[projector.backend]\nkind = \"serial\"\nport = \"/proc/../dev/zero\"\n[safety.interlock]\nkind = \"line\"\nport = \"/dev/zero\"\n[real_time]\npace = \"real\"",
+        6,
+        8,
+        "safety.interlock.port",
+        "projector's own",
+    ),
     ("[safety.limits]\nmean_level = 1.1", 2, 14, "safety.limits.mean_level", "must be 0 to 1"),
     ("[safety.limits]\nmean_level = 0.0005", 2, 14, "safety.limits.mean_level", "below a thousandth"),
     ("[safety.limits]\nmean_window_s = 0.1", 2, 17, "safety.limits.mean_window_s", "must be 0.5 to 3600 s"),

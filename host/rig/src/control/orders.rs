@@ -33,7 +33,8 @@ pub(crate) enum Kept {
     Forgotten,
     /// It is not kept over restarts, or (for ARM) the standing order is not forgotten; the reason.
     Not(String),
-    /// There is no state folder. A rig with a mock projector does not need one.
+    /// In no file: there is no state folder, and a rig with a mock projector does not need one; or every start is by
+    /// hand.
     Nowhere,
 }
 
@@ -88,10 +89,9 @@ impl Desk {
     /// For a run that begins while `stands` stands in `path`. The light receives that order before this returns, so
     /// that the link comes up dark.
     pub(crate) fn new(monitor: Arc<RunMonitor>, stands: Option<&Stands>, path: PathBuf) -> Self {
-        let stands = stands.map(|s| s.order);
-        stands.into_iter().for_each(|order| monitor.give_order(order));
-        let outcome = stands.map(|_| Kept::In(path));
-        Self { monitor, newest: 0, waiting: None, settled: 0, outcome, stands }
+        stands.into_iter().for_each(|stands| monitor.give_order(stands.order));
+        let outcome = stands.map(|stands| if stands.is_on_disk { Kept::In(path) } else { Kept::Nowhere });
+        Self { monitor, newest: 0, waiting: None, settled: 0, outcome, stands: stands.map(|s| s.order) }
     }
 
     /// Gives an order: to the light at once (ARM only when no order stands on the disk any more), then to the disk.
@@ -137,6 +137,11 @@ impl Desk {
             self.newest += 1;
             self.queue(Order::Safe, By::Projector);
         }
+        // The interlock itself keeps this run dark; the order keeps the next one dark.
+        if self.monitor.interlock_awaits_reset() && self.stands.is_none() {
+            self.newest += 1;
+            self.queue(Order::Black, By::Interlock);
+        }
     }
 
     /// The next order to be written; pass the result to [`Desk::settle`].
@@ -153,6 +158,7 @@ impl Desk {
             // An order that came while the disk was busy is newer than this one.
             if self.newest == given.number {
                 self.stands = None;
+                self.monitor.reset_interlock();
                 self.monitor.arm_unless_darkened(given.signals);
             }
         }
@@ -161,10 +167,10 @@ impl Desk {
         self.outcome = Some(outcome);
     }
 
-    /// The run ends. After an `orderly` end BLACK and FREEZE are to be forgotten, and SAFE remains.
-    pub(crate) fn end(&mut self, orderly: bool) {
+    /// The run ends, and with it BLACK and FREEZE if `ends_them`. SAFE remains.
+    pub(crate) fn end(&mut self, ends_them: bool) {
         self.absorb();
-        if orderly && matches!(self.stands, Some(Order::Black | Order::Freeze)) {
+        if ends_them && matches!(self.stands, Some(Order::Black | Order::Freeze)) {
             // This arms nothing: the run is over, and after a stop request the monitor lets no ARM through.
             self.monitor.request_stop();
             self.give(Order::Arm, By::Signal);
@@ -255,11 +261,11 @@ impl Orders {
         self.inner.state().desk.kept()
     }
 
-    /// Ends the thread; waits at most half a second. After an orderly end BLACK and FREEZE are forgotten, and SAFE
-    /// remains.
+    /// Ends the thread; waits at most half a second. After an orderly end BLACK and FREEZE of a mock are forgotten; all
+    /// else remains.
     pub fn end(mut self, orderly: bool) {
         let mut state = self.inner.state();
-        state.desk.end(orderly);
+        state.desk.end(orderly && self.inner.file.ends_with_the_run());
         state.closing = true;
         self.inner.changed.notify_all();
         let waited = self.inner.changed.wait_timeout_while(state, END_WITHIN, |state| !state.closed);
@@ -308,8 +314,10 @@ impl Inner {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::config::{MockProjectorConfig, ProjectorBackend};
+    use crate::config::{MockProjectorConfig, ProjectorBackend, Restart, UsbProjectorConfig};
+    use crate::interlock::{Contact, Interlock};
     use crate::standing::{standing_in, Identity};
+    use std::sync::atomic::{AtomicBool, Ordering};
     use std::time::Instant;
 
     struct Rig {
@@ -320,15 +328,23 @@ mod tests {
 
     impl Rig {
         fn new(name: &str) -> Self {
+            Self::with(name, &ProjectorBackend::Mock(MockProjectorConfig::default()))
+        }
+
+        fn with(name: &str, backend: &ProjectorBackend) -> Self {
             let dir = std::env::temp_dir().join(format!("dpm-order-thread-{}-{name}", std::process::id()));
             let _ = std::fs::remove_dir_all(&dir);
-            let identity = Identity::of(&ProjectorBackend::Mock(MockProjectorConfig::default()));
-            Self { dir, identity, monitor: Arc::default() }
+            Self { dir, identity: Identity::of(backend), monitor: Arc::default() }
         }
 
         fn start(&self) -> Orders {
-            let (file, error, stands) = OrderFile::open(Some(self.dir.clone()), self.identity.clone());
+            self.start_by(Restart::ByItself)
+        }
+
+        fn start_by(&self, start: Restart) -> Orders {
+            let (file, error, kept) = OrderFile::open(Some(self.dir.clone()), self.identity.clone());
             assert!(error.is_none(), "{error:?}");
+            let stands = Stands::at_start(kept, start);
             Orders::start(self.monitor.clone(), file, true, stands.as_ref()).unwrap()
         }
 
@@ -376,29 +392,101 @@ mod tests {
         orders.end(true);
     }
 
+    /// Found in use, R3: a restart of the service brought light back that somebody had ended by BLACK.
     #[test]
-    fn r4_an_orderly_end_forgets_black_but_not_safe_and_a_run_that_died_forgets_nothing() {
-        let mut rig = Rig::new("end");
-        for (order, orderly, left) in [
-            (Order::Black, true, None),
-            (Order::Freeze, true, None),
-            (Order::Safe, true, Some(Order::Safe)),
-            (Order::Arm, true, None),
-            (Order::Black, false, Some(Order::Black)),
-            (Order::Arm, false, None),
-            (Order::Freeze, false, Some(Order::Black)),
-            (Order::Safe, false, Some(Order::Safe)),
+    fn r3_no_end_lifts_an_order_but_that_of_a_mock_and_then_only_what_is_no_safe() {
+        let real = ProjectorBackend::Usb(UsbProjectorConfig::default());
+        let [mut mock, mut real] = [Rig::new("end"), Rig::with("end-real", &real)];
+        let (black, safe) = (Some(Order::Black), Some(Order::Safe));
+        // What is left of a mock's order and of a real projector's.
+        for (order, orderly, of_mock, of_real) in [
+            (Order::Black, true, None, black),
+            (Order::Arm, true, None, None),
+            (Order::Freeze, true, None, black),
+            (Order::Safe, true, safe, safe),
+            (Order::Arm, true, None, None),
+            (Order::Black, false, black, black),
+            (Order::Arm, false, None, None),
+            (Order::Freeze, false, black, black),
+            (Order::Safe, false, safe, safe),
         ] {
-            // The monitor of a finished run remains stopped.
-            rig.monitor = Arc::default();
-            let orders = rig.start();
-            // The standing order has been given to the light.
-            assert_eq!(rig.monitor.dark_is_ordered(), rig.on_disk().is_some());
-            let ticket = orders.give(order, By::Key);
-            settled(&orders, ticket);
-            orders.end(orderly);
-            assert_eq!(rig.on_disk(), left, "{order:?} {orderly}");
+            for (rig, left) in [(&mut mock, of_mock), (&mut real, of_real)] {
+                // The monitor of a finished run remains stopped.
+                rig.monitor = Arc::default();
+                let orders = rig.start();
+                // The standing order has been given to the light.
+                assert_eq!(rig.monitor.dark_is_ordered(), rig.on_disk().is_some());
+                let ticket = orders.give(order, By::Key);
+                settled(&orders, ticket);
+                orders.end(orderly);
+                assert_eq!(rig.on_disk(), left, "{} {order:?} {orderly}", rig.identity);
+            }
         }
+    }
+
+    #[test]
+    fn a_start_by_hand_is_dark_until_somebody_arms_and_so_is_the_next() {
+        let mut rig = Rig::new("by-hand");
+        for _ in 0..2 {
+            rig.monitor = Arc::default();
+            let orders = rig.start_by(Restart::ByHand);
+            assert_eq!((rig.monitor.take_order(), orders.kept()), (Some(Order::Black), Some(Order::Black)));
+            assert_eq!(rig.on_disk(), None, "the rig file holds it, and no order of a person");
+            let ticket = orders.give(Order::Arm, By::Key);
+            assert_eq!(settled(&orders, ticket), Kept::Forgotten);
+            assert_eq!((rig.monitor.take_order(), orders.kept()), (Some(Order::Arm), None));
+            orders.end(true);
+        }
+        // An order that was given before it was armed is kept as ever.
+        rig.monitor = Arc::default();
+        let orders = rig.start_by(Restart::ByHand);
+        let ticket = orders.give(Order::Freeze, By::Key);
+        assert!(matches!(settled(&orders, ticket), Kept::In(_)));
+        orders.end(false);
+        assert_eq!(rig.on_disk(), Some(Order::Black));
+    }
+
+    struct Switch(Arc<AtomicBool>);
+
+    impl Contact for Switch {
+        fn is_closed(&mut self) -> bool {
+            self.0.load(Ordering::Relaxed)
+        }
+    }
+
+    /// An interlock that is reset by hand and has opened: dark after it has closed, and in the next run.
+    #[test]
+    fn an_interlock_that_is_reset_by_hand_waits_for_arm_over_restarts() {
+        let rig = Rig::with("reset", &ProjectorBackend::Usb(UsbProjectorConfig::default()));
+        let contact = Arc::new(AtomicBool::new(true));
+        let interlock = Interlock::with_contact("a switch", Switch(contact.clone())).unwrap();
+        rig.monitor.set_interlock(interlock.reset_by(Restart::ByHand));
+        let orders = rig.start();
+        let until = |what: &str, done: &dyn Fn() -> bool| {
+            let begin = Instant::now();
+            while !done() {
+                assert!(begin.elapsed() < Duration::from_secs(20), "{what}");
+                std::thread::sleep(Duration::from_millis(1));
+            }
+        };
+        // A busy machine that asks the contact too late opens it as well.
+        let is_armed = || {
+            settled(&orders, orders.give(Order::Arm, By::Key));
+            rig.monitor.light_allowed() && rig.on_disk().is_none()
+        };
+        until("light", &is_armed);
+        contact.store(false, Ordering::Relaxed);
+        until("kept", &|| rig.on_disk() == Some(Order::Black));
+        // ARM while it is open permits nothing, now or when it closes.
+        settled(&orders, orders.give(Order::Arm, By::Key));
+        until("kept again", &|| rig.on_disk() == Some(Order::Black) && orders.kept().is_some());
+        contact.store(true, Ordering::Relaxed);
+        for _ in 0..50 {
+            assert!(!rig.monitor.light_allowed(), "nobody has armed it since it closed");
+            std::thread::sleep(Duration::from_millis(1));
+        }
+        until("light again", &is_armed);
+        orders.end(true);
     }
 
     #[test]

@@ -52,8 +52,10 @@ fn signal(child: &Child, signal: &str) {
 fn process(limit: Duration) {
     let dir = folder("process");
     let file = dir.join("guard.pid");
-    let interlock =
-        of(InterlockConfig::Process(ProcessInterlockConfig { name: None, pid_file: Some(file.clone()) }));
+    let interlock = of(InterlockConfig::Process(ProcessInterlockConfig {
+        pid_file: Some(file.clone()),
+        ..Default::default()
+    }));
     assert!(!interlock.is_closed(), "no file");
     std::fs::write(&file, "not a number").unwrap();
     stays(&interlock, false);
@@ -93,7 +95,8 @@ fn named_process(limit: Duration) {
     let program = dir.join(format!("dg{}", std::process::id()));
     std::os::unix::fs::symlink("/bin/sleep", &program).unwrap();
     let name = program.file_name().unwrap().to_str().unwrap().to_owned();
-    let interlock = of(InterlockConfig::Process(ProcessInterlockConfig { name: Some(name), pid_file: None }));
+    let interlock =
+        of(InterlockConfig::Process(ProcessInterlockConfig { name: Some(name), ..Default::default() }));
     assert!(!interlock.is_closed());
     for _ in 0..2 {
         let mut child = Command::new(&program).arg("600").spawn().unwrap();

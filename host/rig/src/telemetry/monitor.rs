@@ -139,7 +139,11 @@ impl fmt::Display for ProjectorHealth {
             Self::Frozen => write!(f, "frozen; `dpm arm` lets the picture move again"),
             Self::Stopped => write!(f, "dark"),
             Self::InterlockOpen => {
-                write!(f, "dark, safety.interlock is open; light comes back when it closes, unless black, freeze or safe was ordered")
+                write!(
+                    f,
+                    "dark by safety.interlock; light comes back when it closes, unless black, freeze or safe was ordered; where \
+                     its reset is \"by hand\", after it has closed and `dpm arm`"
+                )
             }
             Self::Resting(LimitReached::Mean) => write!(
                 f,
@@ -331,6 +335,16 @@ impl RunMonitor {
     /// every poll.
     pub fn light_allowed(&self) -> bool {
         self.interlock.get().is_none_or(Interlock::is_closed)
+    }
+
+    /// True if the interlock has opened, and permits no light until [`RunMonitor::reset_interlock`].
+    pub(crate) fn interlock_awaits_reset(&self) -> bool {
+        self.interlock.get().is_some_and(Interlock::awaits_reset)
+    }
+
+    /// A person wants light again.
+    pub(crate) fn reset_interlock(&self) {
+        self.interlock.get().into_iter().for_each(Interlock::reset);
     }
 
     /// Reports, once per run, which bodies the tracker has not seen one second after its start, why, and what to do.

@@ -159,23 +159,20 @@ fn r4_a_damaged_state_file_keeps_the_next_run_dark() {
     bench.comes_up_dark_until_armed("counts as SAFE");
 }
 
-/// Found in use, R4: BLACK of a run that died remains; an orderly end forgets it.
+/// Found in use, R4 and R3: BLACK of a run that died remains, and whoever restarts a service brings no light back.
 #[test]
-fn r4_black_outlives_a_run_that_died_and_not_one_that_ended() {
+fn r3_orders_outlive_a_run_that_died_and_one_that_ended() {
     let bench = Bench::new("black");
     bench.killed_after("black");
     bench.comes_up_dark_until_armed("BLACK stands since");
-    let run = bench.lit();
-    bench.order("black", &run, 0);
-    run.signal("TERM");
-    assert_eq!(run.finish().0.code(), Some(0));
-    assert_eq!(bench.kept(), None);
-    let run = bench.lit();
-    bench.order("safe", &run, 0);
-    run.signal("TERM");
-    assert_eq!(run.finish().0.code(), Some(0));
-    bench.power_cycle();
-    bench.comes_up_dark_until_armed("SAFE stands since");
+    for (order, told) in [("black", "BLACK stands since"), ("safe", "SAFE stands since")] {
+        let run = bench.lit();
+        bench.order(order, &run, 0);
+        run.signal("TERM");
+        assert_eq!(run.finish().0.code(), Some(0));
+        bench.power_cycle();
+        bench.comes_up_dark_until_armed(told);
+    }
 }
 
 /// Found in use, R1 and R6: SAFE by a link of the port did not hold a run by the port itself, and a second program by
@@ -203,6 +200,21 @@ fn r1_a_link_of_the_port_is_the_same_projector() {
     run.finish();
     bench.power_cycle();
     bench.comes_up_dark_until_armed("SAFE stands since");
+}
+
+#[test]
+fn a_start_by_hand_is_dark_until_somebody_arms() {
+    let bench = Bench::new("by-hand");
+    let mut args = run_words(&bench.path);
+    args.extend(["--set".into(), "safety.start=\"by hand\"".into()]);
+    let mut run = start_with(&args, &[("DPM_STATE_DIR", bench.state.to_str().unwrap())]);
+    run.wait_for_line(LONG, |line| line.contains("(safety.start)") && line.contains("dpm arm"));
+    run.wait_for_line(LONG, |line| line.contains("projector: black"));
+    assert!(!bench.far.is_lit() && bench.kept().is_none());
+    bench.order("arm", &run, 0);
+    bench.far.until(LONG, "light after the order", &mut |s| s.lit);
+    run.signal("TERM");
+    assert_eq!(run.finish().0.code(), Some(0));
 }
 
 /// Found in use, R4: without a folder in which SAFE can be kept, a real projector is not run.

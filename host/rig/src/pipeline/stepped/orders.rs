@@ -82,7 +82,7 @@ impl SteppedOrders {
 
     /// The process ends: all that waits is written.
     pub fn end(mut self, orderly: bool) {
-        self.desk.end(orderly);
+        self.desk.end(orderly && self.file.ends_with_the_run());
         let writes = self.writes.take().map(|(_, given)| given);
         let mut next = writes.or_else(|| self.desk.next());
         while let Some(given) = next {
