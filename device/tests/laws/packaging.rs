@@ -144,7 +144,17 @@ fn the_unit_starts_on_every_distribution_and_stops_trying() {
     assert!((2..=10).contains(&limit) && limit * (pause + 10) <= seconds, "{limit} in {seconds} s");
     assert_eq!(value(&unit, "Service", "StateDirectory"), "dpm");
     let runtime = value(&unit, "Service", "RuntimeDirectory");
-    assert_eq!(value(&unit, "Service", "Environment"), format!("DPM_RUNTIME_DIR=/run/{runtime}"));
+    let environment = &unit[&("Service".to_owned(), "Environment".to_owned())];
+    assert!(environment.contains(&format!("DPM_RUNTIME_DIR=/run/{runtime}")), "{environment:?}");
+    // systemd divides a value that stands without quotes at its spaces.
+    assert!(
+        environment.iter().all(|v| !v.contains(' ') || v.starts_with('"') && v.ends_with('"')),
+        "{environment:?}"
+    );
+    assert!(
+        environment.contains(&"\"DPM_SET_SAFETY__START=by hand\"".to_owned()),
+        "no light with nobody there"
+    );
     for key in ["StateDirectoryMode", "RuntimeDirectoryMode"] {
         assert_eq!(value(&unit, "Service", key), "0700", "{key}: nobody else's");
     }
