@@ -39,7 +39,7 @@
 //! let hello = HostMessage::Hello(HostHello { version_min: 2, version_max: 2, codecs: 1 });
 //! let mut payload = [0; MAX_CONTROL_BYTES];
 //! let (kind, n) = hello.write(&mut payload);
-//! let bytes = Packet::new(Header::control(kind, 7, 0), &payload[..n]).parts().concat();
+//! let bytes = Packet::new(Header::control(kind, 7, 0), &payload[..n]).to_vec();
 //!
 //! // Its bytes arrive in small pieces, behind some noise.
 //! let (mut decoder, mut firmware) = (Decoder::new(), Firmware::default());

@@ -23,6 +23,15 @@ pub const REST_US: u32 = 2_000_000;
 /// Rows of a plane that are counted; more rows change the mean only insignificantly.
 const ROWS: u32 = 32;
 
+/// Bytes of rows that are counted in one step.
+const NEAR_BYTES: usize = 2048;
+
+fn ones(bytes: &[u8]) -> u64 {
+    let (words, rest) = bytes.as_chunks::<8>();
+    let words: u64 = words.iter().map(|w| u64::from(u64::from_le_bytes(*w).count_ones())).sum();
+    words + rest.iter().map(|b| u64::from(b.count_ones())).sum::<u64>()
+}
+
 /// Mean luminance of a frame, 0 to [`FULL_LUMINANCE`], from evenly spaced rows of its planes. Channel weights are those of Rec. 709.
 ///
 /// # Panics
@@ -32,16 +41,25 @@ pub fn mean_luminance(raster: Raster, schedule: &PlaneSchedule, planes: &[u8]) -
     assert!(planes.len() == plane_bytes * schedule.len(), "bytes of planes");
     let rows = raster.height().min(ROWS);
     let mut light = 0u64;
+    // The rows come from memory that no cache near this core holds. Copies alone keep many of these reads on their way
+    // at once; between two of them there is no room for counting.
+    let (mut near, mut filled) = ([0u8; NEAR_BYTES], 0);
     for (spec, plane) in schedule.planes().iter().zip(planes.chunks_exact(plane_bytes)) {
         let mut lit = 0u64;
         for i in 0..rows {
             // The middle row of each of `rows` equal bands.
             let y = ((2 * i + 1) * raster.height() / (2 * rows)) as usize;
-            let row = &plane[y * row_bytes..][..row_bytes];
-            let (words, rest) = row.as_chunks::<8>();
-            lit += words.iter().map(|w| u64::from(u64::from_le_bytes(*w).count_ones())).sum::<u64>();
-            lit += rest.iter().map(|b| u64::from(b.count_ones())).sum::<u64>();
+            for piece in plane[y * row_bytes..][..row_bytes].chunks(NEAR_BYTES) {
+                if filled + piece.len() > NEAR_BYTES {
+                    lit += ones(&near[..filled]);
+                    filled = 0;
+                }
+                near[filled..filled + piece.len()].copy_from_slice(piece);
+                filled += piece.len();
+            }
         }
+        lit += ones(&near[..filled]);
+        filled = 0;
         let weight = match spec.channel {
             Channel::Red => 2126,
             Channel::Green => 7152,

@@ -22,7 +22,7 @@ mod tracks;
 
 pub use crate::packet::{
     crc32c, crc32c_append, crc32c_append_table, frame_newer, packet_bytes, trailer_bytes, Codec, Decoder,
-    DecoderCounters, Header, HeaderError, MessageType, Packet, PacketSink, HEADER_BYTES, MAGIC,
+    DecoderCounters, Header, HeaderError, MessageType, Packet, PacketSink, Trailer, HEADER_BYTES, MAGIC,
     MAX_CONTROL_BYTES, MAX_PAYLOAD_BYTES, VERSION,
 };
 pub use codec::{rle_encode, CodecError, RleDecoder};

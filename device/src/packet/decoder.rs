@@ -4,12 +4,8 @@
 //! [`PacketSink`], so a plane is copied once. A header counts only if its own checksum is right, so a damaged length
 //! never swallows the stream.
 
-use super::crc::crc32c_append;
+use super::crc::{crc32c_append, BLOCK_BYTES};
 use super::header::{trailer_bytes, u32_at, Header, HeaderError, HEADER_BYTES, MAGIC};
-
-/// Payload bytes that are checksummed and passed on in one step: few enough that the sink reads them from the
-/// first-level cache.
-const BLOCK_BYTES: usize = 16 * 1024;
 
 /// Receives what a [`Decoder`] finds. Calls come as `begin`, then any number of `payload`, then `end`.
 pub trait PacketSink {
@@ -252,7 +248,7 @@ mod tests {
             target_at: DeviceTicks(u64::from(frame) * 77),
             ..Header::control(MessageType::Plane, 9, 0)
         };
-        Packet::new(header, payload).parts().concat()
+        Packet::new(header, payload).to_vec()
     }
 
     proptest! {

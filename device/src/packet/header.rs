@@ -1,6 +1,6 @@
 //! The 32-byte header of a packet, and the three pieces of a packet on the wire.
 
-use super::crc::crc32c;
+use super::crc::{crc32c, crc32c_append, BLOCK_BYTES};
 use crate::time::DeviceTicks;
 
 /// Longest payload of any message except PLANE: TRACKS of eight regions.
@@ -249,24 +249,20 @@ pub const fn packet_bytes(payload_bytes: usize) -> usize {
 pub struct Packet<'a> {
     header: [u8; HEADER_BYTES],
     payload: &'a [u8],
-    trailer: [u8; 8],
-    trailer_len: u8,
+    /// None: padding and the checksum of the payload.
+    trailer: Option<Trailer>,
 }
 
 impl<'a> Packet<'a> {
-    /// Checksums header and payload. The header's length field is set from `payload`.
+    /// Checksums the header; the payload is checksummed when the packet is written. The header's length field is set
+    /// from `payload`.
     ///
     /// # Panics
     /// When `payload` is longer than [`MAX_PAYLOAD_BYTES`].
     pub fn new(header: Header, payload: &'a [u8]) -> Self {
         assert!(payload.len() <= MAX_PAYLOAD_BYTES, "payload of {} bytes", payload.len());
         let header = Header { payload_bytes: payload.len() as u32, ..header }.encode();
-        let trailer_len = trailer_bytes(payload.len());
-        let mut trailer = [0u8; 8];
-        if trailer_len > 0 {
-            trailer[trailer_len - 4..trailer_len].copy_from_slice(&crc32c(payload).to_le_bytes());
-        }
-        Self { header, payload, trailer, trailer_len: trailer_len as u8 }
+        Self { header, payload, trailer: None }
     }
 
     /// Exactly these bytes, unchecked, to test how a receiver treats a packet that is damaged, cut short or of another
@@ -275,17 +271,91 @@ impl<'a> Packet<'a> {
         let mut bytes = [0u8; 8];
         let n = trailer.len().min(bytes.len());
         bytes[..n].copy_from_slice(&trailer[..n]);
-        Self { header, payload, trailer: bytes, trailer_len: n as u8 }
+        Self { header, payload, trailer: Some(Trailer { bytes, len: n as u8 }) }
     }
 
-    /// Header, payload and trailer in the order they are sent; the last two may be empty.
-    pub fn parts(&self) -> [&[u8]; 3] {
-        [&self.header, self.payload, &self.trailer[..self.trailer_len as usize]]
+    /// The first bytes of the packet.
+    pub fn header(&self) -> &[u8; HEADER_BYTES] {
+        &self.header
+    }
+
+    /// What follows the header; may be empty.
+    pub fn payload(&self) -> &'a [u8] {
+        self.payload
+    }
+
+    /// What follows the payload; empty where the payload is. Reads the whole payload:
+    /// [`write_to`](Self::write_to) passes over it once for the copy and the checksum.
+    pub fn trailer(&self) -> Trailer {
+        self.trailer.unwrap_or_else(|| Trailer::new(self.payload.len(), crc32c(self.payload)))
+    }
+
+    /// Copies the whole packet to the beginning of `out` and returns [`wire_bytes`](Self::wire_bytes). The payload is
+    /// read from memory once: each block is checksummed, and copied from the first-level cache.
+    ///
+    /// # Panics
+    /// When `out` is shorter than the packet.
+    pub fn write_to(&self, out: &mut [u8]) -> usize {
+        let (to, rest) = out.split_at_mut(HEADER_BYTES);
+        to.copy_from_slice(&self.header);
+        let (to, rest) = rest.split_at_mut(self.payload.len());
+        let trailer = match self.trailer {
+            Some(trailer) => {
+                to.copy_from_slice(self.payload);
+                trailer
+            }
+            None => {
+                let blocks = self.payload.chunks(BLOCK_BYTES).zip(to.chunks_mut(BLOCK_BYTES));
+                let checksum = blocks.fold(0, |checksum, (block, to)| {
+                    let checksum = crc32c_append(checksum, block);
+                    to.copy_from_slice(block);
+                    checksum
+                });
+                Trailer::new(self.payload.len(), checksum)
+            }
+        };
+        rest[..trailer.len()].copy_from_slice(&trailer);
+        self.wire_bytes()
+    }
+
+    /// The whole packet, for tests and programs that may allocate.
+    #[cfg(feature = "std")]
+    pub fn to_vec(&self) -> Vec<u8> {
+        let mut bytes = vec![0; self.wire_bytes()];
+        self.write_to(&mut bytes);
+        bytes
     }
 
     /// Bytes of the whole packet.
     pub fn wire_bytes(&self) -> usize {
-        HEADER_BYTES + self.payload.len() + self.trailer_len as usize
+        let trailer = self.trailer.map_or(trailer_bytes(self.payload.len()), |trailer| trailer.len());
+        HEADER_BYTES + self.payload.len() + trailer
+    }
+}
+
+/// The last bytes of a packet: padding and the payload's checksum.
+#[derive(Clone, Copy, Debug)]
+pub struct Trailer {
+    bytes: [u8; 8],
+    len: u8,
+}
+
+impl Trailer {
+    /// For a payload of `payload_bytes`.
+    fn new(payload_bytes: usize, checksum: u32) -> Self {
+        let (mut bytes, len) = ([0u8; 8], trailer_bytes(payload_bytes));
+        if len > 0 {
+            bytes[len - 4..len].copy_from_slice(&checksum.to_le_bytes());
+        }
+        Self { bytes, len: len as u8 }
+    }
+}
+
+impl core::ops::Deref for Trailer {
+    type Target = [u8];
+
+    fn deref(&self) -> &[u8] {
+        &self.bytes[..usize::from(self.len)]
     }
 }
 
@@ -336,14 +406,24 @@ mod tests {
         };
         let packet = Packet::new(header, &[0x80, 0x01, 0xff, 0x00, 0x3c]);
         let mut wire = [0u8; 44];
-        let mut at = 0;
-        for part in packet.parts() {
-            wire[at..at + part.len()].copy_from_slice(part);
-            at += part.len();
-        }
-        assert_eq!(at, packet.wire_bytes());
+        assert_eq!(packet.write_to(&mut wire), packet.wire_bytes());
         assert_eq!(wire, GOLDEN);
+        assert_eq!([packet.header(), packet.payload(), &packet.trailer()].concat(), GOLDEN);
         assert_eq!(Header::decode(GOLDEN[..32].try_into().unwrap()), Ok(header));
+    }
+
+    /// The checksum of a payload that is copied block by block is that of the whole.
+    #[test]
+    fn a_long_packet_is_the_same_whether_written_or_put_together() {
+        for len in [0, 1, BLOCK_BYTES - 1, BLOCK_BYTES, BLOCK_BYTES + 1, 3 * BLOCK_BYTES + 7] {
+            let payload: Vec<u8> = (0..len).map(|i| (i * 31 / 8) as u8).collect();
+            let packet = Packet::new(Header::control(MessageType::Plane, 9, 0), &payload);
+            assert_eq!(
+                packet.to_vec(),
+                [&packet.header()[..], &payload, &packet.trailer()].concat(),
+                "{len} bytes"
+            );
+        }
     }
 
     #[test]

@@ -432,12 +432,8 @@ impl LinkDevice for ProjectorFirmware {
             let (kind, n) = message.write(&mut payload);
             let packet = Packet::new(Header::control(kind, session, 0), &payload[..n]);
             let mut wire = [0u8; packet_bytes(MAX_CONTROL_BYTES)];
-            let mut at = 0;
-            for part in packet.parts() {
-                wire[at..at + part.len()].copy_from_slice(part);
-                at += part.len();
-            }
-            sink(Lane::Control, &wire[..at]);
+            let len = packet.write_to(&mut wire);
+            sink(Lane::Control, &wire[..len]);
         };
         let session = self.core.session;
         if let Some(asked) = self.core.hello_due.take() {

@@ -43,7 +43,7 @@ impl<D: LinkDevice> Direct<D> {
 impl<D: LinkDevice> Transport for Direct<D> {
     fn send(&mut self, now: HostTime, lane: Lane, packets: &[Packet<'_>]) -> Result<(), SendError> {
         for packet in packets {
-            for part in packet.parts() {
+            for part in [packet.header(), packet.payload(), &packet.trailer()] {
                 if !part.is_empty() {
                     self.device.receive(now, lane, part);
                 }
@@ -135,14 +135,7 @@ pub fn threaded(frame_bytes: usize, depth: usize, policy: WaitPolicy) -> (HostEn
 }
 
 fn gather(out: &mut [u8], packets: &[Packet<'_>]) -> usize {
-    let mut at = 0;
-    for packet in packets {
-        for part in packet.parts() {
-            out[at..at + part.len()].copy_from_slice(part);
-            at += part.len();
-        }
-    }
-    at
+    packets.iter().fold(0, |at, packet| at + packet.write_to(&mut out[at..]))
 }
 
 impl HostEnd {

@@ -273,7 +273,11 @@ impl Transport for SerialTransport {
                         return Err(SendError::Busy);
                     }
                     self.control.resize(from + room, 0);
-                    let n = encode(&packet.parts(), &mut self.control[from..]).unwrap_or(0);
+                    let n = encode(
+                        &[packet.header(), packet.payload(), &packet.trailer()],
+                        &mut self.control[from..],
+                    )
+                    .unwrap_or(0);
                     self.control.truncate(from + n);
                 }
             }
@@ -283,7 +287,8 @@ impl Transport for SerialTransport {
                 }
                 let mut at = 0;
                 for (packet, end) in packets.iter().zip(&mut self.ends) {
-                    let n = encode(&packet.parts(), &mut self.data[at..]);
+                    let n =
+                        encode(&[packet.header(), packet.payload(), &packet.trailer()], &mut self.data[at..]);
                     at += n.unwrap_or_else(|| {
                         panic!("frame longer than the {} bytes agreed", self.settings.frame_bytes)
                     });

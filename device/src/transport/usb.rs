@@ -131,13 +131,7 @@ impl Outgoing {
             self.endpoint,
             buffer.len()
         );
-        let mut at = 0;
-        for packet in packets {
-            for part in packet.parts() {
-                buffer[at..at + part.len()].copy_from_slice(part);
-                at += part.len();
-            }
-        }
+        let at = packets.iter().fold(0, |at, packet| at + packet.write_to(&mut buffer[at..]));
         if self.ring.in_flight() == 0 {
             self.progress_at = now;
         }

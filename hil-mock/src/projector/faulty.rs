@@ -50,7 +50,7 @@ impl PacketSink for Reassembly {
     }
     fn end(&mut self, intact: bool) {
         if let Some(header) = self.header.take().filter(|_| intact) {
-            self.whole.push(Packet::new(header, &self.payload).parts().concat());
+            self.whole.push(Packet::new(header, &self.payload).to_vec());
         }
     }
 }

@@ -25,11 +25,7 @@ struct Apart {
 
 impl Transport for Apart {
     fn send(&mut self, now: HostTime, lane: Lane, packets: &[Packet<'_>]) -> Result<(), SendError> {
-        let mut at = 0;
-        for part in packets.iter().flat_map(|p| p.parts()) {
-            self.buffer[at..at + part.len()].copy_from_slice(part);
-            at += part.len();
-        }
+        packets.iter().fold(0, |at, packet| at + packet.write_to(&mut self.buffer[at..]));
         let begin = Instant::now();
         let result = self.device.send(now, lane, packets);
         self.device_time += begin.elapsed();

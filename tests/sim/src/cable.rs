@@ -219,7 +219,7 @@ impl Cable {
         self.disturbed |= is_bad || faults.short > 0.0;
         for packet in packets {
             let from = bytes.len();
-            packet.parts().into_iter().for_each(|part| bytes.extend_from_slice(part));
+            bytes.extend(packet.to_vec());
             if !is_bad {
                 continue;
             }

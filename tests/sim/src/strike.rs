@@ -21,7 +21,7 @@ struct Words(Vec<Vec<u8>>);
 
 impl Transport for Words {
     fn send(&mut self, _: HostTime, _: Lane, packets: &[Packet<'_>]) -> Result<(), SendError> {
-        self.0.extend(packets.iter().map(|packet| packet.parts().concat()));
+        self.0.extend(packets.iter().map(|packet| packet.to_vec()));
         Ok(())
     }
 

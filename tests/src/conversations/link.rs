@@ -29,11 +29,11 @@ type Answers = Vec<(Lane, Vec<u8>)>;
 impl Transport for Cable {
     fn send(&mut self, now: HostTime, lane: Lane, packets: &[Packet<'_>]) -> Result<(), SendError> {
         for packet in packets {
-            let head = packet.parts()[0];
+            let head = packet.header();
             self.session = u32::from_le_bytes([head[8], head[9], head[10], head[11]]);
             self.sent.extend(MessageType::from_code(head[5]));
             if let Some((to_device, _)) = &mut self.kept {
-                to_device.extend(packet.parts().concat());
+                to_device.extend(packet.to_vec());
             }
         }
         self.device.as_mut().map_or(Ok(()), |device| device.send(now, lane, packets))
@@ -197,7 +197,7 @@ fn packets(mut bytes: &[u8], mut each: impl FnMut(i64, Lane, &dyn Fn(u32) -> Vec
                 target_at: DeviceTicks(u64::from(target) * 1_000_000),
                 ..Header::control(kind, session, 0)
             };
-            let mut wire = Packet::new(header, payload).parts().concat();
+            let mut wire = Packet::new(header, payload).to_vec();
             if let (true, Some(byte)) = (how & 2 != 0, wire.get_mut(usize::from(how >> 2))) {
                 *byte ^= 0x10;
             }

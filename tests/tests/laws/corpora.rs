@@ -36,10 +36,10 @@ fn made() -> Vec<(&'static str, &'static str, Vec<u8>)> {
     let mut stream = Vec::new();
     for message in [HostMessage::Stop, HostMessage::Arm(3), HostMessage::Sync(7)] {
         let (kind, n) = message.write(&mut payload);
-        stream.extend(Packet::new(Header::control(kind, 42, 0), &payload[..n]).parts().concat());
+        stream.extend(Packet::new(Header::control(kind, 42, 0), &payload[..n]).to_vec());
     }
     let plane = Header { led_code: 7, frame: 1, ..Header::control(MessageType::Plane, 42, 0) };
-    stream.extend(Packet::new(plane, &[0xf0, 0x0f, 0x80]).parts().concat());
+    stream.extend(Packet::new(plane, &[0xf0, 0x0f, 0x80]).to_vec());
     seeds.push(("link_stream", "messages", stream.clone()));
     let mut coded = vec![0; 256];
     let mut bits = [0u8; 64];

@@ -20,14 +20,14 @@ impl Script {
         let mut payload = [0; MAX_CONTROL_BYTES];
         let (kind, n) = message.write(&mut payload);
         let packet = Packet::new(Header::control(kind, session, 0), &payload[..n]);
-        self.inbound.extend(packet.parts().concat());
+        self.inbound.extend(packet.to_vec());
     }
 }
 
 impl Transport for Script {
     fn send(&mut self, _: HostTime, _: Lane, packets: &[Packet<'_>]) -> Result<(), SendError> {
         for packet in packets {
-            let header = Header::decode(packet.parts()[0].try_into().unwrap()).unwrap();
+            let header = Header::decode(packet.header()).unwrap();
             self.session = header.session;
             self.sent.push(header.kind);
         }
@@ -127,7 +127,7 @@ fn u10_answers_to_others_old_answers_and_answers_never_asked_for_change_nothing(
     let fault = Fault { latched: 0, code: FaultCode::Arm, detail: 0, at: DeviceTicks(0) };
     script.say(session, &DeviceMessage::Fault(fault));
     // A PLANE and a HELLO of a host come back: a cable that echoes.
-    let looped = Packet::new(Header::control(MessageType::Plane, session, 0), &[0; 200]).parts().concat();
+    let looped = Packet::new(Header::control(MessageType::Plane, session, 0), &[0; 200]).to_vec();
     script.inbound.extend(looped);
     // So does the host's own question for the time, which would be the quickest answer of all.
     let echo = Echo { host_sent_ns: 3, device_received: DeviceTicks(0), device_sent: DeviceTicks(0) };
@@ -187,7 +187,7 @@ const WAY_NS: i64 = 30_000;
 
 impl Transport for Distant {
     fn send(&mut self, now: HostTime, lane: Lane, packets: &[Packet<'_>]) -> Result<(), SendError> {
-        let [header, payload, _] = packets[0].parts();
+        let (header, payload) = (packets[0].header(), packets[0].payload());
         if header[5] == MessageType::Echo as u8 {
             let host_sent_ns = u64::from_le_bytes(payload[..8].try_into().unwrap());
             let at = DeviceTicks(now.plus_ns(WAY_NS).0 as u64);
@@ -316,7 +316,7 @@ proptest! {
         for (i, (framed, kind, bytes)) in pieces.iter().enumerate() {
             if *framed {
                 let kind = MessageType::from_code(*kind).unwrap();
-                let packet = Packet::new(Header::control(kind, script.session, 0), bytes).parts().concat();
+                let packet = Packet::new(Header::control(kind, script.session, 0), bytes).to_vec();
                 script.inbound.extend(packet);
             } else {
                 script.inbound.extend(bytes);

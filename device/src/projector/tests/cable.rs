@@ -14,7 +14,7 @@ struct BadCable {
 impl Transport for BadCable {
     fn send(&mut self, now: HostTime, lane: Lane, packets: &[Packet<'_>]) -> Result<(), SendError> {
         for packet in packets {
-            let mut bytes = packet.parts().concat();
+            let mut bytes = packet.to_vec();
             self.sent += 1;
             let draw = self.draws.bits(self.sent);
             let device = self.inner.device_mut();
@@ -131,7 +131,7 @@ proptest! {
                 let kind = MessageType::from_code(*kind).unwrap();
                 let codec = Codec::from_code((*frame >> 8) as u8 % 4).unwrap();
                 let header = Header { frame: *frame, codec, plane: *frame as u8 % 30, led_code: 7, ..Header::control(kind, session, 0) };
-                let packet = Packet::new(header, payload).parts().concat();
+                let packet = Packet::new(header, payload).to_vec();
                 mock.receive(now, if *control { Lane::Control } else { Lane::Data }, &packet);
             }
             let mut replies = 0;

@@ -220,7 +220,7 @@ fn the_documents_tracks_move_the_documents_frame() {
     };
     let mut asks = config[32..32 + 41].to_vec();
     asks[19] = 2;
-    let config = Packet::new(Header::control(MessageType::Config, 42, 0), &asks).parts().concat();
+    let config = Packet::new(Header::control(MessageType::Config, 42, 0), &asks).to_vec();
     let panel = Raster::new(16, 1).unwrap();
     let mut mock = ProjectorFirmware::new(FirmwareConfig {
         greatest_shift: Some(8),

@@ -8,7 +8,7 @@ use crate::link::{Commit, Echo, HostHello, HostMessage};
 fn packet(session: u32, message: &HostMessage) -> Vec<u8> {
     let mut payload = [0; MAX_CONTROL_BYTES];
     let (kind, n) = message.write(&mut payload);
-    Packet::new(Header::control(kind, session, 0), &payload[..n]).parts().concat()
+    Packet::new(Header::control(kind, session, 0), &payload[..n]).to_vec()
 }
 
 fn hello(session: u32, version: u16) -> Vec<u8> {
@@ -41,12 +41,12 @@ fn frame(
     let mut all = Vec::new();
     for (k, spec) in PlaneSchedule::rgb24().planes().iter().enumerate().skip(without) {
         let header = Header { plane: k as u8, led_code: spec.led_code(), ..header };
-        all.push(Packet::new(header, &bytes[k * n..(k + 1) * n]).parts().concat());
+        all.push(Packet::new(header, &bytes[k * n..(k + 1) * n]).to_vec());
     }
     let commit = Commit { sent: (1 << 24) - 1, kept: 0, base_frame: 0, frames_sent: count, dark_from };
     let mut payload = [0; MAX_CONTROL_BYTES];
     let (kind, n) = HostMessage::Commit(commit).write(&mut payload);
-    all.push(Packet::new(Header { kind, ..header }, &payload[..n]).parts().concat());
+    all.push(Packet::new(Header { kind, ..header }, &payload[..n]).to_vec());
     all
 }
 

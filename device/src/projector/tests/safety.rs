@@ -88,7 +88,7 @@ fn a_storm_of_damage_ends_the_light() {
     }
     assert!(rig.cable.device().is_lit());
     let session = rig.cable.device().core.session;
-    let mut bad = Packet::new(Header::control(MessageType::Sync, session, 0), &[0; 4]).parts().concat();
+    let mut bad = Packet::new(Header::control(MessageType::Sync, session, 0), &[0; 4]).to_vec();
     bad[34] ^= 1;
     for n in 0..1000 {
         assert!(rig.cable.device().is_lit(), "after {n}");

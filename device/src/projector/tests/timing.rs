@@ -57,7 +57,7 @@ fn status_reports_how_long_a_frame_took_to_arrive() {
     let schedule = PlaneSchedule::rgb24();
     for (k, spec) in schedule.planes().iter().enumerate() {
         let header = Header { plane: k as u8, led_code: spec.led_code(), ..header };
-        let packet = Packet::new(header, &bytes[k * n..(k + 1) * n]).parts().concat();
+        let packet = Packet::new(header, &bytes[k * n..(k + 1) * n]).to_vec();
         rig.cable.device_mut().receive(begun.plus_ns(10_000 * k as i64), Lane::Data, &packet);
     }
     let commit = HostMessage::Commit(Commit {
@@ -68,7 +68,7 @@ fn status_reports_how_long_a_frame_took_to_arrive() {
         dark_from: DeviceTicks(u64::MAX),
     });
     let (kind, len) = commit.write(&mut payload);
-    let packet = Packet::new(Header { kind, ..header }, &payload[..len]).parts().concat();
+    let packet = Packet::new(Header { kind, ..header }, &payload[..len]).to_vec();
     rig.cable.device_mut().receive(begun.plus_ns(400_000), Lane::Data, &packet);
     let told = rig.cable.device().status().timing.expect("it was asked for");
     assert_eq!((told.frame, told.transfer_ns), (7, 400_000));

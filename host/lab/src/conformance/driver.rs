@@ -212,9 +212,7 @@ impl<'a> Bench<'a> {
             }
         }
         self.fed_at = self.now();
-        let whole = packets
-            .iter()
-            .filter(|p| p.parts()[0].first_chunk::<32>().is_some_and(|h| Header::decode(h).is_ok()));
+        let whole = packets.iter().filter(|p| Header::decode(p.header()).is_ok());
         self.packets_sent = self.packets_sent.wrapping_add(whole.count() as u32);
         Ok(())
     }

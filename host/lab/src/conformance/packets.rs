@@ -114,7 +114,7 @@ fn header_damaged(b: &mut Bench<'_>) -> R {
     let right = Packet::new(header, &payload);
     let mut bytes = header.encode();
     bytes[29] ^= 0x40;
-    let trailer = right.parts()[2].to_vec();
+    let trailer = right.trailer().to_vec();
     let (before, after) = answered(b, &[Packet::from_raw(bytes, &payload, &trailer)], "a damaged header")?;
     check(after.state == DeviceState::Configured, "no effect of an ARM with a damaged header", || {
         tell(&after)
@@ -139,7 +139,7 @@ fn foreign(b: &mut Bench<'_>, at: usize, value: u8, what: &str) -> R {
     let payload = *b"DPML";
     let header = Header::control(MessageType::Arm, b.session, 4);
     let right = Packet::new(header, &payload);
-    let trailer = right.parts()[2].to_vec();
+    let trailer = right.trailer().to_vec();
     let bytes = other_header(&header, at, value);
     let (before, after) = answered(b, &[Packet::from_raw(bytes, &payload, &trailer)], what)?;
     check(after.state == DeviceState::Configured, &format!("no effect of {what}"), || tell(&after))?;

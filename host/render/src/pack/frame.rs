@@ -65,6 +65,7 @@ impl BitPlaneFrame {
     ///
     /// # Panics
     /// When the schedule has no such plane.
+    #[cfg(test)]
     pub(crate) fn plane_mut(&mut self, index: usize) -> &mut [u8] {
         let size = self.raster.plane_bytes();
         &mut self.bytes_mut()[index * size..(index + 1) * size]

@@ -1,10 +1,12 @@
 //! Linear drive into code values, and code values into the bit planes that a DMD shows.
 //!
-//! Every kernel gives the same bytes as `scalar`, whatever the raster. The GPU's packer is held to the same bytes.
+//! Every kernel gives the same bytes, whatever the raster. The GPU's packer is held to the same bytes.
 
 mod frame;
 pub mod gpu;
 mod halftone;
+#[cfg(any(target_arch = "x86_64", target_arch = "aarch64"))]
+mod lanes;
 mod quantise;
 mod scalar;
 #[cfg(target_arch = "x86_64")]
@@ -21,34 +23,29 @@ const BLOCK_PIXELS: usize = 512;
 /// Bytes of a block in each plane: a whole cache line.
 const BLOCK_BYTES: usize = BLOCK_PIXELS / 8;
 /// Bytes of a batch in each plane. Planes of 1024 x 768 lie exactly 24 x 4 KiB apart, so lines at the same place of all
-/// planes compete for one set of the first-level cache, which holds eight or twelve of them: several neighbours written in a row
-/// spread over as many sets, and no more than eight planes are written in turn.
+/// planes compete for one set of the first-level cache, which holds eight or twelve of them. So a kernel writes a batch in that
+/// cache, and several lines of a plane move on in a row.
 const BATCH_BYTES: usize = 8 * BLOCK_BYTES;
 /// Bit planes that code values hold: 8 bits of red, green and blue.
 const CODE_BITS: usize = 24;
 
 /// A batch's bits: for each bit of the code value a stretch of its plane.
+type Planes = [[u8; BATCH_BYTES]; CODE_BITS];
+
+/// The same, on a cache line.
 #[repr(align(64))]
-struct Batch([[u8; BATCH_BYTES]; CODE_BITS]);
-
-/// Where a kernel puts the bits of a batch, for each bit of the code value: in a [`Batch`] or in the planes themselves.
-type Targets<'a> = [&'a mut [u8; BATCH_BYTES]; CODE_BITS];
-
-/// Where whole batches go.
-#[derive(Clone, Copy, PartialEq, Eq)]
-enum Way {
-    /// Into the planes at once: for kernels that write few planes in turn, a stretch of each.
-    Direct,
-    /// By way of a [`Batch`] in the first-level cache: for kernels that write a line of every plane.
-    Collected,
-}
+struct Batch(Planes);
 
 /// A way to pack, chosen by what the CPU can do.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, serde::Serialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Kernel {
-    /// Plain Rust: the reference, runs everywhere.
+    /// Plain Rust, for every processor.
     Scalar,
+    /// Every x86-64.
+    Sse2,
+    /// Every AArch64.
+    Neon,
     /// x86-64 with AVX2.
     Avx2,
     /// x86-64 with AVX-512 F, BW, VBMI and GFNI.
@@ -61,13 +58,21 @@ impl Kernel {
         #[cfg(target_arch = "x86_64")]
         {
             if simd::has_avx512() && simd::has_avx2() {
-                return &[Self::Scalar, Self::Avx2, Self::Avx512];
+                return &[Self::Scalar, Self::Sse2, Self::Avx2, Self::Avx512];
             }
             if simd::has_avx2() {
-                return &[Self::Scalar, Self::Avx2];
+                return &[Self::Scalar, Self::Sse2, Self::Avx2];
             }
+            &[Self::Scalar, Self::Sse2]
         }
-        &[Self::Scalar]
+        #[cfg(target_arch = "aarch64")]
+        {
+            &[Self::Scalar, Self::Neon]
+        }
+        #[cfg(not(any(target_arch = "x86_64", target_arch = "aarch64")))]
+        {
+            &[Self::Scalar]
+        }
     }
 
     /// The fastest kernel that this CPU can run.
@@ -79,6 +84,8 @@ impl Kernel {
     pub const fn name(self) -> &'static str {
         match self {
             Self::Scalar => "scalar",
+            Self::Sse2 => "SSE2",
+            Self::Neon => "NEON",
             Self::Avx2 => "AVX2",
             Self::Avx512 => "AVX-512 with GFNI",
         }
@@ -168,10 +175,15 @@ pub fn pack(kernel: Kernel, codes: &[u32], frame: &mut BitPlaneFrame) {
     match kernel {
         Kernel::Scalar => scalar::pack(codes, frame),
         #[cfg(target_arch = "x86_64")]
+        Kernel::Sse2 => lanes::pack(codes, frame),
+        #[cfg(target_arch = "aarch64")]
+        Kernel::Neon => lanes::pack(codes, frame),
+        #[cfg(target_arch = "x86_64")]
         Kernel::Avx2 => simd::pack_avx2(codes, frame),
         #[cfg(target_arch = "x86_64")]
         Kernel::Avx512 => simd::pack_avx512(codes, frame),
-        #[cfg(not(target_arch = "x86_64"))]
+        // Not among those of this processor.
+        #[allow(unreachable_patterns)]
         _ => scalar::pack(codes, frame),
     }
 }
@@ -196,14 +208,23 @@ pub fn unpack(frame: &BitPlaneFrame, codes: &mut [u32]) {
     }
 }
 
-/// Packs runs of pixels by `kernel`, which takes blocks and puts their bits at an offset in the targets. Rows that end on a byte
-/// are one long run; other rows are a run each.
+/// Moves a batch of a plane to where it belongs, by way of the caches.
+#[cfg_attr(
+    target_arch = "x86_64",
+    allow(dead_code, reason = "every kernel of this processor has a better way")
+)]
+fn copy(to: &mut [u8; BATCH_BYTES], from: &[u8; BATCH_BYTES]) {
+    *to = *from;
+}
+
+/// Packs runs of pixels by `kernel`, which takes blocks and puts their bits at an offset in a batch; `put` moves a whole batch of a
+/// plane to where it belongs. Rows that end on a byte are one long run; other rows are a run each.
 #[inline(always)]
 fn pack_blocks(
     codes: &[u32],
     frame: &mut BitPlaneFrame,
-    way: Way,
-    mut kernel: impl FnMut(&[[u32; BLOCK_PIXELS]], &mut Targets<'_>, usize),
+    put: impl Fn(&mut [u8; BATCH_BYTES], &[u8; BATCH_BYTES]),
+    mut kernel: impl FnMut(&[[u32; BLOCK_PIXELS]], &mut Planes, usize),
 ) {
     let raster = frame.raster();
     let width = raster.width() as usize;
@@ -214,47 +235,23 @@ fn pack_blocks(
     };
     let (bits, plane_bytes) = (frame.source_bits(), raster.plane_bytes());
     let bits = &bits[..frame.schedule().len()];
-    // Of several planes that show one bit, the others are copies of the first.
-    let first: [Option<usize>; CODE_BITS] =
-        std::array::from_fn(|bit| bits.iter().position(|&b| usize::from(b) == bit));
     let bytes = frame.bytes_mut();
     let mut batch = Batch([[0; BATCH_BYTES]; CODE_BITS]);
     for (run, pixels) in codes.chunks_exact(run_pixels).enumerate() {
         for (i, pixels) in pixels.chunks(8 * BATCH_BYTES).enumerate() {
-            let at = run * run_bytes + i * BATCH_BYTES;
-            let count = pixels.len().div_ceil(8);
-            let direct = way == Way::Direct && count == BATCH_BYTES;
-            let mut targets = batch.0.each_mut();
-            if direct {
-                for (p, plane) in bytes.chunks_exact_mut(plane_bytes).enumerate() {
-                    let bit = usize::from(bits[p]);
-                    if let (true, Ok(stretch)) =
-                        (first[bit] == Some(p), (&mut plane[at..at + count]).try_into())
-                    {
-                        targets[bit] = stretch;
-                    }
-                }
-            }
+            let (at, count) = (run * run_bytes + i * BATCH_BYTES, pixels.len().div_ceil(8));
             let (whole, rest) = pixels.as_chunks::<BLOCK_PIXELS>();
-            kernel(whole, &mut targets, 0);
+            kernel(whole, &mut batch.0, 0);
             if !rest.is_empty() {
                 let mut padded = [0; BLOCK_PIXELS];
                 padded[..rest.len()].copy_from_slice(rest);
-                kernel(&[padded], &mut targets, BLOCK_BYTES * whole.len());
+                kernel(&[padded], &mut batch.0, BLOCK_BYTES * whole.len());
             }
-            for (p, &bit) in bits.iter().enumerate() {
-                let bit = usize::from(bit);
-                let to = p * plane_bytes + at;
-                match first[bit] {
-                    Some(f) if direct && f == p => {}
-                    Some(f) if direct => {
-                        bytes.copy_within(f * plane_bytes + at..f * plane_bytes + at + count, to)
-                    }
-                    _ => match <&mut [u8; BATCH_BYTES]>::try_from(&mut bytes[to..to + count]) {
-                        // A copy of known length is a few instructions.
-                        Ok(whole) => *whole = batch.0[bit],
-                        Err(_) => bytes[to..to + count].copy_from_slice(&batch.0[bit][..count]),
-                    },
+            for (plane, &bit) in bytes.chunks_exact_mut(plane_bytes).zip(bits) {
+                let (to, from) = (&mut plane[at..at + count], &batch.0[usize::from(bit)]);
+                match to.try_into() {
+                    Ok(whole) => put(whole, from),
+                    Err(_) => plane[at..at + count].copy_from_slice(&from[..count]),
                 }
             }
         }

@@ -1,4 +1,4 @@
-//! Every packer against the plain one, and that one against bytes written by hand.
+//! Every packer against the definition, bit by bit, and against bytes written by hand.
 
 use super::quantise::{quantise_scalar, ROUND};
 use super::*;
@@ -16,6 +16,22 @@ fn frame(width: u32, height: u32, schedule: PlaneSchedule) -> BitPlaneFrame {
     // A recycled frame holds the former one's bits.
     frame.bytes_mut().fill(0xa5);
     frame
+}
+
+/// Bit by bit, as [`dpm_device::planes`] has it.
+fn pack_by_definition(codes: &[u32], frame: &mut BitPlaneFrame) {
+    let raster = frame.raster();
+    for (i, bit) in frame.source_bits().into_iter().enumerate().take(frame.schedule().len()) {
+        let rows = frame.plane_mut(i).chunks_exact_mut(raster.row_bytes());
+        for (row, pixels) in rows.zip(codes.chunks_exact(raster.width() as usize)) {
+            for (byte, eight) in row.iter_mut().zip(pixels.chunks(8)) {
+                *byte = 0;
+                for (x, code) in eight.iter().enumerate() {
+                    *byte |= ((code >> bit & 1) as u8) << (7 - x);
+                }
+            }
+        }
+    }
 }
 
 #[test]
@@ -91,7 +107,7 @@ fn every_kernel_gives_the_same_bytes_on_every_size() {
         ]);
         for schedule in [PlaneSchedule::rgb24(), PlaneSchedule::mono8(), odd.unwrap()] {
             let mut want = frame(width, height, schedule);
-            scalar::pack(&codes, &mut want);
+            pack_by_definition(&codes, &mut want);
             for &kernel in Kernel::available() {
                 let mut got = frame(width, height, schedule);
                 pack(kernel, &codes, &mut got);
