@@ -5,7 +5,7 @@ use super::follow::Follower;
 use super::keeper::{is_dark, LinkKeeper};
 use super::pace::Pace;
 use super::pack::is_overtaken;
-use super::queue::QueueWatch;
+use super::queue::{FrameNeed, QueueWatch, StandingWait};
 use super::slack::{SentFrame, SlackMeter};
 use crate::frame::job::{Fate, FrameNote};
 use crate::plan::lead::LeadEstimator;
@@ -64,6 +64,7 @@ pub(crate) struct LinkStage<P> {
     lead: LeadEstimator,
     slack: SlackMeter,
     queue: QueueWatch,
+    standing: StandingWait,
     /// Sessions of the link, and steps of the projector's clock, so far.
     seen: [u64; 2],
     /// `None` if no tracks are sent.
@@ -73,8 +74,9 @@ pub(crate) struct LinkStage<P> {
     ready_at: Option<HostTime>,
     /// Until when a frame last waited for room in the device.
     credit_until: HostTime,
-    /// How long the frame being offered waited for room, nanoseconds; `None` if the lead does not learn from it.
-    waited_ns: Option<i64>,
+    /// How long the frame being offered waited for room in the device, and for stages that were busy with frames before
+    /// it, nanoseconds; `None` if the lead does not learn from it.
+    waits_ns: Option<[i64; 2]>,
     ending: Option<Ending>,
     looks: u32,
     pace: PhantomData<P>,
@@ -93,12 +95,13 @@ impl<P: Pace> LinkStage<P> {
             lead,
             slack: SlackMeter::new(),
             queue: QueueWatch::new(slot_ns),
+            standing: StandingWait::new(slot_ns),
             seen: [0; 2],
             follower: None,
             slot_ns,
             ready_at: None,
             credit_until: HostTime(i64::MIN / 2),
-            waited_ns: None,
+            waits_ns: None,
             ending: None,
             looks,
             pace: PhantomData,
@@ -141,7 +144,7 @@ impl<P: Pace> LinkStage<P> {
 
     /// Polls the link and does what is due between frames.
     pub(crate) fn poll(&mut self, now: HostTime, transport: &mut dyn Transport) {
-        let Self { facts, link, keeper, follower, lead, slack, seen, .. } = self;
+        let Self { facts, link, keeper, follower, slack, seen, .. } = self;
         let alive = now.ns_since(HostTime(facts.alive_at_ns.load(Ordering::Relaxed))) <= ALIVE_WITHIN_NS;
         let result = keeper.poll(now, link, transport, !P::FOLLOWS_CLOCK, alive, &facts.monitor);
         let now_seen = [link.counters().sessions, keeper.clock_steps()];
@@ -149,11 +152,7 @@ impl<P: Pace> LinkStage<P> {
             slack.forget();
         }
         let timing = link.status().and_then(|status| status.timing);
-        if let Some(needed_ns) = timing.and_then(|timing| slack.observe(timing, now)) {
-            lead.measured(needed_ns);
-            facts.lead_ns.store(lead.lead_ns(), Ordering::Relaxed);
-            facts.typical_ns.store(lead.typical_ns(), Ordering::Relaxed);
-        }
+        let need = timing.and_then(|timing| slack.observe(timing, now));
         let beyond_ns = if link.measures_timing() { 0 } else { keeper.travel_ns() + RECEIPT_NS };
         facts.travel_ns.store(beyond_ns, Ordering::Relaxed);
         if let Err(e) = result {
@@ -162,6 +161,17 @@ impl<P: Pace> LinkStage<P> {
         if let Some(follower) = follower {
             follower.poll(now, keeper.time(), link, transport);
         }
+        if let Some(need) = need {
+            self.learn(need);
+        }
+    }
+
+    /// The lead learns what a frame needed.
+    fn learn(&mut self, need: FrameNeed) {
+        let Self { facts, lead, standing, .. } = self;
+        standing.observe(need, |needed_ns| lead.measured(needed_ns));
+        facts.lead_ns.store(lead.lead_ns(), Ordering::Relaxed);
+        facts.typical_ns.store(lead.typical_ns(), Ordering::Relaxed);
     }
 
     /// Offers a packed frame at `now`. `is_newest`: no other frame waits behind it. Call [`LinkStage::taken`] when it
@@ -194,9 +204,10 @@ impl<P: Pace> LinkStage<P> {
         if now > ready_at {
             self.credit_until = now;
         }
-        self.waited_ns = Some(now.ns_since(ready_at) + queued_ns);
+        let waited_ns = now.ns_since(ready_at) + queued_ns;
         let stamps = &note.timeline;
         let idle_ns = stamps.packing_at.ns_since(stamps.rendered_at) + now.ns_since(stamps.packed_at);
+        self.waits_ns = Some([waited_ns, idle_ns - waited_ns]);
         self.facts.queue_stands.store(self.queue.observe(idle_ns, now), Ordering::Relaxed);
         // Where the projector's clock is not well known, light may come later than it seems.
         let latest = self.lit_at(note, now).plus_ns(self.keeper.time().bound_ns);
@@ -215,7 +226,7 @@ impl<P: Pace> LinkStage<P> {
                 follower.sent(plan);
             }
         } else {
-            self.waited_ns = None;
+            self.waits_ns = None;
         }
         Offer::Settled
     }
@@ -225,7 +236,7 @@ impl<P: Pace> LinkStage<P> {
     /// more.
     pub(crate) fn taken(&mut self, note: &mut FrameNote, now: HostTime) {
         note.timeline.sent_at = now;
-        let Some(waited_ns) = self.waited_ns.take() else { return };
+        let Some([waited_ns, behind_ns]) = self.waits_ns.take() else { return };
         if self.link.measures_timing() && note.is_sent() {
             self.slack.sent(SentFrame {
                 frame: note.plan.id.0 as u32,
@@ -233,11 +244,11 @@ impl<P: Pace> LinkStage<P> {
                 due_at: note.timeline.due_at,
                 sent_at: now,
                 waited_ns,
+                behind_ns,
             });
         } else {
-            self.lead.measured(now.ns_since(note.latch_due_at) - waited_ns + self.slack.travel_ns());
-            self.facts.lead_ns.store(self.lead.lead_ns(), Ordering::Relaxed);
-            self.facts.typical_ns.store(self.lead.typical_ns(), Ordering::Relaxed);
+            let needed_ns = now.ns_since(note.latch_due_at) - waited_ns + self.slack.travel_ns();
+            self.learn(FrameNeed { needed_ns, behind_ns });
         }
     }
 

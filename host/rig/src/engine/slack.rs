@@ -7,6 +7,7 @@
 //! for example, its slot was not where the host believed. Two instants of the host's own clock bound the error: the frame
 //! was whole after it was sent, and before its report was read.
 
+use super::queue::FrameNeed;
 use crate::telemetry::projector::SlackReport;
 use crate::telemetry::signed::SignedHistogram;
 use dpm_device::link::FrameTiming;
@@ -30,6 +31,8 @@ pub(crate) struct SentFrame {
     pub sent_at: HostTime,
     /// How long it waited for room in the device, nanoseconds. An earlier start would only fill the device more.
     pub waited_ns: i64,
+    /// How long it waited for stages that were busy with frames before it, nanoseconds.
+    pub behind_ns: i64,
 }
 
 /// See the module's documentation.
@@ -78,7 +81,7 @@ impl SlackMeter {
     /// Reads the timing of a report at `now`. Returns the time that the frame needed from the instant at which it should have
     /// been latched until it was whole in the device, without the time that it waited for room, nanoseconds; `None` if
     /// the report says nothing new.
-    pub(crate) fn observe(&mut self, timing: FrameTiming, now: HostTime) -> Option<i64> {
+    pub(crate) fn observe(&mut self, timing: FrameTiming, now: HostTime) -> Option<FrameNeed> {
         if self.read == Some(timing) {
             return None;
         }
@@ -94,7 +97,8 @@ impl SlackMeter {
         }));
         self.slack.record(slack_ns);
         self.transfer.record(i64::from(timing.transfer_ns));
-        Some(whole_at.ns_since(sent.latch_due_at) - sent.waited_ns)
+        let needed_ns = whole_at.ns_since(sent.latch_due_at) - sent.waited_ns;
+        Some(FrameNeed { needed_ns, behind_ns: sent.behind_ns })
     }
 
     /// From sent to whole, as most frames need it, nanoseconds; 0 while nothing is known.
@@ -125,7 +129,7 @@ mod tests {
     fn frame(frame: u32) -> SentFrame {
         let latch_due_at = HostTime(100 * MS + i64::from(frame) * MS);
         let (due_at, sent_at) = (latch_due_at.plus_ns(3 * MS), latch_due_at.plus_ns(MS));
-        SentFrame { frame, latch_due_at, due_at, sent_at, waited_ns: 0 }
+        SentFrame { frame, latch_due_at, due_at, sent_at, waited_ns: 0, behind_ns: 0 }
     }
 
     fn timing(frame: u32, slack_ns: i64) -> FrameTiming {
@@ -136,10 +140,11 @@ mod tests {
     fn what_a_frame_needed_is_its_lead_without_its_slack() {
         let mut meter = SlackMeter::new();
         for k in 0..200 {
-            meter.sent(SentFrame { waited_ns: i64::from(k % 3), ..frame(k) });
+            meter.sent(SentFrame { waited_ns: i64::from(k % 3), behind_ns: 5, ..frame(k) });
             let read_at = frame(k).due_at;
-            let needed = meter.observe(timing(k, MS / 2), read_at);
-            assert_eq!(needed, Some(5 * MS / 2 - i64::from(k % 3)));
+            let need = meter.observe(timing(k, MS / 2), read_at);
+            let needed_ns = 5 * MS / 2 - i64::from(k % 3);
+            assert_eq!(need, Some(FrameNeed { needed_ns, behind_ns: 5 }));
             assert_eq!(meter.observe(timing(k, MS / 2), read_at), None, "a report that was read");
             assert_eq!(meter.observe(timing(k + 1000, MS / 2), read_at), None, "a frame that was never sent");
         }
@@ -156,8 +161,8 @@ mod tests {
             let mut meter = SlackMeter::new();
             meter.sent(frame(1));
             let read_at = frame(1).sent_at.plus_ns(MS / 4);
-            let needed = meter.observe(timing(1, 3 * MS / 2 + wrong_ms * MS), read_at).expect("it is new");
-            assert!((MS..=5 * MS / 4).contains(&needed), "{needed}");
+            let need = meter.observe(timing(1, 3 * MS / 2 + wrong_ms * MS), read_at).expect("it is new");
+            assert!((MS..=5 * MS / 4).contains(&need.needed_ns), "{need:?}");
             assert!(meter.travel_ns() <= MS / 2 + 1, "{}", meter.travel_ns());
         }
     }
