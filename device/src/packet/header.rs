@@ -1,5 +1,6 @@
 //! The 32-byte header of a packet, and the three pieces of a packet on the wire.
 
+use super::copy_block;
 use super::crc::{crc32c, crc32c_append, BLOCK_BYTES};
 use crate::time::DeviceTicks;
 
@@ -308,7 +309,7 @@ impl<'a> Packet<'a> {
                 let blocks = self.payload.chunks(BLOCK_BYTES).zip(to.chunks_mut(BLOCK_BYTES));
                 let checksum = blocks.fold(0, |checksum, (block, to)| {
                     let checksum = crc32c_append(checksum, block);
-                    to.copy_from_slice(block);
+                    copy_block(to, block);
                     checksum
                 });
                 Trailer::new(self.payload.len(), checksum)

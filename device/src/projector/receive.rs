@@ -4,6 +4,7 @@ use crate::link::{
     frame_newer, Assembly, Codec, Commit, ConfigRefusal, Echo, FaultCode, FrameTiming, Header, HostMessage,
     MessageType, PacketSink, RleDecoder, SlotClock,
 };
+use crate::packet::copy_block;
 use crate::time::DeviceTicks;
 use crate::transport::Lane;
 
@@ -181,7 +182,7 @@ impl Core {
         match form {
             Form::Raw { filled } => {
                 if let Some(to) = share.get_mut(*filled..*filled + bytes.len()) {
-                    to.copy_from_slice(bytes);
+                    copy_block(to, bytes);
                     *filled += bytes.len();
                 }
             }
