@@ -77,6 +77,8 @@ pub(crate) struct LinkStage<P> {
     /// How long the frame being offered waited for room in the device, and for stages that were busy with frames before
     /// it, nanoseconds; `None` if the lead does not learn from it.
     waits_ns: Option<[i64; 2]>,
+    /// When the frame before was packed, and when it left this stage.
+    before: [HostTime; 2],
     ending: Option<Ending>,
     looks: u32,
     pace: PhantomData<P>,
@@ -102,6 +104,7 @@ impl<P: Pace> LinkStage<P> {
             ready_at: None,
             credit_until: HostTime(i64::MIN / 2),
             waits_ns: None,
+            before: [HostTime(i64::MIN / 2); 2],
             ending: None,
             looks,
             pace: PhantomData,
@@ -207,7 +210,12 @@ impl<P: Pace> LinkStage<P> {
         let waited_ns = now.ns_since(ready_at) + queued_ns;
         let stamps = &note.timeline;
         let idle_ns = stamps.packing_at.ns_since(stamps.rendered_at) + now.ns_since(stamps.packed_at);
-        self.waits_ns = Some([waited_ns, idle_ns - waited_ns]);
+        // While a frame before it was packed, and while one was sent; not what a wake takes, which an earlier start makes
+        // up for.
+        let [packed_before, sent_before] = self.before;
+        let behind_ns = packed_before.ns_since(stamps.rendered_at).max(0)
+            + (sent_before.ns_since(stamps.packed_at) - queued_ns).max(0);
+        self.waits_ns = Some([waited_ns, behind_ns]);
         self.facts.queue_stands.store(self.queue.observe(idle_ns, now), Ordering::Relaxed);
         // Where the projector's clock is not well known, light may come later than it seems.
         let latest = self.lit_at(note, now).plus_ns(self.keeper.time().bound_ns);
@@ -236,6 +244,7 @@ impl<P: Pace> LinkStage<P> {
     /// more.
     pub(crate) fn taken(&mut self, note: &mut FrameNote, now: HostTime) {
         note.timeline.sent_at = now;
+        self.before = [note.timeline.packed_at, now];
         let Some([waited_ns, behind_ns]) = self.waits_ns.take() else { return };
         if self.link.measures_timing() && note.is_sent() {
             self.slack.sent(SentFrame {
