@@ -44,6 +44,9 @@ pub struct FittedView {
 /// Share of the picture's width or height that the bodies fill.
 const FILL: f64 = 0.9;
 
+/// The camera is at least this share of the bodies' size before the nearest point.
+const CLEARANCE: f64 = 0.1;
+
 /// Views that are tried, the best liked first: degrees around the upward axis, from +Z to +X. glTF's models face +Z.
 const AROUND: [f64; 8] = [20.0, -25.0, 65.0, -70.0, 110.0, -115.0, 155.0, 200.0];
 
@@ -96,7 +99,7 @@ impl FittedView {
             along.add(from_centre, toward);
         }
         // The camera stays out of the bodies, also where they are a needle that points at it.
-        let outside = nearest + 0.1 * (upper - lower).length();
+        let outside = nearest + CLEARANCE * (upper - lower).length();
         let distance = across.distance().max(along.distance()).max(outside);
         let look_at = centre + right * across.middle() + up * along.middle();
         let position = look_at + back * distance;
@@ -271,8 +274,9 @@ mod tests {
         RigConfig::demo(&Overrides { variables: vec![], flags }).unwrap()
     }
 
-    /// The camera of the view, and the share of the picture's sides that the points of the scene fill from the middle on.
-    fn filled(scene: &Scene, poses: &[DAffine3], raster: Raster) -> (ProjectorCamera, [DVec2; 2]) {
+    /// The camera of the view, the share of the picture's sides that the points of the scene fill from the middle on, and
+    /// whether the camera is as near to them as it may be.
+    fn filled(scene: &Scene, poses: &[DAffine3], raster: Raster) -> (ProjectorCamera, [DVec2; 2], bool) {
         let rig = config(&[]);
         let view = FittedView::new(&rig, scene, poses, raster).unwrap();
         let p = view.applied_to(&rig, SnapshotView::Fit).projector;
@@ -284,15 +288,19 @@ mod tests {
         let ends = points(scene, poses)
             .map(at)
             .fold([DVec2::INFINITY, DVec2::NEG_INFINITY], |[l, u], p| [l.min(p), u.max(p)]);
-        (camera, ends)
+        let forward = (look_at - position).normalize();
+        let nearest = points(scene, poses).map(|p| (p - position).dot(forward)).fold(f64::INFINITY, f64::min);
+        let size = bounds(scene, poses).map_or(0.0, |[lower, upper]| (upper - lower).length());
+        (camera, ends, nearest <= CLEARANCE * size * (1.0 + 1e-6))
     }
 
-    /// The law of a fitted view: all of the bodies is inside the picture, and fills more than half of one of its sides.
+    /// The law of a fitted view: all of the bodies is inside the picture, and fills more than half of one of its sides unless
+    /// the camera is as near as it may be: a needle that points at it fills less.
     fn holds(scene: &Scene, poses: &[DAffine3], raster: Raster) -> Result<ProjectorCamera, String> {
-        let (camera, [lower, upper]) = filled(scene, poses, raster);
+        let (camera, [lower, upper], is_near) = filled(scene, poses, raster);
         let inside = lower.min_element() > -0.95 && upper.max_element() < 0.95;
         let fills = (upper - lower).max_element() > 1.0;
-        if inside && fills {
+        if inside && (fills || is_near) {
             Ok(camera)
         } else {
             Err(format!("from {lower} to {upper} of a picture from -1 to 1, with {camera:?}"))
