@@ -13,7 +13,7 @@ use dpm_common::so3::{so3_between, so3_exp};
 use glam::{DQuat, DVec3};
 
 /// A manifold of dimension three with tangents in the world frame.
-pub trait Chart {
+pub trait Chart: Copy {
     /// A point on it.
     type Point: Copy + std::fmt::Debug + PartialEq;
     /// Tangents up to this length add up like vectors, with enough precision to fit curves to them.
@@ -97,9 +97,16 @@ impl Covariance {
         }
     }
 
+    /// That of a motion by `model` after `h` seconds.
+    pub(crate) fn after(&self, model: &MotionModel, h: f64) -> Self {
+        let mut after = self.propagated(&model.transition(h));
+        after.add_scaled(&model.process_noise(h), 1.0);
+        after
+    }
+
     /// Joseph form for one position measurement of variance `r`; returns the gains too. 1 - K is computed as R / S, because
     /// the subtraction would lose every digit when P exceeds R by sixteen orders of magnitude.
-    fn updated(&self, r: f64) -> (Self, [f64; 3]) {
+    pub(crate) fn updated(&self, r: f64) -> (Self, [f64; 3]) {
         let s = self.pp + r;
         if s <= 0.0 {
             return (*self, [0.0; 3]);
@@ -137,6 +144,14 @@ impl Covariance {
         let explained = if conditional_v > 0.0 { link * link / conditional_v } else { 0.0 };
         self.pp = self.pp.max(self.pa * self.pa * over_a + explained);
         self
+    }
+
+    /// This one and `other`, of which the mixture has the share `w`.
+    pub(crate) fn mixed(&self, other: &Self, w: f64) -> Self {
+        let mut mixed = Self::default();
+        mixed.add_scaled(self, 1.0 - w);
+        mixed.add_scaled(other, w);
+        mixed
     }
 
     fn add_scaled(&mut self, o: &Self, w: f64) {
@@ -222,26 +237,18 @@ impl MotionModel {
     }
 }
 
-/// Mean and covariance of a motion at one instant.
+/// A motion at one instant.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub struct Kinematics<P> {
+pub struct Motion<P> {
     /// Position or rotation.
     pub point: P,
     /// Per second, world frame.
     pub velocity: DVec3,
     /// Per second squared, world frame.
     pub acceleration: DVec3,
-    /// Of the three, along x, y and z.
-    pub covariance: [Covariance; 3],
 }
 
-impl<P: Copy> Kinematics<P> {
-    /// A point at rest, known to `variance` per axis.
-    pub(crate) fn held(point: P, variance: f64) -> Self {
-        let covariance = [Covariance { pp: variance, ..Covariance::default() }; 3];
-        Self { point, velocity: DVec3::ZERO, acceleration: DVec3::ZERO, covariance }
-    }
-
+impl<P: Copy> Motion<P> {
     /// Where the point will be after `h` seconds (may be negative), if its acceleration lasts for [`ACCELERATES_S`] and
     /// its velocity from then on. An estimated acceleration is mostly noise beyond that: at 50 ms, an error of
     /// 30 m/s^2 would move a body by 38 mm.
@@ -257,6 +264,23 @@ impl<P: Copy> Kinematics<P> {
     /// Where the point will be after `h` seconds (may be negative) at constant acceleration.
     pub(crate) fn point_at<C: Chart<Point = P>>(&self, h: f64) -> P {
         C::moved(self.point, (self.velocity + self.acceleration * (0.5 * h)) * h)
+    }
+}
+
+/// Mean and covariance of a motion at one instant.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Kinematics<P> {
+    /// The mean.
+    pub mean: Motion<P>,
+    /// Of position, velocity and acceleration, along x, y and z.
+    pub covariance: [Covariance; 3],
+}
+
+impl<P: Copy> Kinematics<P> {
+    /// A point at rest, known to `variance` per axis.
+    pub(crate) fn held(point: P, variance: f64) -> Self {
+        let covariance = [Covariance { pp: variance, ..Covariance::default() }; 3];
+        Self { mean: Motion { point, velocity: DVec3::ZERO, acceleration: DVec3::ZERO }, covariance }
     }
 }
 
@@ -309,9 +333,77 @@ pub struct ImmConfig {
 }
 
 impl ImmConfig {
+    fn step(&self, h: f64) -> Step {
+        let among = std::array::from_fn(|i| {
+            let stays = libm::exp(-h / self.dwell_s[i]);
+            std::array::from_fn(|j| if i == j { stays } else { (1.0 - stays) * self.leave_to[i][j] })
+        });
+        Step {
+            among,
+            forgotten: self.leave_to[RECALLED],
+            unrecalled: libm::exp(-h / self.recall_after_s),
+            transitions: self.models.map(|model| model.transition(h)),
+            noises: self.models.map(|model| model.process_noise(h)),
+        }
+    }
+
     /// The greatest acceleration that a body is believed to repeat, m/s^2 or rad/s^2: twenty times the expected one.
     pub(crate) fn greatest_recalled(&self) -> f64 {
         24.0 * self.onset_acceleration
+    }
+}
+
+/// Models for bodies whose turns take about `acceleration` (m/s^2 or rad/s^2) and whose velocity changes in a good part
+/// of a second: coasting; steady acceleration; swinging at the pace of a hand or a rocker; a sharp manoeuvre, which
+/// bridges the onset of a turn; and the body's motion the last time. The numbers were found by a random search over
+/// shuttles and swings of 1 to 3 Hz with 0.1 mm of noise at 500 Hz (the table in `docs/lab/PREDICTION.md`); densities
+/// scale with the square of the acceleration.
+pub fn models_for(acceleration: f64) -> ImmConfig {
+    let a2 = acceleration * acceleration;
+    let model = |accelerates, swing_rad_s, noise| MotionModel { accelerates, swing_rad_s, noise };
+    ImmConfig {
+        models: [
+            model(false, 0.0, 1e-7 * a2),
+            model(true, 0.0, 0.012 * a2),
+            model(true, 10.0, 0.0017 * a2),
+            model(true, 0.0, 28.0 * a2),
+            model(false, 0.0, 1e-5 * a2),
+        ],
+        dwell_s: [1.0, 0.07, 1.0, 0.03, 1.5],
+        leave_to: [
+            [0.0, 0.02, 0.94, 0.04, 0.0],
+            [0.54, 0.0, 0.01, 0.45, 0.0],
+            [0.24, 0.01, 0.0, 0.75, 0.0],
+            [0.05, 0.8, 0.15, 0.0, 0.0],
+            [0.85, 0.05, 0.05, 0.05, 0.0],
+        ],
+        recall_after_s: 0.03,
+        onset_acceleration: 0.83 * acceleration,
+        initial_velocity: 4.0 * acceleration,
+    }
+}
+
+/// What all axes of a bank have in common when it advances by one step.
+struct Step {
+    /// Share of mode `i` that is in mode `j` afterwards, if nothing but the models decides.
+    among: [[f64; MODES]; MODES],
+    /// Where [`RECALLED`] goes when nothing is recalled any more.
+    forgotten: [f64; MODES],
+    /// Share of any other mode that does not change to [`RECALLED`] while a motion is recalled.
+    unrecalled: f64,
+    transitions: [Transition; MODES],
+    noises: [Covariance; MODES],
+}
+
+impl Step {
+    /// Share of mode `i` that is in mode `j` afterwards.
+    fn share(&self, i: usize, j: usize, recalls: bool) -> f64 {
+        match (i == RECALLED, recalls) {
+            (true, false) => self.forgotten[j],
+            (false, true) if j == RECALLED => 1.0 - self.unrecalled,
+            (false, true) => self.among[i][j] * self.unrecalled,
+            _ => self.among[i][j],
+        }
     }
 }
 
@@ -356,8 +448,17 @@ impl AxisBank {
         all
     };
 
+    /// Modes that count for anything: most bodies recall nothing most of the time.
+    fn possible(&self, recalls: bool) -> usize {
+        if recalls || self.probability[RECALLED] > 0.0 {
+            MODES
+        } else {
+            RECALLED
+        }
+    }
+
     /// Moment-matched mean and covariance of weighted modes.
-    fn mixture(modes: &[AxisMode; MODES], weight: &[f64; MODES]) -> AxisMode {
+    fn mixture(modes: &[AxisMode], weight: &[f64]) -> AxisMode {
         let mut mean = AxisMode::default();
         for (m, &w) in modes.iter().zip(weight) {
             mean.offset += m.offset * w;
@@ -373,22 +474,9 @@ impl AxisBank {
         mean
     }
 
-    /// Share of mode `i` that is in mode `j` after `h` seconds.
-    fn share(config: &ImmConfig, h: f64, i: usize, j: usize, recalls: bool) -> f64 {
-        if i == RECALLED && !recalls {
-            return config.leave_to[i][j];
-        }
-        let stays = libm::exp(-h / config.dwell_s[i]);
-        let among = if i == j { stays } else { (1.0 - stays) * config.leave_to[i][j] };
-        match (recalls && i != RECALLED, libm::exp(-h / config.recall_after_s)) {
-            (true, stays) if j == RECALLED => 1.0 - stays,
-            (true, stays) => among * stays,
-            (false, _) => among,
-        }
-    }
-
-    /// Mixes the modes and propagates all of them by `h` >= 0 seconds.
-    fn advance(&mut self, config: &ImmConfig, h: f64, recalled: Option<RecalledAxis>) {
+    /// Mixes the modes and propagates all of them by `step`.
+    fn advance(&mut self, config: &ImmConfig, step: &Step, recalled: Option<RecalledAxis>) {
+        let possible = self.possible(recalled.is_some());
         let mut moved = self.modes;
         let mut foretold = [0.0; MODES];
         // A coasting mode has no information on the acceleration at the start of a turn; its zero is not an estimate.
@@ -398,17 +486,17 @@ impl AxisBank {
                 source.covariance.aa = config.onset_acceleration * config.onset_acceleration;
             }
         }
-        for (j, model) in config.models.iter().enumerate() {
-            let mut weight: [f64; MODES] = std::array::from_fn(|i| {
-                Self::share(config, h, i, j, recalled.is_some()) * self.probability[i]
-            });
+        for (j, model) in config.models.iter().enumerate().take(possible) {
+            let mut weight: [f64; MODES] =
+                std::array::from_fn(|i| step.share(i, j, recalled.is_some()) * self.probability[i]);
             foretold[j] = weight.iter().sum();
             let mode = &mut moved[j];
             if foretold[j] > 0.0 {
                 weight.iter_mut().for_each(|w| *w /= foretold[j]);
-                *mode = Self::mixture(if model.accelerates { &open } else { &self.modes }, &weight);
+                let sources = if model.accelerates { &open } else { &self.modes };
+                *mode = Self::mixture(&sources[..possible], &weight);
             }
-            let f = model.transition(h);
+            let f = &step.transitions[j];
             let (v, a) = (mode.velocity, mode.acceleration);
             mode.offset += f.p[1] * v + f.p[2] * a;
             mode.velocity = f.v[1] * v + f.v[2] * a;
@@ -418,8 +506,8 @@ impl AxisBank {
                 mode.velocity += recalled.faster;
                 mode.acceleration = recalled.acceleration;
             }
-            mode.covariance = mode.covariance.propagated(&f);
-            mode.covariance.add_scaled(&model.process_noise(h), 1.0);
+            mode.covariance = mode.covariance.propagated(f);
+            mode.covariance.add_scaled(&step.noises[j], 1.0);
         }
         self.modes = moved;
         self.probability = foretold;
@@ -427,8 +515,9 @@ impl AxisBank {
 
     /// Updates with a measured offset of variance `r`.
     fn update(&mut self, z: f64, r: f64) {
+        let possible = self.possible(false);
         let mut log_likelihood = [0.0; MODES];
-        for (mode, log_l) in self.modes.iter_mut().zip(&mut log_likelihood) {
+        for (mode, log_l) in self.modes.iter_mut().zip(&mut log_likelihood).take(possible) {
             let innovation = z - mode.offset;
             let s = (mode.covariance.pp + r).max(f64::MIN_POSITIVE);
             *log_l = -0.5 * (innovation * innovation / s + libm::log(s));
@@ -481,10 +570,29 @@ impl<C: Chart> Imm<C> {
     pub(crate) fn combined(&self) -> Kinematics<C::Point> {
         let mean = self.axes.map(|axis| AxisBank::mixture(&axis.modes, &axis.probability));
         Kinematics {
-            point: C::moved(self.base, DVec3::from_array(mean.map(|m| m.offset))),
-            velocity: DVec3::from_array(mean.map(|m| m.velocity)),
-            acceleration: DVec3::from_array(mean.map(|m| m.acceleration)),
+            mean: Motion {
+                point: C::moved(self.base, DVec3::from_array(mean.map(|m| m.offset))),
+                velocity: DVec3::from_array(mean.map(|m| m.velocity)),
+                acceleration: DVec3::from_array(mean.map(|m| m.acceleration)),
+            },
             covariance: mean.map(|m| m.covariance),
+        }
+    }
+
+    /// Mean of the banks.
+    pub(crate) fn mean(&self) -> Motion<C::Point> {
+        let [mut offset, mut velocity, mut acceleration] = [[0.0; 3]; 3];
+        for (i, axis) in self.axes.iter().enumerate() {
+            for (mode, p) in axis.modes.iter().zip(axis.probability) {
+                offset[i] += mode.offset * p;
+                velocity[i] += mode.velocity * p;
+                acceleration[i] += mode.acceleration * p;
+            }
+        }
+        Motion {
+            point: C::moved(self.base, DVec3::from_array(offset)),
+            velocity: DVec3::from_array(velocity),
+            acceleration: DVec3::from_array(acceleration),
         }
     }
 
@@ -500,13 +608,14 @@ impl<C: Chart> Imm<C> {
 
     /// Mixes the modes and propagates all of them by `h` >= 0 seconds, [`RECALLED`] according to `recalled`.
     pub fn advance(&mut self, config: &ImmConfig, h: f64, recalled: Option<Recalled>) {
+        let step = config.step(h);
         for (i, axis) in self.axes.iter_mut().enumerate() {
             let along = recalled.filter(|r| r.matters[i]).map(|r| RecalledAxis {
                 moved: r.moved[i],
                 faster: r.faster[i],
                 acceleration: r.acceleration[i],
             });
-            axis.advance(config, h, along);
+            axis.advance(config, &step, along);
         }
         self.rebase();
     }
@@ -544,7 +653,6 @@ impl<C: Chart> Imm<C> {
 
 #[cfg(test)]
 mod tests {
-    use super::super::pose_filter::models_for;
     use super::*;
     use proptest::prelude::*;
 
@@ -554,7 +662,7 @@ mod tests {
         let config = models_for(5.0);
         for (h, recalls) in [0.0, 0.002, 0.1, 10.0].into_iter().flat_map(|h| [(h, false), (h, true)]) {
             for i in 0..MODES {
-                let sum: f64 = (0..MODES).map(|j| AxisBank::share(&config, h, i, j, recalls)).sum();
+                let sum: f64 = (0..MODES).map(|j| config.step(h).share(i, j, recalls)).sum();
                 assert!((sum - 1.0).abs() < 1e-12, "{sum} of mode {i} after {h} s, recalled: {recalls}");
             }
         }

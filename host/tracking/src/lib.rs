@@ -1,8 +1,8 @@
 //! Turns tracker samples into the pose of each body at the instant at which its light will fall.
 //!
 //! [`pose_filter`] judges and filters the samples of one body, [`state`] is its result as plain data and predicts,
-//! [`bank`] keeps one filter per body. [`imm`], [`noise`] and [`recall`] (from smoothed samples) are the estimators
-//! inside. The tests measure all of it against closed-form motion. No sample is used before it arrived; everything is
+//! [`bank`] keeps one filter per body. [`imm`], [`learner`], [`noise`] and [`recall`] (from smoothed samples) are the
+//! estimators inside. The tests measure all of it against closed-form motion. No sample is used before it arrived; everything is
 //! f64; time is integer nanoseconds.
 //!
 //! # Example: a body at 1 m/s, 3 ms after its newest sample
@@ -36,6 +36,7 @@ mod bank;
 #[cfg(test)]
 mod evaluation;
 pub mod imm;
+mod learner;
 mod noise;
 pub mod pose_filter;
 mod recall;

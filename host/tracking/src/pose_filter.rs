@@ -5,7 +5,8 @@
 //! three such samples that agree replace the track. So a teleport is accepted within three samples and never
 //! extrapolated across, and a burst of outliers changes nothing.
 
-use super::imm::{Imm, ImmConfig, Kinematics, MotionModel, Rotations, Translations};
+use super::imm::{Kinematics, Rotations, Translations};
+use super::learner::Learner;
 use super::noise::NoiseEstimator;
 use super::recall::Recall;
 #[cfg(test)]
@@ -58,10 +59,14 @@ pub struct PoseFilterConfig {
     pub rotation_noise_rad: f64,
     /// Measure the noise from the samples themselves instead of using the two values above permanently.
     pub measure_noise: bool,
-    /// Models for positions.
-    pub position_models: ImmConfig,
-    /// Models for rotations.
-    pub rotation_models: ImmConfig,
+    /// About how much bodies accelerate in turns, m/s^2. The filter learns from their samples what it is.
+    pub acceleration_m_s2: f64,
+    /// The same for rotations, rad/s^2.
+    pub angular_acceleration_rad_s2: f64,
+    /// Learn how sharply the body moves; otherwise the two values above are used permanently.
+    pub learns: bool,
+    /// Mean time after which a body that moves as it did before is believed to repeat itself, seconds.
+    pub recall_after_s: f64,
     /// Samples further than this many standard deviations from the prediction are set aside.
     pub gate_sigmas: f64,
     /// Fastest plausible motion, m/s.
@@ -87,8 +92,10 @@ impl Default for PoseFilterConfig {
             position_noise_m: 1e-4,
             rotation_noise_rad: 1e-3,
             measure_noise: true,
-            position_models: models_for(5.0),
-            rotation_models: models_for(20.0),
+            acceleration_m_s2: 5.0,
+            angular_acceleration_rad_s2: 20.0,
+            learns: true,
+            recall_after_s: 0.03,
             gate_sigmas: 6.0,
             max_speed_m_s: 20.0,
             max_acceleration_m_s2: 500.0,
@@ -100,43 +107,12 @@ impl Default for PoseFilterConfig {
     }
 }
 
-/// Models for bodies whose turns take about `acceleration` (m/s^2 or rad/s^2) and whose velocity changes in a good part
-/// of a second: coasting; steady acceleration; swinging at the pace of a hand or a rocker; a sharp manoeuvre, which
-/// bridges the onset of a turn; and the body's motion the last time. The numbers were found by a random search over
-/// shuttles and swings of 1 to 3 Hz with 0.1 mm of noise at 500 Hz (the table in `docs/lab/PREDICTION.md`); densities
-/// scale with the square of the acceleration.
-pub fn models_for(acceleration: f64) -> ImmConfig {
-    let a2 = acceleration * acceleration;
-    let model = |accelerates, swing_rad_s, noise| MotionModel { accelerates, swing_rad_s, noise };
-    ImmConfig {
-        models: [
-            model(false, 0.0, 1e-7 * a2),
-            model(true, 0.0, 0.012 * a2),
-            model(true, 10.0, 0.0017 * a2),
-            model(true, 0.0, 28.0 * a2),
-            model(false, 0.0, 1e-5 * a2),
-        ],
-        dwell_s: [1.0, 0.07, 1.0, 0.03, 1.5],
-        leave_to: [
-            [0.0, 0.02, 0.94, 0.04, 0.0],
-            [0.54, 0.0, 0.01, 0.45, 0.0],
-            [0.24, 0.01, 0.0, 0.75, 0.0],
-            [0.05, 0.8, 0.15, 0.0, 0.0],
-            [0.85, 0.05, 0.05, 0.05, 0.0],
-        ],
-        recall_after_s: 0.03,
-        onset_acceleration: 0.83 * acceleration,
-        initial_velocity: 4.0 * acceleration,
-    }
-}
-
 impl PoseFilterConfig {
     /// The same without recall ([`super::recall`]): for comparison.
     #[cfg(test)]
     pub(crate) fn without_recall(mut self) -> Self {
         // So late that it never happens.
-        self.position_models.recall_after_s = f64::INFINITY;
-        self.rotation_models.recall_after_s = f64::INFINITY;
+        self.recall_after_s = f64::INFINITY;
         self
     }
 
@@ -146,8 +122,8 @@ impl PoseFilterConfig {
         let lost_after_ns = i64::from(lost_after_ms.max(1)) * 1_000_000;
         let defaults = Self::default();
         Self {
-            position_models: models_for(acceleration),
-            rotation_models: models_for(angular_acceleration),
+            acceleration_m_s2: acceleration,
+            angular_acceleration_rad_s2: angular_acceleration,
             max_acceleration_m_s2: (100.0 * acceleration).max(defaults.max_acceleration_m_s2),
             max_angular_acceleration_rad_s2: (100.0 * angular_acceleration)
                 .max(defaults.max_angular_acceleration_rad_s2),
@@ -233,8 +209,8 @@ struct Measured {
 
 #[derive(Clone, Debug)]
 struct Track {
-    position: Imm<Translations>,
-    rotation: Imm<Rotations>,
+    position: Learner<Translations>,
+    rotation: Learner<Rotations>,
     newest: Measured,
     /// Length of the current run of identical poses, and whether the body moved before it.
     repeats: u32,
@@ -382,6 +358,11 @@ impl PoseFilter {
         self.predict(at).map_or(Freshness::Lost, |p| p.freshness)
     }
 
+    /// Steps by which the learned accelerations of position and rotation lie above the settings; each doubles them.
+    pub fn levels(&self) -> [i32; 2] {
+        self.track.as_ref().map_or([0; 2], |track| [track.position.level(), track.rotation.level()])
+    }
+
     fn variances(&self) -> (f64, f64) {
         if self.config.measure_noise {
             (self.position_noise.variance(), self.rotation_noise.variance())
@@ -408,25 +389,27 @@ impl PoseFilter {
                 let mut position = track.position;
                 let mut rotation = track.rotation;
                 let (from_ns, to_ns) = (track.newest.at.0, z.at.0);
-                let (models, turns) = (&c.position_models, &c.rotation_models);
-                let (most, most_turn) = (models.greatest_recalled(), turns.greatest_recalled());
-                position.advance(models, h, self.position_recall.between(from_ns, to_ns, most));
-                rotation.advance(turns, h, self.rotation_recall.between(from_ns, to_ns, most_turn));
+                let (most, most_turn) = (position.greatest_recalled(), rotation.greatest_recalled());
+                position.advance(h, self.position_recall.between(from_ns, to_ns, most));
+                rotation.advance(h, self.rotation_recall.between(from_ns, to_ns, most_turn));
                 // The unseen effect of the strongest plausible acceleration counts as two standard deviations.
                 let slack = 0.25 * h * h;
                 let gate = c.gate_sigmas * c.gate_sigmas;
-                let inside = position.distance_squared(z.position, rp, slack * c.max_acceleration_m_s2)
-                    <= gate
-                    && rotation.distance_squared(z.rotation, rr, slack * c.max_angular_acceleration_rad_s2)
-                        <= gate;
+                let [slack_p, slack_r] =
+                    [c.max_acceleration_m_s2, c.max_angular_acceleration_rad_s2].map(|most| slack * most);
+                let inside = position.bank().distance_squared(z.position, rp, slack_p) <= gate
+                    && rotation.bank().distance_squared(z.rotation, rr, slack_r) <= gate;
                 if inside {
-                    self.last_nis = Some([position.update(z.position, rp), rotation.update(z.rotation, rr)]);
+                    self.last_nis = Some([
+                        position.update(to_ns, z.position, rp),
+                        rotation.update(to_ns, z.rotation, rr),
+                    ]);
                     track.position = position;
                     track.rotation = rotation;
                     self.candidates = [None; ACQUIRE_SAMPLES];
                     self.position_noise.push(z.at.0, z.position);
                     self.rotation_noise.push(z.at.0, z.rotation);
-                    let (p, r) = (position.combined(), rotation.combined());
+                    let (p, r) = (position.bank().mean(), rotation.bank().mean());
                     self.position_recall.push(to_ns, z.position, p.point, p.velocity, rp.sqrt());
                     self.rotation_recall.push(to_ns, z.rotation, r.point, r.velocity, rr.sqrt());
                     return track.accept(z, c.stuck_after);
@@ -456,8 +439,14 @@ impl PoseFilter {
         let [Some(first), rest @ ..] = self.candidates else {
             return Verdict::SetAside;
         };
-        let mut position = Imm::new(&c.position_models, first.position, rp);
-        let mut rotation = Imm::new(&c.rotation_models, first.rotation, rr);
+        // What was learned of the body before it was lost is true of it still.
+        let [level_p, level_r] = self.levels();
+        let (a, turn, late) = (c.acceleration_m_s2, c.angular_acceleration_rad_s2, c.recall_after_s);
+        let mut position = Learner::new(a, late, level_p, first.position, rp);
+        let mut rotation = Learner::new(turn, late, level_r, first.rotation, rr);
+        if !c.learns {
+            (position, rotation) = (position.without_learning(), rotation.without_learning());
+        }
         self.position_noise.break_track();
         self.rotation_noise.break_track();
         self.position_recall.break_track();
@@ -465,10 +454,10 @@ impl PoseFilter {
         let mut before = first;
         for z in rest.into_iter().flatten() {
             let h = z.at.ns_since(before.at) as f64 * 1e-9;
-            position.advance(&c.position_models, h, None);
-            rotation.advance(&c.rotation_models, h, None);
-            position.update(z.position, rp);
-            rotation.update(z.rotation, rr);
+            position.advance(h, None);
+            rotation.advance(h, None);
+            position.update(z.at.0, z.position, rp);
+            rotation.update(z.at.0, z.rotation, rr);
             before = z;
         }
         self.last_nis = None;

@@ -55,8 +55,8 @@ impl TrackState {
     pub fn predict(&self, at: HostTime) -> PosePrediction {
         let horizon_ns = at.ns_since(self.captured_at);
         let h = horizon_ns.clamp(-self.lost_after_ns, self.lost_after_ns) as f64 * 1e-9;
-        let position = self.position.point_after::<Translations>(h);
-        let rotation = self.rotation.point_after::<Rotations>(h);
+        let position = self.position.mean.point_after::<Translations>(h);
+        let rotation = self.rotation.mean.point_after::<Rotations>(h);
         let freshness = if horizon_ns > self.lost_after_ns {
             Freshness::Lost
         } else if horizon_ns > self.tracked_for_ns {
@@ -66,8 +66,10 @@ impl TrackState {
         };
         PosePrediction {
             pose: Pose { position_m: position.to_array(), rotation_xyzw: rotation.to_array() },
-            linear_velocity_m_s: (self.position.velocity + self.position.acceleration * h).to_array(),
-            angular_velocity_rad_s: (self.rotation.velocity + self.rotation.acceleration * h).to_array(),
+            linear_velocity_m_s: (self.position.mean.velocity + self.position.mean.acceleration * h)
+                .to_array(),
+            angular_velocity_rad_s: (self.rotation.mean.velocity + self.rotation.mean.acceleration * h)
+                .to_array(),
             horizon_ns,
             position_sigma_m: self
                 .position

@@ -7,8 +7,8 @@ use dpm_common::so3::{so3_between, so3_exp, so3_log};
 use dpm_device::pose::Pose;
 use dpm_device::time::HostTime;
 use dpm_device::tracker::{BodyIndex, TrackerSample};
+use dpm_tracking::imm::models_for;
 use dpm_tracking::imm::{Imm, Translations};
-use dpm_tracking::pose_filter::models_for;
 use dpm_tracking::{Freshness, PoseFilter, PoseFilterConfig, PosePrediction, Verdict};
 use glam::{DQuat, DVec3};
 

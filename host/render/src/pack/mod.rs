@@ -209,10 +209,6 @@ pub fn unpack(frame: &BitPlaneFrame, codes: &mut [u32]) {
 }
 
 /// Moves a batch of a plane to where it belongs, by way of the caches.
-#[cfg_attr(
-    target_arch = "x86_64",
-    allow(dead_code, reason = "every kernel of this processor has a better way")
-)]
 fn copy(to: &mut [u8; BATCH_BYTES], from: &[u8; BATCH_BYTES]) {
     *to = *from;
 }

@@ -456,9 +456,9 @@ section! {
     pub struct PredictionConfig {
         /// Off shows the newest sample without prediction, for comparison.
         on: bool = true, "", Any;
-        /// Expected acceleration of the bodies. A larger value follows faster and passes more noise.
+        /// Expected acceleration of the bodies, until the filters have learned it from their samples.
         acceleration: f64 = 5.0, "m/s^2", Within(1e-3, 1e4);
-        /// Expected angular acceleration of the bodies.
+        /// Expected angular acceleration of the bodies, until it is learned.
         angular_acceleration: f64 = 20.0, "rad/s^2", Within(1e-3, 1e5);
         /// Standard deviation of the tracker's position.
         noise_m: f64 = 1e-4, "m", Within(1e-9, 1.0);

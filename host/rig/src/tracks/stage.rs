@@ -8,7 +8,7 @@ use crate::tracks::gauges::{AddedCounts, TrackerGauges};
 use dpm_device::time::HostTime;
 use dpm_device::tracker::{BodyIndex, Tracker, TrackerError};
 use dpm_handoff::latest::Publisher;
-use dpm_tracking::{PoseFilterBank, TrackState};
+use dpm_tracking::{PoseFilterBank, PoseFilterConfig, TrackState};
 use std::sync::Arc;
 use std::time::Duration;
 
@@ -93,7 +93,8 @@ const fn remedy(tracker: &TrackerConfig) -> &'static str {
 /// once is worth more noise, which [`crate::engine::follow`] keeps out by its gate.
 const LIVELIER: f64 = 1.5;
 
-/// Filters for the bodies of `rig` that expect `livelier` times the acceleration of the rig file.
+/// Filters for the bodies of `rig` that expect `livelier` times the acceleration of the rig file. Only those of frames learn
+/// it: after steady motion they would expect no turn, and what tracks correct is surprise.
 fn bank(rig: &Rig, livelier: f64) -> PoseFilterBank {
     // Each frame decides how long a body is shown without samples, see [`crate::plan::frame::FramePlan::fill`]. The filter
     // only needs to know how long a track is worth keeping.
@@ -105,7 +106,8 @@ fn bank(rig: &Rig, livelier: f64) -> PoseFilterBank {
         ..prediction.clone()
     };
     let bodies = rig.bodies.len().min(MAX_TRACKED);
-    PoseFilterBank::new(&vec![expected.to_filter(longest_ms); bodies])
+    let filter = PoseFilterConfig { learns: livelier <= 1.0, ..expected.to_filter(longest_ms) };
+    PoseFilterBank::new(&vec![filter; bodies])
 }
 
 impl TrackingStage {

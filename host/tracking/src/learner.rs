@@ -1,0 +1,306 @@
+//! Learns how sharply a body moves, from its own samples.
+//!
+//! No filter serves a foot, a hand, a drone and a machine. Two kinds run side by side: a bank of models ([`super::imm`]),
+//! which is best where a body rests, coasts, turns and repeats itself, and a ladder of filters of constant acceleration,
+//! each driven by four times the noise of the one below, of which one fits a motion that never coasts. At every sample
+//! each is asked where it expected the body, 4 ms before. The rung whose forecasts of the last quarter of a second erred
+//! least says what acceleration the bank's models are scaled for, and the prediction is the mean of that rung and the
+//! bank, each weighted by how little it erred beyond the tracker's noise.
+//!
+//! A rung is cheap: its gains depend on the stamps and the noise alone, so the three axes share them, and all rungs
+//! share the tangent space of one base point.
+
+use super::imm::{models_for, Chart, Covariance, Imm, ImmConfig, Kinematics, Motion, MotionModel, Recalled};
+use glam::DVec3;
+
+/// Rungs of the ladder, and the one that fits the acceleration of the settings.
+const RUNGS: usize = 9;
+const MIDDLE: usize = 4;
+/// Density of the white jerk that drives the middle rung for an acceleration of 1 m/s^2 or rad/s^2. This and the three
+/// below were found on the recordings of `docs/lab/PREDICTION.md`.
+const JERK: f64 = 8.0;
+/// An error counts 1/e of a new one after this time, seconds.
+const MEMORY_S: f64 = 0.25;
+/// A rung replaces the one in use when its squared errors are less than this share of that one's.
+const BETTER: f64 = 0.9;
+/// Share of the tracker's noise that is taken out of the errors before bank and rung are weighted. Its estimate may be
+/// too large by a tenth.
+const NOISE_SHARE: f64 = 0.9;
+/// Forecasts are judged as far ahead as light usually lies, nanoseconds.
+const AHEAD_NS: i64 = 4_000_000;
+/// Samples from which forecasts are kept. A tracker above 2 kHz is judged by shorter ones.
+const KEPT: usize = 9;
+/// Forecasts before the first choice.
+const SETTLES: u32 = 32;
+
+/// A filter of constant acceleration. Its position is an offset from the ladder's base.
+#[derive(Clone, Copy, Debug, Default)]
+struct Rung {
+    offset: DVec3,
+    velocity: DVec3,
+    acceleration: DVec3,
+    /// Of each axis.
+    covariance: Covariance,
+}
+
+impl Rung {
+    fn offset_after(&self, h: f64) -> DVec3 {
+        self.offset + (self.velocity + self.acceleration * (0.5 * h)) * h
+    }
+}
+
+/// What was known at a sample.
+#[derive(Clone, Copy, Debug)]
+struct Past<P> {
+    at_ns: i64,
+    bank: Motion<P>,
+    base: P,
+    rungs: [Rung; RUNGS],
+}
+
+/// Sums of squared errors of forecasts, m^2 or rad^2, the older ones fading.
+#[derive(Clone, Copy, Debug, Default)]
+struct Errors {
+    bank: f64,
+    rungs: [f64; RUNGS],
+    /// What the tracker's noise makes of any forecast.
+    noise: f64,
+    /// Forecasts that were judged.
+    count: u32,
+}
+
+/// See the module's documentation.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct Learner<C: Chart> {
+    /// Of the settings, m/s^2 or rad/s^2.
+    acceleration: f64,
+    learns: bool,
+    recall_after_s: f64,
+    bank: Imm<C>,
+    base: C::Point,
+    rungs: [Rung; RUNGS],
+    best: usize,
+    errors: Errors,
+    past: [Option<Past<C::Point>>; KEPT],
+    next: usize,
+}
+
+impl<C: Chart> Learner<C> {
+    /// Starts at a measured point of variance `r` with unknown velocity. The body is expected to accelerate by
+    /// `acceleration` doubled `level` times, and to repeat itself after `recall_after_s` ([`ImmConfig`]).
+    pub(crate) fn new(acceleration: f64, recall_after_s: f64, level: i32, z: C::Point, r: f64) -> Self {
+        let config = models_for(acceleration * f64::from(level).exp2());
+        let covariance = Covariance {
+            pp: r,
+            vv: config.initial_velocity.powi(2),
+            aa: config.onset_acceleration.powi(2),
+            ..Covariance::default()
+        };
+        Self {
+            acceleration,
+            learns: true,
+            recall_after_s,
+            bank: Imm::new(&config, z, r),
+            base: z,
+            rungs: [Rung { covariance, ..Rung::default() }; RUNGS],
+            best: (MIDDLE as i32 + level).clamp(0, RUNGS as i32 - 1) as usize,
+            errors: Errors::default(),
+            past: [None; KEPT],
+            next: 0,
+        }
+    }
+
+    /// The same, whose bank alone predicts, for the acceleration of the settings.
+    pub(crate) fn without_learning(self) -> Self {
+        Self { learns: false, ..self }
+    }
+
+    /// Steps by which the learned acceleration lies above that of the settings; each doubles it.
+    pub(crate) fn level(&self) -> i32 {
+        self.best as i32 - MIDDLE as i32
+    }
+
+    /// The bank's models.
+    fn config(&self) -> ImmConfig {
+        let acceleration = self.acceleration * f64::from(self.level()).exp2();
+        ImmConfig { recall_after_s: self.recall_after_s, ..models_for(acceleration) }
+    }
+
+    /// As [`ImmConfig::greatest_recalled`].
+    pub(crate) fn greatest_recalled(&self) -> f64 {
+        self.config().greatest_recalled()
+    }
+
+    /// The bank, which judges whether a sample can be true.
+    pub(crate) fn bank(&self) -> &Imm<C> {
+        &self.bank
+    }
+
+    /// Mean and covariance of the motion.
+    pub(crate) fn combined(&self) -> Kinematics<C::Point> {
+        let (bank, rung) = (self.bank.combined(), &self.rungs[self.best]);
+        let w = self.errors.share_of_rung(self.best);
+        let apart = C::between(bank.mean.point, C::moved(self.base, rung.offset));
+        Kinematics {
+            mean: Motion {
+                point: C::moved(bank.mean.point, apart * w),
+                velocity: bank.mean.velocity.lerp(rung.velocity, w),
+                acceleration: bank.mean.acceleration.lerp(rung.acceleration, w),
+            },
+            covariance: bank.covariance.map(|covariance| covariance.mixed(&rung.covariance, w)),
+        }
+    }
+
+    /// Advances all filters by `h` >= 0 seconds, the bank according to `recalled`.
+    pub(crate) fn advance(&mut self, h: f64, recalled: Option<Recalled>) {
+        self.bank.advance(&self.config(), h, recalled);
+        if !self.learns {
+            return;
+        }
+        for (k, rung) in self.rungs.iter_mut().enumerate() {
+            let acceleration = self.acceleration * f64::from(k as i32 - MIDDLE as i32).exp2();
+            let noise = JERK * acceleration * acceleration;
+            rung.offset = rung.offset_after(h);
+            rung.velocity += rung.acceleration * h;
+            rung.covariance =
+                rung.covariance.after(&MotionModel { accelerates: true, swing_rad_s: 0.0, noise }, h);
+        }
+    }
+
+    /// Updates all filters with a measurement of variance `r` at `at_ns`, to which they were advanced. Returns the
+    /// normalised innovation squared of the bank.
+    pub(crate) fn update(&mut self, at_ns: i64, z: C::Point, r: f64) -> f64 {
+        let nis = self.bank.update(z, r);
+        if !self.learns {
+            return nis;
+        }
+        let measured = C::between(self.base, z);
+        for rung in &mut self.rungs {
+            let (covariance, [kp, kv, ka]) = rung.covariance.updated(r);
+            let innovation = measured - rung.offset;
+            rung.covariance = covariance;
+            rung.offset += innovation * kp;
+            rung.velocity += innovation * kv;
+            rung.acceleration += innovation * ka;
+        }
+        self.judge(at_ns, z, r);
+        // The base follows, so that offsets stay small against the chart's curvature.
+        let moved = self.rungs[self.best].offset;
+        self.base = C::moved(self.base, moved);
+        self.rungs.iter_mut().for_each(|rung| rung.offset -= moved);
+        self.past[self.next] =
+            Some(Past { at_ns, bank: self.bank.mean(), base: self.base, rungs: self.rungs });
+        self.next = (self.next + 1) % KEPT;
+        nis
+    }
+
+    /// Compares what the filters expected with `z`, and chooses a rung.
+    fn judge(&mut self, at_ns: i64, z: C::Point, r: f64) {
+        let Some(newest) = &self.past[(self.next + KEPT - 1) % KEPT] else { return };
+        let kept = || self.past.iter().flatten();
+        let nearest = kept().filter(|past| at_ns - past.at_ns >= AHEAD_NS).max_by_key(|past| past.at_ns);
+        let Some(from) = nearest.or_else(|| kept().min_by_key(|past| past.at_ns)) else { return };
+        let h = (at_ns - from.at_ns) as f64 * 1e-9;
+        let errors = &mut self.errors;
+        let fade = 1.0 / (1.0 + (at_ns - newest.at_ns) as f64 * 1e-9 / MEMORY_S);
+        errors.bank = errors.bank * fade + C::between(from.bank.point_after::<C>(h), z).length_squared();
+        let measured = C::between(from.base, z);
+        for (error, rung) in errors.rungs.iter_mut().zip(&from.rungs) {
+            *error = *error * fade + (measured - rung.offset_after(h)).length_squared();
+        }
+        errors.noise = errors.noise * fade + 3.0 * r;
+        errors.count = errors.count.saturating_add(1);
+        if errors.count < SETTLES {
+            return;
+        }
+        let least =
+            (0..RUNGS).min_by(|&a, &b| errors.rungs[a].total_cmp(&errors.rungs[b])).unwrap_or(self.best);
+        if errors.rungs[least] < BETTER * errors.rungs[self.best] {
+            self.best = least;
+        }
+    }
+}
+
+impl Errors {
+    /// Weight of the rung beside the bank: the fourth powers of their errors, beyond what the noise makes of both.
+    fn share_of_rung(&self, rung: usize) -> f64 {
+        let excess = |error: f64| (error - NOISE_SHARE * self.noise).max(0.01 * self.noise).powi(4);
+        let (bank, rung) = (excess(self.bank), excess(self.rungs[rung]));
+        let share = bank / (bank + rung);
+        if self.count >= SETTLES && share.is_finite() {
+            share
+        } else {
+            0.0
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::imm::{Rotations, Translations};
+    use super::super::testing::Gauss;
+    use super::*;
+    use dpm_common::so3::so3_exp;
+    use glam::DQuat;
+
+    const NOISE: f64 = 1e-4;
+
+    /// A learner for 5 m/s^2 after 4 s of a swing of this amplitude (m) and angular frequency (rad/s), at 500 Hz.
+    fn after_swing(amplitude: f64, w: f64) -> Learner<Translations> {
+        let mut gauss = Gauss::new(3);
+        let at = |i: i64| DVec3::X * amplitude * (w * i as f64 * 2e-3).sin();
+        let mut learner = Learner::new(5.0, f64::INFINITY, 0, at(0), NOISE * NOISE);
+        for i in 1..2000 {
+            learner.advance(2e-3, None);
+            learner.update(i * 2_000_000, at(i) + gauss.vector(NOISE), NOISE * NOISE);
+        }
+        learner
+    }
+
+    /// The jerk of a swing grows with the cube of its frequency, and the level with it.
+    #[test]
+    fn the_level_follows_the_motion() {
+        let levels = [0.5, 3.0, 10.0, 30.0].map(|w| after_swing(0.1, w).level());
+        assert!(levels.is_sorted() && levels[0] < 0 && levels[3] > 0, "{levels:?}");
+    }
+
+    /// A body at rest is where the samples' mean is: the bank's calm is not lost to a rung.
+    #[test]
+    fn a_body_at_rest_stays_calm() {
+        let learner = after_swing(0.0, 1.0);
+        let mean = learner.combined().mean;
+        assert!(mean.point.length() < 0.5 * NOISE, "{mean:?}");
+        assert!(learner.errors.share_of_rung(learner.best) < 0.5);
+    }
+
+    /// What is learned does not depend on where a rotation begins.
+    #[test]
+    fn rotations_are_learned_in_any_attitude() {
+        let learned = |begin: DQuat| {
+            let mut gauss = Gauss::new(3);
+            let turn = |i: i64| so3_exp(DVec3::Y * (0.5 * (8.0 * i as f64 * 2e-3).sin()));
+            let mut learner = Learner::<Rotations>::new(20.0, f64::INFINITY, 0, turn(0) * begin, 1e-6);
+            for i in 1..2000 {
+                learner.advance(2e-3, None);
+                learner.update(i * 2_000_000, so3_exp(gauss.vector(1e-3)) * turn(i) * begin, 1e-6);
+            }
+            (learner.level(), learner.combined().mean.velocity)
+        };
+        let (level, velocity) = learned(DQuat::IDENTITY);
+        let (other_level, other) = learned(DQuat::from_rotation_x(2.0));
+        assert_eq!(level, other_level);
+        assert!((velocity - other).length() < 1e-6, "{velocity} and {other}");
+    }
+
+    /// Before enough forecasts were judged, and where nothing can be compared, the bank alone predicts.
+    #[test]
+    fn the_bank_predicts_until_there_is_a_choice() {
+        let mut learner = Learner::<Translations>::new(5.0, f64::INFINITY, 0, DVec3::ONE, 0.0);
+        for i in 1..i64::from(SETTLES) {
+            assert_eq!(learner.combined(), learner.bank().combined());
+            learner.advance(2e-3, None);
+            learner.update(i * 2_000_000, DVec3::ONE, 0.0);
+        }
+        assert_eq!(Errors { count: 1000, ..Errors::default() }.share_of_rung(0), 0.0, "0 / 0");
+    }
+}
