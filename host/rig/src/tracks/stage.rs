@@ -93,9 +93,8 @@ const fn remedy(tracker: &TrackerConfig) -> &'static str {
 /// once is worth more noise, which [`crate::engine::follow`] keeps out by its gate.
 const LIVELIER: f64 = 1.5;
 
-/// Filters for the bodies of `rig` that expect `livelier` times the acceleration of the rig file. Only those of frames learn
-/// it: after steady motion they would expect no turn, and what tracks correct is surprise.
-fn bank(rig: &Rig, livelier: f64) -> PoseFilterBank {
+/// Filters for the bodies of `rig` that expect `livelier` times the acceleration of the rig file, and learn it if they may.
+fn bank(rig: &Rig, livelier: f64, learns: bool) -> PoseFilterBank {
     // Each frame decides how long a body is shown without samples, see [`crate::plan::frame::FramePlan::fill`]. The filter
     // only needs to know how long a track is worth keeping.
     let longest_ms = rig.config.safety.predict_ms.unwrap_or(MAX_PREDICT_MS);
@@ -106,7 +105,7 @@ fn bank(rig: &Rig, livelier: f64) -> PoseFilterBank {
         ..prediction.clone()
     };
     let bodies = rig.bodies.len().min(MAX_TRACKED);
-    let filter = PoseFilterConfig { learns: livelier <= 1.0, ..expected.to_filter(longest_ms) };
+    let filter = PoseFilterConfig { learns, ..expected.to_filter(longest_ms) };
     PoseFilterBank::new(&vec![filter; bodies])
 }
 
@@ -116,7 +115,7 @@ impl TrackingStage {
         let bodies = rig.bodies.len().min(MAX_TRACKED);
         Self {
             tracker,
-            bank: bank(rig, 1.0),
+            bank: bank(rig, 1.0, true),
             lively: None,
             received_at: vec![HostTime(0); bodies],
             contradictory: vec![0; bodies],
@@ -138,7 +137,9 @@ impl TrackingStage {
 
     /// The same with filters that follow faster, for [`TrackingStage::publish_lively`].
     pub(crate) fn with_lively(self, rig: &Rig) -> Self {
-        Self { lively: Some(bank(rig, LIVELIER)), ..self }
+        // Two filters that had learned differently would draw a frame at one place and correct it to another; and after
+        // steady motion neither would expect the turn that tracks are for.
+        Self { bank: bank(rig, 1.0, false), lively: Some(bank(rig, LIVELIER, false)), ..self }
     }
 
     /// Reads what has arrived by `now` and publishes the tracks.
