@@ -7,9 +7,11 @@
 mod frames;
 mod inbox;
 mod light;
+mod reported;
 mod types;
 
 use super::compact::Compactor;
+use super::flash::REST_US;
 use super::limits::LimitReached;
 use super::message::{
     Config, ConfigRefusal, DeviceHello, DeviceState, Echo, Fault, FaultCode, HostHello, HostMessage, Status,
@@ -23,6 +25,7 @@ use crate::time::{DeviceTicks, HostTime};
 use crate::transport::{Lane, SendError, Transport, TransportError};
 use inbox::{Inbox, ECHOES_KEPT};
 use light::FieldCount;
+use reported::ReportedField;
 pub use types::{
     DropReason, EchoSample, Epoch, LinkCounters, LinkError, LinkSettings, LinkState, SendOutcome, Verb,
 };
@@ -62,6 +65,8 @@ pub struct HostLink {
     last_frame: Option<u32>,
     /// Counts light and flashes against the limits.
     field: FieldCount,
+    /// `None` without a limit of flashes.
+    reported: Option<ReportedField>,
     /// The caller wants to send tracks, if the device follows them.
     wants_tracks: bool,
     /// TRACKS sent in this session.
@@ -95,6 +100,7 @@ impl HostLink {
             Compactor::new(settings.raster, settings.schedule.len(), frame_ns, settings.codecs)
         });
         let field = FieldCount::new(&settings);
+        let reported = settings.flash_limit.map(|limit| ReportedField::new(settings.rate, limit));
         Self {
             settings,
             sessions,
@@ -112,6 +118,7 @@ impl HostLink {
             frames_sent: 0,
             last_frame: None,
             field,
+            reported,
             wants_tracks: false,
             tracks_sent: 0,
             rest: None,
@@ -141,6 +148,9 @@ impl HostLink {
         self.losses = 0;
         self.rest = None;
         self.field.new_session();
+        if let Some(reported) = &mut self.reported {
+            reported.new_session();
+        }
     }
 
     /// Permits light once the device is configured, shows the picture again after BLACK or FREEZE, or acknowledges latched
@@ -255,12 +265,23 @@ impl HostLink {
                 self.arm(0);
             }
         }
+        self.count_reported(now, transport);
         self.advance(transport)?;
         // Runs after the input was read: where a medium stamps with the poll's `now`, no answer may be older than its
         // question.
         self.exchange_clocks(now, transport)?;
         self.request(now, transport)?;
         Ok(self.state)
+    }
+
+    /// Lets the light rest if what the device reports flashes too often.
+    fn count_reported(&mut self, now: HostTime, transport: &mut dyn Transport) {
+        let Self { inbox, reported, slots, .. } = self;
+        let (Some(reported), Some(status), Some(slots)) = (reported, &inbox.status, slots) else { return };
+        let is_struck = slots.slot_at(status.now).is_some_and(|slot| reported.observe(status, slot));
+        if is_struck && self.ordered.is_none() && self.rest.is_none() && self.state == LinkState::Streaming {
+            self.rest_for(now, u64::from(REST_US), DropReason::FlashLimit, transport);
+        }
     }
 
     /// True if the device has fallen silent.

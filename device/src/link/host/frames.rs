@@ -73,7 +73,9 @@ impl HostLink {
         if self.last_frame.is_some_and(|last| !frame_newer(frame, last)) {
             return Err(DropReason::NotNewer);
         }
-        self.rests(now, [target_at, dark_from], planes, transport)?;
+        if let Some((_, reason)) = self.rest {
+            return Err(reason);
+        }
         if self.credit() == 0 {
             return Err(DropReason::NoCredit);
         }
@@ -83,6 +85,8 @@ impl HostLink {
             }
             return Err(DropReason::LinkBusy);
         }
+        // A frame that is not sent adds no light: the device repeats the one before.
+        self.rests(now, [target_at, dark_from], planes, transport)?;
         let has_base = !self.key_due && self.last_frame.is_some();
         let forms = match &mut self.compactor {
             Some(compactor) => compactor.compact(planes, has_base),
@@ -91,6 +95,9 @@ impl HostLink {
         let forms = &forms[..schedule.len()];
         let bytes = self.send_packets(now, (frame, target_at, dark_from), planes, forms, transport)?;
         self.count_sent(now, frame, planes, forms, bytes);
+        if let Some(reported) = &mut self.reported {
+            reported.sent(frame, self.field.luminance());
+        }
         Ok(())
     }
 
@@ -170,9 +177,6 @@ impl HostLink {
         planes: &[u8],
         transport: &mut dyn Transport,
     ) -> Result<(), DropReason> {
-        if let Some((_, reason)) = self.rest {
-            return Err(reason);
-        }
         let Some(slots) = self.slots else { return Ok(()) };
         // Frames are sent even while an order keeps them dark.
         let shown = match self.ordered {
@@ -188,10 +192,21 @@ impl HostLink {
                 (self.settings.limits.rest_us(limit), DropReason::LightLimit(limit))
             }
         };
+        self.rest_for(now, rest_us, reason, transport);
+        Err(reason)
+    }
+
+    /// Keeps the field dark for `rest_us`.
+    pub(super) fn rest_for(
+        &mut self,
+        now: HostTime,
+        rest_us: u64,
+        reason: DropReason,
+        transport: &mut dyn Transport,
+    ) {
         // If it does not get through now, `poll` repeats it until the device confirms it.
         let _ = self.give(now, Verb::Black, transport);
         self.rest = Some((now.plus_ns((rest_us * 1000) as i64), reason));
-        Err(reason)
     }
 }
 

@@ -74,6 +74,11 @@ impl FieldCount {
         (self.slot, self.held) = (None, Brightness::default());
     }
 
+    /// Mean luminance of the frame that was counted last; 0 if it is kept dark or no limit of flashes is on.
+    pub(super) fn luminance(&self) -> u32 {
+        self.held.luminance
+    }
+
     /// Counts a frame for the slot that `times`, its target and the end of its light, lie in; returns the limit that it would
     /// exceed. The device is dark then, until a frame is sent.
     ///

@@ -40,6 +40,10 @@ pub(crate) struct Facts {
     pub next_frame: AtomicU64,
     /// The slot after the last one to be planned; 0 while it is not known.
     pub end_slot: AtomicU64,
+    /// Slots that each frame gets: more than one if renderer, packing or link is slower than the slots.
+    pub slots_a_frame: AtomicU64,
+    /// Slots for which the light of a frame must last at least, because the next may come as late.
+    pub light_slots: AtomicU64,
     /// Slots from one planned frame to the next, in thousandths, averaged over the last frames.
     pub stride_milli: AtomicU64,
     /// Frames wait for busy stages, and none has found a stage idle for long.
@@ -76,6 +80,8 @@ impl Facts {
             alive_at_ns: AtomicI64::new(now.0),
             next_frame: AtomicU64::new(0),
             end_slot: AtomicU64::new(0),
+            slots_a_frame: AtomicU64::new(1),
+            light_slots: AtomicU64::new(1),
             stride_milli: AtomicU64::new(1000),
             queue_stands: AtomicBool::new(false),
             gpu_is_slow: AtomicBool::new(false),

@@ -1,5 +1,6 @@
 //! Decides when a packed frame is sent or left out, does what is due between frames, and ends the light.
 
+use super::cadence::Cadence;
 use super::facts::{Facts, RECEIPT_NS};
 use super::follow::Follower;
 use super::keeper::{is_dark, LinkKeeper};
@@ -11,9 +12,9 @@ use crate::frame::job::{Fate, FrameNote};
 use crate::plan::lead::LeadEstimator;
 use crate::telemetry::projector::ProjectorReport;
 use crate::tracks::TrackSnapshot;
-use dpm_device::link::{HostLink, LinkState, SendOutcome};
+use dpm_device::link::{DropReason, HostLink, LinkState, SendOutcome};
 use dpm_device::time::HostTime;
-use dpm_device::transport::Transport;
+use dpm_device::transport::{Lane, Transport};
 use dpm_handoff::latest::{Publisher, Reader};
 use std::marker::PhantomData;
 use std::sync::atomic::Ordering;
@@ -41,7 +42,7 @@ const DARK_LOOKS_OUTSIDE: u32 = 300;
 /// What happened to a frame that was offered.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) enum Offer {
-    /// The device has no room for it. Offer it again at this instant.
+    /// The device or the medium has no room for it. Offer it again at this instant.
     Again(HostTime),
     /// It was sent or left out; its note records which.
     Settled,
@@ -65,6 +66,7 @@ pub(crate) struct LinkStage<P> {
     slack: SlackMeter,
     queue: QueueWatch,
     standing: StandingWait,
+    cadence: Cadence,
     /// Sessions of the link, and steps of the projector's clock, so far.
     seen: [u64; 2],
     /// `None` if no tracks are sent.
@@ -98,6 +100,7 @@ impl<P: Pace> LinkStage<P> {
             slack: SlackMeter::new(),
             queue: QueueWatch::new(slot_ns),
             standing: StandingWait::new(slot_ns),
+            cadence: Cadence::new(slot_ns),
             seen: [0; 2],
             follower: None,
             slot_ns,
@@ -198,7 +201,7 @@ impl<P: Pace> LinkStage<P> {
             self.ready_at = None;
             return Offer::Settled;
         }
-        if self.waits_for_room(now, note) {
+        if self.waits_for_room(now, note, transport) {
             return Offer::Again(now.plus_ns(CREDIT_STEP_NS));
         }
         self.ready_at = None;
@@ -245,6 +248,7 @@ impl<P: Pace> LinkStage<P> {
     pub(crate) fn taken(&mut self, note: &mut FrameNote, now: HostTime) {
         note.timeline.sent_at = now;
         self.before = [note.timeline.packed_at, now];
+        self.learn_cadence(&note.fate, now);
         let Some([waited_ns, behind_ns]) = self.waits_ns.take() else { return };
         if self.link.measures_timing() && note.is_sent() {
             self.slack.sent(SentFrame {
@@ -288,12 +292,28 @@ impl<P: Pace> LinkStage<P> {
         time.host_of_slot(time.slot_after(arrives_at))
     }
 
-    /// True while a frame must wait for room in the device. It waits at most until its slot begins.
-    fn waits_for_room(&self, now: HostTime, note: &FrameNote) -> bool {
+    /// True while a frame must wait for room in the device or on the medium. It waits at most until its slot begins.
+    fn waits_for_room(&self, now: HostTime, note: &FrameNote, medium: &mut dyn Transport) -> bool {
         self.is_streaming()
-            && self.link.credit() == 0
+            && (self.link.credit() == 0 || !medium.has_room(Lane::Data))
             && now < note.timeline.due_at
             && !self.facts.monitor.stop_requested()
+    }
+
+    /// The cadence learns from a settled frame at `now`.
+    fn learn_cadence(&mut self, fate: &Fate, now: HostTime) {
+        use DropReason::{FlashLimit, LightLimit, LinkLost, NotNewer, NotStreaming};
+        match fate {
+            Fate::Offered(SendOutcome::Sent) => self.cadence.sent(now),
+            Fate::Offered(SendOutcome::Dropped {
+                reason: NotStreaming | LinkLost | NotNewer | FlashLimit | LightLimit(_),
+            }) => self.cadence.pause(),
+            _ => return,
+        }
+        if P::FOLLOWS_CLOCK {
+            self.facts.slots_a_frame.store(self.cadence.slots(), Ordering::Relaxed);
+            self.facts.light_slots.store(self.cadence.light_slots(), Ordering::Relaxed);
+        }
     }
 
     /// Ends the light, step by step: after the last frames' light if the run is complete, at once if a stop was

@@ -3,6 +3,7 @@
 //! Each part takes an instant and what has happened. It returns what to do and when to ask again:
 //!
 //! - [`plan`]: which slot the next frame is for, and when its poses are read;
+//! - `cadence`: how many slots a frame gets;
 //! - [`pack`]: how long to wait for the GPU, and which frame to leave out;
 //! - [`follow`]: what a projector that can move parts of a frame is told of the bodies meanwhile;
 //! - [`link`]: when a frame is sent, the operator's orders, the projector's clock, and how the light ends;
@@ -12,6 +13,7 @@
 //! pace one thread drives all parts under a clock that it moves. [`pace::Pace`] defines the differences between the
 //! two.
 
+mod cadence;
 pub(crate) mod connect;
 pub(crate) mod error;
 pub(crate) mod facts;

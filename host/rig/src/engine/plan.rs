@@ -124,7 +124,8 @@ impl<P: Pace> PlanStage<P> {
     ) {
         let predict_ns = self.horizon.predict_ns(latch.lead_ns, snapshot.latency_ns);
         self.facts.predict_ns.store(predict_ns, Ordering::Relaxed);
-        let stride = self.stride(latch.slot);
+        // The light of a frame lasts until the next one is due.
+        let stride = self.stride(latch.slot).max(self.facts.light_slots.load(Ordering::Relaxed));
         let applied = self.parameters.latest().0;
         if self.used != Some(applied.version) {
             self.used = Some(applied.version);
@@ -163,7 +164,11 @@ impl<P: Pace> PlanStage<P> {
         let mean = before.saturating_mul(15).saturating_add(self.stride(slot) * 1000) / 16;
         self.facts.stride_milli.store(mean, Ordering::Relaxed);
         self.last_slot = Some(slot);
-        self.next_slot = slot + 1;
+        self.next_slot = slot + self.slots_a_frame();
+    }
+
+    fn slots_a_frame(&self) -> u64 {
+        self.facts.slots_a_frame.load(Ordering::Relaxed)
     }
 
     /// Slots from the previous frame to one for `slot`.

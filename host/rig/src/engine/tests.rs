@@ -20,10 +20,11 @@ use crate::plan::link_time::LinkTime;
 use crate::rig::Rig;
 use crate::telemetry::monitor::RunMonitor;
 use crate::tracks::TrackSnapshot;
-use dpm_device::link::{DeviceState, HostLink, SendOutcome};
+use dpm_device::link::{DeviceState, HostLink, Packet, SendOutcome};
 use dpm_device::planes::Raster;
 use dpm_device::time::HostTime;
 use dpm_device::transport::inproc::Direct;
+use dpm_device::transport::{Lane, LinkDevice, SendError, Transport, TransportError};
 use dpm_render::pack::BitPlaneFrame;
 use std::sync::atomic::Ordering;
 use std::sync::Arc;
@@ -49,11 +50,16 @@ struct Bench {
 }
 
 fn bench(flags: &[&str], options: RunOptions) -> Bench {
+    bench_with(flags, options, 1)
+}
+
+/// The same with a mock that holds so many frames.
+fn bench_with(flags: &[&str], options: RunOptions, frame_buffers: u8) -> Bench {
     let rig = rig(flags);
     let monitor = Arc::new(RunMonitor::default());
     let mut now = HostTime(5 * MS);
     let mut setup = MockConfig::new(rig.camera.raster);
-    setup.frame_buffers = 1;
+    setup.frame_buffers = frame_buffers;
     let mock = EmulatedProjector::new(setup, "", 1, now).expect("no faults");
     let mut cable = Direct::new(mock);
     let mut link = HostLink::new(projector::link_settings(&rig.config, rig.camera.raster));
@@ -239,6 +245,91 @@ fn a_frame_waits_for_room_until_its_slot_begins() {
     fourth.timeline.due_at = late;
     assert_eq!(stage.offer(late, &mut fourth, planes.bytes(), true, &mut bench.cable), Offer::Settled);
     assert_eq!(fourth.fate, Fate::TooOld);
+}
+
+/// A cable on which a frame takes `frame_ns`, and on which one frame finds room at a time.
+struct Narrow {
+    cable: Direct<EmulatedProjector>,
+    frame_ns: i64,
+    waiting: Option<(HostTime, Vec<u8>)>,
+}
+
+impl Transport for Narrow {
+    fn send(&mut self, now: HostTime, lane: Lane, packets: &[Packet<'_>]) -> Result<(), SendError> {
+        match lane {
+            Lane::Control => self.cable.send(now, lane, packets),
+            Lane::Data if self.waiting.is_some() => Err(SendError::Busy),
+            Lane::Data => {
+                let bytes = packets.iter().flat_map(Packet::to_vec).collect();
+                self.waiting = Some((now.plus_ns(self.frame_ns), bytes));
+                Ok(())
+            }
+        }
+    }
+
+    fn has_room(&mut self, lane: Lane) -> bool {
+        lane == Lane::Control || self.waiting.is_none()
+    }
+
+    fn receive(
+        &mut self,
+        now: HostTime,
+        sink: &mut dyn FnMut(Lane, HostTime, &[u8]),
+    ) -> Result<(), TransportError> {
+        if let Some((at, bytes)) = self.waiting.take_if(|(at, _)| *at <= now) {
+            self.cable.device_mut().receive(at, Lane::Data, &bytes);
+        }
+        self.cable.receive(now, sink)
+    }
+
+    fn name(&self) -> &str {
+        "narrow"
+    }
+}
+
+/// Light is steady, at every n-th slot, over a cable that carries no frame for each slot: after a quarter of a second no slot
+/// is dark, no fault is latched, and frames are as many as fit.
+#[test]
+fn a_cable_slower_than_its_slots_carries_every_nth_frame_steadily() {
+    for tenths in [15, 44, 125] {
+        let mut bench = bench_with(&["real_time.pace=\"real\""], RunOptions::default(), 4);
+        let (mut plan, mut stage) = (bench.plan::<Real>(), bench.link::<Real>());
+        let frame_ns = tenths * bench.slot_ns / 10;
+        let raster = bench.facts.rig.camera.raster;
+        let other = EmulatedProjector::new(MockConfig::new(raster), "", 2, bench.now).expect("no faults");
+        let cable = std::mem::replace(&mut bench.cable, Direct::new(other));
+        let mut medium = Narrow { cable, frame_ns, waiting: None };
+        let schedule = bench.facts.rig.config.projector.schedule();
+        let planes = vec![0xff; BitPlaneFrame::new(raster, schedule).bytes().len()];
+        let begin = bench.now;
+        let mut blank_at = [0; 2];
+        while bench.now.ns_since(begin) < 4_000 * MS {
+            let before = bench.now;
+            let mut note = bench.planned(&mut plan).expect("no end");
+            let mut now = before;
+            while now < bench.now {
+                now = bench.now.min(now.plus_ns(MS / 5));
+                stage.poll(now, &mut medium);
+            }
+            (note.timeline.rendered_at, note.timeline.packing_at, note.timeline.packed_at) = (now, now, now);
+            while let Offer::Again(at) = stage.offer(now, &mut note, &planes, true, &mut medium) {
+                now = at;
+            }
+            stage.taken(&mut note, now);
+            bench.now = bench.now.max(now);
+            let seconds = bench.now.ns_since(begin) / (1_000 * MS);
+            if seconds < 1 {
+                blank_at[0] = medium.cable.device_mut().projector().status().slots_blank;
+            }
+            blank_at[1] = medium.cable.device_mut().projector().status().slots_blank;
+        }
+        let status = medium.cable.device_mut().projector().status();
+        let fits = (tenths as u64).div_ceil(10);
+        let slots = bench.facts.slots_a_frame.load(Ordering::Relaxed);
+        assert_eq!((status.state, status.faults), (DeviceState::Armed, 0), "{tenths}");
+        assert!((fits - fits / 4..=fits).contains(&slots), "{tenths}: {slots} slots a frame");
+        assert_eq!(blank_at[0], blank_at[1], "{tenths}: dark slots after the first second, {status:?}");
+    }
 }
 
 /// How long after the last frame the projector is told to be dark, nanoseconds; `None`: never.
