@@ -21,6 +21,11 @@ impl PoseFilterBank {
         Some(self.filters.get_mut(usize::from(sample.body.0))?.update(sample))
     }
 
+    /// A body's [`PoseFilter::levels`]; `None` if there is no such body.
+    pub fn levels(&self, body: BodyIndex) -> Option<[i32; 2]> {
+        self.filters.get(usize::from(body.0)).map(PoseFilter::levels)
+    }
+
     /// A body's track as plain data.
     pub fn state(&self, body: BodyIndex) -> Option<TrackState> {
         self.filters.get(usize::from(body.0))?.state()

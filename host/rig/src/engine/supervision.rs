@@ -12,6 +12,7 @@ use super::facts::Facts;
 use super::pulse::{Pulse, Silence, StandingOf};
 use super::slowness::{told, Slowness};
 use crate::telemetry::monitor::{ProjectorHealth, RunCounts};
+use crate::tracks::keys::told as contradicted;
 use dpm_device::time::HostTime;
 use dpm_render::gpu::{AfterLoss, LossBudget};
 use std::sync::atomic::Ordering;
@@ -225,6 +226,7 @@ impl Supervision {
         self.tell_if_slow(now);
         self.tell_if_nothing_is_lit(now);
         self.tell_if_gpu_stays(now);
+        self.tell_of_keys();
         if self.link.observe(link, now, step_ns, self.ask) {
             self.facts.fail(PipelineError::Hung { stage: link.name() });
             return Some(Irreplaceable::Link);
@@ -331,6 +333,21 @@ impl Supervision {
             )
         });
         monitor.note(format!("no frame has been lit for a second, although frames are made{why}"));
+    }
+
+    /// Informs the operator of keys that the motion of a body contradicts.
+    fn tell_of_keys(&self) {
+        let Facts { monitor, rig, .. } = &*self.facts;
+        let prediction = &rig.config.prediction;
+        let keys = [
+            ("prediction.acceleration", prediction.acceleration, "m/s^2"),
+            ("prediction.angular_acceleration", prediction.angular_acceleration, "rad/s^2"),
+        ];
+        for (body, key, level) in monitor.samples().take_contradicted() {
+            if let Some(body) = rig.bodies.get(body) {
+                monitor.note(contradicted(&body.name, level, keys[key]));
+            }
+        }
     }
 
     /// Informs the operator when frames come for every n-th slot only, and when they come for each slot again.

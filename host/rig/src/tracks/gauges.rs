@@ -3,7 +3,7 @@
 
 use crate::config::MAX_TRACKED;
 use dpm_device::tracker::{BodyCounters, BodyIndex, SampleGate, TrackerCounters};
-use std::sync::atomic::{AtomicU64, Ordering};
+use std::sync::atomic::{AtomicI32, AtomicU64, Ordering};
 use std::sync::OnceLock;
 
 /// What became of the tracker's samples in a run, over all times that the tracker was opened. A sample is one pose of
@@ -84,6 +84,9 @@ impl TrackerReport {
 pub(crate) struct TrackerGauges {
     counts: [AtomicU64; COUNTS],
     bodies: OnceLock<Box<[[AtomicU64; BODY_COUNTS]]>>,
+    /// By body: steps by which the keys for acceleration and turning are wrong, each a factor of two; 0 if they are not, or
+    /// once that was read.
+    contradicted: OnceLock<Box<[[AtomicI32; 2]]>>,
 }
 
 const COUNTS: usize = 10;
@@ -142,7 +145,22 @@ impl TrackerGauges {
 
     /// Makes room for `bodies` bodies; once per run.
     pub(crate) fn begin(&self, bodies: usize) {
-        let _ = self.bodies.set((0..bodies.min(MAX_TRACKED)).map(|_| Default::default()).collect());
+        let bodies = bodies.min(MAX_TRACKED);
+        let _ = self.bodies.set((0..bodies).map(|_| Default::default()).collect());
+        let _ = self.contradicted.set((0..bodies).map(|_| Default::default()).collect());
+    }
+
+    /// Where [`super::keys`] stores what contradicts the keys, by body.
+    pub(super) fn contradicted(&self) -> &[[AtomicI32; 2]] {
+        self.contradicted.get().map_or(&[], |all| all)
+    }
+
+    /// Takes what contradicts the keys: body, 0 for acceleration or 1 for turning, and steps.
+    pub(crate) fn take_contradicted(&self) -> impl Iterator<Item = (usize, usize, i32)> + '_ {
+        let all = self.contradicted().iter().enumerate();
+        all.flat_map(|(body, keys)| keys.iter().enumerate().map(move |(key, level)| (body, key, level)))
+            .filter(|(_, _, level)| level.load(Ordering::Relaxed) != 0)
+            .map(|(body, key, level)| (body, key, level.swap(0, Ordering::Relaxed)))
     }
 
     /// The numbers as a report; `None` if no tracker has counted anything.

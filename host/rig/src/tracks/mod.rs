@@ -1,6 +1,7 @@
 //! From the tracker's samples to the tracks of all bodies.
 
 pub mod gauges;
+pub(crate) mod keys;
 mod seen;
 mod source;
 mod stage;

@@ -1,5 +1,6 @@
 //! The first stage of a frame: puts newly arrived samples into the tracks of all bodies.
 
+use super::keys::KeyWatch;
 use super::seen::{SeenBodies, Unseen};
 use super::tracker_frame::TrackerFrame;
 use crate::config::{PredictionConfig, TrackerConfig, MAX_TRACKED};
@@ -9,6 +10,7 @@ use dpm_device::time::HostTime;
 use dpm_device::tracker::{BodyIndex, Tracker, TrackerError};
 use dpm_handoff::latest::Publisher;
 use dpm_tracking::{PoseFilterBank, PoseFilterConfig, TrackState};
+use glam::DVec3;
 use std::sync::Arc;
 use std::time::Duration;
 
@@ -48,6 +50,8 @@ pub struct TrackingStage {
     received_at: Vec<HostTime>,
     /// Samples by body that the filters did not accept.
     contradictory: Vec<u64>,
+    /// Whether the motion contradicts the keys, by body.
+    keys: Vec<KeyWatch>,
     /// What was added to the gauges of the run, and when it is due again.
     added: AddedCounts,
     add_at: HostTime,
@@ -119,6 +123,7 @@ impl TrackingStage {
             lively: None,
             received_at: vec![HostTime(0); bodies],
             contradictory: vec![0; bodies],
+            keys: vec![KeyWatch::default(); bodies],
             added: AddedCounts::new(bodies),
             add_at: HostTime(i64::MIN),
             bodies,
@@ -215,6 +220,13 @@ impl TrackingStage {
         if let Some(gate) = self.tracker.gate() {
             gauges.add(gate, &self.contradictory, &mut self.added);
         }
+        for (i, (keys, contradicted)) in self.keys.iter_mut().zip(gauges.contradicted()).enumerate() {
+            let body = BodyIndex(i as u16);
+            if let (Some(state), Some(levels)) = (self.bank.state(body), self.bank.levels(body)) {
+                let speeds = [state.position.mean.velocity, state.rotation.mean.velocity];
+                keys.look(levels, speeds.map(DVec3::length), contradicted);
+            }
+        }
     }
 
     /// What the tracker says of itself.
@@ -273,6 +285,7 @@ mod tests {
     use crate::config::{Overrides, RigConfig};
     use dpm_device::planes::Raster;
     use dpm_device::pose::Pose;
+    use dpm_device::rng::Draws;
     use dpm_device::tracker::TrackerSample;
     use dpm_handoff::latest::latest;
 
@@ -367,6 +380,66 @@ mod tests {
                 assert_eq!(text.contains(&names[0]), of == 0, "{text}");
                 assert!(text.contains(&names[1]), "{text}");
             }
+        }
+    }
+
+    /// Swings to and fro by 0.1 m, twice a second for 16 m/s^2, or once in two seconds for 1 m/s^2.
+    struct Swings {
+        hz: f64,
+    }
+
+    impl Tracker for Swings {
+        fn poll(
+            &mut self,
+            now: HostTime,
+            sink: &mut dyn FnMut(&TrackerSample),
+        ) -> Result<usize, TrackerError> {
+            let phase = std::f64::consts::TAU * self.hz * now.0 as f64 * 1e-9;
+            // A tenth of a millimetre of noise.
+            let noise = ((Draws::new(1).bits(now.0 as u64) >> 11) as f64 / (1u64 << 53) as f64 - 0.5) * 2e-4;
+            sink(&TrackerSample {
+                body: BodyIndex(0),
+                pose: Pose { position_m: [0.1 * phase.sin() + noise, 0.0, 1.0], ..Pose::IDENTITY },
+                tracked: true,
+                mean_error_m: 0.0,
+                sequence: (now.0 / 1_000_000) as u32,
+                captured_at: now,
+                received_at: now,
+            });
+            Ok(1)
+        }
+
+        fn name(&self) -> &str {
+            "swinging"
+        }
+
+        fn status(&self) -> String {
+            String::new()
+        }
+    }
+
+    #[test]
+    fn a_key_that_the_motion_contradicts_is_found_and_a_right_one_is_not() {
+        for (acceleration, hz, wrong) in [(0.1, 2.0, true), (16.0, 2.0, false), (1000.0, 0.5, true)] {
+            let flags = vec![format!("prediction.acceleration={acceleration}")];
+            let config =
+                RigConfig::demo(&Overrides { flags, ..Default::default() }).unwrap_or_else(|e| panic!("{e}"));
+            let rig = Rig::build(&config, Raster::new(16, 16)).unwrap_or_else(|e| panic!("{e}"));
+            let mut stage = TrackingStage::new(&rig, Box::new(Swings { hz }));
+            let (mut publisher, _reader) = latest(TrackSnapshot::empty(2));
+            let gauges = TrackerGauges::default();
+            gauges.begin(2);
+            let mut found = Vec::new();
+            for step in 0..10_000i64 {
+                let now = HostTime(7_000_000_000 + step * 2_000_000);
+                stage.step(now, &mut publisher).expect("it speaks");
+                stage.add_counts(now, &gauges, false);
+                found.extend(gauges.take_contradicted());
+            }
+            assert_eq!(found.len(), usize::from(wrong), "{acceleration} m/s^2 at {hz} Hz: {found:?}");
+            assert!(found
+                .iter()
+                .all(|(body, key, level)| (*body, *key) == (0, 0) && (*level > 0) == (hz > 1.0)));
         }
     }
 }
