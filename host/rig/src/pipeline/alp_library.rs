@@ -1,13 +1,14 @@
-//! What `dpm doctor` says of the vendor's libraries for a ViALUX ALP. It looks at them and loads none: to load a library
-//! is to run it, and a rig file may name any.
+//! The vendor's libraries for a ViALUX ALP, by the look of their files. None is loaded: to load a library is to run it,
+//! and a rig file may name any.
 
-use super::{Finding, State};
 use dpm_common::unix::{user, user_name};
 use dpm_device::regular_file;
 use std::io::Read;
 use std::os::unix::fs::MetadataExt;
 use std::path::{Path, PathBuf};
 
+/// What to do where there is none.
+pub const REMEDY: &str = "install the vendor's ALP for Linux, see docs/ALP.md";
 /// Where systems keep libraries.
 const FOLDERS: [&str; 6] = [
     "usr/lib/x86_64-linux-gnu",
@@ -22,36 +23,56 @@ const NAMES: [&str; 6] =
     ["libalp51.so", "libalp50.so", "libalp44.so", "libalp43.so", "libalp42.so", "libalp41.so"];
 /// Bytes of the head of an ELF file up to the machine that it is for.
 const HEAD: u64 = 20;
+/// The list that `ldconfig` makes of the libraries in all folders that `/etc/ld.so.conf` names.
+const CACHE: &str = "etc/ld.so.cache";
+/// Bytes of the longest list that is read; a large system has some hundred thousand.
+const MOST_CACHE_BYTES: u64 = 1 << 24;
 
-/// The libraries of these names below `root`.
-fn installed(root: &Path, names: &[&str]) -> Vec<PathBuf> {
-    let all = FOLDERS.iter().flat_map(|folder| names.iter().map(move |name| Path::new(folder).join(name)));
-    all.filter(|file| root.join(file).exists()).map(|file| Path::new("/").join(file)).collect()
+/// The ALP libraries below `root`, in the folders of systems.
+pub fn installed(root: &Path) -> Vec<PathBuf> {
+    FOLDERS
+        .iter()
+        .flat_map(|folder| NAMES.iter().map(move |name| Path::new(folder).join(name)))
+        .filter(|file| root.join(file).exists())
+        .map(|file| Path::new("/").join(file))
+        .collect()
 }
 
-/// The library that a rig file names, or without a name the one that the system has, by the look of its file.
-pub(super) fn library(named: Option<&Path>) -> Finding {
-    let name = "projector";
-    let missing = |found: String| {
-        Finding::new(name, State::Missing, found, "install the vendor's ALP for Linux, see docs/ALP.md")
-    };
-    let of_loader = |name: &str| installed(Path::new("/"), &[name]).into_iter().next();
+/// Where the loader finds the library `name`: in the folders of `search` (`LD_LIBRARY_PATH`), in its list, or where
+/// systems keep libraries.
+fn of_loader(root: &Path, search: &str, name: &str) -> Option<PathBuf> {
+    let named =
+        search.split(':').filter(|folder| !folder.is_empty()).map(|folder| Path::new(folder).join(name));
+    let listed = regular_file::read(&root.join(CACHE), MOST_CACHE_BYTES).unwrap_or_default();
+    let listed: Vec<PathBuf> = listed
+        .split(|byte| *byte == 0)
+        .filter_map(|text| std::str::from_utf8(text).ok())
+        .filter_map(|text| text.find('/').and_then(|at| text.get(at..)))
+        .map(PathBuf::from)
+        .filter(|path| path.file_name().is_some_and(|file| file == name))
+        .collect();
+    let system = FOLDERS.iter().map(|folder| Path::new("/").join(folder).join(name));
+    let there = |file: &PathBuf| root.join(file.strip_prefix("/").unwrap_or(file)).exists();
+    named.filter(|file| file.exists()).chain(listed.into_iter().chain(system).filter(there)).next()
+}
+
+/// The library that a rig file names, or without a name the newest one that the system has; and a doubt about it, empty if
+/// there is none.
+///
+/// # Errors
+/// Which library is missing, or is none for this machine.
+pub fn find(named: Option<&Path>) -> Result<(PathBuf, String), String> {
+    let search = std::env::var("LD_LIBRARY_PATH").unwrap_or_default();
+    let of_loader = |name: &str| of_loader(Path::new("/"), &search, name);
     let file = match named.map(|path| (path, path.to_str())) {
         // The loader looks for a name alone where the system keeps its libraries.
         Some((path, Some(name))) if !name.contains('/') => of_loader(name).ok_or(path.display().to_string()),
         Some((path, _)) => Ok(path.to_owned()),
         None => NAMES.iter().find_map(|name| of_loader(name)).ok_or("an ALP library".into()),
     };
-    match file.map_err(|name| format!("{name}: not found")).and_then(|file| Ok((look_at(&file)?, file))) {
-        Err(why) => missing(format!("ALP: {why}")),
-        Ok((doubt, file)) => {
-            let found = format!("ALP: {} is a library for this machine{doubt}", file.display());
-            let state = if doubt.is_empty() { State::Ok } else { State::Warning };
-            let remedy =
-                "`dpm doctor --load-libraries RIG.toml` runs it, and asks the device what it can show";
-            Finding::new(name, state, found, remedy)
-        }
-    }
+    let file = file.map_err(|name| format!("{name}: not found"))?;
+    let doubt = look_at(&file)?;
+    Ok((file, doubt))
 }
 
 /// Reads the head of a library and who may change it. Returns a doubt, or nothing.
@@ -84,58 +105,75 @@ fn look_at(file: &Path) -> Result<String, String> {
     })
 }
 
-/// The ALP libraries below `root`.
-pub(super) fn libraries(root: &Path) -> Finding {
-    let found = installed(root, &NAMES);
-    if found.is_empty() {
-        let remedy = "needed only for a ViALUX ALP: install the vendor's ALP for Linux";
-        return Finding::new("ALP library", State::Info, "none", remedy);
-    }
-    let found: Vec<String> = found.iter().map(|file| file.display().to_string()).collect();
-    Finding::new("ALP library", State::Ok, found.join(", "), "")
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
     use std::os::unix::fs::PermissionsExt;
 
+    /// A folder of a test that stands for the root of a system.
+    fn root(name: &str) -> PathBuf {
+        std::env::temp_dir().join(format!("dpm-alp-{}-{name}", std::process::id()))
+    }
+
     #[test]
     fn installed_libraries_are_listed() {
-        let root = std::env::temp_dir().join(format!("dpm-doctor-alp-{}", std::process::id()));
+        let root = root("installed");
         let folder = root.join("usr/lib/x86_64-linux-gnu");
         std::fs::create_dir_all(&folder).unwrap();
-        assert_eq!(libraries(&root).state, State::Info);
+        assert!(installed(&root).is_empty());
         for name in ["libalp43.so", "libalp50.so", "libalps.so"] {
             std::fs::write(folder.join(name), "").unwrap();
         }
-        let finding = libraries(&root);
+        let found = installed(&root);
         std::fs::remove_dir_all(&root).unwrap();
-        let expected = "/usr/lib/x86_64-linux-gnu/libalp50.so, /usr/lib/x86_64-linux-gnu/libalp43.so";
-        assert_eq!((finding.state, finding.found.as_str()), (State::Ok, expected));
+        let expected = ["libalp50.so", "libalp43.so"];
+        assert_eq!(found, expected.map(|name| Path::new("/usr/lib/x86_64-linux-gnu").join(name)));
+    }
+
+    /// A run ends where the look finds no library, so the look finds what the loader finds.
+    #[test]
+    fn a_name_is_looked_for_where_the_loader_looks() {
+        let root = root("loader");
+        for folder in ["etc", "opt/vialux", "named"] {
+            std::fs::create_dir_all(root.join(folder)).unwrap();
+        }
+        let find = |search: &str| of_loader(&root, search, "libalp43.so");
+        assert_eq!(find(""), None);
+        std::fs::write(
+            root.join(CACHE),
+            b"glibc-ld.so.cache1.1\0\x01/opt/vialux/libalp43.so\0/lib/libm.so.6\0",
+        )
+        .unwrap();
+        assert_eq!(find(""), None, "listed, and gone since");
+        std::fs::write(root.join("opt/vialux/libalp43.so"), "").unwrap();
+        assert_eq!(find(""), Some("/opt/vialux/libalp43.so".into()));
+        let named = root.join("named/libalp43.so");
+        std::fs::write(&named, "").unwrap();
+        assert_eq!(find(&format!("/nowhere::{}", root.join("named").display())), Some(named));
+        std::fs::remove_dir_all(&root).unwrap();
     }
 
     /// Found in use, R10: the constructor of a library that a rig file named ran as whoever asked the doctor.
     #[test]
     fn a_library_is_judged_by_its_file() {
-        let file = std::env::temp_dir().join(format!("dpm-doctor-libalp-{}.so", std::process::id()));
+        let file = std::env::temp_dir().join(format!("dpm-libalp-{}.so", std::process::id()));
         let judged = |bytes: &[u8], mode| {
             std::fs::write(&file, bytes).unwrap();
             std::fs::set_permissions(&file, std::fs::Permissions::from_mode(mode)).unwrap();
-            library(Some(&file)).state
+            find(Some(&file)).map(|(_, doubt)| doubt)
         };
         // This test is a shared object too: it may be loaded anywhere.
         let head = std::fs::read("/proc/self/exe").unwrap()[..64].to_vec();
-        assert_eq!(judged(&head, 0o644), State::Ok);
-        assert_eq!(judged(&head, 0o666), State::Warning);
+        assert_eq!(judged(&head, 0o644), Ok(String::new()));
+        assert!(judged(&head, 0o666).unwrap().contains("others may change it"));
         for byte in [0, 4, 16, 18] {
             let mut other = head.clone();
             other[byte] ^= 1;
-            assert_eq!(judged(&other, 0o644), State::Missing, "byte {byte}");
+            assert!(judged(&other, 0o644).unwrap_err().contains("no library"), "byte {byte}");
         }
-        assert_eq!(judged(&head[..10], 0o644), State::Missing);
+        assert!(judged(&head[..10], 0o644).is_err());
         std::fs::remove_file(&file).unwrap();
-        assert_eq!(library(Some(&file)).state, State::Missing);
-        assert_eq!(library(Some(Path::new("libalp-of-nobody.so"))).state, State::Missing);
+        assert!(find(Some(&file)).is_err());
+        assert!(find(Some(Path::new("libalp-of-nobody.so"))).unwrap_err().contains("not found"));
     }
 }

@@ -166,6 +166,8 @@ impl fmt::Display for ProjectorHealth {
 #[derive(Debug, Default)]
 pub struct RunMonitor {
     stop: AtomicBool,
+    /// The run compiles shaders or builds its scene: nothing is lit, and it may be abandoned.
+    sets_up: AtomicBool,
     /// The newest order that was not yet taken; 0 for none. The upper half of an ARM contains the number of orders
     /// that had come as signals when the ARM was requested, so that it does not undo a later BLACK or SAFE.
     order: AtomicU64,
@@ -242,7 +244,34 @@ impl RunCounts {
     }
 }
 
+/// A run that sets up, until this is dropped or its projector is about to be opened.
+#[derive(Debug)]
+pub struct SettingUp<'a>(&'a RunMonitor);
+
+impl Drop for SettingUp<'_> {
+    fn drop(&mut self) {
+        self.0.end_set_up();
+    }
+}
+
 impl RunMonitor {
+    /// Declares that the run sets up: it has opened no projector, holds nothing that must be given back, and whoever stops
+    /// it may abandon it.
+    pub fn begin_set_up(&self) -> SettingUp<'_> {
+        self.sets_up.store(true, Ordering::SeqCst);
+        SettingUp(self)
+    }
+
+    /// Declares that the projector is about to be opened: from now on the run ends in order.
+    pub(crate) fn end_set_up(&self) {
+        self.sets_up.store(false, Ordering::SeqCst);
+    }
+
+    /// True while the run sets up.
+    pub fn sets_up(&self) -> bool {
+        self.sets_up.load(Ordering::SeqCst)
+    }
+
     /// Requests an orderly stop of the run: dark, flush, report.
     pub fn request_stop(&self) {
         self.stop.store(true, Ordering::Relaxed);
