@@ -4,8 +4,8 @@
 use crate::config::RigConfig;
 use crate::failure::{Failure, FailureKind};
 use crate::pipeline::projector;
-use crate::run_rig::gpu_options;
-use dpm_render::gpu::Gpu;
+use dpm_render::gpu::{Gpu, GpuOptions};
+use dpm_render::least_memory_bytes;
 
 /// Something that a rig needs.
 pub struct Part {
@@ -45,4 +45,17 @@ pub const PARTS: [Part; 2] = [PROJECTOR, GPU];
 /// The first that is missing.
 pub fn look(config: &RigConfig) -> Result<(), Failure> {
     PARTS.iter().try_for_each(|part| part.look(config))
+}
+
+/// Frames that are in flight at least.
+const FEWEST_SLOTS: usize = 2;
+
+/// Which GPU the rig file asks for.
+pub(crate) fn gpu_options(config: &RigConfig) -> GpuOptions {
+    GpuOptions {
+        validation: std::env::var_os("DPM_VALIDATION").is_some(),
+        device: config.render.gpu.clone(),
+        memory_bytes: least_memory_bytes(config.projector.raster(), &config.render.to_method(), FEWEST_SLOTS),
+        ..GpuOptions::default()
+    }
 }

@@ -13,8 +13,8 @@ use crate::telemetry::trace::write_trace;
 use crate::tracks::SourceError;
 use dpm_common::files::{check_folder, write_atomically};
 use dpm_device::planes::{Channel, Raster};
-use dpm_render::gpu::{validation_messages, Gpu, GpuError, GpuOptions};
-use dpm_render::{least_memory_bytes, RenderError};
+use dpm_render::gpu::{validation_messages, Gpu, GpuError};
+use dpm_render::RenderError;
 use glam::Vec3;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
@@ -178,25 +178,12 @@ pub fn check_output_folder(dir: &Path) -> Result<(), Failure> {
         .map_err(|e| Failure::new(FailureKind::BadInput, format!("{e}; choose another folder with --out")))
 }
 
-/// Frames that are in flight at least.
-const FEWEST_SLOTS: usize = 2;
-
 /// Opens the GPU that the rig file names.
 ///
 /// # Errors
 /// There is no such GPU (exit code 4); the message says what to install.
 pub fn open_gpu(config: &RigConfig) -> Result<Arc<Gpu>, Failure> {
-    Gpu::open(&gpu_options(config)).map_err(|e| Failure::new(FailureKind::NoGpu, e))
-}
-
-/// Which GPU the rig file asks for.
-pub(crate) fn gpu_options(config: &RigConfig) -> GpuOptions {
-    GpuOptions {
-        validation: std::env::var_os("DPM_VALIDATION").is_some(),
-        device: config.render.gpu.clone(),
-        memory_bytes: least_memory_bytes(config.projector.raster(), &config.render.to_method(), FEWEST_SLOTS),
-        ..GpuOptions::default()
-    }
+    Gpu::open(&presence::gpu_options(config)).map_err(|e| Failure::new(FailureKind::NoGpu, e))
 }
 
 /// The smaller raster that software Vulkan traces, with a note about it.
