@@ -133,7 +133,8 @@ impl fmt::Display for ProjectorHealth {
             Self::Lost => write!(f, "lost, dark; plug it in again and the run goes on"),
             Self::Faulted(0) => write!(f, "dark, and it names no fault"),
             Self::Faulted(mask) => {
-                write!(f, "dark, latched faults: {}; {}", faults::names(*mask), remedy(*mask))
+                let kind = if mask & !faults::PASSING != 0 { "latched" } else { "passing" };
+                write!(f, "dark, {kind} faults: {}; {}", faults::names(*mask), remedy(*mask))
             }
             Self::Black => write!(f, "black; `dpm arm` shows the picture again"),
             Self::Frozen => write!(f, "frozen; `dpm arm` lets the picture move again"),
@@ -516,9 +517,12 @@ mod tests {
     fn a_fault_says_what_brings_light_back() {
         for (mask, part) in [
             (0, "names no fault"),
-            (faults::WATCHDOG, "watchdog; no frame came in safety.watchdog_ms; light comes back by itself"),
+            (
+                faults::WATCHDOG,
+                "passing faults: watchdog; no frame came in safety.watchdog_ms; light comes back by itself",
+            ),
             (faults::CHECKSUM_STORM, "packets were damaged; light comes back by itself"),
-            (faults::WATCHDOG | faults::LAMP, "watchdog, lamp; `dpm arm` acknowledges them"),
+            (faults::WATCHDOG | faults::LAMP, "latched faults: watchdog, lamp; `dpm arm` acknowledges them"),
             (faults::HOST_SAFE, "`dpm arm`"),
         ] {
             let told = ProjectorHealth::Faulted(mask).to_string();
