@@ -7,6 +7,7 @@
 //! 100 ms, and the link's thread counted as hung.
 #![allow(unsafe_code)]
 
+use std::ffi::CString;
 use std::io;
 use std::os::fd::AsRawFd;
 use std::time::Duration;
@@ -25,6 +26,20 @@ pub fn open(path: &str, baud: u32) -> serialport::Result<Box<dyn SerialPort>> {
     let port = serialport::new(path, baud).exclusive(true).open_native()?;
     port.clear(serialport::ClearBuffer::Input)?;
     Ok(never_wait(port)?)
+}
+
+/// Why the device file at `path` certainly cannot be opened: absent, or closed to this user. It is not opened.
+pub fn refused(path: &str) -> Option<Refusal> {
+    let path = CString::new(path).ok()?;
+    // SAFETY: a NUL-terminated string that outlives the call.
+    if unsafe { libc::access(path.as_ptr(), libc::R_OK | libc::W_OK) } == 0 {
+        return None;
+    }
+    match io::Error::last_os_error().kind() {
+        io::ErrorKind::NotFound => Some(Refusal::Absent),
+        io::ErrorKind::PermissionDenied => Some(Refusal::Denied),
+        _ => None,
+    }
 }
 
 /// Why a port cannot be opened, as far as the library reports it.

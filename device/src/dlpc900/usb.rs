@@ -101,6 +101,15 @@ pub fn list() -> Result<Vec<UsbPlace>, PortError> {
         .collect())
 }
 
+/// Looks whether a DLPC900 is there, at `place` if that is given, and opens none.
+///
+/// # Errors
+/// [`PortError::NotFound`], or libusb's.
+pub fn look(place: Option<UsbPlace>) -> Result<(), PortError> {
+    let is_there = list()?.into_iter().any(|there| place.is_none_or(|place| place == there));
+    is_there.then_some(()).ok_or(PortError::NotFound)
+}
+
 fn is_dlpc900(d: &Device<Context>) -> bool {
     d.device_descriptor().is_ok_and(|d| (d.vendor_id(), d.product_id()) == (VENDOR, PRODUCT))
 }

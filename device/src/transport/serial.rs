@@ -43,6 +43,24 @@ pub struct SerialSettings {
     pub frame_bytes: usize,
 }
 
+impl SerialSettings {
+    /// Looks whether the port is there and this user may open it, and opens nothing: to open a port raises its control
+    /// lines, which restarts some boards.
+    ///
+    /// # Errors
+    /// Not found, or no permission (with the group to join).
+    pub fn look(&self) -> Result<(), TransportError> {
+        let device = format!("serial port {}", self.path);
+        match tty::refused(&self.path) {
+            None => Ok(()),
+            Some(Refusal::Denied) => {
+                Err(TransportError::PermissionDenied { device, remedy: Refusal::Denied.remedy().into() })
+            }
+            Some(_) => Err(TransportError::NotFound { device }),
+        }
+    }
+}
+
 /// Counters of the line.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct SerialCounters {

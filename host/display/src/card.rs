@@ -29,7 +29,7 @@ use crate::scan_out::{DisplayError, Flip, Picture, Pixels, ScanOut};
 mod find;
 mod guard;
 
-pub use find::{cards, connector_names, connector_names_of, open_for};
+pub use find::{cards, connector_names, connector_names_of, look_for, open_for};
 pub use guard::{let_go, show_black};
 
 use find::path_of;

@@ -14,8 +14,8 @@ use std::time::{Duration, Instant};
 
 use dpm_handoff::path::Lock;
 
-use crate::card::{let_go, open_for, Card};
-use crate::kms::Kms;
+use crate::card::{let_go, look_for, open_for, Card};
+use crate::kms::{Connector, Kms};
 use crate::scan_out::DisplayError;
 
 // The X server of the tests borrows how it sends a descriptor.
@@ -132,6 +132,28 @@ pub fn opener(
             }
             other => other,
         }
+    }
+}
+
+/// The connectors among which [`opener`] would choose, whoever drives them; nothing is taken and nobody is asked. `None`
+/// where only a desktop can tell.
+///
+/// # Errors
+/// No such card, no right to open it, or a desktop that this program cannot ask.
+pub fn look(
+    card: Option<&Path>,
+    connector: Option<&str>,
+    access: Access,
+) -> Result<Option<Vec<Connector>>, DisplayError> {
+    match access {
+        Access::Lent(lender) => desktop(lender).map(|_| None),
+        Access::Alone => look_for(card, connector).map(Some),
+        Access::Auto => match look_for(card, connector) {
+            Err(denied @ DisplayError::Denied(_)) => {
+                desktop(Lender::of_environment().ok_or(denied)?).map(|_| None)
+            }
+            other => other.map(Some),
+        },
     }
 }
 

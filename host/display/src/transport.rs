@@ -2,6 +2,7 @@
 //! is unplugged and comes back.
 
 use std::ffi::OsString;
+use std::path::Path;
 use std::process::{Command, Stdio};
 use std::sync::mpsc::{channel, Receiver, TryRecvError};
 use std::sync::{Arc, OnceLock};
@@ -17,6 +18,7 @@ use dpm_device::transport::{Lane, SendError, Transport, TransportError};
 use dpm_handoff::wake::WaitPolicy;
 
 use crate::kms::Kms;
+use crate::lease::{self, Access};
 use crate::panel::{DisplayCounts, Panel, PanelSettings};
 use crate::scan_out::{DisplayError, ScanOut};
 use crate::set_up::{plan, DisplaySettings};
@@ -49,10 +51,7 @@ pub fn on_card(
     settings: DisplaySettings,
 ) -> Opener {
     Arc::new(move || {
-        let device = || match &settings.connector {
-            Some(connector) => format!("display {connector}"),
-            None => "display".into(),
-        };
+        let device = || device_of(&settings);
         let failed = |e: DisplayError| e.of(device());
         let mut kms = card().map_err(failed)?;
         let connectors = kms.connectors().map_err(failed)?;
@@ -63,6 +62,26 @@ pub fn on_card(
         let name = format!("display {} ({}){lent}", plan.setup.connector, plan.setup.timing);
         Ok(Shown { out: kms, panel: plan.panel, name, warnings: plan.warnings })
     })
+}
+
+/// The display of `settings` in messages.
+fn device_of(settings: &DisplaySettings) -> String {
+    match &settings.connector {
+        Some(connector) => format!("display {connector}"),
+        None => "display".into(),
+    }
+}
+
+/// Looks whether the display of `settings` is there and has its mode. No display is taken.
+///
+/// # Errors
+/// What [`on_card`] would find with the card of [`lease::opener`], as far as it can be seen without taking the display.
+pub fn look(card: Option<&Path>, access: Access, settings: &DisplaySettings) -> Result<(), TransportError> {
+    let connectors = lease::look(card, settings.connector.as_deref(), access);
+    let Some(connectors) = connectors.map_err(|e| e.of(device_of(settings)))? else { return Ok(()) };
+    plan(&connectors, settings)
+        .map(drop)
+        .map_err(|e| TransportError::Unsuitable { device: device_of(settings), why: e.0 })
 }
 
 /// How the program starts the guardian of a display: the command without the display's own arguments.

@@ -13,7 +13,7 @@ use dpm_device::planes::{PlaneSchedule, Raster};
 use dpm_device::time::FrameRate;
 
 #[cfg(feature = "x11")]
-pub use x11::{opener, Window};
+pub use x11::{look, opener, Window};
 
 /// What a rig file says of its window.
 #[derive(Clone, Debug)]
@@ -40,11 +40,23 @@ pub fn interrupt_program() {
 /// The opener of a window in a program that was built without X11: it refuses.
 #[cfg(not(feature = "x11"))]
 pub fn opener(_: WindowSettings, _: impl Fn() + Send + Sync + 'static) -> crate::transport::Opener {
-    std::sync::Arc::new(|| {
-        let why = "this program was built without its feature \"x11\", which shows windows; build it with that feature, \
-                   or choose another projector.backend.kind";
-        Err(dpm_device::transport::TransportError::Unsuitable { device: "window".into(), why: why.into() })
-    })
+    std::sync::Arc::new(|| Err(left_out()))
+}
+
+/// The same without an opener.
+///
+/// # Errors
+/// Always: no window can be shown.
+#[cfg(not(feature = "x11"))]
+pub fn look(_: &WindowSettings) -> Result<(), dpm_device::transport::TransportError> {
+    Err(left_out())
+}
+
+#[cfg(not(feature = "x11"))]
+fn left_out() -> dpm_device::transport::TransportError {
+    let why = "this program was built without its feature \"x11\", which shows windows; build it with that feature, \
+               or choose another projector.backend.kind";
+    dpm_device::transport::TransportError::Unsuitable { device: "window".into(), why: why.into() }
 }
 
 #[cfg(all(test, not(feature = "x11")))]

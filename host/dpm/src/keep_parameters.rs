@@ -1,5 +1,5 @@
-//! Keeps the parameters of a run for the next one: numbers in the rig file, motions in the calibration file. The files
-//! that are replaced are kept beside the new ones.
+//! Keeps the parameters of a run for the next one: numbers in the rig file, motions in the calibration file, which the rig
+//! file then names. The files that are replaced are kept beside the new ones.
 
 use crate::calibrate::nudge::{check_known, keep, Moved};
 use crate::calibrate::results::Results;
@@ -27,20 +27,37 @@ pub(crate) fn no_file() -> Saver {
 /// Writes what is to be kept. Everything is checked before the first file is touched.
 fn save(path: &Path, rig: &Rig, kept: &ToKeep) -> Result<String, String> {
     let results = motions(path, rig, kept)?;
-    let mut told = Vec::new();
-    if !kept.keys.is_empty() {
-        // A link leads to the file that is meant.
-        let path = path.canonicalize().map_err(|e| format!("{}: {e}", path.display()))?;
-        told.push(write_keys(&path, &kept.keys)?);
+    // A link leads to the file that is meant.
+    let path = path.canonicalize().map_err(|e| format!("{}: {e}", path.display()))?;
+    let mut config = rig.config.clone();
+    let mut keys = kept.keys.clone();
+    if let Some(results) = results.as_ref().filter(|_| config.calibration.file.is_none()) {
+        // Without the entry the next run would not have what is kept.
+        keys.push((["calibration", "file"], Setting::Text(name_for(results.path(), &path)?)));
+        config.calibration.file = Some(results.path().to_owned());
     }
+    let edit = if keys.is_empty() { None } else { Some(Edit::prepared(path, &keys)?) };
+    let mut told = Vec::new();
+    // The rig file last, because it must not name a file that is not there.
     if let Some(results) = results {
-        let written = results.save(&rig.config).map_err(|e| {
-            let before = if told.is_empty() { String::new() } else { format!("{}; but ", told.join("; ")) };
-            format!("{before}{e}")
-        })?;
-        told.push(written.replace('\n', " "));
+        told.push(results.save(&config).map_err(|e| e.to_string())?.replace('\n', " "));
+    }
+    if let Some(edit) = edit {
+        told.push(edit.write().map_err(|e| match told.join("; ") {
+            before if before.is_empty() => e,
+            before => format!("{before}; but {e}"),
+        })?);
     }
     Ok(told.join("; "))
+}
+
+/// How the rig file at `rig` names `file`: without a folder if both lie in the same.
+fn name_for(file: &Path, rig: &Path) -> Result<String, String> {
+    let folder = dpm_common::files::folder_of(file).canonicalize();
+    let folder = folder.map_err(|e| format!("{}: {e}", file.display()))?;
+    let name = file.file_name().ok_or_else(|| format!("{}: is no file", file.display()))?;
+    let named = if rig.parent() == Some(&*folder) { PathBuf::from(name) } else { folder.join(name) };
+    named.into_os_string().into_string().map_err(|_| format!("{}: its name is no text", file.display()))
 }
 
 /// The calibration file with the motions of `kept`; `None` if there are none.
@@ -64,23 +81,40 @@ fn motions(path: &Path, rig: &Rig, kept: &ToKeep) -> Result<Option<Results>, Str
     Ok(Some(results))
 }
 
-fn write_keys(path: &Path, keys: &[([&'static str; 2], Setting)]) -> Result<String, String> {
-    let named = |e: &dyn std::fmt::Display| format!("{}: {e}", path.display());
-    let old = regular_file::read_text(path, MAX_FILE_BYTES).map_err(|e| named(&e))?;
-    let new = edited(&old, keys).map_err(|e| named(&e))?;
-    // A file that needs flags beside it is no worse than before.
-    let check = |text: &str| {
-        let purpose = Purpose { at_rest: true, ..Purpose::default() };
-        let base = path.parent().unwrap_or(Path::new(""));
-        RigConfig::parse_for(&path.display().to_string(), text, base, &Overrides::default(), purpose)
-    };
-    if let (Ok(_), Err(wrong)) = (check(&old), check(&new)) {
-        return Err(format!("the rig file would not be valid any more: {wrong}"));
+/// A rig file with other values that can be written.
+struct Edit {
+    path: PathBuf,
+    text: String,
+}
+
+impl Edit {
+    /// The rig file at `path` with the values of `keys`, read and checked. Nothing is written yet.
+    fn prepared(path: PathBuf, keys: &[([&'static str; 2], Setting)]) -> Result<Self, String> {
+        let named = |e: &dyn std::fmt::Display| format!("{}: {e}", path.display());
+        let old = regular_file::read_text(&path, MAX_FILE_BYTES).map_err(|e| named(&e))?;
+        let text = edited(&old, keys).map_err(|e| named(&e))?;
+        // A file that needs flags beside it is no worse than before. The calibration file may be about to be written.
+        let check = |text: &str| {
+            let purpose = Purpose { at_rest: true, calibrates: true, ..Purpose::default() };
+            let base = path.parent().unwrap_or(Path::new(""));
+            RigConfig::parse_for(&path.display().to_string(), text, base, &Overrides::default(), purpose)
+        };
+        if let (Ok(_), Err(wrong)) = (check(&old), check(&text)) {
+            return Err(format!("the rig file would not be valid any more: {wrong}"));
+        }
+        Ok(Self { path, text })
     }
-    let kept = keep_old(path, MAX_FILE_BYTES).map_err(|e| named(&e))?;
-    write_atomically(path, |file| file.write_all(new.as_bytes())).map_err(|e| e.to_string())?;
-    let beside = kept.map_or(String::new(), |old| format!(" (the one before is kept as {})", old.display()));
-    Ok(format!("written: {}{beside}", path.display()))
+
+    /// Writes it; the file before is kept.
+    fn write(&self) -> Result<String, String> {
+        let kept =
+            keep_old(&self.path, MAX_FILE_BYTES).map_err(|e| format!("{}: {e}", self.path.display()))?;
+        write_atomically(&self.path, |file| file.write_all(self.text.as_bytes()))
+            .map_err(|e| e.to_string())?;
+        let beside =
+            kept.map_or(String::new(), |old| format!(" (the one before is kept as {})", old.display()));
+        Ok(format!("written: {}{beside}", self.path.display()))
+    }
 }
 
 fn value_of(setting: &Setting) -> Value {

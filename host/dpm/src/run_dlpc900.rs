@@ -27,6 +27,7 @@ use dpm_rig::failure::{Failure, FailureKind};
 use dpm_rig::order::Order;
 use dpm_rig::pipeline::projector::NO_WATCHDOG;
 use dpm_rig::pipeline::{renderer_settings, PipelineError};
+use dpm_rig::presence;
 use dpm_rig::rig::Rig;
 use dpm_rig::run_rig::open_gpu;
 use dpm_rig::telemetry::monitor::{ProjectorHealth, RunMonitor};
@@ -252,6 +253,7 @@ fn load(
     warnings: &mut Vec<String>,
     monitor: &RunMonitor,
 ) -> Result<(PatternSequence, usize), Failure> {
+    presence::GPU.look(config)?;
     let rig = Rig::build(config, None)?;
     let schedule = config.projector.schedule();
     let most = frames_held(dmd, schedule.len());

@@ -13,7 +13,7 @@ use dpm_rig::pipeline::{renderer_settings, PipelineError};
 use dpm_rig::rig::Rig;
 use dpm_rig::run_rig::{open_gpu, traced_raster};
 use dpm_scene::bvh::{BodyBvh, Refit};
-use dpm_scene::{Body, Deformed, Environment, Material, Scene};
+use dpm_scene::{Body, Deformed, Environment, Material, Scene, TextureRef};
 use serde::Serialize;
 
 /// One part that not every rig needs.
@@ -81,13 +81,17 @@ pub(crate) fn scene_entries(scene: &Scene, needs: &SceneNeeds, clamp: f64) -> Ve
         Environment::Constant(_) => "constant environment",
         Environment::Equirect { .. } => "environment image",
     };
+    let is_of_file = |t: &TextureRef| !scene.textures.get(t.texture as usize).is_some_and(|t| t.of_vertices);
+    let of_file = material(scene, |m| m.textures().flatten().any(|t| is_of_file(&t)));
+    let painted = material(scene, |m| m.textures().any(|t| t.is_some()));
     vec![
-        part(
-            "textures",
-            needs.textures,
-            material(scene, |m| m.textures().any(|t| t.is_some())),
-            "no texture on any triangle",
-        ),
+        match (of_file, painted) {
+            (None, Some(name)) => {
+                let reason = format!("{name}; they become a texture");
+                part("colours of vertices", needs.textures, Some(reason), "no texture on any triangle")
+            }
+            (of_file, _) => part("textures", needs.textures, of_file, "no texture on any triangle"),
+        },
         part(
             "normal maps",
             needs.normal_maps,
@@ -477,6 +481,20 @@ mod tests {
         assert!(off.left_out && off.switched_off && off.why.contains("plane_poses"), "{off:?}");
         let equal = entry(&["projector.weights=\"equal\""]);
         assert!(equal.needed && equal.why.starts_with("24 groups"), "{equal:?}");
+    }
+
+    /// Found in use, O12: the plan named textures of a file that has none, but colours of vertices.
+    #[test]
+    fn textures_that_no_file_has_are_told_as_colours_of_vertices() {
+        let config = RigConfig::demo(&Overrides { variables: vec![], flags: vec![] }).unwrap();
+        let mut scene = Rig::build(&config, None).unwrap().scene;
+        let needs = SceneData::build(&scene).unwrap().needs;
+        let first = |scene: &Scene| scene_entries(scene, &needs, 0.0).remove(0);
+        assert_eq!(first(&scene).feature, "textures");
+        scene.textures.iter_mut().for_each(|texture| texture.of_vertices = true);
+        let entry = first(&scene);
+        assert_eq!(entry.feature, "colours of vertices");
+        assert!(entry.why.contains("they become a texture"), "{}", entry.why);
     }
 
     #[test]

@@ -47,6 +47,7 @@ pub mod picture_stream;
 pub mod pictures;
 pub mod pipeline;
 pub mod plan;
+pub mod presence;
 mod render;
 pub mod rig;
 pub mod run_rig;

@@ -80,6 +80,33 @@ pub enum RigError {
     Unsupported(String),
 }
 
+impl RigError {
+    /// The part of the rig that it is about, and what to do.
+    pub fn part_and_remedy(&self) -> (&'static str, String) {
+        match self {
+            Self::Scene(e) => ("scene", e.remedy()),
+            Self::Projector(_) => (
+                "projector's view",
+                "correct projector.position, projector.look_at, projector.up or projector.horizontal_fov_deg"
+                    .into(),
+            ),
+            Self::Picture { .. } => ("pictures", "name another picture there, or leave the key out".into()),
+            Self::Motion { index, .. } | Self::MotionTable { index, .. } => {
+                ("motion", format!("correct scene.bodies.{index}.motion, see docs/CONFIG.md"))
+            }
+            Self::Calibration(e) if e.key == "calibration.file" => {
+                ("calibration", "measure again with `dpm calibrate`, or leave calibration.file out".into())
+            }
+            Self::Calibration(e) => ("calibration", format!("correct {} as it says", e.key)),
+            Self::Drive(e) => {
+                ("light", format!("correct {}, or measure it again with `dpm calibrate light`", e.key))
+            }
+            Self::UnknownBody { key, .. } => ("observer", format!("write one of these names at {key}")),
+            Self::Unsupported(_) => ("rig", "choose another value there".into()),
+        }
+    }
+}
+
 /// One tracked body of the rig.
 #[derive(Clone, Debug)]
 pub struct RigBody {
@@ -215,6 +242,19 @@ impl Rig {
     /// A part cannot be built. The error names its key.
     pub fn with_config(self, config: &RigConfig) -> Result<Self, RigError> {
         Self::around(self.scene, config, Some(self.camera.raster))
+    }
+
+    /// Builds the projector's camera of `config` and drops it: what a mistake in the scene must not hide.
+    ///
+    /// # Errors
+    /// It cannot be built. The error names its key.
+    pub fn check_camera(config: &RigConfig) -> Result<(), RigError> {
+        let raster = config.projector.raster();
+        match &measured(config)?.projector {
+            Some(section) => measured_camera(section, config, raster).map(drop)?,
+            None => camera(config, raster, &mut Vec::new()).map(drop)?,
+        }
+        Ok(())
     }
 
     fn around(mut scene: Scene, config: &RigConfig, raster: Option<Raster>) -> Result<Self, RigError> {

@@ -2,8 +2,10 @@
 
 use super::pictures::{pictures, to_srgb};
 use crate::config::{ProjectorBackend, RigConfig};
+use crate::engine::connect::ConnectError;
 use crate::failure::{Ended, Failure, FailureKind};
 use crate::pipeline::{self, PipelineError, RunOptions, RunOutcome};
+use crate::presence;
 use crate::rig::{Rig, RigError};
 use crate::telemetry::monitor::RunMonitor;
 use crate::telemetry::report::Report;
@@ -11,8 +13,8 @@ use crate::telemetry::trace::write_trace;
 use crate::tracks::SourceError;
 use dpm_common::files::{check_folder, write_atomically};
 use dpm_device::planes::{Channel, Raster};
-use dpm_render::gpu::{validation_messages, Gpu, GpuError, GpuOptions};
-use dpm_render::{least_memory_bytes, RenderError};
+use dpm_render::gpu::{validation_messages, Gpu, GpuError};
+use dpm_render::RenderError;
 use glam::Vec3;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
@@ -26,6 +28,10 @@ use std::sync::Arc;
 pub fn run_rig(config: &RigConfig, monitor: &Arc<RunMonitor>) -> Result<Ended<Report>, Failure> {
     // Checked before the run, because the run's report is written there.
     check_output_folder(&config.output.dir)?;
+    // What can be seen missing is, before minutes are spent.
+    presence::look(config)?;
+    // Nothing is lit yet: whoever stops the run waits for nothing.
+    let setting_up = monitor.begin_set_up();
     let gpu = open_gpu(config)?;
     let mut notes = Vec::new();
     let raster = traced_raster(config, &gpu, &mut notes);
@@ -48,7 +54,11 @@ pub fn run_rig(config: &RigConfig, monitor: &Arc<RunMonitor>) -> Result<Ended<Re
     let keep_frames = if output.images && has_light { window } else { 0 };
     let slots = config.slots_to_run();
     let options = RunOptions { frames: config.run.frames, slots, keep_frames, ..RunOptions::default() };
-    let mut outcome = pipeline::run(rig.clone(), &gpu, options, monitor)?;
+    let mut outcome = match pipeline::run(rig.clone(), &gpu, options, monitor) {
+        Err(PipelineError::Connect(ConnectError::Stopped)) => return Ok(stopped_before_light(config)),
+        other => other?,
+    };
+    drop(setting_up);
     let _writing = dpm_common::stopping::WritingFiles::begin();
     let mut ended = Ended::from(std::mem::take(&mut outcome.report));
     ended.report.warnings.splice(0..0, notes);
@@ -77,14 +87,38 @@ pub fn run_rig(config: &RigConfig, monitor: &Arc<RunMonitor>) -> Result<Ended<Re
             .warnings
             .push(format!("{count} messages of the Vulkan validation layer, the first: {first}"));
     }
-    let path = output.dir.join("report.json");
+    write_report(&mut ended, &output.dir);
+    Ok(ended)
+}
+
+/// The end of a run that was stopped before its projector was up, with its report in the output folder.
+pub fn stopped_before_light(config: &RigConfig) -> Ended<Report> {
+    let p = &config.projector;
+    let mut ended = Ended::from(Report {
+        raster: [p.width, p.height],
+        planes: p.schedule().len() as u32,
+        frame_rate_hz: p.frame_rate.hz(),
+        pace: config.real_time.pace.word(),
+        gpu: "none".into(),
+        method: config.render.method.word(),
+        prediction: config.prediction.on,
+        stopped: true,
+        warnings: vec![ConnectError::Stopped.to_string()],
+        ..Report::default()
+    });
+    write_report(&mut ended, &config.output.dir);
+    ended
+}
+
+/// Writes the report into the folder `dir`, and names the file in it.
+fn write_report(ended: &mut Ended<Report>, dir: &Path) {
+    let path = dir.join("report.json");
     ended.report.files.push(path.clone());
     let text = ended.report.to_json();
     let written = write_atomically(&path, |out| std::io::Write::write_all(out, text.as_bytes()));
     if ended.keep(written.map_err(|e| cannot_write(&path, &e))).is_none() {
         ended.report.files.pop();
     }
-    Ok(ended)
 }
 
 /// The largest number of notes printed at the start. The report contains all of them.
@@ -144,21 +178,12 @@ pub fn check_output_folder(dir: &Path) -> Result<(), Failure> {
         .map_err(|e| Failure::new(FailureKind::BadInput, format!("{e}; choose another folder with --out")))
 }
 
-/// Frames that are in flight at least.
-const FEWEST_SLOTS: usize = 2;
-
 /// Opens the GPU that the rig file names.
 ///
 /// # Errors
 /// There is no such GPU (exit code 4); the message says what to install.
 pub fn open_gpu(config: &RigConfig) -> Result<Arc<Gpu>, Failure> {
-    let options = GpuOptions {
-        validation: std::env::var_os("DPM_VALIDATION").is_some(),
-        device: config.render.gpu.clone(),
-        memory_bytes: least_memory_bytes(config.projector.raster(), &config.render.to_method(), FEWEST_SLOTS),
-        ..GpuOptions::default()
-    };
-    Gpu::open(&options).map_err(|e| Failure::new(FailureKind::NoGpu, e))
+    Gpu::open(&presence::gpu_options(config)).map_err(|e| Failure::new(FailureKind::NoGpu, e))
 }
 
 /// The smaller raster that software Vulkan traces, with a note about it.

@@ -39,8 +39,10 @@ pub enum SceneError {
         remedy: String,
     },
     /// The rig file names a node that does not exist, or exists several times.
-    #[error("{problem} (nodes with a name: {known})")]
+    #[error("{key}: {problem} (nodes with a name: {known})")]
     Node {
+        /// The key of the rig file.
+        key: String,
         /// The name and the problem.
         problem: String,
         /// Names to choose from.
@@ -72,6 +74,25 @@ pub enum SceneError {
 }
 
 impl SceneError {
+    /// What to do about it, for whoever writes the rig file.
+    pub fn remedy(&self) -> String {
+        match self {
+            Self::InFile { problem, .. } => problem.remedy(),
+            Self::Read(_) => "correct scene.file: it is taken from the rig file's own folder".into(),
+            Self::Node { key, .. } => {
+                format!("write one of these names at {key} in the rig file, letter by letter, or name the node so in the file")
+            }
+            Self::Animation { .. } => "correct scene.animation in the rig file".into(),
+            Self::Broken { .. } => {
+                "correct this object in the program that wrote the file, or name another scene.file".into()
+            }
+            Self::TooLarge { .. } | Self::Unsupported { .. } | Self::TimedOut(_) => {
+                "change the file so, or name another scene.file; docs/SCENES.md says what is read".into()
+            }
+            Self::Internal(_) => "please report it with the file; until then name another scene.file".into(),
+        }
+    }
+
     /// A contradiction inside the file.
     pub(crate) fn broken(object: impl Into<String>, problem: impl Into<String>) -> Self {
         Self::Broken { object: object.into(), problem: problem.into() }

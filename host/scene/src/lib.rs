@@ -322,6 +322,8 @@ pub struct Texture {
     pub wrap_v: Wrap,
     /// No interpolation.
     pub nearest: bool,
+    /// No file has it: it was made of the colours of vertices.
+    pub of_vertices: bool,
     /// Of a clip: when each of its pictures ends, in nanoseconds from the beginning of a round; rising, above 0. Empty: there is
     /// one picture.
     pub ends_ns: Vec<i64>,
@@ -331,7 +333,8 @@ impl Texture {
     /// One picture that repeats, and is interpolated.
     pub fn repeated([width, height]: [u32; 2], texels: Vec<[u8; 4]>, srgb: bool) -> Self {
         let (wrap_u, wrap_v) = (Wrap::Repeat, Wrap::Repeat);
-        Self { width, height, texels, srgb, wrap_u, wrap_v, nearest: false, ends_ns: vec![] }
+        let (nearest, of_vertices, ends_ns) = (false, false, vec![]);
+        Self { width, height, texels, srgb, wrap_u, wrap_v, nearest, of_vertices, ends_ns }
     }
 
     /// Texels of one picture.

@@ -31,6 +31,7 @@ mod real_pace;
 mod references;
 mod rig_files;
 mod scene_files;
+mod security;
 mod stability_on_gpu;
 mod structure;
 mod tracks;

@@ -79,11 +79,28 @@ impl UsbSettings {
         ))
     }
 
+    /// Looks whether the device is there and may be opened, and claims nothing.
+    ///
+    /// # Errors
+    /// No USB, no such device, or no permission.
+    pub fn look(&self) -> Result<(), TransportError> {
+        self.find(&context(&self.describe())?).map(drop)
+    }
+
     /// The open device with its interface claimed, and its name with the device file in it.
     pub(super) fn open_handle(
         &self,
         context: &Context,
     ) -> Result<(DeviceHandle<Context>, String), TransportError> {
+        let (handle, name) = self.find(context)?;
+        match claim(&handle) {
+            Ok(()) => Ok((handle, name)),
+            Err(e) => Err(TransportError::of_usb("claim the interface of", name, e)),
+        }
+    }
+
+    /// The open device, and its name with the device file in it.
+    fn find(&self, context: &Context) -> Result<(DeviceHandle<Context>, String), TransportError> {
         let name = self.describe();
         let devices = context.devices().map_err(|e| TransportError::of_usb("look for", name.clone(), e))?;
         let mut refused = None;
@@ -94,12 +111,7 @@ impl UsbSettings {
             }
             let name = format!("{name} at {}", node_of(&device));
             match self.try_open(&device) {
-                Ok(Some(handle)) => {
-                    return match claim(&handle) {
-                        Ok(()) => Ok((handle, name)),
-                        Err(e) => Err(TransportError::of_usb("claim the interface of", name, e)),
-                    }
-                }
+                Ok(Some(handle)) => return Ok((handle, name)),
                 Ok(None) => {}
                 Err(e) => refused = Some(TransportError::of_usb("open", name, e)),
             }

@@ -94,7 +94,7 @@ pub fn join(section: &str, key: &str) -> String {
 }
 
 /// The name in `known` of which `name` is most likely a misspelling: at most two letters or a third of them differ.
-fn nearest<'k>(name: &str, known: &[&'k str]) -> Option<&'k str> {
+pub fn nearest<'k>(name: &str, known: &[&'k str]) -> Option<&'k str> {
     let limit = (name.chars().count() / 3).max(if name.len() > 3 { 2 } else { 1 });
     known.iter().map(|k| (edit_distance(name, k), *k)).filter(|(d, _)| *d <= limit).min().map(|(_, k)| k)
 }

@@ -58,9 +58,23 @@ pub(super) fn path_of(descriptor: &OwnedFd) -> PathBuf {
 /// # Errors
 /// No such card; or as [`Card::open`].
 pub fn open_for(card: Option<&Path>, connector: Option<&str>) -> Result<Box<dyn Kms>, DisplayError> {
-    if let Some(path) = card {
-        return Ok(Box::new(Card::open(path)?));
+    match card {
+        Some(path) => Ok(Box::new(Card::open(path)?)),
+        None => Ok(Box::new(Card::open(&find(connector)?)?)),
     }
+}
+
+/// The connectors of the card that [`open_for`] would open, whoever drives its displays.
+///
+/// # Errors
+/// No such card, or no right to open it.
+pub fn look_for(card: Option<&Path>, connector: Option<&str>) -> Result<Vec<Connector>, DisplayError> {
+    let path = card.map_or_else(|| find(connector), |path| Ok(path.to_owned()))?;
+    Card::look(&path)?.connectors()
+}
+
+/// The first card that has the connector `connector`, or a display at any.
+fn find(connector: Option<&str>) -> Result<PathBuf, DisplayError> {
     let all = cards();
     let mut first_error = None;
     for path in &all {
@@ -70,7 +84,7 @@ pub fn open_for(card: Option<&Path>, connector: Option<&str>) -> Result<Box<dyn 
         };
         match Card::look(path).and_then(|mut card| card.connectors()) {
             Ok(connectors) if all.len() == 1 || connectors.iter().any(fits) => {
-                return Ok(Box::new(Card::open(path)?));
+                return Ok(path.clone());
             }
             Ok(_) => {}
             Err(e) => first_error = first_error.or(Some(e)),

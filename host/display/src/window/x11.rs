@@ -37,10 +37,7 @@ pub fn opener(settings: WindowSettings, on_close: impl Fn() + Send + Sync + 'sta
     let is_closed = Arc::new(AtomicBool::new(false));
     let on_close: OnClose = Arc::new(on_close);
     Arc::new(move || {
-        let name = match &settings.monitor {
-            Some(monitor) => format!("window on {monitor}"),
-            None => "window".into(),
-        };
+        let name = name_of(&settings);
         if is_closed.load(Ordering::Acquire) {
             return Err(DisplayError::Closed.of(name));
         }
@@ -51,6 +48,24 @@ pub fn opener(settings: WindowSettings, on_close: impl Fn() + Send + Sync + 'sta
         let warnings = window.warnings.clone();
         Ok(Shown { out: Box::new(window), panel, name, warnings })
     })
+}
+
+/// Looks whether a server is there that can show the window of `settings`, and shows none.
+///
+/// # Errors
+/// What [`opener`] would find before it makes a window.
+pub fn look(settings: &WindowSettings) -> Result<(), TransportError> {
+    let name = name_of(settings);
+    panel_settings(settings).map_err(|why| TransportError::Unsuitable { device: name.clone(), why })?;
+    Desk::find(settings).map(drop).map_err(|e| e.of(name))
+}
+
+/// The window of `settings` in messages.
+fn name_of(settings: &WindowSettings) -> String {
+    match &settings.monitor {
+        Some(monitor) => format!("window on {monitor}"),
+        None => "window".into(),
+    }
 }
 
 /// What the panel has to know, or why the rig file cannot be shown in a window.

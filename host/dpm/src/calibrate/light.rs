@@ -3,7 +3,8 @@
 
 use super::dialogue::Dialogue;
 use super::levels::{Field, Levels, Readings, Room};
-use super::pace::{Pace, Paced};
+use super::pace::{Light, Pace, Paced, MOST_INTERRUPTIONS, SPOILT};
+use super::parts::Parts;
 use super::recorder::{wait_until_up, while_stamped, Port, Recorder, Timed};
 use super::results::Results;
 use super::showing::Showing;
@@ -38,6 +39,8 @@ pub struct Progress {
     ambient: Option<Steady>,
     /// Among tiles: whether the sensor lies on one of the complement.
     is_on_complement: Option<bool>,
+    /// How often the light went off.
+    interruptions: u32,
 }
 
 /// How light is measured.
@@ -92,7 +95,16 @@ pub fn measure(
         watch(&levels, &recorder, &dialogue, (Pace::of(config, monitor), monitor))
     };
     let (watched, lights) = while_stamped(config, levels.clone(), (clock, seconds), monitor, read)?;
-    watched.and_then(|samples| {
+    watched.and_then(|(samples, is_interrupted)| {
+        progress.interruptions += u32::from(is_interrupted);
+        let may_repeat = is_interrupted && progress.interruptions <= MOST_INTERRUPTIONS;
+        if is_interrupted {
+            dialogue.tell("The light went off and is back: the levels that it has spoilt are shown again.");
+        }
+        let again = progress.is_on_complement.is_none() && ways.in_tiles || samples.is_empty();
+        if may_repeat && again {
+            return Ok(None);
+        }
         let showing = Showing::of(&lights, config.projector.frame_rate)?;
         let room = Room { flicker_hz, ambient };
         if ways.in_tiles && progress.is_on_complement.is_none() {
@@ -103,7 +115,7 @@ pub fn measure(
         let before = progress.readings.count();
         progress.readings.add(&levels, &showing, &samples, room).map_err(refused)?;
         let missing = all.count() - progress.readings.count();
-        if missing > 0 && progress.readings.count() > before {
+        if missing > 0 && (progress.readings.count() > before || may_repeat) {
             dialogue.tell(&format!(
                 "{missing} of {} levels were not seen whole; they are shown again.",
                 all.count()
@@ -164,22 +176,33 @@ fn levels_of(config: &RigConfig, ways: &Ways, is_on_complement: Option<bool>) ->
     Ok(levels)
 }
 
-/// Waits while the levels are shown, and gives the samples.
+/// Waits while the levels are shown, and gives the samples, and whether the light went off: then those of before.
 fn watch(
     levels: &Levels,
     recorder: &Recorder,
     dialogue: &Dialogue,
     (mut pace, monitor): (Pace<'_>, &RunMonitor),
-) -> Result<Paced<Vec<Timed>>, Failure> {
+) -> Result<Paced<(Vec<Timed>, bool)>, Failure> {
     recorder.take();
     let (begin, mut told) = (Instant::now(), 0);
+    let mut parts = Parts::new(Duration::from_secs_f64(levels.seconds()));
+    let all = |parts: Parts<Vec<Timed>>| parts.all().flatten().collect::<Vec<_>>();
     while begin.elapsed().as_secs_f64() < levels.seconds() {
         if monitor.stop_requested() {
             return Err(refused("the measurement was interrupted; run the same command again"));
         }
         std::thread::sleep(Duration::from_millis(50));
-        if let Some(carried_hz) = pace.look()? {
-            return Ok(Paced::TooFast { carried_hz });
+        let before = begin.elapsed();
+        match pace.look()? {
+            Light::Enough => {}
+            Light::TooFew(carried_hz) => return Ok(Paced::TooFast { carried_hz }),
+            Light::Interrupted => {
+                parts.spoil(before.saturating_sub(SPOILT), begin.elapsed());
+                return Ok(Paced::Done((all(parts), true)));
+            }
+        }
+        if begin.elapsed() >= parts.next() {
+            parts.add(recorder.take().0, begin.elapsed());
         }
         // Full white comes up within two levels.
         let (_, saturated) = recorder.counts();
@@ -195,7 +218,8 @@ fn watch(
             dialogue.tell(&format!("{:3} of {:.0} s", 10 * tens, levels.seconds()));
         }
     }
-    Ok(Paced::Done(recorder.take().0))
+    parts.add(recorder.take().0, begin.elapsed());
+    Ok(Paced::Done((all(parts), false)))
 }
 
 /// Writes the brightness along a sweep: column, row, distance in metres, direction to the lens in the wand's body, level.

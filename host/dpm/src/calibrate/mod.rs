@@ -12,6 +12,7 @@ pub mod lines;
 pub mod nudge;
 pub mod outline;
 pub mod pace;
+pub mod parts;
 pub mod poses;
 pub mod projector;
 pub mod recorder;

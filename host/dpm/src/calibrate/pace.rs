@@ -1,5 +1,6 @@
 //! Whether link and machine carry the frames that a measurement shows, and the rate at which they would.
 
+use dpm_device::link::faults;
 use dpm_device::time::FrameRate;
 use dpm_rig::config::{ProjectorBackend, RigConfig};
 use dpm_rig::failure::{Failure, FailureKind};
@@ -16,6 +17,13 @@ const LEAST_SHARE: f64 = 0.3;
 const ROOM: f64 = 0.8;
 /// Frames a second below which no measurement makes sense.
 const SLOWEST_HZ: u32 = 8;
+/// Light that went off by a fault that passes is awaited for so long; the run gives such a fault a rest of its own.
+const RETURN_WITHIN: Duration = Duration::from_secs(15);
+/// What was seen in so long a time before such a fault was noticed may be spoilt by it: no frame came before the watchdog
+/// acted, and reports of light arrive later than the light.
+pub const SPOILT: Duration = Duration::from_secs(1);
+/// The light of a measurement may go off so many times.
+pub const MOST_INTERRUPTIONS: u32 = 3;
 
 /// What a measurement came to.
 #[derive(Clone, Debug, PartialEq)]
@@ -42,34 +50,77 @@ impl<T> Paced<T> {
     }
 }
 
+/// What a look at a run shows.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub enum Light {
+    /// Enough frames arrive.
+    Enough,
+    /// Only so many frames a second arrive.
+    TooFew(f64),
+    /// A fault that passes put it off, and it is there again. What was seen since [`SPOILT`] before that is to be repeated.
+    Interrupted,
+}
+
 /// Counts the frames of a run while it goes on.
 pub struct Pace<'a> {
     monitor: &'a RunMonitor,
     rate: FrameRate,
     seen: VecDeque<(Instant, u64)>,
+    interruptions: u32,
 }
 
 impl<'a> Pace<'a> {
     /// Of the run of `config` that `monitor` watches, from now on.
     pub fn of(config: &RigConfig, monitor: &'a RunMonitor) -> Self {
-        Self { monitor, rate: config.projector.frame_rate, seen: VecDeque::new() }
+        Self { monitor, rate: config.projector.frame_rate, seen: VecDeque::new(), interruptions: 0 }
     }
 
-    /// Looks at the counters; call it some times a second. Frames a second, if those of the last two seconds are too few.
+    /// Looks at the counters; call it some times a second. Waits for the light where it comes back by itself.
     ///
     /// # Errors
-    /// The projector is dark for another reason than its frames (exit code 3).
-    pub fn look(&mut self) -> Result<Option<f64>, Failure> {
+    /// The projector is dark and stays so, or goes dark again and again (exit code 3).
+    pub fn look(&mut self) -> Result<Light, Failure> {
         let (now, lit) = (Instant::now(), self.monitor.counts().frames_lit);
         match self.monitor.projector() {
-            ProjectorHealth::Up | ProjectorHealth::Stopped => Ok(self.count(now, lit)),
-            // The link was lost and comes up again, with slots that begin elsewhere.
-            ProjectorHealth::Connecting | ProjectorHealth::Lost => Ok(Some(self.carried_hz(now, lit))),
-            health => {
-                let told = format!("the light went off: the projector is {health}");
-                Err(Failure::new(FailureKind::Device, told))
+            ProjectorHealth::Up | ProjectorHealth::Stopped => {
+                Ok(self.count(now, lit).map_or(Light::Enough, Light::TooFew))
             }
+            // The link was lost and comes up again, with slots that begin elsewhere.
+            ProjectorHealth::Connecting | ProjectorHealth::Lost => {
+                Ok(Light::TooFew(self.carried_hz(now, lit)))
+            }
+            ProjectorHealth::Faulted(mask) if mask != 0 && mask & !faults::PASSING == 0 => {
+                self.wait_for_return(mask)
+            }
+            health => Err(went_off(&health.to_string())),
         }
+    }
+
+    /// Waits until the light is back after the passing faults `mask`.
+    fn wait_for_return(&mut self, mask: u32) -> Result<Light, Failure> {
+        self.interruptions += 1;
+        let why = faults::names(mask);
+        if self.interruptions > MOST_INTERRUPTIONS {
+            let told = format!(
+                "{} times ({why}), and each time what it had spoilt was repeated: is the link fast enough? `dpm link-test` \
+                 measures it; end other programs, or raise safety.watchdog_ms",
+                self.interruptions
+            );
+            return Err(went_off(&told));
+        }
+        let begin = Instant::now();
+        while self.monitor.projector() != ProjectorHealth::Up {
+            if begin.elapsed() > RETURN_WITHIN || self.monitor.stop_requested() {
+                return Err(went_off(&format!(
+                    "{why}, and it did not come back: {}",
+                    self.monitor.projector()
+                )));
+            }
+            std::thread::sleep(Duration::from_millis(20));
+        }
+        // The frames that are missing since are those of the fault.
+        self.seen.clear();
+        Ok(Light::Interrupted)
     }
 
     /// Frames a second since the oldest look that is remembered.
@@ -95,17 +146,28 @@ impl<'a> Pace<'a> {
     /// # Errors
     /// As [`Pace::look`].
     pub fn try_out(&mut self) -> Result<Option<f64>, Failure> {
-        let begin = Instant::now();
+        let mut begin = Instant::now();
         let mut last = None;
         while begin.elapsed() < LOOK_BACK + LOOK_BACK / 4 && !self.monitor.stop_requested() {
             std::thread::sleep(Duration::from_millis(50));
-            last = self.look()?;
+            last = match self.look()? {
+                Light::Enough => None,
+                Light::TooFew(carried_hz) => Some(carried_hz),
+                Light::Interrupted => {
+                    begin = Instant::now();
+                    None
+                }
+            };
             if self.monitor.projector() != ProjectorHealth::Up {
                 break;
             }
         }
         Ok(last)
     }
+}
+
+fn went_off(why: &str) -> Failure {
+    Failure::new(FailureKind::Device, format!("the light went off: {why}"))
 }
 
 /// The rig at a rate that a link which carried `carried_hz` can keep.
@@ -124,9 +186,12 @@ pub fn slower(config: &RigConfig, carried_hz: f64) -> Result<RigConfig, Failure>
     }
     let rate = FrameRate::new(hz, 1).filter(|_| hz >= SLOWEST_HZ).ok_or_else(|| {
         let told = format!(
-            "only {carried_hz:.1} of {:.0} frames/s reached the projector, and a measurement needs {SLOWEST_HZ}: is the \
-             link fast enough? `dpm link-test` measures it; end other programs, or take a smaller raster",
-            config.projector.frame_rate.hz()
+            "only {carried_hz:.1} of {:.0} frames/s reached the projector, and a measurement needs {:.0}: it is made at \
+             {:.0} % of what arrives, with {SLOWEST_HZ} frames/s or more. Is the link fast enough? `dpm link-test` measures \
+             it; end other programs, or take a smaller raster",
+            config.projector.frame_rate.hz(),
+            f64::from(SLOWEST_HZ) / ROOM,
+            100.0 * ROOM
         );
         Failure::new(FailureKind::Device, told)
     })?;
@@ -144,7 +209,7 @@ mod tests {
         let monitor = RunMonitor::default();
         let rate = FrameRate::new(60, 1).unwrap();
         let begin = Instant::now();
-        let mut pace = Pace { monitor: &monitor, rate, seen: VecDeque::new() };
+        let mut pace = Pace { monitor: &monitor, rate, seen: VecDeque::new(), interruptions: 0 };
         let mut at = |ms: u64, lit: u64| pace.count(begin + Duration::from_millis(ms), lit);
         let hz = 30.0;
         for ms in (0..=3000).step_by(50) {
@@ -170,9 +235,52 @@ mod tests {
         let slow = slower(&config, 100.0).unwrap();
         assert_eq!(slow.projector.frame_rate, FrameRate::new(80, 1).unwrap());
         assert_eq!(slow.projector.width, config.projector.width);
-        for hz in [9.0, 0.0] {
+        for hz in [9.8, 0.0] {
             let told = slower(&config, hz).unwrap_err().message;
             assert!(told.contains("frames/s reached the projector"), "{told}");
+            // Found in use, O9: "only 9.8 of 60 frames/s reached the projector, and a measurement needs 8".
+            assert!(told.contains("and a measurement needs 10:"), "{told}");
         }
+        assert_eq!(
+            slower(&config, 10.0).unwrap().projector.frame_rate,
+            FrameRate::new(SLOWEST_HZ, 1).unwrap()
+        );
+    }
+
+    /// Found in use, O9: a sweep of half a minute was thrown away for one event of the watchdog, which passes by itself.
+    #[test]
+    fn light_that_comes_back_by_itself_is_awaited_and_other_darkness_is_not() {
+        use ProjectorHealth::{Black, Faulted, Up};
+        let (config, monitor) = (RigConfig::default(), RunMonitor::default());
+        let mut pace = Pace::of(&config, &monitor);
+        for round in 0..=MOST_INTERRUPTIONS {
+            monitor.set_projector(Up);
+            assert_eq!(pace.look().unwrap(), Light::Enough);
+            assert_eq!(pace.seen.len(), 1, "what was counted before the fault is forgotten");
+            monitor.set_projector(Faulted(faults::WATCHDOG));
+            let looked = std::thread::scope(|scope| {
+                scope.spawn(|| {
+                    std::thread::sleep(Duration::from_millis(60));
+                    monitor.set_projector(Up);
+                });
+                pace.look()
+            });
+            match looked {
+                Ok(light) => assert!(light == Light::Interrupted && round < MOST_INTERRUPTIONS, "{light:?}"),
+                Err(told) => assert!(
+                    round == MOST_INTERRUPTIONS && told.message.contains("4 times (watchdog)"),
+                    "{round}: {told}"
+                ),
+            }
+        }
+        for health in [Black, Faulted(faults::WATCHDOG | faults::LAMP), Faulted(0)] {
+            monitor.set_projector(health);
+            let told = Pace::of(&config, &monitor).look().unwrap_err();
+            assert!(told.message.starts_with("the light went off: "), "{told}");
+        }
+        // Whoever stops the measurement does not wait for the light.
+        monitor.set_projector(Faulted(faults::CHECKSUM_STORM));
+        monitor.request_stop();
+        assert!(Pace::of(&config, &monitor).look().unwrap_err().message.contains("did not come back"));
     }
 }

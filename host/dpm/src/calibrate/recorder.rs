@@ -177,6 +177,9 @@ fn wait_for(
     Ok(())
 }
 
+/// Reports of light are kept for so much longer than a measurement takes: for the operator, and for parts that are repeated.
+const SPARE_S: f64 = 150.0;
+
 /// Slot and first photon of each lit frame.
 pub type Lights = Vec<(u64, HostTime)>;
 
@@ -192,7 +195,7 @@ pub fn while_stamped<T>(
     monitor: &Arc<RunMonitor>,
     work: impl FnOnce() -> Result<T, Failure>,
 ) -> Result<(T, Lights), Failure> {
-    let frames = (config.projector.frame_rate.hz() * (seconds + 60.0)) as usize;
+    let frames = (config.projector.frame_rate.hz() * (seconds + SPARE_S)) as usize;
     while_shown(monitor, || run_pattern_stamped(config, source, (clock, frames), monitor), work)
 }
 

@@ -34,6 +34,11 @@ impl Results {
         Ok(Self { path, file })
     }
 
+    /// Where it lies.
+    pub fn path(&self) -> &Path {
+        &self.path
+    }
+
     /// The rig as it runs with what this file holds, whether or not the rig file names it yet.
     ///
     /// # Errors

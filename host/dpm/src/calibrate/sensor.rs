@@ -3,7 +3,8 @@
 
 use super::codes::{CodeSource, InverseSource};
 use super::dialogue::Dialogue;
-use super::pace::{Pace, Paced};
+use super::pace::{Light, Pace, Paced, SPOILT};
+use super::parts::Parts;
 use super::poses::Poses;
 use super::recorder::{wait_until_up, while_stamped, Port, Recorder, Timed};
 use super::results::Results;
@@ -391,34 +392,46 @@ impl Sweeping<'_> {
         mut pace: Pace<'_>,
         monitor: &RunMonitor,
     ) -> Result<Paced<Collected>, Failure> {
-        let (begin, mut told) = (Instant::now(), 0);
-        let (mut path, mut blocks, mut clipped) = (Vec::new(), Vec::new(), 0);
-        while begin.elapsed().as_secs_f64() < seconds {
+        let begin = Instant::now();
+        let mut path = Vec::new();
+        let mut parts = Parts::new(Duration::from_secs_f64(seconds));
+        while !parts.are_over(begin.elapsed()) {
             if monitor.stop_requested() {
                 return Err(refused("the measurement was interrupted; run the same command again"));
             }
             std::thread::sleep(Duration::from_millis(50));
-            if let Some(carried_hz) = pace.look()? {
-                return Ok(Paced::TooFast { carried_hz });
+            let before = begin.elapsed();
+            match pace.look()? {
+                Light::Enough => {}
+                Light::TooFew(carried_hz) => return Ok(Paced::TooFast { carried_hz }),
+                Light::Interrupted => {
+                    self.recorder.take();
+                    let again = parts.spoil(before.saturating_sub(SPOILT), begin.elapsed());
+                    self.dialogue.tell(&format!(
+                        "The light went off and is back: the last {:.0} s are repeated, go on.",
+                        again.as_secs_f64()
+                    ));
+                }
             }
             path.extend(self.poses.take().into_iter().flatten());
-            let fives = begin.elapsed().as_secs() / 5;
-            if fives > told {
-                told = fives;
+            if begin.elapsed() >= parts.next() {
                 let (fresh, fresh_clipped) = self.recorder.take();
-                clipped += fresh_clipped;
                 let next = match fresh_clipped {
                     0 => guide.next(frame_ns, &fresh, &path),
                     n => format!("{n} blocks are saturated: choose a lower --gain, or go further away"),
                 };
-                blocks.extend(fresh);
-                self.dialogue.tell(&format!("{:3} of {seconds:.0} s: {next}", 5 * fives));
+                let done = parts.add((fresh, fresh_clipped), begin.elapsed());
+                self.dialogue.tell(&format!("{:3.0} of {seconds:.0} s: {next}", done.as_secs_f64()));
             }
         }
         path.extend(self.poses.take().into_iter().flatten());
-        let (fresh, fresh_clipped) = self.recorder.take();
-        blocks.extend(fresh);
-        Ok(Paced::Done((blocks, clipped + fresh_clipped, path)))
+        parts.add(self.recorder.take(), begin.elapsed());
+        let (mut blocks, mut clipped) = (Vec::new(), 0);
+        for (fresh, fresh_clipped) in parts.all() {
+            blocks.extend(fresh);
+            clipped += fresh_clipped;
+        }
+        Ok(Paced::Done((blocks, clipped, path)))
     }
 }
 

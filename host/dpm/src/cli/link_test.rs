@@ -9,6 +9,7 @@ use dpm_lab::link_test::{judge_projector, link_test, Content};
 use dpm_rig::config::RigConfig;
 use dpm_rig::failure::{Failure, FailureKind};
 use dpm_rig::interlock::Interlock;
+use dpm_rig::presence;
 use dpm_rig::rig::Rig;
 use dpm_rig::run_rig::open_gpu;
 use dpm_rig::standing::Identity;
@@ -70,6 +71,7 @@ pub(super) fn execute(args: &LinkTestArgs) -> Result<(), Failure> {
     if args.conformance {
         return judge(args, &config, &stop);
     }
+    presence::PROJECTOR.look(&config)?;
     let rig = Rig::build(&config, None)?;
     let content = if args.prepared {
         Content::prepared(&rig, args.count)

@@ -35,6 +35,7 @@ mod watch;
 use clap::{ColorChoice, CommandFactory, FromArgMatches, Parser, Subcommand};
 use dpm_rig::failure::Failure;
 use dpm_rig::order::Order;
+use std::any::TypeId;
 use std::io::Write;
 use std::process::ExitCode;
 
@@ -179,7 +180,15 @@ fn command() -> clap::Command {
     let version = format!("{} ({})", env!("CARGO_PKG_VERSION"), dpm_common::commit::get());
     let long = format!("{version}\nfeatures: {}", features());
     // Leaked once or twice per process; the parser keeps them for as long.
-    Cli::command().version(&*version.leak()).long_version(&*long.leak())
+    negatives_reach_their_checks(Cli::command().version(&*version.leak()).long_version(&*long.leak()))
+}
+
+/// A number below 0 is no flag: the check of the flag says what is allowed.
+fn negatives_reach_their_checks(command: clap::Command) -> clap::Command {
+    let is_number = |arg: &clap::Arg| arg.get_value_parser().type_id() == TypeId::of::<f64>();
+    command
+        .mut_args(move |arg| if is_number(&arg) { arg.allow_negative_numbers(true) } else { arg })
+        .mut_subcommands(negatives_reach_their_checks)
 }
 
 fn dispatch(command: &Command) -> Result<(), Failure> {

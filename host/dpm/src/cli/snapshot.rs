@@ -42,6 +42,17 @@ pub(super) fn execute(args: &SnapshotArgs) -> Result<(), Failure> {
     let mut flags = args.flags.clone();
     let mut rig = args.file.as_deref();
     let end = rig.and_then(Path::extension).and_then(|end| end.to_str()).map(str::to_ascii_lowercase);
+    if let (Some(file), Some(end)) = (rig, end.as_deref().filter(|end| *end != "toml")) {
+        if !SCENES.contains(&end) && !file.exists() {
+            let told = format!(
+                "{}: there is no such file; name a rig file (.toml) or a scene: .{}. What other programs write can be \
+                 exported as glTF 2.0 (.glb)",
+                file.display(),
+                SCENES.join(", .")
+            );
+            return Err(Failure::new(FailureKind::BadInput, told));
+        }
+    }
     if end.is_some_and(|end| SCENES.contains(&end.as_str())) {
         if let Some(other) = flags.scene.replace(rig.take().unwrap_or(Path::new("")).to_owned()) {
             let told =

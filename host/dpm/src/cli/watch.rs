@@ -24,7 +24,8 @@ use dpm_rig::control::{rig_name, runtime_folder};
 use dpm_rig::failure::{Ended, Failure, FailureKind};
 use dpm_rig::interlock::Interlock;
 use dpm_rig::order::Order;
-use dpm_rig::run_rig::{cannot_write, check_output_folder};
+use dpm_rig::pipeline::leave_behind;
+use dpm_rig::run_rig::{cannot_write, check_output_folder, stopped_before_light};
 use dpm_rig::standing::{state_folder, By, Identity, OrderFile, Stands};
 use dpm_rig::telemetry::monitor::{ProjectorHealth, RunMonitor};
 use dpm_rig::telemetry::report::{to_json, Report};
@@ -50,7 +51,8 @@ pub(crate) fn run_and_report(
     json: bool,
     run: impl FnOnce(&RigConfig, &Arc<RunMonitor>) -> Result<Ended<Report>, Failure> + Send + 'static,
 ) -> Result<(), Failure> {
-    let Ended { report, failure } = watch(rig, run)?;
+    let stopped = |rig: &RigConfig| Ok(stopped_before_light(rig));
+    let Ended { report, failure } = watch_with(rig, Keys::new(), false, stopped, run)?;
     print(&if json { report.to_json() + "\n" } else { report.to_table() });
     failure.map_or(Ok(()), Err)?;
     report.check_lit()
@@ -106,7 +108,7 @@ pub(super) fn watch<T: Send + 'static>(
     rig: RigConfig,
     run: impl FnOnce(&RigConfig, &Arc<RunMonitor>) -> Result<T, Failure> + Send + 'static,
 ) -> Result<T, Failure> {
-    watch_with(rig, Keys::new(), false, run)
+    watch_with(rig, Keys::new(), false, not_begun, run)
 }
 
 /// The same for a run that talks to the operator itself: keys are not read, and no progress is shown.
@@ -117,13 +119,20 @@ pub(super) fn watch_quietly<T: Send + 'static>(
     rig: RigConfig,
     run: impl FnOnce(&RigConfig, &Arc<RunMonitor>) -> Result<T, Failure> + Send + 'static,
 ) -> Result<T, Failure> {
-    watch_with(rig, None, true, run)
+    watch_with(rig, None, true, not_begun, run)
 }
 
+/// The end of a run without a report of its own that was stopped while it set up.
+fn not_begun<T>(_: &RigConfig) -> Result<T, Failure> {
+    Err(Failure::new(FailureKind::Device, "stopped before anything was lit"))
+}
+
+/// `stopped`: the result of a run that is abandoned because a signal came while it set up.
 fn watch_with<T: Send + 'static>(
     rig: RigConfig,
     keys: Option<Keys>,
     is_quiet: bool,
+    stopped: impl FnOnce(&RigConfig) -> Result<T, Failure>,
     run: impl FnOnce(&RigConfig, &Arc<RunMonitor>) -> Result<T, Failure> + Send + 'static,
 ) -> Result<T, Failure> {
     let locks = take_locks(&rig)?;
@@ -174,9 +183,18 @@ fn watch_with<T: Send + 'static>(
         signal_told: false,
         notifier: Notifier::from_environment(),
     };
-    let result = watcher.until_finished(&finished)?;
-    // A panic was already turned into the error above.
-    let _ = worker.join();
+    let result = match watcher.until_finished(&finished)? {
+        Some(result) => {
+            // A panic was already turned into the error above.
+            let _ = worker.join();
+            result
+        }
+        None => {
+            // A driver that compiles shaders hears nothing, and holds nothing that must be given back.
+            leave_behind();
+            stopped(&shown)
+        }
+    };
     let result = match result {
         Ok(_) if stopping::has_panicked() => Err(Failure::new(
             FailureKind::Device,
@@ -238,25 +256,28 @@ struct Watcher<'a> {
 }
 
 impl Watcher<'_> {
-    /// Watches until the run returns its result.
+    /// Watches until the run returns its result. `None` if it was stopped while it set up: it is left behind.
     ///
     /// # Errors
     /// The run will never return: a thread of it hangs.
     fn until_finished<T>(
         &mut self,
         finished: &Receiver<Result<T, Failure>>,
-    ) -> Result<Result<T, Failure>, Failure> {
+    ) -> Result<Option<Result<T, Failure>>, Failure> {
         let mut ticks = 0u32;
         loop {
             match finished.recv_timeout(TICK) {
-                Ok(result) => return Ok(result),
+                Ok(result) => return Ok(Some(result)),
                 Err(RecvTimeoutError::Timeout) => {}
                 Err(RecvTimeoutError::Disconnected) => {
                     let told = "the run ended by a panic (see above)";
-                    return Ok(Err(Failure::new(FailureKind::Device, told)));
+                    return Ok(Some(Err(Failure::new(FailureKind::Device, told))));
                 }
             }
             self.follow_orders();
+            if self.signal_told && self.monitor.sets_up() {
+                return Ok(None);
+            }
             self.monitor.take_notes().iter().for_each(|note| self.teller.note(note));
             if let Some(why) = self.monitor.gave_up() {
                 // The projector has been told to go dark by a thread that does not hang.

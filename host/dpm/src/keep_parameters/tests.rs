@@ -98,3 +98,37 @@ fn a_motion_that_cannot_be_kept_is_refused_before_a_file_is_touched() {
     assert_eq!(std::fs::read_to_string(&path).unwrap(), RIG);
     assert!(no_file()(&rig, &ToKeep::default()).unwrap_err().contains("rigs/demo.toml"));
 }
+
+/// Found in use, O7: the motion was kept in a calibration file that the next run did not read, because the rig file did
+/// not name it.
+#[test]
+fn a_motion_that_is_kept_moves_the_light_of_the_next_run() {
+    let folder = Folder::new("named");
+    let text = "# Mine.\n[tracker] # far\nkind = \"natnet\"\nserver = \"127.0.0.1\"\n[[scene.bodies]]\nname = \"bunny\"\n";
+    let (path, rig) = folder.rig(text);
+    assert_eq!(rig.config.calibration.file, None);
+    let moved = DAffine3::from_translation(glam::DVec3::new(0.01, -0.02, 0.03));
+    let kept = ToKeep { bodies: vec![("bunny".to_owned(), moved)], ..ToKeep::default() };
+    let told = saver(path.clone())(&rig, &kept).unwrap();
+    assert!(told.contains("calibration.toml") && !told.contains("name it in the rig file"), "{told}");
+    let written = std::fs::read_to_string(&path).unwrap();
+    assert_eq!(written, format!("{text}\n[calibration]\nfile = \"calibration.toml\"\n"));
+    assert_eq!(std::fs::read_to_string(folder.0.join("rig.toml.1.old")).unwrap(), text);
+    let purpose = || Purpose { at_rest: true, ..Purpose::default() };
+    let next = RigConfig::load_for(&path, &Overrides::default(), purpose()).unwrap();
+    let body = |rig: &Rig| rig.bodies.iter().find(|b| b.name == "bunny").unwrap().mesh_to_body;
+    let next = Rig::build(&next, Raster::new(8, 8)).unwrap();
+    assert!(body(&next).abs_diff_eq(moved, 1e-12), "{:?}", body(&next));
+    // From then on the entry is there, and the rig file stays as it is.
+    let again = DAffine3::from_translation(glam::DVec3::new(0.0, 0.0, 0.5));
+    let kept = ToKeep { bodies: vec![("bunny".to_owned(), again)], ..ToKeep::default() };
+    saver(path.clone())(&next, &kept).unwrap();
+    assert_eq!(std::fs::read_to_string(&path).unwrap(), written);
+    // A rig file in which the entry cannot be made leaves both files as they were.
+    let (path, rig) = folder.rig(&format!("{text}[projector]\nwidth = 640\nheight = 480\n"));
+    std::fs::remove_file(folder.0.join("calibration.toml")).unwrap();
+    std::fs::write(&path, "calibration = {}\n").unwrap();
+    let told = saver(path.clone())(&rig, &kept).unwrap_err();
+    assert!(told.contains("by hand"), "{told}");
+    assert!(!folder.0.join("calibration.toml").exists());
+}

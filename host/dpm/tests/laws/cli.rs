@@ -179,3 +179,23 @@ fn error_lists_its_groups_and_refuses_budgets_and_numbers_that_are_none() {
     let nothing = dpm(&["error", "merge", "--out", "/nonexistent"], &[]);
     assert!(code(&nothing) == 2 && err(&nothing).contains("--index"), "{}", err(&nothing));
 }
+
+/// Found in use, O12: clap advised "-- -3", and a picture that is not there was told as a rig file.
+#[test]
+fn what_was_meant_is_what_the_message_speaks_of() {
+    let rig = concat!(env!("CARGO_MANIFEST_DIR"), "/../../rigs/mock.toml");
+    for (args, told) in [
+        (&["run", rig, "--seconds", "-3"][..], "--seconds -3.0: must be above 0 and at most 1e9"),
+        (&["calibrate", "wand", rig, "--seconds", "-3"][..], "write seconds, 0.1 to 3600"),
+        (&["snapshot", "gone.fbx"][..], "gone.fbx: there is no such file"),
+    ] {
+        let output = dpm(args, &[]);
+        assert_eq!(code(&output), 2, "{args:?}: {}", err(&output));
+        assert!(err(&output).contains(told), "{args:?}: {}", err(&output));
+        assert!(
+            !err(&output).contains("rig file: No such") && !err(&output).contains("-- -3"),
+            "{}",
+            err(&output)
+        );
+    }
+}

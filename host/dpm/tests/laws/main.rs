@@ -9,6 +9,7 @@ mod manual;
 mod opencv_light;
 mod pattern;
 mod peer;
+mod presence;
 mod real_pace;
 mod report;
 mod rig_file;

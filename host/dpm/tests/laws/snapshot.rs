@@ -103,6 +103,8 @@ fn a_far_greater_exposure_is_told() {
     let (dark, usual) = (told("0.01"), told("0.7"));
     assert!(dark.contains("the scene is dark, so its pictures are "), "{dark}");
     assert!(!usual.contains("the scene is dark"), "{usual}");
+    // Found in use, O12: every success ended with two lines of pictures that its method does not have.
+    assert!(!usual.contains("\nno "), "{usual}");
 }
 
 /// Scenes and rig files of other kinds.

@@ -12,6 +12,7 @@ use dpm_common::files::write_atomically;
 use dpm_rig::config::RigConfig;
 use dpm_rig::failure::{Ended, Failure};
 use dpm_rig::pipeline::{self, RunOptions, RunOutcome};
+use dpm_rig::presence;
 use dpm_rig::rig::Rig;
 use dpm_rig::run_rig::{cannot_write, check_output_folder, open_gpu, traced_raster};
 use dpm_rig::telemetry::interval::{Interval, IntervalKind};
@@ -57,6 +58,7 @@ pub fn profile_rig(
         let rig = Arc::new(Rig::build(config, None)?);
         (pipeline::run_prepared(rig.clone(), options, monitor)?, Vec::new(), rig)
     } else {
+        presence::look(config)?;
         let gpu = open_gpu(config)?;
         let mut notes = Vec::new();
         let rig = Arc::new(Rig::build(config, traced_raster(config, &gpu, &mut notes))?);

@@ -160,8 +160,12 @@ pub fn snapshot(
     warnings.extend(rig.scene.warnings.iter().cloned());
     let mut player = Player::new(&rig, &gpu)?;
     let what = &request.what;
-    let wanted: Vec<_> =
-        SnapshotImage::ALL.into_iter().filter(|i| what.is_empty() || what.contains(i)).collect();
+    // Without names all that the method has; of a name that it has not, the request was refused.
+    let is_wanted = |i: &SnapshotImage| match what.is_empty() {
+        true => missing(*i, &player.method).is_none(),
+        false => what.contains(i),
+    };
+    let wanted: Vec<_> = SnapshotImage::ALL.into_iter().filter(is_wanted).collect();
     player.play(request.frame, wanted.contains(&SnapshotImage::Viewer))?;
     let raster = rig.camera.raster;
     let mut report = SnapshotReport {
@@ -304,12 +308,9 @@ impl<'a> Player<'a> {
     /// Writes a picture, with what belongs to it, into `dir`.
     fn save(&mut self, image: SnapshotImage, dir: &Path, report: &mut SnapshotReport) -> Result<(), Failure> {
         let is_fitted = report.view.is_some();
-        let canvas = match missing(image, &self.method) {
-            Some(why) => Err(why.to_owned()),
-            None if image == SnapshotImage::Viewer => {
-                viewer(self.rig, self.gpu, self.light.make_contiguous(), is_fitted)?
-            }
-            None => Ok(self.views(is_fitted).paint(image)),
+        let canvas = match image {
+            SnapshotImage::Viewer => viewer(self.rig, self.gpu, self.light.make_contiguous(), is_fitted)?,
+            _ => Ok(self.views(is_fitted).paint(image)),
         };
         match canvas {
             Ok(canvas) => report.files.push(save_png(&dir.join(image.name() + ".png"), &canvas)?),

@@ -209,6 +209,25 @@ fn open_with(
     unsafe { instance.create_device(physical, &info, None) }
 }
 
+/// The devices in words.
+fn listed(candidates: &[Candidate]) -> String {
+    let one =
+        |c: &Candidate| format!("{} ({})", c.summary.name, c.summary.refused.as_deref().unwrap_or("usable"));
+    match candidates {
+        [] => "none".into(),
+        all => all.iter().map(one).collect::<Vec<_>>().join(", "),
+    }
+}
+
+/// Why none of the devices that were `found` is opened.
+fn no_device(options: &GpuOptions, only: Option<&DeviceId>, found: String) -> GpuError {
+    let name =
+        options.device.as_ref().map_or(String::new(), |d| format!(" and a name that contains \"{d}\""));
+    let which = only.map_or(String::new(), |id| format!(", the very {} that was lost", id.name));
+    let needed = format!("Vulkan 1.2 with scalarBlockLayout and shaderBufferInt64Atomics{name}{which}");
+    GpuError::NoDevice { found, needed }
+}
+
 impl Gpu {
     /// All devices that the loader knows.
     ///
@@ -228,6 +247,18 @@ impl Gpu {
         Self::open_device(options, None, FIRST_SETUP_WAIT_NS)
     }
 
+    /// Looks whether there is a device that [`Gpu::open`] would try to open, and opens none.
+    ///
+    /// # Errors
+    /// No loader, no driver, or no device that has what is needed.
+    pub fn look(options: &GpuOptions) -> Result<(), GpuError> {
+        let instance = create_instance(false)?;
+        let candidates = candidates(&instance, options)?;
+        let found = listed(&candidates);
+        let is_there = !usable(&instance, candidates, options).is_empty();
+        is_there.then_some(()).ok_or_else(|| no_device(options, None, found))
+    }
+
     /// The devices that the options allow, best first.
     pub(super) fn ranked(options: &GpuOptions) -> Result<Vec<DeviceId>, GpuError> {
         let instance = create_instance(options.validation)?;
@@ -243,12 +274,7 @@ impl Gpu {
     ) -> Result<Arc<Self>, GpuError> {
         let instance = create_instance(options.validation)?;
         let candidates = candidates(&instance, options)?;
-        let found = candidates
-            .iter()
-            .map(|c| format!("{} ({})", c.summary.name, c.summary.refused.as_deref().unwrap_or("usable")))
-            .collect::<Vec<_>>()
-            .join(", ");
-        let found = if found.is_empty() { "none".to_owned() } else { found };
+        let found = listed(&candidates);
         let mut usable = usable(&instance, candidates, options);
         usable.retain(|c| only.is_none_or(|id| c.id == *id));
         let mut first_error = None;
@@ -301,11 +327,7 @@ impl Gpu {
                 setup_wait_ns,
             }));
         }
-        let name =
-            options.device.as_ref().map_or(String::new(), |d| format!(" and a name that contains \"{d}\""));
-        let which = only.map_or(String::new(), |id| format!(", the very {} that was lost", id.name));
-        let needed = format!("Vulkan 1.2 with scalarBlockLayout and shaderBufferInt64Atomics{name}{which}");
-        Err(first_error.unwrap_or(GpuError::NoDevice { found, needed }))
+        Err(first_error.unwrap_or_else(|| no_device(options, only, found)))
     }
 
     /// Describes this device.

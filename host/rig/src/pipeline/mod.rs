@@ -14,6 +14,7 @@
 //! One frame is one [`crate::frame::job::FrameJob`]: memory and a note, boxed once and recycled. In the steady state
 //! no stage allocates, locks or logs, and every wait is bounded. All hand-offs are those of `dpm_handoff`.
 
+pub mod alp_library;
 mod crew;
 mod link;
 mod outcome;
@@ -34,5 +35,5 @@ pub use crate::engine::options::{RunOptions, Stall, StallIn};
 pub use outcome::RunOutcome;
 pub use run::{run, run_over, run_pattern, run_prepared};
 pub use settings::{output, renderer_settings};
-pub use supervisor::has_left_threads_behind;
+pub use supervisor::{has_left_threads_behind, leave_behind};
 pub use threads::on_frame_path;

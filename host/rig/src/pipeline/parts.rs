@@ -115,12 +115,13 @@ impl CrewParts {
             output: output(rig, gpu, options.verify),
             ..renderer_settings(rig)
         };
-        let mut renderer =
-            origin.gpu().map(|gpu| Renderer::new(gpu, &rig.scene, settings(gpu))).transpose()?;
+        // The tracker first: to open it takes a moment, and shaders may take a minute.
         let tracker: Box<dyn Tracker> = match origin {
             Origin::Pattern(..) => Box::new(NoTracker),
             _ => open_for(rig, clock, HostTime(0))?,
         };
+        let mut renderer =
+            origin.gpu().map(|gpu| Renderer::new(gpu, &rig.scene, settings(gpu))).transpose()?;
         let memory = (0..options.in_flight.max(2))
             .map(|_| frame_memory(rig, renderer.as_mut()))
             .collect::<Result<_, _>>()?;

@@ -1,8 +1,10 @@
 //! Opens the medium of `[projector.backend]`, and derives the link's settings from the rig file.
 
+use super::alp_library;
 use crate::config::{
     AlpConfig, AlpWeights, Compaction, DisplayConfig, DisplayEncoding, DisplayLease, Dlpc900BehindConfig,
-    Pace, ProjectorBackend, ResponseConfig, RigConfig, WindowConfig,
+    Pace, ProjectorBackend, ResponseConfig, RigConfig, SerialProjectorConfig, UsbProjectorConfig,
+    WindowConfig,
 };
 use crate::engine::connect::ConnectError;
 use crate::standing::Identity;
@@ -87,19 +89,13 @@ pub fn open(
     };
     Ok(match &config.projector.backend {
         ProjectorBackend::Usb(usb) => {
-            let settings = UsbSettings {
-                vendor_id: usb.vendor_id,
-                product_id: usb.product_id,
-                serial: usb.serial_number.clone(),
-                depth: usb.transfers_in_flight as usize,
-                ..UsbSettings::new(frame_bytes)
-            };
+            let settings = usb_settings(usb, frame_bytes);
             let warnings = settings.memory_advice().into_iter().collect();
             let transport = Box::new(UsbTransport::open(settings).map_err(failed)?);
             Some(Medium { transport, warnings })
         }
         ProjectorBackend::Serial(serial) => {
-            let settings = SerialSettings { path: serial.port.clone(), baud: serial.baud, frame_bytes };
+            let settings = serial_settings(serial, frame_bytes);
             // The locks and the standing orders of this run are those of the device that it has found.
             let (first, backend) =
                 (Identity::of(&config.projector.backend), config.projector.backend.clone());
@@ -114,6 +110,59 @@ pub fn open(
         ProjectorBackend::Alp(alp) => Some(open_alp(config, alp, frame_bytes, surroundings)?),
         ProjectorBackend::Mock(_) | ProjectorBackend::Dlpc900(_) => None,
     })
+}
+
+/// Looks whether the projector of a rig file is there and may be used. It takes milliseconds, and nothing is opened, lit
+/// or loaded; [`open`] may still find more. A DLPC900 is opened first by its own run.
+///
+/// # Errors
+/// What is missing, in the words of [`open`] where that finds it too.
+pub fn look(config: &RigConfig) -> Result<(), ConnectError> {
+    let raster = config.projector.raster();
+    let frame_bytes = frame_bytes(raster, config.projector.schedule().len());
+    let looked = match &config.projector.backend {
+        ProjectorBackend::Usb(usb) => usb_settings(usb, frame_bytes).look(),
+        ProjectorBackend::Serial(serial) => serial_settings(serial, frame_bytes).look(),
+        ProjectorBackend::Display(display) => look_at_display(config, display, raster),
+        ProjectorBackend::Window(window) => {
+            dpm_display::window::look(&window_settings(config, window, raster))
+        }
+        ProjectorBackend::Alp(alp) => {
+            alp_library::find(alp.library.as_deref()).map(drop).map_err(|why| TransportError::Unsuitable {
+                device: "ALP".into(),
+                why: format!("{why}; {}", alp_library::REMEDY),
+            })
+        }
+        ProjectorBackend::Mock(_) | ProjectorBackend::Dlpc900(_) => Ok(()),
+    };
+    looked.map_err(|e| ConnectError::from(LinkError::Transport(e)))
+}
+
+fn look_at_display(
+    config: &RigConfig,
+    display: &DisplayConfig,
+    raster: Raster,
+) -> Result<(), TransportError> {
+    let settings = display_settings(config, display, raster)?;
+    dpm_display::transport::look(display.card.as_deref(), access(display), &settings)?;
+    let Some(behind) = &display.dlpc900 else { return Ok(()) };
+    let place = place_of(behind)?;
+    usb::look(place)
+        .map_err(|e| TransportError::Unsuitable { device: usb::describe(place), why: e.to_string() })
+}
+
+fn usb_settings(usb: &UsbProjectorConfig, frame_bytes: usize) -> UsbSettings {
+    UsbSettings {
+        vendor_id: usb.vendor_id,
+        product_id: usb.product_id,
+        serial: usb.serial_number.clone(),
+        depth: usb.transfers_in_flight as usize,
+        ..UsbSettings::new(frame_bytes)
+    }
+}
+
+fn serial_settings(serial: &SerialProjectorConfig, frame_bytes: usize) -> SerialSettings {
+    SerialSettings { path: serial.port.clone(), baud: serial.baud, frame_bytes }
 }
 
 /// What a rig file says of its display.
@@ -150,13 +199,7 @@ fn open_display(
     surroundings: &Surroundings,
 ) -> Result<Medium, TransportError> {
     let settings = display_settings(config, display, raster)?;
-    let access = match display.lease {
-        DisplayLease::Auto => Access::Auto,
-        DisplayLease::Off => Access::Alone,
-        DisplayLease::X11 => Access::Lent(Lender::X11),
-        DisplayLease::Wayland => Access::Lent(Lender::Wayland),
-    };
-    let card = lease::opener(display.card.clone(), display.connector.clone(), access);
+    let card = lease::opener(display.card.clone(), display.connector.clone(), access(display));
     let mut opener = on_card(card, settings);
     if let Some(behind) = &display.dlpc900 {
         opener = feeding(opener, config, display, behind, surroundings)?;
@@ -173,6 +216,27 @@ fn open_display(
     Ok(medium)
 }
 
+/// How the rig comes by its display.
+fn access(display: &DisplayConfig) -> Access {
+    match display.lease {
+        DisplayLease::Auto => Access::Auto,
+        DisplayLease::Off => Access::Alone,
+        DisplayLease::X11 => Access::Lent(Lender::X11),
+        DisplayLease::Wayland => Access::Lent(Lender::Wayland),
+    }
+}
+
+/// A key of the DLPC900 behind a display, refused.
+fn refused_behind(key: &str, why: String) -> TransportError {
+    TransportError::Unsuitable { device: format!("projector.backend.dlpc900.{key}"), why }
+}
+
+/// Where the DLPC900 behind a display is plugged in, if the rig file says it.
+fn place_of(behind: &Dlpc900BehindConfig) -> Result<Option<UsbPlace>, TransportError> {
+    let place = behind.device.as_deref().map(str::parse::<UsbPlace>).transpose();
+    place.map_err(|e| refused_behind("device", e.to_string()))
+}
+
 /// The opener of a display with the DLPC900 that it feeds.
 fn feeding(
     opener: Opener,
@@ -181,17 +245,12 @@ fn feeding(
     behind: &Dlpc900BehindConfig,
     surroundings: &Surroundings,
 ) -> Result<Opener, TransportError> {
-    let refused = |key: &str, why: String| TransportError::Unsuitable {
-        device: format!("projector.backend.dlpc900.{key}"),
-        why,
-    };
-    let place = behind.device.as_deref().map(str::parse::<UsbPlace>).transpose();
-    let place = place.map_err(|e| refused("device", e.to_string()))?;
+    let place = place_of(behind)?;
     let schedule = config.projector.schedule();
     let Some(video) = display.video_patterns(config.projector.frame_rate, &schedule) else {
         return Ok(opener);
     };
-    let video = video.map_err(|e| refused("exposure_us", e.to_string()))?;
+    let video = video.map_err(|e| refused_behind("exposure_us", e.to_string()))?;
     Ok(dpm_display::dlpc900::behind(
         opener,
         Arc::new(move || usb::open(place)),
@@ -200,16 +259,21 @@ fn feeding(
     ))
 }
 
-fn open_window(config: &RigConfig, window: &WindowConfig, raster: Raster) -> Result<Medium, TransportError> {
+/// What a rig file says of its window.
+fn window_settings(config: &RigConfig, window: &WindowConfig, raster: Raster) -> WindowSettings {
     let projector = &config.projector;
-    let settings = WindowSettings {
+    WindowSettings {
         server: window.server.clone(),
         monitor: window.monitor.clone(),
         commit_ns: window.commit_ns(projector.frame_rate.slot_len_ns(0)),
         raster,
         schedule: projector.schedule(),
         rate: projector.frame_rate,
-    };
+    }
+}
+
+fn open_window(config: &RigConfig, window: &WindowConfig, raster: Raster) -> Result<Medium, TransportError> {
+    let settings = window_settings(config, window, raster);
     let mut medium = open_panel(config, dpm_display::window::opener(settings, interrupt_program))?;
     medium.warnings.extend(linear_code_values(config));
     Ok(medium)

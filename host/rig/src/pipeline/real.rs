@@ -73,6 +73,7 @@ pub(super) fn run_at_real_pace(
     let standstill =
         StandstillMonitor::start(Arc::new(clock.sleeping()), STANDSTILL_NS, rights.highest_priority()).ok();
     let watch = Stopwatch::start();
+    monitor.end_set_up();
     let mut far = open_far_end(rig, open, lights_in, options, origin.is_marked(), clock, &rights, monitor)?;
     let (link, time) = bring_up(rig, far.medium.as_mut(), monitor, &mut || {
         clock.wait_until(clock.now().plus_ns(CONNECT_STEP_NS))

@@ -29,7 +29,7 @@ pub fn has_left_threads_behind() -> bool {
 }
 
 /// Records that threads are left behind.
-pub(super) fn leave_behind() {
+pub fn leave_behind() {
     LEFT_BEHIND.store(true, Ordering::Relaxed);
 }
 

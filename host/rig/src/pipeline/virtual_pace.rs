@@ -49,6 +49,7 @@ pub(super) fn run_at_virtual_pace(
 ) -> Result<Ran, PipelineError> {
     // Virtual pace permits only trackers without a clock of their own.
     let mut parts = CrewParts::new(rig, origin, options, Arc::new(|| HostTime(0)))?;
+    monitor.end_set_up();
     // The link comes up just before the first frame. The filters need the time before that.
     let mut now = HostTime(LISTEN_NS);
     let (lights_in, lights) = light_channel();

@@ -133,7 +133,8 @@ impl fmt::Display for ProjectorHealth {
             Self::Lost => write!(f, "lost, dark; plug it in again and the run goes on"),
             Self::Faulted(0) => write!(f, "dark, and it names no fault"),
             Self::Faulted(mask) => {
-                write!(f, "dark, latched faults: {}; {}", faults::names(*mask), remedy(*mask))
+                let kind = if mask & !faults::PASSING != 0 { "latched" } else { "passing" };
+                write!(f, "dark, {kind} faults: {}; {}", faults::names(*mask), remedy(*mask))
             }
             Self::Black => write!(f, "black; `dpm arm` shows the picture again"),
             Self::Frozen => write!(f, "frozen; `dpm arm` lets the picture move again"),
@@ -166,6 +167,8 @@ impl fmt::Display for ProjectorHealth {
 #[derive(Debug, Default)]
 pub struct RunMonitor {
     stop: AtomicBool,
+    /// The run compiles shaders or builds its scene: nothing is lit, and it may be abandoned.
+    sets_up: AtomicBool,
     /// The newest order that was not yet taken; 0 for none. The upper half of an ARM contains the number of orders
     /// that had come as signals when the ARM was requested, so that it does not undo a later BLACK or SAFE.
     order: AtomicU64,
@@ -242,7 +245,34 @@ impl RunCounts {
     }
 }
 
+/// A run that sets up, until this is dropped or its projector is about to be opened.
+#[derive(Debug)]
+pub struct SettingUp<'a>(&'a RunMonitor);
+
+impl Drop for SettingUp<'_> {
+    fn drop(&mut self) {
+        self.0.end_set_up();
+    }
+}
+
 impl RunMonitor {
+    /// Declares that the run sets up: it has opened no projector, holds nothing that must be given back, and whoever stops
+    /// it may abandon it.
+    pub fn begin_set_up(&self) -> SettingUp<'_> {
+        self.sets_up.store(true, Ordering::SeqCst);
+        SettingUp(self)
+    }
+
+    /// Declares that the projector is about to be opened: from now on the run ends in order.
+    pub(crate) fn end_set_up(&self) {
+        self.sets_up.store(false, Ordering::SeqCst);
+    }
+
+    /// True while the run sets up.
+    pub fn sets_up(&self) -> bool {
+        self.sets_up.load(Ordering::SeqCst)
+    }
+
     /// Requests an orderly stop of the run: dark, flush, report.
     pub fn request_stop(&self) {
         self.stop.store(true, Ordering::Relaxed);
@@ -487,9 +517,12 @@ mod tests {
     fn a_fault_says_what_brings_light_back() {
         for (mask, part) in [
             (0, "names no fault"),
-            (faults::WATCHDOG, "watchdog; no frame came in safety.watchdog_ms; light comes back by itself"),
+            (
+                faults::WATCHDOG,
+                "passing faults: watchdog; no frame came in safety.watchdog_ms; light comes back by itself",
+            ),
             (faults::CHECKSUM_STORM, "packets were damaged; light comes back by itself"),
-            (faults::WATCHDOG | faults::LAMP, "watchdog, lamp; `dpm arm` acknowledges them"),
+            (faults::WATCHDOG | faults::LAMP, "latched faults: watchdog, lamp; `dpm arm` acknowledges them"),
             (faults::HOST_SAFE, "`dpm arm`"),
         ] {
             let told = ProjectorHealth::Faulted(mask).to_string();

@@ -72,6 +72,20 @@ pub fn open_for(
     open(&rig.config.tracker, keys, motions, clock, start)
 }
 
+/// Opens the tracker of a rig file for `bodies` by their names alone, without a scene. The mock in this process, which
+/// plays the scene's bodies, has none then. A recording starts at `start`.
+///
+/// # Errors
+/// Its address, file or settings are wrong.
+pub fn open_for_names(
+    config: &RigConfig,
+    bodies: Vec<BodyKey>,
+    clock: Arc<dyn HostClock>,
+    start: HostTime,
+) -> Result<Box<dyn Tracker>, SourceError> {
+    open(&config.tracker, bodies, Vec::new(), clock, start)
+}
+
 /// Opens the tracker of a rig file for bodies that need not be the rig's, such as a wand. Poses are in the rig's world.
 /// Their times are the tracker's own: `tracker.latency_us` is not applied. The mock in this process has no such bodies.
 ///

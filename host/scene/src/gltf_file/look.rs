@@ -261,6 +261,7 @@ impl Reader<'_> {
             nearest: sampler
                 .as_ref()
                 .is_some_and(|s| s.mag_filter() == Some(gltf::texture::MagFilter::Nearest)),
+            of_vertices: false,
             ends_ns: vec![],
         })
     }

@@ -146,6 +146,7 @@ impl Paint {
         Texture {
             wrap_u: Wrap::Clamp,
             wrap_v: Wrap::Clamp,
+            of_vertices: true,
             ..Texture::repeated([width, height], texels, true)
         }
     }

@@ -7,10 +7,12 @@ use dpm_common::clock::{Clock, MonotonicClock};
 use dpm_device::dlpc900::driver::Dlpc900;
 use dpm_device::dlpc900::usb::{describe, UsbHid, UsbPlace};
 use dpm_device::link::{faults, DeviceHello, HostLink, LinkState};
+use dpm_device::tracker::BodyKey;
 use dpm_device::transport::Transport;
 use dpm_rig::config::{Dlpc900Config, ProjectorBackend, RigConfig, TrackerConfig};
-use dpm_rig::pipeline::connect;
 use dpm_rig::pipeline::projector::{self, Surroundings};
+use dpm_rig::pipeline::{alp_library, connect};
+use dpm_rig::presence;
 use dpm_rig::rig::Rig;
 use dpm_rig::standing::Identity;
 use dpm_rig::telemetry::monitor::RunMonitor;
@@ -22,22 +24,47 @@ const LISTEN_NS: i64 = 3_000_000_000;
 /// Time between two polls of the tracker, nanoseconds.
 const POLL_EVERY_NS: i64 = 500_000;
 
-/// Which bodies the tracker reports, and how often.
-pub(super) fn tracker(rig: &Rig) -> Finding {
+/// The bodies that the tracker should report: those of the rig, or where the scene could not be read those that the rig
+/// file names. `None` if only the scene's file has their names.
+fn bodies(config: &RigConfig, rig: Option<&Rig>) -> Option<Vec<BodyKey>> {
+    let named = &config.scene.bodies;
+    let key =
+        |(i, name): (usize, &String)| BodyKey { name: name.clone(), id: named.get(i).and_then(|b| b.id) };
+    let names: Vec<&String> = match rig {
+        Some(rig) => rig.bodies.iter().map(|b| &b.name).collect(),
+        None if named.is_empty() => return None,
+        None => named.iter().map(|b| &b.name).collect(),
+    };
+    Some(names.into_iter().enumerate().map(key).collect())
+}
+
+/// Which bodies the tracker reports, and how often. `rig`: the rig of `config`, if its scene could be read.
+pub(super) fn tracker(config: &RigConfig, rig: Option<&Rig>) -> Finding {
     let name = "tracker";
-    if matches!(rig.config.tracker, TrackerConfig::Mock(_)) {
+    if matches!(config.tracker, TrackerConfig::Mock(_)) {
         return Finding::new(name, State::Info, "the mock in this process", "");
     }
-    if rig.bodies.is_empty() {
+    let Some(bodies) = bodies(config, rig) else {
+        let found = "which bodies it has to report is in the scene's file, which could not be read";
+        return Finding::new(
+            name,
+            State::Warning,
+            found,
+            "name them as scene.bodies, or correct the scene first",
+        );
+    };
+    if bodies.is_empty() {
         return Finding::new(name, State::Info, "no body is tracked", "");
     }
     let clock = MonotonicClock::new(0);
     let start = clock.now();
-    let mut tracker = match dpm_rig::tracks::open_for(rig, Arc::new(move || clock.now()), start) {
+    let opened =
+        dpm_rig::tracks::open_for_names(config, bodies.clone(), Arc::new(move || clock.now()), start);
+    let mut tracker = match opened {
         Ok(tracker) => tracker,
         Err(e) => return Finding::new(name, State::Missing, e.to_string(), "see docs/TRACKERS.md"),
     };
-    let mut seen = vec![0u32; rig.bodies.len()];
+    let mut seen = vec![0u32; bodies.len()];
     let failed = loop {
         let now = clock.now();
         if now.ns_since(start) > LISTEN_NS {
@@ -54,7 +81,7 @@ pub(super) fn tracker(rig: &Rig) -> Finding {
         clock.wait_until(now.plus_ns(POLL_EVERY_NS));
     };
     let seconds = 1e-9 * LISTEN_NS as f64;
-    let told = rig.bodies.iter().zip(&seen).map(|(body, count)| match count {
+    let told = bodies.iter().zip(&seen).map(|(body, count)| match count {
         0 => format!("\"{}\" is not seen", body.name),
         _ => format!("\"{}\" {:.0} times a second", body.name, f64::from(*count) / seconds),
     });
@@ -80,11 +107,23 @@ pub(super) fn projector(config: &RigConfig, loads: bool) -> Finding {
         Ok(locks) => locks,
         Err(e) => return failed(e.message),
     };
+    if let Err(missing) = presence::PROJECTOR.look(config) {
+        return failed(missing.message);
+    }
     let answered = match &config.projector.backend {
         ProjectorBackend::Mock(_) => {
             return Finding::new("projector", State::Info, "the mock in this process", "");
         }
-        ProjectorBackend::Alp(alp) if !loads => return super::alp::library(alp.library.as_deref()),
+        ProjectorBackend::Alp(alp) if !loads => match alp_library::find(alp.library.as_deref()) {
+            Ok((file, doubt)) => {
+                let found = format!("ALP: {} is a library for this machine{doubt}", file.display());
+                let state = if doubt.is_empty() { State::Ok } else { State::Warning };
+                let remedy =
+                    "`dpm doctor --load-libraries RIG.toml` runs it, and asks the device what it can show";
+                return Finding::new("projector", state, found, remedy);
+            }
+            Err(why) => Err(why),
+        },
         ProjectorBackend::Dlpc900(dlpc900) => controller(dlpc900),
         _ => linked(config),
     };

@@ -1,7 +1,6 @@
 //! `dpm doctor`: what this machine can do, line by line, and how to fix what is missing; with a rig file also whether that
 //! rig can run here.
 
-mod alp;
 mod devices;
 mod rig;
 
@@ -14,9 +13,10 @@ use dpm_common::realtime::{self, Refusal};
 use dpm_display::kms::Connector;
 use dpm_render::gpu::{DeviceSummary, GpuOptions};
 use dpm_rig::failure::{Failure, FailureKind};
+use dpm_rig::pipeline::alp_library;
 use dpm_rig::telemetry::report::to_json;
 use std::fs;
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 
 /// Flags of `dpm doctor`.
 #[derive(clap::Args, Clone, Debug)]
@@ -105,7 +105,7 @@ pub(super) fn execute(args: &DoctorArgs) -> Result<(), Failure> {
     findings.extend(system.usb());
     findings.push(system.serial_ports());
     findings.extend(displays(&display::look()));
-    findings.push(alp::libraries(&system.root));
+    findings.push(alp_libraries(&system.root));
     let of_rig = config.as_ref().map(|config| rig::findings(config, args.load_libraries));
     let missing = |of: &[Finding]| {
         of.iter().filter(|f| f.state == State::Missing).map(|f| f.name.clone()).collect::<Vec<_>>()
@@ -242,6 +242,17 @@ fn displays(all: &[Seen]) -> Vec<Finding> {
         findings.push(Finding::new("displays", State::Info, "no graphics card that can set modes", ""));
     }
     findings
+}
+
+/// The ALP libraries below `root`.
+fn alp_libraries(root: &Path) -> Finding {
+    let found = alp_library::installed(root);
+    if found.is_empty() {
+        let remedy = "needed only for a ViALUX ALP: install the vendor's ALP for Linux";
+        return Finding::new("ALP library", State::Info, "none", remedy);
+    }
+    let found: Vec<String> = found.iter().map(|file| file.display().to_string()).collect();
+    Finding::new("ALP library", State::Ok, found.join(", "), "")
 }
 
 /// The result of trying a right on a thread that ended at once.
@@ -478,7 +489,6 @@ fn table(findings: &[Finding]) -> String {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use std::path::Path;
 
     struct Root(PathBuf);
 

@@ -7,9 +7,10 @@ use super::{Finding, State};
 use dpm_calibration::file;
 use dpm_rig::calibration_steps::age::{aged, days_since, OLD_DAYS};
 use dpm_rig::calibration_steps::is_simulated;
-use dpm_rig::config::{LiveSource, RigConfig};
+use dpm_rig::config::{BodyConfig, LiveSource, PictureSource, RigConfig};
 use dpm_rig::picture_stream::look_at;
-use dpm_rig::rig::Rig;
+use dpm_rig::presence;
+use dpm_rig::rig::{Rig, RigError};
 use dpm_rig::standing::{standing_in, state_folder, Identity};
 use std::net::{SocketAddr, TcpListener};
 use std::path::Path;
@@ -23,16 +24,23 @@ const MOST_WARNINGS: usize = 4;
 /// Everything that can be said of the rig of `config`. `loads`: the code of libraries that it names may run.
 pub(super) fn findings(config: &RigConfig, loads: bool) -> Vec<Finding> {
     let mut all = vec![set_up(config)];
-    match Rig::build(config, None) {
-        Err(e) => all.push(Finding::new("scene", State::Missing, e.to_string(), "correct the rig file")),
-        Ok(rig) => {
-            all.extend([scene(&rig), devices::tracker(&rig)]);
-            all.extend(pictures(&rig));
+    let rig = Rig::build(config, None);
+    match &rig {
+        Err(e) => {
+            all.push(faulty(e));
+            // The camera is built after the scene, and a mistake in either hides none in the other.
+            let camera =
+                matches!(e, RigError::Scene(_) | RigError::Picture { .. }).then(|| Rig::check_camera(config));
+            all.extend(camera.and_then(Result::err).as_ref().map(faulty));
         }
+        Ok(rig) => all.push(scene(rig)),
     }
+    all.push(devices::tracker(config, rig.as_ref().ok()));
+    all.extend(pictures(config));
     all.push(calibration(config));
     all.extend(standing_order(config));
     all.push(devices::projector(config, loads));
+    all.extend(gpu(config));
     all.extend(page(config));
     all.push(output(&config.output.dir));
     all
@@ -50,6 +58,27 @@ fn set_up(config: &RigConfig) -> Finding {
         Identity::of(&p.backend)
     );
     Finding::new("rig", State::Info, found, "")
+}
+
+/// A part of the rig that cannot be built.
+fn faulty(error: &RigError) -> Finding {
+    let (part, remedy) = error.part_and_remedy();
+    Finding::new(part, State::Missing, error.to_string(), remedy)
+}
+
+/// The GPU that a run would take, if there is none or the rig file asks for a certain one.
+fn gpu(config: &RigConfig) -> Option<Finding> {
+    let part = presence::GPU;
+    match (part.look(config), &config.render.gpu) {
+        (Err(missing), _) => {
+            let remedy = "render.gpu names a part of one of the devices above; without it the best is taken";
+            Some(Finding::new(part.name, State::Missing, missing.message, remedy))
+        }
+        (Ok(()), Some(name)) => {
+            Some(Finding::new(part.name, State::Ok, format!("there is one named {name:?}"), ""))
+        }
+        (Ok(()), None) => None,
+    }
 }
 
 fn scene(rig: &Rig) -> Finding {
@@ -71,7 +100,7 @@ fn scene(rig: &Rig) -> Finding {
 }
 
 /// The bodies that show what another program makes. Without it they are black, and all else works.
-fn pictures(rig: &Rig) -> Vec<Finding> {
+fn pictures(config: &RigConfig) -> Vec<Finding> {
     let finding = |body: &str, source: &LiveSource| {
         let name = format!("pictures of {body}");
         match look_at(source) {
@@ -81,7 +110,11 @@ fn pictures(rig: &Rig) -> Vec<Finding> {
             }
         }
     };
-    rig.live_pictures().map(|(body, source, _)| finding(body, source)).collect()
+    let live = |body: &BodyConfig| match &body.texture {
+        Some(PictureSource::Live(source)) => Some(finding(&body.name, source)),
+        _ => None,
+    };
+    config.scene.bodies.iter().filter_map(live).collect()
 }
 
 /// Whether the rig was measured, what of it, and how long ago.
@@ -212,7 +245,7 @@ mod tests {
     fn a_body_without_its_pipe_is_a_warning() {
         let of = |texture: &str| {
             let body = format!("scene.bodies=[{{ name = \"bunny\", texture = \"{texture}\" }}]");
-            pictures(&Rig::build(&demo(&[body]), None).unwrap())
+            pictures(&demo(&[body]))
         };
         let missing = &of("pipe:/nowhere/bunny")[0];
         assert_eq!((missing.state, &missing.name[..]), (State::Warning, "pictures of bunny"));
@@ -221,7 +254,7 @@ mod tests {
             "{missing:?}"
         );
         assert!(of("pipe:/etc/passwd")[0].found.contains("it is no named pipe"));
-        assert!(pictures(&Rig::build(&demo(&[]), None).unwrap()).is_empty());
+        assert!(pictures(&demo(&[])).is_empty());
     }
 
     #[test]

@@ -2,6 +2,7 @@
 
 use std::collections::HashSet;
 
+use dpm_common::keys::read::nearest;
 use glam::Vec3;
 
 use super::super::super::{BodySelector, LoadOptions, SceneError};
@@ -60,17 +61,20 @@ pub(crate) fn choose_bodies(
     let present = descendants(document, &roots);
     let names: Vec<Option<&str>> =
         present.iter().map(|&i| document.nodes().nth(i).and_then(|n| n.name())).collect();
-    let find = |name: &str| find_node(&names, &present, name);
-    let mut virtual_nodes = options.virtual_nodes.iter().map(|n| find(n)).collect::<Result<Vec<_>, _>>()?;
+    let find = |key: String, name: &str| find_node(&names, &present, key, name);
+    let of_virtual = |(i, name): (usize, &String)| find(format!("scene.virtual_nodes.{i}"), name);
+    let mut virtual_nodes =
+        options.virtual_nodes.iter().enumerate().map(of_virtual).collect::<Result<Vec<_>, _>>()?;
     let known: HashSet<&str> = names.iter().copied().flatten().collect();
     let named = |name: &str| known.contains(name);
     if options.bodies.iter().all(|b| b.node.is_none() && !named(&b.name)) {
         return Ok(choose_automatically(document, roots, virtual_nodes, &options.bodies, warnings));
     }
     let mut bodies: Vec<Claim> = vec![];
-    for BodySelector { name, node, projected } in &options.bodies {
+    for (i, BodySelector { name, node, projected }) in options.bodies.iter().enumerate() {
+        let key = if node.is_some() { "node" } else { "name" };
         let node = node.as_ref().unwrap_or(name);
-        let index = find(node)?;
+        let index = find(format!("scene.bodies.{i}.{key}"), node)?;
         if let Some(other) = bodies.iter().find(|b| b.node == index) {
             return Err(SceneError::broken(
                 format!("body '{name}'"),
@@ -83,21 +87,34 @@ pub(crate) fn choose_bodies(
     Ok(Claims { bodies, virtual_nodes })
 }
 
-/// The only node named `name` in `present`; `names` holds the nodes' names.
-fn find_node(names: &[Option<&str>], present: &[usize], name: &str) -> Result<usize, SceneError> {
+/// The only node named `name` in `present`; `names` holds the nodes' names. `key` of the rig file names it.
+fn find_node(
+    names: &[Option<&str>],
+    present: &[usize],
+    key: String,
+    name: &str,
+) -> Result<usize, SceneError> {
     let matching: Vec<usize> =
         present.iter().zip(names).filter(|(_, n)| **n == Some(name)).map(|(i, _)| *i).collect();
     if let [one] = matching[..] {
         return Ok(one);
     }
     let known: Vec<String> = names.iter().flatten().take(30).map(|n| shorten(n)).collect();
+    let all: Vec<&str> = names.iter().flatten().copied().collect();
     let problem = match matching.len() {
-        0 => format!("the scene has no node '{name}'"),
+        0 => match nearest(name, &all) {
+            Some(near) => format!("the scene has no node '{name}', did you mean '{near}'?"),
+            None => format!("the scene has no node '{name}'"),
+        },
         n => format!(
             "the scene has {n} nodes named '{name}', so which one is meant cannot be told: rename them"
         ),
     };
-    Err(SceneError::Node { problem, known: if known.is_empty() { "none".into() } else { known.join(", ") } })
+    Err(SceneError::Node {
+        key,
+        problem,
+        known: if known.is_empty() { "none".into() } else { known.join(", ") },
+    })
 }
 
 /// The first objects of the scene with a mesh become the given movable bodies, or, if none are given, two bodies with
