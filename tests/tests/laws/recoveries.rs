@@ -42,7 +42,7 @@ fn after(crews: usize, monitor: &RunMonitor, notes: &mut Vec<String>) -> (usize,
         let alone =
             ["dpm-tracking", "dpm-plan", "dpm-pack"].iter().all(|name| threads.get(*name) == Some(&1));
         let made = notes.iter().filter(|note| note.contains("light again after")).count();
-        if made >= crews && alone && !threads.contains_key("dpm-remake") {
+        if made >= crews && alone {
             return (threads.values().sum(), bytes);
         }
         assert!(begin.elapsed() < PATIENCE, "{made} recoveries: {threads:?}, {notes:#?}");

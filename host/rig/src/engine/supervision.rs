@@ -128,6 +128,8 @@ pub(crate) struct Supervision {
     losses: LossBudget,
     /// Of crews that are replaced on the same GPU.
     hung: LossBudget,
+    /// Frames that had light on some body, and when the last of them was seen.
+    lit: (u64, HostTime),
     /// What the last crew was replaced for, and when the last light before was seen, while none has followed.
     recovering: Option<(String, HostTime)>,
     /// The crew that took over works.
@@ -215,6 +217,7 @@ impl Supervision {
             facts,
             losses: LossBudget::default(),
             hung: LossBudget::new(MOST_HUNG, LossBudget::WITHIN_NS),
+            lit: (0, HostTime(0)),
             recovering: None,
             is_back: false,
             link: Silence::default(),
@@ -239,6 +242,11 @@ impl Supervision {
         step_ns: i64,
     ) -> Option<Irreplaceable> {
         self.tell_if_slow(now);
+        let frames_lit = self.facts.monitor.counts().frames_lit;
+        if frames_lit != self.lit.0 {
+            self.lit = (frames_lit, now);
+            self.tell_of_recovery(Some(now));
+        }
         self.tell_if_nothing_is_lit(now);
         self.tell_if_gpu_stays(now);
         let link_hangs = self.link.observe(link, now, step_ns, self.ask, 0);
@@ -308,7 +316,11 @@ impl Supervision {
             "{}; the stages are restarted, and the projector is dark meanwhile{bound}",
             trouble.in_words()
         ));
-        let since = self.recovering.take().map_or(self.unlit.ended_at.unwrap_or(now), |(_, since)| since);
+        let mut since = if self.lit.0 == 0 { now } else { self.lit.1 };
+        if let Some((cause, before)) = self.recovering.take() {
+            facts.recovered(Recovery { cause, dark_s: None });
+            since = before;
+        }
         self.recovering = Some((trouble.in_words(), since));
         self.is_back = false;
         self.made_by = now.plus_ns(MADE_WITHIN_NS);
@@ -364,13 +376,7 @@ impl Supervision {
         let monitor = &self.facts.monitor;
         let is_up = monitor.projector() == ProjectorHealth::Up;
         let lit = monitor.link().lit_by_device();
-        let results = self.unlit.results;
-        let told = self.unlit.observe(&monitor.counts(), lit, is_up, now);
-        if self.unlit.results != results {
-            self.tell_of_recovery(Some(now));
-        }
-        let monitor = &self.facts.monitor;
-        let Some(is_unlit) = told else { return };
+        let Some(is_unlit) = self.unlit.observe(&monitor.counts(), lit, is_up, now) else { return };
         if !is_unlit {
             return monitor.note("frames are lit again".into());
         }

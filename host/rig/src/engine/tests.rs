@@ -425,9 +425,11 @@ fn a_new_crew_is_waited_for_three_minutes() {
 
 #[test]
 fn the_run_ends_when_the_link_or_the_collector_falls_silent() {
+    // A run that is to stop does not wait for the link to go on.
     for (which, expected) in [(0, Irreplaceable::Link), (1, Irreplaceable::Collector)] {
         let bench = bench(&[], RunOptions::default());
         let mut mind = supervision(&bench.facts);
+        bench.facts.monitor.request_stop();
         let pulses = [Pulse::new("link"), Pulse::new("collector")];
         pulses[which].beat(HostTime(0), 20 * MS);
         let mut at_ms = 0;

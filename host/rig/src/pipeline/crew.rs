@@ -70,6 +70,11 @@ impl CrewState {
         }
     }
 
+    /// Tracking has ended and closed its tracker.
+    pub(super) fn has_left_tracker(&self) -> bool {
+        self.returned[TRACKING].load(Ordering::Acquire)
+    }
+
     /// Packing waits for the GPU to finish `frame` from `now` on, which should take `limit_ns` at most.
     pub(super) fn waits_for_gpu(&self, frame: u64, now: HostTime, limit_ns: u64) {
         self.rendering.store(frame, Ordering::Relaxed);

@@ -8,7 +8,7 @@ use super::projector::{self, OpenMedium};
 use super::rights::Rights;
 use super::run::Ran;
 use super::settings::lead_estimator;
-use super::supervisor::{join_within, Maker, Supervisor, Wreckage};
+use super::supervisor::{join_within, Maker, Supervisor, Workshop, Wreckage};
 use super::threads::{policy, Shared, STAGE_THREADS};
 use crate::config::ProjectorBackend;
 use crate::engine::error::PipelineError;
@@ -292,6 +292,7 @@ impl Threads {
             mind: Supervision::new(shared.facts.clone(), standing_of),
             ports: ports_in,
             maker,
+            workshop: Workshop::default(),
             wreckage: Wreckage::default(),
         };
         let rights = shared.rights.clone();

@@ -1,18 +1,18 @@
 //! The supervisor's thread, which no stage can delay. It checks every other thread and carries out what
 //! [`Supervision`] decides.
 
-use super::crew::{Crew, Port};
+use super::crew::{Crew, CrewState, Port};
 use super::parts::CrewParts;
 use super::threads::Shared;
 use crate::engine::error::PipelineError;
 use crate::engine::facts::Facts;
 use crate::engine::pulse::Pulse;
 use crate::engine::supervision::{Irreplaceable, Making, Remake, Supervision, Trouble, Verdict};
-use crossbeam::channel::{unbounded, Receiver, TryRecvError};
+use crossbeam::channel::{unbounded, Receiver, Sender, TryRecvError};
 use dpm_common::clock::{Clock, Stopwatch};
 use dpm_common::realtime::starvation::{is_worker, Starvation};
 use dpm_device::time::HostTime;
-use dpm_handoff::channel::Sender;
+use dpm_handoff::channel::Sender as PortSender;
 use dpm_render::gpu::devices_unfinished;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::Arc;
@@ -20,6 +20,8 @@ use std::time::Duration;
 
 /// Time between two checks.
 const LOOK: Duration = Duration::from_millis(2);
+/// How long the next crew waits for the tracker of an abandoned one, nanoseconds. A tracking thread that hangs keeps it.
+const TRACKER_FREE_WITHIN_NS: u64 = 50_000_000;
 /// Time between two looks at how the machine serves the run, nanoseconds.
 const SHORTAGE_NS: i64 = 500_000_000;
 /// When the link is over, how long to wait for threads that should end, nanoseconds.
@@ -47,9 +49,53 @@ pub(super) struct Supervisor {
     pub(super) shared: Arc<Shared>,
     pub(super) mind: Supervision,
     /// Informs the link of a new crew.
-    pub(super) ports: Sender<Port>,
+    pub(super) ports: PortSender<Port>,
     pub(super) maker: Maker,
+    pub(super) workshop: Workshop,
     pub(super) wreckage: Wreckage,
+}
+
+/// Where crews are made that take over: a thread that begins with the first of them and lives as long as the run. A thread for
+/// each would have memory of its own for all that it allocates (an arena of the C library), and each would keep some.
+#[derive(Default)]
+pub(super) struct Workshop(Option<(Sender<Order>, Receiver<Made>)>);
+
+/// How to make a crew, and the one before it.
+type Order = (Remake, Arc<CrewState>);
+type Made = Result<CrewParts, PipelineError>;
+
+impl Workshop {
+    /// Orders a crew in the place of `before`.
+    fn order(&mut self, maker: &Maker, remake: Remake, before: Arc<CrewState>) -> std::io::Result<()> {
+        if self.0.is_none() {
+            let ((orders, ordered), (done, made)) = (unbounded::<Order>(), unbounded());
+            let maker = maker.clone();
+            std::thread::Builder::new().name("dpm-remake".into()).spawn(move || {
+                for (remake, before) in ordered {
+                    // The next crew opens the same tracker, whose port has one owner.
+                    let watch = Stopwatch::start();
+                    while !before.has_left_tracker() && watch.elapsed_ns() < TRACKER_FREE_WITHIN_NS {
+                        std::thread::sleep(LOOK);
+                    }
+                    drop(before);
+                    if done.send(maker(remake)).is_err() {
+                        break;
+                    }
+                }
+            })?;
+            self.0 = Some((orders, made));
+        }
+        if let Some((orders, _)) = &self.0 {
+            // Where the thread has panicked, `made` tells.
+            let _ = orders.send((remake, before));
+        }
+        Ok(())
+    }
+
+    /// The crew that was ordered, if it is ready.
+    fn made(&self) -> Result<Made, TryRecvError> {
+        self.0.as_ref().map_or(Err(TryRecvError::Disconnected), |(_, made)| made.try_recv())
+    }
 }
 
 /// Crews that were abandoned and have not ended. What a crew owns is freed by its own threads, each when it ends, so nothing
@@ -119,7 +165,7 @@ enum Shift {
     /// A crew.
     Works(Crew),
     /// Nobody; a new crew is being made, by a thread that may hang in a driver.
-    IsMade(Receiver<Result<CrewParts, PipelineError>>),
+    IsMade,
     /// Nobody, and no crew will follow.
     Over,
 }
@@ -164,27 +210,22 @@ impl Supervisor {
                     }
                 }
             }
-            Shift::IsMade(result) => match result.try_recv() {
+            Shift::IsMade => match self.workshop.made() {
                 Ok(Ok(parts)) => self.begin(parts),
-                Ok(Err(error)) => self.waits(result, Making::Failed(error), now),
-                Err(TryRecvError::Empty) => self.waits(result, Making::Waits, now),
-                Err(TryRecvError::Disconnected) => self.waits(result, Making::Panicked, now),
+                Ok(Err(error)) => self.waits(Making::Failed(error), now),
+                Err(TryRecvError::Empty) => self.waits(Making::Waits, now),
+                Err(TryRecvError::Disconnected) => self.waits(Making::Panicked, now),
             },
             Shift::Over => Shift::Over,
         }
     }
 
     /// No new crew is ready yet.
-    fn waits(
-        &self,
-        result: Receiver<Result<CrewParts, PipelineError>>,
-        making: Making,
-        now: HostTime,
-    ) -> Shift {
+    fn waits(&self, making: Making, now: HostTime) -> Shift {
         // The thread that makes the crew may hang in a driver.
         let may_hang = matches!(making, Making::Waits);
         if self.mind.waits_for(making, now) {
-            return Shift::IsMade(result);
+            return Shift::IsMade;
         }
         if may_hang {
             leave_behind();
@@ -213,15 +254,11 @@ impl Supervisor {
             Verdict::End => return Shift::Works(crew),
             Verdict::Abandon { remake, .. } => remake,
         };
+        let state = crew.state.clone();
         self.wreckage.take(crew);
         let Some(remake) = remake else { return Shift::Over };
-        let (done, result) = unbounded();
-        let maker = self.maker.clone();
-        let made = std::thread::Builder::new().name("dpm-remake".into()).spawn(move || {
-            let _ = done.send(maker(remake));
-        });
-        match made {
-            Ok(_) => Shift::IsMade(result),
+        match self.workshop.order(&self.maker, remake, state) {
+            Ok(()) => Shift::IsMade,
             Err(source) => {
                 self.shared.facts.fail(PipelineError::Thread { stage: "remake", source });
                 Shift::Over
@@ -234,7 +271,7 @@ impl Supervisor {
         self.mind.tell_of_recovery(None);
         let crew = match shift {
             Shift::Works(crew) => Some(crew),
-            Shift::IsMade(_) => {
+            Shift::IsMade => {
                 leave_behind();
                 None
             }

@@ -137,7 +137,8 @@ impl DarkBody {
 pub struct Recovery {
     /// Why.
     pub cause: String,
-    /// From the last light before to the first light after, seconds; `None` if no light followed.
+    /// From the last light on a body before to the first after, seconds; `None` if none followed before another crew was replaced, or the run
+    /// ended.
     pub dark_s: Option<f64>,
 }
 
