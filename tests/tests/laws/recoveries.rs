@@ -15,9 +15,9 @@ const PATIENCE: Duration = Duration::from_secs(240);
 /// Crews that are replaced.
 const RECOVERIES: u64 = 6;
 /// Longer than the supervisor needs to find a stage hung, on a busy machine too.
-const STALL: Duration = Duration::from_secs(2);
+const STALL: Duration = Duration::from_millis(1_500);
 /// Frames from one stall to the next: more than are planned while one lasts.
-const EVERY: u64 = 180;
+const EVERY: u64 = 60;
 
 /// Threads of this process by name, and its resident memory, bytes.
 fn held() -> (BTreeMap<String, usize>, u64) {
@@ -52,9 +52,9 @@ fn after(crews: usize, monitor: &RunMonitor, notes: &mut Vec<String>) -> (usize,
 
 fn recovers(gpu: &Arc<Gpu>) {
     let flags =
-        ["real_time.pace=\"real\"", "projector.frame_rate=60", "render.method=\"full\"", "render.spp=1"];
+        ["real_time.pace=\"real\"", "projector.frame_rate=30", "render.method=\"full\"", "render.spp=1"];
     let rig = demo_rig(48, 32, &flags);
-    let stall = Stall { stage: StallIn::Crew, frame: 60, length: STALL, times: RECOVERIES, every: EVERY };
+    let stall = Stall { stage: StallIn::Crew, frame: 30, length: STALL, times: RECOVERIES, every: EVERY };
     let options = RunOptions { stall: Some(stall), ..RunOptions::default() };
     let monitor = Arc::new(RunMonitor::default());
     let run = {

@@ -60,7 +60,9 @@ pub(crate) struct Facts {
     pub stalls: AtomicU64,
     /// Share of the last half second in which a thread that frames need was ready to run and got no core, in thousandths.
     pub starved_milli: AtomicU64,
-    /// For how long that was so during the run, nanoseconds.
+    /// The same for any program of the machine, lately, in thousandths; 0 if the system does not say.
+    pub pressure_milli: AtomicU64,
+    /// For how long threads of frames got no core during the run, nanoseconds.
     pub starved_ns: AtomicI64,
     /// How long the first crew took to be made, nanoseconds; 0 if that was not measured.
     pub made_ns: AtomicI64,
@@ -97,6 +99,7 @@ impl Facts {
             is_complete: AtomicBool::new(false),
             stalls: AtomicU64::new(0),
             starved_milli: AtomicU64::new(0),
+            pressure_milli: AtomicU64::new(0),
             starved_ns: AtomicI64::new(0),
             made_ns: AtomicI64::new(0),
             recoveries: Lock::new(Vec::new()),

@@ -40,9 +40,9 @@ pub(super) const STARVED_MILLI: u64 = 400;
 /// Who holds frames up.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(super) enum SlowBy {
-    /// The machine has too little processor time. A thread that frames need got no core for this share of the time, in thousandths; `pressure`:
-    /// the share in which some program got none, 0 to 1.
-    Machine { starved_milli: u64, pressure: Option<f64> },
+    /// The machine has too little processor time. A thread that frames need got no core for the first share of the time, some program
+    /// of the machine for the second, in thousandths; 0 if that is not known.
+    Machine { starved_milli: u64, pressure_milli: u64 },
     /// The GPU needs a slot or more for a frame.
     Renderer,
     /// Packing or the link.
@@ -54,8 +54,11 @@ pub(super) fn told(is_slow: bool, stride_milli: u64, hz: f64, by: SlowBy) -> Str
     let every = stride_milli as f64 / 1e3;
     let rate = format!("one frame per {every:.1} slots, {:.1} of {hz:.1} per second", hz / every);
     match (is_slow, by) {
-        (true, SlowBy::Machine { starved_milli, pressure }) => {
-            let all = pressure.map_or_else(String::new, |p| format!(", and other programs too in {:.0} %", p * 100.0));
+        (true, SlowBy::Machine { starved_milli, pressure_milli }) => {
+            let all = match pressure_milli {
+                0 => String::new(),
+                milli => format!(", and some program of the machine in {} %", milli / 10),
+            };
             format!(
                 "the machine is short of processor time: {rate}; a thread that frames need was ready and got no core in {} % of the \
                  time{all}; end other programs, or let this one go first (real_time.priority)",
@@ -103,7 +106,7 @@ mod tests {
             .starts_with("the renderer is slower than its slots: one frame per 1.5 slots, 631.3 of 947.0"));
         let rest = of(SlowBy::Rest);
         assert!(rest.contains("the renderer would keep up") && rest.contains("dpm link-test"));
-        let starved = of(SlowBy::Machine { starved_milli: 730, pressure: Some(0.9) });
+        let starved = of(SlowBy::Machine { starved_milli: 730, pressure_milli: 900 });
         assert!(
             starved.contains("short of processor time")
                 && starved.contains("73 %")

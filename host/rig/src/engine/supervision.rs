@@ -14,7 +14,6 @@ use super::pulse::{Pulse, Silence, StandingOf};
 use super::slowness::{told, SlowBy, Slowness, STARVED_MILLI};
 use crate::telemetry::monitor::{ProjectorHealth, RunCounts};
 use crate::telemetry::report::Recovery;
-use dpm_common::realtime::os::processor_pressure;
 use dpm_device::time::HostTime;
 use dpm_render::gpu::{AfterLoss, Gpu, LossBudget};
 use std::sync::atomic::Ordering;
@@ -421,7 +420,10 @@ impl Supervision {
         if let Some(is_slow) = self.slowness.observe(stride_milli, now) {
             let starved = facts.starved_milli.load(Ordering::Relaxed);
             let by = if starved >= STARVED_MILLI {
-                SlowBy::Machine { starved_milli: starved, pressure: processor_pressure() }
+                SlowBy::Machine {
+                    starved_milli: starved,
+                    pressure_milli: facts.pressure_milli.load(Ordering::Relaxed),
+                }
             } else if facts.gpu_is_slow.load(Ordering::Relaxed) {
                 SlowBy::Renderer
             } else {

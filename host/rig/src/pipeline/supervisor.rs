@@ -10,6 +10,7 @@ use crate::engine::pulse::Pulse;
 use crate::engine::supervision::{Irreplaceable, Making, Remake, Supervision, Trouble, Verdict};
 use crossbeam::channel::{unbounded, Receiver, Sender, TryRecvError};
 use dpm_common::clock::{Clock, Stopwatch};
+use dpm_common::realtime::os::processor_pressure;
 use dpm_common::realtime::starvation::{is_worker, Starvation};
 use dpm_device::time::HostTime;
 use dpm_handoff::channel::Sender as PortSender;
@@ -151,6 +152,8 @@ impl Shortage {
         self.looked_at = Some(now);
         let milli = self.needed.share_milli(now.0);
         facts.starved_milli.store(milli as u64, Ordering::Relaxed);
+        let pressure = processor_pressure().map_or(0, |share| (share * 1000.0) as u64);
+        facts.pressure_milli.store(pressure, Ordering::Relaxed);
         facts.starved_ns.fetch_add(span_ns / 1000 * milli, Ordering::Relaxed);
     }
 
@@ -281,14 +284,11 @@ impl Supervisor {
             crew.state.tracking_over.store(true, Ordering::Release);
         }
         let begin = Stopwatch::start();
-        loop {
-            self.wreckage.look();
-            let is_over = self.wreckage.crews.is_empty() && crew.as_ref().is_none_or(Crew::is_over);
-            if is_over || begin.elapsed_ns() >= END_WITHIN_NS {
-                break;
-            }
+        // Nobody waits for crews that were abandoned: the report must be written in time.
+        while crew.as_ref().is_some_and(|crew| !crew.is_over()) && begin.elapsed_ns() < END_WITHIN_NS {
             std::thread::sleep(LOOK);
         }
+        self.wreckage.look();
         if !self.wreckage.crews.is_empty() {
             leave_behind();
         }

@@ -97,8 +97,13 @@ fn what_a_device_that_was_given_up_held_is_free_when_it_has_finished() {
     let mut bench = Bench::open();
     bench.frame(0).unwrap();
     let before = memory_given_up().bytes;
-    session.set("submit-hang@frame=1,ms=500");
+    assert!(bench.gpu.answers(Duration::from_secs(60)));
+    session.set("submit-hang@frame=1,ms=3000");
     bench.submit(1).unwrap();
+    assert!(
+        !bench.gpu.answers(Duration::from_millis(100)),
+        "what it is given stands behind the frame that hangs"
+    );
     bench.gpu.give_up();
     assert!(memory_given_up().bytes > before);
     let next = reopened(&bench.gpu);
