@@ -8,11 +8,11 @@ use super::live_textures::{LiveTextures, Piece};
 use super::memory::{SharedBuffers, SHOWN_BYTES};
 use super::optics::OpticsLayout;
 use super::passes::{Grid, FIRST_PASSES, PASSES, TABLE};
-use super::plan::{Pipelines, RendererPlan};
+use super::plan::RendererPlan;
+use super::prepared::PreparedScene;
 use super::read_back::{History, Surface};
 use super::resources::Resources;
 use super::scene_data::{rows, world_bounds, BodyData, Keep, SceneData};
-use super::scene_gpu::SceneGpu;
 use super::settings::{FrameInputs, Overlapping, RenderError, RendererSettings};
 use super::slot::FrameSlot;
 use super::tiles::TileList;
@@ -66,6 +66,7 @@ pub struct Renderer {
     /// The order of frames that overlap.
     orders: Orders,
     optics: OpticsLayout,
+    prepared: PreparedScene,
     pub(super) gpu: Arc<Gpu>,
 }
 
@@ -98,12 +99,7 @@ impl Renderer {
 
     /// What this renderer was made from.
     pub fn plan(&self) -> RendererPlan {
-        RendererPlan {
-            data: self.data.clone(),
-            settings: self.settings.clone(),
-            keep: self.keep,
-            tracked: self.tracked.clone(),
-        }
+        self.prepared.plan().clone()
     }
 
     /// The same renderer on this device, as it was before its first frame.
@@ -111,14 +107,29 @@ impl Renderer {
     /// # Errors
     /// The raster or the scene is too large for this device, or the GPU's own.
     pub fn from_plan(gpu: &Arc<Gpu>, plan: &RendererPlan) -> Result<Self, RenderError> {
+        // Refused before the work of uploading and compiling.
+        let shared = SharedBuffers::new(gpu, &plan.settings)?;
+        Self::on(PreparedScene::new(gpu, plan)?, shared)
+    }
+
+    /// Another renderer of a scene that was prepared for one before, as that one was before its first frame. It is made at once: nothing is compiled,
+    /// and only a scene with the pictures of other programs is uploaded again.
+    ///
+    /// # Errors
+    /// The GPU's own.
+    pub fn from_prepared(prepared: &PreparedScene) -> Result<Self, RenderError> {
+        let shared = SharedBuffers::new(&prepared.gpu, &prepared.plan.settings)?;
+        Self::on(prepared.for_another()?, shared)
+    }
+
+    fn on(prepared: PreparedScene, shared: SharedBuffers) -> Result<Self, RenderError> {
+        let (gpu, plan, reading) = (&prepared.gpu, &prepared.plan, prepared.reading);
         let RendererPlan { data, settings, keep, tracked } = plan.clone();
-        let shared = SharedBuffers::new(gpu, &settings)?;
-        let reading = plan.reading(gpu.summary())?;
-        let scene_gpu = SceneGpu::new(gpu, &data, reading)?;
         let optics = OpticsLayout::new(&settings);
-        let Pipelines { table, each: pipelines } = plan.pipelines(gpu, reading)?;
-        let decides_rates =
-            TABLE.iter().zip(&pipelines).any(|(pass, p)| pass.grid == Grid::Rates && p.is_some());
+        let decides_rates = TABLE
+            .iter()
+            .zip(&prepared.pipelines.each)
+            .any(|(pass, p)| pass.grid == Grid::Rates && p.is_some());
         let overlaps = match settings.overlap {
             Overlapping::Never => false,
             Overlapping::WhereItCan => gpu.has_two_queues(),
@@ -131,7 +142,12 @@ impl Renderer {
         let movers = Movers::new(data.bodies.len(), &settings.plane_groups, !settings.shows_halftones());
         let live = LiveTextures::new(&data.live, settings.most_live_texels);
         Ok(Self {
-            resources: Arc::new(Resources { pipelines, table, shared, scene: scene_gpu, overlap }),
+            resources: Arc::new(Resources {
+                pipelines: prepared.pipelines.clone(),
+                shared,
+                scene: prepared.scene().clone(),
+                overlap,
+            }),
             bodies: data.bodies.clone(),
             reading,
             data,
@@ -148,7 +164,13 @@ impl Renderer {
             orders: Orders::default(),
             optics,
             gpu: gpu.clone(),
+            prepared,
         })
+    }
+
+    /// Its scene and passes, for a renderer that takes over on the same device.
+    pub fn prepared(&self) -> &PreparedScene {
+        &self.prepared
     }
 
     /// Whether the device finds itself what a ray meets (ray query), or the shaders do.
@@ -194,12 +216,12 @@ impl Renderer {
         let buffers = FrameBuffers::new(gpu, settings, scene, tile_list.len(), body_tree, live, debug)?;
         buffers.clear(gpu, settings)?;
         let set_of = |parity| {
-            let all = (&resources.shared, &resources.scene);
+            let all = (&resources.shared, &*resources.scene);
             let bindings: Vec<_> = gpu_structs::BINDINGS
                 .iter()
                 .map(|&(name, binding)| (binding, buffers.of(name, parity, settings, all)))
                 .collect();
-            BindingSet::with_tree(&resources.table, &bindings, buffers.device_tree.as_ref())
+            BindingSet::with_tree(&resources.pipelines.table, &bindings, buffers.device_tree.as_ref())
         };
         let sets = [set_of(0)?, set_of(1)?];
         let lists = |parity: usize| -> Result<[CommandList; 2], GpuError> {
@@ -262,7 +284,7 @@ impl Renderer {
         parity: usize,
     ) {
         let (resources, raster) = (&self.resources, self.settings.raster);
-        for (pass, pipeline) in TABLE[rows.clone()].iter().zip(&resources.pipelines[rows]) {
+        for (pass, pipeline) in TABLE[rows.clone()].iter().zip(&resources.pipelines.each[rows]) {
             if let Some(pipeline) = pipeline {
                 match pass.grid {
                     Grid::Tiles => r.dispatch_indirect(pipeline, set, &b.arguments, PER_TILE_QUARTER),

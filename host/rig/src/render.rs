@@ -72,23 +72,21 @@ pub(crate) fn warm_up(
 /// The longest single wait for the GPU.
 const GPU_STEP_NS: u64 = 5_000_000;
 
-/// Waits for the GPU, if the job uses one, in steps of 5 ms. Calls `alive` before each step.
+/// Waits for the GPU, if the job uses one, in steps of 5 ms, as long as `goes_on`, which is asked before each step.
 ///
-/// Returns false if the GPU did not finish within `timeout_ns`.
+/// Returns false if the GPU has not finished then.
 ///
 /// # Errors
 /// The GPU was lost.
-pub(crate) fn finish(job: &mut FrameJob, timeout_ns: u64, mut alive: impl FnMut()) -> Result<bool, GpuError> {
+pub(crate) fn finish(job: &mut FrameJob, mut goes_on: impl FnMut() -> bool) -> Result<bool, GpuError> {
     let Some(slot) = job.memory.gpu.as_mut() else { return Ok(true) };
     let watch = Stopwatch::start();
     let cost = loop {
-        alive();
-        let left = timeout_ns.saturating_sub(watch.elapsed_ns());
-        if let Some(cost) = slot.poll_done(left.min(GPU_STEP_NS))? {
-            break cost;
-        }
-        if left <= GPU_STEP_NS {
+        if !goes_on() {
             return Ok(false);
+        }
+        if let Some(cost) = slot.poll_done(GPU_STEP_NS)? {
+            break cost;
         }
     };
     let gpu: u64 = cost.pass_ns.iter().sum();
@@ -96,4 +94,11 @@ pub(crate) fn finish(job: &mut FrameJob, timeout_ns: u64, mut alive: impl FnMut(
     // The wait for the fence overlaps other frames. The stage's cost is the GPU's own time where that is known.
     job.note.timeline.wall_ns[Stage::Render as usize] = if gpu > 0 { gpu } else { watch.elapsed_ns() };
     Ok(true)
+}
+
+/// Drops a frame that nobody wants any more, once the GPU has finished it or was given up: until then the GPU uses its memory.
+pub(crate) fn dismiss(mut job: FrameJob) {
+    if let Some(slot) = job.memory.gpu.as_mut() {
+        while let Ok(None) = slot.poll_done(GPU_STEP_NS) {}
+    }
 }

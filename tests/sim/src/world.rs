@@ -739,7 +739,7 @@ impl World {
         };
         let lag = self.lag.load(Ordering::Relaxed);
         // A trap may go off late, in a stage that had nothing to do while the GPU hung: then a start is still to come.
-        let ends_late = self.restart_at != i64::MAX && self.restart_at - RESTART_NS - self.calm_since < S;
+        let ends_late = self.restart_at != i64::MAX && self.restart_at - RESTART_NS - self.calm_since < 4 * S;
         let start_ready = if ends_late { self.restart_at + BEGINS_WITHIN_NS } else { 0 };
         let longest = lock(&self.cable).longest;
         let is_frozen = self.t < self.frozen_until;

@@ -28,6 +28,7 @@ mod many_bodies;
 mod methods;
 mod packing_on_gpu;
 mod real_pace;
+mod recoveries;
 mod references;
 mod rig_files;
 mod scene_files;

@@ -2,12 +2,13 @@
 //! at once; and how reliably it does.
 //!
 //! Every right is requested, and none is required. A refusal is one [`Refusal`] with the limit to set, which the
-//! caller shows once; the rig continues to run. [`os`] requests for threads and memory, [`awake`] for idle cores, and
-//! [`standstill`] measures when the machine itself stood still.
+//! caller shows once; the rig continues to run. [`os`] requests for threads and memory, [`awake`] for idle cores,
+//! [`standstill`] measures when the machine itself stood still, and [`starvation`] for how long threads waited for a core.
 
 pub mod awake;
 pub mod os;
 pub mod standstill;
+pub mod starvation;
 
 use dpm_handoff::wake::WaitPolicy;
 

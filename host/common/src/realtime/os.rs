@@ -250,6 +250,20 @@ pub struct Standing {
     pub ready: bool,
     /// Processor time that it has used, nanoseconds.
     pub ran_ns: i64,
+    /// Time for which it was ready and got no core, nanoseconds. What it waits now is added when it runs.
+    pub waited_ns: i64,
+}
+
+impl Standing {
+    /// For how long of the last `span_ns` it was ready to run and got no core, nanoseconds; `before`: as it stood at the beginning of them, if that
+    /// is known.
+    pub fn starved_ns(self, before: Option<Self>, span_ns: i64) -> i64 {
+        let before = before.unwrap_or(Self { ready: true, ..self });
+        let waited_ns = self.waited_ns - before.waited_ns;
+        // A thread that waits now, and did not run meanwhile, has probably waited for all of it.
+        let waits_ns = if self.ready { span_ns - (self.ran_ns - before.ran_ns) } else { 0 };
+        waited_ns.max(waits_ns).clamp(0, span_ns.max(0))
+    }
 }
 
 /// What the thread `id` of this process is doing; `None` if the kernel does not say or the thread is gone. Allocates
@@ -262,8 +276,31 @@ pub fn standing_of(id: i32) -> Option<Standing> {
     let state = stat.rsplit(')').next()?.split_whitespace().next()?;
     let ready = state == "R";
     let mut text = [0u8; 96];
-    let ran_ns = read_of_thread(id, "schedstat", &mut text)?.split_whitespace().next()?.parse().ok()?;
-    Some(Standing { ready, ran_ns })
+    let mut counts = read_of_thread(id, "schedstat", &mut text)?.split_whitespace();
+    let ran_ns = counts.next()?.parse().ok()?;
+    Some(Standing { ready, ran_ns, waited_ns: counts.next()?.parse().ok()? })
+}
+
+/// The threads of this process, each with its id and its name.
+#[cfg(target_os = "linux")]
+pub fn threads(mut each: impl FnMut(i32, &str)) {
+    let Ok(tasks) = std::fs::read_dir("/proc/self/task") else { return };
+    for id in tasks.flatten().filter_map(|task| task.file_name().to_str()?.parse().ok()) {
+        let mut text = [0u8; 32];
+        if let Some(name) = read_of_thread(id, "comm", &mut text) {
+            each(id, name.trim_end());
+        }
+    }
+}
+
+/// Share of the last ten seconds in which some program of this machine was ready to run and got no core, 0 to 1 (pressure stall
+/// information); `None` if the kernel does not say.
+#[cfg(target_os = "linux")]
+pub fn processor_pressure() -> Option<f64> {
+    let text = std::fs::read_to_string("/proc/pressure/cpu").ok()?;
+    let some = text.lines().find_map(|line| line.strip_prefix("some "))?;
+    let percent: f64 = some.split(' ').find_map(|word| word.strip_prefix("avg10="))?.parse().ok()?;
+    Some(percent / 100.0)
 }
 
 /// The beginning of a file about the thread `id`.
@@ -353,6 +390,12 @@ mod elsewhere {
     /// Unknown.
     pub fn thread_id() -> i32 {
         0
+    }
+    /// None.
+    pub fn threads(_each: impl FnMut(i32, &str)) {}
+    /// Unknown.
+    pub fn processor_pressure() -> Option<f64> {
+        None
     }
     /// Unknown.
     pub fn standing_of(_id: i32) -> Option<super::Standing> {

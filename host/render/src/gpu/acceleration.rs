@@ -41,13 +41,13 @@ struct Tree {
 
 impl Drop for Tree {
     fn drop(&mut self) {
-        if self.gpu.is_abandoned() {
-            return;
-        }
-        if let Some(calls) = &self.gpu.acceleration {
-            // SAFETY: owners wait for the GPU before dropping, or the device is lost; the handle is ours alone.
-            unsafe { calls.destroy_acceleration_structure(self.handle, None) }
-        }
+        let tree = self.handle;
+        self.gpu.destroy(move |gpu| {
+            if let Some(calls) = &gpu.acceleration {
+                // SAFETY: owners wait for the GPU before dropping, or the device is lost; the handle is ours alone.
+                unsafe { calls.destroy_acceleration_structure(tree, None) }
+            }
+        });
     }
 }
 

@@ -344,17 +344,17 @@ impl Buffer {
 
 impl Drop for Buffer {
     fn drop(&mut self) {
-        if self.gpu.is_abandoned() {
-            return;
-        }
-        // SAFETY: owners wait for the GPU before dropping (FrameFence does in its Drop), or the device is lost; handles are ours alone.
-        unsafe {
-            if let Some(view) = self.view {
-                self.gpu.device.destroy_buffer_view(view, None);
+        let (view, handle, memory, bytes) = (self.view, self.handle, self.memory, self.held_bytes);
+        self.gpu.destroy(move |gpu| {
+            // SAFETY: owners wait for the GPU before dropping (FrameFence does in its Drop), or the device is lost; handles are ours alone.
+            unsafe {
+                if let Some(view) = view {
+                    gpu.device.destroy_buffer_view(view, None);
+                }
+                gpu.device.destroy_buffer(handle, None);
+                gpu.device.free_memory(memory, None);
             }
-            self.gpu.device.destroy_buffer(self.handle, None);
-            self.gpu.device.free_memory(self.memory, None);
-        }
-        self.gpu.holds(0, self.held_bytes);
+            gpu.freed(bytes);
+        });
     }
 }

@@ -125,16 +125,16 @@ pub(super) fn submit_in_turn(buffers: &[vk::CommandBuffer], fence: &mut FrameFen
 
 impl Drop for CommandList {
     fn drop(&mut self) {
-        if self.gpu.is_abandoned() {
-            return;
-        }
-        // SAFETY: owners wait for the fence first.
-        unsafe {
-            if let Some(q) = self.queries {
-                self.gpu.device.destroy_query_pool(q, None);
+        let (queries, pool) = (self.queries, self.pool);
+        self.gpu.destroy(move |gpu| {
+            // SAFETY: owners wait for the fence first.
+            unsafe {
+                if let Some(q) = queries {
+                    gpu.device.destroy_query_pool(q, None);
+                }
+                gpu.device.destroy_command_pool(pool, None);
             }
-            self.gpu.device.destroy_command_pool(self.pool, None);
-        }
+        });
     }
 }
 
@@ -263,7 +263,8 @@ impl Recorder<'_> {
     }
 }
 
-/// How long to wait for the end of a submission before its memory is freed. After that the device is given up and keeps the memory.
+/// How long to wait for the end of a submission before its memory is freed. After that the device is given up and keeps the memory until it has
+/// finished.
 pub(super) const LAST_WAIT_NS: u64 = 2_000_000_000;
 
 /// Signals when a submission is done. Dropping it waits for the submission, at most 2 s, and not at all if the device is lost or was given up.
@@ -350,11 +351,12 @@ impl Drop for FrameFence {
         if !matches!(self.poll(LAST_WAIT_NS), Ok(true)) && !self.gpu.is_lost() {
             self.gpu.give_up();
         }
-        if self.gpu.is_abandoned() {
-            return;
+        let fence = self.fence;
+        if self.pending && self.gpu.is_abandoned() {
+            return self.gpu.leave(fence);
         }
         // SAFETY: not pending any more, or the device is lost.
-        unsafe { self.gpu.device.destroy_fence(self.fence, None) }
+        self.gpu.destroy(move |gpu| unsafe { gpu.device.destroy_fence(fence, None) });
     }
 }
 
@@ -380,26 +382,42 @@ pub(super) fn copy_now(gpu: &Arc<Gpu>, from: &Buffer, to: &Buffer, bytes: usize)
 
 #[cfg(test)]
 mod tests {
-    use crate::gpu::{memory_given_up, Buffer, Gpu, GpuOptions, MemoryKind};
+    use crate::gpu::{memory_given_up, Buffer, FrameFence, Gpu, GpuOptions, MemoryKind};
+    use ash::vk;
+    use std::time::{Duration, Instant};
 
     /// Large enough that its pages go back to the system when it is freed: reading them then would end this process.
     const LEN: usize = 64 << 20;
 
     #[test]
-    fn a_device_that_is_waited_for_no_longer_keeps_its_memory() {
+    fn a_device_that_was_given_up_keeps_its_memory_until_it_has_finished() {
         let gpu = Gpu::open(&GpuOptions::default()).expect("a Vulkan device");
         let mut buffer = Buffer::new(&gpu, "kept", LEN, MemoryKind::Upload).expect("memory");
         buffer.bytes_mut().fill(7);
         let first = buffer.bytes_mut().as_ptr();
+        // A submission that does not end: of this fence nothing was submitted yet.
+        let mut fence = FrameFence::new(&gpu).expect("a fence");
+        fence.pending = true;
+        let raw = fence.fence;
         let before = memory_given_up();
         gpu.give_up();
         gpu.give_up();
-        drop((buffer, gpu));
-        // SAFETY: what a device that was given up holds is never freed.
+        drop((fence, buffer));
+        // SAFETY: what a device that was given up may use is not freed.
         let bytes = unsafe { std::slice::from_raw_parts(first, LEN) };
         assert!(bytes.iter().step_by(4096).all(|b| *b == 7));
         // Counted once, and by no more than what it held. (Other tests of this process may give up devices of their own meanwhile.)
         let after = memory_given_up();
         assert!(after.devices > before.devices && after.bytes >= before.bytes + LEN as u64);
+        // It finishes at last.
+        let ([queue, _], turn) = gpu.queues().expect("nobody else submits");
+        // SAFETY: the turn is this thread's, and the fence, which waits for its end, is unsignalled.
+        unsafe { gpu.device.queue_submit(queue, &[vk::SubmitInfo::default()], raw) }.expect("it works");
+        drop(turn);
+        let begin = Instant::now();
+        while memory_given_up().bytes >= before.bytes + LEN as u64 {
+            assert!(begin.elapsed() < Duration::from_secs(60), "never freed");
+            std::thread::sleep(Duration::from_millis(5));
+        }
     }
 }

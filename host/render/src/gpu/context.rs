@@ -8,6 +8,7 @@ use super::devices::{
 use super::error::GpuError;
 use super::instance::{create_instance, Instance};
 use super::kept::Kept;
+use super::leftovers::Leftovers;
 use super::turn::{Held, Turn};
 use ash::{khr, vk};
 use std::ffi::{CStr, CString};
@@ -39,7 +40,7 @@ pub struct GpuOptions {
 ///
 /// Once a device [is lost](Gpu::is_lost) it is not used any more: every call that would use it fails at once. A device that its driver reports as
 /// lost is closed as any other. A device that was [given up](Gpu::give_up) because it did not finish may continue to use everything that it was
-/// given. So nothing of it is freed, and its memory stays allocated until the process ends ([`memory_given_up`] returns how much).
+/// given. So nothing of it is freed before it has finished; [`memory_given_up`] returns how much memory waits for that.
 pub struct Gpu {
     pub(super) device: ash::Device,
     /// Where frames begin and where they end. The same queue twice where the device has one.
@@ -63,6 +64,8 @@ pub struct Gpu {
     pub(super) scratch_alignment: u64,
     /// Layouts and compiled pipelines of renderers that are gone.
     pub(super) kept: Kept,
+    /// What was dropped while the device, given up, may still use it.
+    pub(super) leftovers: Leftovers,
     instance: ManuallyDrop<Instance>,
     /// One of [`State`].
     state: AtomicU8,
@@ -92,17 +95,17 @@ impl std::fmt::Debug for Gpu {
     }
 }
 
-/// Memory of devices that were given up. It stays allocated until the process ends.
+/// Memory of devices that were given up. It stays allocated until the device has finished what it was given.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct MemoryGivenUp {
     /// How many devices were given up so far.
     pub devices: u64,
-    /// What their buffers hold, bytes.
+    /// What their buffers still hold, bytes.
     pub bytes: u64,
 }
 
 static DEVICES_GIVEN_UP: AtomicU64 = AtomicU64::new(0);
-static BYTES_GIVEN_UP: AtomicU64 = AtomicU64::new(0);
+pub(super) static BYTES_GIVEN_UP: AtomicU64 = AtomicU64::new(0);
 
 /// Memory of all devices that this process gave up ([`Gpu::give_up`]).
 pub fn memory_given_up() -> MemoryGivenUp {
@@ -320,6 +323,7 @@ impl Gpu {
                 acceleration,
                 scratch_alignment,
                 kept: Kept::default(),
+                leftovers: Leftovers::default(),
                 instance: ManuallyDrop::new(instance),
                 state: AtomicU8::new(State::Well as u8),
                 held_bytes: AtomicU64::new(0),
@@ -395,15 +399,15 @@ impl Gpu {
         self.state() != State::Well
     }
 
-    /// Gives up a device that does not finish. Nothing is submitted to it or waited for any more, and nothing of it is freed, so dropping what was
-    /// made from it returns at once. Calling it again changes nothing.
+    /// Gives up a device that does not finish. Nothing is submitted to it any more, and dropping what was made from it returns at once: what the device
+    /// may still use is destroyed when it has finished. Calling it again changes nothing.
     pub fn give_up(&self) {
         if self.becomes(State::GivenUp) {
             let bytes = self.held_bytes.load(Ordering::Relaxed);
             DEVICES_GIVEN_UP.fetch_add(1, Ordering::Relaxed);
             BYTES_GIVEN_UP.fetch_add(bytes, Ordering::Relaxed);
             tracing::warn!(
-                "{} did not finish and was given up; {} MiB of its memory stay taken until this program ends",
+                "{} did not finish and was given up; {} MiB of its memory stay taken until it has finished",
                 self.name,
                 bytes.div_ceil(1 << 20)
             );
@@ -434,7 +438,7 @@ impl Gpu {
         }
     }
 
-    /// True when nothing of this device may be destroyed.
+    /// True when the device may still use what was made from it.
     pub(super) fn is_abandoned(&self) -> bool {
         self.state() == State::GivenUp
     }
@@ -494,7 +498,7 @@ impl Gpu {
 
 impl Drop for Gpu {
     fn drop(&mut self) {
-        if self.is_abandoned() {
+        if self.has_leftovers() {
             return;
         }
         // SAFETY: everything made from the device holds an Arc to this, so it is all gone, and every submission was waited for by its

@@ -27,10 +27,10 @@ impl LossBudget {
     /// Allows three losses a minute. A GPU that is lost more often is of no use.
     pub const MOST: usize = 3;
     /// A minute, nanoseconds.
-    pub(crate) const WITHIN_NS: i64 = 60_000_000_000;
+    pub const WITHIN_NS: i64 = 60_000_000_000;
 
     /// Allows `most` losses within any `within_ns` nanoseconds.
-    pub(crate) fn new(most: usize, within_ns: i64) -> Self {
+    pub fn new(most: usize, within_ns: i64) -> Self {
         Self { recent: Vec::with_capacity(most), most, within_ns, total: 0 }
     }
 

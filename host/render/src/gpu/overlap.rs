@@ -128,12 +128,9 @@ impl Overlap {
 
 impl Drop for Overlap {
     fn drop(&mut self) {
-        if self.gpu.is_abandoned() {
-            return;
-        }
         for semaphore in self.ended {
             // SAFETY: every frame that uses it was waited for: slots hold this until their fences were.
-            unsafe { self.gpu.device.destroy_semaphore(semaphore, None) };
+            self.gpu.destroy(move |gpu| unsafe { gpu.device.destroy_semaphore(semaphore, None) });
         }
     }
 }

@@ -212,11 +212,9 @@ impl BindingSet {
 
 impl Drop for BindingSet {
     fn drop(&mut self) {
-        if self.table.gpu.is_abandoned() {
-            return;
-        }
+        let pool = self.pool;
         // SAFETY: owners wait for the GPU before dropping.
-        unsafe { self.table.gpu.device.destroy_descriptor_pool(self.pool, None) }
+        self.table.gpu.destroy(move |gpu| unsafe { gpu.device.destroy_descriptor_pool(pool, None) });
     }
 }
 
@@ -245,6 +243,7 @@ impl ComputePipeline {
             spirv: shader.spirv,
             constants: constants.to_vec(),
         };
+        gpu.alive("compiling a compute pipeline")?;
         if let Some(pipeline) = gpu.kept.take(&key) {
             return Ok(Self { pipeline, table: table.clone(), key });
         }
@@ -263,7 +262,6 @@ impl ComputePipeline {
         let values: Vec<u32> = constants.iter().map(|c| c.1).collect();
         let data = bytemuck::cast_slice(&values);
         let specialization = vk::SpecializationInfo::default().map_entries(&entries).data(data);
-        gpu.alive("compiling a compute pipeline")?;
         // SAFETY: the SPIR-V is ours, checked by tests; module and pipeline are destroyed here and in Drop.
         unsafe {
             let module =
@@ -293,13 +291,10 @@ impl ComputePipeline {
 impl Drop for ComputePipeline {
     fn drop(&mut self) {
         let gpu = &self.table.gpu;
-        if gpu.is_abandoned() {
-            return;
-        }
-        // Owners wait for the GPU before dropping, so the next owner may have it at once.
+        // Owners wait for the GPU before dropping, so the next owner may have it at once. A device that was given up makes none any more.
         if let Some(oldest) = gpu.kept.give_back(self.key.clone(), self.pipeline) {
             // SAFETY: it was given back by its owner, as above, and nobody has taken it since.
-            unsafe { gpu.device.destroy_pipeline(oldest, None) }
+            gpu.destroy(move |gpu| unsafe { gpu.device.destroy_pipeline(oldest, None) });
         }
     }
 }

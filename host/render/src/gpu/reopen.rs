@@ -1,6 +1,6 @@
 //! After a loss: opens the same device again, or another one.
 
-use super::commands::run_now;
+use super::commands::{run_now, CommandList, FrameFence};
 use super::context::Gpu;
 use super::devices::DeviceId;
 use super::error::GpuError;
@@ -8,8 +8,6 @@ use crossbeam::channel::bounded;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
-/// A device that has not opened and run an empty submission within this time does not come back.
-const COMES_BACK_WITHIN: Duration = Duration::from_secs(2);
 /// Time between two attempts on the same device. Drivers need a moment to reset a device.
 const BETWEEN: Duration = Duration::from_millis(100);
 /// How long to wait for copies at set-up on a device that was opened again, nanoseconds.
@@ -18,6 +16,9 @@ const SETUP_WAIT_NS: u64 = 2_000_000_000;
 const MOST_TRIED: usize = 8;
 
 impl Gpu {
+    /// A device that has not opened and run an empty submission within this time does not come back.
+    pub const COMES_BACK_WITHIN: Duration = Duration::from_secs(2);
+
     /// Opens a device in place of this one, which is given up unless its driver reported it as lost. The same device is tried first, repeatedly
     /// for 2 s. Then the others that the options of [`Gpu::open`] allow are tried, best first, for 2 s each. A device counts as open after an empty
     /// submission ran on it. The log and the summary of the result name the device if it is another one.
@@ -38,7 +39,7 @@ impl Gpu {
             Err(error) => told.push(error.to_string()),
         }
         let options = self.options.clone();
-        let others = match within(COMES_BACK_WITHIN, "listing devices", move || Gpu::ranked(&options)) {
+        let others = match within(Self::COMES_BACK_WITHIN, "listing devices", move || Gpu::ranked(&options)) {
             Ok(all) => all.into_iter().filter(|id| *id != self.id).take(MOST_TRIED),
             Err(error) => {
                 told.push(error.to_string());
@@ -46,7 +47,7 @@ impl Gpu {
             }
         };
         for id in others {
-            match self.open_now(id, COMES_BACK_WITHIN) {
+            match self.open_now(id, Self::COMES_BACK_WITHIN) {
                 Ok(gpu) => {
                     let (was, is) = (self.device_name(), gpu.device_name());
                     tracing::warn!(
@@ -61,17 +62,31 @@ impl Gpu {
         Err(none_left(&told))
     }
 
+    /// Whether the device still runs what it is given: an empty submission ends within `limit`. A thread that hangs in the driver with its turn at the
+    /// queue keeps it from that.
+    pub fn answers(self: &Arc<Self>, limit: Duration) -> bool {
+        let gpu = self.clone();
+        let asked = within(limit, "running an empty submission", move || {
+            let list = CommandList::record(&gpu, 0, |_| ())?;
+            let mut fence = FrameFence::new(&gpu)?;
+            list.submit(&mut fence)?;
+            fence.wait(u64::try_from(limit.as_nanos()).unwrap_or(u64::MAX))
+        });
+        asked.is_ok()
+    }
+
     /// Opens this device again: tries until it works, or until its time is over.
     fn same_again(&self) -> Result<Arc<Gpu>, GpuError> {
         let begin = Instant::now();
         loop {
-            let error =
-                match self.open_now(self.id.clone(), COMES_BACK_WITHIN.saturating_sub(begin.elapsed())) {
-                    Ok(gpu) => return Ok(gpu),
-                    Err(error) => error,
-                };
+            let error = match self
+                .open_now(self.id.clone(), Self::COMES_BACK_WITHIN.saturating_sub(begin.elapsed()))
+            {
+                Ok(gpu) => return Ok(gpu),
+                Err(error) => error,
+            };
             // An attempt with too little time would only report a timeout.
-            if begin.elapsed() + 2 * BETWEEN >= COMES_BACK_WITHIN {
+            if begin.elapsed() + 2 * BETWEEN >= Self::COMES_BACK_WITHIN {
                 return Err(error);
             }
             std::thread::sleep(BETWEEN);

@@ -41,11 +41,10 @@ pub enum PipelineError {
         stage: &'static str,
     },
     /// The stages were restarted too often.
-    #[error(
-        "more than {} failures within a minute, the last: {last}; the run ends in the dark",
-        dpm_render::gpu::LossBudget::MOST
-    )]
+    #[error("more than {most} failures within a minute, the last: {last}; the run ends in the dark")]
     KeepsFailing {
+        /// How many there may be.
+        most: usize,
         /// The last failure.
         last: String,
     },

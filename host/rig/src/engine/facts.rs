@@ -9,6 +9,7 @@ use crate::plan::horizon::Horizon;
 use crate::plan::lead::LeadEstimator;
 use crate::rig::Rig;
 use crate::telemetry::monitor::RunMonitor;
+use crate::telemetry::report::Recovery;
 use dpm_device::time::HostTime;
 use dpm_handoff::path::Lock;
 use std::sync::atomic::{AtomicBool, AtomicI64, AtomicU64, Ordering};
@@ -17,6 +18,9 @@ use std::sync::Arc;
 /// Time that a projector needs to receive and check a frame after the medium has accepted all of it, nanoseconds, for one
 /// that does not report how early frames are whole.
 pub(crate) const RECEIPT_NS: i64 = 500_000;
+
+/// Most recoveries that a report lists.
+const RECOVERIES_KEPT: usize = 256;
 
 /// Facts of a whole run.
 pub(crate) struct Facts {
@@ -56,6 +60,17 @@ pub(crate) struct Facts {
     pub gpu_since_ns: AtomicI64,
     /// All frames of the run are planned.
     pub is_complete: AtomicBool,
+    /// Stalls of the run's options that have struck.
+    pub stalls: AtomicU64,
+    /// Share of the last half second in which a thread that frames need was ready to run and got no core, in thousandths.
+    pub starved_milli: AtomicU64,
+    /// The same for any program of the machine, lately, in thousandths; 0 if the system does not say.
+    pub pressure_milli: AtomicU64,
+    /// For how long threads of frames got no core during the run, nanoseconds.
+    pub starved_ns: AtomicI64,
+    /// How long the first crew took to be made, nanoseconds; 0 if that was not measured.
+    pub made_ns: AtomicI64,
+    recoveries: Lock<Vec<Recovery>>,
     error: Lock<Option<PipelineError>>,
 }
 
@@ -88,6 +103,12 @@ impl Facts {
             predict_ns: AtomicI64::new(predict_ns),
             gpu_since_ns: AtomicI64::new(i64::MAX),
             is_complete: AtomicBool::new(false),
+            stalls: AtomicU64::new(0),
+            starved_milli: AtomicU64::new(0),
+            pressure_milli: AtomicU64::new(0),
+            starved_ns: AtomicI64::new(0),
+            made_ns: AtomicI64::new(0),
+            recoveries: Lock::new(Vec::new()),
             error: Lock::new(None),
         }
     }
@@ -98,6 +119,20 @@ impl Facts {
             first.get_or_insert(error);
         }
         self.monitor.request_stop();
+    }
+
+    /// Adds a crew that was replaced. Not for the frame path.
+    pub(crate) fn recovered(&self, recovery: Recovery) {
+        if let Ok(mut all) = self.recoveries.lock() {
+            if all.len() < RECOVERIES_KEPT {
+                all.push(recovery);
+            }
+        }
+    }
+
+    /// The first crews that were replaced.
+    pub(crate) fn recoveries(&self) -> Vec<Recovery> {
+        self.recoveries.lock().map(|all| all.clone()).unwrap_or_default()
     }
 
     /// Why the run failed.

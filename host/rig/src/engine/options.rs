@@ -11,9 +11,11 @@ pub enum StallIn {
     Pack,
     /// From bit planes to the transport.
     Link,
+    /// Plan, pack and tracking in turn, where a stall repeats.
+    Crew,
 }
 
-/// A stage that stalls once, for tests of the recovery.
+/// A stage that stalls, for tests of the recovery.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Stall {
     /// The stage.
@@ -23,6 +25,19 @@ pub struct Stall {
     pub frame: u64,
     /// For this long.
     pub length: std::time::Duration,
+    /// And again so many frames later, for so many stalls in all; 1: once.
+    pub times: u64,
+    /// Frames from one stall to the next.
+    pub every: u64,
+}
+
+impl Stall {
+    /// Whether `stage` stalls before `frame`, after `struck` stalls.
+    pub(crate) fn strikes(&self, stage: StallIn, frame: u64, struck: u64) -> bool {
+        let turn = [StallIn::Plan, StallIn::Pack, StallIn::Tracking][(struck % 3) as usize];
+        let is_meant = if self.stage == StallIn::Crew { turn == stage } else { self.stage == stage };
+        is_meant && struck < self.times && frame >= self.frame + struck * self.every
+    }
 }
 
 /// How a run differs from the rig file.
@@ -42,7 +57,7 @@ pub struct RunOptions {
     pub in_flight: usize,
     /// Tell the operator if frames are rendered more slowly than slots come.
     pub tells_slow: bool,
-    /// A stage that stalls once.
+    /// A stage that stalls.
     pub stall: Option<Stall>,
 }
 

@@ -16,17 +16,21 @@ struct GpuTimes {
     recent: [i64; 64],
     count: usize,
     last_done_at: HostTime,
+    /// Shortest and longest wait, nanoseconds.
+    bounds_ns: [i64; 2],
 }
 
 impl GpuTimes {
     /// Frames after which the GPU is warm.
     const WARM: usize = 16;
-    /// Shortest and longest wait, nanoseconds.
-    const SHORTEST_NS: i64 = 100_000_000;
-    const LONGEST_NS: i64 = 2_000_000_000;
+    /// Of a GPU.
+    const BOUNDS_NS: [i64; 2] = [100_000_000, 2_000_000_000];
+    /// Of software Vulkan, which has no hardware that could hang, and whose frames wait for the same cores as everything else.
+    const SOFTWARE_BOUNDS_NS: [i64; 2] = [1_000_000_000, 10_000_000_000];
 
-    fn new() -> Self {
-        Self { recent: [0; 64], count: 0, last_done_at: HostTime(i64::MIN) }
+    fn new(is_software: bool) -> Self {
+        let bounds_ns = if is_software { Self::SOFTWARE_BOUNDS_NS } else { Self::BOUNDS_NS };
+        Self { recent: [0; 64], count: 0, last_done_at: HostTime(i64::MIN), bounds_ns }
     }
 
     /// The next frames may take as long as those of a GPU that is not warm.
@@ -61,12 +65,12 @@ impl GpuTimes {
         }
     }
 
-    /// How long to wait for a frame: four times the longest of the last 64 (their 99th percentile), at most two
-    /// seconds.
+    /// How long to wait for a frame: four times the longest of the last 64 (their 99th percentile), within bounds.
     fn limit_ns(&self) -> u64 {
         let longest = self.recent.iter().copied().max().unwrap_or(0);
-        let limit = if self.count < Self::WARM { Self::LONGEST_NS } else { longest.saturating_mul(4) };
-        limit.clamp(Self::SHORTEST_NS, Self::LONGEST_NS) as u64
+        let [least, most] = self.bounds_ns;
+        let limit = if self.count < Self::WARM { most } else { longest.saturating_mul(4) };
+        limit.clamp(least, most) as u64
     }
 }
 
@@ -84,9 +88,15 @@ pub(crate) struct PackStage {
 impl PackStage {
     /// For a crew. `budget`: `None` if every frame gets the rays that the rig file asks for.
     pub(crate) fn new(facts: Arc<Facts>, crew: Arc<CrewFacts>, budget: Option<BudgetController>) -> Self {
-        let this = Self { facts, crew, times: GpuTimes::new(), budget, late_in_a_row: 0, allowed: [0; 2] };
+        let this =
+            Self { facts, crew, times: GpuTimes::new(false), budget, late_in_a_row: 0, allowed: [0; 2] };
         this.wait_is_over();
         this
+    }
+
+    /// The same with software Vulkan in the place of a GPU, if `is_software`.
+    pub(crate) fn on_software(self, is_software: bool) -> Self {
+        Self { times: GpuTimes::new(is_software), ..self }
     }
 
     /// From `now` on packing waits for the GPU to finish the frame of `note`. Returns how long it may take, nanoseconds.
@@ -154,7 +164,7 @@ mod tests {
 
     #[test]
     fn a_gpu_is_waited_for_four_times_as_long_as_it_lately_took() {
-        let mut times = GpuTimes::new();
+        let mut times = GpuTimes::new(false);
         assert_eq!(times.limit_ns(), 2_000_000_000, "not warm yet");
         let at = |ms: i64| HostTime(ms * 1_000_000);
         for i in 0..40 {
@@ -175,6 +185,13 @@ mod tests {
             times.finished((at(10_000 + 10 * i), at(10_001 + 10 * i)), None, false);
         }
         assert_eq!(times.limit_ns(), 100_000_000);
+        // A processor that draws has other work too.
+        let mut times = GpuTimes::new(true);
+        assert_eq!(times.limit_ns(), 10_000_000_000);
+        for i in 0..16 {
+            times.finished((at(10 * i), at(10 * i + 1)), None, false);
+        }
+        assert_eq!(times.limit_ns(), 1_000_000_000);
     }
 
     /// Found on an H100: the budget held the GPU's own time at 0.80 of a slot, and with what it takes to start it and to
@@ -183,7 +200,7 @@ mod tests {
     fn what_a_frame_waits_for_on_an_idle_gpu_does_not_count_as_the_gpus_time() {
         const SLOT_NS: i64 = 1_055_966;
         let own = SLOT_NS * 8 / 10;
-        let (mut times, crew) = (GpuTimes::new(), CrewFacts::new(2 * SLOT_NS, SLOT_NS));
+        let (mut times, crew) = (GpuTimes::new(false), CrewFacts::new(2 * SLOT_NS, SLOT_NS));
         assert!(crew.gpu.is_slow(), "the first frame, with a cold GPU");
         for i in 0..1000 {
             let submitted_at = HostTime(i * SLOT_NS);

@@ -37,6 +37,11 @@ impl Pulse {
         self.thread.store(thread, Ordering::Relaxed);
     }
 
+    /// The thread's id in the operating system; 0 before it began.
+    pub(crate) fn thread(&self) -> i32 {
+        self.thread.load(Ordering::Relaxed)
+    }
+
     /// The thread is alive and will beat again within `expected_ns`.
     pub(crate) fn beat(&self, now: HostTime, expected_ns: i64) {
         self.until_ns.store(now.0.saturating_add(expected_ns), Ordering::Relaxed);
@@ -48,7 +53,7 @@ impl Pulse {
     }
 
     /// True when a beat is overdue.
-    fn is_overdue(&self, now: HostTime) -> bool {
+    pub(crate) fn is_overdue(&self, now: HostTime) -> bool {
         self.until_ns.load(Ordering::Relaxed) < now.0
     }
 }
@@ -57,8 +62,8 @@ impl Pulse {
 pub(crate) type StandingOf = fn(i32) -> Option<Standing>;
 
 /// The supervisor's view of one thread: how long it has been silent beyond its announcement. Time in which the thread
-/// was ready to run but got no core does not count: a starved thread is late, not hung. A thread in an endless loop
-/// counts as silent.
+/// was ready to run but got no core does not count, nor that of a worker which it may wait for: what starves is late, not
+/// hung. A thread in an endless loop counts as silent.
 #[derive(Clone, Copy, Debug, Default)]
 pub(crate) struct Silence {
     silent_ns: i64,
@@ -66,25 +71,38 @@ pub(crate) struct Silence {
 }
 
 impl Silence {
-    /// Checks `pulse` at `now`, `step_ns` after the last check. True when its thread is hung.
-    pub(crate) fn observe(&mut self, pulse: &Pulse, now: HostTime, step_ns: i64, ask: StandingOf) -> bool {
+    /// Checks `pulse` at `now`, `step_ns` after the last check; for `starved_ns` of it a worker that the thread may wait for
+    /// got no core. True when the thread is hung.
+    pub(crate) fn observe(
+        &mut self,
+        pulse: &Pulse,
+        now: HostTime,
+        step_ns: i64,
+        ask: StandingOf,
+        starved_ns: i64,
+    ) -> bool {
         let overdue = pulse.is_overdue(now);
         // Only overdue threads are looked up.
-        let standing = if overdue { ask(pulse.thread.load(Ordering::Relaxed)) } else { None };
-        self.step(overdue, step_ns, standing)
+        let standing = if overdue { ask(pulse.thread()) } else { None };
+        self.step(overdue, step_ns, standing, starved_ns)
     }
 
-    fn step(&mut self, overdue: bool, step_ns: i64, standing: Option<Standing>) -> bool {
+    /// For how long it has been silent, nanoseconds.
+    pub(crate) fn silent_ns(&self) -> i64 {
+        self.silent_ns
+    }
+
+    fn step(&mut self, overdue: bool, step_ns: i64, standing: Option<Standing>, starved_ns: i64) -> bool {
         if !overdue {
             *self = Self::default();
             return false;
         }
         let step_ns = step_ns.clamp(0, LONGEST_STEP_NS);
-        let ran_ns = match (standing, self.before) {
-            (Some(now), Some(before)) => (now.ran_ns - before.ran_ns).clamp(0, step_ns),
+        let own_ns = match (standing, self.before) {
+            (Some(now), before) => now.starved_ns(before, step_ns),
             _ => 0,
         };
-        self.silent_ns += if standing.is_some_and(|s| s.ready) { ran_ns } else { step_ns };
+        self.silent_ns += step_ns - own_ns.max(starved_ns).clamp(0, step_ns);
         self.before = standing;
         self.silent_ns > HUNG_AFTER_NS
     }
@@ -96,6 +114,10 @@ mod tests {
 
     const MS: i64 = 1_000_000;
 
+    fn standing(ready: bool, ran_ns: i64, waited_ns: i64) -> Standing {
+        Standing { ready, ran_ns, waited_ns }
+    }
+
     /// Steps until the thread counts as hung, at most 1000.
     fn steps(mut each: impl FnMut(&mut Silence) -> bool) -> Option<usize> {
         let mut silence = Silence::default();
@@ -104,26 +126,41 @@ mod tests {
 
     #[test]
     fn a_thread_is_hung_after_a_tenth_of_a_second_beyond_what_it_announced() {
-        assert_eq!(steps(|s| s.step(true, 2 * MS, None)), Some(51));
-        let asleep = Standing { ready: false, ran_ns: 7 };
-        assert_eq!(steps(|s| s.step(true, 2 * MS, Some(asleep))), Some(51));
-        assert_eq!(steps(|s| s.step(false, 2 * MS, None)), None);
+        assert_eq!(steps(|s| s.step(true, 2 * MS, None, 0)), Some(51));
+        let asleep = standing(false, 7, 0);
+        assert_eq!(steps(|s| s.step(true, 2 * MS, Some(asleep), 0)), Some(51));
+        assert_eq!(steps(|s| s.step(false, 2 * MS, None, 0)), None);
     }
 
     #[test]
     fn a_machine_that_stood_still_and_a_thread_without_a_core_are_not_hung_threads() {
         let mut silence = Silence::default();
-        assert!(!silence.step(true, 60_000 * MS, None), "the supervisor itself was away for a minute");
+        assert!(!silence.step(true, 60_000 * MS, None, 0), "the supervisor itself was away for a minute");
         assert_eq!(silence.silent_ns, LONGEST_STEP_NS);
-        let starving = steps(|s| s.step(true, 2 * MS, Some(Standing { ready: true, ran_ns: 5 })));
+        let starving = steps(|s| s.step(true, 2 * MS, Some(standing(true, 5, 0)), 0));
         assert_eq!(starving, None);
         // A thread in an endless loop is silent, too.
         let mut ran_ns = 0;
         let circling = steps(|s| {
             ran_ns += 2 * MS;
-            s.step(true, 2 * MS, Some(Standing { ready: true, ran_ns }))
+            s.step(true, 2 * MS, Some(standing(true, ran_ns, 0)), 0)
         });
         assert_eq!(circling, Some(52));
+    }
+
+    /// Found in use, R9: a stage slept while the workers of software Vulkan, for which it waited, got no core.
+    #[test]
+    fn a_thread_that_waits_for_starved_workers_is_not_hung_and_one_beside_them_is_later() {
+        let asleep = || Some(standing(false, 7, 0));
+        assert_eq!(steps(|s| s.step(true, 2 * MS, asleep(), 2 * MS)), None);
+        assert_eq!(steps(|s| s.step(true, 2 * MS, asleep(), MS)), Some(101));
+        // A thread that got a core between two looks tells by the kernel's count that it had waited.
+        let mut waited_ns = 0;
+        let late = steps(|s| {
+            waited_ns += 3 * MS / 2;
+            s.step(true, 2 * MS, Some(standing(false, 0, waited_ns)), 0)
+        });
+        assert!(late.is_some_and(|late| (198..=202).contains(&late)), "{late:?}");
     }
 
     #[test]
@@ -131,7 +168,7 @@ mod tests {
         let mut n = 0;
         let now_and_then = steps(|s| {
             n += 1;
-            s.step(n % 40 != 0, 2 * MS, None)
+            s.step(n % 40 != 0, 2 * MS, None, 0)
         });
         assert_eq!(now_and_then, None);
     }

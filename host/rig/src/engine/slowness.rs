@@ -34,16 +34,42 @@ impl Slowness {
     }
 }
 
-/// The note to the operator of a projector with `hz` slots a second. `by_gpu`: the GPU needs a slot or more for a frame.
-pub(super) fn told(is_slow: bool, stride_milli: u64, hz: f64, by_gpu: bool) -> String {
+/// Threads that frames need got no core for such a share of the time: the machine is what holds frames up, in thousandths.
+pub(super) const STARVED_MILLI: u64 = 400;
+
+/// Who holds frames up.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub(super) enum SlowBy {
+    /// The machine has too little processor time. A thread that frames need got no core for the first share of the time, some program
+    /// of the machine for the second, in thousandths; 0 if that is not known.
+    Machine { starved_milli: u64, pressure_milli: u64 },
+    /// The GPU needs a slot or more for a frame.
+    Renderer,
+    /// Packing or the link.
+    Rest,
+}
+
+/// The note to the operator of a projector with `hz` slots a second.
+pub(super) fn told(is_slow: bool, stride_milli: u64, hz: f64, by: SlowBy) -> String {
     let every = stride_milli as f64 / 1e3;
     let rate = format!("one frame per {every:.1} slots, {:.1} of {hz:.1} per second", hz / every);
-    match (is_slow, by_gpu) {
-        (true, true) => format!(
+    match (is_slow, by) {
+        (true, SlowBy::Machine { starved_milli, pressure_milli }) => {
+            let all = match pressure_milli {
+                0 => String::new(),
+                milli => format!(", and some program of the machine in {} %", milli / 10),
+            };
+            format!(
+                "the machine is short of processor time: {rate}; a thread that frames need was ready and got no core in {} % of the \
+                 time{all}; end other programs, or let this one go first (real_time.priority)",
+                starved_milli / 10
+            )
+        }
+        (true, SlowBy::Renderer) => format!(
             "the renderer is slower than its slots: {rate}; a smaller raster, fewer samples (render.spp) or another method \
              make it faster"
         ),
-        (true, false) => format!(
+        (true, SlowBy::Rest) => format!(
             "frames come for every n-th slot only, although the renderer would keep up: {rate}; packing or the link holds \
              them up, and the causes of missed slots and `dpm link-test` tell which"
         ),
@@ -75,9 +101,16 @@ mod tests {
 
     #[test]
     fn the_note_blames_the_renderer_only_where_it_is_slow() {
-        let of = |by_gpu| super::told(true, 1_500, 947.0, by_gpu);
-        assert!(of(true)
+        let of = |by| super::told(true, 1_500, 947.0, by);
+        assert!(of(SlowBy::Renderer)
             .starts_with("the renderer is slower than its slots: one frame per 1.5 slots, 631.3 of 947.0"));
-        assert!(of(false).contains("the renderer would keep up") && of(false).contains("dpm link-test"));
+        let rest = of(SlowBy::Rest);
+        assert!(rest.contains("the renderer would keep up") && rest.contains("dpm link-test"));
+        let starved = of(SlowBy::Machine { starved_milli: 730, pressure_milli: 900 });
+        assert!(
+            starved.contains("short of processor time")
+                && starved.contains("73 %")
+                && starved.contains("90 %")
+        );
     }
 }

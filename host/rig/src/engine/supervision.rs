@@ -3,21 +3,27 @@
 //! - A stage of the crew (tracking, plan, pack) hangs, or a GPU fails or does not finish: the crew is abandoned, so
 //!   that nothing it still does reaches the light, and a new one is made. Meanwhile the projector goes dark, because
 //!   every frame carries the instant at which its light ends.
-//! - The link's thread or the collector hangs: nobody can replace it, so the run ends. In the first case the watchdog
-//!   darkens the projector; in the second case the link does.
+//! - The link's thread or the collector hangs: nobody can replace it. The link may go on within two seconds, in which the
+//!   projector goes dark by itself; otherwise the run ends. If the collector hangs the run ends, and the link darkens the
+//!   projector.
 //! - A stage panics: this is a bug. The run ends in the dark.
 
 use super::error::PipelineError;
 use super::facts::Facts;
 use super::pulse::{Pulse, Silence, StandingOf};
-use super::slowness::{told, Slowness};
+use super::slowness::{told, SlowBy, Slowness, STARVED_MILLI};
 use crate::telemetry::monitor::{ProjectorHealth, RunCounts};
+use crate::telemetry::report::Recovery;
 use crate::tracks::keys::told as contradicted;
 use dpm_device::time::HostTime;
-use dpm_render::gpu::{AfterLoss, LossBudget};
+use dpm_render::gpu::{AfterLoss, Gpu, LossBudget};
 use std::sync::atomic::Ordering;
 use std::sync::Arc;
 
+/// Crews that a minute may cost whose stages hang while the GPU is well: each is dark for less than a second.
+const MOST_HUNG: usize = 20;
+/// A link that hangs for longer does not come back: nobody can send orders to the projector meanwhile.
+const LINK_RETURNS_NS: i64 = 2_000_000_000;
 /// How long it may take to make a new crew, nanoseconds: drivers translate shaders for it.
 const MADE_WITHIN_NS: i64 = 180_000_000_000;
 /// The operator is informed that a frame stays on the GPU after this time, nanoseconds. A GPU that is still warming up
@@ -46,14 +52,11 @@ impl Trouble {
         matches!(self, Self::Hung(_) | Self::Failed(PipelineError::GpuHangs { .. }))
     }
 
-    /// Planning and packing call the GPU's driver, which may be what hangs.
+    /// A stage that hangs may do so in a call of the GPU's driver: whoever makes the next crew asks the GPU.
     fn remake(&self) -> Remake {
         match self {
-            Self::Hung("tracking") => Remake::Crew,
-            Self::Failed(PipelineError::Gpu { .. } | PipelineError::GpuHangs { .. }) | Self::Hung(_) => {
-                Remake::CrewAndGpu
-            }
-            Self::Failed(_) | Self::Panicked(_) => Remake::Crew,
+            Self::Failed(PipelineError::Gpu { .. } | PipelineError::GpuHangs { .. }) => Remake::CrewAndGpu,
+            Self::Failed(_) | Self::Panicked(_) | Self::Hung(_) => Remake::Crew,
         }
     }
 
@@ -78,7 +81,7 @@ impl Trouble {
 /// How to make a new crew.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) enum Remake {
-    /// With the same GPU.
+    /// With the same GPU if it answers, and else as below.
     Crew,
     /// With the GPU reopened, or another one.
     CrewAndGpu,
@@ -123,8 +126,18 @@ pub(crate) enum Irreplaceable {
 pub(crate) struct Supervision {
     facts: Arc<Facts>,
     losses: LossBudget,
+    /// Of crews that are replaced on the same GPU.
+    hung: LossBudget,
+    /// Frames that had light on some body, and when the last of them was seen.
+    lit: (u64, HostTime),
+    /// What the last crew was replaced for, and when the last light before was seen, while none has followed.
+    recovering: Option<(String, HostTime)>,
+    /// The crew that took over works.
+    is_back: bool,
     link: Silence,
     collector: Silence,
+    /// The operator was told that the link hangs.
+    link_hangs: bool,
     ask: StandingOf,
     made_by: HostTime,
     slowness: Slowness,
@@ -203,8 +216,13 @@ impl Supervision {
         Self {
             facts,
             losses: LossBudget::default(),
+            hung: LossBudget::new(MOST_HUNG, LossBudget::WITHIN_NS),
+            lit: (0, HostTime(0)),
+            recovering: None,
+            is_back: false,
             link: Silence::default(),
             collector: Silence::default(),
+            link_hangs: false,
             ask,
             made_by: HostTime(i64::MAX),
             slowness: Slowness::default(),
@@ -224,14 +242,31 @@ impl Supervision {
         step_ns: i64,
     ) -> Option<Irreplaceable> {
         self.tell_if_slow(now);
+        let frames_lit = self.facts.monitor.counts().frames_lit;
+        if frames_lit != self.lit.0 {
+            self.lit = (frames_lit, now);
+            self.tell_of_recovery(Some(now));
+        }
         self.tell_if_nothing_is_lit(now);
         self.tell_if_gpu_stays(now);
         self.tell_of_keys();
-        if self.link.observe(link, now, step_ns, self.ask) {
+        let link_hangs = self.link.observe(link, now, step_ns, self.ask, 0);
+        if link_hangs && (self.facts.monitor.stop_requested() || self.link.silent_ns() > LINK_RETURNS_NS) {
             self.facts.fail(PipelineError::Hung { stage: link.name() });
             return Some(Irreplaceable::Link);
         }
-        if self.collector.observe(collector, now, step_ns, self.ask) {
+        if link_hangs != self.link_hangs && (link_hangs || !link.is_overdue(now)) {
+            self.link_hangs = link_hangs;
+            self.facts.monitor.note(match link_hangs {
+                true => format!(
+                    "the link's thread hangs; the projector is dark by itself meanwhile, no order reaches it, and the run ends if the \
+                     thread does not go on within {} s",
+                    LINK_RETURNS_NS / 1_000_000_000
+                ),
+                false => "the link's thread goes on".into(),
+            });
+        }
+        if self.collector.observe(collector, now, step_ns, self.ask, 0) {
             let hung = PipelineError::Hung { stage: collector.name() };
             // The link still darkens the projector, but the thread that would return from the run is the one that
             // hangs.
@@ -257,31 +292,52 @@ impl Supervision {
             return Verdict::End;
         }
         let (hangs, remake) = (trouble.hangs(), trouble.remake());
-        let is_ending = facts.monitor.stop_requested() || facts.is_complete.load(Ordering::Acquire);
-        if is_ending {
+        if facts.monitor.stop_requested() {
+            // The light ends anyway, and nothing of the run is lost by it.
+            facts.monitor.note(format!("{}, while the run ends", trouble.in_words()));
+            return Verdict::Abandon { hangs, remake: None };
+        }
+        if facts.is_complete.load(Ordering::Acquire) {
             facts.fail(trouble.into_error());
             return Verdict::Abandon { hangs, remake: None };
         }
-        if self.losses.lost(now) == AfterLoss::GiveUp {
-            facts.fail(PipelineError::KeepsFailing { last: trouble.into_error().to_string() });
+        let (budget, most) = match remake {
+            Remake::Crew => (&mut self.hung, MOST_HUNG),
+            Remake::CrewAndGpu => (&mut self.losses, LossBudget::MOST),
+        };
+        if budget.lost(now) == AfterLoss::GiveUp {
+            facts.fail(PipelineError::KeepsFailing { most, last: trouble.into_error().to_string() });
             return Verdict::Abandon { hangs, remake: None };
         }
+        let bound = match remake {
+            Remake::Crew => String::new(),
+            Remake::CrewAndGpu => format!("; {}", until_gpu_is_back(&facts)),
+        };
         facts.monitor.note(format!(
-            "{}; the stages are restarted, and the projector is dark meanwhile",
+            "{}; the stages are restarted, and the projector is dark meanwhile{bound}",
             trouble.in_words()
         ));
+        let mut since = if self.lit.0 == 0 { now } else { self.lit.1 };
+        if let Some((cause, before)) = self.recovering.take() {
+            facts.recovered(Recovery { cause, dark_s: None });
+            since = before;
+        }
+        self.recovering = Some((trouble.in_words(), since));
+        self.is_back = false;
         self.made_by = now.plus_ns(MADE_WITHIN_NS);
         Verdict::Abandon { hangs, remake: Some(remake) }
     }
 
-    /// A new crew is not ready yet. True while the run waits for it. Otherwise the run has ended, and `Making::Waits`
+    /// A new crew is not ready yet. True while the run waits for it. Otherwise the run ends or has ended, and `Making::Waits`
     /// means that the thread that makes the crew may hang in a driver.
     pub(crate) fn waits_for(&self, making: Making, now: HostTime) -> bool {
         let error = match making {
-            Making::Waits if now < self.made_by && !self.facts.monitor.stop_requested() => return true,
+            Making::Panicked => PipelineError::Panicked("GPU"),
+            // Whoever makes the crew is left behind. The projector is dark, and the run ends in order.
+            _ if self.facts.monitor.stop_requested() => return false,
+            Making::Waits if now < self.made_by => return true,
             Making::Waits => PipelineError::Hung { stage: "GPU" },
             Making::Failed(error) => error,
-            Making::Panicked => PipelineError::Panicked("GPU"),
         };
         self.facts.fail(error);
         false
@@ -305,8 +361,8 @@ impl Supervision {
         }
         self.facts.monitor.note(match why {
             OnGpu::Stays => {
-                "the GPU has worked on one frame for a second, and nothing new is lit meanwhile; after two seconds it \
-                 is given up and opened again"
+                "the GPU has worked on one frame for a second, and nothing new is lit meanwhile; if it does not finish \
+                 it is given up and opened again"
                     .into()
             }
             OnGpu::HoldsUp => format!(
@@ -335,6 +391,27 @@ impl Supervision {
         monitor.note(format!("no frame has been lit for a second, although frames are made{why}"));
     }
 
+    /// Keeps what the last crew was replaced for, with the time until light followed: at `lit_at`, or `None` if the run ends before.
+    pub(crate) fn tell_of_recovery(&mut self, lit_at: Option<HostTime>) {
+        if let (Some((_, since)), Some(at), false) = (&mut self.recovering, lit_at, self.is_back) {
+            // A frame that the old crew had still sent.
+            *since = at;
+            return;
+        }
+        let Some((cause, since)) = self.recovering.take() else { return };
+        let dark_s = lit_at.map(|at| at.ns_since(since) as f64 * 1e-9);
+        if let Some(dark_s) = dark_s {
+            self.facts.monitor.note(format!("light again after {dark_s:.2} s"));
+        }
+        self.facts.recovered(Recovery { cause, dark_s });
+    }
+
+    /// A new crew works.
+    pub(crate) fn is_remade(&mut self) {
+        self.is_back = true;
+        self.facts.monitor.note("the stages are running again; the picture is back".into());
+    }
+
     /// Informs the operator of keys that the motion of a body contradicts.
     fn tell_of_keys(&self) {
         let Facts { monitor, rig, .. } = &*self.facts;
@@ -358,10 +435,31 @@ impl Supervision {
         }
         let stride_milli = facts.stride_milli.load(Ordering::Relaxed);
         if let Some(is_slow) = self.slowness.observe(stride_milli, now) {
-            let by_gpu = facts.gpu_is_slow.load(Ordering::Relaxed);
-            facts.monitor.note(told(is_slow, stride_milli, facts.rig.rate().hz(), by_gpu));
+            let starved = facts.starved_milli.load(Ordering::Relaxed);
+            let by = if starved >= STARVED_MILLI {
+                SlowBy::Machine {
+                    starved_milli: starved,
+                    pressure_milli: facts.pressure_milli.load(Ordering::Relaxed),
+                }
+            } else if facts.gpu_is_slow.load(Ordering::Relaxed) {
+                SlowBy::Renderer
+            } else {
+                SlowBy::Rest
+            };
+            facts.monitor.note(told(is_slow, stride_milli, facts.rig.rate().hz(), by));
         }
     }
+}
+
+/// How long the light may stay away while a GPU is opened again, for the operator.
+pub(crate) fn until_gpu_is_back(facts: &Facts) -> String {
+    let made_s = facts.made_ns.load(Ordering::Relaxed) as f64 * 1e-9;
+    format!(
+        "the GPU is opened again within {} s or another one is tried, its programs and the first frames took {made_s:.1} s at \
+         the start of the run, and after {} s the run ends",
+        Gpu::COMES_BACK_WITHIN.as_secs(),
+        MADE_WITHIN_NS / 1_000_000_000
+    )
 }
 
 #[cfg(test)]

@@ -51,6 +51,10 @@ pub(super) struct CrewState {
     pub(super) planning: AtomicU64,
     /// What planning and packing share.
     pub(super) facts: Arc<CrewFacts>,
+    /// Number of the frame for which packing waits, since when, nanoseconds, and by when the GPU should have finished it.
+    pub(super) rendering: AtomicU64,
+    pub(super) rendering_since: AtomicU64,
+    pub(super) gpu: Pulse,
     pub(super) pulses: [Pulse; 3],
     /// Per stage: its thread has returned without a panic.
     pub(super) returned: [AtomicBool; 3],
@@ -66,6 +70,18 @@ impl CrewState {
         }
     }
 
+    /// Tracking has ended and closed its tracker.
+    pub(super) fn has_left_tracker(&self) -> bool {
+        self.returned[TRACKING].load(Ordering::Acquire)
+    }
+
+    /// Packing waits for the GPU to finish `frame` from `now` on, which should take `limit_ns` at most.
+    pub(super) fn waits_for_gpu(&self, frame: u64, now: HostTime, limit_ns: u64) {
+        self.rendering.store(frame, Ordering::Relaxed);
+        self.rendering_since.store(now.0 as u64, Ordering::Relaxed);
+        self.gpu.beat(now, limit_ns as i64);
+    }
+
     /// True when the crew's threads should end.
     pub(super) fn is_dismissed(&self, shared: &Shared) -> bool {
         self.is_abandoned.load(Ordering::Relaxed) || shared.facts.monitor.stop_requested()
@@ -78,6 +94,7 @@ pub(super) struct Crew {
     tracking: JoinHandle<Option<String>>,
     others: [JoinHandle<()>; 2],
     silences: [Silence; 3],
+    gpu_silence: Silence,
 }
 
 impl Crew {
@@ -92,7 +109,8 @@ impl Crew {
         let frame_ns = first.gpu_ns.unwrap_or(first.wall_ns);
         let facts = Arc::new(CrewFacts::new(frame_ns, rig.rate().slot_len_ns(0)));
         facts.budget_milli.store(budget_milli, Ordering::Relaxed);
-        let stage = PackStage::new(shared.facts.clone(), facts.clone(), budget);
+        let is_software = renderer.as_ref().is_some_and(|r| r.prepared().gpu().summary().software);
+        let stage = PackStage::new(shared.facts.clone(), facts.clone(), budget).on_software(is_software);
         // There is room for all of them: no stage ever finds the next one's channel full.
         let jobs = memory.len();
         let (mut free_in, free) = channel(jobs, policy);
@@ -106,6 +124,9 @@ impl Crew {
             tracking_over: AtomicBool::new(false),
             planning: AtomicU64::new(0),
             facts: facts.clone(),
+            rendering: AtomicU64::new(0),
+            rendering_since: AtomicU64::new(0),
+            gpu: Pulse::new("GPU"),
             pulses: [Pulse::new("tracking"), Pulse::new("plan"), Pulse::new("pack")],
             returned: [const { AtomicBool::new(false) }; 3],
             failure: Lock::new(None),
@@ -150,31 +171,52 @@ impl Crew {
                 })
                 .map_err(refused("pack"))?
         };
-        let crew = Self { state, tracking, others: [plan, pack], silences: Default::default() };
+        let crew = Self {
+            state,
+            tracking,
+            others: [plan, pack],
+            silences: Default::default(),
+            gpu_silence: Silence::default(),
+        };
         Ok((crew, Port { jobs: to_link_out, free: free_in, times, tracks }))
     }
 
-    /// Checks the crew, `step_ns` after the last check.
-    pub(super) fn trouble(&mut self, now: HostTime, step_ns: i64) -> Option<Trouble> {
+    /// Checks the crew, `step_ns` after the last check. `starved_ns` looks for how long of such a step a worker got no core for which a stage may
+    /// wait; it is asked only while something is overdue.
+    pub(super) fn trouble(
+        &mut self,
+        now: HostTime,
+        step_ns: i64,
+        starved_ns: impl FnOnce(i64) -> i64,
+    ) -> Option<Trouble> {
         let failure = self.state.failure.lock().ok().and_then(|mut f| f.take());
         if let Some(error) = failure {
             return Some(Trouble::Failed(error));
         }
         let finished =
             [self.tracking.is_finished(), self.others[0].is_finished(), self.others[1].is_finished()];
-        for (i, pulse) in self.state.pulses.iter().enumerate() {
-            if finished[i] && !self.state.returned[i].load(Ordering::Acquire) {
+        let state = &self.state;
+        let is_late = state.gpu.is_overdue(now) || state.pulses.iter().any(|pulse| pulse.is_overdue(now));
+        let starved_ns = if is_late { starved_ns(step_ns) } else { 0 };
+        for (i, pulse) in state.pulses.iter().enumerate() {
+            if finished[i] && !state.returned[i].load(Ordering::Acquire) {
                 return Some(Trouble::Panicked(pulse.name()));
             }
-            if self.silences[i].observe(pulse, now, step_ns, standing_of) {
+            if self.silences[i].observe(pulse, now, step_ns, standing_of, starved_ns) {
                 return Some(Trouble::Hung(pulse.name()));
             }
+        }
+        if self.gpu_silence.observe(&state.gpu, now, step_ns, |_| None, starved_ns) {
+            let [frame, since] =
+                [&state.rendering, &state.rendering_since].map(|n| n.load(Ordering::Relaxed));
+            let ms = (now.0 as u64).saturating_sub(since) / 1_000_000;
+            return Some(Trouble::Failed(PipelineError::GpuHangs { frame, ms }));
         }
         None
     }
 
-    /// Abandons the crew. Its threads end when they notice it, or with the process.
-    pub(super) fn abandon(self) {
+    /// Abandons the crew. Its threads end when they notice it, or with the process; each drops what is its own.
+    pub(super) fn abandon(&self) {
         self.state.is_abandoned.store(true, Ordering::Relaxed);
         self.state.tracking_over.store(true, Ordering::Release);
     }

@@ -25,7 +25,7 @@ use dpm_device::tracker::Tracker;
 use dpm_device::transport::Transport;
 use dpm_render::gpu::Gpu;
 use dpm_render::pack::{BitPlaneFrame, Kernel};
-use dpm_render::{RenderError, Renderer, RendererSettings};
+use dpm_render::{PreparedScene, RenderError, Renderer, RendererSettings};
 use std::sync::Arc;
 use std::time::Duration;
 
@@ -100,6 +100,16 @@ pub(super) struct CrewParts {
     pub(super) budget_milli: u64,
 }
 
+/// What crews leave to those that take over from them on the same device.
+#[derive(Clone)]
+pub(super) struct Heritage {
+    /// `None` if nothing is rendered.
+    scene: Option<PreparedScene>,
+    budget: Option<BudgetController>,
+    first: WarmUp,
+    budget_milli: u64,
+}
+
 impl CrewParts {
     /// Trackers outside this process stamp their packets with `clock`.
     ///
@@ -115,13 +125,54 @@ impl CrewParts {
             output: output(rig, gpu, options.verify),
             ..renderer_settings(rig)
         };
+        let renderer = || origin.gpu().map(|gpu| Renderer::new(gpu, &rig.scene, settings(gpu))).transpose();
+        Self::drawn_by(renderer, rig, origin, options, clock)
+    }
+
+    /// The same for a crew that takes over on the same device, at real pace: nothing is compiled, no frame is drawn that is never shown, and what
+    /// was learned of the device at the start holds.
+    ///
+    /// # Errors
+    /// As [`CrewParts::new`].
+    pub(super) fn taking_over(
+        heritage: &Heritage,
+        rig: &Rig,
+        origin: &Origin,
+        options: RunOptions,
+        clock: Arc<dyn HostClock>,
+    ) -> Result<Self, PipelineError> {
+        let Heritage { scene, budget, first, budget_milli } = heritage.clone();
+        let renderer = || scene.as_ref().map(Renderer::from_prepared).transpose();
+        let parts = Self::drawn_by(renderer, rig, origin, options, clock)?;
+        Ok(Self { budget, first, budget_milli, ..parts }.with_tracks(rig))
+    }
+
+    /// What a crew that takes over on the same device needs of this one.
+    pub(super) fn heritage(&self) -> Heritage {
+        Heritage {
+            scene: self.renderer.as_ref().map(|renderer| renderer.prepared().clone()),
+            budget: self.budget.clone(),
+            first: self.first,
+            budget_milli: self.budget_milli,
+        }
+    }
+
+    fn drawn_by<E>(
+        renderer: impl FnOnce() -> Result<Option<Renderer>, E>,
+        rig: &Rig,
+        origin: &Origin,
+        options: RunOptions,
+        clock: Arc<dyn HostClock>,
+    ) -> Result<Self, PipelineError>
+    where
+        PipelineError: From<E>,
+    {
         // The tracker first: to open it takes a moment, and shaders may take a minute.
         let tracker: Box<dyn Tracker> = match origin {
             Origin::Pattern(..) => Box::new(NoTracker),
             _ => open_for(rig, clock, HostTime(0))?,
         };
-        let mut renderer =
-            origin.gpu().map(|gpu| Renderer::new(gpu, &rig.scene, settings(gpu))).transpose()?;
+        let mut renderer = renderer()?;
         let memory = (0..options.in_flight.max(2))
             .map(|_| frame_memory(rig, renderer.as_mut()))
             .collect::<Result<_, _>>()?;
@@ -170,10 +221,16 @@ impl CrewParts {
                 self.budget_milli = budget.rays();
             }
         }
+        Ok(self.with_tracks(rig))
+    }
+
+    /// With the filters that tracks between frames need, if the rig sends any.
+    fn with_tracks(self, rig: &Rig) -> Self {
         if rig.wants_tracks() {
-            self.tracking = self.tracking.with_lively(rig);
+            Self { tracking: self.tracking.with_lively(rig), ..self }
+        } else {
+            self
         }
-        Ok(self)
     }
 
     /// The same, in a run that has seen the bodies of `seen` before.

@@ -3,12 +3,12 @@
 
 use super::crew::{Crew, OnExit, Port};
 use super::link::{device_thread, link_thread, Line};
-use super::parts::{bring_up, mock_projector, CrewParts, Origin};
+use super::parts::{bring_up, mock_projector, CrewParts, Heritage, Origin};
 use super::projector::{self, OpenMedium};
 use super::rights::Rights;
 use super::run::Ran;
 use super::settings::lead_estimator;
-use super::supervisor::{join_within, Maker, Supervisor};
+use super::supervisor::{join_within, Maker, Supervisor, Workshop, Wreckage};
 use super::threads::{policy, Shared, STAGE_THREADS};
 use crate::config::ProjectorBackend;
 use crate::engine::error::PipelineError;
@@ -17,7 +17,7 @@ use crate::engine::keeper::LinkKeeper;
 use crate::engine::link::LinkStage;
 use crate::engine::options::RunOptions;
 use crate::engine::pulse::Pulse;
-use crate::engine::supervision::{Remake, Supervision};
+use crate::engine::supervision::{until_gpu_is_back, Remake, Supervision};
 use crate::light::collector::{Collector, Inbox};
 use crate::light::notes::note_channel;
 use crate::light::recorder::{light_channel, LightNote, LightReceiver, LightRecorder, LightSender};
@@ -53,6 +53,8 @@ const LOOK_NS: i64 = 5_000_000_000;
 /// Time between two passes of the collector. It is not woken for every frame, which would cost the frame path two
 /// system calls per frame.
 const REST: Duration = Duration::from_millis(2);
+/// A GPU that is well runs an empty submission behind the frames that it still has within this time.
+const ANSWERS_WITHIN: Duration = Duration::from_secs(2);
 /// How long the end of a run waits for threads that have nothing left to do.
 const END_WITHIN: Duration = Duration::from_secs(1);
 
@@ -67,7 +69,9 @@ pub(super) fn run_at_real_pace(
     let spin_ns = if usable_cores() > STAGE_THREADS { 50_000 } else { 0 };
     let clock = origin.clock().map_or_else(|| MonotonicClock::new(spin_ns), |clock| clock.spinning(spin_ns));
     let seen = Arc::new(SeenBodies::new(rig.bodies.len()));
+    let making = Stopwatch::start();
     let parts = crew_parts(rig, origin, options, clock, true)?.remembering(&seen);
+    let (heritage, made_ns) = (parts.heritage(), making.elapsed_ns() as i64);
     let (lights_in, lights) = light_channel();
     let rights = Arc::new(Rights::new(&rig.config.real_time, monitor));
     let standstill =
@@ -80,6 +84,7 @@ pub(super) fn run_at_real_pace(
     })?;
     let lead = lead_estimator(rig, &link, parts.first.wall_ns);
     let facts = Arc::new(Facts::new(rig.clone(), monitor.clone(), options, &lead, clock.now()));
+    facts.made_ns.store(made_ns, Ordering::Relaxed);
     tell_horizon(&facts);
     let keeper = LinkKeeper::new(
         time,
@@ -101,7 +106,9 @@ pub(super) fn run_at_real_pace(
         Collector::new(rig.clone(), options.keep_frames.max(options.keep_records), options.verify)
             .about(origin.gpu().is_none(), standstill.as_ref().map(StandstillMonitor::seen));
 
-    let maker = maker(rig, origin.clone(), options, clock, seen);
+    // The supervisor tells this thread from those that the driver made.
+    shared.collector_pulse.begin(thread_id());
+    let maker = maker(&facts, origin.clone(), heritage, clock, seen);
     let (threads, mut inbox) = Threads::start(&shared, parts, line, maker, lights)?;
     // A panic before the end of this function ends the light.
     let stop_on_panic = OnExit(|| {
@@ -141,22 +148,40 @@ fn crew_parts(
     CrewParts::new(rig, origin, options, Arc::new(move || clock.now()))?.at_real_pace(rig, origin, wakes)
 }
 
-/// Makes crews that take over. A GPU that failed is reopened with the same options.
+/// Makes crews that take over: on the same GPU, with what was prepared there, as long as it answers. A GPU that failed or does not answer is reopened
+/// with the same options.
 fn maker(
-    rig: &Arc<Rig>,
+    facts: &Arc<Facts>,
     origin: Origin,
-    options: RunOptions,
+    heritage: Heritage,
     clock: MonotonicClock,
     seen: Arc<SeenBodies>,
 ) -> Maker {
-    let rig = rig.clone();
-    let origin = Lock::new(origin);
+    let facts = facts.clone();
+    let state = Lock::new((origin, Some(heritage)));
     Arc::new(move |remake| {
-        let mut origin = origin.lock().map_err(|_| PipelineError::Panicked("remake"))?;
-        if let (Origin::Gpu(old), Remake::CrewAndGpu) = (&mut *origin, remake) {
-            *old = old.reopen().map_err(RenderError::from)?;
+        let mut state = state.lock().map_err(|_| PipelineError::Panicked("remake"))?;
+        let (origin, heritage) = &mut *state;
+        if let Origin::Gpu(gpu) = origin {
+            let answers = remake == Remake::Crew && gpu.answers(ANSWERS_WITHIN);
+            if remake == Remake::Crew && !answers {
+                facts.monitor.note(format!("the GPU does not answer either; {}", until_gpu_is_back(&facts)));
+            }
+            if !answers {
+                // What lies on a device that failed is of no use to the next one.
+                *heritage = None;
+                *gpu = gpu.reopen().map_err(RenderError::from)?;
+            }
         }
-        Ok(crew_parts(&rig, &origin, options, clock, false)?.remembering(&seen))
+        let (rig, options) = (&facts.rig, facts.options);
+        let parts = match heritage {
+            Some(heritage) => {
+                CrewParts::taking_over(heritage, rig, origin, options, Arc::new(move || clock.now()))?
+            }
+            None => crew_parts(rig, origin, options, clock, false)?,
+        };
+        *heritage = Some(parts.heritage());
+        Ok(parts.remembering(&seen))
     })
 }
 
@@ -268,6 +293,8 @@ impl Threads {
             mind: Supervision::new(shared.facts.clone(), standing_of),
             ports: ports_in,
             maker,
+            workshop: Workshop::default(),
+            wreckage: Wreckage::default(),
         };
         let rights = shared.rights.clone();
         let supervisor = spawn("supervisor", move || {

@@ -154,6 +154,8 @@ impl Ran {
         report.tracker = facts.monitor.sample_counts();
         report.warnings.extend(report.tracker.as_ref().and_then(TrackerReport::warning));
         report.stopped = facts.monitor.stop_requested();
+        report.recoveries = facts.recoveries();
+        report.starved_s = facts.starved_ns.load(Ordering::Relaxed) as f64 * 1e-9;
         report.frames_per_wall_second = report.frames_lit as f64 / wall_s.max(1e-9);
         report.warnings.extend(warnings);
         report.warnings.extend(rig.scene.warnings.iter().cloned());

@@ -59,8 +59,6 @@ const REPLAN_NS: i64 = 100_000;
 const WAIT_FOR_TRACKER: Duration = Duration::from_millis(2);
 /// Time between two polls of a tracker that cannot be waited for.
 const POLL_REST: Duration = Duration::from_micros(200);
-/// At the end, how long to wait for frames that the GPU still works on, nanoseconds.
-const RELEASED_WITHIN_NS: u64 = 30_000_000_000;
 
 /// What all threads of a run share, whichever crew works.
 pub(super) struct Shared {
@@ -78,9 +76,14 @@ pub(super) struct Shared {
     pub(super) rights: Arc<Rights>,
 }
 
-/// Stalls if the run's options ask for it.
+/// Stalls if the run's options ask for it. A stall strikes once, also where a new crew works on the same frame again.
 pub(super) fn may_stall(facts: &Facts, stage: StallIn, frame: u64) {
-    if let Some(stall) = facts.options.stall.filter(|s| (s.stage, s.frame) == (stage, frame)) {
+    let Some(stall) = facts.options.stall else { return };
+    let struck = facts.stalls.load(Ordering::Relaxed);
+    let next = struck + 1;
+    if stall.strikes(stage, frame, struck)
+        && facts.stalls.compare_exchange(struck, next, Ordering::Relaxed, Ordering::Relaxed).is_ok()
+    {
         std::thread::sleep(stall.length);
     }
 }
@@ -196,18 +199,10 @@ pub(super) fn plan_thread(
         facts.is_complete.store(true, Ordering::Release);
     }
     pulse.end();
-    // This also ends packing.
+    // This also ends packing, which waits for the frames that the GPU still has. They keep what the GPU reads, so the renderer may
+    // go before them.
     drop(desk);
-    let Some(renderer) = renderer else { return };
-    let watch = Stopwatch::start();
-    while crew.facts.gpu.in_flight() > 0 {
-        if watch.elapsed_ns() > RELEASED_WITHIN_NS {
-            // The GPU may read the renderer's memory for an unknown time, so the memory is never freed.
-            std::mem::forget(renderer);
-            return;
-        }
-        std::thread::sleep(Duration::from_millis(1));
-    }
+    drop(renderer);
 }
 
 /// The planning thread's state.
@@ -288,6 +283,10 @@ impl<'a> PlanDesk<'a> {
         if shared.clock.now().ns_since(now) > REPLAN_NS {
             return Some(());
         }
+        // A thread that hung until now must not keep the GPU from its successor.
+        if crew.is_abandoned.load(Ordering::Relaxed) {
+            return None;
+        }
         let Some(mut job) = self.hottest.pop() else { return Some(()) };
         job.note.held_up_by = self.held_up_by.take();
         let watch = Stopwatch::start();
@@ -338,13 +337,25 @@ pub(super) fn pack_thread(
     let pulse = &crew.pulses[PACK];
     pulse.begin(thread_id());
     let alive = || pulse.beat(clock.now(), WAIT_NS + STEP_NS);
-    while let Some(mut job) = next(&mut jobs, alive) {
+    let goes_on = || {
+        alive();
+        !crew.is_abandoned.load(Ordering::Relaxed)
+    };
+    let mut unfinished = None;
+    while let Some(mut job) = next(&mut jobs, goes_on) {
         let frame = job.note.plan.id.0;
         enter_frame_path(frame >= WARM_UP_FRAMES);
         may_stall(facts, StallIn::Pack, frame);
-        let limit_ns = stage.wait_from(&job.note, clock.now());
-        if let Err(failure) = rendered(&mut job, limit_ns, alive) {
-            crew.fail(failure);
+        let begin = clock.now();
+        crew.waits_for_gpu(frame, begin, stage.wait_from(&job.note, begin));
+        // The supervisor judges whether the GPU hangs: it sees whether the machine serves the driver's workers.
+        let is_rendered = crate::render::finish(&mut job, goes_on);
+        crew.gpu.end();
+        if !matches!(is_rendered, Ok(true)) {
+            if let Err(source) = is_rendered {
+                crew.fail(PipelineError::Gpu { frame, source });
+            }
+            unfinished = Some(job);
             break;
         }
         let now = clock.now();
@@ -367,25 +378,36 @@ pub(super) fn pack_thread(
     }
     enter_frame_path(false);
     pulse.end();
+    dismiss(unfinished, jobs);
 }
 
-/// Waits at most `limit_ns` for the GPU to finish a frame; calls `alive` before each wait.
+/// Drops what the GPU still has of a crew that has ended or was abandoned, each frame when the GPU has finished it. Ends when planning has, so that
+/// no frame is overlooked.
+fn dismiss(mut unfinished: Option<FrameJob>, mut jobs: Receiver<FrameJob>) {
+    while unfinished.is_some() || !jobs.is_finished() {
+        if let Some(job) = unfinished.take().or_else(|| pop_within(&mut jobs, WAIT_NS)) {
+            crate::render::dismiss(job);
+        }
+    }
+}
+
+/// Waits at most `limit_ns` for the GPU to finish a frame.
 ///
 /// # Errors
 /// The GPU does not finish in time, or was lost.
-pub(super) fn rendered(job: &mut FrameJob, limit_ns: u64, alive: impl FnMut()) -> Result<(), PipelineError> {
+pub(super) fn rendered(job: &mut FrameJob, limit_ns: u64) -> Result<(), PipelineError> {
     let frame = job.note.plan.id.0;
-    match crate::render::finish(job, limit_ns, alive) {
+    let watch = Stopwatch::start();
+    match crate::render::finish(job, || watch.elapsed_ns() < limit_ns) {
         Ok(true) => Ok(()),
         Ok(false) => Err(PipelineError::GpuHangs { frame, ms: limit_ns / 1_000_000 }),
         Err(source) => Err(PipelineError::Gpu { frame, source }),
     }
 }
 
-/// The next job, or `None` if no more will come; calls `alive` before each wait.
-fn next(from: &mut Receiver<FrameJob>, alive: impl Fn()) -> Option<FrameJob> {
-    loop {
-        alive();
+/// The next job, or `None` if no more will come or it does not go on, which is asked before each wait.
+fn next(from: &mut Receiver<FrameJob>, goes_on: impl Fn() -> bool) -> Option<FrameJob> {
+    while goes_on() {
         if let Some(job) = pop_within(from, WAIT_NS) {
             return Some(job);
         }
@@ -393,4 +415,5 @@ fn next(from: &mut Receiver<FrameJob>, alive: impl Fn()) -> Option<FrameJob> {
             return None;
         }
     }
+    None
 }

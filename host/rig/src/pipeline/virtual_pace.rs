@@ -266,7 +266,7 @@ impl World {
         enter_frame_path(frame >= WARM_UP_FRAMES);
         self.at_work = "pack";
         may_stall(&self.facts, StallIn::Pack, frame);
-        rendered(job, if frame == 0 { FIRST_FRAME_TIMEOUT_NS } else { GPU_TIMEOUT_NS }, || ())?;
+        rendered(job, if frame == 0 { FIRST_FRAME_TIMEOUT_NS } else { GPU_TIMEOUT_NS })?;
         let rendered_at = job.note.timeline.submitted_at.plus_ns(self.costs[1]);
         (job.note.timeline.rendered_at, job.note.timeline.packing_at) = (rendered_at, rendered_at);
         if self.pack.is_wanted(&mut job.note, rendered_at, true) {
@@ -339,7 +339,7 @@ impl World {
     fn clear(&mut self) {
         while let Some(mut job) = self.under_way.pop_front() {
             job.note.fate = Fate::Stopped;
-            if rendered(&mut job, GPU_TIMEOUT_NS, || ()).is_err() {
+            if rendered(&mut job, GPU_TIMEOUT_NS).is_err() {
                 return self.abandon(job);
             }
             self.release(job);

@@ -132,6 +132,16 @@ impl DarkBody {
     }
 }
 
+/// A crew of stages that was replaced while the run went on.
+#[derive(Clone, Debug, PartialEq, serde::Serialize)]
+pub struct Recovery {
+    /// Why.
+    pub cause: String,
+    /// From the last light on a body before to the first after, seconds; `None` if none followed before another crew was replaced, or the run
+    /// ended.
+    pub dark_s: Option<f64>,
+}
+
 /// A stage's wall time.
 #[derive(Clone, Debug, PartialEq)]
 pub struct StageTime {
@@ -168,6 +178,10 @@ pub struct Report {
     pub dark_by_body: Vec<DarkBody>,
     /// The run was stopped before it was complete.
     pub stopped: bool,
+    /// Crews of stages that hung or lost the GPU and were replaced, the first 256.
+    pub recoveries: Vec<Recovery>,
+    /// For how long a thread that frames need was ready to run and got no core because the machine was busy, seconds.
+    pub starved_s: f64,
     /// Frames that were planned but never lit.
     pub frames_dropped: u64,
     /// Frames that were not lit because no new picture was wanted.
@@ -289,6 +303,8 @@ impl Default for Report {
             frames_dark: 0,
             dark_by_body: Vec::new(),
             stopped: false,
+            recoveries: Vec::new(),
+            starved_s: 0.0,
             frames_dropped: 0,
             frames_withheld: 0,
             frames_unrecorded: 0,

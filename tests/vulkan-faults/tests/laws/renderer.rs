@@ -5,7 +5,7 @@
 
 use crate::common;
 use crate::common::{assert_no_validation_messages, clean, layer, submit, Bench, PATIENCE_NS, SLACK};
-use dpm_render::gpu::{memory_given_up, Gpu, GpuError};
+use dpm_render::gpu::{devices_unfinished, memory_given_up, Gpu, GpuError};
 use dpm_render::History;
 use dpm_render::{FrameSlot, Renderer};
 use std::sync::mpsc::channel;
@@ -65,6 +65,55 @@ fn a_renderer_takes_the_pipelines_of_one_that_is_gone_and_draws_the_same() {
     shows_the_right_pictures(third);
     shows_the_right_pictures(second);
     drop(gpu);
+    assert_no_validation_messages();
+}
+
+/// A crew that takes over from one that hangs waits for no compiler, whatever the threads of the old one still hold.
+#[test]
+fn a_renderer_that_takes_over_compiles_nothing_and_draws_the_same_beside_the_old_one() {
+    let session = layer("");
+    clean();
+    let mut first = Bench::open();
+    first.frame(0).unwrap();
+    first.submit(1).unwrap();
+    let compiled = session.count(Call::Pipeline);
+    let renderer = Renderer::from_prepared(first.renderer.prepared()).unwrap_or_else(|e| panic!("{e}"));
+    let slot = renderer.create_slot(false).unwrap();
+    let second = shows_the_right_pictures(Bench { renderer, slot, gpu: first.gpu.clone() });
+    assert_eq!(session.count(Call::Pipeline), compiled);
+    drop(first);
+    let mut second = second;
+    assert_eq!(second.frame(3).unwrap(), clean()[3]);
+    drop(second);
+    assert_no_validation_messages();
+}
+
+/// Found in use, R2: what a device that was given up held stayed until the end of the program, also where the device had finished
+/// long ago.
+#[test]
+fn what_a_device_that_was_given_up_held_is_free_when_it_has_finished() {
+    let session = layer("");
+    clean();
+    let mut bench = Bench::open();
+    bench.frame(0).unwrap();
+    let before = memory_given_up().bytes;
+    assert!(bench.gpu.answers(Duration::from_secs(60)));
+    session.set("submit-hang@frame=1,ms=3000");
+    bench.submit(1).unwrap();
+    assert!(
+        !bench.gpu.answers(Duration::from_millis(100)),
+        "what it is given stands behind the frame that hangs"
+    );
+    bench.gpu.give_up();
+    assert!(memory_given_up().bytes > before);
+    let next = reopened(&bench.gpu);
+    drop(bench);
+    let begin = Instant::now();
+    while devices_unfinished() > 0 || memory_given_up().bytes > before {
+        assert!(begin.elapsed().as_nanos() < u128::from(PATIENCE_NS), "{:?}", memory_given_up());
+        std::thread::sleep(Duration::from_millis(5));
+    }
+    drop(next);
     assert_no_validation_messages();
 }
 

@@ -263,7 +263,7 @@ impl Crew {
             return Some(Trouble::Panicked(stage));
         }
         for (pulse, silence) in self.pulses.iter().zip(&mut self.silences) {
-            if silence.observe(pulse, now, step_ns, |_| None) {
+            if silence.observe(pulse, now, step_ns, |_| None, 0) {
                 return Some(Trouble::Hung(pulse.name()));
             }
         }

@@ -481,7 +481,7 @@ impl Running {
                     CrewParts::stepped(&self.facts.rig, tracker, self.facts.options.in_flight, frame_ns)
                         .remembering(&self.seen);
                 self.crew = Some(Crew::new(&self.facts, parts, self.time, &mut self.line, now));
-                self.facts.monitor.note("the stages are running again; the picture is back".into());
+                self.mind.is_remade();
             }
         }
     }

@@ -30,7 +30,7 @@ fn run(stage: StallIn, watchdog_ms: u32) -> Vec<FrameRecord> {
     let options = RunOptions {
         frames: FRAMES,
         keep_frames: FRAMES as usize,
-        stall: Some(Stall { stage, frame: STALLED, length: STALL }),
+        stall: Some(Stall { stage, frame: STALLED, length: STALL, times: 1, every: 0 }),
         ..RunOptions::default()
     };
     let outcome =
