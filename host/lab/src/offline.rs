@@ -43,7 +43,7 @@ impl OfflinePredictor {
     pub(crate) fn new(rig: &Rig) -> Result<Self, SourceError> {
         let tracker = open_for(rig, std::sync::Arc::new(|| HostTime(0)), HostTime(0))?;
         let stage = TrackingStage::new(rig, tracker);
-        let (publisher, reader) = latest(TrackSnapshot::empty(rig.bodies.len()));
+        let (publisher, reader) = latest(TrackSnapshot::empty(rig.tracked_count()));
         Ok(Self { stage, publisher, reader })
     }
 

@@ -10,7 +10,7 @@ use dpm_render::gpu::{Gpu, GpuError};
 use dpm_render::method::Method;
 use dpm_render::{FrameCost, FrameInputs, FrameSlot, RenderError, Renderer, RendererSettings, Surface};
 use dpm_rig::pipeline::renderer_settings;
-use dpm_rig::rig::Rig;
+use dpm_rig::rig::{affine, Rig, RigBody};
 use dpm_shaders::structs::NO_HIT;
 use glam::{DAffine3, DVec2, DVec3, Vec3};
 use std::sync::Arc;
@@ -105,9 +105,7 @@ impl std::ops::Deref for Placed {
 pub fn poses_at(rig: &Rig, slot: u64) -> Placed {
     let rate = rig.rate();
     let t = rate.slot_start_ns(slot) + rate.slot_len_ns(slot) / 2;
-    let tracked = rig
-        .true_poses(t)
-        .unwrap_or_else(|| rig.bodies.iter().map(|b| dpm_rig::rig::affine(&b.rest)).collect());
+    let tracked = rig.true_poses(t).unwrap_or_else(|| rig.tracked().map(|b| affine(&b.rest)).collect());
     let mut poses = Vec::new();
     rig.scene_poses(&tracked, t, &mut poses);
     Placed { poses, animated_at_ns: t }
@@ -317,10 +315,14 @@ impl Theatre {
     }
 }
 
-/// Poses of the tracked bodies among those of the scene's bodies.
-fn tracked_poses(rig: &Rig, poses: &[DAffine3]) -> Vec<DAffine3> {
+/// Poses of all that is tracked: the bodies among those of the scene's, and what people wear.
+fn tracked_poses(rig: &Rig, poses: &Placed) -> Vec<DAffine3> {
     let carried = |i: usize| rig.scene.bodies.iter().position(|b| b.tracked == Some(i as u16));
-    (0..rig.bodies.len()).map(|i| carried(i).map_or(DAffine3::IDENTITY, |b| poses[b])).collect()
+    let bodies = (0..rig.bodies.len()).map(|i| carried(i).map_or(DAffine3::IDENTITY, |b| poses[b]));
+    let place = |worn: &RigBody| {
+        affine(&worn.motion.as_ref().map_or(worn.rest, |motion| motion.pose_at(poses.animated_at_ns)))
+    };
+    bodies.chain(rig.worn.iter().map(place)).collect()
 }
 
 /// Draws one frame of poses, with `spp` samples a pixel on average over the frames, and waits for it, at most two minutes.

@@ -59,7 +59,7 @@ pub(crate) fn warm_up(
 ) -> Result<WarmUp, GpuError> {
     let watch = Stopwatch::start();
     let mut plan = FramePlan::empty(rig);
-    plan.tracked_poses.extend(rig.bodies.iter().map(|b| affine(&b.rest)));
+    plan.tracked_poses.extend(rig.tracked().map(|b| affine(&b.rest)));
     rig.scene_poses(&plan.tracked_poses, 0, &mut plan.scene_poses);
     (plan.eye, plan.gaze) = rig.observer.eye_and_gaze(&plan.tracked_poses);
     plan.budget_milli = budget_milli;

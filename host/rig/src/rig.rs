@@ -3,10 +3,11 @@
 use crate::calibrated::{calibrated_camera, measured, measured_camera, told_of_measured, CameraFileError};
 use crate::config::{
     BodyConfig, BuiltinScene, EnvironmentConfig, FileAxis, GazeConfig, LiveSource, PictureSource,
-    ProjectorBackend, RigConfig, Tracing, TrackerConfig, TracksUse,
+    ProjectorBackend, RigConfig, Tracing, TrackerConfig, TracksUse, MAX_TRACKED,
 };
 use crate::drive::{albedo_of, drive, DriveError, MAX_PICTURE_BYTES};
 use crate::mock::{Motion, MotionError, MotionSpec};
+use dpm_calibration::file::CalibrationFile;
 use dpm_device::planes::{PlaneSchedule, Raster};
 use dpm_device::pose::Pose;
 use dpm_device::regular_file;
@@ -40,20 +41,16 @@ pub enum RigError {
         message: String,
     },
     /// A body's motion is invalid.
-    #[error("scene.bodies[{index}] \"{name}\": motion: {source}")]
+    #[error("\"{name}\": motion: {source}")]
     Motion {
-        /// Index in the rig file.
-        index: usize,
         /// The body's name.
         name: String,
         /// What is wrong.
         source: MotionError,
     },
     /// A body's motion table cannot be read.
-    #[error("scene.bodies[{index}] \"{name}\": motion: {message}")]
+    #[error("\"{name}\": motion: {message}")]
     MotionTable {
-        /// Index in the rig file.
-        index: usize,
         /// The body's name.
         name: String,
         /// What is wrong.
@@ -112,6 +109,8 @@ impl RigError {
 pub struct RigBody {
     /// Name, as the tracker reports it.
     pub name: String,
+    /// Number under which the tracker reports it, if the tracker has no names.
+    pub id: Option<i64>,
     /// Pose of its mesh at rest.
     pub rest: Pose,
     /// From the mesh's space to that of the body that the tracker reports; the identity with the mock tracker, which
@@ -121,7 +120,18 @@ pub struct RigBody {
     pub motion: Option<Motion>,
 }
 
-/// Where the eye is and where it looks, computed from the poses of the tracked bodies.
+/// A head about which no light may be.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct GuardedHead {
+    /// Index of what is tracked of it, among [`Rig::tracked`].
+    pub tracked: usize,
+    /// Radius of the sphere about its origin, metres.
+    pub radius_m: f64,
+    /// For how long it may be lost before all light goes off, nanoseconds.
+    pub lost_ns: i64,
+}
+
+/// Where the eye is and where it looks, computed from the poses of all that is tracked.
 #[derive(Clone, Debug)]
 pub struct Observer {
     position: DVec3,
@@ -182,8 +192,12 @@ pub struct Rig {
     pub scene: Scene,
     /// The projector, at the raster that is traced and projected.
     pub camera: ProjectorCamera,
-    /// The tracked bodies, in the order of the rig file.
+    /// The tracked bodies of the scene, in the order of the rig file.
     pub bodies: Vec<RigBody>,
+    /// What people wear: tracked, and nothing that light falls on.
+    pub worn: Vec<RigBody>,
+    /// The heads that are guarded, the observer's first; empty if the guard is off.
+    pub heads: Vec<GuardedHead>,
     /// The observer's eye.
     pub observer: Observer,
     /// The planes of a frame in the order in which they are shown.
@@ -273,16 +287,30 @@ impl Rig {
                 placed.push(name.as_str());
             }
         }
-        let observer = observer(config, &bodies)?;
+        let worn = rig_worn(config)?;
+        let (observer, heads) = (observer(config, &bodies, &worn)?, heads(config, &bodies, &worn)?);
         let drive = drive(config, &measured, &scene, raster)?;
         let latency_ns = measured.latency.as_ref().map(|l| (l.latency_us * 1e3).round() as i64);
         let calibration = told_of_measured(&measured, config, &placed);
         let schedule = config.projector.schedule();
         let config = config.clone();
-        Ok(Self { config, scene, camera, bodies, observer, schedule, drive, latency_ns, calibration })
+        Ok(Self {
+            config,
+            scene,
+            camera,
+            bodies,
+            worn,
+            heads,
+            observer,
+            schedule,
+            drive,
+            latency_ns,
+            calibration,
+        })
     }
 
-    /// The projector of a rig alone, without scene, bodies or calibration: for light that nothing is traced for.
+    /// The projector of a rig alone, without scene and bodies: for light that nothing is traced for. It is measured only
+    /// where heads are guarded, and there as far as it was.
     ///
     /// # Errors
     /// The projector's place or view makes no camera.
@@ -290,12 +318,42 @@ impl Rig {
         let mut config = config.clone();
         config.keep_projector();
         let raster = config.projector.raster();
-        let camera = camera(&config, raster, &mut Vec::new())?;
-        let observer = observer(&config, &[])?;
-        let (scene, bodies) = (Scene::default(), Vec::new());
-        let (schedule, drive) = (config.projector.schedule(), Drive::default());
-        let (latency_ns, calibration) = (None, None);
-        Ok(Self { config, scene, camera, bodies, observer, schedule, drive, latency_ns, calibration })
+        // The first calibration makes the file.
+        let is_measured = config.calibration.file.as_ref().is_some_and(|file| file.exists());
+        let measured = if is_measured { measured(&config)? } else { CalibrationFile::new() };
+        let camera = match &measured.projector {
+            Some(section) => measured_camera(section, &config, raster)?,
+            None => camera(&config, raster, &mut Vec::new())?,
+        };
+        let worn = rig_worn(&config)?;
+        Ok(Self {
+            camera,
+            observer: observer(&config, &[], &worn)?,
+            heads: heads(&config, &[], &worn)?,
+            scene: Scene::default(),
+            bodies: Vec::new(),
+            worn,
+            schedule: config.projector.schedule(),
+            drive: Drive::default(),
+            latency_ns: measured.latency.as_ref().map(|l| (l.latency_us * 1e3).round() as i64),
+            calibration: None,
+            config,
+        })
+    }
+
+    /// All that the tracker is asked for, in the order of its indices: the bodies of the scene, and what people wear.
+    pub fn tracked(&self) -> impl Iterator<Item = &RigBody> {
+        self.bodies.iter().chain(&self.worn)
+    }
+
+    /// The number of [`Rig::tracked`], as far as they can be tracked.
+    pub fn tracked_count(&self) -> usize {
+        (self.bodies.len() + self.worn.len()).min(MAX_TRACKED)
+    }
+
+    /// Whether a head that is guarded is tracked under index `tracked`.
+    pub(crate) fn guards(&self, tracked: usize) -> bool {
+        self.heads.iter().any(|head| head.tracked == tracked)
     }
 
     /// Frames per second.
@@ -323,9 +381,9 @@ impl Rig {
         })
     }
 
-    /// The true world-from-mesh transform of every tracked body at an instant; `None` unless the tracker is the mock.
+    /// The true world-from-mesh transform of all that is tracked at an instant; `None` unless the tracker is the mock.
     pub fn true_poses(&self, t_ns: i64) -> Option<Vec<DAffine3>> {
-        self.bodies.iter().map(|b| b.motion.as_ref().map(|m| affine(&m.pose_at(t_ns)))).collect()
+        self.tracked().map(|b| b.motion.as_ref().map(|m| affine(&m.pose_at(t_ns)))).collect()
     }
 
     /// True if a projector that follows tracks is sent some. Where poses are not predicted there is nothing to correct, and
@@ -337,7 +395,7 @@ impl Rig {
         config.projector.tracks == TracksUse::Auto && config.prediction.on && carries
     }
 
-    /// Writes the pose of every body of the scene at `t_ns` on the host's clock to `out`: `tracked` for the tracked bodies,
+    /// Writes the pose of every body of the scene at `t_ns` on the host's clock to `out`: `tracked` for the tracked ones,
     /// the rest pose for those that never move, and for parts that move by themselves their place in their carrier at that
     /// time. Allocates nothing if `out` has enough capacity.
     pub fn scene_poses(&self, tracked: &[DAffine3], t_ns: i64, out: &mut Vec<DAffine3>) {
@@ -366,7 +424,12 @@ fn load_scene(config: &RigConfig) -> Result<Scene, SceneError> {
         bodies: c
             .bodies
             .iter()
-            .map(|b| BodySelector { name: b.name.clone(), node: b.node.clone(), projected: true })
+            .map(|b| BodySelector {
+                name: b.name.clone(),
+                node: b.node.clone(),
+                // Light on it would be light in the eyes of whoever wears it.
+                projected: config.observer.body.as_ref() != Some(&b.name),
+            })
             .collect(),
         virtual_nodes: c.virtual_nodes.clone(),
         scale: c.scale,
@@ -466,10 +529,14 @@ fn camera(
 fn motion_spec(index: usize, body: &BodyConfig) -> Result<MotionSpec, RigError> {
     match &body.motion.0 {
         None => Ok(default_motion(index)),
-        Some(table) => toml::Value::Table(table.clone()).try_into().map_err(|e: toml::de::Error| {
-            RigError::MotionTable { index, name: body.name.clone(), message: e.message().to_owned() }
-        }),
+        Some(table) => {
+            read_motion(table).map_err(|message| RigError::MotionTable { name: body.name.clone(), message })
+        }
     }
+}
+
+fn read_motion(table: &toml::Table) -> Result<MotionSpec, String> {
+    toml::Value::Table(table.clone()).try_into().map_err(|e: toml::de::Error| e.message().to_owned())
 }
 
 /// The paper's experiment: the first body moves back and forth at 1 m/s, the second rotates in place, and the others
@@ -504,11 +571,10 @@ fn rig_bodies(config: &RigConfig, scene: &Scene) -> Result<Vec<RigBody>, RigErro
                 None => default_motion(i),
             };
             let motion = if mock {
-                Some(Motion::new(&spec, rest).map_err(|source| RigError::Motion {
-                    index: i,
-                    name: name.clone(),
-                    source,
-                })?)
+                Some(
+                    Motion::new(&spec, rest)
+                        .map_err(|source| RigError::Motion { name: name.clone(), source })?,
+                )
             } else {
                 None
             };
@@ -516,23 +582,78 @@ fn rig_bodies(config: &RigConfig, scene: &Scene) -> Result<Vec<RigBody>, RigErro
                 Some(body) if !mock => body.mesh_to_body.to_affine().unwrap_or(DAffine3::IDENTITY),
                 _ => DAffine3::IDENTITY,
             };
-            Ok(RigBody { name, rest, mesh_to_body, motion })
+            Ok(RigBody { name, id: named.get(i).and_then(|b| b.id), rest, mesh_to_body, motion })
         })
         .collect()
 }
 
-fn observer(config: &RigConfig, bodies: &[RigBody]) -> Result<Observer, RigError> {
-    let find = |key: &'static str, name: &str| {
-        bodies.iter().position(|b| b.name == name).ok_or_else(|| RigError::UnknownBody {
-            key,
-            name: name.to_owned(),
-            known: bodies.iter().map(|b| b.name.as_str()).collect::<Vec<_>>().join(", "),
+/// What people wear, as it is tracked. The observer's is at rest where the eye is without it.
+fn rig_worn(config: &RigConfig) -> Result<Vec<RigBody>, RigError> {
+    let mock = matches!(config.tracker, TrackerConfig::Mock(_));
+    let observer = &config.observer;
+    let eye = DVec3::from_array(observer.position) - DVec3::from_array(observer.eye_offset);
+    let worn = config.worn();
+    let made = worn.into_iter().map(|worn| {
+        let is_observer = observer.tracked.as_ref().is_some_and(|tracked| tracked.0 == *worn);
+        let place = if is_observer { eye.to_array() } else { [0.0; 3] };
+        let rest = Pose { position_m: worn.position.unwrap_or(place), ..Pose::IDENTITY };
+        let name = worn.name.clone();
+        let motion = match &worn.motion.0 {
+            _ if !mock => None,
+            None => Some(MotionSpec::Still {}),
+            Some(table) => Some(
+                read_motion(table)
+                    .map_err(|message| RigError::MotionTable { name: name.clone(), message })?,
+            ),
+        };
+        let motion = motion.map(|spec| Motion::new(&spec, rest)).transpose();
+        let motion = motion.map_err(|source| RigError::Motion { name: name.clone(), source })?;
+        Ok(RigBody { name, id: worn.id, rest, mesh_to_body: DAffine3::IDENTITY, motion })
+    });
+    made.collect()
+}
+
+/// The index of `name` among all that is tracked.
+fn tracked_index(
+    key: &'static str,
+    name: &str,
+    bodies: &[RigBody],
+    worn: &[RigBody],
+) -> Result<usize, RigError> {
+    let all = || bodies.iter().chain(worn).map(|b| b.name.as_str());
+    let unknown =
+        || RigError::UnknownBody { key, name: name.to_owned(), known: all().collect::<Vec<_>>().join(", ") };
+    all().position(|known| known == name).ok_or_else(unknown)
+}
+
+/// The heads that are guarded. The observer's sphere is about the eye however the head is turned, so it is larger by the
+/// eye's distance from the origin of what is tracked.
+fn heads(config: &RigConfig, bodies: &[RigBody], worn: &[RigBody]) -> Result<Vec<GuardedHead>, RigError> {
+    let observer = &config.observer;
+    let carrier = observer.tracked.as_ref().map(|t| &t.0.name).or(observer.body.as_ref());
+    let offset_m = DVec3::from_array(observer.eye_offset).length();
+    let head = |name: &str| {
+        let more_m = if carrier.is_some_and(|carrier| carrier == name) { offset_m } else { 0.0 };
+        Ok(GuardedHead {
+            tracked: tracked_index("safety.eyes.heads", name, bodies, worn)?,
+            radius_m: config.safety.eyes.radius + more_m,
+            lost_ns: i64::from(config.safety.eyes.lost_ms) * 1_000_000,
         })
     };
+    config.heads().into_iter().map(head).collect()
+}
+
+fn observer(config: &RigConfig, bodies: &[RigBody], worn: &[RigBody]) -> Result<Observer, RigError> {
+    let find = |key: &'static str, name: &str| tracked_index(key, name, bodies, worn);
     let c = &config.observer;
+    let carrier = match (&c.tracked, &c.body) {
+        (Some(tracked), _) => Some(find("observer.tracked", &tracked.0.name)?),
+        (None, Some(body)) => Some(find("observer.body", body)?),
+        (None, None) => None,
+    };
     Ok(Observer {
         position: DVec3::from_array(c.position),
-        carrier: c.body.as_deref().map(|n| find("observer.body", n)).transpose()?,
+        carrier,
         eye_offset: DVec3::from_array(c.eye_offset),
         gaze: match &c.gaze {
             GazeConfig::Point(p) => Gaze::Point(DVec3::from_array(p.point)),
@@ -620,6 +741,64 @@ mod tests {
         // 60 degrees per second, starting at 100 ms.
         assert_eq!([after(-5), after(0), after(100), after(600)], [0.0, 0.0, 0.0, 30.0]);
         assert_eq!(o.widening_deg(i64::MAX), 180.0);
+    }
+
+    /// Who looks needs no mesh, and what carries the eye is never lit: neither glasses that are no body, nor a body.
+    #[test]
+    fn a_tracked_observer_is_no_surface() {
+        let build = |settings: &[&str]| {
+            let flags = settings.iter().map(|s| (*s).to_owned()).collect();
+            let config = RigConfig::demo(&Overrides { variables: vec![], flags }).unwrap();
+            Rig::build(&config, Raster::new(8, 8)).unwrap()
+        };
+        let plain = build(&[]);
+        let sway = "motion={kind=\"sway\",peak_rate_rad_s=1,peak_acceleration_rad_s2=4}";
+        let tracked = format!("observer.tracked={{name=\"glasses\",{sway}}}");
+        let straight = "observer.gaze={kind=\"straight\"}";
+        let rig = build(&[&tracked, straight, "observer.eye_offset=[0, 0.03, 0]"]);
+        assert_eq!((rig.bodies.len(), rig.tracked_count()), (2, 3));
+        assert_eq!(rig.scene.bodies.len(), plain.scene.bodies.len());
+        // At the middle of its sway the eye is where it is without a tracker, and it turns with the glasses later.
+        let at = |ms: i64| rig.observer.eye_and_gaze(&rig.true_poses(ms * 1_000_000).unwrap());
+        let (eye, gaze) = at(0);
+        let position = DVec3::from_array(rig.config.observer.position);
+        assert!(
+            (eye - position).length() < 1e-12 && (gaze - eye + DVec3::Z).length() < 1e-12,
+            "{eye} {gaze}"
+        );
+        assert!((at(100).1 - at(100).0 + DVec3::Z).length() > 0.05);
+        assert_eq!(rig.heads, [GuardedHead { tracked: 2, radius_m: 0.15 + 0.03, lost_ns: 500_000_000 }]);
+        assert_eq!(build(&[&tracked, "safety.eyes.guard=false"]).heads, []);
+        // A body of the scene that carries the eye is one of those that are tracked, and no light falls on it.
+        let file = std::env::temp_dir().join(format!("dpm-glasses-{}.obj", std::process::id()));
+        std::fs::write(&file, "v 0 0 0\nv 1 0 0\nv 0 1 0\no glasses\nf 1 2 3\no box\nf 1 2 3\n").unwrap();
+        let scene = format!("scene.file=\"{}\"", file.display());
+        let old =
+            build(&[&scene, "scene.bodies=[{name=\"glasses\"},{name=\"box\"}]", "observer.body=\"glasses\""]);
+        let lit = |name: &str| old.scene.bodies.iter().find(|b| b.name == name).unwrap().projected;
+        assert_eq!((lit("glasses"), lit("box"), old.tracked_count(), old.heads.len()), (false, true, 2, 1));
+        std::fs::remove_file(&file).unwrap();
+    }
+
+    /// The projector alone, for patterns, still knows where heads are and where its light goes.
+    #[test]
+    fn a_rig_without_scene_keeps_its_heads() {
+        let flags = [
+            "observer.body=\"bunny\"",
+            "observer.eye_offset=[0, 0.05, 0]",
+            "safety.eyes.heads=[\"bunny\", {name=\"visitor\", id=7, position=[0, 1, 0]}]",
+            "tracker.rate_hz=120",
+        ];
+        let flags = flags.map(str::to_owned).to_vec();
+        let config = RigConfig::demo(&Overrides { variables: vec![], flags }).unwrap();
+        let rig = Rig::of_projector(&config).unwrap();
+        let names: Vec<_> = rig.tracked().map(|b| (b.name.as_str(), b.id)).collect();
+        assert_eq!(names, [("bunny", None), ("visitor", Some(7))]);
+        let radii: Vec<_> = rig.heads.iter().map(|head| (head.tracked, head.radius_m)).collect();
+        assert_eq!(radii, [(0, 0.15 + 0.05), (1, 0.15)]);
+        assert_eq!((rig.bodies.len(), rig.config.tracker.rate_hz()), (0, Some(120)));
+        let again = Rig::of_projector(&rig.config).unwrap();
+        assert_eq!((&again.heads, again.tracked_count()), (&rig.heads, 2), "once more gives the same");
     }
 
     #[test]

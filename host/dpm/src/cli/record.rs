@@ -54,7 +54,7 @@ pub(super) fn execute(args: &RecordArgs) -> Result<(), Failure> {
     let clock = MonotonicClock::new(0);
     let start = clock.now();
     let tracker = dpm_rig::tracks::open_for(&rig, Arc::new(move || clock.now()), start)?;
-    let bodies: Vec<_> = rig.bodies.iter().map(|b| BodyKey { name: b.name.clone(), id: None }).collect();
+    let bodies: Vec<_> = rig.tracked().map(|b| BodyKey { name: b.name.clone(), id: None }).collect();
     let mut recorder = Recorder::create(tracker, &args.out, &bodies, start)?;
     let mut say_at = start.plus_ns(SAY_EVERY_NS);
     let failed = loop {

@@ -91,7 +91,7 @@ impl Eye {
     /// What the observer sees, radiance in scene units, in `light`, which falls on tracked bodies at `poses` at `t_ns` on the
     /// host's clock. `None` while nothing can be seen.
     pub(super) fn viewer(&mut self, light: &Linear, poses: &[DAffine3], t_ns: i64) -> Option<Linear> {
-        if poses.len() != self.rig.bodies.len() {
+        if poses.len() != self.rig.tracked_count() {
             return None;
         }
         let projector = self.rig.camera.at_raster(self.raster);

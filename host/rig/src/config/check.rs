@@ -2,7 +2,10 @@
 
 use super::check_projector::projector;
 use super::world::{EnvironmentConfig, GazeConfig, TrackerConfig};
-use super::{LiveSource, Pace, PictureSource, ProjectorBackend, Purpose, ResponseConfig, RigConfig};
+use super::{
+    LiveSource, Pace, PictureSource, ProjectorBackend, Purpose, ResponseConfig, RigConfig, Wearable,
+    WearableConfig,
+};
 use crate::mock::{self, FaultError};
 use dpm_common::keys::read::{ConfigValue, Reader};
 use dpm_device::regular_file;
@@ -12,6 +15,9 @@ use std::path::{Path, PathBuf};
 /// The maximum number of tracked bodies. It is the number of poses in a snapshot of the tracks, and the number of
 /// bodies that the renderer can distinguish.
 pub(crate) const MAX_TRACKED: usize = 256;
+
+/// The maximum number of heads that are guarded: each costs every frame a look at all mirrors.
+const MAX_HEADS: usize = 16;
 
 /// Refuses several keys that contradict each other, at the first of them that was written. The message names all of
 /// them with their values, so that nobody must guess which other key is involved. `problem` itself names the keys
@@ -154,27 +160,30 @@ fn bodies(rig: &RigConfig, reader: &mut Reader) {
             );
         }
     }
-    if let Some(first) = bodies.get(MAX_TRACKED) {
+    let room = MAX_TRACKED - rig.worn().len().min(MAX_HEADS);
+    if let Some(first) = bodies.get(room) {
         let count = bodies.len();
         let problem = format!(
-            "has {count} bodies, {} more than the {MAX_TRACKED} that are tracked: {:?} is the first of them",
-            count - MAX_TRACKED,
+            "has {count} bodies, {} more than the {room} that are tracked: {:?} is the first of them",
+            count - room,
             first.name
         );
         refuse(reader, &["scene.bodies"], problem, "bodies that move as one can be one body".into());
     }
-    let mut must_exist = |key: &str, name: &str| {
-        if !bodies.iter().any(|b| b.name == name) {
+    worn(rig, &ids, reader);
+    let mut must_exist = |key: &str, name: &str, worn: &[&WearableConfig]| {
+        let mut known = bodies.iter().map(|b| &b.name).chain(worn.iter().map(|w| &w.name));
+        if !known.any(|known| known == name) {
             let known: Vec<String> = bodies.iter().map(|b| format!("{:?}", b.name)).collect();
             let known = if known.is_empty() { "none".into() } else { known.join(", ") };
             refuse(reader, &[key], format!("no body is called {name:?}"), format!("bodies: {known}"));
         }
     };
     if let Some(name) = &rig.observer.body {
-        must_exist("observer.body", name);
+        must_exist("observer.body", name, &[]);
     }
     if let GazeConfig::Tracked(gaze) = &rig.observer.gaze {
-        must_exist("observer.gaze.target", &gaze.target);
+        must_exist("observer.gaze.target", &gaze.target, &rig.worn());
     }
     if rig.scene.file.is_some() && reader.is_written("scene.builtin") {
         refuse(
@@ -184,13 +193,77 @@ fn bodies(rig: &RigConfig, reader: &mut Reader) {
             "remove one of the two".into(),
         );
     }
-    if rig.observer.body.is_none() && reader.is_written("observer.eye_offset") {
+    let is_carried = rig.observer.body.is_some() || rig.observer.tracked.is_some();
+    if !is_carried && reader.is_written("observer.eye_offset") {
         refuse(
             reader,
             &["observer.eye_offset"],
-            "is given without `observer.body`, the body that it is measured from".into(),
-            "set `observer.body`, or put the eye at `observer.position`".into(),
+            "is given without `observer.tracked`, the rigid body that it is measured from".into(),
+            "set `observer.tracked`, or put the eye at `observer.position`".into(),
         );
+    }
+}
+
+/// What people wear: the observer, and the heads of `[safety.eyes]`.
+fn worn(rig: &RigConfig, ids: &HashMap<i64, usize>, reader: &mut Reader) {
+    let bodies = &rig.scene.bodies;
+    if let (Some(Wearable(tracked)), Some(body)) = (&rig.observer.tracked, &rig.observer.body) {
+        let keys =
+            [("observer.tracked", shown(tracked.name.clone())), ("observer.body", shown(body.clone()))];
+        let remedy = "keep `observer.tracked`, which needs no mesh".to_owned();
+        contradict(reader, &keys, "one eye is carried by one of them", remedy);
+    }
+    let heads = rig.safety.eyes.heads.iter().enumerate();
+    let heads = heads.map(|(i, head)| (format!("safety.eyes.heads.{i}"), &head.0));
+    let observer = rig.observer.tracked.iter().map(|tracked| ("observer.tracked".to_owned(), &tracked.0));
+    let mut seen: HashMap<i64, &str> = HashMap::new();
+    for (key, worn) in observer.chain(heads) {
+        let is_body = bodies.iter().any(|b| b.name == worn.name);
+        if is_body && key == "observer.tracked" {
+            refuse(
+                reader,
+                &[&key],
+                format!("{:?} is one of `scene.bodies`, on which light falls", worn.name),
+                "remove that entry: who looks needs neither a node nor a mesh".into(),
+            );
+        }
+        let other = worn.id.and_then(|id| {
+            let body = ids.get(&id).map(|i| bodies[*i].name.as_str());
+            body.or_else(|| seen.get(&id).copied()).filter(|other| *other != worn.name)
+        });
+        if let (Some(id), Some(other)) = (worn.id, other) {
+            refuse(
+                reader,
+                &[&key],
+                format!("{:?} and {other:?} have the same id {id}", worn.name),
+                "each needs the id that the tracker gives it".into(),
+            );
+        }
+        worn.id.map(|id| seen.insert(id, &worn.name));
+        let moves = worn.motion.0.is_some() || worn.position.is_some();
+        if moves && !matches!(rig.tracker, TrackerConfig::Mock(_)) {
+            refuse(
+                reader,
+                &[&key],
+                format!(
+                    "has a motion or a position, with `tracker.kind` = {:?}, which reports the poses itself",
+                    rig.tracker.word()
+                ),
+                "remove it, set tracker.kind = \"mock\", or try the rig with --simulate".into(),
+            );
+        }
+    }
+    if !rig.heads().is_empty() && matches!(rig.projector.backend, ProjectorBackend::Dlpc900(_)) {
+        let keys = ["safety.eyes.heads", "observer.tracked", "observer.body"];
+        let problem = "names a head, and a DLPC900 cannot spare it: its patterns are loaded before anybody knows where \
+                       the head will be";
+        let remedy = "keep people out of the beam, and set safety.eyes.guard = false";
+        refuse(reader, &keys, problem.into(), remedy.into());
+    }
+    if rig.heads().len() > MAX_HEADS {
+        let problem =
+            format!("are {} heads with the observer's, and {MAX_HEADS} are guarded", rig.heads().len());
+        refuse(reader, &["safety.eyes.heads"], problem, String::new());
     }
 }
 

@@ -16,6 +16,7 @@ mod projector;
 mod run;
 mod safety;
 mod values;
+mod wearable;
 mod world;
 
 #[cfg(test)]
@@ -32,10 +33,11 @@ pub use page::{PageConfig, DEFAULT_PAGE};
 pub use projector::*;
 pub use run::*;
 pub use safety::{
-    InterlockConfig, InterlockSignal, KeyInterlockConfig, LimitsConfig, LineInterlockConfig,
+    EyesConfig, InterlockConfig, InterlockSignal, KeyInterlockConfig, LimitsConfig, LineInterlockConfig,
     NoInterlockConfig, ProcessInterlockConfig, Restart, SafetyConfig,
 };
 pub use values::{Axes, BitOrder, LiveSource, PerChannel, PictureSource};
+pub use wearable::{Wearable, WearableConfig};
 pub use world::*;
 
 use crate::mock::MotionSpec;
@@ -179,18 +181,67 @@ impl RigConfig {
 
     /// Forgets everything that says what light is drawn: scene, tracker, observer and the projector's calibration, so
     /// that none of them has to exist. Pictures, traces and the flight recorder of a run tell of those, so none is
-    /// written.
+    /// written. Where heads are guarded, what says where they are and where light falls stays.
     pub fn keep_projector(&mut self) {
-        self.scene = SceneConfig::default();
-        self.tracker = TrackerConfig::default();
-        self.observer = ObserverConfig::default();
-        self.calibration = CalibrationConfig::default();
+        let (heads, old) = (self.guarded(), std::mem::take(&mut self.observer));
+        let is_tracked = old.tracked.is_some() || old.body.is_some();
         let projector = &mut self.projector;
-        (projector.calibration, projector.calibration_unit) = (None, None);
-        (projector.calibration_camera, projector.calibration_region) = (None, None);
-        (self.projector.flat_field, self.projector.response) = (None, ResponseConfig::default());
+        if heads.is_empty() {
+            self.tracker = TrackerConfig::default();
+            self.calibration = CalibrationConfig::default();
+            (projector.calibration, projector.calibration_unit) = (None, None);
+            (projector.calibration_camera, projector.calibration_region) = (None, None);
+        } else if is_tracked {
+            self.observer.tracked = heads.first().cloned();
+            (self.observer.position, self.observer.eye_offset) = (old.position, old.eye_offset);
+        }
+        self.scene = SceneConfig::default();
+        self.safety.eyes.heads = heads;
+        (projector.flat_field, projector.response) = (None, ResponseConfig::default());
         let output = &mut self.output;
         (output.images, output.trace, output.flight_recorder) = (false, false, false);
+    }
+
+    /// What people wear that is no body of the scene, each once: the observer first, then the heads of `safety.eyes`.
+    pub fn worn(&self) -> Vec<&WearableConfig> {
+        let mut worn: Vec<&WearableConfig> = Vec::new();
+        for Wearable(one) in self.observer.tracked.iter().chain(&self.safety.eyes.heads) {
+            let is_known = |name: &String| name == &one.name;
+            let is_body = self.scene.bodies.iter().any(|b| is_known(&b.name));
+            if !is_body && !worn.iter().any(|w| is_known(&w.name)) {
+                worn.push(one);
+            }
+        }
+        worn
+    }
+
+    /// The names of the heads about which no light may be, the observer's first; none if the guard is off.
+    pub fn heads(&self) -> Vec<&str> {
+        let eyes = &self.safety.eyes;
+        let observer =
+            self.observer.tracked.iter().map(|t| t.0.name.as_str()).chain(self.observer.body.as_deref());
+        let mut heads: Vec<&str> = Vec::new();
+        for name in observer.chain(eyes.heads.iter().map(|head| head.0.name.as_str())).filter(|_| eyes.guard)
+        {
+            if !heads.contains(&name) {
+                heads.push(name);
+            }
+        }
+        heads
+    }
+
+    /// What is tracked of the heads that are guarded, whether or not it is a body of the scene.
+    fn guarded(&self) -> Vec<Wearable> {
+        let worn = self.worn();
+        let of = |name: &str| match worn.iter().find(|w| w.name == name) {
+            Some(worn) => (*worn).clone(),
+            None => {
+                let body = self.scene.bodies.iter().find(|b| b.name == name).cloned().unwrap_or_default();
+                let motion = body.motion;
+                WearableConfig { name: name.to_owned(), id: body.id, motion, ..WearableConfig::default() }
+            }
+        };
+        self.heads().into_iter().map(|name| Wearable(of(name))).collect()
     }
 
     /// Number of slots in `run.seconds`, at least one; 0 if there is no limit.

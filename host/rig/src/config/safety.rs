@@ -1,7 +1,7 @@
 //! `[safety]` with its limits and interlock: what happens when something fails, how much light is permitted, and what else
 //! must permit it.
 
-use super::{Origin, ProjectorBackend, RigConfig};
+use super::{Origin, ProjectorBackend, RigConfig, Wearable};
 use dpm_common::keys::read::{Any, NotEmpty, Reader, Within};
 use dpm_common::{kinds, section, words};
 use dpm_device::link::{LightLimits, MAX_LIMIT_MS, MIN_LIMIT_MS};
@@ -37,6 +37,8 @@ section! {
         start: Restart = Restart::ByItself, "", Any;
         /// How much light is permitted; docs/SAFETY.md says what that does for people and what it does not.
         limits: LimitsConfig = LimitsConfig::default(), "", Any;
+        /// Where no light may be, because somebody's eyes are there.
+        eyes: EyesConfig = EyesConfig::default(), "", Any;
         /// What else must permit light.
         interlock: InterlockConfig = InterlockConfig::default(), "", Any;
     }
@@ -78,6 +80,23 @@ impl LimitsConfig {
             window_ms: if mean_permille > 0 { (self.mean_window_s * 1000.0).round() as u32 } else { 0 },
             full_white_ms: (self.full_white_s * 1000.0).floor() as u32,
         }
+    }
+}
+
+section! {
+    /// The eye guard: no light within a sphere about every tracked head, which is no safety device (docs/SAFETY.md).
+    pub struct EyesConfig {
+        /// Off lets light fall on tracked heads too. Without a tracked head it has nothing to guard.
+        guard: bool = true, "", Any;
+        /// Further tracked people, each by what is tracked of the head: `["visitor"]`. The observer is guarded without being
+        /// named here. An entry is a name or a table, as in `observer.tracked`, or one of `scene.bodies[].name`.
+        heads: Vec<Wearable> = Vec::new(), "", Any;
+        /// Radius of the sphere about the observer's eye, or about the origin of another tracked head. It grows by what
+        /// the tracker and the prediction do not know.
+        radius: f64 = 0.15, "m", Within(0.01, 10.0);
+        /// The sphere of a head that the tracker loses grows at 2 m/s for this long; then the rig is dark until the head
+        /// is seen again.
+        lost_ms: u32 = 500, "ms", Within(0, 60_000);
     }
 }
 

@@ -1,6 +1,7 @@
 //! `[tracker]`, `[observer]`, `[scene]` and `[prediction]`: what moves, who looks, and what is shown.
 
 use super::values::{Axes, Each, PerChannel, PictureSource};
+use super::wearable::Wearable;
 use crate::mock::{Motion, MotionSpec};
 use dpm_common::keys::read::{Any, ConfigValue, NotEmpty, Reader, Within};
 use dpm_common::keys::source::Node;
@@ -202,9 +203,15 @@ impl TrackerConfig {
 section! {
     /// The eye for which the picture is computed.
     pub struct ObserverConfig {
-        /// Position of the eye if no tracked body carries it.
+        /// Position of the eye if it is not tracked, and until the tracker has seen it.
         position: [f64; 3] = [0.25, 0.35, 1.0], "m", Within(-1e6, 1e6);
-        /// Name of the tracked body that carries the eye, for example tracked glasses; one of `scene.bodies[].name`.
+        /// The rigid body that carries the eye, for example glasses, by the name under which the tracker reports it. It
+        /// needs neither a node of the scene nor a mesh, and is no entry of `scene.bodies`. A table says more than the name:
+        /// `{ name = "glasses", id = 7 }` for a tracker that has numbers and no names, and
+        /// `{ name = "glasses", motion = { kind = "sway", peak_rate_rad_s = 1, peak_acceleration_rad_s2 = 4 } }` for the mock,
+        /// with which it stands at `position` without a motion.
+        tracked: Option<Wearable> = None, "", Any;
+        /// The same by one of `scene.bodies[].name`, whose mesh is then never lit; `tracked` needs no mesh.
         body: Option<String> = None, "", NotEmpty;
         /// Position of the eye in that body's space.
         eye_offset: [f64; 3] = [0.0, 0.0, 0.0], "m", Within(-10.0, 10.0);
@@ -241,7 +248,7 @@ section! {
 section! {
     /// Gaze that follows a body.
     pub struct GazeTrackedConfig {
-        /// Name of the body; one of `scene.bodies[].name`.
+        /// Name of the body: one of `scene.bodies[].name`, or what a person wears.
         target: String = String::new(), "", NotEmpty;
     }
 }

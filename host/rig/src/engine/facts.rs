@@ -83,7 +83,7 @@ impl Facts {
         lead: &LeadEstimator,
         now: HostTime,
     ) -> Self {
-        monitor.samples().begin(rig.bodies.len());
+        monitor.samples().begin(rig.tracked_count());
         let predict_ns = Horizon::of_rig(&rig.config).predict_ns(lead.lead_ns() + RECEIPT_NS, 0);
         Self {
             rig,

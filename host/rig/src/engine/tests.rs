@@ -94,7 +94,7 @@ impl Bench {
         let latch = stage.choose_slot(&self.time, self.now)?;
         self.now = self.now.max(latch.at);
         let mut note = Box::new(FrameNote::new(&self.facts.rig));
-        let nothing = TrackSnapshot::empty(self.facts.rig.bodies.len());
+        let nothing = TrackSnapshot::empty(self.facts.rig.tracked_count());
         stage.plan(&latch, &mut note, &self.time, &nothing, self.now);
         stage.submitted(&mut note, self.now);
         Some(note)

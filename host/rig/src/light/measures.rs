@@ -98,7 +98,7 @@ impl RegistrationMeasures {
         let Some(at) = record.timeline.centre_at else { return };
         let Some(truth) = self.rig.true_poses(at.0) else { return };
         let counted = |px: f64| (px * PER_PIXEL).round() as u64;
-        for (i, truth) in truth.iter().enumerate() {
+        for (i, truth) in truth.iter().enumerate().take(self.rig.bodies.len()) {
             if !prepared && record.dark.get(i).copied().flatten().is_some() {
                 continue;
             }
@@ -123,14 +123,14 @@ impl RegistrationMeasures {
         for planes in &mut self.planes {
             planes.clear();
         }
-        self.planes.resize_with(record.tracked_poses.len(), Vec::new);
+        self.planes.resize_with(self.rig.bodies.len(), Vec::new);
         let reach = self.instants.iter().fold(0.0f64, |reach, instant| reach.max(instant.abs()));
         let follows = |i: usize| {
             let [first, last] = &record.swept_poses;
             first.get(i).zip(last.get(i)).is_some_and(|(a, b)| self.meter.is_followed(i, a, b, reach))
         };
         self.follows.clear();
-        self.follows.extend((0..record.tracked_poses.len()).map(follows));
+        self.follows.extend((0..self.rig.bodies.len()).map(follows));
         let lights = lights_of_frame(&self.rig, last.ns_since(lit_at));
         for (k, ((middle_ns, light), instant)) in lights.zip(&self.instants).enumerate() {
             let moves = *moves.and_then(|slot| slot.planes().get(k)).unwrap_or(&Moves::NONE);

@@ -131,9 +131,9 @@ impl Crew {
             returned: [const { AtomicBool::new(false) }; 3],
             failure: Lock::new(None),
         });
-        let (publisher, reader) = latest(TrackSnapshot::empty(rig.bodies.len()));
+        let (publisher, reader) = latest(TrackSnapshot::empty(rig.tracked_count()));
         let (to_link, tracks) =
-            rig.wants_tracks().then(|| latest(TrackSnapshot::empty(rig.bodies.len()))).unzip();
+            rig.wants_tracks().then(|| latest(TrackSnapshot::empty(rig.tracked_count()))).unzip();
         let (times, time) = latest(shared.time);
         let gpu_free = Waiter::new(policy);
         let gpu_waker = gpu_free.waker();

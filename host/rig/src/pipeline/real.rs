@@ -68,7 +68,7 @@ pub(super) fn run_at_real_pace(
     // On a machine with fewer cores than stages, a spinning thread delays the very stages that it waits for.
     let spin_ns = if usable_cores() > STAGE_THREADS { 50_000 } else { 0 };
     let clock = origin.clock().map_or_else(|| MonotonicClock::new(spin_ns), |clock| clock.spinning(spin_ns));
-    let seen = Arc::new(SeenBodies::new(rig.bodies.len()));
+    let seen = Arc::new(SeenBodies::new(rig.tracked_count()));
     let making = Stopwatch::start();
     let parts = crew_parts(rig, origin, options, clock, true)?.remembering(&seen);
     let (heritage, made_ns) = (parts.heritage(), making.elapsed_ns() as i64);

@@ -89,7 +89,7 @@ pub(super) fn run_at_virtual_pace(
         sent_at: now,
         costs: facts.modelled_costs(),
         track_ns: i64::from(rig.config.real_time.stage_costs_us.track) * 1000,
-        latest: latest(TrackSnapshot::empty(rig.bodies.len())),
+        latest: latest(TrackSnapshot::empty(rig.tracked_count())),
         cable,
         recorder: recorder.seen_by(monitor),
         free,
@@ -136,7 +136,7 @@ impl LateTracks {
             return Ok(None);
         }
         let tracker = open_for(rig, Arc::new(|| HostTime(0)), HostTime(0))?;
-        let empty = || latest(TrackSnapshot::empty(rig.bodies.len()));
+        let empty = || latest(TrackSnapshot::empty(rig.tracked_count()));
         let ((frames, _), (publisher, reader)) = (empty(), empty());
         let tracking = TrackingStage::new(rig, tracker).with_lively(rig);
         Ok(Some(Self { tracking, frames, publisher, reader: Some(reader) }))

@@ -40,7 +40,7 @@ pub(crate) struct FramePlan {
     pub received_at: HostTime,
     /// At least one body is lit, so `captured_at` is the age of the light.
     pub is_lit: bool,
-    /// Per tracked body: predicted world-from-mesh.
+    /// Per tracked body: predicted world-from-mesh; behind them the same of what people wear.
     pub tracked_poses: Vec<DAffine3>,
     /// Per tracked body: world-from-mesh by the newest sample, without prediction.
     pub sampled_poses: Vec<DAffine3>,
@@ -122,7 +122,7 @@ impl FramePlan {
             captured_at: HostTime(0),
             received_at: HostTime(0),
             is_lit: false,
-            tracked_poses: Vec::with_capacity(bodies),
+            tracked_poses: Vec::with_capacity(rig.tracked_count()),
             sampled_poses: Vec::with_capacity(bodies),
             seen: Vec::with_capacity(bodies),
             dark: Vec::with_capacity(bodies),
@@ -240,6 +240,13 @@ impl FramePlan {
             self.sigma_m.push(sigma_m);
             // A seen body has a known pose, whether or not its sample is new enough for light.
             self.seen.push(track.is_some());
+        }
+        for (i, worn) in rig.tracked().enumerate().skip(rig.bodies.len()) {
+            // Who looks is no light, so what is known of it is used however old it is.
+            let track = snapshot.tracks.get(i).copied().flatten();
+            let at = |state: &TrackState| if rig.config.prediction.on { centre } else { state.captured_at };
+            self.tracked_poses
+                .push(affine(&track.map_or(worn.rest, |(state, _)| state.predict(at(&state)).pose)));
         }
         self.is_lit = oldest[0].is_some();
         (self.captured_at, self.received_at) = oldest[0].or(oldest[1]).unwrap_or((self.due_at, self.due_at));

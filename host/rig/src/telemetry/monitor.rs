@@ -479,7 +479,7 @@ impl RunMonitor {
     /// What has become of the tracker's samples so far; `None` before the first ones.
     pub fn sample_counts(&self) -> Option<TrackerReport> {
         let rig = self.live.rig();
-        self.samples.report(rig.into_iter().flat_map(|rig| rig.bodies.iter().map(|body| body.name.as_str())))
+        self.samples.report(rig.into_iter().flat_map(|rig| rig.tracked().map(|body| body.name.as_str())))
     }
 
     /// What became of the tracker's samples.

@@ -62,13 +62,8 @@ pub fn open_for(
     clock: Arc<dyn HostClock>,
     start: HostTime,
 ) -> Result<Box<dyn Tracker>, SourceError> {
-    let named = &rig.config.scene.bodies;
-    let key = |(i, b): (usize, &crate::rig::RigBody)| BodyKey {
-        name: b.name.clone(),
-        id: named.get(i).and_then(|c| c.id),
-    };
-    let keys = rig.bodies.iter().enumerate().map(key).collect();
-    let motions = rig.bodies.iter().filter_map(|b| b.motion.clone()).collect();
+    let keys = rig.tracked().map(|b| BodyKey { name: b.name.clone(), id: b.id }).collect();
+    let motions = rig.tracked().filter_map(|b| b.motion.clone()).collect();
     open(&rig.config.tracker, keys, motions, clock, start)
 }
 

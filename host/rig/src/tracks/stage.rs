@@ -108,7 +108,7 @@ fn bank(rig: &Rig, livelier: f64, learns: bool) -> PoseFilterBank {
         angular_acceleration: livelier * prediction.angular_acceleration,
         ..prediction.clone()
     };
-    let bodies = rig.bodies.len().min(MAX_TRACKED);
+    let bodies = rig.tracked_count();
     let filter = PoseFilterConfig { learns, ..expected.to_filter(longest_ms) };
     PoseFilterBank::new(&vec![filter; bodies])
 }
@@ -116,7 +116,7 @@ fn bank(rig: &Rig, livelier: f64, learns: bool) -> PoseFilterBank {
 impl TrackingStage {
     /// A stage for the rig's bodies.
     pub fn new(rig: &Rig, tracker: Box<dyn Tracker>) -> Self {
-        let bodies = rig.bodies.len().min(MAX_TRACKED);
+        let bodies = rig.tracked_count();
         Self {
             tracker,
             bank: bank(rig, 1.0, true),
@@ -256,21 +256,28 @@ impl TrackingStage {
     /// Names the bodies that have not been seen yet and are therefore dark, the tracker's explanation, and what to
     /// do. `None` if all were seen.
     pub(crate) fn not_seen_yet(&self, rig: &Rig) -> Option<Unseen> {
-        let told = self.unseen(rig, "has not seen", "and no light falls there until it does")?;
+        let told = self.unseen(
+            rig,
+            "has not seen",
+            ["and no light falls there until it does", "and no light falls until it does"],
+        )?;
         let bodies = (0..self.bodies).filter(|body| self.is_unseen(*body)).collect();
         Some(Unseen { told, bodies, seen: self.seen.clone() })
     }
 
     /// The same at the end of a run, with any other message of the tracker.
     pub(crate) fn never_seen(&self, rig: &Rig) -> Option<String> {
-        let unseen = self.unseen(rig, "never saw", "so no light fell there");
+        let unseen = self.unseen(rig, "never saw", ["so no light fell there", "so no light fell"]);
         unseen.into_iter().chain(self.tracker.warning()).reduce(|a, b| format!("{a}; {b}"))
     }
 
-    fn unseen(&self, rig: &Rig, verb: &str, consequence: &str) -> Option<String> {
-        let all = rig.bodies.iter().enumerate().take(self.bodies);
+    /// `consequences`: where a body was not seen, and where a head that is guarded was not.
+    fn unseen(&self, rig: &Rig, verb: &str, consequences: [&str; 2]) -> Option<String> {
+        let all = || rig.tracked().enumerate().take(self.bodies);
+        let is_guarded = |i: usize| self.is_unseen(i) && rig.guards(i);
+        let consequence = consequences[usize::from(all().any(|(i, _)| is_guarded(i)))];
         let names: Vec<_> =
-            all.filter(|(i, _)| self.is_unseen(*i)).map(|(_, body)| format!("{:?}", body.name)).collect();
+            all().filter(|(i, _)| self.is_unseen(*i)).map(|(_, body)| format!("{:?}", body.name)).collect();
         (!names.is_empty()).then(|| {
             let (names, status) = (names.join(", "), self.tracker.status());
             let (tracker, remedy) = (self.tracker.name(), remedy(&rig.config.tracker));

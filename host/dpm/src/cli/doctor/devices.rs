@@ -27,15 +27,16 @@ const POLL_EVERY_NS: i64 = 500_000;
 /// The bodies that the tracker should report: those of the rig, or where the scene could not be read those that the rig
 /// file names. `None` if only the scene's file has their names.
 fn bodies(config: &RigConfig, rig: Option<&Rig>) -> Option<Vec<BodyKey>> {
+    let key = |name: &String, id: Option<i64>| BodyKey { name: name.clone(), id };
     let named = &config.scene.bodies;
-    let key =
-        |(i, name): (usize, &String)| BodyKey { name: name.clone(), id: named.get(i).and_then(|b| b.id) };
-    let names: Vec<&String> = match rig {
-        Some(rig) => rig.bodies.iter().map(|b| &b.name).collect(),
-        None if named.is_empty() => return None,
-        None => named.iter().map(|b| &b.name).collect(),
-    };
-    Some(names.into_iter().enumerate().map(key).collect())
+    match rig {
+        Some(rig) => Some(rig.tracked().map(|b| key(&b.name, b.id)).collect()),
+        None if named.is_empty() => None,
+        None => {
+            let worn = config.worn().into_iter().map(|worn| key(&worn.name, worn.id));
+            Some(named.iter().map(|b| key(&b.name, b.id)).chain(worn).collect())
+        }
+    }
 }
 
 /// Which bodies the tracker reports, and how often. `rig`: the rig of `config`, if its scene could be read.

@@ -136,9 +136,9 @@ impl Crew {
         now: HostTime,
     ) -> Self {
         let crew = Arc::new(CrewFacts::new(parts.first.wall_ns, facts.rig.rate().slot_len_ns(0)));
-        let (publisher, reader) = latest(TrackSnapshot::empty(facts.rig.bodies.len()));
+        let (publisher, reader) = latest(TrackSnapshot::empty(facts.rig.tracked_count()));
         let to_link = facts.rig.wants_tracks().then(|| {
-            let (to_link, newest) = latest(TrackSnapshot::empty(facts.rig.bodies.len()));
+            let (to_link, newest) = latest(TrackSnapshot::empty(facts.rig.tracked_count()));
             line.stage.follow_by(newest);
             to_link
         });

@@ -371,7 +371,7 @@ impl Running {
         let stage = LinkStage::new(facts.clone(), link, keeper, lead);
         let mut line = Line::new(stage, notes_in, now);
         let tracker = run.machine.opens_tracker(now);
-        let seen = Arc::new(SeenBodies::new(rig.bodies.len()));
+        let seen = Arc::new(SeenBodies::new(rig.tracked_count()));
         let parts = CrewParts::stepped(&rig, tracker, options.in_flight, frame_ns).remembering(&seen);
         let crew = Crew::new(&facts, parts, time, &mut line, now);
         Self {
