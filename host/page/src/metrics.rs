@@ -5,6 +5,7 @@
 use crate::state::State;
 use dpm_rig::control::rig_name;
 use dpm_rig::order::Order;
+use dpm_rig::plan::dark::DarkCause;
 use dpm_rig::telemetry::histogram_steps::UPPER_NS;
 use dpm_rig::telemetry::live::LiveSnapshot;
 use dpm_rig::telemetry::monitor::ProjectorHealth;
@@ -39,6 +40,9 @@ families! {
     ORDERED = "dpm_slots_ordered_dark_total", "counter", "Slots in which no new picture was wanted, by reason";
     BODY_LIT = "dpm_body_lit", "gauge", "1 while light falls on the body";
     BODY_DARK = "dpm_body_dark_frames_total", "counter", "Lit frames in which the body was dark, by cause";
+    EYES = "dpm_eye_guard_frames_total", "counter", "Frames that the eye guard cut, and frames that it made dark because a head was lost";
+    EYE_MIRRORS = "dpm_eye_guard_mirrors_total", "counter", "Mirrors that it cut, of all frames together";
+    HEAD_LOST = "dpm_eye_guard_lost_total", "counter", "How often all light went off because the head was lost";
     INTERVAL = "dpm_interval_seconds", "histogram", "Time between two stamps of a frame (docs/LATENCY.md); negative times count in the lowest bucket";
     SAMPLE_AGE = "dpm_sample_age_seconds", "gauge", "Age of the oldest sample among the lit bodies when the newest frame was due";
     PREDICT = "dpm_prediction_seconds", "gauge", "The longest time for which prediction may extend a track";
@@ -162,11 +166,23 @@ fn run(out: &mut Out, figures: &LiveSnapshot) {
     }
     out.family(BODY_DARK);
     for d in &r.dark_by_body {
-        for (cause, n) in
-            [("never_seen", d.never_seen), ("silent", d.silent), ("beyond_horizon", d.beyond_horizon)]
-        {
-            out.value(&[("body", &d.body), ("cause", cause)], n as f64);
+        for cause in DarkCause::ALL {
+            out.value(&[("body", &d.body), ("cause", cause.name())], d.of(cause) as f64);
         }
+    }
+    out.family(EYES);
+    if let Some(eyes) = &r.eyes {
+        for (what, n) in [("cut", eyes.frames_cut), ("dark", eyes.frames_dark)] {
+            out.value(&[("what", what)], n as f64);
+        }
+    }
+    out.family(EYE_MIRRORS);
+    if let Some(eyes) = &r.eyes {
+        out.value(&[], eyes.mirrors_cut as f64);
+    }
+    out.family(HEAD_LOST);
+    for (head, n) in r.eyes.iter().flat_map(|eyes| eyes.heads.iter().zip(&eyes.losses)) {
+        out.value(&[("head", head)], *n as f64);
     }
     intervals(out, figures);
     let seconds = |ns: i64| ns as f64 * 1e-9;

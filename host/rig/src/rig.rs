@@ -233,6 +233,13 @@ impl Rig {
     /// A part cannot be built. The error names its key.
     pub fn build(config: &RigConfig, raster: Option<Raster>) -> Result<Self, RigError> {
         let mut scene = load_scene(config)?;
+        // Light on what carries the eye would be light in the eyes of whoever wears it.
+        let carrier = config.scene.bodies.iter().position(|b| config.observer.body.as_ref() == Some(&b.name));
+        for body in
+            scene.bodies.iter_mut().filter(|b| carrier.is_some() && b.tracked.map(usize::from) == carrier)
+        {
+            body.projected = false;
+        }
         show_pictures(config, &mut scene)?;
         let features = SceneFeatures::of(&scene);
         let has_lights = features.lamp_triangles + features.punctual_lights > 0;
@@ -424,12 +431,7 @@ fn load_scene(config: &RigConfig) -> Result<Scene, SceneError> {
         bodies: c
             .bodies
             .iter()
-            .map(|b| BodySelector {
-                name: b.name.clone(),
-                node: b.node.clone(),
-                // Light on it would be light in the eyes of whoever wears it.
-                projected: config.observer.body.as_ref() != Some(&b.name),
-            })
+            .map(|b| BodySelector { name: b.name.clone(), node: b.node.clone(), projected: true })
             .collect(),
         virtual_nodes: c.virtual_nodes.clone(),
         scale: c.scale,

@@ -14,6 +14,7 @@ mod doctor;
 mod documents;
 mod end_to_end;
 mod error_runs;
+mod eyes;
 mod frame_law;
 mod frame_path_calls;
 mod gaze;

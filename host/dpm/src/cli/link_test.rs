@@ -6,6 +6,7 @@ use crate::signals;
 use dpm_common::stopping;
 use dpm_lab::conformance::{rules, Extent};
 use dpm_lab::link_test::{judge_projector, link_test, Content};
+use dpm_rig::calibration_steps::is_simulated;
 use dpm_rig::config::RigConfig;
 use dpm_rig::failure::{Failure, FailureKind};
 use dpm_rig::interlock::Interlock;
@@ -57,6 +58,15 @@ pub(crate) struct LinkTestArgs {
 pub(super) fn execute(args: &LinkTestArgs) -> Result<(), Failure> {
     args.flags.refuse("dpm link-test", &["--frames", "--seconds", "--no-prediction", "--out"])?;
     let config = args.flags.rig_at_rest(Some(&args.rig))?;
+    if let (Some(head), false) = (config.heads().first(), is_simulated(&config)) {
+        return Err(Failure::new(
+            FailureKind::BadInput,
+            format!(
+                "dpm link-test follows no head, and this rig spares that of {head:?}: see that nobody is in the beam, and add \
+                 --set safety.eyes.guard=false"
+            ),
+        ));
+    }
     let _locks = take_locks(&config)?;
     refuse_where_dark_stands(&Identity::of(&config.projector.backend))?;
     signals::install()

@@ -29,7 +29,7 @@ const LASTS_US: u32 = 5_000;
 /// Spacing of the three instants through which a distance is drawn as a parabola, nanoseconds.
 const SPACING_NS: i64 = 500_000;
 /// Greatest shift, mirrors: no light is further from its body than this by more than a body can surprise.
-const CLAMP: u8 = 8;
+pub(crate) const CLAMP: u8 = 8;
 /// The least distance that moves anything, mirrors: below half a mirror no shift brings light nearer to its place.
 const LEAST_GATE: f64 = 0.5;
 /// Points of a body at which the distance is taken.

@@ -53,6 +53,8 @@ pub(crate) struct LinkKeeper {
     milli_celsius: Option<i32>,
     /// The interlock was closed at the last check.
     allowed: bool,
+    /// No light may fall on heads that move, so no picture is held.
+    pub guards_heads: bool,
 }
 
 impl LinkKeeper {
@@ -74,6 +76,7 @@ impl LinkKeeper {
             rearmed: 0,
             milli_celsius: None,
             allowed: true,
+            guards_heads: false,
         }
     }
 
@@ -233,8 +236,8 @@ impl LinkKeeper {
     fn obey(&mut self, now: HostTime, order: Order, link: &mut HostLink, transport: &mut dyn Transport) {
         let verb = match order {
             Order::Black => Verb::Black,
-            // Nothing is lit that could be frozen.
-            Order::Freeze if !self.allowed => Verb::Black,
+            // Nothing is lit that could be frozen, or nothing could be cut of it when a head moves into it.
+            Order::Freeze if !self.allowed || self.guards_heads => Verb::Black,
             Order::Freeze => Verb::Freeze,
             Order::Safe => Verb::Safe,
             Order::Arm if !self.allowed => {

@@ -88,7 +88,13 @@ pub(crate) struct LinkStage<P> {
 
 impl<P: Pace> LinkStage<P> {
     /// For a link that is up.
-    pub(crate) fn new(facts: Arc<Facts>, link: HostLink, keeper: LinkKeeper, lead: LeadEstimator) -> Self {
+    pub(crate) fn new(
+        facts: Arc<Facts>,
+        link: HostLink,
+        mut keeper: LinkKeeper,
+        lead: LeadEstimator,
+    ) -> Self {
+        keeper.guards_heads = !facts.rig.heads.is_empty();
         let slot_ns = facts.rig.rate().slot_len_ns(0);
         // If light is known only from reports, the projector is outside this process.
         let looks = if keeper.has_reports() { DARK_LOOKS_OUTSIDE } else { DARK_LOOKS };

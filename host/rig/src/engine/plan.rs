@@ -5,6 +5,7 @@ use super::pace::{modelled_ns, Pace};
 use crate::frame::job::{Fate, FrameNote};
 use crate::frame::FrameTimeline;
 use crate::parameters::applied::Applied;
+use crate::plan::eyes::HeadWatch;
 use crate::plan::frame::PlanInputs;
 use crate::plan::horizon::Horizon;
 use crate::plan::link_time::LinkTime;
@@ -41,6 +42,7 @@ pub(crate) struct PlanStage<P> {
     facts: Arc<Facts>,
     crew: Arc<CrewFacts>,
     horizon: Horizon,
+    heads: HeadWatch,
     /// What the operator may change while the run goes on.
     parameters: Reader<Applied>,
     /// The newest version of them that was used; `None` before the first frame.
@@ -66,7 +68,19 @@ impl<P: Pace> PlanStage<P> {
         let slot_ns = facts.rig.rate().slot_len_ns(0);
         let parameters = facts.monitor.parameters().follow(&facts.rig);
         let (used, last_slot) = (None, None);
-        Self { facts, crew, horizon, parameters, used, slot_ns, next_slot, last_slot, pace: PhantomData }
+        let heads = HeadWatch::new(&facts.rig);
+        Self {
+            facts,
+            crew,
+            horizon,
+            heads,
+            parameters,
+            used,
+            slot_ns,
+            next_slot,
+            last_slot,
+            pace: PhantomData,
+        }
     }
 
     /// True when everything that the run was asked for is planned.
@@ -143,6 +157,7 @@ impl<P: Pace> PlanStage<P> {
             now,
         };
         note.plan.fill(&self.facts.rig, snapshot, &inputs);
+        note.plan.spare(&mut self.heads, &self.facts.rig, snapshot, &inputs);
         note.fate = Fate::UnderWay;
         note.latch_due_at = latch.due_at;
         note.timeline = FrameTimeline {

@@ -46,6 +46,8 @@ pub(crate) struct FrameNote {
     pub cost: Option<FrameCost>,
     /// Hash of the code values, to be compared with the light.
     pub code_hash: u64,
+    /// Mirrors that are dark in all its planes for the eyes of tracked people.
+    pub cut_mirrors: u32,
     /// What became of it.
     pub fate: Fate,
 }
@@ -61,6 +63,7 @@ impl FrameNote {
             timeline: FrameTimeline::default(),
             cost: None,
             code_hash: 0,
+            cut_mirrors: 0,
             fate: Fate::UnderWay,
         }
     }

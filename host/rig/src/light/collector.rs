@@ -6,6 +6,7 @@ use crate::frame::job::{Fate, FrameNote};
 use crate::frame::slots::OrderedDark;
 use crate::frame::{FrameTimeline, Stage, STAGES};
 use crate::light::dark_bodies::DarkBodies;
+use crate::light::eye_counts::EyeCounts;
 use crate::light::live_view::bodies_of;
 use crate::light::measures::{histogram, RegistrationMeasures};
 use crate::light::notes::NoteReceiver;
@@ -62,6 +63,7 @@ pub(crate) struct Collector {
     /// Something is lit that is not tracked.
     has_still_light: bool,
     dark_bodies: DarkBodies,
+    eyes: EyeCounts,
     lit: u64,
     /// Lit frames in which every body was dark.
     dark: u64,
@@ -138,6 +140,7 @@ impl Collector {
         Self {
             placement: Placement::new(rig.bodies.len()),
             dark_bodies: DarkBodies::new(rig.bodies.len()),
+            eyes: EyeCounts::new(&rig),
             has_still_light: rig.scene.bodies.iter().any(|b| b.tracked.is_none() && b.projected),
             slots: SlotLedger::new(rig.rate(), lead_ns),
             rig,
@@ -320,6 +323,9 @@ impl Collector {
         self.dark += u64::from(is_dark);
         self.late += u64::from(late);
         monitor.count_lit(is_dark, late);
+        if let Some(told) = self.eyes.lit(record, at) {
+            monitor.note(told);
+        }
         if !self.prepared {
             let bodies = &self.rig.bodies;
             self.dark_bodies.lit(&record.dark, at, |body, told| {
@@ -330,6 +336,9 @@ impl Collector {
 
     /// True if the frame was lit but its light fell nowhere.
     fn is_dark(&self, record: &FrameRecord) -> bool {
+        if record.head_lost.is_some() {
+            return true;
+        }
         let nothing_tracked = record.dark.is_empty() || record.dark.iter().any(Option::is_none);
         !self.prepared && !self.has_still_light && !nothing_tracked
     }
@@ -394,6 +403,8 @@ impl Collector {
                 swept_poses: job.plan.swept_poses.clone(),
                 sampled_poses: job.plan.sampled_poses.clone(),
                 dark: job.plan.dark.clone(),
+                cut_mirrors: job.cut_mirrors,
+                head_lost: job.plan.eyes.lost,
                 eye: job.plan.eye,
                 parameters: job.plan.parameters,
                 code_hash: job.code_hash,
@@ -523,6 +534,7 @@ impl Collector {
         report.frames_lit = self.lit;
         report.frames_dark = self.dark;
         report.dark_by_body = self.dark_bodies.report(self.rig.bodies.iter().map(|b| b.name.as_str()));
+        report.eyes = self.eyes.report();
         report.frames_withheld = self.withheld;
         report.frames_unrecorded = self.unrecorded;
         report.frames_dropped = self.dropped;

@@ -55,6 +55,8 @@ impl DarkBodies {
                 continue;
             }
             match (cause, body.told) {
+                // That is told once for the whole rig.
+                (Some(DarkCause::HeadLost), None) => {}
                 (Some(cause), None) => {
                     body.told = Some(since);
                     note(i, format!("is dark: {}", cause.told()));
@@ -79,6 +81,7 @@ impl DarkBodies {
                 never_seen: of(body, DarkCause::NeverSeen),
                 silent: of(body, DarkCause::Silent),
                 beyond_horizon: of(body, DarkCause::BeyondHorizon),
+                head_lost: of(body, DarkCause::HeadLost),
             })
             .collect()
     }

@@ -26,6 +26,10 @@ pub struct FrameRecord {
     pub sampled_poses: Vec<DAffine3>,
     /// Per tracked body: why no light fell on it; `None` if light fell on it.
     pub dark: Vec<Option<DarkCause>>,
+    /// Mirrors that were dark in all its planes for the eyes of tracked people.
+    pub cut_mirrors: u32,
+    /// The head, among [`crate::rig::Rig::heads`], whose loss made it dark as a whole.
+    pub head_lost: Option<usize>,
     /// The eye in world coordinates.
     pub eye: DVec3,
     /// Which version of the operator's parameters it was drawn with; 0 is the rig file's.

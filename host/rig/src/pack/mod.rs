@@ -1,5 +1,6 @@
-//! Packs the code values of a finished frame into bit planes.
+//! Packs the code values of a finished frame into bit planes, without the light that would meet a tracked head.
 
+pub mod eye_mask;
 pub mod prepared;
 pub mod source;
 
@@ -7,32 +8,63 @@ use crate::frame::job::{hash_codes, FrameJob};
 use crate::frame::Stage;
 use dpm_common::clock::Stopwatch;
 use dpm_render::pack::{self, Kernel, Shown};
+use eye_mask::EyeMask;
 use source::Pictures;
 
-/// Packs the code values of a finished frame into planes. A job without GPU takes its picture from `pictures`.
-pub(crate) fn pack(job: &mut FrameJob, kernel: Kernel, verify: bool, pictures: &mut Option<Pictures>) {
-    let FrameJob { note, memory } = job;
-    let watch = Stopwatch::start();
-    if let Some(slot) = &memory.gpu {
-        let codes = slot.codes();
-        match slot.planes() {
-            Some(planes) => pack::gpu::take(planes, &mut memory.planes),
-            None => pack::pack(kernel, codes, &mut memory.planes),
+/// What turns finished frames into planes. All planes that are sent come from here.
+pub(crate) struct Packer {
+    /// How to pack planes if the GPU does not.
+    pub kernel: Kernel,
+    /// `None` if a GPU renders.
+    pub pictures: Option<Pictures>,
+    /// `None` if no head is guarded.
+    pub eyes: Option<EyeMask>,
+}
+
+impl Packer {
+    /// Packs the code values of a finished frame into planes. What the eyes of tracked people forbid is dark in them,
+    /// whatever the picture is. With `verify` the light of the planes goes into the frame's note.
+    pub(crate) fn pack(&mut self, job: &mut FrameJob, verify: bool) {
+        let FrameJob { note, memory } = job;
+        let watch = Stopwatch::start();
+        match (&memory.gpu, &mut self.pictures) {
+            (Some(slot), _) => match slot.planes() {
+                Some(planes) => pack::gpu::take(planes, &mut memory.planes),
+                None => pack::pack(self.kernel, slot.codes(), &mut memory.planes),
+            },
+            (None, Some(Pictures::Marked(prepared))) => {
+                prepared.pack(self.kernel, note.plan.id.0, &mut memory.planes);
+            }
+            (None, Some(Pictures::Drawn(painter))) => {
+                painter.pack(self.kernel, (note.plan.id.0, note.plan.slot), memory);
+            }
+            (None, None) => return,
         }
+        spare(job, &mut self.eyes);
+        let FrameJob { note, memory } = job;
         note.timeline.wall_ns[Stage::Pack as usize] = watch.elapsed_ns();
-        if verify {
-            let shown = Shown::by(memory.planes.schedule());
-            note.code_hash = hash_codes(codes.iter().map(|&c| shown.light(c)));
+        if !verify {
+            return;
         }
-        return;
+        if let Some(slot) = &memory.gpu {
+            let shown = Shown::by(memory.planes.schedule());
+            let eyes = self.eyes.as_ref().filter(|_| note.cut_mirrors > 0);
+            let is_cut = |pixel: usize| eyes.is_some_and(|eyes| eyes.is_cut(pixel));
+            let lit = slot.codes().iter().enumerate().map(|(i, &code)| if is_cut(i) { 0 } else { code });
+            note.code_hash = hash_codes(lit.map(|code| shown.light(code)));
+        } else if let Some(Pictures::Drawn(painter)) = &mut self.pictures {
+            note.code_hash = hash_codes(painter.light_of(&memory.planes).iter().copied());
+        }
     }
-    match pictures {
-        Some(Pictures::Marked(prepared)) => prepared.pack(kernel, note.plan.id.0, &mut memory.planes),
-        Some(Pictures::Drawn(painter)) => painter.pack(kernel, (note.plan.id.0, note.plan.slot), memory),
-        None => return,
-    }
-    note.timeline.wall_ns[Stage::Pack as usize] = watch.elapsed_ns();
-    if let (true, Some(Pictures::Drawn(painter))) = (verify, pictures) {
-        note.code_hash = hash_codes(painter.light_of(&memory.planes).iter().copied());
+}
+
+/// Makes the mirrors dark of a packed frame that `eyes` forbids, and counts them in its note.
+pub(crate) fn spare(job: &mut FrameJob, eyes: &mut Option<EyeMask>) {
+    let FrameJob { note, memory } = job;
+    let plan = &note.plan;
+    note.cut_mirrors = eyes.as_mut().map_or(0, |eyes| eyes.cut(&plan.eyes, &plan.camera, &mut memory.planes));
+    if note.cut_mirrors > 0 {
+        // The planes are those of the picture no longer.
+        memory.picture = None;
     }
 }

@@ -331,3 +331,89 @@ fn neither_scene_nor_tracker_nor_calibration_has_to_exist() {
     );
     assert_eq!(ended.unwrap_or_else(|e| panic!("{e}")).report.frames_lit, 3);
 }
+
+/// Shows full light for three seconds while a tracked head passes through the beam again and again. Holds every frame of the
+/// light to the law: no mirror is lit whose ray meets the sphere about the true head, from the first photon of its slot to
+/// the last. Returns the report, and for each frame when it was lit and the share of its mirrors that were.
+fn light_about_a_head(more: &[&str]) -> (crate::telemetry::report::Report, Vec<(f64, f64)>) {
+    let mut keys = vec![
+        "projector.width=96",
+        "projector.height=72",
+        "projector.frame_rate=240",
+        "real_time.pace=\"virtual\"",
+        "run.frames=1",
+        "observer.position=[0.05, 0.2, 0.5]",
+        "observer.tracked={ name = \"glasses\", motion = { kind = \"sinusoid\", peak_speed_m_s = 1.2, \
+         peak_acceleration_m_s2 = 3.0 } }",
+        "safety.eyes.radius=0.08",
+        "safety.flashes_per_second=0",
+    ];
+    keys.extend(more);
+    let (_, rig) = rig_of_projector(&keys);
+    let (raster, frames) = (rig.camera.raster, 720);
+    let options = RunOptions { frames, keep_frames: frames as usize, ..RunOptions::default() };
+    let source = Arc::new(show(Pattern::Full, raster, 1, None).unwrap());
+    let outcome = run_pipeline(rig.clone(), source, None, options, &Arc::new(RunMonitor::default()))
+        .unwrap_or_else(|e| panic!("{e}"));
+    assert_eq!((outcome.light.len() as u64, outcome.light_mismatches), (frames, 0), "{:?}", outcome.report);
+    let radius = rig.config.safety.eyes.radius;
+    let ray = |i: usize| {
+        let (x, y) = (i as u32 % raster.width(), i as u32 / raster.width());
+        rig.camera.ray(glam::DVec2::new(f64::from(x) + 0.5, f64::from(y) + 0.5)).direction
+    };
+    let rays: Vec<_> = (0..raster.pixel_count()).map(ray).collect();
+    let share = |light: &crate::light::recorder::LightFrame| {
+        for end_ns in [0, rig.rate().slot_len_ns(0)] {
+            let at = light.first_photon_at.plus_ns(end_ns);
+            let to = rig.true_poses(at.0).unwrap()[0].translation - rig.camera.position();
+            let meets = |ray: &glam::DVec3| (to - *ray * to.dot(*ray).max(0.0)).length() <= radius;
+            for (i, ray) in rays.iter().enumerate() {
+                assert!(light.codes[i] == [0; 3] || !meets(ray), "frame {}: light on a head", light.frame);
+            }
+        }
+        let lit = light.codes.iter().filter(|code| **code != [0; 3]).count();
+        (light.first_photon_at.0 as f64 * 1e-9, lit as f64 / light.codes.len() as f64)
+    };
+    (outcome.report, outcome.light.iter().map(share).collect())
+}
+
+#[test]
+fn no_light_of_a_pattern_falls_on_a_head_that_passes() {
+    let (report, lit) = light_about_a_head(&[]);
+    let eyes = report.eyes.expect("a head is guarded");
+    assert_eq!((eyes.heads, eyes.frames_dark, eyes.losses), (vec!["glasses".to_owned()], 0, vec![0]));
+    // It passes: most of the field is lit always, and all of it at times.
+    let [least, most] = lit.iter().fold([1.0f64, 0.0], |[a, b], (_, share)| [a.min(*share), b.max(*share)]);
+    assert!(least > 0.3 && least < 0.8 && most == 1.0, "{least} {most}");
+    let cut = lit.iter().filter(|(_, share)| *share < 1.0).count() as u64;
+    assert_eq!(eyes.frames_cut, cut);
+    assert!(eyes.most_mirrors > 0 && eyes.mirrors_cut > u64::from(eyes.most_mirrors));
+}
+
+/// The tracker loses the head for more than a second: the guard grows, then all is dark until the head is seen again.
+#[test]
+fn a_head_that_is_lost_makes_the_light_smaller_and_then_dark_until_it_is_seen() {
+    let (report, lit) = light_about_a_head(&["tracker.faults=\"dropout@800ms+1400ms\""]);
+    let eyes = report.eyes.expect("a head is guarded");
+    assert_eq!(eyes.losses, [1], "{lit:?}");
+    let dark: Vec<f64> = lit.iter().filter(|(_, share)| *share == 0.0).map(|(at, _)| *at).collect();
+    assert_eq!(eyes.frames_dark, dark.len() as u64);
+    // Half a second after the last sample, or sooner where the guard has grown over the whole beam.
+    let (first, last) = (dark[0], dark[dark.len() - 1]);
+    assert!(first > 0.9 && first < 0.8 + 0.5 + 0.05 && last > 2.19 && last < 2.3, "{first} {last}");
+    let is_one_stretch = dark.windows(2).all(|two| two[1] - two[0] < 0.01);
+    assert!(is_one_stretch && report.frames_dark == dark.len() as u64, "{:?}", report.frames_dark);
+    let grows = lit.iter().filter(|(at, _)| (0.86..first).contains(at)).map(|(_, share)| *share);
+    assert!(grows.clone().count() > 5 && grows.is_sorted_by(|a, b| a >= b), "{lit:?}");
+}
+
+/// Where the guard is off, light falls on heads as on everything else.
+#[test]
+fn without_the_guard_a_pattern_is_whole() {
+    let small =
+        ["projector.width=64", "real_time.pace=\"virtual\"", "run.frames=1", "safety.eyes.guard=false"];
+    let keys: Vec<&str> = small.into_iter().chain(["observer.tracked=\"glasses\""]).collect();
+    let (_, rig) = rig_of_projector(&keys);
+    let raster = rig.camera.raster;
+    light_is_the_pattern(Arc::new(show(Pattern::Full, raster, 1, None).unwrap()), &rig, 3);
+}

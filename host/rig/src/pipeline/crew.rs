@@ -103,7 +103,7 @@ impl Crew {
     /// # Errors
     /// The system cannot start a thread.
     pub(super) fn start(shared: &Arc<Shared>, parts: CrewParts) -> Result<(Self, Port), PipelineError> {
-        let CrewParts { tracking, renderer, pictures, kernel, budget, memory, first, budget_milli } = parts;
+        let CrewParts { tracking, renderer, packer, budget, memory, first, budget_milli } = parts;
         let rig = &shared.facts.rig;
         let policy = policy(rig);
         let frame_ns = first.gpu_ns.unwrap_or(first.wall_ns);
@@ -166,7 +166,7 @@ impl Crew {
             named("pack")
                 .spawn(move || {
                     let inbox = PackInbox { jobs: to_pack_out, gpu_waker };
-                    pack_thread(&shared, &state, stage, kernel, pictures, inbox, to_link_in);
+                    pack_thread(&shared, &state, stage, packer, inbox, to_link_in);
                     state.returned[PACK].store(true, Ordering::Release);
                 })
                 .map_err(refused("pack"))?

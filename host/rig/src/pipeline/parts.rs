@@ -9,8 +9,10 @@ use crate::engine::options::RunOptions;
 use crate::frame::job::FrameMemory;
 use crate::light::recorder::{LightRecorder, LightSender};
 use crate::mock::{DeviceClock, EmulatedProjector, MockConfig, GREATEST_SHIFT};
+use crate::pack::eye_mask::EyeMask;
 use crate::pack::prepared::PreparedFrames;
 use crate::pack::source::{PatternPainter, PatternSource, Pictures};
+use crate::pack::Packer;
 use crate::pipeline::projector;
 use crate::plan::budget::BudgetController;
 use crate::plan::link_time::LinkTime;
@@ -43,7 +45,7 @@ pub(super) enum Origin {
     Gpu(Arc<Gpu>),
     /// They are prepared and marked.
     Prepared,
-    /// They are patterns: nothing is traced, and no tracker is asked.
+    /// They are patterns: nothing is traced, and no tracker is asked but for heads that are guarded.
     Pattern(Arc<dyn PatternSource>, Option<MonotonicClock>),
 }
 
@@ -86,10 +88,7 @@ pub(super) struct CrewParts {
     pub(super) tracking: TrackingStage,
     /// `None` if nothing is rendered.
     pub(super) renderer: Option<Renderer>,
-    /// `None` if a GPU renders.
-    pub(super) pictures: Option<Pictures>,
-    /// How to pack planes if the GPU does not.
-    pub(super) kernel: Kernel,
+    pub(super) packer: Packer,
     /// `None` if every frame gets the rays that the rig file asks for.
     pub(super) budget: Option<BudgetController>,
     /// Memory for the frames.
@@ -169,7 +168,7 @@ impl CrewParts {
     {
         // The tracker first: to open it takes a moment, and shaders may take a minute.
         let tracker: Box<dyn Tracker> = match origin {
-            Origin::Pattern(..) => Box::new(NoTracker),
+            Origin::Pattern(..) if rig.heads.is_empty() => Box::new(NoTracker),
             _ => open_for(rig, clock, HostTime(0))?,
         };
         let mut renderer = renderer()?;
@@ -179,8 +178,11 @@ impl CrewParts {
         Ok(Self {
             tracking: TrackingStage::new(rig, tracker),
             renderer,
-            pictures: origin.pictures(rig.camera.raster),
-            kernel: Kernel::best(),
+            packer: Packer {
+                kernel: Kernel::best(),
+                pictures: origin.pictures(rig.camera.raster),
+                eyes: EyeMask::of_rig(rig),
+            },
             budget: None,
             memory,
             first: WarmUp::default(),
@@ -281,6 +283,8 @@ pub(super) fn mock_projector(
     let emulated = EmulatedProjector::new(setup, &mock.faults, config.render.seed, start)
         .map_err(|e| RigError::Unsupported(format!("projector.backend.faults: {e}")))?;
     let kept = [options.keep_frames, options.keep_frames.max(options.keep_records)];
+    // The eye guard cuts marks too, and a frame without one would count as torn.
+    let marked = marked && rig.heads.is_empty();
     let recorder = LightRecorder::new(lights, kept, options.verify, rig.schedule, marked);
     Ok((emulated, recorder))
 }

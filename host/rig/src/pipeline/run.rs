@@ -65,7 +65,8 @@ pub fn run_prepared(
     run_from(rig, &Origin::Prepared, &projector::open, RunOptions { verify: false, ..options }, monitor)
 }
 
-/// Shows the pictures of `source`, without a GPU and without a tracker, whatever the rig's tracker is.
+/// Shows the pictures of `source`, without a GPU. The rig's tracker is asked for heads that are guarded, and for nothing
+/// else.
 ///
 /// # Errors
 /// As for [`run`], except those of the GPU and of the tracker.

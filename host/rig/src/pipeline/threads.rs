@@ -13,7 +13,7 @@ use crate::engine::pulse::Pulse;
 use crate::frame::job::FrameJob;
 use crate::frame::slots::MissCause;
 use crate::frame::Stage;
-use crate::pack::source::Pictures;
+use crate::pack::Packer;
 use crate::plan::link_time::LinkTime;
 use crate::rig::Rig;
 use crate::tracks::{TrackSnapshot, TrackingStage};
@@ -25,7 +25,6 @@ use dpm_handoff::channel::{Receiver, Sender};
 use dpm_handoff::latest::{Publisher, Reader};
 use dpm_handoff::path::{self, Place};
 use dpm_handoff::wake::{WaitPolicy, Waiter, Waker};
-use dpm_render::pack::Kernel;
 use dpm_render::Renderer;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::Arc;
@@ -326,8 +325,7 @@ pub(super) fn pack_thread(
     shared: &Shared,
     crew: &CrewState,
     mut stage: PackStage,
-    kernel: Kernel,
-    mut pictures: Option<Pictures>,
+    mut packer: Packer,
     inbox: PackInbox,
     mut to_link: Sender<FrameJob>,
 ) {
@@ -369,7 +367,7 @@ pub(super) fn pack_thread(
         }
         job.note.timeline.packing_at = now;
         if stage.is_wanted(&mut job.note, now, jobs.is_empty()) {
-            crate::pack::pack(&mut job, kernel, facts.options.verify, &mut pictures);
+            packer.pack(&mut job, facts.options.verify);
         }
         job.note.timeline.packed_at = clock.now();
         if to_link.push(job).is_err() || crew.is_abandoned.load(Ordering::Relaxed) {

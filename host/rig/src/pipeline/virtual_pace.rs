@@ -270,7 +270,7 @@ impl World {
         let rendered_at = job.note.timeline.submitted_at.plus_ns(self.costs[1]);
         (job.note.timeline.rendered_at, job.note.timeline.packing_at) = (rendered_at, rendered_at);
         if self.pack.is_wanted(&mut job.note, rendered_at, true) {
-            crate::pack::pack(job, self.parts.kernel, self.facts.options.verify, &mut self.parts.pictures);
+            self.parts.packer.pack(job, self.facts.options.verify);
         }
         job.note.timeline.packed_at = rendered_at.plus_ns(self.costs[2]);
         self.send(job);

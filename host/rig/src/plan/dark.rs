@@ -11,11 +11,13 @@ pub enum DarkCause {
     /// The tracker reports the body, but the frame's light falls later after the newest sample than
     /// `safety.predict_ms` allows.
     BeyondHorizon,
+    /// The tracker has lost a head that is guarded, so nothing is lit (`[safety.eyes]`).
+    HeadLost,
 }
 
 impl DarkCause {
     /// All causes, in the order of their counters.
-    pub(crate) const ALL: [Self; 3] = [Self::NeverSeen, Self::Silent, Self::BeyondHorizon];
+    pub const ALL: [Self; 4] = [Self::NeverSeen, Self::Silent, Self::BeyondHorizon, Self::HeadLost];
 
     /// The name in reports.
     pub const fn name(self) -> &'static str {
@@ -23,6 +25,7 @@ impl DarkCause {
             Self::NeverSeen => "never_seen",
             Self::Silent => "silent",
             Self::BeyondHorizon => "beyond_horizon",
+            Self::HeadLost => "head_lost",
         }
     }
 
@@ -34,6 +37,9 @@ impl DarkCause {
             Self::BeyondHorizon => {
                 "the light falls later after its newest sample than safety.predict_ms allows (raise safety.predict_ms, or \
                  reduce the latency from the tracker to the light)"
+            }
+            Self::HeadLost => {
+                "the tracker has lost a head that is guarded (bring it into view; [safety.eyes] says how long it may be lost)"
             }
         }
     }

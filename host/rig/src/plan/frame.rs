@@ -2,6 +2,7 @@
 //! off.
 
 use super::dark::DarkCause;
+use super::eyes::{GuardedEyes, HeadWatch};
 use super::light_centre::{light_centre_ns, planes_follow};
 use super::link_time::LinkTime;
 use crate::parameters::applied::Applied;
@@ -65,6 +66,8 @@ pub(crate) struct FramePlan {
     pub scene_poses: Vec<DAffine3>,
     /// The same for `swept_poses`.
     pub swept_scene: [Vec<DAffine3>; 2],
+    /// What must stay dark for the eyes of tracked people.
+    pub eyes: GuardedEyes,
     /// The eye in world coordinates, metres.
     pub eye: DVec3,
     /// The gaze point in world coordinates, metres.
@@ -134,6 +137,7 @@ impl FramePlan {
             sigma_m: Vec::with_capacity(bodies),
             scene_poses: Vec::with_capacity(rig.scene.bodies.len()),
             swept_scene: [(); 2].map(|()| Vec::with_capacity(rig.scene.bodies.len())),
+            eyes: GuardedEyes::empty(rig),
             eye: DVec3::ZERO,
             gaze: DVec3::ZERO,
             widen_deg: 0.0,
@@ -174,6 +178,25 @@ impl FramePlan {
         if let Some(point) = inputs.applied.gaze {
             // A point that the operator names is never lost.
             (self.gaze, self.widen_deg) = (point, 0.0);
+        }
+    }
+
+    /// Spares the heads of `rig`, as `watch` knows them by `snapshot`. While one is lost, no body is lit.
+    pub(crate) fn spare(
+        &mut self,
+        watch: &mut HeadWatch,
+        rig: &Rig,
+        snapshot: &TrackSnapshot,
+        inputs: &PlanInputs<'_>,
+    ) {
+        let late_ns = rig.config.projector.light_delay_ns();
+        let end = inputs.slots.host_of(self.dark_from).plus_ns(late_ns + inputs.slots.bound_ns);
+        let light = [self.due_at.plus_ns(late_ns - inputs.slots.bound_ns), end];
+        watch.guard(&rig.heads, snapshot, inputs.now, light, &mut self.eyes);
+        if self.eyes.lost.is_some() {
+            self.dark.iter_mut().for_each(|dark| *dark = dark.or(Some(DarkCause::HeadLost)));
+            self.lost.fill(true);
+            self.is_lit = false;
         }
     }
 

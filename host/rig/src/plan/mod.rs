@@ -3,6 +3,7 @@
 
 pub mod budget;
 pub mod dark;
+pub mod eyes;
 pub mod frame;
 pub mod horizon;
 pub mod lead;

@@ -4,6 +4,7 @@ use super::projector::ProjectorReport;
 use super::signed::SignedHistogram;
 use crate::failure::{Failure, FailureKind};
 use crate::frame::slots::MissCause;
+use crate::light::eye_counts::EyesReport;
 use crate::plan::dark::DarkCause;
 use crate::tracks::gauges::TrackerReport;
 use hdrhistogram::Histogram;
@@ -114,15 +115,18 @@ pub struct DarkBody {
     pub silent: u64,
     /// Frames whose light fell later after the newest sample than `safety.predict_ms` allows.
     pub beyond_horizon: u64,
+    /// Frames in which the tracker had lost a head that is guarded.
+    pub head_lost: u64,
 }
 
 impl DarkBody {
     /// The frames of one cause.
-    pub(crate) fn of(&self, cause: DarkCause) -> u64 {
+    pub fn of(&self, cause: DarkCause) -> u64 {
         match cause {
             DarkCause::NeverSeen => self.never_seen,
             DarkCause::Silent => self.silent,
             DarkCause::BeyondHorizon => self.beyond_horizon,
+            DarkCause::HeadLost => self.head_lost,
         }
     }
 
@@ -176,6 +180,9 @@ pub struct Report {
     pub frames_dark: u64,
     /// Bodies that were dark in some of these frames, by cause.
     pub dark_by_body: Vec<DarkBody>,
+    /// What the eye guard did; absent where no head is guarded.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub eyes: Option<EyesReport>,
     /// The run was stopped before it was complete.
     pub stopped: bool,
     /// Crews of stages that hung or lost the GPU and were replaced, the first 256.
@@ -302,6 +309,7 @@ impl Default for Report {
             frames_lit: 0,
             frames_dark: 0,
             dark_by_body: Vec::new(),
+            eyes: None,
             stopped: false,
             recoveries: Vec::new(),
             starved_s: 0.0,
@@ -528,6 +536,7 @@ mod tests {
             never_seen,
             silent,
             beyond_horizon,
+            head_lost: 0,
         };
         let report = Report {
             frames_dark: 1195,

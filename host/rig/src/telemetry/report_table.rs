@@ -73,6 +73,13 @@ impl Report {
             let text = format!("{} frames: {}", body.total(), causes.join(", "));
             table.row(&format!("  dark: {}", body.body), text);
         }
+        if let Some(eyes) = &self.eyes {
+            let (heads, cut) = (eyes.heads.join(", "), eyes.frames_cut);
+            let lost: u64 = eyes.losses.iter().sum();
+            let dark = some(lost, format!(", {} frames dark because one was lost", eyes.frames_dark));
+            let text = format!("{heads}: {cut} frames cut, by {} mirrors at most{dark}", eyes.most_mirrors);
+            table.row("eye guard", text);
+        }
     }
 
     fn set_up_rows(&self, table: &mut Table) {

@@ -39,23 +39,23 @@ fn bodies(config: &RigConfig, rig: Option<&Rig>) -> Option<Vec<BodyKey>> {
     }
 }
 
-/// Which bodies the tracker reports, and how often. `rig`: the rig of `config`, if its scene could be read.
-pub(super) fn tracker(config: &RigConfig, rig: Option<&Rig>) -> Finding {
+/// What the tracker told of each body while it was listened to: its name, and how many samples.
+pub(super) type Heard = Vec<(String, u32)>;
+
+/// Which bodies the tracker reports, and how often. `rig`: the rig of `config`, if its scene could be read. With it what
+/// was heard, if anybody listened.
+pub(super) fn tracker(config: &RigConfig, rig: Option<&Rig>) -> (Finding, Option<Heard>) {
     let name = "tracker";
     if matches!(config.tracker, TrackerConfig::Mock(_)) {
-        return Finding::new(name, State::Info, "the mock in this process", "");
+        return (Finding::new(name, State::Info, "the mock in this process", ""), None);
     }
     let Some(bodies) = bodies(config, rig) else {
         let found = "which bodies it has to report is in the scene's file, which could not be read";
-        return Finding::new(
-            name,
-            State::Warning,
-            found,
-            "name them as scene.bodies, or correct the scene first",
-        );
+        let remedy = "name them as scene.bodies, or correct the scene first";
+        return (Finding::new(name, State::Warning, found, remedy), None);
     };
     if bodies.is_empty() {
-        return Finding::new(name, State::Info, "no body is tracked", "");
+        return (Finding::new(name, State::Info, "no body is tracked", ""), None);
     }
     let clock = MonotonicClock::new(0);
     let start = clock.now();
@@ -63,7 +63,10 @@ pub(super) fn tracker(config: &RigConfig, rig: Option<&Rig>) -> Finding {
         dpm_rig::tracks::open_for_names(config, bodies.clone(), Arc::new(move || clock.now()), start);
     let mut tracker = match opened {
         Ok(tracker) => tracker,
-        Err(e) => return Finding::new(name, State::Missing, e.to_string(), "see docs/TRACKERS.md"),
+        Err(e) => {
+            let finding = Finding::new(name, State::Missing, e.to_string(), "see docs/TRACKERS.md");
+            return (finding, None);
+        }
     };
     let mut seen = vec![0u32; bodies.len()];
     let failed = loop {
@@ -87,7 +90,7 @@ pub(super) fn tracker(config: &RigConfig, rig: Option<&Rig>) -> Finding {
         _ => format!("\"{}\" {:.0} times a second", body.name, f64::from(*count) / seconds),
     });
     let found = told.collect::<Vec<_>>().join(", ");
-    match failed {
+    let finding = match failed {
         Some(why) => Finding::new(name, State::Missing, format!("{found}; {why}"), "see docs/TRACKERS.md"),
         None if seen.contains(&0) => {
             let state = if seen.iter().all(|count| *count == 0) { State::Missing } else { State::Warning };
@@ -95,7 +98,8 @@ pub(super) fn tracker(config: &RigConfig, rig: Option<&Rig>) -> Finding {
             Finding::new(name, state, found, remedy)
         }
         None => Finding::new(name, State::Ok, found, ""),
-    }
+    };
+    (finding, Some(bodies.into_iter().map(|body| body.name).zip(seen).collect()))
 }
 
 /// Whether the projector answers, and whether it can show the rig's frames. `loads`: the code of a library that the rig

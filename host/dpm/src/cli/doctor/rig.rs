@@ -35,7 +35,8 @@ pub(super) fn findings(config: &RigConfig, loads: bool) -> Vec<Finding> {
         }
         Ok(rig) => all.push(scene(rig)),
     }
-    all.push(devices::tracker(config, rig.as_ref().ok()));
+    let (tracker, heard) = devices::tracker(config, rig.as_ref().ok());
+    all.extend([tracker, observer(config, heard.as_ref())]);
     all.extend(pictures(config));
     all.push(calibration(config));
     all.extend(standing_order(config));
@@ -97,6 +98,38 @@ fn scene(rig: &Rig) -> Finding {
     let more = if more > 0 { format!("; and {more} more") } else { String::new() };
     let remedy = "`dpm plan` of this rig file lists every note, docs/SCENES.md says what is read";
     Finding::new("scene", State::Warning, format!("{found}; {}{more}", told.join("; ")), remedy)
+}
+
+/// Whose eyes the rig follows and spares, and whether the tracker tells of them, if it was `heard`.
+fn observer(config: &RigConfig, heard: Option<&devices::Heard>) -> Finding {
+    let name = "observer";
+    let (eyes, observer, heads) = (&config.safety.eyes, &config.observer, config.heads());
+    let carrier = observer.tracked.as_ref().map(|t| &t.0.name).or(observer.body.as_ref());
+    let eye = match carrier {
+        Some(carrier) => format!("the eye is carried by {carrier:?}"),
+        None => format!("the eye is at {:?} m and is not tracked", observer.position),
+    };
+    let named = |heads: Vec<&str>| heads.iter().map(|h| format!("{h:?}")).collect::<Vec<_>>().join(", ");
+    let is_unheard = |head: &&str| {
+        heard.is_some_and(|heard| !heard.iter().any(|(name, count)| name == head && *count > 0))
+    };
+    let missing: Vec<&str> = heads.iter().copied().filter(is_unheard).collect();
+    let spared = format!("the eye guard spares {} by {} m", named(heads.clone()), eyes.radius);
+    if !missing.is_empty() {
+        let found = format!("{eye}; {spared}; the tracker does not tell of {}", named(missing));
+        let remedy = "the rig stays dark until it does: give the rigid body this name in the tracking software and bring it into \
+                      view, or take it out of observer.tracked and safety.eyes.heads";
+        return Finding::new(name, State::Warning, found, remedy);
+    }
+    if !heads.is_empty() {
+        let found = format!("{eye}; {spared}, and the rig goes dark {} ms after one is lost", eyes.lost_ms);
+        return Finding::new(name, State::Ok, found, "");
+    }
+    if carrier.is_some() || !eyes.heads.is_empty() {
+        let found = format!("{eye}; the eye guard is off: light falls on heads");
+        return Finding::new(name, State::Warning, found, "set safety.eyes.guard = true");
+    }
+    Finding::new(name, State::Info, eye, "")
 }
 
 /// The bodies that show what another program makes. Without it they are black, and all else works.

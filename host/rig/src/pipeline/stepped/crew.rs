@@ -11,7 +11,9 @@ use crate::engine::pulse::{Pulse, Silence};
 use crate::engine::supervision::Trouble;
 use crate::frame::job::{FrameJob, FrameMemory, FrameNote};
 use crate::frame::slots::MissCause;
+use crate::pack::eye_mask::EyeMask;
 use crate::pack::prepared::PreparedFrames;
+use crate::pack::Packer;
 use crate::pipeline::parts::CrewParts;
 use crate::pipeline::threads::{POLL_WITHIN_NS, STEP_NS, WAIT_NS};
 use crate::plan::link_time::LinkTime;
@@ -43,8 +45,7 @@ impl CrewParts {
         Self {
             tracking: tracking(rig, tracker),
             renderer: None,
-            pictures: None,
-            kernel: Kernel::best(),
+            packer: Packer { kernel: Kernel::best(), pictures: None, eyes: EyeMask::of_rig(rig) },
             budget: None,
             memory: (0..in_flight.max(2)).map(|_| memory()).collect(),
             first: WarmUp { wall_ns: frame_ns, gpu_ns: None },
@@ -118,6 +119,7 @@ pub(super) struct Crew {
     prepared: PreparedFrames,
     /// Code values of a frame in which all bodies are dark.
     black: Vec<u32>,
+    eyes: Option<EyeMask>,
     kernel: Kernel,
     pulses: [Pulse; 3],
     silences: [Silence; 3],
@@ -171,7 +173,8 @@ impl Crew {
             packing: Packing::Waits { until: None, limit_ns: 0 },
             prepared: PreparedFrames::new(facts.rig.camera.raster),
             black: vec![0; facts.rig.camera.raster.pixel_count()],
-            kernel: parts.kernel,
+            eyes: parts.packer.eyes,
+            kernel: parts.packer.kernel,
             pulses: [Pulse::new("tracking"), Pulse::new("plan"), Pulse::new("pack")],
             silences: Default::default(),
             failure: None,
@@ -439,6 +442,7 @@ impl Crew {
             } else {
                 dpm_render::pack::pack(self.kernel, &self.black, &mut memory.planes);
             }
+            crate::pack::spare(&mut job, &mut self.eyes);
         }
         match machine.takes(Part::Pack, frame, now) {
             Takes::Ns(ns) => self.packing = Packing::Packs { at: now.plus_ns(ns), job },
