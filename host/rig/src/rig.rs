@@ -635,10 +635,12 @@ fn heads(config: &RigConfig, bodies: &[RigBody], worn: &[RigBody]) -> Result<Vec
     let carrier = observer.tracked.as_ref().map(|t| &t.0.name).or(observer.body.as_ref());
     let offset_m = DVec3::from_array(observer.eye_offset).length();
     let head = |name: &str| {
-        let more_m = if carrier.is_some_and(|carrier| carrier == name) { offset_m } else { 0.0 };
+        let tracked = tracked_index("safety.eyes.heads", name, bodies, worn)?;
+        let of_eye_m = if carrier.is_some_and(|carrier| carrier == name) { offset_m } else { 0.0 };
+        let of_mesh_m = bodies.get(tracked).map_or(0.0, |body| body.mesh_to_body.translation.length());
         Ok(GuardedHead {
-            tracked: tracked_index("safety.eyes.heads", name, bodies, worn)?,
-            radius_m: config.safety.eyes.radius + more_m,
+            tracked,
+            radius_m: config.safety.eyes.radius + of_eye_m + of_mesh_m,
             lost_ns: i64::from(config.safety.eyes.lost_ms) * 1_000_000,
         })
     };

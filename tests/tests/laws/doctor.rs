@@ -7,7 +7,8 @@ use std::process::Stdio;
 /// A tracker with a body and a projector of 128 x 96 mirrors, and a folder with their rig file.
 fn bench(name: &str, command_port: u16) -> (SensorWandMock, RunFolder) {
     let port = command_port.to_string();
-    let mock = ["--raster", "128x96", "--body", "bunny:0.03,0.02,0.05", "--command-port", &port];
+    let bodies = ["--body", "bunny:0.03,0.02,0.05", "--body", "glasses:0.03,0.02,0.05"];
+    let mock: Vec<&str> = ["--raster", "128x96", "--command-port", &port].into_iter().chain(bodies).collect();
     let mock = SensorWandMock::start(&mock);
     let folder = RunFolder::new(&format!("doctor-{name}"));
     let rig = mock.rig([128, 96], 60, command_port) + "[[scene.bodies]]\nname = \"bunny\"\n";
@@ -43,6 +44,20 @@ fn a_rig_that_can_run_is_told_from_one_that_cannot() {
     assert!(state == "ok" && found.contains("24 planes are within its limits"), "{found}");
     assert_eq!(part(&json, "calibration")[0], "warning");
     assert!(part(&json, "rig")[1].contains("width = 128, height = 96, frame_rate = 60, planes = 24"));
+
+    // Who looks needs no node of the scene, and a head that the tracker does not tell of is named.
+    let heads = ["--set", "observer.tracked=\"glasses\"", "--set", "safety.eyes.heads=[\"hat\"]"];
+    let (code, json, _) = doctor(&folder, &heads);
+    let [state, found, remedy] = part(&json, "observer");
+    assert!(code == Some(0) && state == "warning", "{json:#}");
+    assert!(
+        found.contains("the eye is carried by \"glasses\"") && found.contains("\"hat\" by 0.15 m"),
+        "{found}"
+    );
+    assert!(
+        found.ends_with("the tracker does not tell of \"hat\"") && remedy.contains("stays dark"),
+        "{found} {remedy}"
+    );
 
     // Another raster, another address: each is named, and nothing else is.
     let (code, json, told) = doctor(&folder, &["--set", "projector.width=256"]);

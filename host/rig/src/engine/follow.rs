@@ -4,6 +4,7 @@
 //! The link's part polls [`Follower::poll`]. It reads the newest tracks, which another thread publishes, and never waits;
 //! nothing is allocated after the start.
 
+use crate::pack::eye_mask::TILE;
 use crate::plan::frame::FramePlan;
 use crate::plan::link_time::LinkTime;
 use crate::rig::{affine, Rig};
@@ -29,7 +30,9 @@ const LASTS_US: u32 = 5_000;
 /// Spacing of the three instants through which a distance is drawn as a parabola, nanoseconds.
 const SPACING_NS: i64 = 500_000;
 /// Greatest shift, mirrors: no light is further from its body than this by more than a body can surprise.
-pub(crate) const CLAMP: u8 = 8;
+const CLAMP: u8 = 8;
+// The eye guard spares the next tile of mirrors and no more.
+const _: () = assert!(CLAMP as usize <= TILE);
 /// The least distance that moves anything, mirrors: below half a mirror no shift brings light nearer to its place.
 const LEAST_GATE: f64 = 0.5;
 /// Points of a body at which the distance is taken.

@@ -14,6 +14,7 @@ use super::supervision::{Irreplaceable, Making, Remake, Supervision, Trouble, Ve
 use crate::config::{Overrides, RigConfig};
 use crate::frame::job::{Fate, FrameNote};
 use crate::mock::{EmulatedProjector, MockConfig};
+use crate::order::Order;
 use crate::pipeline::projector;
 use crate::plan::lead::LeadEstimator;
 use crate::plan::link_time::LinkTime;
@@ -329,6 +330,26 @@ fn a_cable_slower_than_its_slots_carries_every_nth_frame_steadily() {
         assert_eq!((status.state, status.faults), (DeviceState::Armed, 0), "{tenths}");
         assert!((fits - fits / 4..=fits).contains(&slots), "{tenths}: {slots} slots a frame");
         assert_eq!(blank_at[0], blank_at[1], "{tenths}: dark slots after the first second, {status:?}");
+    }
+}
+
+/// A frame that is held cannot be cut when a head moves into it, so FREEZE is BLACK where heads are guarded.
+#[test]
+fn no_frame_is_frozen_where_heads_are_guarded() {
+    for (keys, then) in [
+        (&[][..], DeviceState::Frozen),
+        (&["observer.tracked=\"glasses\""], DeviceState::Black),
+        (&["observer.tracked=\"glasses\"", "safety.eyes.guard=false"], DeviceState::Frozen),
+    ] {
+        let mut bench = bench(keys, RunOptions::default());
+        let mut stage = bench.link::<Real>();
+        bench.facts.monitor.give_order(Order::Freeze);
+        for ms in 0..20 {
+            let now = bench.now.plus_ns(ms * MS);
+            bench.facts.alive_at_ns.store(now.0, Ordering::Relaxed);
+            stage.poll(now, &mut bench.cable);
+        }
+        assert_eq!(bench.cable.device_mut().projector().status().state, then, "{keys:?}");
     }
 }
 

@@ -4,24 +4,8 @@
 
 use crate::light::record::FrameRecord;
 use crate::rig::Rig;
+use crate::telemetry::report::EyesReport;
 use dpm_device::time::HostTime;
-
-/// What the eye guard did to the light of a run.
-#[derive(Clone, Debug, Default, PartialEq, serde::Serialize)]
-pub struct EyesReport {
-    /// Names of the heads that were guarded.
-    pub heads: Vec<String>,
-    /// Lit frames of which mirrors were cut.
-    pub frames_cut: u64,
-    /// These mirrors in all: each is dark in every plane of its frame.
-    pub mirrors_cut: u64,
-    /// Most mirrors that were cut of a frame, while no head was lost.
-    pub most_mirrors: u32,
-    /// Frames that were dark as a whole because a head was lost.
-    pub frames_dark: u64,
-    /// For each head: how often all light went off because it was lost.
-    pub losses: Vec<u64>,
-}
 
 /// Counts for one run.
 #[derive(Clone, Debug, Default)]

@@ -3,7 +3,7 @@
 
 pub(crate) mod collector;
 mod dark_bodies;
-pub mod eye_counts;
+mod eye_counts;
 mod live_view;
 mod measures;
 pub(crate) mod notes;

@@ -4,7 +4,6 @@
 //! around all its rays meets the cone around a head, both with their tips in the projector. So every mirror whose ray
 //! meets the sphere is dark, lens and all, and no mirror is that lies more than a tile's breadth beside it.
 
-use crate::engine::follow::CLAMP;
 use crate::plan::eyes::{EyeGuard, GuardedEyes};
 use crate::rig::Rig;
 use dpm_device::planes::Raster;
@@ -20,9 +19,6 @@ const ROUNDING: f32 = 1e-6;
 /// The rays of a tile's border are taken at its corners and half way between. Between them a lens bends the border by
 /// less than this share of the tile.
 const BENT: f64 = 1.02;
-
-// Tracks may move light by as much, see `EyeMask::new`.
-const _: () = assert!(CLAMP as usize <= TILE);
 
 /// Tiles next to each other in a row of tiles.
 #[derive(Clone, Debug, PartialEq, Eq)]

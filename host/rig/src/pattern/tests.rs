@@ -384,7 +384,7 @@ fn no_light_of_a_pattern_falls_on_a_head_that_passes() {
     assert_eq!((eyes.heads, eyes.frames_dark, eyes.losses), (vec!["glasses".to_owned()], 0, vec![0]));
     // It passes: most of the field is lit always, and all of it at times.
     let [least, most] = lit.iter().fold([1.0f64, 0.0], |[a, b], (_, share)| [a.min(*share), b.max(*share)]);
-    assert!(least > 0.3 && least < 0.8 && most == 1.0, "{least} {most}");
+    assert!(least > 0.2 && least < 0.8 && most == 1.0, "{least} {most}");
     let cut = lit.iter().filter(|(_, share)| *share < 1.0).count() as u64;
     assert_eq!(eyes.frames_cut, cut);
     assert!(eyes.most_mirrors > 0 && eyes.mirrors_cut > u64::from(eyes.most_mirrors));
@@ -397,12 +397,17 @@ fn a_head_that_is_lost_makes_the_light_smaller_and_then_dark_until_it_is_seen() 
     let eyes = report.eyes.expect("a head is guarded");
     assert_eq!(eyes.losses, [1], "{lit:?}");
     let dark: Vec<f64> = lit.iter().filter(|(_, share)| *share == 0.0).map(|(at, _)| *at).collect();
-    assert_eq!(eyes.frames_dark, dark.len() as u64);
-    // Half a second after the last sample, or sooner where the guard has grown over the whole beam.
+    // Before that the guard has grown over the whole beam.
+    assert!(
+        eyes.frames_dark > 180 && eyes.frames_dark < dark.len() as u64,
+        "{} {}",
+        eyes.frames_dark,
+        dark.len()
+    );
     let (first, last) = (dark[0], dark[dark.len() - 1]);
     assert!(first > 0.9 && first < 0.8 + 0.5 + 0.05 && last > 2.19 && last < 2.3, "{first} {last}");
     let is_one_stretch = dark.windows(2).all(|two| two[1] - two[0] < 0.01);
-    assert!(is_one_stretch && report.frames_dark == dark.len() as u64, "{:?}", report.frames_dark);
+    assert!(is_one_stretch && report.frames_dark == eyes.frames_dark, "{}", report.frames_dark);
     let grows = lit.iter().filter(|(at, _)| (0.86..first).contains(at)).map(|(_, share)| *share);
     assert!(grows.clone().count() > 5 && grows.is_sorted_by(|a, b| a >= b), "{lit:?}");
 }

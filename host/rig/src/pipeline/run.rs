@@ -99,6 +99,13 @@ fn run_from(
     if let Some(used) = &rig.calibration {
         monitor.note(format!("calibration: {used}"));
     }
+    let heads: Vec<String> = rig.config.heads().iter().map(|head| format!("{head:?}")).collect();
+    if !heads.is_empty() {
+        monitor.note(format!(
+            "eye guard: no light falls about the head {}, and none at all while one is lost",
+            heads.join(", ")
+        ));
+    }
     if matches!(origin, Origin::Pattern(..)) {
         monitor.parameters().close();
     }

@@ -4,7 +4,6 @@ use super::projector::ProjectorReport;
 use super::signed::SignedHistogram;
 use crate::failure::{Failure, FailureKind};
 use crate::frame::slots::MissCause;
-use crate::light::eye_counts::EyesReport;
 use crate::plan::dark::DarkCause;
 use crate::tracks::gauges::TrackerReport;
 use hdrhistogram::Histogram;
@@ -144,6 +143,23 @@ pub struct Recovery {
     /// From the last light on a body before to the first after, seconds; `None` if none followed before another crew was replaced, or the run
     /// ended.
     pub dark_s: Option<f64>,
+}
+
+/// What the eye guard did to the light of a run.
+#[derive(Clone, Debug, Default, PartialEq, serde::Serialize)]
+pub struct EyesReport {
+    /// Names of the heads that were guarded.
+    pub heads: Vec<String>,
+    /// Lit frames of which mirrors were cut.
+    pub frames_cut: u64,
+    /// These mirrors in all: each is dark in every plane of its frame.
+    pub mirrors_cut: u64,
+    /// Most mirrors that were cut of a frame, while no head was lost.
+    pub most_mirrors: u32,
+    /// Frames that were dark as a whole because a head was lost.
+    pub frames_dark: u64,
+    /// For each head: how often all light went off because it was lost.
+    pub losses: Vec<u64>,
 }
 
 /// A stage's wall time.

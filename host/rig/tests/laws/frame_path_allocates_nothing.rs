@@ -2,17 +2,23 @@
 
 use counting_allocator::{requests_in, Counting};
 use dpm_common::clock::{Clock, ManualClock};
+use dpm_device::planes::{PlaneSchedule, Raster};
 use dpm_device::pose::Pose;
 use dpm_device::time::{FrameRate, HostTime};
 use dpm_device::tracker::{BodyIndex, TrackerSample};
 use dpm_handoff::latest::latest;
 use dpm_handoff::ring::{exchange, ring};
 use dpm_handoff::wake::{WaitPolicy, Waiter};
+use dpm_render::pack::BitPlaneFrame;
 use dpm_rig::frame::FrameTimeline;
+use dpm_rig::pack::eye_mask::EyeMask;
 use dpm_rig::plan::budget::{BudgetConfig, BudgetController};
+use dpm_rig::plan::eyes::{EyeGuard, GuardedEyes};
 use dpm_rig::plan::lead::LeadEstimator;
 use dpm_rig::telemetry::profile::Profiler;
+use dpm_scene::geometry::projector::ProjectorCamera;
 use dpm_tracking::{PoseFilterBank, PoseFilterConfig, TrackState};
+use glam::DVec3;
 
 #[global_allocator]
 static ALLOCATOR: Counting = Counting::BY_THREAD;
@@ -38,7 +44,12 @@ fn a_hundred_thousand_frames_allocate_nothing() {
     })
     .unwrap();
     let mut profiler = Profiler::new(rate, true, 947);
-    let mut predicted = 0u64;
+    let raster = Raster::new(64, 48).unwrap();
+    let camera = ProjectorCamera::look_at(raster, DVec3::ZERO, -DVec3::Z, DVec3::Y, 0.6).unwrap();
+    let mut mask = EyeMask::new(&camera, true);
+    let mut planes = BitPlaneFrame::new(raster, PlaneSchedule::rgb24());
+    let mut eyes = GuardedEyes { spheres: Vec::with_capacity(4), lost: None };
+    let (mut predicted, mut cut) = (0u64, 0u64);
     let allocated = requests_in(|| {
         for frame in 0..100_000u64 {
             let due = HostTime(rate.slot_start_ns(frame));
@@ -74,11 +85,18 @@ fn a_hundred_thousand_frames_allocate_nothing() {
             drainer.give_back(buffer).expect("it came from here");
             events_in.push(frame).expect("drained every frame");
             assert_eq!(events_out.pop(), Some(frame));
+            eyes.spheres.clear();
+            for head in 0..frame % 5 {
+                let centre = DVec3::new(0.1 * head as f64 - 0.2, 1e-5 * frame as f64 - 0.5, -1.0);
+                eyes.spheres.push(EyeGuard { centre, radius_m: 0.05 });
+            }
+            cut += u64::from(mask.cut(&eyes, &camera, &mut planes));
             budget.measured(budget.rays(), 800_000 + (frame % 300_000) as i64);
             let timeline = FrameTimeline { lit_at: Some(due), due_at: due, ..FrameTimeline::default() };
             profiler.lit(&timeline, frame, frame % 100 == 0);
         }
     });
     assert_eq!(allocated, 0, "{allocated} allocations and releases in 100,000 frames");
+    assert!(cut > 1_000_000, "{cut} mirrors: heads were in the beam");
     assert!(predicted > 190_000, "{predicted} poses: the loop did its work");
 }

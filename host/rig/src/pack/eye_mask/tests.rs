@@ -170,7 +170,7 @@ fn tracks_move_no_light_into_the_guard() {
                 continue;
             }
             let (x, y) = (mirror as i64 % width, mirror as i64 / width);
-            let most = i64::from(CLAMP);
+            let most = TILE as i64;
             for (dx, dy) in [(-most, 0), (most, 0), (0, -most), (0, most), (most, most), (-most, most)] {
                 let (x, y) = ((x + dx).clamp(0, width - 1), (y + dy).clamp(0, height - 1));
                 assert!(mask.is_cut((y * width + x) as usize), "seed {seed}: light may come from {x}, {y}");
