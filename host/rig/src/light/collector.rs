@@ -404,6 +404,7 @@ impl Collector {
                 sampled_poses: job.plan.sampled_poses.clone(),
                 dark: job.plan.dark.clone(),
                 cut_mirrors: job.cut_mirrors,
+                guard_radius_m: job.plan.eyes.spheres.iter().fold(0.0, |most, s| s.radius_m.max(most)),
                 head_lost: job.plan.eyes.lost,
                 eye: job.plan.eye,
                 parameters: job.plan.parameters,

@@ -34,6 +34,7 @@ impl EyeCounts {
         r.frames_dark += u64::from(record.head_lost.is_some());
         if record.head_lost.is_none() {
             r.most_mirrors = r.most_mirrors.max(record.cut_mirrors);
+            r.greatest_radius_m = r.greatest_radius_m.max(record.guard_radius_m);
         }
         match (record.head_lost, self.lost) {
             (Some(head), None) => {

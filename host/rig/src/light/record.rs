@@ -28,6 +28,8 @@ pub struct FrameRecord {
     pub dark: Vec<Option<DarkCause>>,
     /// Mirrors that were dark in all its planes for the eyes of tracked people.
     pub cut_mirrors: u32,
+    /// Radius of the largest sphere about one, metres; 0 if no head is guarded.
+    pub guard_radius_m: f64,
     /// The head, among [`crate::rig::Rig::heads`], whose loss made it dark as a whole.
     pub head_lost: Option<usize>,
     /// The eye in world coordinates.

@@ -120,8 +120,8 @@ impl EyeMask {
     fn mark(&mut self, sphere: &EyeGuard, camera: &ProjectorCamera) {
         let to = camera.to_projector_space(sphere.centre);
         let distance_m = to.length();
-        // Also for what is no number: where a head is not known, it is everywhere.
-        if !(distance_m > sphere.radius_m) {
+        // Where a head is not known, it is everywhere. So it is if its radius is no number: no tile is clear then.
+        if distance_m <= sphere.radius_m || !distance_m.is_finite() {
             self.is_cut.fill(true);
             return;
         }

@@ -388,6 +388,7 @@ fn no_light_of_a_pattern_falls_on_a_head_that_passes() {
     let cut = lit.iter().filter(|(_, share)| *share < 1.0).count() as u64;
     assert_eq!(eyes.frames_cut, cut);
     assert!(eyes.most_mirrors > 0 && eyes.mirrors_cut > u64::from(eyes.most_mirrors));
+    assert!(eyes.greatest_radius_m > 0.08 && eyes.greatest_radius_m < 0.25, "{}", eyes.greatest_radius_m);
 }
 
 /// The tracker loses the head for more than a second: the guard grows, then all is dark until the head is seen again.

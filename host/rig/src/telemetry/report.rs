@@ -156,6 +156,8 @@ pub struct EyesReport {
     pub mirrors_cut: u64,
     /// Most mirrors that were cut of a frame, while no head was lost.
     pub most_mirrors: u32,
+    /// Radius of the largest sphere about a head, metres, while none was lost.
+    pub greatest_radius_m: f64,
     /// Frames that were dark as a whole because a head was lost.
     pub frames_dark: u64,
     /// For each head: how often all light went off because it was lost.

@@ -77,7 +77,8 @@ impl Report {
             let (heads, cut) = (eyes.heads.join(", "), eyes.frames_cut);
             let lost: u64 = eyes.losses.iter().sum();
             let dark = some(lost, format!(", {} frames dark because one was lost", eyes.frames_dark));
-            let text = format!("{heads}: {cut} frames cut, by {} mirrors at most{dark}", eyes.most_mirrors);
+            let (mirrors, m) = (eyes.most_mirrors, eyes.greatest_radius_m);
+            let text = format!("{heads}: {cut} frames cut, by {mirrors} mirrors and {m:.2} m at most{dark}");
             table.row("eye guard", text);
         }
     }
