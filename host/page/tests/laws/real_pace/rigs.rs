@@ -11,7 +11,7 @@ use std::sync::{Arc, Mutex};
 use std::time::{Duration, Instant};
 
 /// A state as a rig tells it, and a field that no version has.
-const STATE: &str = r#"{"now":{"pid":7,"up_s":UP,"projector":"up","told":"up","is_light":true,"standing":null,
+const STATE: &str = r#"{"now":{"pid":7,"up_s":UP,"light":{"word":"LIT","state":"lit","told":"","is_lit":true},"standing":null,
     "interlock":["pin",true],"tracker":null,"is_stopping":false,"counts":{"frames_planned":9,"frames_lit":LIT,
     "frames_dark":0,"slots":LIT,"slots_missed":0,"more":1},"viewers":1,"secret":"unknown field"},"figures":{"bodies":[
     {"name":"bunny","seen":true,"dark":null,"told":null,"at_m":[0,0,1]},
@@ -162,7 +162,9 @@ fn a_rig_that_answers_is_shown_and_each_that_does_not_says_why() {
     assert_eq!(rig["address"], good.address.to_string());
     assert_eq!(rig["port"], good.address.port());
     assert!(
-        rig["why"].is_null() && rig["told"]["projector"] == "up" && rig["told"]["is_light"] == true,
+        rig["why"].is_null()
+            && rig["told"]["light"]["word"] == "LIT"
+            && rig["told"]["light"]["is_lit"] == true,
         "{rig}"
     );
     assert_eq!(rig["told"]["celsius"], 41.5);
@@ -248,7 +250,7 @@ fn a_rig_is_shown_and_commanded_through_a_tunnel() {
     assert_eq!(order(&format!("http://{to}")), 200, "the rig's own name stays one of its own");
     assert_eq!(order("http://127.0.0.1:1"), 403, "a server at another port of this machine");
     assert_eq!(order(&format!("http://{tunnel}")), 200);
-    wait(&page, "rig", PATIENCE, |rig| rig["told"]["projector"] == "BLACK");
+    wait(&page, "rig", PATIENCE, |rig| rig["told"]["light"]["word"] == "DARK BY ORDER");
     rig.end_run();
 }
 
@@ -257,19 +259,22 @@ fn a_real_rig_is_understood_and_its_silence_is_told() {
     let mut rig = Running::start("overview");
     let page = overview(&[format!("rig={}", rig.address)]);
     let now = wait(&page, "rig", PATIENCE, |rig| rig["told"]["lit_per_s"].as_f64().is_some_and(|n| n > 1.0));
-    assert!(now["told"]["projector"] == "up" && now["told"]["is_light"] == true, "{now}");
+    assert!(now["told"]["light"]["word"] == "LIT" && now["told"]["light"]["is_lit"] == true, "{now}");
     assert!(
         !now["told"]["bodies"].as_array().unwrap().is_empty() && now["told"]["celsius"].is_null(),
         "{now}"
     );
     assert_eq!(now["told"]["version"], env!("CARGO_PKG_VERSION"));
     rig.order("black");
-    let now = wait(&page, "rig", PATIENCE, |rig| rig["told"]["projector"] == "BLACK");
-    assert!(now["told"]["is_light"] == false, "{now}");
+    let now = wait(&page, "rig", PATIENCE, |rig| rig["told"]["light"]["word"] == "DARK BY ORDER");
+    assert!(now["told"]["light"]["is_lit"] == false, "{now}");
     rig.end_run();
     drop(rig);
     let now = wait(&page, "rig", PATIENCE, |rig| rig["contact"] == "no");
-    assert!(now["told"]["projector"] == "BLACK" && now["heard_s_ago"].as_f64().unwrap() >= 3.0, "{now}");
+    assert!(
+        now["told"]["light"]["word"] == "DARK BY ORDER" && now["heard_s_ago"].as_f64().unwrap() >= 3.0,
+        "{now}"
+    );
     assert!(now["why"].as_str().unwrap().contains("nobody listens"), "{now}");
 }
 

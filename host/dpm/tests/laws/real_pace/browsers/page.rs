@@ -74,9 +74,9 @@ fn change_exposure(browser: &mut Browser) {
     browser.wait("use", "document.getElementById('used').textContent === 'in use, not saved'");
     wait_for_light(browser, "darker light", |mean| mean > 0.0 && mean < 0.5 * before);
     browser.press("b");
-    browser.wait("state", "document.getElementById('state').textContent === 'BLACK'");
+    browser.wait("state", "document.getElementById('state').textContent === 'DARK BY ORDER'");
     browser.press("a");
-    browser.wait("state", "document.getElementById('state').textContent === 'UP'");
+    browser.wait("state", "document.getElementById('state').textContent === 'LIT'");
     browser.value("document.getElementById('save').click()");
     browser.wait("refusal", &format!("{told}.includes('has no rig file')"));
     browser.press("u");
@@ -110,7 +110,7 @@ fn the_page_shows_the_rig_obeys_its_operator_and_comes_back() {
     let link = format!("http://{address}/#token={}", token.trim());
     let mut browser = Browser::open(program, &own_folder("browser"), &link);
     browser.screen(1280, 900, false);
-    browser.wait("state", "document.getElementById('state').textContent === 'UP'");
+    browser.wait("state", "document.getElementById('state').textContent === 'LIT'");
     assert_eq!(browser.value("location.hash"), "", "the token stays in the address");
     browser.wait("buttons", "!document.getElementById('black').disabled");
     wait_for_light(&mut browser, "light", |mean| mean > 1.0);
@@ -127,7 +127,7 @@ fn the_page_shows_the_rig_obeys_its_operator_and_comes_back() {
         "answer",
         "document.getElementById('answer').textContent.startsWith('BLACK: ok: projector black')",
     );
-    browser.wait("state", "document.getElementById('state').textContent === 'BLACK'");
+    browser.wait("state", "document.getElementById('state').textContent === 'DARK BY ORDER'");
     wait_for_light(&mut browser, "dark", |mean| mean == 0.0);
     browser.picture(&pictures.join("desktop-black.png"), false);
     browser.press("a");
@@ -146,7 +146,7 @@ fn the_page_shows_the_rig_obeys_its_operator_and_comes_back() {
     browser.picture(&pictures.join("phone-whole.png"), true);
     browser.click("safe");
     browser.wait("answer", "document.getElementById('answer').textContent.startsWith('SAFE: ok: ')");
-    browser.wait("state", "document.getElementById('state').textContent === 'SAFE'");
+    browser.wait("state", "document.getElementById('state').textContent === 'DARK BY ORDER'");
     wait_for_light(&mut browser, "dark", |mean| mean == 0.0);
     assert_eq!(browser.complaints, Vec::<String>::new());
 
