@@ -244,7 +244,8 @@ fn a_rig_is_shown_and_commanded_through_a_tunnel() {
     assert_eq!(now["port"], tunnel.port());
     let order = |origin: &str| {
         let host = tunnel.to_string();
-        let headers = [("Host", host.as_str()), ("Origin", origin), ("X-Dpm-Token", rig.token.as_str())];
+        let signed = rig.signed("POST", "/api/orders/black");
+        let headers = [("Host", host.as_str()), ("Origin", origin), ("X-Dpm-Order", signed.as_str())];
         ask(tunnel, "POST", "/api/orders/black", &headers).status
     };
     assert_eq!(order(&format!("http://{to}")), 200, "the rig's own name stays one of its own");
@@ -284,7 +285,7 @@ fn the_overview_refuses_other_names_other_sites_and_orders() {
     let page = overview(&[format!("good={}", good.address)]);
     let body = get(&page, "/").body;
     assert!(body.ends_with("</html>\n") && !body.contains("{{") && body.contains("--ground: #"));
-    assert!(!body.contains("dpm-token"), "it needs no token");
+    assert!(!body.contains("dpm-page"), "it needs no key");
     assert!(get(&page, "/").head.contains("script-src 'nonce-"));
     let own = page.address().to_string();
     let host = ("Host", own.as_str());
@@ -302,7 +303,7 @@ fn the_overview_refuses_other_names_other_sites_and_orders() {
     for path in ["/api/orders/black", "/api/parameters/undo", "/api/calibration/stop", "/api/rigs"] {
         assert_eq!(ask(page.address(), "POST", path, &[host]).status, 405, "{path}");
     }
-    for path in ["/api/state", "/api/events", "/metrics", "/calibration", "/api/token", "/api/flights/0"] {
+    for path in ["/api/state", "/api/events", "/metrics", "/calibration", "/api/key", "/api/flights/0"] {
         assert_eq!(get(&page, path).status, 404, "{path}");
     }
     let far = Rigs::new(vec!["127.0.0.1:1".parse().unwrap()]).unwrap();
