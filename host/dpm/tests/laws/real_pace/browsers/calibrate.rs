@@ -46,7 +46,7 @@ fn text_of(browser: &mut Browser, what: &str) -> String {
 /// The steps as they stand there without a token, and by keys alone.
 fn look(browser: &mut Browser, rig: &str) {
     browser.wait("steps", "document.querySelectorAll('#steps section').length === 9");
-    browser.wait("refusal", "!document.getElementById('token').hidden");
+    browser.wait("refusal", "!document.getElementById('keyless').hidden");
     assert_eq!(browser.value("[...document.querySelectorAll('.run')].every(b => b.disabled)"), true);
     assert_eq!(text_of(browser, "section.next h3"), "Sharpen and aim the picture");
     assert_eq!(text_of(browser, "section.next code"), format!("dpm pattern focus-star {rig}"));

@@ -5,7 +5,7 @@ use crate::browser;
 use crate::browser::{Browser, PATIENCE};
 use crate::cli_common::{self, code, dpm, err, out, own_folder, start_with};
 use std::io::{Read, Write};
-use std::net::{SocketAddr, TcpListener, TcpStream};
+use std::net::{Shutdown, SocketAddr, TcpListener, TcpStream};
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Arc, Mutex};
 use std::thread::JoinHandle;
@@ -43,6 +43,8 @@ const THIEF: &str = "<!doctype html><title>rig</title><script>
 struct Impostor {
     stop: Arc<AtomicBool>,
     heard: Arc<Mutex<String>>,
+    /// A browser opens connections before it needs them.
+    streams: Arc<Mutex<Vec<TcpStream>>>,
     address: SocketAddr,
     thread: Option<JoinHandle<()>>,
 }
@@ -59,19 +61,21 @@ impl Impostor {
             std::thread::sleep(Duration::from_millis(20));
         };
         let (stop, heard) = (Arc::new(AtomicBool::new(false)), Arc::new(Mutex::new(String::new())));
+        let streams = Arc::new(Mutex::new(Vec::new()));
         let thread = std::thread::spawn({
-            let (stop, heard) = (stop.clone(), heard.clone());
+            let (stop, heard, streams) = (stop.clone(), heard.clone(), streams.clone());
             move || {
                 for stream in listener.incoming().map_while(Result::ok) {
                     if stop.load(Ordering::SeqCst) {
                         return;
                     }
                     let heard = heard.clone();
+                    streams.lock().unwrap().push(stream.try_clone().unwrap());
                     std::thread::spawn(move || answer(stream, &heard));
                 }
             }
         });
-        Self { stop, heard, address, thread: Some(thread) }
+        Self { stop, heard, streams, address, thread: Some(thread) }
     }
 
     fn heard(&self) -> String {
@@ -84,6 +88,9 @@ impl Drop for Impostor {
         self.stop.store(true, Ordering::SeqCst);
         let _ = TcpStream::connect(self.address);
         let _ = self.thread.take().map(JoinHandle::join);
+        for stream in self.streams.lock().unwrap().iter() {
+            let _ = stream.shutdown(Shutdown::Both);
+        }
     }
 }
 

@@ -159,7 +159,7 @@ fn the_page_shows_the_rig_obeys_its_operator_and_comes_back() {
     let mut second = rig(&address);
     second.wait_for_line(PATIENCE, |line| line.contains("page: http"));
     browser.wait("return", "!document.body.classList.contains('stale')");
-    browser.wait("state", "document.getElementById('state').textContent === 'SAFE'");
+    browser.wait("state", "document.getElementById('state').textContent === 'DARK BY ORDER'");
     browser.wait("buttons", "!document.getElementById('arm').disabled");
     browser.click("arm");
     browser
