@@ -1,13 +1,14 @@
 //! `[osc]`: Open Sound Control, over which other programs take light away, and change parameters if they know the token.
 
 use super::{Origin, RigConfig};
-use crate::control::osc::decode::MOST_TOKEN;
 use dpm_common::keys::read::{Any, NotEmpty, Reader};
 use dpm_common::section;
 use std::net::{IpAddr, SocketAddr};
 
+/// Longest token, bytes.
+pub const MOST_OSC_TOKEN: usize = 64;
 /// Lengths that `osc.token` may have.
-const TOKEN_LENGTHS: std::ops::RangeInclusive<usize> = 12..=MOST_TOKEN;
+const TOKEN_LENGTHS: std::ops::RangeInclusive<usize> = 12..=MOST_OSC_TOKEN;
 /// The largest number of addresses in `osc.from`.
 const MAX_SENDERS: usize = 64;
 

@@ -173,7 +173,11 @@ fn a_start_by_hand_a_lost_body_a_hung_stage_and_a_silent_tracker_are_called_by_t
     );
     let mut run = start(&["run", &rig]);
     let asked = Asked { address, far: &far };
-    asked.agrees("NEVER ARMED");
+    // First the projector is connected, and then the start waits for a person.
+    let begin = Instant::now();
+    while !asked.agrees("NEVER ARMED")["now"]["light"]["told"].as_str().unwrap().contains("safety.start") {
+        assert!(begin.elapsed() < LONG, "it waits for nobody");
+    }
     order("arm", &run);
     let state = asked.agrees("PARTLY LIT");
     let told = state["now"]["light"]["told"].as_str().unwrap().to_owned();

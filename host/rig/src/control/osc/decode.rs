@@ -7,6 +7,7 @@
 //! Format: opensoundcontrol.org, "OSC 1.0 specification" (Wright, 2002). Everything is aligned to four bytes and big
 //! endian. A time tag is read and ignored: what comes is meant for now.
 
+use crate::config::MOST_OSC_TOKEN;
 use crate::order::Order;
 use std::fmt;
 
@@ -14,8 +15,6 @@ use std::fmt;
 const DEEPEST: usize = 4;
 /// Most numbers of a message that are read.
 pub const MOST_NUMBERS: usize = 16;
-/// Longest token that is read, bytes; a longer text is none.
-pub const MOST_TOKEN: usize = 64;
 /// First part of every address, and of one with a token.
 const PREFIX: &str = "/dpm/";
 const TOKEN: &str = "token/";
@@ -142,7 +141,7 @@ fn arguments_of<'a>(tags: &str, mut rest: &'a [u8]) -> Result<(Option<Vec<f64>>,
             b's' | b'S' => {
                 let (told, after) = text(rest)?;
                 rest = after;
-                if token.is_none() && told.len() <= MOST_TOKEN {
+                if token.is_none() && told.len() <= MOST_OSC_TOKEN {
                     token = Some(told);
                     continue;
                 }

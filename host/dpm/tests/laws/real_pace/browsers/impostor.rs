@@ -125,6 +125,7 @@ fn answer(mut stream: TcpStream, heard: &Mutex<String>) {
         // It stays open, as the rig's events do.
         let _ = stream.read(&mut bytes);
     }
+    let _ = stream.shutdown(Shutdown::Both);
 }
 
 #[test]
