@@ -12,8 +12,8 @@ use std::time::{Duration, Instant};
 
 /// A state as a rig tells it, and a field that no version has.
 const STATE: &str = r#"{"now":{"pid":7,"up_s":UP,"light":{"word":"LIT","state":"lit","told":"","is_lit":true},"standing":null,
-    "interlock":["pin",true],"tracker":null,"is_stopping":false,"counts":{"frames_planned":9,"frames_lit":LIT,
-    "frames_dark":0,"slots":LIT,"slots_missed":0,"more":1},"viewers":1,"secret":"unknown field"},"figures":{"bodies":[
+    "interlock":["pin",true],"tracker":null,"is_stopping":false,"counts":{"frames_planned":9,"frames_lit":FRAMES,
+    "frames_dark":0,"slots":FRAMES,"slots_missed":0,"more":1},"viewers":1,"secret":"unknown field"},"figures":{"bodies":[
     {"name":"bunny","seen":true,"dark":null,"told":null,"at_m":[0,0,1]},
     {"name":"teapot","seen":true,"dark":"silent","told":"LONG","at_m":[0,0,1]}],
     "link":{"celsius":41.5},"setup":{"rig":"/etc/dpm/stage.toml","version":"0.1.0","commit":"abc"}}}"#;
@@ -55,7 +55,7 @@ impl Fake {
         let begin = Instant::now();
         Self::serve(move |mut stream| {
             let up = begin.elapsed().as_secs_f64() + 10.0;
-            let text = STATE.replace("UP", &up.to_string()).replace("LIT", &((up * 50.0) as u64).to_string());
+            let text = STATE.replace("UP", &up.to_string()).replace("FRAMES", &((up * 50.0) as u64).to_string());
             let _ = stream.write_all(http("200 OK", &text.replace("LONG", &"long ".repeat(1000))).as_bytes());
         })
     }
