@@ -448,6 +448,10 @@ pub fn osc_datagram(bytes: &[u8]) {
         (all, end.is_ok())
     };
     let _ = osc::decode(bytes, &mut |one| {
+        let one = one.map(|said| {
+            assert!(said.token.is_none_or(|token| token.len() <= bytes.len()));
+            said.heard
+        });
         assert_ne!(one, Ok(osc::Heard::Order(Order::Arm)));
         if let Ok(osc::Heard::Set { name, numbers }) = one {
             assert!(numbers.len() <= osc::MOST_NUMBERS && name.len() <= bytes.len());

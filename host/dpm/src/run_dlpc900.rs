@@ -390,7 +390,7 @@ pub(crate) fn present<P: HidPort>(
         let rested = if matches!(stopped, Err(Dlpc900Error::Port { .. })) { stopped } else { d.idle() };
         (result, rested)
     });
-    monitor.set_projector(ProjectorHealth::Stopped);
+    monitor.set_projector_and_light(ProjectorHealth::Stopped);
     result?;
     match rested {
         Err(e) if !e.is_gone() => Err(e.into()),
@@ -449,7 +449,7 @@ impl<P: HidPort> Watch<'_, P> {
             }
         }
         while !self.monitor.light_allowed() && !self.monitor.stop_requested() {
-            self.monitor.set_projector(ProjectorHealth::InterlockOpen);
+            self.monitor.set_projector_and_light(ProjectorHealth::InterlockOpen);
             std::thread::sleep(STEP);
         }
         Ok(())
@@ -484,7 +484,7 @@ impl<P: HidPort> Watch<'_, P> {
         }
         word.interlock_done.store(number, Ordering::SeqCst);
         self.report.setup_s = watch.elapsed_ns() as f64 * 1e-9;
-        self.monitor.set_projector(self.health());
+        self.monitor.set_projector_and_light(self.health());
         Ok(())
     }
 
@@ -520,10 +520,10 @@ impl<P: HidPort> Watch<'_, P> {
             let wanted = if self.allowed { self.standing } else { Some(Order::Black) };
             obey(self.d, wanted)?;
             self.word.interlock_done.store(number, Ordering::SeqCst);
-            self.monitor.set_projector(self.health());
+            self.monitor.set_projector_and_light(self.health());
         } else if self.allowed && order.is_some() {
             obey(self.d, self.standing)?;
-            self.monitor.set_projector(health(self.standing));
+            self.monitor.set_projector_and_light(health(self.standing));
         } else if self.allowed && due {
             // What was ordered while the interlock was open is done when it closes.
             self.looked = Stopwatch::start();
@@ -560,7 +560,7 @@ impl<P: HidPort> Watch<'_, P> {
             // Right after it was plugged in it may still be without rights, in other hands, or silent.
             Err(e) if e.is_gone() || self.lost && matches!(e, Dlpc900Error::Port { .. }) => {
                 self.lost = true;
-                self.monitor.set_projector(ProjectorHealth::Lost);
+                self.monitor.set_projector_and_light(ProjectorHealth::Lost);
             }
             Err(e) => return Err(e.into()),
         }

@@ -393,7 +393,8 @@ impl Cause {
 /// Waits until the run reports this state of its projector, at most 20 s.
 fn until_told(monitor: &RunMonitor, wanted: ProjectorHealth) {
     let watch = Stopwatch::start();
-    while monitor.projector() != wanted {
+    let is_lit = matches!(wanted, ProjectorHealth::Up | ProjectorHealth::Frozen);
+    while monitor.projector() != wanted || monitor.light().is_lit() != is_lit {
         assert!(watch.elapsed_ns() < 20_000_000_000, "{} instead of {wanted}", monitor.projector());
         std::thread::sleep(Duration::from_millis(1));
     }

@@ -2,6 +2,7 @@
 //! ones, notes, and pictures. What a slow viewer has no room for is never made.
 
 use crate::shared::Viewer;
+use crate::site::Site;
 use crate::state::State;
 use base64::prelude::{Engine, BASE64_STANDARD};
 use dpm_rig::telemetry::live::LiveSnapshot;
@@ -28,10 +29,14 @@ pub(crate) struct Events {
     /// Of the parameters that were told last.
     parameters: Option<[u64; 3]>,
     pictures: u64,
+    /// For whom events are proven, and how many there were.
+    proven_for: Option<(Arc<Site>, String)>,
+    count: u64,
 }
 
 impl Events {
-    pub(crate) fn new(viewer: Viewer) -> Self {
+    /// With a number that the viewer has drawn, its events are proven by the rig's secret.
+    pub(crate) fn new(viewer: Viewer, proven_for: Option<(Arc<Site>, String)>) -> Self {
         Self {
             viewer,
             next: Box::pin(sleep(Duration::ZERO)),
@@ -40,6 +45,8 @@ impl Events {
             figures: None,
             parameters: None,
             pictures: 0,
+            proven_for,
+            count: 0,
         }
     }
 
@@ -67,21 +74,21 @@ impl Events {
         }
         if self.ticks.is_multiple_of(STATE_EVERY) {
             let state = State::of(&shared);
-            event(&mut text, "state", &state.now);
+            self.event(&mut text, "state", &state.now);
             let is_new = state.figures.as_ref().map(Arc::as_ptr) != self.figures.as_ref().map(Arc::as_ptr);
             if is_new || self.ticks == 0 {
-                event(&mut text, "figures", &state.to_json().figures);
+                self.event(&mut text, "figures", &state.to_json().figures);
                 self.figures = state.figures;
             }
             let mark = shared.monitor.parameters().mark();
             if mark != self.parameters || self.ticks == 0 {
                 self.parameters = mark;
-                event(&mut text, "parameters", &shared.monitor.parameters().shown());
+                self.event(&mut text, "parameters", &shared.monitor.parameters().shown());
             }
             let notes = shared.notes.since(self.notes_from);
             if let Some(last) = notes.last() {
                 self.notes_from = last.number + 1;
-                event(&mut text, "notes", &notes);
+                self.event(&mut text, "notes", &notes);
             }
         }
         self.ticks = self.ticks.wrapping_add(1).max(1);
@@ -96,17 +103,28 @@ impl Events {
                 "told": pictures.told,
                 "per_s": pictures.per_s,
             });
-            event(&mut text, "pictures", &told);
+            self.event(&mut text, "pictures", &told);
         }
         text
     }
-}
 
-fn event(text: &mut String, name: &str, data: &impl serde::Serialize) {
-    // JSON on one line has no line feed inside.
-    if let Ok(data) = serde_json::to_string(data) {
-        for part in ["event: ", name, "\ndata: ", &data, "\n\n"] {
+    fn event(&mut self, text: &mut String, name: &str, data: &impl serde::Serialize) {
+        // JSON on one line has no line feed inside.
+        let Ok(data) = serde_json::to_string(data) else { return };
+        for part in ["event: ", name, "\ndata: ", &data, "\n"] {
             *text += part;
         }
+        if let Some((site, number)) = &self.proven_for {
+            // What a browser hands to the page's script with the event.
+            for part in [
+                "id: ",
+                &site.door.guard.event_proof(number, self.count, name, &data).unwrap_or_default(),
+                "\n",
+            ] {
+                *text += part;
+            }
+        }
+        self.count += 1;
+        text.push('\n');
     }
 }

@@ -3,12 +3,18 @@
 //! A browser runs scripts of other sites on this machine. The header `Host` tells a page that was reached under a
 //! foreign name (DNS rebinding), `Origin` and `Sec-Fetch-Site` tell a request that another site caused.
 
+use crate::proof::{is_number, Prover, Unproven};
 use crate::token::Token;
-use hyper::header::{HeaderMap, HeaderName, HeaderValue, HOST, ORIGIN};
+use hyper::header::{HeaderMap, HeaderName, HOST, ORIGIN};
+use hyper::Request;
 use std::net::SocketAddr;
 
-/// The header that carries the token of an order.
-pub const TOKEN: HeaderName = HeaderName::from_static("x-dpm-token");
+/// The header that proves an order: a challenge of the rig, a space, and the signature ([`crate::proof`]).
+pub const ORDER: HeaderName = HeaderName::from_static("x-dpm-order");
+/// The header with the number for which the answer is to be proven.
+pub const NUMBER: HeaderName = HeaderName::from_static("x-dpm-number");
+/// The header with that proof.
+pub const PROOF: HeaderName = HeaderName::from_static("x-dpm-proof");
 const FETCH_SITE: HeaderName = HeaderName::from_static("sec-fetch-site");
 const FETCH_MODE: HeaderName = HeaderName::from_static("sec-fetch-mode");
 const FETCH_DEST: HeaderName = HeaderName::from_static("sec-fetch-dest");
@@ -27,11 +33,11 @@ fn refused(status: u16, told: impl Into<String>) -> Refused {
 }
 
 /// The names under which the page may be asked for.
-#[derive(Clone, Debug)]
+#[derive(Debug)]
 pub(crate) struct Guard {
     hosts: Vec<String>,
     origins: Vec<String>,
-    token: Option<Token>,
+    prover: Option<Prover>,
     /// What to do about a request that named another host.
     remedy: &'static str,
 }
@@ -48,7 +54,8 @@ impl Guard {
         // Beyond this machine there is TLS only.
         origins.extend(names.iter().map(|name| format!("https://{}", name.to_ascii_lowercase())));
         hosts.extend(names.iter().map(|name| name.to_ascii_lowercase()));
-        Self { hosts, origins, token, remedy: "; add a proxy's name to page.hosts" }
+        let prover = token.as_ref().and_then(Prover::new);
+        Self { hosts, origins, prover, remedy: "; add a proxy's name to page.hosts" }
     }
 
     /// For an overview of several rigs at `address`, which has no rig file and no orders.
@@ -92,18 +99,56 @@ impl Guard {
         self.origins.iter().any(|o| o.eq_ignore_ascii_case(origin)) || through_tunnel()
     }
 
-    /// An order: it knows the token.
-    pub(crate) fn check_token(&self, headers: &HeaderMap) -> Result<(), Refused> {
-        let Some(token) = &self.token else {
-            return Err(refused(503, "this page gives no orders, because it has no token; use `dpm black`"));
-        };
-        let told = headers.get_all(TOKEN).iter().collect::<Vec<&HeaderValue>>();
-        match told.as_slice() {
-            [told] if token.is(told.as_bytes()) => Ok(()),
-            [] => Err(refused(401, "no token: open the page by the link that the rig has printed, or send what its file page.token holds")),
-            _ => Err(refused(403, "wrong token: open the page by the link that the rig has printed, or send what its file page.token holds")),
-        }
+    /// A new challenge for a page that wants to ask for something.
+    pub(crate) fn challenge(&self) -> Result<String, Refused> {
+        self.prover()?.challenge().ok_or_else(|| refused(503, "the operating system gave no random bytes"))
     }
+
+    /// A request that does something: it is signed by the secret over a challenge of this process, and has no body.
+    pub(crate) fn check_order<B: hyper::body::Body>(&self, request: &Request<B>) -> Result<(), Refused> {
+        let prover = self.prover()?;
+        let told = single(request.headers(), &ORDER);
+        let told = match (told, request.headers().contains_key(ORDER)) {
+            (Some(told), _) => told,
+            (None, false) => {
+                return Err(refused(401, "not signed: open the page by the link that `dpm page` prints"))
+            }
+            (None, true) => return Err(refused(403, "not signed as docs/PAGE.md says")),
+        };
+        if !request.body().is_end_stream() {
+            return Err(refused(400, "a signed request has no body"));
+        }
+        prover.check(request.method().as_str(), path_of(request), told).map_err(|unproven| match unproven {
+            Unproven::Form => refused(403, "not signed as docs/PAGE.md says"),
+            Unproven::Challenge => refused(403, "the challenge is old, used, or of another run: ask again"),
+            Unproven::Signature => {
+                refused(403, "signed by another key: open the page by the link that `dpm page` prints")
+            }
+        })
+    }
+
+    /// The proof of an answer, if the request asks for one.
+    pub(crate) fn proof<B>(&self, request: &Request<B>, status: u16, body: &[u8]) -> Option<String> {
+        let number = single(request.headers(), &NUMBER).filter(|number| is_number(number))?;
+        let asked = (request.method().as_str(), path_of(request), number);
+        Some(self.prover.as_ref()?.sign_answer(asked, status, body))
+    }
+
+    /// The proof of an event of a viewer that has drawn `number`.
+    pub(crate) fn event_proof(&self, number: &str, count: u64, name: &str, data: &str) -> Option<String> {
+        Some(self.prover.as_ref()?.sign_event(number, count, name, data))
+    }
+
+    fn prover(&self) -> Result<&Prover, Refused> {
+        self.prover.as_ref().ok_or_else(|| {
+            refused(503, "this page gives no orders, because it has no token; use `dpm black`")
+        })
+    }
+}
+
+/// Path and query of a request, as they are signed.
+fn path_of<B>(request: &Request<B>) -> &str {
+    request.uri().path_and_query().map_or("", |path| path.as_str())
 }
 
 /// Whether a host is this machine by a name that no name server decides, with any port or none.
@@ -139,6 +184,7 @@ fn single<'a>(headers: &'a HeaderMap, name: &HeaderName) -> Option<&'a str> {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::proof::{sign_request, Key};
 
     fn headers(all: &[(&str, &str)]) -> HeaderMap {
         let mut map = HeaderMap::new();
@@ -239,16 +285,31 @@ mod tests {
     }
 
     #[test]
-    fn an_order_needs_exactly_one_right_token() {
-        let token = token();
-        let told = |all: &[(&str, &str)]| guard().check_token(&headers(all)).map_err(|r| r.status);
-        assert_eq!(told(&[("x-dpm-token", token.as_str())]), Ok(()));
+    fn an_order_needs_exactly_one_right_signature() {
+        let guard = guard();
+        let key = Key::of_orders(&token());
+        let path = "/api/orders/black?x=1";
+        let request = |all: &[(&str, &str)], body: &str| {
+            let mut request = Request::post(path).body(body.to_owned()).unwrap();
+            *request.headers_mut() = headers(all);
+            request
+        };
+        let told = |all: &[(&str, &str)]| guard.check_order(&request(all, "")).map_err(|r| r.status);
+        let signed = || {
+            let challenge = guard.challenge().unwrap();
+            format!("{challenge} {}", sign_request(&key, "POST", path, &challenge))
+        };
+        assert_eq!(told(&[("x-dpm-order", &signed())]), Ok(()));
         assert_eq!(told(&[]), Err(401));
-        assert_eq!(told(&[("x-dpm-token", "")]), Err(403));
-        assert_eq!(told(&[("x-dpm-token", &token.as_str()[1..])]), Err(403));
-        assert_eq!(told(&[("x-dpm-token", token.as_str()), ("x-dpm-token", token.as_str())]), Err(403));
+        assert_eq!(told(&[("x-dpm-order", "")]), Err(403));
+        assert_eq!(told(&[("x-dpm-order", token().as_str())]), Err(403));
+        assert_eq!(told(&[("x-dpm-token", token().as_str())]), Err(401));
+        assert_eq!(told(&[("x-dpm-order", &signed()), ("x-dpm-order", &signed())]), Err(403));
+        let whole = guard.check_order(&request(&[("x-dpm-order", &signed())], "body"));
+        assert_eq!(whole.map_err(|r| r.status), Err(400));
         let none = Guard::new("127.0.0.1:1".parse().unwrap(), &[], None);
-        let right = headers(&[("x-dpm-token", token.as_str())]);
-        assert_eq!(none.check_token(&right).unwrap_err().status, 503);
+        let right = request(&[("x-dpm-order", &signed())], "");
+        assert_eq!(none.check_order(&right).unwrap_err().status, 503);
+        assert_eq!(none.challenge().unwrap_err().status, 503);
     }
 }

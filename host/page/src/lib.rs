@@ -1,7 +1,7 @@
 //! The live page of a running rig.
 //!
 //! A small HTTP server on an address of this machine shows what the rig does, takes the orders BLACK, FREEZE, SAFE and
-//! ARM from whoever knows a token, and tells its figures to Prometheus. `docs/PAGE.md` describes it for operators.
+//! ARM from whoever proves to know a secret ([`proof`]), and tells its figures to Prometheus. `docs/PAGE.md` describes it for operators.
 //!
 //! Another page shows several rigs at once, from what the servers of their own pages tell ([`rigs`]).
 //!
@@ -17,6 +17,8 @@ pub mod notes;
 mod orders;
 mod parameters;
 mod pictures;
+pub mod probe;
+pub mod proof;
 mod query;
 pub mod rigs;
 mod routes;
@@ -27,5 +29,5 @@ mod state;
 mod stream;
 pub mod token;
 
-pub use guard::TOKEN;
+pub use guard::{NUMBER, ORDER, PROOF};
 pub use server::{Page, PageError, Settings};

@@ -7,8 +7,8 @@ use dpm_rig::control::rig_name;
 use dpm_rig::order::Order;
 use dpm_rig::plan::dark::DarkCause;
 use dpm_rig::telemetry::histogram_steps::UPPER_NS;
+use dpm_rig::telemetry::light_state::LightState;
 use dpm_rig::telemetry::live::LiveSnapshot;
-use dpm_rig::telemetry::monitor::ProjectorHealth;
 use dpm_rig::telemetry::projector::{DeviceCounts, ProjectorReport};
 use dpm_rig::tracks::gauges::TrackerReport;
 use std::fmt::Write;
@@ -27,7 +27,7 @@ macro_rules! families {
 families! {
     INFO = "dpm_info", "gauge", "1; the labels name the program, the rig and its parts";
     UP_SECONDS = "dpm_up_seconds", "gauge", "Seconds since the page began";
-    PROJECTOR_STATE = "dpm_projector_state", "gauge", "1 for the state that the projector is in, 0 for the others";
+    LIGHT_STATE = "dpm_light_state", "gauge", "1 for the state of the light, 0 for the others: lit, partly_lit, dark_by_order, dark, stalled, never_armed";
     STANDING = "dpm_order_standing", "gauge", "1 for the order that stands and is kept over restarts, 0 for the others";
     INTERLOCK = "dpm_interlock_closed", "gauge", "1 while the interlock permits light; absent without an interlock";
     PLANNED = "dpm_frames_planned_total", "counter", "Frames planned";
@@ -67,7 +67,7 @@ pub(crate) fn text(state: &State) -> String {
     let mut out = Out { text: String::with_capacity(16 << 10), family: "" };
     rig(&mut out, state);
     match &state.figures {
-        Some(figures) => run(&mut out, figures),
+        Some(figures) => run(&mut out, state, figures),
         None => counted(&mut out, state),
     }
     out.family(PICTURES);
@@ -97,10 +97,9 @@ fn rig(out: &mut Out, state: &State) {
     ];
     out.family(INFO).value(&labels, 1.0);
     out.family(UP_SECONDS).value(&[], now.up_s);
-    out.family(PROJECTOR_STATE);
-    for health in ProjectorHealth::WORDS {
-        let word = health.word().to_ascii_lowercase();
-        out.value(&[("state", &word)], f64::from(health.word() == state.health.word()));
+    out.family(LIGHT_STATE);
+    for word in LightState::WORDS {
+        out.value(&[("state", &LightState::name_of(word))], f64::from(word == now.light.word));
     }
     out.family(STANDING);
     for (order, word) in Order::ALL.iter().filter(|(order, _)| *order != Order::Arm) {
@@ -144,7 +143,7 @@ fn frames(out: &mut Out, counts: [u64; 5]) {
     }
 }
 
-fn run(out: &mut Out, figures: &LiveSnapshot) {
+fn run(out: &mut Out, state: &State, figures: &LiveSnapshot) {
     let r = &figures.report;
     out.family(PLANNED).value(&[], figures.planned as f64);
     frames(out, [r.frames_lit, r.frames_dark, r.frames_dropped, r.frames_withheld, r.frames_unrecorded]);
@@ -161,8 +160,8 @@ fn run(out: &mut Out, figures: &LiveSnapshot) {
         }
     }
     out.family(BODY_LIT);
-    for body in &figures.bodies {
-        out.value(&[("body", &body.name)], f64::from(body.dark.is_none()));
+    for (body, dark) in &state.bodies {
+        out.value(&[("body", body)], f64::from(state.now.light.is_lit && dark.is_none()));
     }
     out.family(BODY_DARK);
     for d in &r.dark_by_body {

@@ -3,10 +3,12 @@
 use crate::calibration::{self, Guide};
 use crate::connections::{Connection, Doing};
 use crate::events::Events;
-use crate::guard::Refused;
+use crate::guard::{Refused, PROOF};
 use crate::metrics;
 use crate::orders;
 use crate::parameters;
+use crate::proof::is_number;
+use crate::query::part;
 use crate::rigs::Rigs;
 use crate::shared::Shared;
 use crate::site::{Serves, Site};
@@ -34,7 +36,7 @@ const NONCE: &str = "{{nonce}}";
 const SHARED: [(&str, &str); 3] = [
     ("{{style}}", include_str!("shared.css")),
     ("{{script}}", include_str!("shared.js")),
-    ("{{token}}", include_str!("token.js")),
+    ("{{key}}", include_str!("key.js")),
 ];
 /// Longest page of a flight, bytes.
 const MAX_FLIGHT_BYTES: u64 = 1 << 20;
@@ -111,6 +113,12 @@ pub(crate) async fn answer(
         }
         Ok(()) => route(&request, &connection, &site).await,
     };
+    if let Answer::Whole(Some(body)) = response.body() {
+        let proof = site.door.guard.proof(&request, response.status().as_u16(), body);
+        if let Some(proof) = proof.and_then(|proof| HeaderValue::from_str(&proof).ok()) {
+            response.headers_mut().insert(PROOF, proof);
+        }
+    }
     if !matches!(response.body(), Answer::Events(_)) {
         connection.now_does(Doing::Nothing);
     }
@@ -139,6 +147,13 @@ async fn route(
     let path = request.uri().path();
     if let (Some(word), Some(run)) = (path.strip_prefix("/api/orders/"), site.serves.run()) {
         return order(request, word, connection, (site, run)).await;
+    }
+    if path == "/api/challenge" && request.method() == Method::GET {
+        // An order waits for it.
+        return match site.door.guard.challenge() {
+            Ok(challenge) => whole(StatusCode::OK, "text/plain; charset=utf-8", challenge),
+            Err(refused) => refusal(refused),
+        };
     }
     tokio::time::sleep(site.door.pace()).await;
     match &site.serves {
@@ -171,12 +186,12 @@ async fn of_rig(
             Some(told) => json(StatusCode::OK, &told),
             None => plain(StatusCode::INTERNAL_SERVER_ERROR, "the calibration file could not be read"),
         },
-        ("/api/token", _) => match site.door.guard.check_token(request.headers()) {
+        ("/api/key", _) => match site.door.guard.check_order(request) {
             Ok(()) => plain(StatusCode::OK, "ok"),
             Err(refused) => refusal(refused),
         },
         ("/favicon.ico", _) => plain(StatusCode::NOT_FOUND, "none"),
-        (_, Some(run)) => of_run(path, connection, run).await,
+        (_, Some(run)) => of_run(request, connection, (site, run)).await,
         _ => plain(StatusCode::NOT_FOUND, "there is / and /api/calibration"),
     }
 }
@@ -194,7 +209,12 @@ fn of_rigs(request: &Request<Incoming>, rigs: &Rigs) -> Response<Answer> {
 }
 
 /// What there is to see of a run.
-async fn of_run(path: &str, connection: &Arc<Connection>, shared: &Arc<Shared>) -> Response<Answer> {
+async fn of_run(
+    request: &Request<Incoming>,
+    connection: &Arc<Connection>,
+    (site, shared): (&Arc<Site>, &Arc<Shared>),
+) -> Response<Answer> {
+    let path = request.uri().path();
     match path {
         "/" => page(PAGE),
         "/metrics" => {
@@ -206,7 +226,10 @@ async fn of_run(path: &str, connection: &Arc<Connection>, shared: &Arc<Shared>) 
         "/api/events" => match shared.viewer() {
             Some(viewer) => {
                 connection.now_does(Doing::Views);
-                let mut response = Response::new(Answer::Events(Box::new(Events::new(viewer))));
+                let mut response = Response::new(Answer::Events(Box::new(Events::new(
+                    viewer,
+                    number_of(request).map(|number| (site.clone(), number)),
+                ))));
                 let kind = HeaderValue::from_static("text/event-stream");
                 response.headers_mut().insert(header::CONTENT_TYPE, kind);
                 response
@@ -223,13 +246,18 @@ async fn of_run(path: &str, connection: &Arc<Connection>, shared: &Arc<Shared>) 
     }
 }
 
+/// The number for which a viewer wants its events proven.
+fn number_of(request: &Request<Incoming>) -> Option<String> {
+    part(request.uri().query().unwrap_or_default(), "number").filter(|number| is_number(number))
+}
+
 async fn order(
     request: &Request<Incoming>,
     word: &str,
     connection: &Arc<Connection>,
     (site, shared): (&Site, &Arc<Shared>),
 ) -> Response<Answer> {
-    if let Err(refused) = site.door.guard.check_token(request.headers()) {
+    if let Err(refused) = site.door.guard.check_order(request) {
         tokio::time::sleep(site.door.pace()).await;
         return refusal(refused);
     }
@@ -244,13 +272,13 @@ async fn order(
     json(StatusCode::OK, &orders::give(order, shared).await)
 }
 
-/// A change of the parameters. It knows the token as an order does, but it has waited its turn as every other request.
+/// A change of the parameters. It is signed as an order is, but it has waited its turn as every other request.
 async fn change(
     request: &Request<Incoming>,
     word: &str,
     (site, shared): (&Site, &Arc<Shared>),
 ) -> Response<Answer> {
-    if let Err(refused) = site.door.guard.check_token(request.headers()) {
+    if let Err(refused) = site.door.guard.check_order(request) {
         return refusal(refused);
     }
     if request.method() != Method::POST {
@@ -269,13 +297,13 @@ async fn change(
     }
 }
 
-/// An act of a calibration, by whoever knows the token.
+/// An act of a calibration, by whoever knows the secret.
 async fn calibrate(
     request: &Request<Incoming>,
     word: &str,
     (site, guide): (&Site, &Arc<dyn Guide>),
 ) -> Response<Answer> {
-    if let Err(refused) = site.door.guard.check_token(request.headers()) {
+    if let Err(refused) = site.door.guard.check_order(request) {
         return refusal(refused);
     }
     if request.method() != Method::POST {

@@ -1,11 +1,12 @@
 //! What the page shows, as JSON.
 
 use crate::shared::Shared;
-use dpm_device::link::faults;
 use dpm_rig::control::rig_name;
+use dpm_rig::plan::dark::DarkCause;
 use dpm_rig::telemetry::histogram_steps::UPPER_NS;
+use dpm_rig::telemetry::light_state::LightState;
 use dpm_rig::telemetry::live::LiveSnapshot;
-use dpm_rig::telemetry::monitor::{ProjectorHealth, RunCounts};
+use dpm_rig::telemetry::monitor::{RunCounts, RunMonitor};
 use dpm_rig::telemetry::projector::ProjectorReport;
 use dpm_rig::tracks::gauges::TrackerReport;
 use serde_json::{json, Value};
@@ -18,11 +19,7 @@ pub(crate) struct Now {
     pub pid: u32,
     /// Seconds since the page began.
     pub up_s: f64,
-    /// The projector's state as a word, and as a sentence.
-    pub projector: &'static str,
-    pub told: String,
-    /// Light may come out of the projector.
-    pub is_light: bool,
+    pub light: Light,
     /// The order that stands and is kept over restarts.
     pub standing: Option<&'static str>,
     /// On what light depends, and whether it is permitted.
@@ -36,10 +33,31 @@ pub(crate) struct Now {
     pub viewers: usize,
 }
 
+/// The state of the light.
+#[derive(Clone, Debug, serde::Serialize)]
+pub(crate) struct Light {
+    /// One of the six words of [`LightState::WORDS`], and the same as programs write it.
+    pub word: &'static str,
+    pub state: String,
+    /// Why, and what to do; the bodies without light with their reasons. Empty where the word says everything.
+    pub told: String,
+    /// Mirrors were lit in the last second.
+    pub is_lit: bool,
+}
+
+impl Light {
+    fn of(monitor: &RunMonitor) -> Self {
+        let state = monitor.light();
+        let word = state.word();
+        Self { word, state: LightState::name_of(word), told: monitor.light_told(), is_lit: state.is_lit() }
+    }
+}
+
 /// The state at one moment.
 pub(crate) struct State {
     pub now: Now,
-    pub health: ProjectorHealth,
+    /// Per tracked body: its name, and why it has no light.
+    pub bodies: Vec<(String, Option<DarkCause>)>,
     /// The collector's figures; `None` before the first ones.
     pub figures: Option<Arc<LiveSnapshot>>,
     /// What the link has carried.
@@ -61,17 +79,10 @@ pub(crate) struct StateJson<'a> {
 impl State {
     pub(crate) fn of(shared: &Shared) -> Self {
         let monitor = &shared.monitor;
-        let health = monitor.projector();
         let now = Now {
             pid: std::process::id(),
             up_s: (shared.began.elapsed().as_secs_f64() * 1e3).round() / 1e3,
-            projector: match health {
-                // What the operator has ordered is no fault to them.
-                ProjectorHealth::Faulted(faults::HOST_SAFE) => "SAFE",
-                health => health.word(),
-            },
-            told: health.to_string(),
-            is_light: matches!(health, ProjectorHealth::Up | ProjectorHealth::Frozen),
+            light: Light::of(monitor),
             standing: shared.orders.kept().map(|order| order.word()),
             interlock: monitor.interlock().map(|i| (i.what().to_owned(), i.is_closed())),
             tracker: monitor.tracker().map(str::to_owned),
@@ -84,15 +95,78 @@ impl State {
             rig.live_pictures().map(|(body, _, pictures)| (body.to_owned(), pictures.count())).collect()
         });
         let tracker = monitor.sample_counts();
-        Self { now, health, figures, carried: monitor.carried(), tracker, pictures, setup: setup(shared) }
+        let bodies = monitor.bodies().into_iter().map(|(name, dark)| (name.to_owned(), dark)).collect();
+        Self { now, bodies, figures, carried: monitor.carried(), tracker, pictures, setup: setup(shared) }
     }
 
     pub(crate) fn to_json(&self) -> StateJson<'_> {
-        let mut figures = self.figures.as_ref().map_or(json!({}), |f| told_of(f));
+        let mut figures = self.figures.as_ref().map_or(json!({}), |f| self.told_of(f));
         figures["setup"] = self.setup.clone();
         figures["link"] = json!(self.carried);
         figures["tracker"] = json!(self.tracker);
         StateJson { now: &self.now, figures }
+    }
+
+    fn told_of(&self, f: &LiveSnapshot) -> Value {
+        let report = &f.report;
+        let bodies: Vec<Value> = f
+            .bodies
+            .iter()
+            .zip(&report.dark_by_body)
+            .zip(&self.bodies)
+            .map(|((body, dark), (_, why))| {
+                let (cause, told) = match why {
+                    Some(cause) => (Some(cause.name()), Some(cause.told().to_owned())),
+                    None if self.now.light.is_lit => (None, None),
+                    None => (Some("no_light"), Some(format!("the light is {}", self.now.light.word))),
+                };
+                json!({
+                    "name": body.name,
+                    "seen": body.seen,
+                    "dark": cause,
+                    "told": told,
+                    "at_m": body.at_m,
+                    "dark_frames": dark,
+                })
+            })
+            .collect();
+        let intervals: Vec<Value> = f
+            .intervals
+            .iter()
+            .map(|i| {
+                json!({
+                    "name": i.name,
+                    "modelled": i.modelled,
+                    "count": i.steps.count,
+                    "up_to": i.steps.up_to.as_slice(),
+                })
+            })
+            .collect();
+        let misses: Vec<Value> = f
+            .misses
+            .iter()
+            .map(|m| {
+                let ago_ns = f.frame.due_at.ns_since(m.begin).max(0);
+                json!({ "slot": m.slot, "count": m.count, "cause": m.cause, "ago_s": ago_ns as f64 / 1e9 })
+            })
+            .collect();
+        json!({
+            "report": report,
+            "is_final": f.is_final,
+            "bodies": bodies,
+            "intervals": intervals,
+            "frame": {
+                "id": f.frame.id,
+                "parameters": f.frame.parameters,
+                "sample_age_ms": f.frame.sample_age_ns.map(|ns| ns as f64 / 1e6),
+                "budget_spp": f.frame.budget_spp,
+                "predict_ms": f.frame.predict_ns as f64 / 1e6,
+            },
+            "misses": misses,
+            "flights": f.flights,
+            "rays": f.rays,
+            "samples": f.samples,
+        })
     }
 }
 
@@ -113,60 +187,4 @@ fn setup(shared: &Shared) -> Value {
         all["seconds"] = json!(config.run.seconds);
     }
     all
-}
-
-fn told_of(f: &LiveSnapshot) -> Value {
-    let report = &f.report;
-    let bodies: Vec<Value> = f
-        .bodies
-        .iter()
-        .zip(&report.dark_by_body)
-        .map(|(body, dark)| {
-            json!({
-                "name": body.name,
-                "seen": body.seen,
-                "dark": body.dark.map(|cause| cause.name()),
-                "told": body.dark.map(|cause| cause.told()),
-                "at_m": body.at_m,
-                "dark_frames": dark,
-            })
-        })
-        .collect();
-    let intervals: Vec<Value> = f
-        .intervals
-        .iter()
-        .map(|i| {
-            json!({
-                "name": i.name,
-                "modelled": i.modelled,
-                "count": i.steps.count,
-                "up_to": i.steps.up_to.as_slice(),
-            })
-        })
-        .collect();
-    let misses: Vec<Value> = f
-        .misses
-        .iter()
-        .map(|m| {
-            let ago_ns = f.frame.due_at.ns_since(m.begin).max(0);
-            json!({ "slot": m.slot, "count": m.count, "cause": m.cause, "ago_s": ago_ns as f64 / 1e9 })
-        })
-        .collect();
-    json!({
-        "report": report,
-        "is_final": f.is_final,
-        "bodies": bodies,
-        "intervals": intervals,
-        "frame": {
-            "id": f.frame.id,
-            "parameters": f.frame.parameters,
-            "sample_age_ms": f.frame.sample_age_ns.map(|ns| ns as f64 / 1e6),
-            "budget_spp": f.frame.budget_spp,
-            "predict_ms": f.frame.predict_ns as f64 / 1e6,
-        },
-        "misses": misses,
-        "flights": f.flights,
-        "rays": f.rays,
-        "samples": f.samples,
-    })
 }

@@ -1,9 +1,11 @@
-//! The secret that whoever gives orders through the page must know: 32 bytes from the operating system, as 64
-//! hexadecimal digits in a file that only the rig's user can read.
+//! The secret that rig and page prove to each other ([`crate::proof`]): 32 bytes from the operating system, as 64
+//! hexadecimal digits in a file that only the rig's user can read. Every port has its own, so that what is proven to the
+//! page of one rig is worth nothing at another rig's.
 //!
 //! The file outlives the process, so a page that is open in a browser can still make the projector dark after the rig
 //! was restarted.
 
+use crate::proof::{hex, unhex};
 use dpm_common::folder::{Folder, FolderError, Owner};
 use std::fmt;
 use std::fs::{File, Permissions};
@@ -11,8 +13,11 @@ use std::io::{Read, Seek, Write};
 use std::os::unix::fs::PermissionsExt;
 use std::path::{Path, PathBuf};
 
-/// Name of the file in the state folder.
-pub const FILE: &str = "page.token";
+/// Name of the file in the state folder for the page at `port`.
+pub fn file(port: u16) -> String {
+    format!("page-{port}.token")
+}
+
 const DIGITS: usize = 64;
 
 /// The secret. Its value is not printed by `{:?}`.
@@ -44,19 +49,20 @@ impl Token {
     pub fn random() -> Result<Self, TokenError> {
         let mut bytes = [0u8; DIGITS / 2];
         getrandom::fill(&mut bytes).map_err(|e| TokenError::Random(e.to_string()))?;
-        Ok(Self(bytes.iter().map(|b| format!("{b:02x}")).collect()))
+        Ok(Self(hex(&bytes)))
     }
 
-    /// The token in the state folder `folder`, which is made if there is none that can be used. Returns the token and
+    /// The token for the page at `port` in the state folder `folder`, which is made if there is none that can be used. Returns the token and
     /// the path of its file.
     ///
     /// # Errors
     /// The folder belongs to somebody else or cannot be written; no random bytes.
-    pub fn kept_in(folder: &Path) -> Result<(Self, PathBuf), TokenError> {
+    pub fn kept_in(folder: &Path, port: u16) -> Result<(Self, PathBuf), TokenError> {
         let folder = Folder::make(folder, Owner::Own)?;
-        let path = folder.path().join(FILE);
+        let name = file(port);
+        let path = folder.path().join(&name);
         let failed = |source| FolderError::Io { path: path.clone(), source };
-        let mut file = folder.open_file(FILE, true)?;
+        let mut file = folder.open_file(&name, true)?;
         let is_private = file.metadata().map_err(failed)?.permissions().mode() & 0o077 == 0;
         let mut text = String::new();
         // What is no text is no token.
@@ -78,8 +84,13 @@ impl Token {
     }
 
     fn parse(text: &str) -> Option<Self> {
-        let is_digit = |b: u8| b.is_ascii_digit() || (b'a'..=b'f').contains(&b);
-        (text.len() == DIGITS && text.bytes().all(is_digit)).then(|| Self(text.to_owned()))
+        (text.len() == DIGITS && unhex(text).is_some()).then(|| Self(text.to_owned()))
+    }
+
+    /// The token that `folder` holds for the page at `port`; `None` if it holds none that can be read.
+    pub fn read_in(folder: &Path, port: u16) -> Option<Self> {
+        let text = std::fs::read_to_string(folder.join(file(port))).ok()?;
+        Self::parse(text.trim_end_matches('\n'))
     }
 
     /// The digits.
@@ -87,10 +98,9 @@ impl Token {
         &self.0
     }
 
-    /// True if `told` is the token. The time that this takes does not depend on where they differ.
-    pub(crate) fn is(&self, told: &[u8]) -> bool {
-        let differs = self.0.bytes().zip(told).fold(0, |all, (a, b)| all | (a ^ b));
-        told.len() == DIGITS && std::hint::black_box(differs) == 0
+    /// The bytes.
+    pub(crate) fn bytes(&self) -> [u8; DIGITS / 2] {
+        unhex(&self.0).and_then(|bytes| bytes.try_into().ok()).expect("a token is so many digits")
     }
 }
 
@@ -102,35 +112,34 @@ mod tests {
     fn a_token_outlives_the_process_and_only_its_user_reads_it() {
         let dir = std::env::temp_dir().join(format!("dpm-page-token-{}", std::process::id()));
         let _ = std::fs::remove_dir_all(&dir);
-        let (first, path) = Token::kept_in(&dir).unwrap();
+        let (first, path) = Token::kept_in(&dir, 7).unwrap();
         assert_eq!(std::fs::metadata(&path).unwrap().permissions().mode() & 0o777, 0o600);
         assert_eq!(std::fs::read_to_string(&path).unwrap().trim_end(), first.as_str());
-        assert_eq!(Token::kept_in(&dir).unwrap().0, first);
+        assert_eq!(Token::kept_in(&dir, 7).unwrap().0, first);
         // One that others could read is replaced.
         std::fs::set_permissions(&path, Permissions::from_mode(0o644)).unwrap();
-        let second = Token::kept_in(&dir).unwrap().0;
+        let second = Token::kept_in(&dir, 7).unwrap().0;
         assert_ne!(second, first);
         assert_eq!(std::fs::metadata(&path).unwrap().permissions().mode() & 0o777, 0o600);
         // A file that holds no token is replaced.
         for bad in ["", "short", &"g".repeat(DIGITS), &"a".repeat(DIGITS + 7)] {
             std::fs::write(&path, bad).unwrap();
-            let (token, _) = Token::kept_in(&dir).unwrap();
+            let (token, _) = Token::kept_in(&dir, 7).unwrap();
             assert!(token.as_str().len() == DIGITS && token != second, "{bad}");
         }
         std::fs::remove_dir_all(dir).unwrap();
     }
 
     #[test]
-    fn only_the_whole_token_is_the_token() {
-        let token = Token::random().unwrap();
-        let text = token.as_str();
-        assert!(token.is(text.as_bytes()));
-        for k in 0..DIGITS {
-            let mut other = text.as_bytes().to_vec();
-            other[k] ^= 1;
-            assert!(!token.is(&other) && !token.is(&text.as_bytes()[..k]), "{k}");
-        }
-        assert!(!token.is(format!("{text}0").as_bytes()) && !format!("{token:?}").contains(text));
-        assert_ne!(Token::random().unwrap(), token);
+    fn every_port_has_its_own_token_and_none_is_printed() {
+        let dir = std::env::temp_dir().join(format!("dpm-page-tokens-{}", std::process::id()));
+        let _ = std::fs::remove_dir_all(&dir);
+        let [one, two] = [1, 2].map(|port| Token::kept_in(&dir, port).unwrap().0);
+        assert_ne!(one, two);
+        assert_eq!(Token::read_in(&dir, 1).as_ref(), Some(&one));
+        assert_eq!(Token::read_in(&dir, 3), None);
+        assert!(!format!("{one:?}").contains(one.as_str()));
+        assert_eq!(hex(&one.bytes()), one.as_str());
+        std::fs::remove_dir_all(dir).unwrap();
     }
 }

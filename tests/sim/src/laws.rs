@@ -13,6 +13,7 @@ use dpm_rig::control::orders::Ticket;
 use dpm_rig::order::Order;
 use dpm_rig::pipeline::stepped::{SteppedEnd, StoredOrder};
 use dpm_rig::rig::Rig;
+use dpm_rig::telemetry::light_state::LightState;
 use dpm_rig::telemetry::monitor::{ProjectorHealth, RunCounts};
 use hil_mock::motion::Motion;
 use hil_mock::projector::LightChange;
@@ -78,6 +79,12 @@ pub struct Laws {
     is_lit: bool,
     lit_since: i64,
     dark_since: i64,
+    /// When a mirror was lit last, and when none was.
+    mirrors: [i64; 2],
+    /// What the program calls the light: lit or not, and since when.
+    word: (Option<bool>, i64),
+    /// The planes that were looked at last have light.
+    looked: (u64, bool),
     /// When a frame with light on the body was lit last.
     good_at: i64,
     good_frames: u64,
@@ -144,6 +151,9 @@ impl Laws {
             is_lit: false,
             lit_since: 0,
             dark_since: 0,
+            mirrors: [0; 2],
+            word: (None, 0),
+            looked: (u64::MAX, false),
             good_at: 0,
             good_frames: 0,
             ticks: [0; 11],
@@ -581,6 +591,37 @@ impl Laws {
     /// The greatest lag of a quiet second, as a share of what is allowed, in thousandths.
     pub fn worst_lag_milli(&self) -> i64 {
         self.lag.worst_milli
+    }
+
+    /// The planes on the mirrors at `t`; `None` while the light is off.
+    pub fn mirrors(&mut self, t: i64, planes: Option<(u64, &[u8])>) {
+        let is_lit = planes.is_some_and(|(generation, planes)| {
+            if self.looked.0 != generation {
+                self.looked = (generation, planes.iter().any(|byte| *byte != 0));
+            }
+            self.looked.1
+        });
+        self.mirrors[usize::from(!is_lit)] = t;
+    }
+
+    /// What the program calls the light at `t` is not wrong for longer than a second; `None` while it says nothing.
+    pub fn word(&mut self, t: i64, word: Option<LightState>) {
+        // A clock that is wrong makes the last second longer or shorter.
+        let word = word.filter(|_| t - self.clock_moved_at > S);
+        let says_lit = word.map(LightState::is_lit);
+        if self.word.0 != says_lit {
+            self.word = (says_lit, t);
+        }
+        let Some(word) = word else { return };
+        let [lit_at, dark_at] = self.mirrors;
+        let since = t - self.word.1.max(if word.is_lit() { lit_at } else { dark_at });
+        if since > S {
+            let light = if word.is_lit() { "no mirror has been lit" } else { "mirrors have been lit" };
+            self.fail(
+                t,
+                format!("the light is called {} ({word:?}), and {light} for {} ms", word.word(), since / MS),
+            );
+        }
     }
 
     /// True when the light has been steady lately.

@@ -374,6 +374,7 @@ impl World {
         self.act();
         self.move_projector();
         self.move_process();
+        self.compare_word();
         if self.restart_at <= self.t {
             self.start();
         }
@@ -537,6 +538,15 @@ impl World {
             }
         }
         self.tracks = Some(tracks);
+    }
+
+    /// The word for the light is compared with the light.
+    fn compare_word(&mut self) {
+        let lit = self.projector.lit_generation().zip(self.projector.lit_planes());
+        self.laws.mirrors(self.t, lit);
+        let is_awake = self.t >= self.frozen_until;
+        let process = self.process.as_ref().filter(|process| is_awake && process.run.is_running());
+        self.laws.word(self.t, process.map(|process| process.monitor.light()));
     }
 
     fn move_process(&mut self) {

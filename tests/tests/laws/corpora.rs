@@ -196,6 +196,8 @@ fn words() -> Vec<(&'static str, &'static str, Vec<u8>)> {
         ("arm", b"/dpm/arm\0\0\0\0"),
         ("exposure", b"/dpm/exposure\0\0\0,f\0\0\x3f\xc0\0\0"),
         ("mixed", b"/dpm/gaze\0\0\0,idhTs\0\0\0\0\0\x01\x40\0\0\0\0\0\0\0\0\0\0\0\0\0\0\x02a\0\0\0"),
+        ("token-text", b"/dpm/exposure\0\0\0,fs\0\x3f\xc0\0\0abc-012345-XYZ\0\0"),
+        ("token-address", b"/dpm/token/abc-012345-XYZ/freeze\0\0\0\0,\0\0\0"),
         ("bundle", b"#bundle\0\0\0\0\0\0\0\0\x01\0\0\0\x0c/dpm/freeze\0\0\0\0\x0c/dpm/arm\0\0\0\0"),
     ] {
         seeds.push(("osc_datagram", name, bytes.into()));

@@ -203,8 +203,9 @@ impl WandSection {
 pub struct BodySection {
     /// Body's frame from the mesh's.
     pub mesh_to_body: Pose,
-    /// Root mean square residual, metres.
-    pub residual_m: f64,
+    /// Root mean square residual, metres; absent where nothing was measured, because it was moved by eye.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub residual_m: Option<f64>,
     /// Where this comes from.
     pub provenance: Provenance,
 }
@@ -212,7 +213,7 @@ pub struct BodySection {
 impl BodySection {
     pub(super) fn check(&self, name: &str) -> Result<(), Wrong> {
         self.mesh_to_body.check(&format!("bodies.{name}.mesh_to_body"))?;
-        within(&format!("bodies.{name}.residual_m"), &[self.residual_m], 0.0, 1.0)
+        within(&format!("bodies.{name}.residual_m"), self.residual_m.as_slice(), 0.0, 1.0)
     }
 }
 

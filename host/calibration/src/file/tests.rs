@@ -36,7 +36,8 @@ fn full() -> CalibrationFile {
     file.projector = Some(ProjectorSection::new(raster, &model, 0.13, 0.05, provenance()));
     file.wand =
         Some(WandSection { tip: [0.01, -0.15, 1.0 / 3.0], tip_sigma_m: 2e-5, provenance: provenance() });
-    let body = BodySection { mesh_to_body: Pose::new(&pose), residual_m: 1e-4, provenance: provenance() };
+    let body =
+        BodySection { mesh_to_body: Pose::new(&pose), residual_m: Some(1e-4), provenance: provenance() };
     file.bodies.insert("the head".into(), body);
     let check =
         CheckSection { points: 6, p50_px: 0.4, largest_px: 0.9, limit_px: 2.0, provenance: provenance() };

@@ -111,7 +111,7 @@ pub fn calibrate(
     }
     let ((motion, residual_m), data) = place;
     let provenance = results.provenance(config, name, data, "rigid motion by least squares");
-    let section = BodySection { mesh_to_body: Pose::new(&motion), residual_m, provenance };
+    let section = BodySection { mesh_to_body: Pose::new(&motion), residual_m: Some(residual_m), provenance };
     results.file.bodies.insert(name.to_owned(), section);
     told += &format!("\n{}", results.save(config)?);
     // Not before the result is written: until then the touches are all there is.

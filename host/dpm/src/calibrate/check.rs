@@ -346,9 +346,11 @@ fn predicted(file: &CalibrationFile, body: &str) -> String {
             p.predicted_p99_px
         )
     });
-    let body = file.bodies.get(body).map_or(format!("\"{body}\" was not calibrated"), |b| {
-        format!("\"{body}\" with a residual of {:.2} mm", 1e3 * b.residual_m)
-    });
+    let body = match file.bodies.get(body).map(|b| b.residual_m) {
+        None => format!("\"{body}\" was not calibrated"),
+        Some(None) => format!("\"{body}\" was moved by eye, so no residual is known"),
+        Some(Some(residual_m)) => format!("\"{body}\" with a residual of {:.2} mm", 1e3 * residual_m),
+    };
     format!("predicted by the calibration file: {projector}; {body}")
 }
 

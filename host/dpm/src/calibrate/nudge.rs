@@ -225,13 +225,10 @@ pub fn keep(results: &mut Results, config: &RigConfig, moved: &Moved, motion: &D
         Moved::Body(name) => {
             let old = results.file.bodies.get(name);
             let data = old.map_or(String::new(), |b| b.provenance.data.clone());
-            // The residual is that of the measurement before: an eye gives none.
-            let residual_m = old.map_or(0.0, |b| b.residual_m);
             let provenance = results.provenance(config, name, data, Provenance::BY_EYE);
-            results
-                .file
-                .bodies
-                .insert(name.clone(), BodySection { mesh_to_body: place, residual_m, provenance });
+            // That of the measurement before does not hold for another place, and an eye gives none.
+            let section = BodySection { mesh_to_body: place, residual_m: None, provenance };
+            results.file.bodies.insert(name.clone(), section);
         }
         Moved::Projector => {
             let data = results.file.projector.as_ref().map_or(String::new(), |p| p.provenance.data.clone());

@@ -21,7 +21,7 @@ pub(super) fn open(
     teller: &Teller,
 ) -> Option<Page> {
     let address = rig.page.address()?;
-    let token = token();
+    let token = token(address.port());
     let settings = Settings {
         address,
         hosts: rig.page.hosts.clone(),
@@ -42,10 +42,10 @@ pub(super) fn open(
     Some(page)
 }
 
-/// The token that is kept in the state folder, and its file; or why there is none.
-pub(super) fn token() -> Result<(Token, PathBuf), String> {
+/// The token for the page at `port` that is kept in the state folder, and its file; or why there is none.
+pub(super) fn token(port: u16) -> Result<(Token, PathBuf), String> {
     let folder = state_folder().ok_or("there is no state folder; name one by DPM_STATE_DIR")?;
-    Token::kept_in(&folder).map_err(|e| e.to_string())
+    Token::kept_in(&folder, port).map_err(|e| e.to_string())
 }
 
 /// Where a page is, in words for the operator.
@@ -61,9 +61,12 @@ pub(super) fn link(address: SocketAddr, token: Result<(Token, PathBuf), String>)
     let link = format!("http://{address}/");
     match token {
         Ok((token, _)) if std::io::stderr().is_terminal() => {
-            Link::Secret(format!("page: {link}#token={}", token.as_str()))
+            Link::Secret(format!("page: {link}#key={}", token.as_str()))
         }
-        Ok((_, path)) => Link::Open(format!("page: {link}; orders need the token in {}", path.display())),
+        Ok((_, path)) => Link::Open(format!(
+            "page: {link}; for orders, `dpm page {address}` prints a link (the key is in {})",
+            path.display()
+        )),
         Err(why) => Link::Open(format!("page: {link}, without orders: {why}")),
     }
 }

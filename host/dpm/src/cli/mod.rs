@@ -16,6 +16,7 @@ mod manual;
 mod order;
 mod os;
 mod osc;
+mod page;
 mod pattern;
 mod plan;
 mod profile;
@@ -89,6 +90,11 @@ enum Command {
     /// A change is used from one frame on, and the answer names the frame. --undo takes the last change back, and --save
     /// writes the values into the rig file and the calibration file for the next run.
     Set(set::SetArgs),
+    /// Print the link for orders to the page of a running rig, if what listens there is the rig
+    ///
+    /// The link holds the key of the rig's page behind the sign #, which no browser sends. Give it to nobody. The page
+    /// keeps the key until it is left.
+    Page(page::PageArgs),
     /// Show several running rigs on one page: state, rates, what is dark and why; without orders
     ///
     /// Asks the live pages of the rigs, once a second while somebody looks. A rig on another machine comes through a
@@ -201,6 +207,7 @@ fn dispatch(command: &Command) -> Result<(), Failure> {
         Command::Safe(args) => order::execute(args, Order::Safe),
         Command::Arm(args) => order::execute(args, Order::Arm),
         Command::Set(args) => set::execute(args),
+        Command::Page(args) => page::execute(args),
         Command::Rigs(args) => rigs::execute(args),
         Command::Pattern(args) => pattern::execute(args),
         Command::Calibrate(args) => calibrate::execute(args),

@@ -15,9 +15,14 @@ pub(super) fn open(
     teller: &Teller,
 ) -> Option<OscSocket> {
     let address = rig.osc.address()?;
-    match OscSocket::serve(address, rig.osc.senders(), monitor.clone(), orders.clone()) {
+    match OscSocket::serve(address, rig.osc.senders(), rig.osc.token.clone(), monitor.clone(), orders.clone())
+    {
         Ok(socket) => {
-            teller.note(&format!("osc: udp {}; it takes no ARM", socket.address()));
+            let may = match rig.osc.token {
+                Some(_) => "it takes no ARM, and without the token only BLACK and SAFE",
+                None => "it only makes dark, because the rig file has no osc.token",
+            };
+            teller.note(&format!("osc: udp {}; {may}", socket.address()));
             Some(socket)
         }
         Err(e) => {

@@ -4,6 +4,7 @@
 use crossbeam::channel::{bounded, Receiver, RecvTimeoutError, Sender};
 use dpm_page::notes::Notes;
 use dpm_rig::failure::{Failure, FailureKind};
+use dpm_rig::telemetry::light_state::LightState;
 use dpm_rig::telemetry::monitor::{ProjectorHealth, RunCounts};
 use indicatif::{ProgressBar, ProgressDrawTarget, ProgressStyle};
 use std::collections::VecDeque;
@@ -22,7 +23,7 @@ pub(super) const SHOWN_EVERY: Duration = Duration::from_millis(50);
 
 enum Word {
     Note(String),
-    Tick(ProjectorHealth, RunCounts),
+    Tick(LightState, RunCounts),
 }
 
 /// Writes notes without ever waiting.
@@ -54,14 +55,14 @@ impl Teller {
                 // Dropped at the end of the thread, whatever ends it.
                 let _ended = ended;
                 let mut progress = Progress::new(total, seconds, every);
-                let mut last = (ProjectorHealth::Connecting, RunCounts::default());
+                let mut last = (LightState::NeverArmed(ProjectorHealth::Connecting), RunCounts::default());
                 while let Ok(word) = heard.recv() {
                     match word {
                         Word::Note(text) => progress.note(&text),
                         Word::Tick(..) if is_quiet => {}
-                        Word::Tick(health, counts) => {
-                            last = (health, counts);
-                            progress.tick(health, counts);
+                        Word::Tick(light, counts) => {
+                            last = (light, counts);
+                            progress.tick(light, counts);
                         }
                     }
                 }
@@ -92,15 +93,15 @@ impl Teller {
     }
 
     /// Shows the progress of the run.
-    pub(super) fn tick(&self, health: ProjectorHealth, counts: RunCounts) {
+    pub(super) fn tick(&self, light: LightState, counts: RunCounts) {
         if let Some(words) = &self.words {
-            let _ = words.try_send(Word::Tick(health, counts));
+            let _ = words.try_send(Word::Tick(light, counts));
         }
     }
 
     /// Writes the rest, for at most a fifth of a second.
-    pub(super) fn finish(&mut self, health: ProjectorHealth, counts: RunCounts) {
-        self.tick(health, counts);
+    pub(super) fn finish(&mut self, light: LightState, counts: RunCounts) {
+        self.tick(light, counts);
         self.words = None;
         let told = self.over.recv_timeout(END_WITHIN) == Err(RecvTimeoutError::Disconnected);
         if let Some(thread) = self.thread.take().filter(|_| told) {
@@ -148,19 +149,21 @@ impl Rate {
     }
 }
 
-/// The text of the bar: the projector's state first, then the progress of the run, in columns that do not move.
-fn told(health: ProjectorHealth, counts: &RunCounts, total: u64, rate: f64) -> String {
+/// The text of the bar: the state of the light first, then the progress of the run, in columns that do not move.
+fn told(light: LightState, counts: &RunCounts, total: u64, rate: f64) -> String {
     let of = if total > 0 { format!("/{total}") } else { String::new() };
     let lit = format!("{}{of}", counts.frames_lit);
-    let mut text = format!("{:<10} {lit:>9} lit {rate:>7.1}/s", health.word());
+    let mut text = format!("{:<13} {lit:>9} lit {rate:>7.1}/s", light.word());
     // A picture that does not move has no meaningful rate and no remaining time.
-    if let ProjectorHealth::Up | ProjectorHealth::Connecting = health {
+    let moves =
+        matches!(light, LightState::Lit { is_held: false } | LightState::PartlyLit { is_held: false });
+    if moves || matches!(light, LightState::NeverArmed(ProjectorHealth::Connecting)) {
         let left = total.saturating_sub(counts.frames_done());
         if rate > 0.0 && left > 0 {
             text += &format!(" {:>6.0} s left", left as f64 / rate);
         }
     } else {
-        text = format!("{:<10} {lit:>9} lit, no new picture", health.word());
+        text = format!("{:<13} {lit:>9} lit, no new picture", light.word());
     }
     text += &format!(", {} slots missed, {} frames dropped", counts.slots_missed, counts.frames_dropped);
     if counts.frames_dark > 0 {
@@ -227,14 +230,14 @@ impl Progress {
         }
     }
 
-    fn tick(&mut self, health: ProjectorHealth, counts: RunCounts) {
+    fn tick(&mut self, light: LightState, counts: RunCounts) {
         let elapsed = self.started.elapsed();
         let rate = self.rate.at(elapsed, counts.frames_lit);
         let done = self.position(&counts);
         match &mut self.shown {
             Shown::Bar(bar) => {
                 bar.set_position(done);
-                bar.set_message(told(health, &counts, self.total, rate));
+                bar.set_message(told(light, &counts, self.total, rate));
                 bar.tick();
             }
             Shown::Lines { next, every } => {
@@ -244,7 +247,7 @@ impl Progress {
                     *next = elapsed + every;
                     let line = serde_json::json!({
                         "elapsed_s": (elapsed.as_secs_f64() * 1e3).round() / 1e3,
-                        "projector": health.word().to_lowercase(),
+                        "light": LightState::name_of(light.word()),
                         "frames_total": self.total,
                         "seconds_total": self.seconds,
                         "frames_lit": counts.frames_lit,
@@ -263,8 +266,8 @@ impl Progress {
         }
     }
 
-    fn finish(mut self, health: ProjectorHealth, counts: RunCounts) {
-        self.tick(health, counts);
+    fn finish(mut self, light: LightState, counts: RunCounts) {
+        self.tick(light, counts);
         if let Shown::Bar(bar) = self.shown {
             bar.finish_and_clear();
         }
@@ -274,26 +277,36 @@ impl Progress {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use dpm_rig::order::Order;
+    use dpm_rig::telemetry::light_state::{Darkness, Stall};
 
     /// Found in use, O13: "17.5505/s" was followed by "17.476/s", and during BLACK the line looked normal.
     #[test]
-    fn the_line_says_how_the_projector_is_and_its_figures_stay_in_place() {
-        use ProjectorHealth::{Black, Connecting, Faulted, Frozen, Lost, Stopped, Up};
+    fn the_line_says_how_the_light_is_and_its_figures_stay_in_place() {
+        use LightState::{Dark, DarkByOrder, Lit, NeverArmed, PartlyLit, Stalled};
         let counts = |lit| RunCounts { frames_lit: lit, slots_missed: 3, ..RunCounts::default() };
-        let at = |lit, rate| told(Up, &counts(lit), 0, rate).find("lit").unwrap();
+        let up = Lit { is_held: false };
+        let at = |lit, rate| told(up, &counts(lit), 0, rate).find(" lit").unwrap();
         assert_eq!(at(7, 947.0), at(1_234_567, 17.476));
-        let rate_ends = |rate| told(Up, &counts(7), 0, rate).find("/s").unwrap();
+        let rate_ends = |rate| told(up, &counts(7), 0, rate).find("/s").unwrap();
         assert_eq!(rate_ends(17.5505), rate_ends(947.0));
-        assert!(told(Up, &counts(146), 0, 17.5505).contains("17.6/s"));
-        assert!(told(Up, &counts(100), 1000, 10.0).contains("90 s left"));
-        for health in [Black, Frozen, Lost, Faulted(1), Stopped] {
-            let text = told(health, &counts(146), 1000, 16.3);
-            assert!(text.starts_with(health.word()) && text.contains("no new picture"), "{text}");
+        assert!(told(up, &counts(146), 0, 17.5505).contains("17.6/s"));
+        assert!(told(PartlyLit { is_held: false }, &counts(100), 1000, 10.0).contains("90 s left"));
+        for light in [
+            Lit { is_held: true },
+            DarkByOrder(Order::Black),
+            Dark(Darkness::Projector(ProjectorHealth::Lost)),
+            Dark(Darkness::Over),
+            Stalled(Stall::NothingSent),
+        ] {
+            let text = told(light, &counts(146), 1000, 16.3);
+            assert!(text.starts_with(light.word()) && text.contains("no new picture"), "{text}");
             assert!(!text.contains("/s") && !text.contains("left"), "{text}");
         }
-        assert!(told(Connecting, &counts(0), 0, 0.0).starts_with("connecting"));
+        let begins = NeverArmed(ProjectorHealth::Connecting);
+        assert!(told(begins, &counts(0), 0, 0.0).starts_with("NEVER ARMED"));
         let dark = RunCounts { frames_dark: 9, ..counts(0) };
-        assert!(told(Up, &dark, 0, 0.0).contains("9 DARK on every body"));
+        assert!(told(Dark(Darkness::Bodies), &dark, 0, 0.0).contains("9 DARK on every body"));
     }
 
     #[test]

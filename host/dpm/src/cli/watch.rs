@@ -212,7 +212,7 @@ fn watch_with<T: Send + 'static>(
         orders.end(result.is_ok());
     }
     monitor.take_notes().iter().for_each(|note| teller.note(note));
-    teller.finish(monitor.projector(), monitor.counts());
+    teller.finish(monitor.light(), monitor.counts());
     result
 }
 
@@ -282,14 +282,14 @@ impl Watcher<'_> {
             if let Some(why) = self.monitor.gave_up() {
                 // The projector has been told to go dark by a thread that does not hang.
                 std::thread::sleep(DARK_WITHIN);
-                self.teller.finish(self.monitor.projector(), self.monitor.counts());
+                self.teller.finish(self.monitor.light(), self.monitor.counts());
                 return Err(Failure::new(FailureKind::Device, why));
             }
             self.tell_changes();
             self.notify();
             ticks = ticks.wrapping_add(1);
             if ticks.is_multiple_of(TICKS_SHOWN) {
-                self.teller.tick(self.health, self.monitor.counts());
+                self.teller.tick(self.monitor.light(), self.monitor.counts());
             }
         }
     }
@@ -321,17 +321,8 @@ impl Watcher<'_> {
             self.notifier.ready();
         }
         self.notifier.alive(now);
-        let (health, monitor) = (self.health, self.monitor);
-        self.notifier.status(now, || {
-            let c = monitor.counts();
-            format!(
-                "{}; {} frames lit, {} of {} slots missed",
-                health.word(),
-                c.frames_lit,
-                c.slots_missed,
-                c.slots
-            )
-        });
+        let monitor = self.monitor;
+        self.notifier.status(now, || status_line(monitor));
     }
 
     /// What is new of the projector and the tracker.
@@ -350,6 +341,14 @@ impl Watcher<'_> {
     }
 }
 
+/// What systemd shows: the word for the light, the reason, and counts.
+fn status_line(monitor: &RunMonitor) -> String {
+    let (c, why) = (monitor.counts(), monitor.light_told());
+    let why = if why.is_empty() { why } else { format!(" ({why})") };
+    let word = monitor.light().word();
+    format!("{word}{why}; {} frames lit, {} of {} slots missed", c.frames_lit, c.slots_missed, c.slots)
+}
+
 /// Reads what stands for the rig's projector, gives it to the run that is about to begin, and starts the thread that keeps orders.
 ///
 /// # Errors
@@ -366,7 +365,11 @@ fn stand_by(rig: &RigConfig, monitor: &Arc<RunMonitor>, teller: &Teller) -> Resu
         }
         teller.note(&format!("warning: {told}"));
     }
+    let is_kept = kept.is_some();
     let stands = Stands::at_start(kept, rig.safety.start);
+    if stands.is_some() && !is_kept {
+        monitor.await_first_arm();
+    }
     if let Some(stands) = &stands {
         teller.note(&told_of(stands));
     }

@@ -270,7 +270,7 @@ fn pipes_and_devices_are_refused_at_once() {
 }
 
 /// A NatNet server of one body, "bunny", that moves around `position_m`.
-fn natnet(motion: &MotionSpec, position_m: [f64; 3]) -> NatNetHost {
+pub(crate) fn natnet(motion: &MotionSpec, position_m: [f64; 3]) -> NatNetHost {
     let epoch = Instant::now();
     let clock: Arc<dyn HostClock> = Arc::new(move || HostTime(epoch.elapsed().as_nanos() as i64));
     let motion = Motion::new(motion, Pose { position_m, ..Pose::IDENTITY }).expect("a motion");

@@ -224,7 +224,7 @@ mod tests {
         assert_eq!(rig.shown(begin + s(1), begin).contact, Contact::Asked, "it may still answer");
         let silent = rig.shown(begin + s(3), begin);
         assert!(silent.contact == Contact::No && silent.why.unwrap().contains("no answer"));
-        let answer = r#"{"now":{"pid":1,"up_s":1,"projector":"up","told":"up","is_light":true,"standing":null,
+        let answer = r#"{"now":{"pid":1,"up_s":1,"light":{"word":"LIT","state":"lit","told":"","is_lit":true},"standing":null,
             "interlock":null,"tracker":null,"is_stopping":false,
             "counts":{"frames_lit":1,"slots":1,"slots_missed":0}},"figures":{}}"#;
         rig.note(Ok(serde_json::from_str(answer).unwrap()));

@@ -53,11 +53,7 @@ struct Now {
 /// What is passed on as the rig tells it.
 #[derive(Clone, Debug, Deserialize, Serialize)]
 struct State {
-    /// The projector's state as a word, and as a sentence.
-    projector: Short,
-    told: Short,
-    /// Light may come out of the projector.
-    is_light: bool,
+    light: Light,
     /// The order that is kept over restarts.
     standing: Option<Short>,
     /// On what light depends, and whether it is permitted.
@@ -66,6 +62,16 @@ struct State {
     tracker: Option<Short>,
     /// The run is asked to end.
     is_stopping: bool,
+}
+
+/// The state of the light.
+#[derive(Clone, Debug, Deserialize, Serialize)]
+struct Light {
+    /// As a word, and as a sentence behind it.
+    word: Short,
+    told: Short,
+    /// Mirrors are lit.
+    is_lit: bool,
 }
 
 #[derive(Clone, Copy, Debug, Deserialize)]

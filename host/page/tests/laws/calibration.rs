@@ -20,7 +20,7 @@ fn a_rig_that_runs_shows_its_steps_to_whoever_may_look() {
     for path in ["/", "/calibration"] {
         let body = rig.ask("GET", path, &[]).body;
         assert!(body.ends_with("</html>\n") && !body.contains("{{"), "{path}");
-        assert!(body.contains("--ground: #") && body.contains("dpm-token"), "{path} lacks what both share");
+        assert!(body.contains("--ground: #") && body.contains("dpm-page"), "{path} lacks what both share");
     }
     let steps = told(&rig.ask("GET", "/api/calibration", &[]).body);
     assert!(steps["runs"] == true && steps["none"].as_str().unwrap().contains("mock"), "{steps}");
@@ -59,25 +59,26 @@ fn a_rig_that_is_only_calibrated_has_steps_and_no_orders() {
 fn nobody_does_a_step_without_the_token_under_another_name_or_from_another_site() {
     let rig = Running::start("acts");
     let path = "/api/calibration/start?step=wand&way=0";
-    let (host, token) = (rig.address.to_string(), rig.token.as_str());
-    let (host, token) = (("Host", host.as_str()), ("X-Dpm-Token", token));
-    let wrong = ("X-Dpm-Token", "0");
+    let (host, right) = (rig.address.to_string(), rig.signed("POST", path));
+    let (host, right) = (("Host", host.as_str()), ("X-Dpm-Order", right.as_str()));
+    let wrong = ("X-Dpm-Order", "0");
     for (headers, status) in [
         (vec![host], 401),
         (vec![host, wrong], 403),
-        (vec![("Host", "evil.example"), token], 421),
-        (vec![host, token, ("Origin", "https://evil.example")], 403),
-        (vec![host, token, ("Sec-Fetch-Site", "cross-site")], 403),
+        (vec![("Host", "evil.example"), right], 421),
+        (vec![host, right, ("Origin", "https://evil.example")], 403),
+        (vec![host, right, ("Sec-Fetch-Site", "cross-site")], 403),
         // It is asked for, and what serves the page decides.
-        (vec![host, token], 400),
+        (vec![host, right], 400),
+        (vec![host, right], 403),
     ] {
         let answer = ask(rig.address, "POST", path, &headers);
         assert_eq!(answer.status, status, "{headers:?}: {}", answer.body);
     }
-    assert_eq!(ask(rig.address, "GET", path, &[host, token]).status, 405);
-    let told = ask(rig.address, "POST", "/api/calibration/stop", &[host, token]).body;
+    assert_eq!(rig.ask_signed("GET", path).status, 405);
+    let told = rig.ask_signed("POST", "/api/calibration/stop").body;
     assert!(told.contains("nobody does Stop here"), "{told}");
-    assert_eq!(ask(rig.address, "POST", "/api/calibration/arm", &[host, token]).status, 404);
-    let told = ask(rig.address, "POST", &path.replace("way=0", "way=0&sensor=--set"), &[host, token]);
+    assert_eq!(rig.ask_signed("POST", "/api/calibration/arm").status, 404);
+    let told = rig.ask_signed("POST", &path.replace("way=0", "way=0&sensor=--set"));
     assert!(told.status == 400 && told.body.contains("path of a device file"), "{}", told.body);
 }

@@ -71,7 +71,8 @@ fn counters_equal_the_report_and_histograms_add_up() {
     for (key, value) in during.iter().filter(|(key, _)| key.contains("_total") || key.contains("_bucket")) {
         assert!(later[key] >= *value, "{key} fell");
     }
-    assert_eq!(later["dpm_projector_state{state=\"up\"}"], 1.0);
+    assert_eq!((later["dpm_light_state{state=\"lit\"}"], later["dpm_body_lit{body=\"bunny\"}"]), (1.0, 1.0));
+    assert_eq!(later["dpm_light_state{state=\"dark\"}"], 0.0);
     let outcome = rig.end_run();
     let report = outcome.report;
     let text = rig.ask("GET", "/metrics", &[]).body;

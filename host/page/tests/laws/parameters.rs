@@ -4,7 +4,7 @@ use crate::common::{ask, Running};
 
 impl Running {
     fn change(&self, path: &str) -> (u16, String) {
-        let answer = self.ask("POST", path, &[("X-Dpm-Token", self.token.as_str())]);
+        let answer = self.ask_signed("POST", path);
         (answer.status, answer.body)
     }
 
@@ -72,19 +72,20 @@ fn nonsense_is_refused_and_changes_nothing() {
 fn nobody_changes_anything_without_the_token_under_another_name_or_from_another_site() {
     let rig = Running::start("stranger");
     let path = "/api/parameters/set?name=exposure&value=9";
-    let (host, token) = (rig.address.to_string(), rig.token.as_str());
-    let wrong = "0".repeat(64);
+    let host = rig.address.to_string();
+    let [other, right] = ["/api/parameters/undo", path].map(|path| rig.signed("POST", path));
+    let (host, right) = (("Host", host.as_str()), ("X-Dpm-Order", right.as_str()));
     for (headers, status) in [
-        (vec![("Host", host.as_str())], 401),
-        (vec![("Host", host.as_str()), ("X-Dpm-Token", wrong.as_str())], 403),
-        (vec![("Host", "evil.example"), ("X-Dpm-Token", token)], 421),
-        (vec![("Host", host.as_str()), ("X-Dpm-Token", token), ("Origin", "https://evil.example")], 403),
-        (vec![("Host", host.as_str()), ("X-Dpm-Token", token), ("Sec-Fetch-Site", "cross-site")], 403),
+        (vec![host], 401),
+        (vec![host, ("X-Dpm-Order", other.as_str())], 403),
+        (vec![("Host", "evil.example"), right], 421),
+        (vec![host, right, ("Origin", "https://evil.example")], 403),
+        (vec![host, right, ("Sec-Fetch-Site", "cross-site")], 403),
     ] {
         let answer = ask(rig.address, "POST", path, &headers);
         assert_eq!(answer.status, status, "{headers:?}: {}", answer.body);
     }
     // A link or a picture of another page is a GET.
-    assert_eq!(rig.ask("GET", path, &[("X-Dpm-Token", token)]).status, 405);
+    assert_eq!(rig.ask_signed("GET", path).status, 405);
     assert_eq!(rig.value("exposure"), (vec![1.0], true));
 }

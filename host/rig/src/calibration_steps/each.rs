@@ -118,7 +118,7 @@ fn wand(judged: &Judged) -> Step {
         None => step,
         Some(wand) => {
             let quality = format!("the tip is known to {:.2} mm", 1e3 * wand.tip_sigma_m);
-            step.with((State::Done, String::new(), Some(judged.measured(quality, &wand.provenance))))
+            step.with((State::Done, String::new(), judged.measured(quality, &wand.provenance)))
         }
     }
 }
@@ -171,9 +171,11 @@ fn body(judged: &Judged, name: &str) -> Step {
             .answered(&[("s", "another point"), ("d", "done")])];
     if let Some(section) = judged.file.bodies.get(name) {
         let checks: Vec<&CheckSection> = judged.file.checks.get(name).into_iter().collect();
-        let quality = format!("residual {:.2} mm", 1e3 * section.residual_m);
+        let quality = section
+            .residual_m
+            .map_or("no residual is known".into(), |m| format!("residual {:.2} mm", 1e3 * m));
         let (state, told) = judged.by_age(&section.provenance, &checks);
-        return step.with((state, told, Some(judged.measured(quality, &section.provenance))));
+        return step.with((state, told, judged.measured(quality, &section.provenance)));
     }
     let own = judged.about.config.scene.bodies.iter().find(|b| b.name == name);
     if own.is_some_and(|b| b.mesh_to_body != Default::default()) {
@@ -228,7 +230,7 @@ fn check(judged: &Judged, name: &str) -> Step {
         "error of the light {:.2} px in the median, {:.2} px at most, of {} points",
         section.p50_px, section.largest_px, section.points
     );
-    let measured = Some(judged.measured(quality, &section.provenance));
+    let measured = judged.measured(quality, &section.provenance);
     // Dates of one form are in the order of their letters.
     let newer = judged.dates_of(name).find(|date| *date > section.provenance.date.as_str());
     let (state, told) = match newer {
@@ -259,7 +261,7 @@ fn nudge(judged: &Judged, names: &[&str]) -> Step {
     let all: Vec<&Provenance> = judged.file.projector.iter().map(|p| &p.provenance).chain(places).collect();
     let newest = all.into_iter().filter(|p| p.is_by_eye()).max_by(|a, b| a.date.cmp(&b.date));
     match newest {
-        Some(from) => step.with((State::Done, String::new(), Some(judged.measured("by eye".into(), from)))),
+        Some(from) => step.with((State::Given, format!("Done on {}, by eye.", day(&from.date)), None)),
         None => {
             let told = "Only where a check finds a shift, or outlines do not fit. A running rig has the same motions among its parameters.";
             step.with((State::Optional, told.into(), None))

@@ -16,9 +16,9 @@ pub(super) struct Judged<'a> {
 pub(super) type Part = (State, String, Option<Measured>);
 
 impl Judged<'_> {
-    /// What was measured, with its age.
-    pub(super) fn measured(&self, quality: String, from: &Provenance) -> Measured {
-        Measured {
+    /// What was measured, with its age; `None` for what was moved by eye since: nothing of it is measured.
+    pub(super) fn measured(&self, quality: String, from: &Provenance) -> Option<Measured> {
+        (!from.is_by_eye()).then(|| Measured {
             date: from.date.clone(),
             age: aged(days_since(&from.date, self.about.now)),
             quality,
@@ -26,7 +26,7 @@ impl Judged<'_> {
             data: from.data.clone(),
             method: from.method.clone(),
             commit: from.commit.clone(),
-        }
+        })
     }
 
     /// A part that was measured at `raster` (`None`: at any) with the rig's projector.
@@ -36,7 +36,7 @@ impl Judged<'_> {
         raster: Option<[u32; 2]>,
         checks: &[&CheckSection],
     ) -> Part {
-        let measured = Some(self.measured(quality, from));
+        let measured = self.measured(quality, from);
         let own = self.about.config.projector.raster();
         if let Some([width, height]) = raster {
             if u64::from(width) * u64::from(own.height()) != u64::from(height) * u64::from(own.width()) {
@@ -60,8 +60,15 @@ impl Judged<'_> {
         (state, told, measured)
     }
 
-    /// Whether a part is old and none of `checks` has confirmed it since.
+    /// Whether a part is old and none of `checks` has confirmed it since, or was moved by eye.
     pub(super) fn by_age(&self, from: &Provenance, checks: &[&CheckSection]) -> (State, String) {
+        if from.is_by_eye() {
+            let told = format!(
+                "It was moved by eye on {} and not measured since, so nothing says how good it is. A check tells.",
+                day(&from.date)
+            );
+            return (State::Given, told);
+        }
         if !is_old(days_since(&from.date, self.about.now)) {
             return (State::Done, String::new());
         }

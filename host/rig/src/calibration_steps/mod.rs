@@ -36,7 +36,7 @@ pub fn is_simulated(config: &RigConfig) -> bool {
 pub enum State {
     /// It was measured, and nothing speaks against it.
     Done,
-    /// The rig file itself gives what would be measured.
+    /// The rig file, or somebody's eye, gives what would be measured.
     Given,
     /// It was measured long ago, and no check has confirmed it since.
     Old,

@@ -74,8 +74,11 @@ pub(crate) fn measured_file() -> CalibrationFile {
     file.projector = Some(ProjectorSection::new(raster, &model, 0.2, 0.1, Provenance::default()));
     let motion =
         DAffine3::from_rotation_translation(DQuat::from_rotation_x(0.3), DVec3::new(0.01, 0.0, 0.02));
-    let body =
-        BodySection { mesh_to_body: Pose::new(&motion), residual_m: 1e-4, provenance: Provenance::default() };
+    let body = BodySection {
+        mesh_to_body: Pose::new(&motion),
+        residual_m: Some(1e-4),
+        provenance: Provenance::default(),
+    };
     file.bodies.insert("venus".into(), body);
     file.latency =
         Some(LatencySection { latency_us: 2500.0, sigma_us: 5.0, provenance: Provenance::default() });
@@ -170,6 +173,30 @@ fn a_measured_rig_has_no_next_step_and_tells_what_each_part_is_worth() {
     assert!(lines.contains("[calibration]") && lines.contains(USUAL_NAME), "{lines}");
     let named = format!("calibration.file={:?}", bench.0.join(USUAL_NAME).display().to_string());
     assert_eq!(bench.steps(&[&named], None).unnamed, None);
+}
+
+/// Found in use, O3: ten degrees by eye counted as measured today with a residual of 0.00 mm.
+#[test]
+fn what_was_moved_by_eye_is_never_shown_as_measured() {
+    let mut file = whole(40);
+    let by_eye = Provenance { method: Provenance::BY_EYE.into(), ..from("venus", 0) };
+    // A file of an earlier program has a residual that nobody measured.
+    for residual_m in [None, Some(0.0), Some(1e-4)] {
+        let body = file.bodies.get_mut("venus").unwrap();
+        (body.residual_m, body.provenance) = (residual_m, by_eye.clone());
+        let steps = Bench::new("by-eye", Some(&file)).steps(&[], None);
+        let venus = step(&steps, "body:venus");
+        assert_eq!((venus.state, venus.measured.as_ref()), (State::Given, None), "{venus:?}");
+        assert!(venus.told.contains("by eye") && !venus.told.contains("0.00"), "{venus:?}");
+        assert_eq!(step(&steps, "nudge").measured, None);
+        // The check is older than the motion.
+        assert_eq!(step(&steps, "check:venus").state, State::Missing);
+    }
+    let projector = file.projector.as_mut().unwrap();
+    projector.provenance = Provenance { device: PROJECTOR.into(), ..by_eye };
+    let steps = Bench::new("by-eye", Some(&file)).steps(&[], None);
+    let projector = step(&steps, "projector");
+    assert_eq!((projector.state, projector.measured.as_ref()), (State::Given, None), "{projector:?}");
 }
 
 #[test]

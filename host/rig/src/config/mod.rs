@@ -28,7 +28,7 @@ pub(crate) use check::MAX_TRACKED;
 pub(crate) use dpm_common::keys::read::KeyDoc;
 pub(crate) use dpm_common::keys::source::VARIABLE_PREFIX;
 pub use dpm_common::keys::{ConfigError, ConfigErrors, Origin};
-pub use osc::OscConfig;
+pub use osc::{OscConfig, MOST_OSC_TOKEN};
 pub use page::{PageConfig, DEFAULT_PAGE};
 pub use projector::*;
 pub use run::*;

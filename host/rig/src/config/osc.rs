@@ -1,22 +1,30 @@
-//! `[osc]`: Open Sound Control, over which other programs change parameters and take light away.
+//! `[osc]`: Open Sound Control, over which other programs take light away, and change parameters if they know the token.
 
 use super::{Origin, RigConfig};
 use dpm_common::keys::read::{Any, NotEmpty, Reader};
 use dpm_common::section;
 use std::net::{IpAddr, SocketAddr};
 
+/// Longest token, bytes.
+pub const MOST_OSC_TOKEN: usize = 64;
+/// Lengths that `osc.token` may have.
+const TOKEN_LENGTHS: std::ops::RangeInclusive<usize> = 12..=MOST_OSC_TOKEN;
 /// The largest number of addresses in `osc.from`.
 const MAX_SENDERS: usize = 64;
 
 section! {
-    /// Open Sound Control over UDP, for parameters and for BLACK, FREEZE and SAFE; see docs/PAGE.md. Off unless
-    /// `listen` is set.
+    /// Open Sound Control over UDP, for BLACK and SAFE, and with a token for FREEZE and parameters; see docs/PAGE.md. Off
+    /// unless `listen` is set.
     pub struct OscConfig {
         /// Address and port on which datagrams are taken, for example `"127.0.0.1:9000"`; port 0 takes a free one.
         listen: Option<String> = None, "", NotEmpty;
-        /// Addresses of other machines that may send, for example `["192.168.1.20"]`. Programs on this machine always
-        /// may. OSC has no secret and UDP addresses can be forged, so name a network that you trust.
+        /// Addresses of the machines that may send, for example `["192.168.1.20"]`. Without any, programs on this machine
+        /// may; with any, they may only if `"127.0.0.1"` is among them. UDP addresses can be forged, so name a network
+        /// that you trust.
         from: Vec<String> = Vec::new(), "", Any;
+        /// What a message must have, as a text among its arguments or in its address, to change a parameter or to
+        /// freeze: 12 to 64 letters, digits, `-` and `_`. Without a token in the rig file OSC only makes dark.
+        token: Option<String> = None, "", NotEmpty;
     }
 }
 
@@ -26,7 +34,7 @@ impl OscConfig {
         self.listen.as_ref()?.parse().ok()
     }
 
-    /// The other machines that may send.
+    /// The machines that may send; none: this one.
     pub fn senders(&self) -> Vec<IpAddr> {
         self.from.iter().filter_map(|ip| ip.parse().ok()).collect()
     }
@@ -49,6 +57,19 @@ pub(super) fn check(rig: &RigConfig, reader: &mut Reader) {
             "name the machines that may send in osc.from, or listen on 127.0.0.1",
         ),
         _ => {}
+    }
+    if let Some(token) = &osc.token {
+        let is_known = |b: u8| b.is_ascii_alphanumeric() || b == b'-' || b == b'_';
+        if !TOKEN_LENGTHS.contains(&token.len()) || !token.bytes().all(is_known) {
+            refuse(
+                "osc.token",
+                "is not 12 to 64 letters, digits, - and _",
+                "draw one, for example with `openssl rand -hex 12`",
+            );
+        }
+        if osc.listen.is_none() {
+            refuse("osc.token", "has no effect, because OSC is off", "set osc.listen as well");
+        }
     }
     if osc.from.len() > MAX_SENDERS {
         refuse("osc.from", "has more than 64 addresses", "name those that send");
@@ -77,6 +98,8 @@ mod tests {
         assert_eq!(told(&[]).unwrap().address(), None);
         let near = told(&["osc.listen=\"127.0.0.1:9000\""]).unwrap();
         assert_eq!((near.address().unwrap().port(), near.senders().len()), (9000, 0));
+        let token = ["osc.listen=\"127.0.0.1:9000\"", "osc.token=\"abc_DEF-012345\""];
+        assert_eq!(told(&token).unwrap().token.as_deref(), Some("abc_DEF-012345"));
         let far = ["osc.listen=\"0.0.0.0:9000\"", "osc.from=[\"192.168.1.20\", \"fe80::1\"]"];
         assert_eq!(told(&far).unwrap().senders().len(), 2);
         for (flags, word) in [
@@ -84,6 +107,9 @@ mod tests {
             (vec![far[1]], "OSC is off"),
             (vec!["osc.listen=\"9000\""], "no address with a port"),
             (vec![far[0], "osc.from=[\"desk\"]"], "no address"),
+            (vec!["osc.token=\"abcdef-012345\""], "OSC is off"),
+            (vec!["osc.listen=\"127.0.0.1:9000\"", "osc.token=\"short\""], "12 to 64"),
+            (vec!["osc.listen=\"127.0.0.1:9000\"", "osc.token=\"a/b c d e f g h\""], "12 to 64"),
         ] {
             let told = told(&flags).unwrap_err();
             assert!(told.contains(word), "{told}");

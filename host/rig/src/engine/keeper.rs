@@ -6,12 +6,14 @@
 //! wait for an ARM of the operator.
 
 use super::connect::ConnectError;
+use super::reported_light::ReportedLight;
 use crate::frame::slots::OrderedDark;
 use crate::light::recorder::LightNote;
 use crate::light::status::StatusLight;
 use crate::order::Order;
 use crate::plan::frame::FramePlan;
 use crate::plan::link_time::LinkTime;
+use crate::telemetry::light_gauge::LightReport;
 use crate::telemetry::link_gauges::{Carried, LinkGauges};
 use crate::telemetry::monitor::{ProjectorHealth, RunMonitor};
 use crate::telemetry::projector::ProjectorReport;
@@ -45,6 +47,9 @@ pub(crate) struct LinkKeeper {
     /// `time` belongs to this session.
     is_timed: bool,
     reports: Option<StatusLight>,
+    /// What the projector's reports say of the light, wherever it is.
+    light: ReportedLight,
+    polled_at: HostTime,
     /// The operator's last order that was not taken back.
     standing: Option<Verb>,
     rearmed_at: HostTime,
@@ -58,9 +63,14 @@ pub(crate) struct LinkKeeper {
 }
 
 impl LinkKeeper {
-    /// For a link that has just come up with `time`. `lights` receives notes of the projector's light if its reports
+    /// For a link that has just come up with `time`, in a rig of so many tracked `bodies`. `lights` receives notes of the projector's light if its reports
     /// are the only source for them; light falls so many nanoseconds after the start of its slot.
-    pub(crate) fn new(time: LinkTime, link: &HostLink, lights: Option<(Sender<LightNote>, i64)>) -> Self {
+    pub(crate) fn new(
+        time: LinkTime,
+        link: &HostLink,
+        bodies: usize,
+        lights: Option<(Sender<LightNote>, i64)>,
+    ) -> Self {
         Self {
             time,
             times: None,
@@ -70,6 +80,8 @@ impl LinkKeeper {
             clock_steps: 0,
             session: link.counters().sessions,
             is_timed: true,
+            light: ReportedLight::new(bodies),
+            polled_at: HostTime(i64::MIN),
             reports: lights.map(|(lights, delay_ns)| StatusLight::new(lights, delay_ns)),
             standing: None,
             rearmed_at: HostTime(i64::MIN),
@@ -156,7 +168,25 @@ impl LinkKeeper {
                 _ => ProjectorHealth::InterlockOpen,
             }
         });
+        self.tell_light(now, link, monitor);
         result
+    }
+
+    /// Tells those who look what light there is, and for how long there has been what.
+    fn tell_light(&mut self, now: HostTime, link: &HostLink, monitor: &RunMonitor) {
+        let gauge = monitor.light_gauge();
+        let before = std::mem::replace(&mut self.polled_at, now);
+        if before.0 != i64::MIN {
+            gauge.spent(monitor.light(), now.ns_since(before).max(0) as u64);
+        }
+        let seen = self.light.observe(link.status(), now, gauge);
+        let standing = self.standing.and_then(|verb| match verb {
+            Verb::Black => Some(Order::Black),
+            Verb::Freeze => Some(Order::Freeze),
+            Verb::Safe => Some(Order::Safe),
+            Verb::Stop => None,
+        });
+        gauge.tell(&LightReport { standing, ..seen });
     }
 
     /// How often the map of the projector's clock was found wrong. What was learned by it is wrong then, too.
@@ -164,8 +194,9 @@ impl LinkKeeper {
         self.clock_steps
     }
 
-    /// Records that the frame of `plan` was sent at `now`.
-    pub(crate) fn sent(&mut self, plan: &FramePlan, now: HostTime) {
+    /// Records that the frame of `plan` was sent at `now`. `has_light`: a mirror is lit in it.
+    pub(crate) fn sent(&mut self, plan: &FramePlan, has_light: bool, now: HostTime) {
+        self.light.sent(plan, has_light, now);
         if let Some(reports) = &mut self.reports {
             reports.sent(plan.id.0 as u32, plan.slot, now);
         }

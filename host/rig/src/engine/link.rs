@@ -7,6 +7,7 @@ use super::keeper::{is_dark, LinkKeeper};
 use super::pace::Pace;
 use super::pack::is_overtaken;
 use super::queue::{FrameNeed, QueueWatch, StandingWait};
+use super::reported_light::has_light;
 use super::slack::{SentFrame, SlackMeter};
 use crate::frame::job::{Fate, FrameNote};
 use crate::plan::lead::LeadEstimator;
@@ -238,7 +239,7 @@ impl<P: Pace> LinkStage<P> {
         let outcome = self.link.send_frame(now, plan.id.0, plan.target_at, plan.dark_from, planes, transport);
         note.fate = Fate::Offered(outcome);
         if outcome == SendOutcome::Sent {
-            self.keeper.sent(plan, now);
+            self.keeper.sent(plan, has_light(planes), now);
             if let Some(follower) = &mut self.follower {
                 follower.sent(plan);
             }
@@ -357,6 +358,9 @@ impl<P: Pace> LinkStage<P> {
             Ending::LastLight { until } => Some(again.min(until)),
             Ending::Stopped { looks } => {
                 let is_over = looks >= self.looks || looks >= DARK_LOOKS && is_dark(&self.link);
+                if is_over {
+                    self.facts.monitor.light_gauge().end();
+                }
                 (!is_over).then_some(again)
             }
         }

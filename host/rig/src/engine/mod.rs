@@ -26,6 +26,7 @@ pub(crate) mod pack;
 pub(crate) mod plan;
 pub(crate) mod pulse;
 mod queue;
+mod reported_light;
 mod slack;
 mod slowness;
 pub(crate) mod supervision;

@@ -29,6 +29,8 @@ const MADE_WITHIN_NS: i64 = 180_000_000_000;
 /// The operator is informed that a frame stays on the GPU after this time, nanoseconds. A GPU that is still warming up
 /// is given up later than that.
 const STAYS_AFTER_NS: i64 = 1_000_000_000;
+/// What the link's thread last told of the light counts for so long, nanoseconds.
+const LINK_SILENT_NS: i64 = 900_000_000;
 /// A frame that has been on the GPU for so long is what keeps the light away, nanoseconds.
 const HOLDS_UP_NS: i64 = 100_000_000;
 /// The operator is informed that frames are made and none is lit after [`STAYS_AFTER_NS`] and so many frames: a slow renderer
@@ -144,6 +146,8 @@ pub(crate) struct Supervision {
     /// Since when the GPU has had the frame of which the operator was last informed.
     told_of_ns: i64,
     unlit: Unlit,
+    /// What the link's thread had told of the light when it last did, and when that was.
+    link_told: (u64, HostTime),
     /// The last light after which the operator was informed that frames on the GPU hold it up.
     told_after: Option<HostTime>,
 }
@@ -228,6 +232,7 @@ impl Supervision {
             slowness: Slowness::default(),
             told_of_ns: i64::MAX,
             unlit: Unlit::default(),
+            link_told: (0, HostTime(i64::MAX)),
             told_after: None,
         }
     }
@@ -241,6 +246,7 @@ impl Supervision {
         now: HostTime,
         step_ns: i64,
     ) -> Option<Irreplaceable> {
+        self.watch_light(now);
         self.tell_if_slow(now);
         let frames_lit = self.facts.monitor.counts().frames_lit;
         if frames_lit != self.lit.0 {
@@ -278,8 +284,19 @@ impl Supervision {
         None
     }
 
+    /// What the link's thread told of the light holds while it goes on, whether it hangs or gets no core.
+    fn watch_light(&mut self, now: HostTime) {
+        let gauge = self.facts.monitor.light_gauge();
+        let tellings = gauge.tellings();
+        if tellings != self.link_told.0 || self.link_told.1 > now {
+            self.link_told = (tellings, now);
+        }
+        gauge.set_link_silent(tellings > 0 && now.ns_since(self.link_told.1) >= LINK_SILENT_NS);
+    }
+
     /// The crew was found working at `now`.
     pub(crate) fn is_well(&self, now: HostTime) {
+        self.facts.monitor.light_gauge().set_restarts(false);
         self.facts.alive_at_ns.store(now.0, Ordering::Relaxed);
     }
 
@@ -324,6 +341,7 @@ impl Supervision {
         }
         self.recovering = Some((trouble.in_words(), since));
         self.is_back = false;
+        facts.monitor.light_gauge().set_restarts(true);
         self.made_by = now.plus_ns(MADE_WITHIN_NS);
         Verdict::Abandon { hangs, remake: Some(remake) }
     }

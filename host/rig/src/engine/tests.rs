@@ -75,7 +75,7 @@ fn bench_with(flags: &[&str], options: RunOptions, frame_buffers: u8) -> Bench {
     let slot_ns = rig.rate().slot_len_ns(0);
     let lead = LeadEstimator::new(slot_ns, 3 * MS, 2 * slot_ns);
     let facts = Arc::new(Facts::new(rig.clone(), monitor, options, &lead, now));
-    let keeper = LinkKeeper::new(time, &link, None);
+    let keeper = LinkKeeper::new(time, &link, rig.bodies.len(), None);
     let crew = Arc::new(CrewFacts::new(0, slot_ns));
     Bench { facts, crew, link: Some((link, keeper)), cable, lead, time, now, slot_ns }
 }

@@ -51,6 +51,7 @@ impl Collector {
             prediction: rig.config.prediction.on,
             projector: Some(monitor.carried()),
             predict_ms: self.newest_live.0.predict_ns as f64 * 1e-6,
+            light_s: monitor.light_times_s(),
             stopped: monitor.stop_requested(),
             ..Report::default()
         };

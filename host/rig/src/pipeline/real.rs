@@ -89,6 +89,7 @@ pub(super) fn run_at_real_pace(
     let keeper = LinkKeeper::new(
         time,
         &link,
+        rig.bodies.len(),
         far.lights.map(|lights| (lights, rig.config.projector.light_delay_ns())),
     );
     let line = Line { stage: LinkStage::new(facts.clone(), link, keeper, lead), medium: far.medium };

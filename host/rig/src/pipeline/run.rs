@@ -159,6 +159,7 @@ impl Ran {
             ..Report::default()
         };
         collector.fill(&mut report);
+        report.light_s = facts.monitor.light_times_s();
         report.tracker = facts.monitor.sample_counts();
         report.warnings.extend(report.tracker.as_ref().and_then(TrackerReport::warning));
         report.stopped = facts.monitor.stop_requested();

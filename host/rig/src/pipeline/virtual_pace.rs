@@ -67,7 +67,7 @@ pub(super) fn run_at_virtual_pace(
     let lead = lead_estimator(rig, &link, 0);
     let facts = Arc::new(Facts::new(rig.clone(), monitor.clone(), options, &lead, now));
     let crew = Arc::new(CrewFacts::new(0, rig.rate().slot_len_ns(0)));
-    let keeper = LinkKeeper::new(time, &link, None);
+    let keeper = LinkKeeper::new(time, &link, rig.bodies.len(), None);
     let (notes_in, notes) = note_channel(rig, monitor);
     let free: Vec<_> = std::mem::take(&mut parts.memory)
         .into_iter()

@@ -4,6 +4,8 @@ pub mod flight;
 mod flight_page;
 pub mod histogram_steps;
 pub mod interval;
+pub(crate) mod light_gauge;
+pub mod light_state;
 pub(crate) mod link_gauges;
 pub mod live;
 pub mod miss_log;

@@ -1,6 +1,8 @@
 //! Counters that a running pipeline maintains and an observing thread reads, and in the other direction the
 //! operator's requests: a stop, and orders for the projector.
 
+use super::light_gauge::LightGauge;
+use super::light_state::LightState;
 use super::link_gauges::LinkGauges;
 use super::live::Live;
 use super::ordered::DarkLog;
@@ -8,12 +10,13 @@ use super::projector::ProjectorReport;
 use crate::interlock::Interlock;
 use crate::order::Order;
 use crate::parameters::ParameterDesk;
+use crate::plan::dark::DarkCause;
 use crate::tracks::gauges::{TrackerGauges, TrackerReport};
 use crate::tracks::Unseen;
 use dpm_common::stopping;
 use dpm_device::link::{faults, LimitReached};
 use dpm_handoff::path::Lock;
-use std::collections::VecDeque;
+use std::collections::{BTreeMap, VecDeque};
 use std::fmt;
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 use std::sync::{OnceLock, PoisonError};
@@ -84,19 +87,6 @@ impl ProjectorHealth {
 }
 
 impl ProjectorHealth {
-    /// One state for every word that [`ProjectorHealth::word`] says.
-    pub const WORDS: [Self; 9] = [
-        Self::Connecting,
-        Self::Up,
-        Self::Lost,
-        Self::Faulted(0),
-        Self::Black,
-        Self::Frozen,
-        Self::Stopped,
-        Self::InterlockOpen,
-        Self::Resting(LimitReached::Mean),
-    ];
-
     /// The state as one word of at most ten letters. It is in capitals if the picture does not move although frames
     /// are made.
     pub const fn word(self) -> &'static str {
@@ -175,6 +165,8 @@ pub struct RunMonitor {
     /// The projector had SAFE latched when the link came up.
     found_safe: AtomicBool,
     projector: AtomicU64,
+    /// What is seen of the light: written by the link's thread and the supervisor.
+    light: LightGauge,
     /// Written at most once.
     tracker: OnceLock<Unseen>,
     /// Why the run will never return; written at most once.
@@ -348,6 +340,54 @@ impl RunMonitor {
     /// The projector's state.
     pub fn projector(&self) -> ProjectorHealth {
         ProjectorHealth::decode(self.projector.load(Ordering::Relaxed))
+    }
+
+    /// The state of the light now.
+    pub fn light(&self) -> LightState {
+        LightState::of(&self.light.evidence(self.projector()))
+    }
+
+    /// Per tracked body of the rig: its name, and why no light has fallen on it for a second; `None` while light falls
+    /// on it wherever the projector has any. Empty before the rig is built.
+    pub fn bodies(&self) -> Vec<(&str, Option<DarkCause>)> {
+        let bodies = self.live.rig().into_iter().flat_map(|rig| &rig.bodies);
+        bodies.enumerate().map(|(k, body)| (body.name.as_str(), self.light.body(k))).collect()
+    }
+
+    /// The state of the light as a sentence behind its word: the reason, and the bodies without light with theirs. Empty
+    /// where the word says everything.
+    pub fn light_told(&self) -> String {
+        let state = self.light();
+        let bodies = self.bodies();
+        let dark =
+            bodies.iter().filter_map(|(name, dark)| dark.map(|cause| format!("{name}: {}", cause.told())));
+        // What keeps every mirror dark is the reason for every body.
+        let dark = dark.filter(|_| state.is_lit() || state.reason().is_none());
+        state.reason().into_iter().chain(dark).collect::<Vec<_>>().join("; ")
+    }
+
+    /// Seconds in each state of the light, by its name.
+    pub fn light_times_s(&self) -> BTreeMap<String, f64> {
+        let name = |word: &&str| LightState::name_of(word);
+        LightState::WORDS.iter().map(name).zip(self.light.times_s()).collect()
+    }
+
+    /// What is seen of the light.
+    pub(crate) fn light_gauge(&self) -> &LightGauge {
+        &self.light
+    }
+
+    /// The run was started by hand, and waits for its first ARM.
+    pub fn await_first_arm(&self) {
+        self.light.await_first_arm();
+    }
+
+    /// Tells the light of a projector that shows what it was given without frames of this program: it is lit while it is
+    /// up or held.
+    pub fn set_projector_and_light(&self, health: ProjectorHealth) {
+        self.set_projector(health);
+        let is_lit = matches!(health, ProjectorHealth::Up | ProjectorHealth::Frozen);
+        self.light.tell_shown(health, is_lit);
     }
 
     /// Makes light depend on `interlock` for the whole run. A second interlock is dropped. Set it before the run
@@ -620,7 +660,6 @@ mod tests {
             assert_eq!(monitor.projector(), health);
         }
         assert!(all.iter().all(|h| h.word().len() <= 10));
-        assert!(all.iter().all(|h| H::WORDS.iter().filter(|w| w.word() == h.word()).count() == 1));
         assert!(H::Faulted(faults::LAMP).to_string().contains("lamp"));
     }
 }

@@ -192,6 +192,9 @@ pub struct Report {
     pub missed_by_cause: BTreeMap<String, u64>,
     /// Slots in which no new picture was wanted, by reason. They are not among `slots`.
     pub ordered_dark: BTreeMap<String, u64>,
+    /// Seconds in each state of the light by its name (docs/PAGE.md): lit, partly_lit, dark_by_order, dark, stalled,
+    /// never_armed; by the projector's own reports.
+    pub light_s: BTreeMap<String, f64>,
     /// Frames whose light left the projector, with light on at least one body. Prepared frames always have light.
     pub frames_lit: u64,
     /// Frames that the projector lit in which every body was dark.
@@ -324,6 +327,7 @@ impl Default for Report {
             excused_by_standstill: 0,
             missed_by_cause: BTreeMap::new(),
             ordered_dark: BTreeMap::new(),
+            light_s: BTreeMap::new(),
             frames_lit: 0,
             frames_dark: 0,
             dark_by_body: Vec::new(),

@@ -2,6 +2,7 @@
 
 use super::report::{Report, MODELLED};
 use crate::plan::dark::DarkCause;
+use crate::telemetry::light_state::LightState;
 use crate::telemetry::projector::ProjectorReport;
 use crate::telemetry::report::Spread;
 
@@ -9,6 +10,7 @@ impl Report {
     /// The report as a table of at most 100 columns.
     pub fn to_table(&self) -> String {
         let mut table = Table::default();
+        self.state_row(&mut table);
         self.slot_rows(&mut table);
         self.frame_rows(&mut table);
         self.set_up_rows(&mut table);
@@ -26,6 +28,15 @@ impl Report {
         let warnings = self.warnings.iter().map(|warning| format!("warning: {warning}\n"));
         let files = self.files.iter().map(|file| format!("see {}\n", file.display()));
         std::iter::once(table.to_text()).chain(warnings).chain(files).collect()
+    }
+
+    fn state_row(&self, table: &mut Table) {
+        let time = |word: &&'static str| Some((*word, *self.light_s.get(&LightState::name_of(word))?));
+        let times = LightState::WORDS.iter().filter_map(time).filter(|(_, s)| *s >= 0.001);
+        let times: Vec<String> = times.map(|(word, s)| format!("{word} {s:.3} s")).collect();
+        if !times.is_empty() {
+            table.row("light", times.join(", "));
+        }
     }
 
     fn slot_rows(&self, table: &mut Table) {

@@ -100,7 +100,7 @@ fn check(world: &World, target: &Target, limit: f64) -> (Vec<Offset>, String, bo
     let mut file = CalibrationFile::new();
     let section = BodySection {
         mesh_to_body: Pose::new(&target.mesh_to_body),
-        residual_m: 3e-4,
+        residual_m: Some(3e-4),
         provenance: Provenance::default(),
     };
     file.bodies.insert("box".into(), section);

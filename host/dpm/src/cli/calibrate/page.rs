@@ -36,7 +36,7 @@ impl GuideArgs {
         let address = self.listen.or_else(|| config.page.address()).or_else(usual);
         let bad = |told: String| Failure::new(FailureKind::BadInput, told);
         let address = address.ok_or_else(|| bad("--listen: name an address with a port".into()))?;
-        let token = token();
+        let token = token(address.port());
         let settings = Settings {
             address,
             hosts: config.page.hosts.clone(),

@@ -103,7 +103,7 @@ fn slots_of_an_operators_black_are_not_late() {
     let mut running = start_with(&args, &own);
     running.wait_for_line(Duration::from_secs(60), |line| {
         serde_json::from_str::<serde_json::Value>(line)
-            .is_ok_and(|told| told["frames_lit"].as_u64() > Some(0) && told["projector"] == "up")
+            .is_ok_and(|told| told["frames_lit"].as_u64() > Some(0) && told["light"] == "lit")
     });
     let id = running.id().to_string();
     assert_eq!(code(&dpm(&["black", "--pid", &id], &own)), 0);

@@ -14,13 +14,13 @@ const PREDICT_MS: u64 = 100;
 const SLOT_MS: u64 = 17;
 
 /// A thread of another process that is stopped as long as this lives.
-struct Stopped {
+pub(super) struct Stopped {
     thread: i32,
 }
 
 impl Stopped {
     /// Stops a thread immediately, as a debugger would.
-    fn new(thread: i32) -> Option<Self> {
+    pub(super) fn new(thread: i32) -> Option<Self> {
         let none = std::ptr::null_mut::<libc::c_void>();
         // SAFETY: ptrace and waitpid change nothing in this process; the status is written during the call.
         unsafe {
@@ -61,7 +61,7 @@ impl Drop for Stopped {
 }
 
 /// Threads of a process with their names.
-fn threads(id: u32) -> Vec<(i32, String)> {
+pub(super) fn threads(id: u32) -> Vec<(i32, String)> {
     let tasks = std::fs::read_dir(format!("/proc/{id}/task")).expect("the process runs");
     let mut all: Vec<_> = tasks
         .filter_map(|task| {

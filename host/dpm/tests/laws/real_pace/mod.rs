@@ -7,6 +7,7 @@ mod conformance;
 mod dlpc900;
 mod gpu_faults;
 mod hangs;
+mod light_word;
 mod record;
 mod run_limits;
 mod run_orders;

@@ -4,6 +4,7 @@
 use dpm_device::planes::Raster;
 use dpm_page::calibration::{Act, Guide, Session};
 use dpm_page::notes::Notes;
+use dpm_page::proof::{sign_request, Key};
 use dpm_page::token::Token;
 use dpm_page::{Page, Settings};
 use dpm_rig::calibration_steps::{About, Steps};
@@ -76,7 +77,7 @@ impl Running {
         let (file, error, _) = OrderFile::open(Some(dir.clone()), Identity::of(&config.projector.backend));
         assert!(error.is_none(), "{error:?}");
         let orders = Arc::new(Orders::start(monitor.clone(), file, true, None).unwrap());
-        let (token, _) = Token::kept_in(&dir).unwrap();
+        let (token, _) = Token::kept_in(&dir, 0).unwrap();
         let settings = Settings {
             address: "127.0.0.1:0".parse().unwrap(),
             hosts: vec!["rig.example.org".into()],
@@ -123,10 +124,19 @@ impl Running {
         ask(self.address, method, path, &headers)
     }
 
-    /// Gives an order with the right token.
+    /// The value of the header by which a request is signed, once.
+    pub(crate) fn signed(&self, method: &str, path: &str) -> String {
+        signed_by(&self.token, method, path, &self.ask("GET", "/api/challenge", &[]).body)
+    }
+
+    /// Asks with a signature.
+    pub(crate) fn ask_signed(&self, method: &str, path: &str) -> Answer {
+        self.ask(method, path, &[("X-Dpm-Order", &self.signed(method, path))])
+    }
+
+    /// Gives an order with the right signature.
     pub(crate) fn order(&self, word: &str) -> serde_json::Value {
-        let path = format!("/api/orders/{word}");
-        let answer = self.ask("POST", &path, &[("X-Dpm-Token", self.token.as_str())]);
+        let answer = self.ask_signed("POST", &format!("/api/orders/{word}"));
         assert_eq!(answer.status, 200, "{}", answer.body);
         serde_json::from_str(&answer.body).unwrap()
     }
@@ -150,6 +160,11 @@ impl Drop for Running {
         }
         let _ = std::fs::remove_dir_all(&self.dir);
     }
+}
+
+/// The value of the header by which a request is signed over `challenge`.
+pub(crate) fn signed_by(token: &Token, method: &str, path: &str, challenge: &str) -> String {
+    format!("{challenge} {}", sign_request(&Key::of_orders(token), method, path, challenge))
 }
 
 #[derive(Debug)]

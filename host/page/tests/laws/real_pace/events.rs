@@ -59,11 +59,15 @@ fn a_viewer_sees_the_light_go_and_come_back() {
     let mut viewer = Viewer::new(&rig);
     let bright = viewer.brightness(|mean| mean > 20.0);
     rig.order("black");
-    let state = viewer.next("state", |now| now["projector"] == "BLACK");
-    assert_eq!((state["is_light"].as_bool(), state["standing"].as_str()), (Some(false), Some("black")));
+    let state = viewer.next("state", |now| now["light"]["word"] == "DARK BY ORDER");
+    assert_eq!(state["light"]["state"], "dark_by_order");
+    assert_eq!(
+        (state["light"]["is_lit"].as_bool(), state["standing"].as_str()),
+        (Some(false), Some("black"))
+    );
     assert_eq!(viewer.brightness(|mean| mean < 1.0), 0.0);
     rig.order("arm");
-    viewer.next("state", |now| now["projector"] == "up" && now["is_light"] == true);
+    viewer.next("state", |now| now["light"]["word"] == "LIT" && now["light"]["is_lit"] == true);
     assert!(viewer.brightness(|mean| mean > 20.0) > bright * 0.5);
     viewer.next("pictures", |p| p["viewer"].is_string() && p["per_s"].as_f64().is_some_and(|n| n <= 10.0));
     let notes = rig.notes.clone();

@@ -11,9 +11,9 @@ use std::sync::{Arc, Mutex};
 use std::time::{Duration, Instant};
 
 /// A state as a rig tells it, and a field that no version has.
-const STATE: &str = r#"{"now":{"pid":7,"up_s":UP,"projector":"up","told":"up","is_light":true,"standing":null,
-    "interlock":["pin",true],"tracker":null,"is_stopping":false,"counts":{"frames_planned":9,"frames_lit":LIT,
-    "frames_dark":0,"slots":LIT,"slots_missed":0,"more":1},"viewers":1,"secret":"unknown field"},"figures":{"bodies":[
+const STATE: &str = r#"{"now":{"pid":7,"up_s":UP,"light":{"word":"LIT","state":"lit","told":"","is_lit":true},"standing":null,
+    "interlock":["pin",true],"tracker":null,"is_stopping":false,"counts":{"frames_planned":9,"frames_lit":FRAMES,
+    "frames_dark":0,"slots":FRAMES,"slots_missed":0,"more":1},"viewers":1,"secret":"unknown field"},"figures":{"bodies":[
     {"name":"bunny","seen":true,"dark":null,"told":null,"at_m":[0,0,1]},
     {"name":"teapot","seen":true,"dark":"silent","told":"LONG","at_m":[0,0,1]}],
     "link":{"celsius":41.5},"setup":{"rig":"/etc/dpm/stage.toml","version":"0.1.0","commit":"abc"}}}"#;
@@ -55,7 +55,8 @@ impl Fake {
         let begin = Instant::now();
         Self::serve(move |mut stream| {
             let up = begin.elapsed().as_secs_f64() + 10.0;
-            let text = STATE.replace("UP", &up.to_string()).replace("LIT", &((up * 50.0) as u64).to_string());
+            let text =
+                STATE.replace("UP", &up.to_string()).replace("FRAMES", &((up * 50.0) as u64).to_string());
             let _ = stream.write_all(http("200 OK", &text.replace("LONG", &"long ".repeat(1000))).as_bytes());
         })
     }
@@ -162,7 +163,9 @@ fn a_rig_that_answers_is_shown_and_each_that_does_not_says_why() {
     assert_eq!(rig["address"], good.address.to_string());
     assert_eq!(rig["port"], good.address.port());
     assert!(
-        rig["why"].is_null() && rig["told"]["projector"] == "up" && rig["told"]["is_light"] == true,
+        rig["why"].is_null()
+            && rig["told"]["light"]["word"] == "LIT"
+            && rig["told"]["light"]["is_lit"] == true,
         "{rig}"
     );
     assert_eq!(rig["told"]["celsius"], 41.5);
@@ -242,13 +245,14 @@ fn a_rig_is_shown_and_commanded_through_a_tunnel() {
     assert_eq!(now["port"], tunnel.port());
     let order = |origin: &str| {
         let host = tunnel.to_string();
-        let headers = [("Host", host.as_str()), ("Origin", origin), ("X-Dpm-Token", rig.token.as_str())];
+        let signed = rig.signed("POST", "/api/orders/black");
+        let headers = [("Host", host.as_str()), ("Origin", origin), ("X-Dpm-Order", signed.as_str())];
         ask(tunnel, "POST", "/api/orders/black", &headers).status
     };
     assert_eq!(order(&format!("http://{to}")), 200, "the rig's own name stays one of its own");
     assert_eq!(order("http://127.0.0.1:1"), 403, "a server at another port of this machine");
     assert_eq!(order(&format!("http://{tunnel}")), 200);
-    wait(&page, "rig", PATIENCE, |rig| rig["told"]["projector"] == "BLACK");
+    wait(&page, "rig", PATIENCE, |rig| rig["told"]["light"]["word"] == "DARK BY ORDER");
     rig.end_run();
 }
 
@@ -257,19 +261,22 @@ fn a_real_rig_is_understood_and_its_silence_is_told() {
     let mut rig = Running::start("overview");
     let page = overview(&[format!("rig={}", rig.address)]);
     let now = wait(&page, "rig", PATIENCE, |rig| rig["told"]["lit_per_s"].as_f64().is_some_and(|n| n > 1.0));
-    assert!(now["told"]["projector"] == "up" && now["told"]["is_light"] == true, "{now}");
+    assert!(now["told"]["light"]["word"] == "LIT" && now["told"]["light"]["is_lit"] == true, "{now}");
     assert!(
         !now["told"]["bodies"].as_array().unwrap().is_empty() && now["told"]["celsius"].is_null(),
         "{now}"
     );
     assert_eq!(now["told"]["version"], env!("CARGO_PKG_VERSION"));
     rig.order("black");
-    let now = wait(&page, "rig", PATIENCE, |rig| rig["told"]["projector"] == "BLACK");
-    assert!(now["told"]["is_light"] == false, "{now}");
+    let now = wait(&page, "rig", PATIENCE, |rig| rig["told"]["light"]["word"] == "DARK BY ORDER");
+    assert!(now["told"]["light"]["is_lit"] == false, "{now}");
     rig.end_run();
     drop(rig);
     let now = wait(&page, "rig", PATIENCE, |rig| rig["contact"] == "no");
-    assert!(now["told"]["projector"] == "BLACK" && now["heard_s_ago"].as_f64().unwrap() >= 3.0, "{now}");
+    assert!(
+        now["told"]["light"]["word"] == "DARK BY ORDER" && now["heard_s_ago"].as_f64().unwrap() >= 3.0,
+        "{now}"
+    );
     assert!(now["why"].as_str().unwrap().contains("nobody listens"), "{now}");
 }
 
@@ -279,7 +286,7 @@ fn the_overview_refuses_other_names_other_sites_and_orders() {
     let page = overview(&[format!("good={}", good.address)]);
     let body = get(&page, "/").body;
     assert!(body.ends_with("</html>\n") && !body.contains("{{") && body.contains("--ground: #"));
-    assert!(!body.contains("dpm-token"), "it needs no token");
+    assert!(!body.contains("dpm-page"), "it needs no key");
     assert!(get(&page, "/").head.contains("script-src 'nonce-"));
     let own = page.address().to_string();
     let host = ("Host", own.as_str());
@@ -297,7 +304,7 @@ fn the_overview_refuses_other_names_other_sites_and_orders() {
     for path in ["/api/orders/black", "/api/parameters/undo", "/api/calibration/stop", "/api/rigs"] {
         assert_eq!(ask(page.address(), "POST", path, &[host]).status, 405, "{path}");
     }
-    for path in ["/api/state", "/api/events", "/metrics", "/calibration", "/api/token", "/api/flights/0"] {
+    for path in ["/api/state", "/api/events", "/metrics", "/calibration", "/api/key", "/api/flights/0"] {
         assert_eq!(get(&page, path).status, 404, "{path}");
     }
     let far = Rigs::new(vec!["127.0.0.1:1".parse().unwrap()]).unwrap();

@@ -1,17 +1,23 @@
-//! Datagrams of OSC 1.0 into what a rig may be asked for: parameters, and the orders BLACK, FREEZE and SAFE. There is no
-//! way to say ARM.
+//! Datagrams of OSC 1.0 into what a rig may be asked for: parameters, and the orders BLACK, FREEZE and SAFE, with the
+//! token that the sender gives. There is no way to say ARM.
+//!
+//! The token is a text among the arguments, `/dpm/exposure 1.5 TOKEN`, or stands in the address for senders that have
+//! numbers only: `/dpm/token/TOKEN/exposure 1.5`. It occurs in no fault that is named.
 //!
 //! Format: opensoundcontrol.org, "OSC 1.0 specification" (Wright, 2002). Everything is aligned to four bytes and big
 //! endian. A time tag is read and ignored: what comes is meant for now.
 
+use crate::config::MOST_OSC_TOKEN;
 use crate::order::Order;
+use std::fmt;
 
 /// Bundles inside each other.
 const DEEPEST: usize = 4;
 /// Most numbers of a message that are read.
 pub const MOST_NUMBERS: usize = 16;
-/// First part of every address.
+/// First part of every address, and of one with a token.
 const PREFIX: &str = "/dpm/";
+const TOKEN: &str = "token/";
 
 /// What a message asks for.
 #[derive(Clone, Debug, PartialEq)]
@@ -29,6 +35,22 @@ pub enum Heard {
     Nothing,
 }
 
+/// A message, with the token that its sender gave.
+#[derive(Clone, PartialEq)]
+pub struct Said {
+    /// What it asks for.
+    pub heard: Heard,
+    /// The token, right or wrong.
+    pub token: Option<String>,
+}
+
+impl fmt::Debug for Said {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let token = self.token.as_ref().map(|_| "secret");
+        f.debug_struct("Said").field("heard", &self.heard).field("token", &token).finish()
+    }
+}
+
 /// Why a datagram, or a message of it, means nothing.
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
 pub enum Wrong {
@@ -41,8 +63,8 @@ pub enum Wrong {
     /// ARM was asked for.
     #[error("ARM is never taken over OSC; use `dpm arm`, the page or a key")]
     Arm,
-    /// An argument is no number.
-    #[error("address {0:?}: an argument is no number")]
+    /// An argument is neither a number nor a token.
+    #[error("address {0:?}: an argument is neither a number nor a token")]
     NoNumber(String),
 }
 
@@ -50,11 +72,11 @@ pub enum Wrong {
 ///
 /// # Errors
 /// The datagram is no OSC.
-pub fn decode(bytes: &[u8], hear: &mut dyn FnMut(Result<Heard, Wrong>)) -> Result<(), Wrong> {
+pub fn decode(bytes: &[u8], hear: &mut dyn FnMut(Result<Said, Wrong>)) -> Result<(), Wrong> {
     packet(bytes, 0, hear)
 }
 
-fn packet(bytes: &[u8], depth: usize, hear: &mut dyn FnMut(Result<Heard, Wrong>)) -> Result<(), Wrong> {
+fn packet(bytes: &[u8], depth: usize, hear: &mut dyn FnMut(Result<Said, Wrong>)) -> Result<(), Wrong> {
     let Some(mut rest) = bytes.strip_prefix(b"#bundle\0") else {
         hear(message(bytes)?);
         return Ok(());
@@ -86,7 +108,7 @@ fn text(bytes: &[u8]) -> Result<(&str, &[u8]), Wrong> {
 }
 
 /// One message. The outer error: it is no OSC; the inner one: it is none of this program's.
-fn message(bytes: &[u8]) -> Result<Result<Heard, Wrong>, Wrong> {
+fn message(bytes: &[u8]) -> Result<Result<Said, Wrong>, Wrong> {
     let (address, rest) = text(bytes)?;
     if !address.starts_with('/') {
         return Err(Wrong::Form("an address does not begin with a slash"));
@@ -94,14 +116,14 @@ fn message(bytes: &[u8]) -> Result<Result<Heard, Wrong>, Wrong> {
     // Old senders leave the tags out if there are no arguments.
     let (tags, arguments) = if rest.is_empty() { (",", rest) } else { text(rest)? };
     let tags = tags.strip_prefix(',').ok_or(Wrong::Form("the type tags do not begin with a comma"))?;
-    let numbers = numbers(tags, arguments)?;
-    Ok(meaning(address, numbers))
+    let (numbers, token) = arguments_of(tags, arguments)?;
+    Ok(meaning(address, numbers, token))
 }
 
-/// The numbers of a message; `None` if an argument is none.
-fn numbers(tags: &str, mut rest: &[u8]) -> Result<Option<Vec<f64>>, Wrong> {
+/// The numbers of a message, `None` if an argument is none, and the one text that may be among them.
+fn arguments_of<'a>(tags: &str, mut rest: &'a [u8]) -> Result<(Option<Vec<f64>>, Option<&'a str>), Wrong> {
     let short = Wrong::Form("an argument is cut off");
-    let (mut all, mut is_sound) = (Vec::new(), true);
+    let (mut all, mut is_sound, mut token) = (Vec::new(), true, None);
     for tag in tags.bytes() {
         let number = match tag {
             b'i' | b'f' => {
@@ -117,7 +139,12 @@ fn numbers(tags: &str, mut rest: &[u8]) -> Result<Option<Vec<f64>>, Wrong> {
             b'T' => Some(1.0),
             b'F' => Some(0.0),
             b's' | b'S' => {
-                rest = text(rest)?.1;
+                let (told, after) = text(rest)?;
+                rest = after;
+                if token.is_none() && told.len() <= MOST_OSC_TOKEN {
+                    token = Some(told);
+                    continue;
+                }
                 None
             }
             _ => return Err(Wrong::Form("an argument is of a type that is not read")),
@@ -127,7 +154,7 @@ fn numbers(tags: &str, mut rest: &[u8]) -> Result<Option<Vec<f64>>, Wrong> {
             all.extend(number);
         }
     }
-    Ok(is_sound.then_some(all))
+    Ok((is_sound.then_some(all), token))
 }
 
 /// A single as the shortest decimal that it stands for: a slider at 1.1 means 1.1.
@@ -136,9 +163,12 @@ fn of_float(word: [u8; 4]) -> f64 {
     single.to_string().parse().unwrap_or(f64::from(single))
 }
 
-fn meaning(address: &str, numbers: Option<Vec<f64>>) -> Result<Heard, Wrong> {
-    let short = || address.chars().take(80).collect::<String>();
-    let name = address.strip_prefix(PREFIX).ok_or_else(|| Wrong::Address(short()))?;
+fn meaning(address: &str, numbers: Option<Vec<f64>>, token: Option<&str>) -> Result<Said, Wrong> {
+    let short = |address: &str| address.chars().take(80).collect::<String>();
+    let name = address.strip_prefix(PREFIX).ok_or_else(|| Wrong::Address(short(address)))?;
+    let with_token = name.strip_prefix(TOKEN).and_then(|rest| rest.split_once('/'));
+    let (token, name) = with_token.map_or((token, name), |(token, name)| (Some(token), name));
+    let token = token.map(str::to_owned);
     let order = match name {
         "black" => Some(Order::Black),
         "freeze" => Some(Order::Freeze),
@@ -149,11 +179,12 @@ fn meaning(address: &str, numbers: Option<Vec<f64>>) -> Result<Heard, Wrong> {
     if let Some(order) = order {
         // A button sends 0 when it is released. An order with arguments that are no numbers is still an order.
         let is_released = numbers.is_some_and(|all| all.first() == Some(&0.0));
-        return Ok(if is_released { Heard::Nothing } else { Heard::Order(order) });
+        let heard = if is_released { Heard::Nothing } else { Heard::Order(order) };
+        return Ok(Said { heard, token });
     }
-    let numbers = numbers.ok_or_else(|| Wrong::NoNumber(short()))?;
+    let numbers = numbers.ok_or_else(|| Wrong::NoNumber(short(name)))?;
     // The address /dpm/body/hare is the parameter body.hare.
-    Ok(Heard::Set { name: name.replacen('/', ".", 1), numbers })
+    Ok(Said { heard: Heard::Set { name: name.replacen('/', ".", 1), numbers }, token })
 }
 
 #[cfg(test)]
@@ -182,7 +213,7 @@ mod tests {
 
     fn heard(bytes: &[u8]) -> (Vec<Result<Heard, Wrong>>, Result<(), Wrong>) {
         let mut all = Vec::new();
-        let end = decode(bytes, &mut |one| all.push(one));
+        let end = decode(bytes, &mut |one| all.push(one.map(|said| said.heard)));
         (all, end)
     }
 
@@ -210,10 +241,38 @@ mod tests {
     }
 
     #[test]
+    fn a_token_is_a_text_among_the_arguments_or_a_part_of_the_address_and_is_never_printed() {
+        let token_of = |bytes: &[u8]| {
+            let mut all = Vec::new();
+            decode(bytes, &mut |one| all.push(one)).unwrap();
+            let told = format!("{all:?}");
+            assert!(!told.contains("abc-012345-XYZ"), "{told}");
+            all.pop().unwrap().map(|said| (said.heard, said.token))
+        };
+        let number = 1.5f32.to_be_bytes().to_vec();
+        let token = Some("abc-012345-XYZ".to_owned());
+        let exposure = Ok((set("exposure", &[1.5]), token.clone()));
+        let secret = padded("abc-012345-XYZ");
+        assert_eq!(token_of(&sent("/dpm/exposure", ",fs", &[&number[..], &secret].concat())), exposure);
+        assert_eq!(token_of(&sent("/dpm/exposure", ",sf", &[&secret, &number[..]].concat())), exposure);
+        assert_eq!(token_of(&sent("/dpm/token/abc-012345-XYZ/exposure", ",f", &number)), exposure);
+        let body = token_of(&sent("/dpm/token/abc-012345-XYZ/body/hare", ",f", &number));
+        assert_eq!(body, Ok((set("body.hare", &[1.5]), token.clone())));
+        let freeze = token_of(&sent("/dpm/token/abc-012345-XYZ/freeze", ",", &[]));
+        assert_eq!(freeze, Ok((Heard::Order(Order::Freeze), token)));
+        assert_eq!(token_of(&sent("/dpm/token/abc-012345-XYZ/arm", ",", &[])), Err(Wrong::Arm));
+        assert_eq!(token_of(&sent("/dpm/exposure", ",f", &number)), Ok((set("exposure", &[1.5]), None)));
+        // What is wrong is named without the token.
+        let two = [&secret[..], &secret].concat();
+        assert!(token_of(&sent("/dpm/token/abc-012345-XYZ/exposure", ",ss", &two)).is_err());
+    }
+
+    #[test]
     fn what_means_nothing_here_is_named_and_nothing_arms() {
         assert_eq!(heard(&padded("/dpm/arm")).0, [Err(Wrong::Arm)]);
         assert!(matches!(heard(&padded("/live/play")).0[..], [Err(Wrong::Address(_))]));
-        assert!(matches!(heard(&sent("/dpm/exposure", ",s", &padded("x"))).0[..], [Err(Wrong::NoNumber(_))]));
+        let two = [padded("x"), padded("y")].concat();
+        assert!(matches!(heard(&sent("/dpm/exposure", ",ss", &two)).0[..], [Err(Wrong::NoNumber(_))]));
         for bad in [
             &b""[..],
             b"/dpm/black",

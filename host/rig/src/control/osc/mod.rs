@@ -1,8 +1,8 @@
-//! OSC over UDP: what the tools of artists speak. It changes parameters, and takes light away or holds it. It never
-//! gives ARM, and it has no answer but the rig's notes.
+//! OSC over UDP: what the tools of artists speak. It takes light away; who gives the rig file's token also changes
+//! parameters and holds the light. It never gives ARM, and it has no answer but the rig's notes.
 //!
-//! UDP knows neither users nor secrets. Who may send is a list of addresses, which a hostile network can forge; that is
-//! why nothing here can make more light than the operator has permitted.
+//! UDP knows no users. Who may send is a list of addresses, which a hostile network can forge, and the token can be read
+//! on the wire; that is why nothing here can make more light than the operator has permitted.
 
 pub mod decode;
 
@@ -13,7 +13,7 @@ use crate::order::Order;
 use crate::parameters::Command;
 use crate::standing::By;
 use crate::telemetry::monitor::RunMonitor;
-use decode::{decode, Heard};
+use decode::{decode, Heard, Said};
 use dpm_common::realtime::os::give_way;
 use std::io;
 use std::net::{IpAddr, SocketAddr, UdpSocket};
@@ -45,13 +45,15 @@ pub struct OscSocket {
 }
 
 impl OscSocket {
-    /// Listens at `address` to datagrams from this machine and from the addresses `from`.
+    /// Listens at `address` to datagrams from the addresses `from`, or from this machine if there are none. Whoever gives
+    /// `token` may do more than make dark; without one nobody may.
     ///
     /// # Errors
     /// The address cannot be listened on, or there is no thread.
     pub fn serve(
         address: SocketAddr,
         from: Vec<IpAddr>,
+        token: Option<String>,
         monitor: Arc<RunMonitor>,
         orders: Arc<Orders>,
     ) -> io::Result<Self> {
@@ -61,6 +63,7 @@ impl OscSocket {
         let mut ear = Ear {
             socket,
             from,
+            token,
             monitor,
             orders,
             waiting: Vec::with_capacity(WAITING),
@@ -114,6 +117,7 @@ struct Refusals {
 struct Ear {
     socket: UdpSocket,
     from: Vec<IpAddr>,
+    token: Option<String>,
     monitor: Arc<RunMonitor>,
     orders: Arc<Orders>,
     waiting: Vec<Waiting>,
@@ -148,19 +152,22 @@ impl Ear {
 
     fn hear(&mut self, bytes: &[u8], from: SocketAddr) {
         let ip = from.ip().to_canonical();
-        if !ip.is_loopback() && !self.from.contains(&ip) {
+        let may_send = if self.from.is_empty() { ip.is_loopback() } else { self.from.contains(&ip) };
+        if !may_send {
             return self.refused.add(format!("{ip} is not in osc.from"));
         }
         let mut all = Vec::new();
         let end = decode(bytes, &mut |one| all.push(one));
         for heard in all.into_iter().chain(end.err().map(Err)) {
-            let done = match heard {
-                Ok(Heard::Order(order)) => {
+            let done = match heard.map(|said| (self.permits(&said), said.heard)) {
+                Ok((permitted, Heard::Order(order))) if permitted.is_ok() || order.is_dark() => {
                     self.order(order, from);
                     continue;
                 }
-                Ok(Heard::Nothing) => continue,
-                Ok(Heard::Set { name, numbers }) => {
+                Ok((_, Heard::Nothing)) => continue,
+                Ok((Err(why), _)) => Err(why.into()),
+                Ok((Ok(()), Heard::Order(_))) => continue,
+                Ok((Ok(()), Heard::Set { name, numbers })) => {
                     let command = Command::Set { name, numbers };
                     parameters::give(&self.monitor, &command, &format!("osc {ip}")).map_err(|e| e.to_string())
                 }
@@ -169,6 +176,16 @@ impl Ear {
             if let Err(why) = done {
                 self.refused.add(format!("{ip}: {why}"));
             }
+        }
+    }
+
+    /// Whether the sender of a message may do more than make dark.
+    fn permits(&self, said: &Said) -> Result<(), &'static str> {
+        match (&self.token, &said.token) {
+            (None, _) => Err("OSC only makes dark, because the rig file has no osc.token"),
+            (Some(_), None) => Err("without the token of the rig file (osc.token) OSC only makes dark"),
+            (Some(right), Some(told)) if is_same(right, told) => Ok(()),
+            (Some(_), Some(_)) => Err("the token is not that of the rig file (osc.token)"),
         }
     }
 
@@ -193,6 +210,12 @@ impl Ear {
             false
         });
     }
+}
+
+/// True if the texts are equal. The time that this takes does not depend on where they differ.
+fn is_same(right: &str, told: &str) -> bool {
+    let differs = right.bytes().zip(told.bytes()).fold(0, |all, (a, b)| all | (a ^ b));
+    right.len() == told.len() && std::hint::black_box(differs) == 0
 }
 
 impl Refusals {

@@ -4,6 +4,8 @@ use crate::rig::Rig;
 use crate::standing::{Identity, OrderFile};
 use dpm_device::planes::Raster;
 
+const TOKEN: &str = "abc-012345-XYZ";
+
 struct Bench {
     monitor: Arc<RunMonitor>,
     osc: OscSocket,
@@ -11,7 +13,7 @@ struct Bench {
 }
 
 impl Bench {
-    fn new(sender: &str) -> Self {
+    fn new(sender: &str, token: Option<&str>) -> Self {
         let config = RigConfig::demo(&Overrides::default()).unwrap();
         let rig = Arc::new(Rig::build(&config, Raster::new(8, 8)).unwrap());
         let monitor = Arc::new(RunMonitor::default());
@@ -19,7 +21,10 @@ impl Bench {
         let identity = Identity::of(&ProjectorBackend::Mock(MockProjectorConfig::default()));
         let (file, _, _) = OrderFile::open(None, identity);
         let orders = Arc::new(Orders::start(monitor.clone(), file, false, None).unwrap());
-        let osc = OscSocket::serve("127.0.0.1:0".parse().unwrap(), vec![], monitor.clone(), orders).unwrap();
+        let osc = {
+            let (any, token) = ("127.0.0.1:0".parse().unwrap(), token.map(str::to_owned));
+            OscSocket::serve(any, vec![], token, monitor.clone(), orders).unwrap()
+        };
         let to = UdpSocket::bind((sender, 0)).unwrap();
         to.connect(osc.address()).unwrap();
         Self { monitor, osc, to }
@@ -52,25 +57,28 @@ impl Bench {
 
 #[test]
 fn parameters_and_dark_orders_are_carried_out_and_arm_is_not() {
-    let bench = Bench::new("127.0.0.1");
-    bench.send("/dpm/exposure", &[1.25]);
+    let bench = Bench::new("127.0.0.1", Some(TOKEN));
+    let with_token = |name: &str| format!("/dpm/token/{TOKEN}/{name}");
+    bench.send(&with_token("exposure"), &[1.25]);
     bench.wait("exposure", || bench.exposure() == 1.25);
-    for (address, order) in
-        [("/dpm/freeze", Order::Freeze), ("/dpm/black", Order::Black), ("/dpm/safe", Order::Safe)]
-    {
-        bench.send(address, &[1.0]);
+    for (address, order) in [
+        (with_token("freeze"), Order::Freeze),
+        ("/dpm/black".into(), Order::Black),
+        ("/dpm/safe".into(), Order::Safe),
+    ] {
+        bench.send(&address, &[1.0]);
         let mut taken = None;
-        bench.wait(address, || {
+        bench.wait(&address, || {
             taken = taken.or(bench.monitor.take_order());
             taken.is_some()
         });
         assert_eq!(taken, Some(order));
     }
     let mut notes = Vec::new();
-    bench.send("/dpm/arm", &[1.0]);
+    bench.send(&with_token("arm"), &[1.0]);
     // A release of a button, and what follows it in order.
     bench.send("/dpm/black", &[0.0]);
-    bench.send("/dpm/exposure", &[0.0]);
+    bench.send(&with_token("exposure"), &[0.0]);
     bench.wait("refusals", || {
         notes.extend(bench.monitor.take_notes());
         notes.iter().any(|n| n.contains("must be 0.000001"))
@@ -81,9 +89,37 @@ fn parameters_and_dark_orders_are_carried_out_and_arm_is_not() {
     assert!(notes.iter().any(|n| n.contains("ARM is never") || n.contains("and 1 more")), "{notes:?}");
 }
 
+/// Found in use, R5 and R14: any user of the machine could set the exposure.
+#[test]
+fn without_the_right_token_osc_only_makes_dark() {
+    let wrong = format!("/dpm/token/{}/", TOKEN.replace('X', "x"));
+    for (token, prefix) in
+        [(None, "/dpm/"), (None, "/dpm/token/abc-012345-XYZ/"), (Some(TOKEN), "/dpm/"), (Some(TOKEN), &wrong)]
+    {
+        let bench = Bench::new("127.0.0.1", token);
+        let before = bench.exposure();
+        bench.send(&format!("{prefix}exposure"), &[1.25]);
+        bench.send(&format!("{prefix}freeze"), &[1.0]);
+        bench.send(&format!("{prefix}black"), &[1.0]);
+        let mut orders = Vec::new();
+        bench.wait("black", || {
+            orders.extend(bench.monitor.take_order());
+            orders.contains(&Order::Black)
+        });
+        // What came before it was refused.
+        assert_eq!((orders, bench.exposure()), (vec![Order::Black], before));
+        let mut notes = Vec::new();
+        bench.wait("refusal", || {
+            notes.extend(bench.monitor.take_notes());
+            notes.iter().any(|note| note.contains("osc.token"))
+        });
+        assert!(!notes.iter().any(|note| note.contains("012345")), "{notes:?}");
+    }
+}
+
 #[test]
 fn a_flood_of_anything_is_told_in_few_notes_and_black_still_arrives() {
-    let bench = Bench::new("127.0.0.1");
+    let bench = Bench::new("127.0.0.1", None);
     for k in 0..3000u32 {
         let _ = bench.to.send(&k.to_be_bytes().repeat(k as usize % 100));
     }
@@ -98,10 +134,11 @@ fn a_flood_of_anything_is_told_in_few_notes_and_black_still_arrives() {
 
 #[test]
 fn a_sender_that_is_not_listed_is_not_heard() {
-    let bench = Bench::new("127.0.0.1");
+    let bench = Bench::new("127.0.0.1", None);
     let mut ear = Ear {
         socket: UdpSocket::bind("127.0.0.1:0").unwrap(),
         from: vec!["192.0.2.7".parse().unwrap()],
+        token: None,
         monitor: bench.monitor.clone(),
         orders: {
             let identity = Identity::of(&ProjectorBackend::Mock(MockProjectorConfig::default()));
@@ -117,11 +154,17 @@ fn a_sender_that_is_not_listed_is_not_heard() {
         ("[2001:db8::1]:9", false),
         ("192.0.2.7:9", true),
         ("[::ffff:192.0.2.7]:9", true),
-        ("127.0.0.9:9", true),
+        // This machine is as every other one where machines are named.
+        ("127.0.0.9:9", false),
     ] {
         ear.hear(black, from.parse().unwrap());
         assert_eq!(bench.monitor.take_order().is_some(), is_heard, "{from}");
     }
-    assert_eq!(ear.refused.count, 2);
+    assert_eq!(ear.refused.count, 3);
+    ear.from.clear();
+    for (from, is_heard) in [("127.0.0.9:9", true), ("[::1]:9", true), ("192.0.2.7:9", false)] {
+        ear.hear(black, from.parse().unwrap());
+        assert_eq!(bench.monitor.take_order().is_some(), is_heard, "{from}");
+    }
     drop(bench.osc);
 }

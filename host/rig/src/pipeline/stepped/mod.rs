@@ -366,8 +366,8 @@ impl Running {
         let facts = Arc::new(Facts::new(rig.clone(), monitor, options, &lead, now));
         let (lights_in, lights) = light_channel();
         let (notes_in, notes) = note_channel(&rig, &run.monitor);
-        let keeper =
-            LinkKeeper::new(time, &link, Some((lights_in.notes, rig.config.projector.light_delay_ns())));
+        let told = (lights_in.notes, rig.config.projector.light_delay_ns());
+        let keeper = LinkKeeper::new(time, &link, rig.bodies.len(), Some(told));
         let stage = LinkStage::new(facts.clone(), link, keeper, lead);
         let mut line = Line::new(stage, notes_in, now);
         let tracker = run.machine.opens_tracker(now);

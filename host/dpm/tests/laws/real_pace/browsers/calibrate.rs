@@ -5,10 +5,9 @@
 
 use crate::browser;
 use crate::browser::{Browser, PATIENCE};
-use crate::cli_common::{own_folder, start, Folder};
+use crate::cli_common::{code, dpm, err, out, own_folder, start, Folder};
 use crate::link_common::{raster, served_time, Projector, PtyProjector};
 use hil_mock::projector::MockConfig;
-use serde_json::json;
 use std::net::TcpListener;
 use std::path::{Path, PathBuf};
 
@@ -47,7 +46,7 @@ fn text_of(browser: &mut Browser, what: &str) -> String {
 /// The steps as they stand there without a token, and by keys alone.
 fn look(browser: &mut Browser, rig: &str) {
     browser.wait("steps", "document.querySelectorAll('#steps section').length === 9");
-    browser.wait("refusal", "!document.getElementById('token').hidden");
+    browser.wait("refusal", "!document.getElementById('keyless').hidden");
     assert_eq!(browser.value("[...document.querySelectorAll('.run')].every(b => b.disabled)"), true);
     assert_eq!(text_of(browser, "section.next h3"), "Sharpen and aim the picture");
     assert_eq!(text_of(browser, "section.next code"), format!("dpm pattern focus-star {rig}"));
@@ -111,7 +110,7 @@ fn the_page_leads_through_a_calibration() {
     let address = TcpListener::bind("127.0.0.1:0").unwrap().local_addr().unwrap().to_string();
     let mut page = start(&["calibrate", "page", &rig, "--listen", &address]);
     page.wait_for_line(PATIENCE, |line| {
-        assert!(!line.contains("token="), "a log is no place for the token: {line}");
+        assert!(!line.contains("key="), "a log is no place for the key: {line}");
         line.contains("page: http")
     });
     let mut browser = Browser::open(program, &own_folder("browser"), &format!("http://{address}/"));
@@ -119,9 +118,9 @@ fn the_page_leads_through_a_calibration() {
     look(&mut browser, &rig);
     check_layout(&mut browser, 1280);
     browser.picture(&pictures.join("desktop-whole.png"), true);
-    let token = std::fs::read_to_string(own_folder("state").join("page.token")).unwrap();
-    browser.value(&format!("location.hash = '#token={}'", token.trim()));
-    browser.call("Page.reload", json!({}));
+    let link = dpm(&["page", &address], &[]);
+    assert_eq!(code(&link), 0, "{}", err(&link));
+    browser.value(&format!("location.hash = '{}'", out(&link).trim().split_once('#').unwrap().1));
     browser.wait("buttons", "document.querySelector('.run') && !document.querySelector('.run').disabled");
     light_and_dark(&mut browser, &projector);
     // A tracker that does not answer is told as on a terminal.

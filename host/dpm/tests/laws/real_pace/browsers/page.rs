@@ -6,7 +6,7 @@
 use crate::browser;
 use crate::browser::{Browser, PATIENCE};
 use crate::cli_common;
-use crate::cli_common::{own_folder, start_with};
+use crate::cli_common::{code, dpm, err, out, own_folder, start_with};
 use std::net::TcpListener;
 use std::path::PathBuf;
 use std::time::{Duration, Instant};
@@ -74,9 +74,9 @@ fn change_exposure(browser: &mut Browser) {
     browser.wait("use", "document.getElementById('used').textContent === 'in use, not saved'");
     wait_for_light(browser, "darker light", |mean| mean > 0.0 && mean < 0.5 * before);
     browser.press("b");
-    browser.wait("state", "document.getElementById('state').textContent === 'BLACK'");
+    browser.wait("state", "document.getElementById('state').textContent === 'DARK BY ORDER'");
     browser.press("a");
-    browser.wait("state", "document.getElementById('state').textContent === 'UP'");
+    browser.wait("state", "document.getElementById('state').textContent === 'LIT'");
     browser.value("document.getElementById('save').click()");
     browser.wait("refusal", &format!("{told}.includes('has no rig file')"));
     browser.press("u");
@@ -103,15 +103,16 @@ fn the_page_shows_the_rig_obeys_its_operator_and_comes_back() {
     std::fs::create_dir_all(&pictures).unwrap();
     let mut first = rig(&address);
     first.wait_for_line(PATIENCE, |line| {
-        assert!(!line.contains("token="), "a log is no place for the token: {line}");
+        assert!(!line.contains("key="), "a log is no place for the key: {line}");
         line.contains("page: http")
     });
-    let token = std::fs::read_to_string(own_folder("state").join("page.token")).unwrap();
-    let link = format!("http://{address}/#token={}", token.trim());
+    let link = dpm(&["page", &address], &[]);
+    assert_eq!(code(&link), 0, "{}", err(&link));
+    let link = out(&link).trim().to_owned();
     let mut browser = Browser::open(program, &own_folder("browser"), &link);
     browser.screen(1280, 900, false);
-    browser.wait("state", "document.getElementById('state').textContent === 'UP'");
-    assert_eq!(browser.value("location.hash"), "", "the token stays in the address");
+    browser.wait("state", "document.getElementById('state').textContent === 'LIT'");
+    assert_eq!(browser.value("location.hash"), "", "the key stays in the address");
     browser.wait("buttons", "!document.getElementById('black').disabled");
     wait_for_light(&mut browser, "light", |mean| mean > 1.0);
     browser.wait("bodies", "document.querySelectorAll('#bodies tr').length === 2");
@@ -127,7 +128,7 @@ fn the_page_shows_the_rig_obeys_its_operator_and_comes_back() {
         "answer",
         "document.getElementById('answer').textContent.startsWith('BLACK: ok: projector black')",
     );
-    browser.wait("state", "document.getElementById('state').textContent === 'BLACK'");
+    browser.wait("state", "document.getElementById('state').textContent === 'DARK BY ORDER'");
     wait_for_light(&mut browser, "dark", |mean| mean == 0.0);
     browser.picture(&pictures.join("desktop-black.png"), false);
     browser.press("a");
@@ -146,7 +147,7 @@ fn the_page_shows_the_rig_obeys_its_operator_and_comes_back() {
     browser.picture(&pictures.join("phone-whole.png"), true);
     browser.click("safe");
     browser.wait("answer", "document.getElementById('answer').textContent.startsWith('SAFE: ok: ')");
-    browser.wait("state", "document.getElementById('state').textContent === 'SAFE'");
+    browser.wait("state", "document.getElementById('state').textContent === 'DARK BY ORDER'");
     wait_for_light(&mut browser, "dark", |mean| mean == 0.0);
     assert_eq!(browser.complaints, Vec::<String>::new());
 
@@ -158,7 +159,7 @@ fn the_page_shows_the_rig_obeys_its_operator_and_comes_back() {
     let mut second = rig(&address);
     second.wait_for_line(PATIENCE, |line| line.contains("page: http"));
     browser.wait("return", "!document.body.classList.contains('stale')");
-    browser.wait("state", "document.getElementById('state').textContent === 'SAFE'");
+    browser.wait("state", "document.getElementById('state').textContent === 'DARK BY ORDER'");
     browser.wait("buttons", "!document.getElementById('arm').disabled");
     browser.click("arm");
     browser

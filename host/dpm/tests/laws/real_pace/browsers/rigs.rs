@@ -60,7 +60,7 @@ fn the_overview_shows_every_rig_and_says_which_one_is_gone() {
     browser.screen(1280, 800, false);
     browser.wait("summary", &is_summary("3 rigs, 2 lit, 1 without contact"));
     for k in 0..2 {
-        browser.wait("state", &format!("{} === 'UP'", part(k, ".word")));
+        browser.wait("state", &format!("{} === 'LIT'", part(k, ".word")));
         browser.wait("rate", &format!("parseFloat({}) > 0", part(k, ".v")));
         browser.wait("bodies", &format!("{}.includes('all 2 bodies lit')", part(k, "ul")));
     }
@@ -72,7 +72,7 @@ fn the_overview_shows_every_rig_and_says_which_one_is_gone() {
     // A phone, while one rig is black.
     let black = dpm(&["black", "--pid", &first.id().to_string()], &[]);
     assert_eq!(code(&black), 0, "{}", err(&black));
-    browser.wait("black", &format!("{} === 'BLACK'", part(0, ".word")));
+    browser.wait("black", &format!("{} === 'DARK BY ORDER'", part(0, ".word")));
     browser.wait("summary", &is_summary("3 rigs, 1 lit, 1 without contact"));
     browser
         .wait("no light", &format!("{}.includes('no light; the tracker sees all 2 bodies')", part(0, "ul")));
@@ -97,7 +97,7 @@ fn the_overview_shows_every_rig_and_says_which_one_is_gone() {
     browser.wait("focus", "document.activeElement === document.querySelector('article a')");
     browser.press("Enter");
     let is_rig = format!("location.host === '{left}' && document.getElementById('state')?.textContent");
-    browser.wait("page of the rig", &format!("({is_rig}) === 'BLACK'"));
+    browser.wait("page of the rig", &format!("({is_rig}) === 'DARK BY ORDER'"));
     // Not at once: a page that is left answers nothing.
     browser.value("void setTimeout(() => history.back(), 50)");
     browser.wait("overview", &is_summary("3 rigs, 0 lit, 2 without contact"));
