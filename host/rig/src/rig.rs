@@ -88,8 +88,8 @@ impl RigError {
                     .into(),
             ),
             Self::Picture { .. } => ("pictures", "name another picture there, or leave the key out".into()),
-            Self::Motion { index, .. } | Self::MotionTable { index, .. } => {
-                ("motion", format!("correct scene.bodies.{index}.motion, see docs/CONFIG.md"))
+            Self::Motion { name, .. } | Self::MotionTable { name, .. } => {
+                ("motion", format!("correct the motion of {name:?} in the rig file, see docs/CONFIG.md"))
             }
             Self::Calibration(e) if e.key == "calibration.file" => {
                 ("calibration", "measure again with `dpm calibrate`, or leave calibration.file out".into())
