@@ -46,14 +46,14 @@ fn after(crews: usize, monitor: &RunMonitor, notes: &mut Vec<String>) -> (usize,
             return (threads.values().sum(), bytes);
         }
         assert!(begin.elapsed() < PATIENCE, "{made} recoveries: {threads:?}, {notes:#?}");
-        std::thread::sleep(Duration::from_millis(2));
+        std::thread::sleep(Duration::from_millis(50));
     }
 }
 
 fn recovers(gpu: &Arc<Gpu>) {
     let flags =
         ["real_time.pace=\"real\"", "projector.frame_rate=30", "render.method=\"full\"", "render.spp=1"];
-    let rig = demo_rig(48, 32, &flags);
+    let rig = demo_rig(24, 16, &flags);
     let stall = Stall { stage: StallIn::Crew, frame: 30, length: STALL, times: RECOVERIES, every: EVERY };
     let options = RunOptions { stall: Some(stall), ..RunOptions::default() };
     let monitor = Arc::new(RunMonitor::default());

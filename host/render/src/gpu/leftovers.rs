@@ -6,9 +6,10 @@ use ash::vk;
 use dpm_handoff::path::Lock;
 use std::sync::atomic::{AtomicU64, Ordering};
 use std::sync::{Arc, MutexGuard, PoisonError};
+use std::time::Duration;
 
-/// How long one wait for a submission takes, nanoseconds.
-const WAIT_NS: u64 = 50_000_000;
+/// Time between two looks at a submission. Between them the thread is not in the driver, which a process that ends may take away.
+const LOOK: Duration = Duration::from_millis(20);
 
 /// Devices whose leftovers are waited for.
 static WAITED_FOR: AtomicU64 = AtomicU64::new(0);
@@ -62,8 +63,12 @@ impl Gpu {
             return;
         }
         let gpu = self.clone();
-        let waits =
-            std::thread::Builder::new().name("dpm-gpu-left".into()).spawn(move || gpu.wait_for_leftovers());
+        let waits = std::thread::Builder::new().name("dpm-gpu-left".into()).spawn(move || {
+            gpu.wait_for_leftovers();
+            // Where nobody else has it, this closes the device.
+            drop(gpu);
+            WAITED_FOR.fetch_sub(1, Ordering::Relaxed);
+        });
         // Without a thread the fences stay, and so does what they guard.
         list.is_waited_for = waits.is_ok();
         if list.is_waited_for {
@@ -72,17 +77,14 @@ impl Gpu {
     }
 
     /// Waits until nothing is left.
-    fn wait_for_leftovers(self: Arc<Self>) {
+    fn wait_for_leftovers(&self) {
         loop {
             let Some(fence) = self.leftovers.list().pending.first().copied() else { return };
             // SAFETY: nobody else has the fence any more.
-            let waited = unsafe { self.device.wait_for_fences(&[fence], true, WAIT_NS) };
-            if waited == Err(vk::Result::TIMEOUT) {
-                continue;
-            }
+            let ended = unsafe { self.device.get_fence_status(fence) };
             // It has ended, or the device is lost. Any other error says nothing, so that everything stays as it is.
-            if !matches!(waited, Ok(()) | Err(vk::Result::ERROR_DEVICE_LOST)) {
-                std::thread::sleep(std::time::Duration::from_nanos(WAIT_NS));
+            if !matches!(ended, Ok(true) | Err(vk::Result::ERROR_DEVICE_LOST)) {
+                std::thread::sleep(LOOK);
                 continue;
             }
             // SAFETY: as above.
@@ -93,12 +95,9 @@ impl Gpu {
                 let all = std::mem::take(&mut list.destroy);
                 list.is_waited_for = false;
                 drop(list);
-                all.into_iter().for_each(|destroy| destroy(&self));
-                WAITED_FOR.fetch_sub(1, Ordering::Relaxed);
-                tracing::info!(
-                    "{} has finished what was left to it, and its memory is free again",
-                    self.summary().name
-                );
+                all.into_iter().for_each(|destroy| destroy(self));
+                let name = &self.summary().name;
+                tracing::info!("{name} has finished what was left to it, and its memory is free again");
                 return;
             }
         }

@@ -49,11 +49,6 @@ pub(crate) enum Trouble {
 }
 
 impl Trouble {
-    /// True if threads of the crew may never return.
-    fn hangs(&self) -> bool {
-        matches!(self, Self::Hung(_) | Self::Failed(PipelineError::GpuHangs { .. }))
-    }
-
     /// A stage that hangs may do so in a call of the GPU's driver: whoever makes the next crew asks the GPU.
     fn remake(&self) -> Remake {
         match self {
@@ -94,11 +89,8 @@ pub(crate) enum Remake {
 pub(crate) enum Verdict {
     /// The run ends; the crew ends by itself.
     End,
-    /// The crew is abandoned; its threads may never return if `hangs`. Then a new crew is made, or with `None` the
-    /// run ends.
+    /// The crew is abandoned. Then a new crew is made, or with `None` the run ends.
     Abandon {
-        /// Threads are left behind.
-        hangs: bool,
         /// How to make the next crew.
         remake: Option<Remake>,
     },
@@ -308,15 +300,15 @@ impl Supervision {
             facts.fail(trouble.into_error());
             return Verdict::End;
         }
-        let (hangs, remake) = (trouble.hangs(), trouble.remake());
+        let remake = trouble.remake();
         if facts.monitor.stop_requested() {
             // The light ends anyway, and nothing of the run is lost by it.
             facts.monitor.note(format!("{}, while the run ends", trouble.in_words()));
-            return Verdict::Abandon { hangs, remake: None };
+            return Verdict::Abandon { remake: None };
         }
         if facts.is_complete.load(Ordering::Acquire) {
             facts.fail(trouble.into_error());
-            return Verdict::Abandon { hangs, remake: None };
+            return Verdict::Abandon { remake: None };
         }
         let (budget, most) = match remake {
             Remake::Crew => (&mut self.hung, MOST_HUNG),
@@ -324,7 +316,7 @@ impl Supervision {
         };
         if budget.lost(now) == AfterLoss::GiveUp {
             facts.fail(PipelineError::KeepsFailing { most, last: trouble.into_error().to_string() });
-            return Verdict::Abandon { hangs, remake: None };
+            return Verdict::Abandon { remake: None };
         }
         let bound = match remake {
             Remake::Crew => String::new(),
@@ -343,7 +335,7 @@ impl Supervision {
         self.is_back = false;
         facts.monitor.light_gauge().set_restarts(true);
         self.made_by = now.plus_ns(MADE_WITHIN_NS);
-        Verdict::Abandon { hangs, remake: Some(remake) }
+        Verdict::Abandon { remake: Some(remake) }
     }
 
     /// A new crew is not ready yet. True while the run waits for it. Otherwise the run ends or has ended, and `Making::Waits`

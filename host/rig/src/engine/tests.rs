@@ -396,17 +396,17 @@ fn three_lost_gpus_a_minute_are_made_good_and_many_more_stages_that_hang() {
     for second in 0..20 {
         // The GPU is asked whether it hangs too, and is kept if it answers.
         let verdict = mind.judge(Trouble::Hung(["tracking", "plan", "pack"][second % 3]), at(second as i64));
-        assert_eq!(verdict, Verdict::Abandon { hangs: true, remake: Some(Remake::Crew) });
+        assert_eq!(verdict, Verdict::Abandon { remake: Some(Remake::Crew) });
     }
     bench.facts.monitor.take_notes();
     for second in 20..23 {
         let verdict = mind.judge(gpu(), at(second));
-        assert_eq!(verdict, Verdict::Abandon { hangs: true, remake: Some(Remake::CrewAndGpu) });
+        assert_eq!(verdict, Verdict::Abandon { remake: Some(Remake::CrewAndGpu) });
         let notes = bench.facts.monitor.take_notes().join("\n");
         assert!(notes.contains("within 2 s") && notes.contains("after 180 s the run ends"), "{notes}");
         assert!(bench.facts.take_error().is_none(), "the run goes on");
     }
-    assert_eq!(mind.judge(gpu(), at(24)), Verdict::Abandon { hangs: true, remake: None });
+    assert_eq!(mind.judge(gpu(), at(24)), Verdict::Abandon { remake: None });
     assert!(matches!(bench.facts.take_error(), Some(PipelineError::KeepsFailing { most: 3, .. })));
     assert!(bench.facts.monitor.stop_requested());
 }
@@ -416,7 +416,7 @@ fn a_stage_that_hangs_every_other_second_ends_the_run_in_the_end() {
     let bench = bench(&[], RunOptions::default());
     let mut mind = supervision(&bench.facts);
     let judged = |k: i64| mind.judge(Trouble::Hung("pack"), HostTime(2_000 * MS * k));
-    let ended = (0..40).map(judged).position(|v| v == Verdict::Abandon { hangs: true, remake: None });
+    let ended = (0..40).map(judged).position(|v| v == Verdict::Abandon { remake: None });
     assert_eq!(ended, Some(20));
     assert!(matches!(bench.facts.take_error(), Some(PipelineError::KeepsFailing { most: 20, .. })));
 }
@@ -432,7 +432,7 @@ fn a_stop_during_a_recovery_is_no_failure() {
     assert!(!mind.waits_for(Making::Waits, HostTime(2 * MS)), "nobody waits for the crew");
     let gpu = PipelineError::GpuHangs { frame: 7, ms: 100 };
     let verdict = mind.judge(Trouble::Failed(gpu), HostTime(3 * MS));
-    assert_eq!(verdict, Verdict::Abandon { hangs: true, remake: None });
+    assert_eq!(verdict, Verdict::Abandon { remake: None });
     mind.tell_of_recovery(None);
     assert!(bench.facts.take_error().is_none());
     let recoveries = bench.facts.recoveries();
@@ -517,7 +517,7 @@ fn a_panic_and_a_failure_at_the_end_are_not_made_good() {
     assert!(matches!(bench.facts.take_error(), Some(PipelineError::Panicked("plan"))));
     // The first failure requested a stop, so no further crew is made.
     let verdict = mind.judge(Trouble::Hung("plan"), HostTime(MS));
-    assert_eq!(verdict, Verdict::Abandon { hangs: true, remake: None });
+    assert_eq!(verdict, Verdict::Abandon { remake: None });
 }
 
 #[test]

@@ -166,7 +166,7 @@ impl Shortage {
 /// Who is working.
 enum Shift {
     /// A crew.
-    Works(Crew),
+    Works(Box<Crew>),
     /// Nobody; a new crew is being made, by a thread that may hang in a driver.
     IsMade,
     /// Nobody, and no crew will follow.
@@ -179,7 +179,7 @@ impl Supervisor {
         let shared = self.shared.clone();
         let clock = shared.clock.sleeping();
         let mut shortage = Shortage::new(&shared.collector_pulse);
-        let mut shift = Shift::Works(crew);
+        let mut shift = Shift::Works(Box::new(crew));
         let mut last = clock.now();
         while !shared.is_link_over.load(Ordering::Acquire) {
             std::thread::sleep(LOOK);
@@ -242,7 +242,7 @@ impl Supervisor {
                 // There is room: the link takes ports within a millisecond, and crews are seconds apart.
                 let _ = self.ports.push(port);
                 self.mind.is_remade();
-                Shift::Works(crew)
+                Shift::Works(Box::new(crew))
             }
             Err(error) => {
                 self.shared.facts.fail(error);
@@ -252,13 +252,13 @@ impl Supervisor {
     }
 
     /// Abandons a crew that is in trouble and starts making a new one, if that can help.
-    fn replace(&mut self, crew: Crew, trouble: Trouble, now: HostTime) -> Shift {
+    fn replace(&mut self, crew: Box<Crew>, trouble: Trouble, now: HostTime) -> Shift {
         let remake = match self.mind.judge(trouble, now) {
             Verdict::End => return Shift::Works(crew),
-            Verdict::Abandon { remake, .. } => remake,
+            Verdict::Abandon { remake } => remake,
         };
         let state = crew.state.clone();
-        self.wreckage.take(crew);
+        self.wreckage.take(*crew);
         let Some(remake) = remake else { return Shift::Over };
         match self.workshop.order(&self.maker, remake, state) {
             Ok(()) => Shift::IsMade,

@@ -453,7 +453,7 @@ impl Running {
         let Some(trouble) = crew.trouble(now, step_ns) else { return self.mind.is_well(now) };
         match self.mind.judge(trouble, now) {
             Verdict::End => crew.ends(),
-            Verdict::Abandon { remake, .. } => {
+            Verdict::Abandon { remake } => {
                 self.line.abandoned();
                 self.crew = None;
                 self.making = remake.map(|remake| {
