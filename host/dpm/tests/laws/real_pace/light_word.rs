@@ -187,9 +187,13 @@ fn a_start_by_hand_a_lost_body_a_hung_stage_and_a_silent_tracker_are_called_by_t
     asked.agrees("DARK BY ORDER");
     order("arm", &run);
     asked.agrees("PARTLY LIT");
-    // A stage hangs, and is replaced.
-    let (thread, _) = threads(run.id()).into_iter().find(|(_, name)| name == "dpm-pack").expect("it runs");
-    let stopped = Stopped::new(thread).expect("it may be traced");
+    // A stage hangs, and so does the supervisor, which would replace it before the light had been gone for a second.
+    let all = threads(run.id());
+    let stopped = ["dpm-supervisor", "dpm-pack"].map(|wanted| {
+        let (thread, _) =
+            all.iter().find(|(_, name)| name == wanted).unwrap_or_else(|| panic!("{wanted}: {all:?}"));
+        Stopped::new(*thread).expect("it may be traced")
+    });
     asked.agrees("STALLED");
     drop(stopped);
     asked.agrees("PARTLY LIT");
