@@ -13,6 +13,8 @@ const LONG: Duration = Duration::from_secs(120);
 
 /// Runs the program to its end; its exit code, the processor time of the process with all its threads in seconds, and its
 /// standard error stream.
+// wait4 takes its end, with what it cost.
+#[allow(clippy::zombie_processes)]
 fn costs(args: &[&str], variables: &[(&str, &str)]) -> (i32, f64, String) {
     let mut command = command(args);
     command.envs(variables.iter().copied()).env_remove("DISPLAY").env_remove("WAYLAND_DISPLAY");
