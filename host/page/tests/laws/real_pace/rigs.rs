@@ -55,7 +55,8 @@ impl Fake {
         let begin = Instant::now();
         Self::serve(move |mut stream| {
             let up = begin.elapsed().as_secs_f64() + 10.0;
-            let text = STATE.replace("UP", &up.to_string()).replace("FRAMES", &((up * 50.0) as u64).to_string());
+            let text =
+                STATE.replace("UP", &up.to_string()).replace("FRAMES", &((up * 50.0) as u64).to_string());
             let _ = stream.write_all(http("200 OK", &text.replace("LONG", &"long ".repeat(1000))).as_bytes());
         })
     }
