@@ -12,6 +12,7 @@ pub mod calibration;
 mod connections;
 mod events;
 mod guard;
+mod hex;
 pub mod metrics;
 pub mod notes;
 mod orders;

@@ -1,7 +1,8 @@
 //! Whether what listens at an address is the rig whose token is here.
 
 use crate::guard::{NUMBER, PROOF};
-use crate::proof::{hex, verifies_answer, Key};
+use crate::hex::hex;
+use crate::proof::{verifies_answer, Key};
 use crate::token::Token;
 use std::io::{self, Read, Write};
 use std::net::{SocketAddr, TcpStream};

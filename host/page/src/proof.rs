@@ -9,6 +9,7 @@
 //!
 //! HMAC: RFC 2104, with SHA-256; the keys are derived by HMAC over a text each.
 
+use crate::hex::{hex, unhex};
 use crate::token::Token;
 use hmac::{Hmac, KeyInit, Mac};
 use sha2::Sha256;
@@ -72,20 +73,6 @@ impl Key {
     pub fn verifies(&self, parts: &[&[u8]], told: &str) -> bool {
         unhex(told).is_some_and(|told| self.begun(parts).verify_slice(&told).is_ok())
     }
-}
-
-/// Hexadecimal digits of bytes.
-pub(crate) fn hex(bytes: &[u8]) -> String {
-    bytes.iter().map(|b| format!("{b:02x}")).collect()
-}
-
-/// Bytes of hexadecimal digits in small letters; `None` if they are none.
-pub(crate) fn unhex(text: &str) -> Option<Vec<u8>> {
-    let is_digit = |b: u8| b.is_ascii_digit() || (b'a'..=b'f').contains(&b);
-    if !text.len().is_multiple_of(2) || !text.bytes().all(is_digit) {
-        return None;
-    }
-    (0..text.len() / 2).map(|k| u8::from_str_radix(&text[2 * k..2 * k + 2], 16).ok()).collect()
 }
 
 /// What a page signs: a method, a path with its query, and the rig's challenge. Such a request has no body.

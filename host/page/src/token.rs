@@ -5,7 +5,7 @@
 //! The file outlives the process, so a page that is open in a browser can still make the projector dark after the rig
 //! was restarted.
 
-use crate::proof::{hex, unhex};
+use crate::hex::{hex, unhex};
 use dpm_common::folder::{Folder, FolderError, Owner};
 use std::fmt;
 use std::fs::{File, Permissions};
