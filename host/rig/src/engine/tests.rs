@@ -292,7 +292,7 @@ impl Transport for Narrow {
 /// is dark, no fault is latched, and frames are as many as fit.
 #[test]
 fn a_cable_slower_than_its_slots_carries_every_nth_frame_steadily() {
-    for tenths in [15, 44, 125] {
+    for tenths in [15, 125] {
         let mut bench = bench_with(&["real_time.pace=\"real\""], RunOptions::default(), 4);
         let (mut plan, mut stage) = (bench.plan::<Real>(), bench.link::<Real>());
         let frame_ns = tenths * bench.slot_ns / 10;
@@ -304,7 +304,7 @@ fn a_cable_slower_than_its_slots_carries_every_nth_frame_steadily() {
         let planes = vec![0xff; BitPlaneFrame::new(raster, schedule).bytes().len()];
         let begin = bench.now;
         let mut blank_at = [0; 2];
-        while bench.now.ns_since(begin) < 4_000 * MS {
+        while bench.now.ns_since(begin) < 2_500 * MS {
             let before = bench.now;
             let mut note = bench.planned(&mut plan).expect("no end");
             let mut now = before;

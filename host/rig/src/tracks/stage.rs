@@ -437,7 +437,7 @@ mod tests {
             let gauges = TrackerGauges::default();
             gauges.begin(2);
             let mut found = Vec::new();
-            for step in 0..10_000i64 {
+            for step in 0..4_000i64 {
                 let now = HostTime(7_000_000_000 + step * 2_000_000);
                 stage.step(now, &mut publisher).expect("it speaks");
                 stage.add_counts(now, &gauges, false);
