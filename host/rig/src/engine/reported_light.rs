@@ -21,6 +21,8 @@ struct Content {
     frame: u32,
     /// At least one mirror is lit in one of its planes.
     has_light: bool,
+    /// It is dark because the head of somebody who is tracked is lost.
+    head_lost: bool,
 }
 
 /// Reads the reports of the projector, one session after the other. Its memory is taken at the start.
@@ -36,6 +38,8 @@ pub(crate) struct ReportedLight {
     last: Option<(DeviceTicks, u32)>,
     mirrors_lit_at: HostTime,
     frame_lit_at: HostTime,
+    /// When a frame was lit last that is dark for a lost head.
+    head_lost_at: HostTime,
     sent_at: HostTime,
     was_armed: bool,
 }
@@ -51,6 +55,7 @@ impl ReportedLight {
             last: None,
             mirrors_lit_at: NEVER,
             frame_lit_at: NEVER,
+            head_lost_at: NEVER,
             sent_at: NEVER,
             was_armed: false,
         }
@@ -60,7 +65,8 @@ impl ReportedLight {
     pub(crate) fn sent(&mut self, plan: &FramePlan, has_light: bool, now: HostTime) {
         let place = self.next;
         self.next = (self.next + 1) % REMEMBERED;
-        self.sent[place] = Some(Content { frame: plan.id.0 as u32, has_light });
+        self.sent[place] =
+            Some(Content { frame: plan.id.0 as u32, has_light, head_lost: plan.eyes.lost.is_some() });
         self.sent_at = now;
         let bodies = self.body_lit_at.len();
         let dark = self.dark[place * bodies..].iter_mut();
@@ -85,6 +91,7 @@ impl ReportedLight {
             mirrors_lit: lately(self.mirrors_lit_at),
             frames_lit: lately(self.frame_lit_at),
             frames_sent: lately(self.sent_at),
+            head_lost: lately(self.head_lost_at),
             was_armed: self.was_armed,
             is_over: false,
             standing: None,
@@ -113,6 +120,9 @@ impl ReportedLight {
             self.mirrors_lit_at = now;
         }
         let Some(place) = place else { return };
+        if self.sent[place].is_some_and(|content| content.head_lost) {
+            self.head_lost_at = now;
+        }
         let bodies = self.body_lit_at.len();
         let dark = &self.dark[place * bodies..(place + 1) * bodies];
         for (body, (lit_at, dark)) in self.body_lit_at.iter_mut().zip(dark).enumerate() {

@@ -15,6 +15,7 @@ mod bit {
     pub(super) const FRAMES_SENT: u64 = 1 << 2;
     pub(super) const WAS_ARMED: u64 = 1 << 3;
     pub(super) const IS_OVER: u64 = 1 << 4;
+    pub(super) const HEAD_LOST: u64 = 1 << 5;
     /// Above them: the order that stands, 0 for none.
     pub(super) const STANDING_SHIFT: u32 = 8;
 }
@@ -28,6 +29,8 @@ pub(crate) struct LightReport {
     pub frames_lit: bool,
     /// A frame was sent within the last second.
     pub frames_sent: bool,
+    /// A frame that is dark for a lost head was lit within the last second.
+    pub head_lost: bool,
     /// The projector was armed in this run.
     pub was_armed: bool,
     /// The run has ended its light.
@@ -75,6 +78,7 @@ impl LightGauge {
         let bits = set(seen.mirrors_lit, bit::MIRRORS_LIT)
             | set(seen.frames_lit, bit::FRAMES_LIT)
             | set(seen.frames_sent, bit::FRAMES_SENT)
+            | set(seen.head_lost, bit::HEAD_LOST)
             | set(seen.was_armed, bit::WAS_ARMED)
             | set(seen.is_over, bit::IS_OVER)
             | seen.standing.map_or(0, |order| order as u64) << bit::STANDING_SHIFT;
@@ -89,6 +93,7 @@ impl LightGauge {
             mirrors_lit: is_lit,
             frames_lit: is_lit,
             frames_sent: is_lit,
+            head_lost: false,
             was_armed,
             is_over: health == ProjectorHealth::Stopped,
             standing: match health {
@@ -156,6 +161,7 @@ impl LightGauge {
             mirrors_lit: is(bit::MIRRORS_LIT),
             frames_lit: is(bit::FRAMES_LIT),
             frames_sent: is(bit::FRAMES_SENT),
+            head_lost: is(bit::HEAD_LOST),
             some_body_dark: self.bodies.iter().any(flag),
             restarts: flag(&self.restarts),
             link_silent: flag(&self.link_silent),
@@ -177,7 +183,7 @@ mod tests {
     fn what_is_told_comes_out_as_evidence() {
         let gauge = LightGauge::default();
         assert_eq!(gauge.evidence(ProjectorHealth::Connecting), Evidence::default());
-        for k in 0..5 {
+        for k in 0..6 {
             let is = |n: u32| n == k;
             let seen = LightReport {
                 mirrors_lit: is(0),
@@ -185,16 +191,17 @@ mod tests {
                 frames_sent: is(2),
                 was_armed: is(3),
                 is_over: is(4),
-                standing: [None, Some(Order::Black), Some(Order::Freeze), Some(Order::Safe), None]
+                head_lost: is(5),
+                standing: [None, Some(Order::Black), Some(Order::Freeze), Some(Order::Safe), None, None]
                     [k as usize],
             };
             gauge.tell(&seen);
             let e = gauge.evidence(ProjectorHealth::Up);
-            let told = [e.mirrors_lit, e.frames_lit, e.frames_sent, e.was_armed, e.is_over];
-            assert_eq!(told, [0, 1, 2, 3, 4].map(is));
+            let told = [e.mirrors_lit, e.frames_lit, e.frames_sent, e.was_armed, e.is_over, e.head_lost];
+            assert_eq!(told, [0, 1, 2, 3, 4, 5].map(is));
             assert_eq!(e.standing, seen.standing);
         }
-        assert_eq!(gauge.tellings(), 5);
+        assert_eq!(gauge.tellings(), 6);
         for (body, cause) in DarkCause::ALL.into_iter().enumerate() {
             assert!(!gauge.evidence(ProjectorHealth::Up).some_body_dark);
             gauge.tell_body(body, Some(cause));

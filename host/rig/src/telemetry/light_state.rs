@@ -33,6 +33,8 @@ pub enum LightState {
 pub enum Darkness {
     /// The projector's state: gone, faulted, resting, or held dark by the interlock.
     Projector(ProjectorHealth),
+    /// Frames are lit, and all of them is dark because a tracked head is lost.
+    HeadLost,
     /// Frames are lit, and every tracked body is dark in them.
     Bodies,
     /// Frames are lit, and their pictures are black although no body is lost.
@@ -71,6 +73,8 @@ pub struct Evidence {
     pub frames_lit: bool,
     /// A frame was sent within the last second.
     pub frames_sent: bool,
+    /// A frame that is dark for a lost head was lit within the last second.
+    pub head_lost: bool,
     /// A tracked body had no light for the last second.
     pub some_body_dark: bool,
     /// The stages are being restarted.
@@ -99,6 +103,7 @@ impl LightState {
             _ if e.link_silent => Self::Stalled(Stall::LinkSilent),
             (_, health) if !e.was_armed => Self::NeverArmed(health),
             (_, ProjectorHealth::Up) if e.restarts => Self::Stalled(Stall::Restarts),
+            (_, ProjectorHealth::Up) if e.frames_lit && e.head_lost => Self::Dark(Darkness::HeadLost),
             (_, ProjectorHealth::Up) if e.frames_lit && e.some_body_dark => Self::Dark(Darkness::Bodies),
             (_, ProjectorHealth::Up) if e.frames_lit => Self::Dark(Darkness::Pictures),
             (_, ProjectorHealth::Up) if e.frames_sent => Self::Stalled(Stall::NothingLit),
@@ -149,6 +154,9 @@ impl LightState {
                 format!("{} stands; `dpm arm` shows the picture again", order.word().to_uppercase())
             }
             Self::Dark(Darkness::Projector(health)) => health.reason(),
+            Self::Dark(Darkness::HeadLost) => {
+                "a tracked head is lost, so nobody can say where eyes are; light comes back when the tracker sees it".into()
+            }
             Self::Dark(Darkness::Bodies) => return None,
             Self::Dark(Darkness::Pictures) => {
                 "the pictures are black: no body is where the projector's light can fall, or nothing lights the scene"
@@ -211,6 +219,7 @@ mod tests {
         mirrors_lit: true,
         frames_lit: true,
         frames_sent: true,
+        head_lost: false,
         some_body_dark: false,
         restarts: false,
         link_silent: false,
@@ -262,6 +271,7 @@ mod tests {
             // The tracker is silent: frames are lit, and they are black.
             (Evidence { some_body_dark: true, ..UNLIT }, L::Dark(Darkness::Bodies)),
             (UNLIT, L::Dark(Darkness::Pictures)),
+            (Evidence { head_lost: true, some_body_dark: true, ..UNLIT }, L::Dark(Darkness::HeadLost)),
             (IDLE, L::Stalled(Stall::NothingLit)),
             (Evidence { frames_sent: false, ..IDLE }, L::Stalled(Stall::NothingSent)),
             (Evidence { restarts: true, ..IDLE }, L::Stalled(Stall::Restarts)),
@@ -299,7 +309,7 @@ mod tests {
     fn the_word_says_light_exactly_where_mirrors_are_lit() {
         let healths = [H::Connecting, H::Up, H::Lost, H::Faulted(1), H::Black, H::Frozen, H::InterlockOpen];
         let orders = [None, Some(Order::Black), Some(Order::Freeze), Some(Order::Safe)];
-        for bits in 0..1u32 << 9 {
+        for bits in 0..1u32 << 10 {
             let bit = |k: u32| bits >> k & 1 == 1;
             for projector in healths {
                 for standing in orders {
@@ -315,6 +325,7 @@ mod tests {
                         restarts: bit(6),
                         link_silent: bit(7),
                         is_over: bit(8),
+                        head_lost: bit(9),
                     };
                     let state = L::of(&e);
                     assert_eq!(state.is_lit(), e.mirrors_lit && !e.link_silent && !e.is_over, "{e:?}");
