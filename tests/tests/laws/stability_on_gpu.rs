@@ -12,13 +12,14 @@ use glam::{DVec3, Vec3};
 
 /// Cases that take several seconds each, and whose law another case holds as well. They are of the second tier, which runs
 /// all cases, with validation. `tests/mutations/run` reads this list.
-pub(crate) const SLOW: [&str; 11] = [
+pub(crate) const SLOW: [&str; 12] = [
     "gpu-constant-input",
     "gpu-energy-of-every-lobe",
     "gpu-lights-that-touch",
     "gpu-mean-in-motion",
     "gpu-mean-in-motion-metal",
     "gpu-no-light",
+    "gpu-random-scenes-mean",
     "gpu-random-scenes-pixels",
     "gpu-random-scenes-surfaces",
     "gpu-rates-keep-energy",

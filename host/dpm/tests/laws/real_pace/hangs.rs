@@ -187,7 +187,7 @@ fn fifty_recoveries_leave_nothing_behind_and_a_stop_during_one_writes_the_report
     let text = include_str!("../../../../../rigs/mock.toml")
         .replace("listen = \"127.0.0.1:8947\"", "listen = \"127.0.0.1:0\"");
     let path = folder.write("rig.toml", &text);
-    let mut run = start(&["run", &path, "--out", &folder.text()]);
+    let mut run = start(&["run", &path, "--out", folder.text()]);
     let id = run.id();
     let crew = ["dpm-plan", "dpm-pack", "dpm-tracking"];
     let newest = |name: &str| threads(id).into_iter().rfind(|(_, n)| n == name).map(|(thread, _)| thread);
