@@ -2,6 +2,7 @@
 //! projector hangs on a serial line, the bytes are on [`crate::line`] instead.
 
 use crate::dice::Dice;
+use crate::guard::stretched;
 use crate::line::{Echo, SerialLine};
 use dpm_device::link::Packet;
 use dpm_device::time::HostTime;
@@ -91,6 +92,8 @@ pub struct Cable {
     pub disturbed: bool,
     dice: Dice,
     spare: Vec<Vec<u8>>,
+    /// Light of frames ends so many ticks later than the host says.
+    pub stretch: u64,
     /// The most transfers that ever waited in either direction.
     pub longest: usize,
 }
@@ -116,6 +119,7 @@ impl Cable {
             disturbed: false,
             dice: Dice::new(seed, 0xcab1e),
             spare: Vec::new(),
+            stretch: 0,
             longest: 0,
         }
     }
@@ -219,7 +223,8 @@ impl Cable {
         self.disturbed |= is_bad || faults.short > 0.0;
         for packet in packets {
             let from = bytes.len();
-            bytes.extend(packet.to_vec());
+            let told = (self.stretch > 0).then(|| stretched(packet, self.stretch)).flatten();
+            bytes.extend(told.unwrap_or_else(|| packet.to_vec()));
             if !is_bad {
                 continue;
             }

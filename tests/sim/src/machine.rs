@@ -145,6 +145,8 @@ pub struct Beneath {
     pub process: u64,
     /// Stages take longer by this factor, in thousandths.
     pub load_milli: i64,
+    /// Steps of the link take so much longer, nanoseconds.
+    pub link_late_ns: i64,
     /// The GPU's time of a usual frame, nanoseconds.
     pub frame_ns: i64,
     /// Frames that were sent and not looked at yet.
@@ -165,6 +167,7 @@ impl Beneath {
             open_traps: VecDeque::new(),
             process: 0,
             load_milli: 1000,
+            link_late_ns: 0,
             frame_ns,
             sent: VecDeque::new(),
             crew_ready_at: 0,
@@ -209,7 +212,8 @@ impl Machine for SimMachine {
             Part::Collector => COLLECTOR_US,
         };
         let load_milli = beneath.load_milli;
-        let ns = drawn(&mut beneath.dice, quantiles) * load_milli / 1000;
+        let late_ns = if part == Part::Link { beneath.link_late_ns } else { 0 };
+        let ns = drawn(&mut beneath.dice, quantiles) * load_milli / 1000 + late_ns;
         if !beneath.traps.is_empty() {
             if let Some(i) = beneath.traps.iter().position(|(of, _)| *of == part) {
                 return match beneath.traps.remove(i).1 {

@@ -264,13 +264,7 @@ impl World {
         let now = HostTime(self.t);
         match kind {
             K::U8 => {
-                self.projector.power_cycle(now);
-                self.see_light();
-                self.new_projector();
-                self.boot_noise();
-                if self.projector.status().faults == 0 {
-                    self.laws.acknowledged();
-                }
+                self.lose_memory();
                 self.lasts(kind, MS, Undo::Nothing);
             }
             K::U11 => {
@@ -294,6 +288,17 @@ impl World {
                 self.again(kind, dice.bits(), rounds);
                 self.lasts(kind, i64::from(rounds) * 10 * MS, Undo::Nothing);
             }
+        }
+    }
+
+    /// The projector loses its power for a moment.
+    pub(crate) fn lose_memory(&mut self) {
+        self.projector.power_cycle(HostTime(self.t));
+        self.see_light();
+        self.new_projector();
+        self.boot_noise();
+        if self.projector.status().faults == 0 {
+            self.laws.acknowledged();
         }
     }
 
@@ -380,6 +385,7 @@ impl World {
                 let ns = dice.decades(5, 2_000) * MS;
                 self.frozen_until = self.frozen_until.max(self.t + ns);
                 self.laws.pauses(self.t, ns);
+                self.laws.stands_still(self.t, self.frozen_until);
                 return self.lasts(kind, ns, Undo::Nothing);
             }
             K::H5 => self.trap(stage, Trap::Panics),

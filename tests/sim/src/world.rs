@@ -1,7 +1,9 @@
 //! The clock, and everything that it moves: process, cable, projector, tracker, disk, service manager and person.
 
 use crate::cable::{lock, Cable};
+use crate::dice::Dice;
 use crate::disk::Disk;
+use crate::guard::{damage, first_packet, Guard};
 use crate::kinds::{Kind, State};
 use crate::laws::{Laws, BEGINS_WITHIN_NS};
 use crate::line::SerialLine;
@@ -43,6 +45,10 @@ const STARTS: usize = 5;
 const STARTS_WITHIN_NS: i64 = 60 * S;
 /// How often a person who clears up looks again.
 const PERSON_NS: i64 = 300 * MS;
+/// How often a neighbour disturbs the cable, where one does ...
+const DISTURB_NS: i64 = 7 * MS;
+/// ... and for how long after the program has fallen silent: as many damaged packets as the projector bears.
+const DISTURBS_NS: i64 = 2 * S;
 /// Slots of which the shifts wait to be judged.
 const MOVES_KEPT: usize = 64;
 
@@ -65,6 +71,8 @@ pub enum Action {
     Again(Kind, u64, u32),
     /// The next episode begins.
     Episode,
+    /// A neighbour disturbs the cable.
+    Disturb,
     /// The faults of the episode strike although its state was not reached.
     Overdue(u32),
 }
@@ -169,6 +177,9 @@ pub struct World {
     pub story: VecDeque<String>,
     /// Print what happens.
     pub is_loud: bool,
+    /// A packet that a neighbour has overheard.
+    overheard: Vec<u8>,
+    neighbour: Dice,
 }
 
 /// The folder of the scene.
@@ -177,6 +188,8 @@ const ASSETS: &str = concat!(env!("CARGO_MANIFEST_DIR"), "/assets");
 fn rig_of(setup: &Setup, acknowledges: bool) -> Result<Rig, String> {
     let tracks = if setup.follows { "tracks = \"auto\"\nhorizontal_fov_deg = 20\n" } else { "" };
     let predict = setup.predict_ms.map_or(String::new(), |ms| format!("predict_ms = {ms}\n"));
+    let watchdog = setup.alone.and_then(Guard::watchdog_ms);
+    let watchdog = watchdog.map_or(String::new(), |ms| format!("watchdog_ms = {ms}\n"));
     let backend = match setup.serial {
         Some(line) => format!("kind = \"serial\", port = \"/dev/simulated\", baud = {}", line.baud),
         None => "kind = \"usb\"".into(),
@@ -191,7 +204,7 @@ fn rig_of(setup: &Setup, acknowledges: bool) -> Result<Rig, String> {
     let text = format!(
         "[tracker]\n{tracker}\nrate_hz = {}\n\
          [projector]\nwidth = {}\nheight = {}\nplanes = {}\nframe_rate = {}\nbackend = {{ {backend} }}\n{tracks}\
-         [scene]\nfile = \"triangle.gltf\"\n[[scene.bodies]]\nname = \"a\"\n[safety]\nacknowledge_faults = {acknowledges}\n{predict}",
+         [scene]\nfile = \"triangle.gltf\"\n[[scene.bodies]]\nname = \"a\"\n[safety]\nacknowledge_faults = {acknowledges}\n{predict}{watchdog}",
         setup.tracker_hz, setup.raster.0, setup.raster.1, setup.planes, setup.rate_hz
     );
     let config = RigConfig::parse("simulated.toml", &text, Path::new(ASSETS), &Overrides::default())
@@ -229,16 +242,20 @@ impl World {
         let seed = setup.seed;
         let mut cable = Cable::new(seed, setup.ns_per_byte, setup.travel_ns);
         cable.keeps_order = setup.follows;
+        let stretch_ns = setup.alone.map_or(0, Guard::stretches_ns) as u64;
+        cable.stretch = stretch_ns / 1000 * u64::from(DeviceClock::IDEAL.tick_hz) / 1_000_000;
         cable.line = setup.serial.map(|line| SerialLine::new(seed, line, setup.travel_ns));
         let laws = Laws::new(&rig, &setup);
         let tracks = setup.follows.then(|| TrackLaws::new(&rig, &setup)).transpose()?;
         let projector = projector_of(&setup, None, 0)?;
-        Ok(Self {
+        let mut beneath = Beneath::new(seed, slot_ns * setup.render_milli / 1000);
+        beneath.link_late_ns = setup.alone.map_or(0, |guard| guard.link_late_ns(slot_ns));
+        let mut world = Self {
             t: 0,
             far: setup.serial.map(|_| SerialEnd::new(&projector)),
             cable: Arc::new(Mutex::new(cable)),
             net: Arc::new(Mutex::new(Net::new(seed, kind, setup.tracker)?)),
-            beneath: Arc::new(Mutex::new(Beneath::new(seed, slot_ns * setup.render_milli / 1000))),
+            beneath: Arc::new(Mutex::new(beneath)),
             disk: Arc::default(),
             clock: Arc::default(),
             lag: Arc::default(),
@@ -272,8 +289,14 @@ impl World {
             rig,
             rig_by_hand,
             by_hand: false,
+            overheard: Vec::new(),
+            neighbour: Dice::new(seed, 0xa10e8),
             setup,
-        })
+        };
+        if world.setup.alone == Some(Guard::Watchdog) {
+            world.plan(DISTURB_NS, Action::Disturb);
+        }
+        Ok(world)
     }
 
     /// The host's clock now.
@@ -403,6 +426,7 @@ impl World {
                 Action::ClearUp => self.clear_up(),
                 Action::Again(kind, seed, round) => self.again(kind, seed, round),
                 Action::Episode => {}
+                Action::Disturb => self.disturb(),
                 Action::Overdue(episode) => self.overdue(episode),
             }
         }
@@ -463,6 +487,9 @@ impl World {
                     self.laws.heard_of_the_dead(self.t);
                 }
                 self.hear(&transfer.bytes, transfer.cut);
+            } else if self.setup.alone == Some(Guard::Watchdog) {
+                self.laws.heard_of_the_silent(self.t);
+                self.overheard = first_packet(&transfer.bytes).unwrap_or_default().to_vec();
             }
             self.projector.receive(HostTime(self.t), transfer.lane, &transfer.bytes);
             if transfer.cut {
@@ -483,6 +510,21 @@ impl World {
         if cable.plugged {
             self.projector.replies(HostTime(self.t), &mut |_, packet| cable.reply(packet));
         }
+    }
+
+    /// A neighbour sends damaged packets while the program is silent.
+    fn disturb(&mut self) {
+        self.plan(self.t + DISTURB_NS, Action::Disturb);
+        let silent_since = self.laws.silent_since();
+        let is_near = silent_since.is_some_and(|since| self.t - since < DISTURBS_NS);
+        if !is_near || !lock(&self.cable).plugged || self.overheard.is_empty() {
+            return;
+        }
+        let mut bytes = self.overheard.clone();
+        damage(&mut bytes, &mut self.neighbour);
+        self.projector.receive(HostTime(self.t), Lane::Data, &bytes);
+        self.projector.end_of_transfer(HostTime(self.t), Lane::Data);
+        self.see_light();
     }
 
     /// The laws of tracks read what is about to reach the projector on the control lane.
@@ -518,7 +560,7 @@ impl World {
             let lag = self.lag.load(Ordering::Relaxed);
             self.fold(3, event.slot ^ u64::from(event.frame.unwrap_or(u32::MAX)) << 32);
             let planes = self.projector.lit_planes();
-            self.laws.light(&event, planes, lag, &self.beneath, self.events);
+            self.laws.light(&event, planes, lag, &self.beneath, self.projector.clock());
         }
         self.see_moves();
     }
@@ -574,6 +616,7 @@ impl World {
         self.fold(4, self.t as u64);
         self.tell(|| format!("the program ends: {exit:?}"));
         self.last_words();
+        self.left_alone();
         match exit {
             // The service manager does not start it again; whoever asked for the stop does.
             Exit::InOrder => self.needs_person = true,
@@ -591,7 +634,15 @@ impl World {
         self.frozen_until = self.frozen_until.min(self.t);
         self.tell(|| "the program is killed".into());
         self.last_words();
+        self.left_alone();
         self.restart_at = self.t + RESTART_NS;
+    }
+
+    /// The program has ended. Where its orders stand alone, the projector keeps none of them.
+    fn left_alone(&mut self) {
+        if self.setup.alone == Some(Guard::Orders) {
+            self.lose_memory();
+        }
     }
 
     fn start(&mut self) {
@@ -809,7 +860,11 @@ impl World {
                 self.restart_at = self.t + 100 * MS;
             }
             St::RePlugging => self.strike(Kind::U1, way),
-            St::FrozenOrBlack => self.give(if way.is_multiple_of(2) { Order::Black } else { Order::Freeze }),
+            // FREEZE holds its picture beyond `dark from`: what ends it is not that guard.
+            St::FrozenOrBlack if way.is_multiple_of(2) || self.setup.alone == Some(Guard::DarkFrom) => {
+                self.give(Order::Black);
+            }
+            St::FrozenOrBlack => self.give(Order::Freeze),
             St::ShuttingDown => self.ask_to_stop(),
             St::Faulted => {
                 if way.is_multiple_of(2) {

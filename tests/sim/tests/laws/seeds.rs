@@ -18,6 +18,7 @@ fn order(seed: u64, rate_hz: Option<u32>, seconds: i64) -> Order {
         follows: None,
         serial: None,
         tracker: Some(TrackerKind::NatNet),
+        alone: None,
         first: Vec::new(),
         without: BTreeSet::new(),
         until: None,
