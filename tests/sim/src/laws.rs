@@ -127,6 +127,8 @@ pub struct Laws {
     has_flashed: bool,
     /// The operator was told that the body is dark, and not yet that it has light again.
     is_told: bool,
+    /// When the operator was told something last.
+    word_at: i64,
     /// Since then the light has been gone without a word to the operator.
     wordless_since: i64,
     /// The worst age of a pose at its first photon, as a share of what is allowed, in thousandths.
@@ -190,6 +192,7 @@ impl Laws {
             elsewhere_at: 0,
             has_flashed: false,
             is_told: false,
+            word_at: 0,
             wordless_since: 0,
             worst_age_milli: 0,
             slowest_return_ns: 0,
@@ -751,6 +754,9 @@ impl Laws {
         for note in &notes {
             self.is_told = note.contains("is dark:") || self.is_told && !note.contains("has light again");
         }
+        if !notes.is_empty() {
+            self.word_at = t;
+        }
         let has_word = !notes.is_empty()
             || self.is_told
             || process.health() != ProjectorHealth::Up
@@ -760,7 +766,7 @@ impl Laws {
             // A word stands until there is light again.
             self.wordless_since = i64::MAX;
         }
-        if self.wordless_since == i64::MAX && t - self.good_at < 200 * MS {
+        if self.wordless_since == i64::MAX && t - self.good_at < 200 * MS && self.good_at > self.word_at {
             self.wordless_since = t;
         }
         if self.wordless_since != i64::MAX

@@ -314,14 +314,16 @@ fn run() -> Result<bool, String> {
     let hours = sum.length_ns as f64 / 3.6e12;
     let below = sum.table.cells_below(1000);
     println!(
-        "{hours:.2} h in {} lives ({} on serial lines; trackers: {} serial, {} VRPN), {} faults, {} laws broken; cells below 1000: {below}; of what is allowed: \
+        "{hours:.2} h in {} lives ({} on serial lines; trackers: {} serial, {} VRPN), {} faults, {} of them with an effect that was seen, {} laws broken; cells below 1000: {below}, never with an effect: {}; of what is allowed: \
          oldest pose {:.0} %, lag of a second {:.0} %; slowest return of light {:.2} s; {:.0} s of real time",
         sum.lives,
         sum.on_lines,
         sum.other_trackers[0],
         sum.other_trackers[1],
         sum.table.total(),
+        sum.table.effects(),
         sum.failures.len(),
+        sum.table.cells_below(1),
         sum.worst_age_milli as f64 / 10.0,
         sum.worst_lag_milli as f64 / 10.0,
         sum.slowest_return_ns as f64 * 1e-9,

@@ -343,8 +343,13 @@ impl World {
     }
 
     fn trap(&mut self, part: Part, trap: Trap) {
-        // The collector may be busy for five seconds; the frame path reports fifty times a second.
-        let found_ns = if part == Part::Collector { 5_300 * MS } else { 300 * MS };
+        // The collector may be busy for five seconds; the frame path reports fifty times a second. Two seconds are left to a link
+        // that hangs to go on, before the run ends.
+        let found_ns = match part {
+            Part::Collector => 5_300 * MS,
+            Part::Link => 2_300 * MS,
+            Part::Tracking | Part::Plan | Part::Pack => 300 * MS,
+        };
         if trap == Trap::Hangs {
             self.laws.hidden_until(self.awake_at() + found_ns);
         }
@@ -368,6 +373,7 @@ impl World {
             }
             K::H3 if dice.happens(0.3) => {
                 // Nothing of the rig reads the wall clock, but the kernel stamps datagrams with it.
+                self.stands();
                 lock(&self.net).wall_ahead += dice.between(-3_600, 3_600) * S;
                 return self.lasts(kind, MS, Undo::Nothing);
             }
@@ -375,6 +381,7 @@ impl World {
             K::H3 if self.t < self.frozen_until => return self.lasts(kind, MS, Undo::Nothing),
             K::H3 => {
                 let ns = dice.decades(50, 3_000) * MS;
+                self.stands();
                 self.frozen_until = self.t + ns;
                 self.lag_by(ns);
                 self.laws.pauses(self.t, ns);
@@ -383,6 +390,7 @@ impl World {
             }
             K::X6 => {
                 let ns = dice.decades(5, 2_000) * MS;
+                self.stands();
                 self.frozen_until = self.frozen_until.max(self.t + ns);
                 self.laws.pauses(self.t, ns);
                 self.laws.stands_still(self.t, self.frozen_until);

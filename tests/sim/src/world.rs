@@ -113,6 +113,28 @@ pub struct Active {
     pub kind: Kind,
     /// How it ends.
     pub undo: Undo,
+    /// The state in which it struck, and what had been seen of its kind before; `None` for what only brings the rig into a
+    /// state.
+    pub struck: Option<Struck>,
+}
+
+/// A fault whose effect is looked for.
+#[derive(Clone, Copy, Debug)]
+pub struct Struck {
+    state: State,
+    seen_before: u64,
+}
+
+/// What the world has seen of faults of the process.
+#[derive(Clone, Copy, Debug, Default)]
+struct Met {
+    kills: u64,
+    stops: u64,
+    orders: u64,
+    refused_files: u64,
+    /// Times that the program's machine or the program itself stood still, or had its clock set.
+    stands: u64,
+    steps: u64,
 }
 
 /// Everything.
@@ -177,6 +199,8 @@ pub struct World {
     pub story: VecDeque<String>,
     /// Print what happens.
     pub is_loud: bool,
+    met: Met,
+    striking: Option<Struck>,
     /// A packet that a neighbour has overheard.
     overheard: Vec<u8>,
     neighbour: Dice,
@@ -289,6 +313,8 @@ impl World {
             rig,
             rig_by_hand,
             by_hand: false,
+            met: Met::default(),
+            striking: None,
             overheard: Vec::new(),
             neighbour: Dice::new(seed, 0xa10e8),
             setup,
@@ -434,14 +460,61 @@ impl World {
 
     fn strike_now(&mut self, kind: Kind, seed: u64) {
         let state = self.state();
-        self.table.count(kind, state);
+        let before = self.seen(kind);
+        self.table.strikes(kind, state);
         self.fold(1, kind as u64 * 8 + state as u64);
         self.tell(|| format!("{kind:?} strikes while {}: {}", state.word(), kind.text()));
         self.laws.disturbed(self.t);
         if !kind.is_of_tracker() {
             self.laws.struck_elsewhere(self.t);
         }
+        self.striking = Some(Struck { state, seen_before: before });
         self.strike(kind, seed);
+        self.striking = None;
+    }
+
+    /// How often an effect of faults of `kind` was seen so far.
+    fn seen(&self, kind: Kind) -> u64 {
+        use Kind as K;
+        let met = &self.met;
+        let cable = || lock(&self.cable).met;
+        match kind {
+            K::T16 | K::N1 | K::N2 | K::N7 => lock(&self.net).met[0],
+            K::N6 => lock(&self.net).met[1],
+            K::U1 | K::U2 | K::U9 => cable().pulls,
+            K::U14 | K::H10 => cable().denied,
+            K::U3 | K::U4 | K::U5 | K::U6 | K::U7 | K::U10 | K::X9 | K::X10 | K::X11
+                if self.setup.serial.is_some() =>
+            {
+                cable().on_line
+            }
+            K::U3 => cable().stalled,
+            K::U4 => cable().slowed,
+            K::U5 => cable().short,
+            K::U6 => cable().babble,
+            K::U7 => cable().spoiled,
+            K::U10 => cable().stale,
+            K::X8 => cable().late,
+            K::U15 | K::H2 | K::X3 => met.kills,
+            K::H6 | K::X4 => met.stops,
+            K::X5 => met.orders,
+            K::G1 | K::G2 => lock(&self.beneath).met[2],
+            K::G4 | K::G5 | K::G6 | K::G7 | K::X7 => lock(&self.beneath).met[1],
+            K::H4 | K::H5 | K::X1 | K::X2 => lock(&self.beneath).met[0],
+            K::H8 | K::H9 => lock(&self.beneath).slowed,
+            K::H1 => lock(&self.disk).met,
+            K::H7 => met.refused_files,
+            K::H3 | K::X6 => met.stands,
+            // The projector itself is struck, whoever looks.
+            K::U8 | K::U11 | K::U12 | K::U13 => self.table.struck(kind),
+            // The tracker or its network: the program runs while it lasts.
+            _ => met.steps,
+        }
+    }
+
+    /// The machine or the program is about to stand still, or a clock is set: an effect if there is a program.
+    pub(crate) fn stands(&mut self) {
+        self.met.stands += u64::from(self.process.is_some());
     }
 
     /// A fault begins that ends after `ns`.
@@ -450,13 +523,18 @@ impl World {
             self.active.push(None);
             self.active.len() - 1
         });
-        self.active[number] = Some(Active { kind, undo });
+        self.active[number] = Some(Active { kind, undo, struck: self.striking.take() });
         self.plan(self.t + ns, Action::End(number));
     }
 
     fn end(&mut self, number: usize) {
         let Some(active) = self.active[number].take() else { return };
         self.tell(|| format!("{:?} is over", active.kind));
+        if let Some(Struck { state, seen_before }) = active.struck {
+            if self.seen(active.kind) > seen_before {
+                self.table.takes_effect(active.kind, state);
+            }
+        }
         // Another fault of the same kind may still last.
         self.undo(&active.undo);
         self.calm_since = self.t;
@@ -600,6 +678,7 @@ impl World {
         if process.due() > host {
             return;
         }
+        self.met.steps += 1;
         process.step(host);
         if process.is_over(host) {
             self.exit();
@@ -629,6 +708,7 @@ impl World {
     /// The program is killed: nothing of it does anything any more.
     pub(crate) fn kill(&mut self) {
         let Some(process) = self.process.take() else { return };
+        self.met.kills += 1;
         self.laws.order_at_exit(&process, self.t);
         self.laws.died(self.t);
         self.frozen_until = self.frozen_until.min(self.t);
@@ -666,6 +746,7 @@ impl World {
             self.laws.acknowledged();
         }
         if std::mem::take(&mut self.bad_file) {
+            self.met.refused_files += 1;
             self.tell(|| "the program refuses the rig file".into());
             self.needs_person = true;
             return;
@@ -709,6 +790,7 @@ impl World {
         let Some(process) = &mut self.process else { return };
         let ticket = process.orders.give(order, dpm_rig::standing::By::Socket { uid: 1000 });
         process.wake_orders(host);
+        self.met.orders += 1;
         self.laws.ordered(order, ticket, self.t);
         self.fold(5, order as u64);
         self.tell(|| format!("a person orders {}", order.word()));
@@ -721,6 +803,7 @@ impl World {
         let host = self.host();
         if let Some(process) = &mut self.process {
             process.ask_to_stop(host);
+            self.met.stops += 1;
             self.laws.asked_to_stop(self.t);
             self.tell(|| "the program is asked to stop".into());
         }
