@@ -2,6 +2,7 @@
 //! projector hangs on a serial line, the bytes are on [`crate::line`] instead.
 
 use crate::dice::Dice;
+use crate::guard::stretched;
 use crate::line::{Echo, SerialLine};
 use dpm_device::link::Packet;
 use dpm_device::time::HostTime;
@@ -15,7 +16,7 @@ const FRAMES_QUEUED: usize = 2;
 const REPLIES_QUEUED: usize = 256;
 
 /// How the cable and the port behave at present.
-#[derive(Clone, Copy, Debug, Default)]
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct CableFaults {
     /// The device takes nothing on the data lane (an endpoint is halted, or it answers NAK).
     pub stalled: bool,
@@ -43,6 +44,31 @@ pub struct CableFaults {
     pub silent: bool,
     /// Of a serial line: its ends run at different rates.
     pub garbled: bool,
+}
+
+/// How often each fault of the cable had an effect.
+#[derive(Clone, Copy, Debug, Default)]
+pub struct CableEffects {
+    /// It was pulled out of a port.
+    pub pulls: u64,
+    /// The port was not opened.
+    pub denied: u64,
+    /// Frames were refused.
+    pub stalled: u64,
+    /// Bytes took longer.
+    pub slowed: u64,
+    /// Transfers ended too early.
+    pub short: u64,
+    /// Replies were damaged.
+    pub babble: u64,
+    /// Old replies came again.
+    pub stale: u64,
+    /// Packets were damaged, lost or doubled.
+    pub spoiled: u64,
+    /// Packets of the control lane were late.
+    pub late: u64,
+    /// Bytes travelled on a serial line that has a fault.
+    pub on_line: u64,
 }
 
 /// Bytes on their way.
@@ -91,6 +117,10 @@ pub struct Cable {
     pub disturbed: bool,
     dice: Dice,
     spare: Vec<Vec<u8>>,
+    /// What its faults did.
+    pub met: CableEffects,
+    /// Light of frames ends so many ticks later than the host says.
+    pub stretch: u64,
     /// The most transfers that ever waited in either direction.
     pub longest: usize,
 }
@@ -116,6 +146,8 @@ impl Cable {
             disturbed: false,
             dice: Dice::new(seed, 0xcab1e),
             spare: Vec::new(),
+            stretch: 0,
+            met: CableEffects::default(),
             longest: 0,
         }
     }
@@ -132,7 +164,8 @@ impl Cable {
     pub fn advance(&mut self, now: i64) {
         self.now = now;
         if let Some(line) = &mut self.line {
-            line.carry(now, &self.faults, self.plugged);
+            let carried = line.carry(now, &self.faults, self.plugged);
+            self.met.on_line += u64::from(carried && self.faults != CableFaults::default());
             self.longest = self.longest.max(line.pieces());
         }
     }
@@ -166,6 +199,7 @@ impl Cable {
         let mut bytes = self.memory();
         bytes.extend_from_slice(packet);
         if self.faults.babble > 0.0 && self.dice.happens(self.faults.babble) {
+            self.met.babble += 1;
             let at = self.dice.bits() as usize % bytes.len();
             bytes[at] ^= (self.dice.bits() as u8).max(1);
             for _ in 0..self.dice.bits() % 40 {
@@ -175,6 +209,7 @@ impl Cable {
         }
         let at = self.now + self.travel_ns;
         if self.faults.stale > 0.0 && self.dice.happens(self.faults.stale) && !self.old_reply.is_empty() {
+            self.met.stale += 1;
             let again = self.old_reply.clone();
             self.back.push_back((at, again));
         }
@@ -191,6 +226,7 @@ impl Cable {
 
     /// The plug is pulled: everything on its way is lost.
     pub fn pull(&mut self) {
+        self.met.pulls += u64::from(self.plugged);
         self.plugged = false;
         self.disturbed = true;
         self.out.clear();
@@ -219,19 +255,23 @@ impl Cable {
         self.disturbed |= is_bad || faults.short > 0.0;
         for packet in packets {
             let from = bytes.len();
-            bytes.extend(packet.to_vec());
+            let told = (self.stretch > 0).then(|| stretched(packet, self.stretch)).flatten();
+            bytes.extend(told.unwrap_or_else(|| packet.to_vec()));
             if !is_bad {
                 continue;
             }
             if self.dice.happens(faults.loss) {
+                self.met.spoiled += 1;
                 bytes.truncate(from);
                 continue;
             }
             let end = bytes.len();
             if self.dice.happens(faults.twice) {
+                self.met.spoiled += 1;
                 bytes.extend_from_within(from..end);
             }
             if self.dice.happens(faults.corrupt) {
+                self.met.spoiled += 1;
                 let at = from + self.dice.bits() as usize % (end - from);
                 bytes[at] ^= 1 << (self.dice.bits() % 8);
             }
@@ -241,10 +281,12 @@ impl Cable {
             let len = self.dice.bits() as usize % bytes.len();
             bytes.truncate(len);
             cut = true;
+            self.met.short += 1;
         }
         let mut ns = bytes.len() as i64 * self.ns_per_byte;
         if faults.slow_milli > 0 {
             ns = ns * faults.slow_milli / 1000;
+            self.met.slowed += 1;
         }
         let begin = self.now.max(if lane == Lane::Data { self.free_at } else { 0 });
         let mut at = begin + ns + self.travel_ns;
@@ -254,6 +296,7 @@ impl Cable {
             // What was late holds up what follows it.
             at = (at + faults.control_late_ns).max(self.control_at);
             self.control_at = at;
+            self.met.late += u64::from(faults.control_late_ns > 0);
         }
         let place = self.out.partition_point(|t| t.at <= at);
         self.out.insert(place, Transfer { at, lane, bytes, cut });
@@ -297,6 +340,7 @@ impl Transport for HostEnd {
             return Err(SendError::Failed(unplugged()));
         }
         if lane == Lane::Data && (cable.faults.stalled || cable.frames_queued() >= FRAMES_QUEUED) {
+            cable.met.stalled += u64::from(cable.faults.stalled);
             return Err(SendError::Busy);
         }
         cable.send(lane, packets);
@@ -304,7 +348,8 @@ impl Transport for HostEnd {
     }
 
     fn has_room(&mut self, lane: Lane) -> bool {
-        let cable = lock(&self.cable);
+        let mut cable = lock(&self.cable);
+        cable.met.stalled += u64::from(lane == Lane::Data && cable.faults.stalled);
         lane == Lane::Control || !cable.faults.stalled && cable.frames_queued() < FRAMES_QUEUED
     }
 
@@ -337,6 +382,7 @@ impl Transport for HostEnd {
     fn reopen(&mut self) -> Result<(), TransportError> {
         let mut cable = lock(&self.cable);
         if cable.faults.denied {
+            cable.met.denied += 1;
             return Err(TransportError::InUse { device: NAME.into() });
         }
         if !cable.plugged {

@@ -18,6 +18,8 @@ pub struct Disk {
     pub is_full: bool,
     /// An order was refused because the disk is full.
     pub lost_order: bool,
+    /// How often the disk refused something, or was slow.
+    pub met: u64,
     /// How much longer a write takes, nanoseconds.
     pub late_ns: i64,
 }
@@ -61,7 +63,9 @@ impl StateFolder for SimFolder {
 
     fn replace(&self, name: &str, bytes: &[u8]) -> Result<(), FolderError> {
         let mut disk = lock(&self.0);
+        disk.met += u64::from(disk.late_ns > 0);
         if disk.refuses || disk.is_full {
+            disk.met += 1;
             disk.lost_order |= !disk.refuses && name.ends_with(".order");
             return Err(refused(name));
         }
@@ -72,6 +76,7 @@ impl StateFolder for SimFolder {
     fn overwrite(&self, name: &str, bytes: &[u8]) -> Result<(), FolderError> {
         let mut disk = lock(&self.0);
         let (refuses, is_full) = (disk.refuses, disk.is_full);
+        disk.met += u64::from(refuses || is_full || disk.late_ns > 0);
         let file = disk.files.get_mut(name).ok_or_else(|| missing(name))?;
         if refuses || is_full && bytes.len() > file.len() {
             return Err(refused(name));
@@ -83,6 +88,7 @@ impl StateFolder for SimFolder {
     fn rename(&self, from: &str, to: &str) -> Result<(), FolderError> {
         let mut disk = lock(&self.0);
         if disk.refuses {
+            disk.met += 1;
             return Err(refused(from));
         }
         let file = disk.files.remove(from).ok_or_else(|| missing(from))?;
@@ -93,6 +99,7 @@ impl StateFolder for SimFolder {
     fn remove(&self, name: &str) -> Result<(), FolderError> {
         let mut disk = lock(&self.0);
         if disk.refuses {
+            disk.met += 1;
             return Err(refused(name));
         }
         disk.files.remove(name);

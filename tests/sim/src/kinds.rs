@@ -267,6 +267,21 @@ impl Kind {
         matches!(self, Self::X9 | Self::X10 | Self::X11)
     }
 
+    /// Why nothing of this kind happens in the world although it strikes; `None` if something does. Such strikes are counted
+    /// apart, and fill no cell.
+    pub fn stands_in(self) -> Option<&'static str> {
+        use Kind as K;
+        match self {
+            K::H11 => Some("the lock that refuses a second instance is not in it"),
+            K::N3 | K::N4 | K::N5 => Some("the control socket is not in it: stages only take longer"),
+            K::G8 => Some("pixels are not in it"),
+            K::F1 | K::F2 | K::F3 | K::F4 | K::F5 | K::F6 | K::F7 | K::F8 | K::F9 | K::F10 => {
+                Some("what reads scenes is not in it: the next start is refused, as for H7")
+            }
+            _ => None,
+        }
+    }
+
     /// Why this kind cannot strike in `state`; `None` if it can.
     pub fn impossible(self, state: State) -> Option<&'static str> {
         use Kind as K;

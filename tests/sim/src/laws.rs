@@ -2,6 +2,7 @@
 //! the program they believe only which frame it sent with which planes, and what it tells the operator.
 
 use crate::cable::lock;
+use crate::guard::Guard;
 use crate::lag::Lag;
 use crate::machine::{hash, Beneath, Sent};
 use crate::plan::Setup;
@@ -16,7 +17,7 @@ use dpm_rig::rig::Rig;
 use dpm_rig::telemetry::light_state::LightState;
 use dpm_rig::telemetry::monitor::{ProjectorHealth, RunCounts};
 use hil_mock::motion::Motion;
-use hil_mock::projector::LightChange;
+use hil_mock::projector::{DeviceClock, LightChange};
 use std::sync::{Arc, Mutex};
 
 const MS: i64 = 1_000_000;
@@ -31,6 +32,8 @@ const DARK_AT_LAST_NS: i64 = 300 * MS;
 pub(crate) const BEGINS_WITHIN_NS: i64 = 300 * MS;
 /// Light returns within this time after all causes are gone.
 const LIT_WITHIN_NS: i64 = S;
+/// The map of a clock whose exchanges are stamped in time is no more wrong than this, besides their travel.
+const CLOCK_NS: i64 = 300_000;
 /// The body's greatest speed, metres a second.
 const SPEED: f64 = 0.3;
 
@@ -61,6 +64,12 @@ pub struct Laws {
     pub broken: Option<Broken>,
     slot_ns: i64,
     watchdog_ns: i64,
+    /// The guard that stands alone.
+    alone: Option<Guard>,
+    /// What may be the error of the host's map of the projector's clock, where that is judged.
+    clock_ns: i64,
+    /// From when to when the program stands still, if its silence is judged.
+    still: Option<(i64, i64)>,
     predict_ns: Option<i64>,
     rate_hz: u32,
     is_quick: bool,
@@ -118,6 +127,8 @@ pub struct Laws {
     has_flashed: bool,
     /// The operator was told that the body is dark, and not yet that it has light again.
     is_told: bool,
+    /// When the operator was told something last.
+    word_at: i64,
     /// Since then the light has been gone without a word to the operator.
     wordless_since: i64,
     /// The worst age of a pose at its first photon, as a share of what is allowed, in thousandths.
@@ -136,6 +147,9 @@ impl Laws {
             broken: None,
             slot_ns,
             watchdog_ns: i64::from(rig.config.watchdog_us()) * 1000,
+            alone: setup.alone,
+            clock_ns: 2 * setup.travel_ns + CLOCK_NS,
+            still: None,
             predict_ns: setup.predict_ms.map(|ms| i64::from(ms) * MS),
             rate_hz: setup.rate_hz,
             is_quick: setup.render_milli < 800,
@@ -178,6 +192,7 @@ impl Laws {
             elsewhere_at: 0,
             has_flashed: false,
             is_told: false,
+            word_at: 0,
             wordless_since: 0,
             worst_age_milli: 0,
             slowest_return_ns: 0,
@@ -263,9 +278,33 @@ impl Laws {
         self.echoed_at = t;
     }
 
+    /// The program stands still from `t` until `until`.
+    pub fn stands_still(&mut self, t: i64, until: i64) {
+        let since = self.still.filter(|(_, end)| t < *end).map_or(t, |(since, _)| since);
+        self.still = Some((since, until)).filter(|_| self.alone == Some(Guard::Watchdog));
+    }
+
+    /// Since when the program has said nothing, because it stands still or is no more.
+    pub fn silent_since(&self) -> Option<i64> {
+        self.died_at.or(self.still.map(|(since, _)| since))
+    }
+
+    /// A frame that was on its way reaches the projector.
+    pub fn heard_of_the_silent(&mut self, t: i64) {
+        if self.silent_since().is_some() {
+            self.echoed_at = t;
+        }
+    }
+
+    /// Silence after which the projector is dark by itself, as far as anything relies on it: where the watchdog is switched off,
+    /// what it does elsewhere is asked of the others.
+    fn usual_watchdog_ns(&self) -> i64 {
+        self.watchdog_ns.min((50 * MS).max(3 * self.slot_ns + MS))
+    }
+
     /// The program starts.
     pub fn started(&mut self, t: i64, is_calm: bool) {
-        (self.stopped_at, self.died_at) = (None, None);
+        (self.stopped_at, self.died_at, self.still) = (None, None, None);
         self.started_at = t;
         (self.crews, self.is_told) = (1, false);
         self.starts_in_calm += u32::from(is_calm);
@@ -398,10 +437,13 @@ impl Laws {
             if peaceful(since, me.disturbed_at.min(since)) && me.disturbed_at <= since {
                 DARK_WITHIN_NS
             } else {
-                DARK_AT_LAST_NS.max(me.watchdog_ns + 50 * MS)
+                DARK_AT_LAST_NS.max(me.usual_watchdog_ns() + 50 * MS)
             }
         };
-        if let Some(s) = self.standing.filter(|s| s.order != Order::Freeze) {
+        // What a program has not said before it ended, or greeted the projector, does not reach it: elsewhere the watchdog ends
+        // that light.
+        let orders_count = self.alone != Some(Guard::Session);
+        if let Some(s) = self.standing.filter(|s| orders_count && s.order != Order::Freeze) {
             let late = at - s.since;
             if late > allowed(s.since, self) {
                 let how = if s.is_orphan { ", which was kept over a restart" } else { "" };
@@ -411,7 +453,7 @@ impl Laws {
                 );
             }
         }
-        if let Some(since) = self.stopped_at {
+        if let Some(since) = self.stopped_at.filter(|_| orders_count) {
             if at - since > allowed(since, self) {
                 self.fail(at, format!("{what} {} ms after a stop was asked for", (at - since) / MS));
             }
@@ -419,6 +461,11 @@ impl Laws {
         if let Some(since) = self.died_at {
             if at - since.max(self.echoed_at) > self.watchdog_ns + self.slot_ns + 2 * MS {
                 self.fail(at, format!("{what} {} ms after the program died", (at - since) / MS));
+            }
+        }
+        if let Some((since, _)) = self.still.filter(|(_, until)| at < *until) {
+            if at - since.max(self.echoed_at) > self.watchdog_ns + self.slot_ns + 2 * MS {
+                self.fail(at, format!("{what} {} ms after the program was stopped", (at - since) / MS));
             }
         }
         if let Some(since) = self.hot_since {
@@ -438,7 +485,7 @@ impl Laws {
         planes: Option<&[u8]>,
         lag: i64,
         beneath: &Arc<Mutex<Beneath>>,
-        _: u64,
+        clock: DeviceClock,
     ) {
         let at = event.first_photon_at.0;
         if event.kind == LightKind::Blank {
@@ -452,8 +499,8 @@ impl Laws {
         let Some(frame) = event.frame else { return };
         let sent = self.sent[frame as usize % REMEMBERED].clone();
         // A frame of the process before may still wait in the projector until its watchdog bites.
-        let is_old =
-            sent.process + 1 == self.process && at - self.started_at < self.watchdog_ns + self.slot_ns;
+        let is_old = sent.process + 1 == self.process
+            && at - self.started_at < self.usual_watchdog_ns() + self.slot_ns;
         if sent.frame == frame && is_old {
             self.showing = Some(sent);
             return;
@@ -472,6 +519,7 @@ impl Laws {
         if planes.is_some_and(|planes| hash(planes) != sent.hash) && at - self.clock_moved_at > S {
             return self.fail(at, format!("frame {frame} is lit with other planes than were sent"));
         }
+        self.judge_clock(&sent, at, lag, clock);
         self.judge_pose(&sent, at, event.last_photon_at.0, lag);
         if sent.captured_at.is_some() {
             self.good_at = at;
@@ -483,6 +531,9 @@ impl Laws {
 
     /// A frame is shown again.
     fn held_too_long(&mut self, at: i64, lag: i64) {
+        if self.alone.is_some_and(|guard| guard.stretches_ns() > 0) {
+            return;
+        }
         // Where the disk refuses to forget FREEZE, a person orders ARM again, which takes a moment.
         if at < self.slow_disk_until + S {
             return;
@@ -508,6 +559,23 @@ impl Laws {
                     held / MS,
                     allowed / MS
                 ),
+            );
+        }
+    }
+
+    /// The slot of a frame begins when the host has said, as well as its exchanges with the projector can tell. Only judged where
+    /// the link is served late: that says nothing of when answers arrived.
+    fn judge_clock(&mut self, sent: &Sent, at: i64, lag: i64, clock: DeviceClock) {
+        if self.alone != Some(Guard::Clock) || at - self.clock_moved_at < 4 * S {
+            return;
+        }
+        let off_ns = clock.instant_of(sent.target_at).0 - lag - sent.due_at;
+        if off_ns.abs() > self.clock_ns {
+            let (off_us, allowed_us) = (off_ns / 1000, self.clock_ns / 1000);
+            let frame = sent.frame;
+            self.fail(
+                at,
+                format!("frame {frame}: its slot begins {off_us} us later than the host thinks; {allowed_us} us are allowed"),
             );
         }
     }
@@ -606,8 +674,10 @@ impl Laws {
 
     /// What the program calls the light at `t` is not wrong for longer than a second; `None` while it says nothing.
     pub fn word(&mut self, t: i64, word: Option<LightState>) {
-        // A clock that is wrong makes the last second longer or shorter.
-        let word = word.filter(|_| t - self.clock_moved_at > S);
+        // A clock that is wrong makes the last second longer or shorter, and who is told another `dark from` than was said is lit
+        // for longer.
+        let is_told = self.alone.is_none_or(|guard| guard.stretches_ns() == 0);
+        let word = word.filter(|_| is_told && t - self.clock_moved_at > S);
         let says_lit = word.map(LightState::is_lit);
         if self.word.0 != says_lit {
             self.word = (says_lit, t);
@@ -684,6 +754,9 @@ impl Laws {
         for note in &notes {
             self.is_told = note.contains("is dark:") || self.is_told && !note.contains("has light again");
         }
+        if !notes.is_empty() {
+            self.word_at = t;
+        }
         let has_word = !notes.is_empty()
             || self.is_told
             || process.health() != ProjectorHealth::Up
@@ -693,7 +766,7 @@ impl Laws {
             // A word stands until there is light again.
             self.wordless_since = i64::MAX;
         }
-        if self.wordless_since == i64::MAX && t - self.good_at < 200 * MS {
+        if self.wordless_since == i64::MAX && t - self.good_at < 200 * MS && self.good_at > self.word_at {
             self.wordless_since = t;
         }
         if self.wordless_since != i64::MAX

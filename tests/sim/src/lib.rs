@@ -3,13 +3,14 @@
 //!
 //! Reading order: [`kinds`] names the faults and the states in which they strike; [`plan`] draws episodes from a seed;
 //! [`world`] has the clock and moves everything; [`strike`] turns a fault into what happens in the world; [`laws`]
-//! judges after every event; [`life`] runs one seed, and shrinks it if a law was broken.
+//! judges after every event; [`guard`] has the lives in which one guard stands alone; [`life`] runs one seed, and shrinks it if a law was broken.
 
 pub mod cable;
 pub mod dice;
 pub mod disk;
 mod far;
 pub mod follow;
+pub mod guard;
 pub mod kinds;
 mod lag;
 pub mod laws;

@@ -1,5 +1,6 @@
 //! Runs one seed for a while, and shrinks it if a law was broken.
 
+use crate::guard::Guard;
 use crate::kinds::Kind;
 use crate::laws::Broken;
 use crate::plan::{Episodes, Setup, TrackerKind};
@@ -23,6 +24,8 @@ pub struct Order {
     pub serial: Option<bool>,
     /// What the tracker speaks, if not as the seed says.
     pub tracker: Option<TrackerKind>,
+    /// The guard of the light that stands alone; the projector then has neither tracks nor a serial line.
+    pub alone: Option<Guard>,
     /// The kinds of which one strikes first in every episode; empty: all in turn.
     pub first: Vec<Kind>,
     /// Faults that do not strike, by number.
@@ -69,7 +72,10 @@ pub struct Lived {
 /// # Errors
 /// The world cannot be made, which is a mistake in this program.
 pub fn live(order: &Order) -> Result<Lived, String> {
-    let setup = Setup::of(order.seed, order.rate_hz, order.follows, order.serial, order.tracker);
+    let setup = match order.alone {
+        Some(guard) => Setup::alone(order.seed, order.rate_hz, order.tracker, guard),
+        None => Setup::of(order.seed, order.rate_hz, order.follows, order.serial, order.tracker),
+    };
     let mut world = World::new(setup.clone())?;
     world.is_loud = order.is_loud;
     world.laws.is_loud = order.is_loud;

@@ -235,8 +235,9 @@ impl SerialLine {
         out.min(self.back.due(byte_ns)).min(free)
     }
 
-    /// Carries everything up to `now`.
-    pub fn carry(&mut self, now: i64, faults: &CableFaults, is_plugged: bool) {
+    /// Carries everything up to `now`. True if there was anything to carry.
+    pub fn carry(&mut self, now: i64, faults: &CableFaults, is_plugged: bool) -> bool {
+        let had_any = !self.out.queue.is_empty() || !self.back.queue.is_empty();
         let byte_ns = self.byte_ns(faults);
         let full_ns = self.full_byte_ns();
         let (mut told, mut replied) = (Vec::new(), Vec::new());
@@ -281,6 +282,7 @@ impl SerialLine {
                 self.input.push_back((at, bytes));
             }
         }
+        had_any
     }
 
     /// Old replies may arrive again.
@@ -381,6 +383,7 @@ impl Driver {
     pub(crate) fn open(cable: &Arc<Mutex<Cable>>) -> Result<Self, &'static str> {
         let mut state = lock(cable);
         if state.faults.denied {
+            state.met.denied += 1;
             return Err("Device or resource busy");
         }
         if !state.plugged {

@@ -145,6 +145,12 @@ pub struct Beneath {
     pub process: u64,
     /// Stages take longer by this factor, in thousandths.
     pub load_milli: i64,
+    /// Steps of the link take so much longer, nanoseconds.
+    pub link_late_ns: i64,
+    /// How often a stage met a trap, a frame one of the GPU, and an opening of it one.
+    pub met: [u64; 3],
+    /// Steps that took longer because the machine was busy.
+    pub slowed: u64,
     /// The GPU's time of a usual frame, nanoseconds.
     pub frame_ns: i64,
     /// Frames that were sent and not looked at yet.
@@ -165,6 +171,9 @@ impl Beneath {
             open_traps: VecDeque::new(),
             process: 0,
             load_milli: 1000,
+            link_late_ns: 0,
+            met: [0; 3],
+            slowed: 0,
             frame_ns,
             sent: VecDeque::new(),
             crew_ready_at: 0,
@@ -209,9 +218,12 @@ impl Machine for SimMachine {
             Part::Collector => COLLECTOR_US,
         };
         let load_milli = beneath.load_milli;
-        let ns = drawn(&mut beneath.dice, quantiles) * load_milli / 1000;
+        let late_ns = if part == Part::Link { beneath.link_late_ns } else { 0 };
+        let ns = drawn(&mut beneath.dice, quantiles) * load_milli / 1000 + late_ns;
+        beneath.slowed += u64::from(load_milli != 1000);
         if !beneath.traps.is_empty() {
             if let Some(i) = beneath.traps.iter().position(|(of, _)| *of == part) {
+                beneath.met[0] += 1;
                 return match beneath.traps.remove(i).1 {
                     Trap::Stalls(more) => Takes::Ns(ns + more),
                     Trap::Hangs => Takes::Forever,
@@ -226,7 +238,9 @@ impl Machine for SimMachine {
         let mut beneath = lock(&self.beneath);
         let spread = beneath.dice.between(900, 1_100);
         let ns = beneath.frame_ns * spread / 1000 * beneath.load_milli.min(2_000) / 1000;
-        match beneath.gpu_traps.pop_front() {
+        let trap = beneath.gpu_traps.pop_front();
+        beneath.met[1] += u64::from(trap.is_some());
+        match trap {
             None => Rendered::After(ns),
             Some(GpuTrap::Late(more)) => Rendered::After(ns + more),
             Some(GpuTrap::Hangs) => Rendered::Never,
@@ -242,7 +256,9 @@ impl Machine for SimMachine {
         let takes_ns = takes_ns * 1_000_000;
         beneath.crew_ready_at = now.0 + takes_ns;
         beneath.crews += 1;
-        let made = match with_gpu.then(|| beneath.open_traps.pop_front()).flatten() {
+        let trap = with_gpu.then(|| beneath.open_traps.pop_front()).flatten();
+        beneath.met[2] += u64::from(trap.is_some());
+        let made = match trap {
             None => Ok(beneath.frame_ns),
             Some(OpenTrap::Absent) => Err(GpuError::NoDevice { found: "none".into(), needed: "one".into() }),
             Some(OpenTrap::OutOfMemory) => Err(GpuError::OutOfMemory {

@@ -1,5 +1,6 @@
 //! `dpm-sim`: hours of rig, with every fault, in minutes.
 
+use dpm_sim::guard::Guard;
 use dpm_sim::kinds::Kind;
 use dpm_sim::life::{live, shrink, Lived, Order};
 use dpm_sim::plan::TrackerKind;
@@ -23,6 +24,8 @@ dpm-sim: a simulated world around the rig, with every fault in every state
                   a fifth VRPN
   --kinds LIST    kinds of faults, as T18,X9; every episode begins with one of them in lives that they can strike;
                   default: all in turn
+  --alone WHO     which guard of the light stands alone: watchdog, dark-from, age, orders, session, clock; none; or
+                  some: default, one of them in a third of the seeds (none of --tracks all, --serial all and --kinds)
   --until EVENT   stop the (single) seed at this event and print what happened
   --without LIST  numbers of faults that do not strike, as a shrunk seed names them
   --minutes M     end after so many minutes of real time
@@ -33,6 +36,26 @@ dpm-sim: a simulated world around the rig, with every fault in every state
   --json          the last line is a JSON object
 ";
 
+/// In whose lives which guard of the light stands alone.
+#[derive(Clone, Copy, PartialEq, Eq)]
+enum Alone {
+    AsDrawn,
+    Of(Option<Guard>),
+}
+
+impl Alone {
+    fn named(word: &str) -> Result<Self, String> {
+        match word {
+            "some" => Ok(Self::AsDrawn),
+            "none" => Ok(Self::Of(None)),
+            _ => match Guard::ALL.into_iter().find(|guard| guard.word() == word) {
+                Some(guard) => Ok(Self::Of(Some(guard))),
+                None => Err(format!("--alone {word:?}: no such guard; --help has them")),
+            },
+        }
+    }
+}
+
 struct Wish {
     hours: f64,
     seed: Option<u64>,
@@ -41,6 +64,7 @@ struct Wish {
     follows: Option<bool>,
     serial: Option<bool>,
     tracker: Option<TrackerKind>,
+    alone: Alone,
     first: Vec<Kind>,
     until: Option<u64>,
     without: BTreeSet<u32>,
@@ -61,6 +85,7 @@ fn wish() -> Result<Wish, String> {
         follows: None,
         serial: None,
         tracker: None,
+        alone: Alone::AsDrawn,
         first: Vec::new(),
         until: None,
         without: BTreeSet::new(),
@@ -95,6 +120,7 @@ fn wish() -> Result<Wish, String> {
             },
             "--tracker" => wish.tracker = tracker_named(&value()?)?,
             "--kinds" => wish.first = kinds_named(&value()?)?,
+            "--alone" => wish.alone = Alone::named(&value()?)?,
             "--until" => wish.until = Some(number(&value()?)?),
             "--without" => {
                 for word in value()?.split(',').filter(|word| !word.is_empty()) {
@@ -114,6 +140,13 @@ fn wish() -> Result<Wish, String> {
     let is_number = |x: f64| x.is_finite() && x > 0.0;
     if !is_number(wish.hours) || !is_number(wish.life_s) || wish.rate == Some(0) {
         return Err("--hours, --life and --rate must be greater than 0".into());
+    }
+    let has_other_rigs = wish.serial == Some(true) || wish.follows == Some(true) || !wish.first.is_empty();
+    if has_other_rigs {
+        if matches!(wish.alone, Alone::Of(Some(_))) {
+            return Err("--alone: not with --tracks all, --serial all or --kinds".into());
+        }
+        wish.alone = Alone::Of(None);
     }
     if wish.serial == Some(true) && wish.follows == Some(true) {
         return Err("--serial all and --tracks all: no tracks are sent on a serial line".into());
@@ -162,6 +195,8 @@ struct Sum {
     on_lines: u64,
     /// Lives whose tracker hangs on a serial line, and those whose tracker is a VRPN server.
     other_trackers: [u64; 2],
+    /// Lives in which each guard stood alone.
+    alone: [u64; Guard::ALL.len()],
     planes_moved: u64,
     placed: Placed,
 }
@@ -187,11 +222,12 @@ fn report(lived: &Lived, order: &Order, shrinks: bool) -> Result<String, String>
         Some(true) => " --serial all",
         Some(false) => " --serial none",
     };
+    let alone = format!(" --alone {}", order.alone.map_or("none", Guard::word));
     let tracker = order.tracker.map_or(String::new(), |kind| format!(" --tracker {}", kind.word()));
     let kinds: Vec<String> = order.first.iter().map(|kind| format!("{kind:?}")).collect();
     let kinds = if kinds.is_empty() { String::new() } else { format!(" --kinds {}", kinds.join(",")) };
     println!(
-        "  again: --seed {}{rate}{tracks}{serial}{tracker}{kinds} --life {:.0} --hours 0.0001 --loud --without {}",
+        "  again: --seed {}{rate}{tracks}{serial}{tracker}{kinds}{alone} --life {:.0} --hours 0.0001 --loud --without {}",
         order.seed,
         (least.length_ns as f64 * 1e-9).ceil() + 1.0,
         if without.is_empty() { "\"\"".into() } else { without.join(",") }
@@ -216,6 +252,10 @@ fn run() -> Result<bool, String> {
             follows: wish.follows,
             serial: wish.serial,
             tracker: wish.tracker,
+            alone: match wish.alone {
+                Alone::AsDrawn => Guard::drawn(seed),
+                Alone::Of(guard) => guard,
+            },
             first: wish.first.clone(),
             without: wish.without.clone(),
             until: wish.until,
@@ -236,6 +276,9 @@ fn run() -> Result<bool, String> {
         sum.on_lines += u64::from(lived.setup.serial.is_some());
         sum.other_trackers[0] += u64::from(lived.setup.tracker.kind() == TrackerKind::Serial);
         sum.other_trackers[1] += u64::from(lived.setup.tracker.kind() == TrackerKind::Vrpn);
+        if let Some(guard) = lived.setup.alone {
+            sum.alone[guard as usize] += 1;
+        }
         sum.planes_moved += lived.planes_moved;
         sum.placed.add(&lived.placed);
         if lived.broken.is_some() {
@@ -271,19 +314,23 @@ fn run() -> Result<bool, String> {
     let hours = sum.length_ns as f64 / 3.6e12;
     let below = sum.table.cells_below(1000);
     println!(
-        "{hours:.2} h in {} lives ({} on serial lines; trackers: {} serial, {} VRPN), {} faults, {} laws broken; cells below 1000: {below}; of what is allowed: \
+        "{hours:.2} h in {} lives ({} on serial lines; trackers: {} serial, {} VRPN), {} faults, {} of them with an effect that was seen, {} laws broken; cells below 1000: {below}, never with an effect: {}; of what is allowed: \
          oldest pose {:.0} %, lag of a second {:.0} %; slowest return of light {:.2} s; {:.0} s of real time",
         sum.lives,
         sum.on_lines,
         sum.other_trackers[0],
         sum.other_trackers[1],
         sum.table.total(),
+        sum.table.effects(),
         sum.failures.len(),
+        sum.table.cells_below(1),
         sum.worst_age_milli as f64 / 10.0,
         sum.worst_lag_milli as f64 / 10.0,
         sum.slowest_return_ns as f64 * 1e-9,
         begin.elapsed().as_secs_f64()
     );
+    let alone = Guard::ALL.map(|guard| format!("{} {}", sum.alone[guard as usize], guard.word()));
+    println!("lives in which one guard stood alone: {}", alone.join(", "));
     let rms = |sum_px2: f64| (sum_px2 / sum.placed.moved.max(1) as f64).sqrt();
     println!(
         "{} of the lives with tracks: {} planes moved; the light of {} was judged: {:.2} mirrors off the body (rms), and \

@@ -102,6 +102,8 @@ pub struct Net {
     old: Vec<u8>,
     travel_ns: i64,
     flooded_at: i64,
+    /// Datagrams that strangers sent, and old ones that came again.
+    pub met: [u64; 2],
     dice: Dice,
     spare: Vec<Vec<u8>>,
     /// Datagrams that were thrown away because the socket was full.
@@ -207,6 +209,7 @@ impl Net {
             old: Vec::new(),
             travel_ns: 150_000,
             flooded_at: 0,
+            met: [0; 2],
             dice: Dice::new(seed, 0x6e65),
             spare: Vec::new(),
             overrun: 0,
@@ -338,6 +341,7 @@ impl Net {
     }
 
     fn stranger(&mut self) {
+        self.met[0] += 1;
         let len = if self.faults.huge { 65_000 } else { self.dice.between(0, 300) as usize };
         let mut bytes: Vec<u8> = self.spare.pop().unwrap_or_default();
         if self.faults.forged && !self.old.is_empty() && self.dice.happens(0.7) {
@@ -369,6 +373,7 @@ impl Net {
         let late = if self.faults.late_ns > 0 { self.dice.between(0, self.faults.late_ns) } else { 0 };
         let at = self.now + self.travel_ns + late;
         if self.faults.replay > 0.0 && self.dice.happens(self.faults.replay) && !self.old.is_empty() {
+            self.met[1] += 1;
             let again = self.old.clone();
             self.push(at, SERVER, again);
         }

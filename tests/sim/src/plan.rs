@@ -1,6 +1,7 @@
 //! What a seed plans: the rig, and one episode of faults after the other.
 
 use crate::dice::Dice;
+use crate::guard::Guard;
 use crate::kinds::{Kind, State};
 use crate::line::SerialSetup;
 use crate::net::BodyMotion;
@@ -119,6 +120,8 @@ pub struct Setup {
     pub raster: (u32, u32),
     /// How the body moves.
     pub motion: BodyMotion,
+    /// The guard of the light that stands alone.
+    pub alone: Option<Guard>,
 }
 
 /// The share of lives whose projector follows tracks.
@@ -224,6 +227,7 @@ impl Setup {
         };
         Self {
             follows,
+            alone: None,
             serial,
             raster,
             motion,
@@ -238,6 +242,20 @@ impl Setup {
             ns_per_byte: dice.between(2, 40),
             travel_ns: dice.between(30, 250) * 1_000,
         }
+    }
+}
+
+/// The rates of lives in which one guard stands alone: short slots would only be slower to simulate.
+const ALONE_RATES: [u32; 3] = [60, 120, 240];
+
+impl Setup {
+    /// The rig of `seed` if `guard` stands alone: on a USB cable, without tracks, with a renderer that keeps up, and with the
+    /// reach of prediction that follows from the rig.
+    pub fn alone(seed: u64, rate_hz: Option<u32>, tracker: Option<TrackerKind>, guard: Guard) -> Self {
+        let drawn = Dice::new(seed, 0xa10e7).one_of(&ALONE_RATES);
+        let setup = Self::of(seed, rate_hz.or(Some(drawn)), Some(false), Some(false), tracker);
+        let render_milli = setup.render_milli.min(700);
+        Self { alone: Some(guard), predict_ms: None, render_milli, ..setup }
     }
 }
 
@@ -297,6 +315,7 @@ impl Episodes {
             .filter(|kind| setup.follows || !kind.needs_tracks())
             .filter(|kind| setup.serial.is_some() || !kind.needs_line())
             .filter(|kind| tracker == TrackerKind::Vrpn || !kind.needs_connection())
+            .filter(|kind| setup.alone.is_none_or(|guard| guard.kinds().contains(kind)))
             .collect::<Vec<_>>();
         let wanted = |kind: &Kind| first.contains(kind) && kind.strikes(tracker);
         let mut first: Vec<Kind> = kinds.iter().copied().filter(wanted).collect();

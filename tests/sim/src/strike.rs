@@ -264,13 +264,7 @@ impl World {
         let now = HostTime(self.t);
         match kind {
             K::U8 => {
-                self.projector.power_cycle(now);
-                self.see_light();
-                self.new_projector();
-                self.boot_noise();
-                if self.projector.status().faults == 0 {
-                    self.laws.acknowledged();
-                }
+                self.lose_memory();
                 self.lasts(kind, MS, Undo::Nothing);
             }
             K::U11 => {
@@ -294,6 +288,17 @@ impl World {
                 self.again(kind, dice.bits(), rounds);
                 self.lasts(kind, i64::from(rounds) * 10 * MS, Undo::Nothing);
             }
+        }
+    }
+
+    /// The projector loses its power for a moment.
+    pub(crate) fn lose_memory(&mut self) {
+        self.projector.power_cycle(HostTime(self.t));
+        self.see_light();
+        self.new_projector();
+        self.boot_noise();
+        if self.projector.status().faults == 0 {
+            self.laws.acknowledged();
         }
     }
 
@@ -338,8 +343,13 @@ impl World {
     }
 
     fn trap(&mut self, part: Part, trap: Trap) {
-        // The collector may be busy for five seconds; the frame path reports fifty times a second.
-        let found_ns = if part == Part::Collector { 5_300 * MS } else { 300 * MS };
+        // The collector may be busy for five seconds; the frame path reports fifty times a second. Two seconds are left to a link
+        // that hangs to go on, before the run ends.
+        let found_ns = match part {
+            Part::Collector => 5_300 * MS,
+            Part::Link => 2_300 * MS,
+            Part::Tracking | Part::Plan | Part::Pack => 300 * MS,
+        };
         if trap == Trap::Hangs {
             self.laws.hidden_until(self.awake_at() + found_ns);
         }
@@ -363,6 +373,7 @@ impl World {
             }
             K::H3 if dice.happens(0.3) => {
                 // Nothing of the rig reads the wall clock, but the kernel stamps datagrams with it.
+                self.stands();
                 lock(&self.net).wall_ahead += dice.between(-3_600, 3_600) * S;
                 return self.lasts(kind, MS, Undo::Nothing);
             }
@@ -370,6 +381,7 @@ impl World {
             K::H3 if self.t < self.frozen_until => return self.lasts(kind, MS, Undo::Nothing),
             K::H3 => {
                 let ns = dice.decades(50, 3_000) * MS;
+                self.stands();
                 self.frozen_until = self.t + ns;
                 self.lag_by(ns);
                 self.laws.pauses(self.t, ns);
@@ -378,8 +390,10 @@ impl World {
             }
             K::X6 => {
                 let ns = dice.decades(5, 2_000) * MS;
+                self.stands();
                 self.frozen_until = self.frozen_until.max(self.t + ns);
                 self.laws.pauses(self.t, ns);
+                self.laws.stands_still(self.t, self.frozen_until);
                 return self.lasts(kind, ns, Undo::Nothing);
             }
             K::H5 => self.trap(stage, Trap::Panics),

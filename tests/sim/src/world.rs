@@ -1,7 +1,9 @@
 //! The clock, and everything that it moves: process, cable, projector, tracker, disk, service manager and person.
 
 use crate::cable::{lock, Cable};
+use crate::dice::Dice;
 use crate::disk::Disk;
+use crate::guard::{damage, first_packet, Guard};
 use crate::kinds::{Kind, State};
 use crate::laws::{Laws, BEGINS_WITHIN_NS};
 use crate::line::SerialLine;
@@ -43,6 +45,10 @@ const STARTS: usize = 5;
 const STARTS_WITHIN_NS: i64 = 60 * S;
 /// How often a person who clears up looks again.
 const PERSON_NS: i64 = 300 * MS;
+/// How often a neighbour disturbs the cable, where one does ...
+const DISTURB_NS: i64 = 7 * MS;
+/// ... and for how long after the program has fallen silent: as many damaged packets as the projector bears.
+const DISTURBS_NS: i64 = 2 * S;
 /// Slots of which the shifts wait to be judged.
 const MOVES_KEPT: usize = 64;
 
@@ -65,6 +71,8 @@ pub enum Action {
     Again(Kind, u64, u32),
     /// The next episode begins.
     Episode,
+    /// A neighbour disturbs the cable.
+    Disturb,
     /// The faults of the episode strike although its state was not reached.
     Overdue(u32),
 }
@@ -105,6 +113,28 @@ pub struct Active {
     pub kind: Kind,
     /// How it ends.
     pub undo: Undo,
+    /// The state in which it struck, and what had been seen of its kind before; `None` for what only brings the rig into a
+    /// state.
+    pub struck: Option<Struck>,
+}
+
+/// A fault whose effect is looked for.
+#[derive(Clone, Copy, Debug)]
+pub struct Struck {
+    state: State,
+    seen_before: u64,
+}
+
+/// What the world has seen of faults of the process.
+#[derive(Clone, Copy, Debug, Default)]
+struct Met {
+    kills: u64,
+    stops: u64,
+    orders: u64,
+    refused_files: u64,
+    /// Times that the program's machine or the program itself stood still, or had its clock set.
+    stands: u64,
+    steps: u64,
 }
 
 /// Everything.
@@ -169,6 +199,11 @@ pub struct World {
     pub story: VecDeque<String>,
     /// Print what happens.
     pub is_loud: bool,
+    met: Met,
+    striking: Option<Struck>,
+    /// A packet that a neighbour has overheard.
+    overheard: Vec<u8>,
+    neighbour: Dice,
 }
 
 /// The folder of the scene.
@@ -177,6 +212,8 @@ const ASSETS: &str = concat!(env!("CARGO_MANIFEST_DIR"), "/assets");
 fn rig_of(setup: &Setup, acknowledges: bool) -> Result<Rig, String> {
     let tracks = if setup.follows { "tracks = \"auto\"\nhorizontal_fov_deg = 20\n" } else { "" };
     let predict = setup.predict_ms.map_or(String::new(), |ms| format!("predict_ms = {ms}\n"));
+    let watchdog = setup.alone.and_then(Guard::watchdog_ms);
+    let watchdog = watchdog.map_or(String::new(), |ms| format!("watchdog_ms = {ms}\n"));
     let backend = match setup.serial {
         Some(line) => format!("kind = \"serial\", port = \"/dev/simulated\", baud = {}", line.baud),
         None => "kind = \"usb\"".into(),
@@ -191,7 +228,7 @@ fn rig_of(setup: &Setup, acknowledges: bool) -> Result<Rig, String> {
     let text = format!(
         "[tracker]\n{tracker}\nrate_hz = {}\n\
          [projector]\nwidth = {}\nheight = {}\nplanes = {}\nframe_rate = {}\nbackend = {{ {backend} }}\n{tracks}\
-         [scene]\nfile = \"triangle.gltf\"\n[[scene.bodies]]\nname = \"a\"\n[safety]\nacknowledge_faults = {acknowledges}\n{predict}",
+         [scene]\nfile = \"triangle.gltf\"\n[[scene.bodies]]\nname = \"a\"\n[safety]\nacknowledge_faults = {acknowledges}\n{predict}{watchdog}",
         setup.tracker_hz, setup.raster.0, setup.raster.1, setup.planes, setup.rate_hz
     );
     let config = RigConfig::parse("simulated.toml", &text, Path::new(ASSETS), &Overrides::default())
@@ -229,16 +266,20 @@ impl World {
         let seed = setup.seed;
         let mut cable = Cable::new(seed, setup.ns_per_byte, setup.travel_ns);
         cable.keeps_order = setup.follows;
+        let stretch_ns = setup.alone.map_or(0, Guard::stretches_ns) as u64;
+        cable.stretch = stretch_ns / 1000 * u64::from(DeviceClock::IDEAL.tick_hz) / 1_000_000;
         cable.line = setup.serial.map(|line| SerialLine::new(seed, line, setup.travel_ns));
         let laws = Laws::new(&rig, &setup);
         let tracks = setup.follows.then(|| TrackLaws::new(&rig, &setup)).transpose()?;
         let projector = projector_of(&setup, None, 0)?;
-        Ok(Self {
+        let mut beneath = Beneath::new(seed, slot_ns * setup.render_milli / 1000);
+        beneath.link_late_ns = setup.alone.map_or(0, |guard| guard.link_late_ns(slot_ns));
+        let mut world = Self {
             t: 0,
             far: setup.serial.map(|_| SerialEnd::new(&projector)),
             cable: Arc::new(Mutex::new(cable)),
             net: Arc::new(Mutex::new(Net::new(seed, kind, setup.tracker)?)),
-            beneath: Arc::new(Mutex::new(Beneath::new(seed, slot_ns * setup.render_milli / 1000))),
+            beneath: Arc::new(Mutex::new(beneath)),
             disk: Arc::default(),
             clock: Arc::default(),
             lag: Arc::default(),
@@ -272,8 +313,16 @@ impl World {
             rig,
             rig_by_hand,
             by_hand: false,
+            met: Met::default(),
+            striking: None,
+            overheard: Vec::new(),
+            neighbour: Dice::new(seed, 0xa10e8),
             setup,
-        })
+        };
+        if world.setup.alone == Some(Guard::Watchdog) {
+            world.plan(DISTURB_NS, Action::Disturb);
+        }
+        Ok(world)
     }
 
     /// The host's clock now.
@@ -403,6 +452,7 @@ impl World {
                 Action::ClearUp => self.clear_up(),
                 Action::Again(kind, seed, round) => self.again(kind, seed, round),
                 Action::Episode => {}
+                Action::Disturb => self.disturb(),
                 Action::Overdue(episode) => self.overdue(episode),
             }
         }
@@ -410,14 +460,61 @@ impl World {
 
     fn strike_now(&mut self, kind: Kind, seed: u64) {
         let state = self.state();
-        self.table.count(kind, state);
+        let before = self.seen(kind);
+        self.table.strikes(kind, state);
         self.fold(1, kind as u64 * 8 + state as u64);
         self.tell(|| format!("{kind:?} strikes while {}: {}", state.word(), kind.text()));
         self.laws.disturbed(self.t);
         if !kind.is_of_tracker() {
             self.laws.struck_elsewhere(self.t);
         }
+        self.striking = Some(Struck { state, seen_before: before });
         self.strike(kind, seed);
+        self.striking = None;
+    }
+
+    /// How often an effect of faults of `kind` was seen so far.
+    fn seen(&self, kind: Kind) -> u64 {
+        use Kind as K;
+        let met = &self.met;
+        let cable = || lock(&self.cable).met;
+        match kind {
+            K::T16 | K::N1 | K::N2 | K::N7 => lock(&self.net).met[0],
+            K::N6 => lock(&self.net).met[1],
+            K::U1 | K::U2 | K::U9 => cable().pulls,
+            K::U14 | K::H10 => cable().denied,
+            K::U3 | K::U4 | K::U5 | K::U6 | K::U7 | K::U10 | K::X9 | K::X10 | K::X11
+                if self.setup.serial.is_some() =>
+            {
+                cable().on_line
+            }
+            K::U3 => cable().stalled,
+            K::U4 => cable().slowed,
+            K::U5 => cable().short,
+            K::U6 => cable().babble,
+            K::U7 => cable().spoiled,
+            K::U10 => cable().stale,
+            K::X8 => cable().late,
+            K::U15 | K::H2 | K::X3 => met.kills,
+            K::H6 | K::X4 => met.stops,
+            K::X5 => met.orders,
+            K::G1 | K::G2 => lock(&self.beneath).met[2],
+            K::G4 | K::G5 | K::G6 | K::G7 | K::X7 => lock(&self.beneath).met[1],
+            K::H4 | K::H5 | K::X1 | K::X2 => lock(&self.beneath).met[0],
+            K::H8 | K::H9 => lock(&self.beneath).slowed,
+            K::H1 => lock(&self.disk).met,
+            K::H7 => met.refused_files,
+            K::H3 | K::X6 => met.stands,
+            // The projector itself is struck, whoever looks.
+            K::U8 | K::U11 | K::U12 | K::U13 => self.table.struck(kind),
+            // The tracker or its network: the program runs while it lasts.
+            _ => met.steps,
+        }
+    }
+
+    /// The machine or the program is about to stand still, or a clock is set: an effect if there is a program.
+    pub(crate) fn stands(&mut self) {
+        self.met.stands += u64::from(self.process.is_some());
     }
 
     /// A fault begins that ends after `ns`.
@@ -426,13 +523,18 @@ impl World {
             self.active.push(None);
             self.active.len() - 1
         });
-        self.active[number] = Some(Active { kind, undo });
+        self.active[number] = Some(Active { kind, undo, struck: self.striking.take() });
         self.plan(self.t + ns, Action::End(number));
     }
 
     fn end(&mut self, number: usize) {
         let Some(active) = self.active[number].take() else { return };
         self.tell(|| format!("{:?} is over", active.kind));
+        if let Some(Struck { state, seen_before }) = active.struck {
+            if self.seen(active.kind) > seen_before {
+                self.table.takes_effect(active.kind, state);
+            }
+        }
         // Another fault of the same kind may still last.
         self.undo(&active.undo);
         self.calm_since = self.t;
@@ -463,6 +565,9 @@ impl World {
                     self.laws.heard_of_the_dead(self.t);
                 }
                 self.hear(&transfer.bytes, transfer.cut);
+            } else if self.setup.alone == Some(Guard::Watchdog) {
+                self.laws.heard_of_the_silent(self.t);
+                self.overheard = first_packet(&transfer.bytes).unwrap_or_default().to_vec();
             }
             self.projector.receive(HostTime(self.t), transfer.lane, &transfer.bytes);
             if transfer.cut {
@@ -483,6 +588,21 @@ impl World {
         if cable.plugged {
             self.projector.replies(HostTime(self.t), &mut |_, packet| cable.reply(packet));
         }
+    }
+
+    /// A neighbour sends damaged packets while the program is silent.
+    fn disturb(&mut self) {
+        self.plan(self.t + DISTURB_NS, Action::Disturb);
+        let silent_since = self.laws.silent_since();
+        let is_near = silent_since.is_some_and(|since| self.t - since < DISTURBS_NS);
+        if !is_near || !lock(&self.cable).plugged || self.overheard.is_empty() {
+            return;
+        }
+        let mut bytes = self.overheard.clone();
+        damage(&mut bytes, &mut self.neighbour);
+        self.projector.receive(HostTime(self.t), Lane::Data, &bytes);
+        self.projector.end_of_transfer(HostTime(self.t), Lane::Data);
+        self.see_light();
     }
 
     /// The laws of tracks read what is about to reach the projector on the control lane.
@@ -518,7 +638,7 @@ impl World {
             let lag = self.lag.load(Ordering::Relaxed);
             self.fold(3, event.slot ^ u64::from(event.frame.unwrap_or(u32::MAX)) << 32);
             let planes = self.projector.lit_planes();
-            self.laws.light(&event, planes, lag, &self.beneath, self.events);
+            self.laws.light(&event, planes, lag, &self.beneath, self.projector.clock());
         }
         self.see_moves();
     }
@@ -558,6 +678,7 @@ impl World {
         if process.due() > host {
             return;
         }
+        self.met.steps += 1;
         process.step(host);
         if process.is_over(host) {
             self.exit();
@@ -574,6 +695,7 @@ impl World {
         self.fold(4, self.t as u64);
         self.tell(|| format!("the program ends: {exit:?}"));
         self.last_words();
+        self.left_alone();
         match exit {
             // The service manager does not start it again; whoever asked for the stop does.
             Exit::InOrder => self.needs_person = true,
@@ -586,12 +708,21 @@ impl World {
     /// The program is killed: nothing of it does anything any more.
     pub(crate) fn kill(&mut self) {
         let Some(process) = self.process.take() else { return };
+        self.met.kills += 1;
         self.laws.order_at_exit(&process, self.t);
         self.laws.died(self.t);
         self.frozen_until = self.frozen_until.min(self.t);
         self.tell(|| "the program is killed".into());
         self.last_words();
+        self.left_alone();
         self.restart_at = self.t + RESTART_NS;
+    }
+
+    /// The program has ended. Where its orders stand alone, the projector keeps none of them.
+    fn left_alone(&mut self) {
+        if self.setup.alone == Some(Guard::Orders) {
+            self.lose_memory();
+        }
     }
 
     fn start(&mut self) {
@@ -615,6 +746,7 @@ impl World {
             self.laws.acknowledged();
         }
         if std::mem::take(&mut self.bad_file) {
+            self.met.refused_files += 1;
             self.tell(|| "the program refuses the rig file".into());
             self.needs_person = true;
             return;
@@ -658,6 +790,7 @@ impl World {
         let Some(process) = &mut self.process else { return };
         let ticket = process.orders.give(order, dpm_rig::standing::By::Socket { uid: 1000 });
         process.wake_orders(host);
+        self.met.orders += 1;
         self.laws.ordered(order, ticket, self.t);
         self.fold(5, order as u64);
         self.tell(|| format!("a person orders {}", order.word()));
@@ -670,6 +803,7 @@ impl World {
         let host = self.host();
         if let Some(process) = &mut self.process {
             process.ask_to_stop(host);
+            self.met.stops += 1;
             self.laws.asked_to_stop(self.t);
             self.tell(|| "the program is asked to stop".into());
         }
@@ -809,7 +943,11 @@ impl World {
                 self.restart_at = self.t + 100 * MS;
             }
             St::RePlugging => self.strike(Kind::U1, way),
-            St::FrozenOrBlack => self.give(if way.is_multiple_of(2) { Order::Black } else { Order::Freeze }),
+            // FREEZE holds its picture beyond `dark from`: what ends it is not that guard.
+            St::FrozenOrBlack if way.is_multiple_of(2) || self.setup.alone == Some(Guard::DarkFrom) => {
+                self.give(Order::Black);
+            }
+            St::FrozenOrBlack => self.give(Order::Freeze),
             St::ShuttingDown => self.ask_to_stop(),
             St::Faulted => {
                 if way.is_multiple_of(2) {

@@ -1,6 +1,7 @@
 //! Seeds that once broke a law, shrunk to what they need, and what a life has to be besides lawful: the same every time.
 
 use dpm_rig::pipeline::stepped::Part;
+use dpm_sim::guard::Guard;
 use dpm_sim::kinds::Kind;
 use dpm_sim::life::{live, Lived, Order};
 use dpm_sim::machine::Trap;
@@ -18,6 +19,7 @@ fn order(seed: u64, rate_hz: Option<u32>, seconds: i64) -> Order {
         follows: None,
         serial: None,
         tracker: Some(TrackerKind::NatNet),
+        alone: None,
         first: Vec::new(),
         without: BTreeSet::new(),
         until: None,
@@ -81,6 +83,34 @@ fn what_once_broke_a_law_keeps_them_all() {
         );
         assert!(lived.table.total() > 0, "seed {seed} has no faults");
     }
+}
+
+/// The guards of the light keep every law alone, and what they have to answer happens.
+#[test]
+fn every_guard_of_the_light_keeps_the_laws_alone() {
+    for guard in Guard::ALL {
+        let mut struck = Vec::new();
+        for seed in 1..4 {
+            let lived = lived(&Order { alone: Some(guard), tracker: None, ..order(seed, None, 40) });
+            assert_eq!(lived.broken, None, "{guard:?}, seed {seed}");
+            assert_eq!(lived.setup.alone, Some(guard));
+            struck.extend(guard.kinds().iter().filter(|kind| lived.table.of(**kind) > 0));
+        }
+        let all = guard.kinds();
+        assert!(all.iter().all(|kind| struck.contains(&kind)), "{guard:?}: {struck:?} of {all:?}");
+    }
+}
+
+/// What only stands in for another fault fills no cell of the table, and neither does what nobody was there to meet.
+#[test]
+fn strikes_without_an_effect_are_counted_apart() {
+    let lived = lived(&Order { first: vec![Kind::H11, Kind::U15], tracker: None, ..order(1, None, 60) });
+    assert!(lived.table.struck(Kind::H11) > 0 && lived.table.struck(Kind::U15) > lived.table.of(Kind::U15));
+    assert!(lived.table.of(Kind::U15) > 0 && lived.table.effects() < lived.table.total());
+    let told = lived.table.to_markdown();
+    let (cells, apart) = told.split_once("| stands in |").expect("a part for what stands in");
+    assert!(!cells.contains("| H11 |") && apart.contains("| H11 |"), "{told}");
+    assert!(cells.contains("| U15 in dark |"), "{told}");
 }
 
 /// The same for lives in which the projector follows tracks.
@@ -286,7 +316,7 @@ fn whichever_stage_hangs_light_ends_by_itself() {
     for seed in 1..=6 {
         let lived = lived(&Order { first: first.clone(), ..order(seed, None, 30) });
         assert_eq!(lived.broken, None, "seed {seed}");
-        struck.extend(first.iter().copied().filter(|kind| lived.table.of(*kind) > 0));
+        struck.extend(first.iter().copied().filter(|kind| lived.table.struck(*kind) > 0));
     }
     assert_eq!(struck, first.into_iter().collect(), "all of them struck");
 }
