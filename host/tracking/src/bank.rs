@@ -21,9 +21,9 @@ impl PoseFilterBank {
         Some(self.filters.get_mut(usize::from(sample.body.0))?.update(sample))
     }
 
-    /// A body's [`PoseFilter::levels`]; `None` if there is no such body.
-    pub fn levels(&self, body: BodyIndex) -> Option<[i32; 2]> {
-        self.filters.get(usize::from(body.0)).map(PoseFilter::levels)
+    /// A body's [`PoseFilter::levels`] and [`PoseFilter::excess`]; `None` if there is no such body.
+    pub fn levels(&self, body: BodyIndex) -> Option<([i32; 2], [f64; 2])> {
+        self.filters.get(usize::from(body.0)).map(|filter| (filter.levels(), filter.excess()))
     }
 
     /// A body's track as plain data.

@@ -65,6 +65,8 @@ struct Errors {
     rungs: [f64; RUNGS],
     /// What the tracker's noise makes of any forecast.
     noise: f64,
+    /// Forecasts in the sums, the older ones fading.
+    weight: f64,
     /// Forecasts that were judged.
     count: u32,
 }
@@ -118,6 +120,13 @@ impl<C: Chart> Learner<C> {
     /// Steps by which the learned acceleration lies above that of the settings; each doubles it.
     pub(crate) fn level(&self) -> i32 {
         self.best as i32 - MIDDLE as i32
+    }
+
+    /// By how much the forecasts of the rung that fits the settings err more than those of the one in use, as a root of mean
+    /// squares, m or rad; 0 before the first choice.
+    pub(crate) fn excess(&self) -> f64 {
+        let Errors { rungs, weight, .. } = &self.errors;
+        ((rungs[MIDDLE] - rungs[self.best]).max(0.0) / weight.max(1.0)).sqrt()
     }
 
     /// The bank's models.
@@ -209,6 +218,7 @@ impl<C: Chart> Learner<C> {
             *error = *error * fade + (measured - rung.offset_after(h)).length_squared();
         }
         errors.noise = errors.noise * fade + 3.0 * r;
+        errors.weight = errors.weight * fade + 1.0;
         errors.count = errors.count.saturating_add(1);
         if errors.count < SETTLES {
             return;

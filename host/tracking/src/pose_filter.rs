@@ -363,6 +363,11 @@ impl PoseFilter {
         self.track.as_ref().map_or([0; 2], |track| [track.position.level(), track.rotation.level()])
     }
 
+    /// By how much forecasts 4 ms ahead would err more with the accelerations of the settings, m and rad.
+    pub fn excess(&self) -> [f64; 2] {
+        self.track.as_ref().map_or([0.0; 2], |track| [track.position.excess(), track.rotation.excess()])
+    }
+
     fn variances(&self) -> (f64, f64) {
         if self.config.measure_noise {
             (self.position_noise.variance(), self.rotation_noise.variance())
