@@ -63,6 +63,14 @@ impl NatNetHost {
     }
 }
 
+/// A UDP port that nobody on this machine uses now: for frames, where the usual one may be taken by a rig.
+///
+/// # Errors
+/// The system has none.
+pub fn free_port() -> io::Result<u16> {
+    Ok(UdpPort::bind(SocketAddrV4::new(Ipv4Addr::LOCALHOST, 0), false)?.local()?.port())
+}
+
 impl Drop for NatNetHost {
     fn drop(&mut self) {
         self.stop.store(true, Ordering::Relaxed);

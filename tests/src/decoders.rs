@@ -14,22 +14,13 @@ use dpm_device::link::{
 use dpm_device::planes::Raster;
 use dpm_device::sensor::wire::{SensorMessage, MAX_FRAME, MAX_PACKET, MAX_SAMPLES};
 use dpm_device::time::{DeviceTicks, HostTime};
-use dpm_device::tracker::natnet::frame::{decode_frame, RigidBody};
-use dpm_device::tracker::natnet::messages::{
-    decode_echo_request, decode_echo_response, request_text, ServerInfo,
-};
-use dpm_device::tracker::natnet::models::decode_models;
-use dpm_device::tracker::natnet::wire::split;
-use dpm_device::tracker::natnet::Version;
-use dpm_device::tracker::record::{Recording, SAMPLE_BYTES};
-use dpm_device::tracker::serial::wire::SerialMessage;
-use dpm_device::tracker::vrpn::wire as vrpn;
 use dpm_rig::config::{Overrides, RigConfig};
 use dpm_rig::control::osc::decode as osc;
 use dpm_rig::control::{server, status_file, Asked};
 use dpm_rig::order::Order;
 use dpm_rig::parameters::command::{Command, MAX_LINE};
 use dpm_rig::standing;
+use dpm_rig::trackers::kinds;
 use dpm_scene::camera_files::{self, Form, LengthUnit, LensKind, ReadOptions, StorageError};
 use hil_mock::faults::FaultPlan;
 use hil_mock::usbip::wire as usbip;
@@ -40,7 +31,7 @@ use std::path::Path;
 pub type Entry = fn(&[u8]);
 
 /// Every entry with the name of its fuzz target, which is also the name of its folder of seeds.
-pub const ALL: [(&str, Entry); 36] = [
+pub const ALL: [(&str, Entry); 37] = [
     ("link_stream", link_stream),
     ("link_rle", link_rle),
     ("link_tracks", link_tracks),
@@ -53,6 +44,7 @@ pub const ALL: [(&str, Entry); 36] = [
     ("sensor_packet", sensor_packet),
     ("texts", texts),
     ("recording", recording),
+    ("tracker_kinds", tracker_kinds),
     ("usbip_stream", usbip_stream),
     ("clock_map", clock_map),
     ("control_words", control_words),
@@ -206,47 +198,37 @@ pub fn dlpc900_image(bytes: &[u8]) {
     }
 }
 
-/// A NatNet datagram in every version.
+/// Any bytes into the decoder `name` of a kind of trackers.
+fn tracker(name: &str, bytes: &[u8]) {
+    let decoder = kinds().iter().flat_map(|kind| kind.decoders).find(|(known, _)| *known == name);
+    decoder.unwrap_or_else(|| panic!("no kind of trackers has the decoder {name:?}")).1(bytes);
+}
+
+/// A NatNet datagram.
 pub fn natnet_datagram(bytes: &[u8]) {
-    let Ok((_, payload)) = split(bytes) else { return };
-    let mut bodies: Vec<RigidBody> = Vec::new();
-    for version in [Version::V3_0, Version::new(3, 1), Version::V4_0, Version::V4_1, Version::V4_2] {
-        let ok = decode_frame(payload, version, &mut bodies).is_ok();
-        assert!(bodies.len() <= payload.len() / 38 && (ok || bodies.is_empty()));
-        if let Ok(models) = decode_models(payload, version) {
-            assert!(models.len() <= payload.len());
-        }
-    }
-    let _ = (ServerInfo::decode(payload), request_text(payload));
-    let _ = (decode_echo_request(payload), decode_echo_response(payload));
+    tracker("natnet_datagram", bytes);
 }
 
-/// A VRPN stream: every message lies within it and is recovered from its own encoding.
-pub fn vrpn_stream(mut bytes: &[u8]) {
-    while let Ok(Some((message, taken))) = vrpn::split(bytes) {
-        assert!(taken > 0 && taken <= bytes.len() && message.payload.len() <= taken);
-        let _ = (vrpn::described_name(message.payload), vrpn::decode_pos_quat(message.payload));
-        let mut out = Vec::new();
-        vrpn::put(&mut out, &message);
-        let (back, all) = vrpn::split(&out).expect("own encoding").expect("whole");
-        assert_eq!((back, all), (message, out.len()));
-        bytes = &bytes[taken..];
-    }
+/// A VRPN stream.
+pub fn vrpn_stream(bytes: &[u8]) {
+    tracker("vrpn_stream", bytes);
 }
 
-/// A packet of the serial pose stream: its own encoding is read as the same message.
+/// A packet of the serial pose stream.
 pub fn serial_pose(bytes: &[u8]) {
-    let encoded = |bytes: &[u8]| {
-        let message = SerialMessage::decode(bytes).ok()?;
-        let mut out = Vec::new();
-        message.encode(&mut out);
-        Some(out)
-    };
-    let Some(first) = encoded(bytes) else { return };
-    let mut deframer = Deframer::new([0u8; 256]);
-    let mut frame = None;
-    deframer.push(&first, &mut |f| frame = Some(f.to_vec()));
-    assert_eq!(encoded(&frame.expect("one frame")), Some(first));
+    tracker("serial_pose", bytes);
+}
+
+/// A tracker's recording.
+pub fn recording(bytes: &[u8]) {
+    tracker("recording", bytes);
+}
+
+/// Any bytes into the decoders of all kinds of trackers: the first byte names one. A new kind needs no target of its own.
+pub fn tracker_kinds(bytes: &[u8]) {
+    let Some((&first, rest)) = bytes.split_first() else { return };
+    let all: Vec<_> = kinds().iter().flat_map(|kind| kind.decoders).collect();
+    all[usize::from(first) % all.len()].1(rest);
 }
 
 /// A packet of a light sensor, as it is and with its checksum corrected: a block has as many levels as it says, none above
@@ -269,32 +251,6 @@ pub fn sensor_packet(bytes: &[u8]) {
         let mut second = [0; MAX_FRAME];
         let m = SensorMessage::decode(&again).expect("own encoding").encode(&mut second).expect("room");
         assert_eq!(frame[..n], second[..m]);
-    }
-}
-
-/// A tracker's recording, unchanged and with its frames' checksums corrected. It has no more samples than its bytes
-/// can contain, and a truncated file gives the beginning of what the whole file gives.
-pub fn recording(bytes: &[u8]) {
-    let read = |bytes: &[u8]| Recording::read_from(&mut &bytes[..], bytes.len() as u64, Path::new("seed"));
-    let mut framed = b"dpm-track-0001\r\n".to_vec();
-    let mut rest = bytes;
-    while let Some((&[low, high], after)) = rest.split_first_chunk::<2>() {
-        let (payload, after) = after.split_at(usize::from(u16::from_le_bytes([low, high])).min(after.len()));
-        let from = framed.len();
-        framed.extend((payload.len() as u32).to_le_bytes());
-        framed.extend(payload);
-        let crc = crc32c(&framed[from..]);
-        framed.extend(crc.to_le_bytes());
-        rest = after;
-    }
-    for bytes in [bytes, &framed] {
-        let Ok(whole) = read(bytes) else { continue };
-        assert!(whole.samples.len() * SAMPLE_BYTES + whole.torn_bytes as usize <= bytes.len());
-        if let Ok(part) = read(&bytes[..bytes.len() * 2 / 3]) {
-            // Compared as text, because numbers in a file may be NaN.
-            let text = |r: &Recording, n: usize| format!("{:?}{:?}", r.bodies, &r.samples[..n]);
-            assert_eq!(text(&part, part.samples.len()), text(&whole, part.samples.len()));
-        }
     }
 }
 

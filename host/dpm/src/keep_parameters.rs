@@ -5,7 +5,7 @@ use crate::calibrate::nudge::{check_known, keep, Moved};
 use crate::calibrate::results::Results;
 use dpm_common::files::{keep_old, write_atomically};
 use dpm_device::regular_file;
-use dpm_rig::config::{Overrides, Purpose, RigConfig, TrackerConfig, MAX_FILE_BYTES};
+use dpm_rig::config::{Overrides, Purpose, RigConfig, MAX_FILE_BYTES};
 use dpm_rig::parameters::desk::{Saver, Setting, ToKeep};
 use dpm_rig::rig::Rig;
 use std::io::Write;
@@ -65,7 +65,7 @@ fn motions(path: &Path, rig: &Rig, kept: &ToKeep) -> Result<Option<Results>, Str
     if kept.projector.is_none() && kept.bodies.is_empty() {
         return Ok(None);
     }
-    if !kept.bodies.is_empty() && matches!(rig.config.tracker, TrackerConfig::Mock(_)) {
+    if !kept.bodies.is_empty() && rig.config.tracker.is_mock() {
         return Err(
             "the mock tracker reports the mesh itself, so no motion of a body can be kept; set it back to 0"
                 .into(),

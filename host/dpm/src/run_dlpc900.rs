@@ -22,7 +22,7 @@ use dpm_device::planes::{Channel, PlaneSchedule};
 use dpm_lab::sequence::{draw, poses_at};
 use dpm_render::pack::{pack, BitPlaneFrame, Kernel};
 use dpm_render::{RenderError, Renderer};
-use dpm_rig::config::{Dlpc900Config, Dlpc900Mode, ProjectorBackend, RigConfig, TrackerConfig, VideoInput};
+use dpm_rig::config::{Dlpc900Config, Dlpc900Mode, ProjectorBackend, RigConfig, VideoInput};
 use dpm_rig::failure::{Failure, FailureKind};
 use dpm_rig::order::Order;
 use dpm_rig::pipeline::projector::NO_WATCHDOG;
@@ -257,7 +257,7 @@ fn load(
     let rig = Rig::build(config, None)?;
     let schedule = config.projector.schedule();
     let most = frames_held(dmd, schedule.len());
-    let frames = if matches!(config.tracker, TrackerConfig::Mock(_)) {
+    let frames = if config.tracker.is_mock() {
         let wanted = if config.run.frames == 0 { most as u64 } else { config.run.frames };
         if wanted > most as u64 {
             warnings.push(format!("the {} holds {most} frames; they are shown repeatedly", dmd.name()));

@@ -8,7 +8,8 @@ use dpm_handoff::latest::{latest, Publisher, Reader};
 use dpm_rig::light::registration::RegistrationMeter;
 use dpm_rig::light::FrameRecord;
 use dpm_rig::rig::{affine, Rig};
-use dpm_rig::tracks::{open_for, SourceError, TrackSnapshot, TrackingStage};
+use dpm_rig::trackers::SourceError;
+use dpm_rig::tracks::{open_for, TrackSnapshot, TrackingStage};
 use glam::DAffine3;
 
 /// Between two predictions of [`AgainstOffline::evenly`].

@@ -53,4 +53,5 @@ pub mod rig;
 pub mod run_rig;
 pub mod standing;
 pub mod telemetry;
+pub mod trackers;
 pub mod tracks;

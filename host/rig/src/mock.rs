@@ -4,13 +4,25 @@
 use hil_mock::faults::FaultKind;
 use hil_mock::projector::FaultyProjector;
 use hil_mock::tracker::TRACKER_FAULTS;
+use std::net::{Ipv4Addr, SocketAddrV4};
 
 pub(crate) use hil_mock::faults::{FaultError, FaultPlan};
 pub(crate) use hil_mock::motion::{Motion, MotionError, MotionSpec};
+pub(crate) use hil_mock::natnet_host::{free_port, NatNetHost};
+pub(crate) use hil_mock::natnet_server::{NatNetServer, NatNetServerConfig};
 pub(crate) use hil_mock::projector::{
     serve_cable, DeviceClock, EmulatedProjector, MockConfig, MockProjector, Served, GREATEST_SHIFT,
 };
-pub(crate) use hil_mock::tracker::{MockTracker, MockTrackerConfig, MockTrackerError};
+pub(crate) use hil_mock::serial_server::{pseudo_terminal, SerialPoseDevice, SerialPoseHost};
+pub(crate) use hil_mock::tracker::{MockTracker, MockTrackerConfig, SampleSource};
+pub(crate) use hil_mock::vrpn_host::VrpnHost;
+pub(crate) use hil_mock::vrpn_server::{VrpnNames, VrpnReports};
+
+/// Any free port of this machine, for a mock server.
+pub(crate) const ANY_PORT: SocketAddrV4 = SocketAddrV4::new(Ipv4Addr::LOCALHOST, 0);
+
+/// What to write as `faults`.
+pub(crate) const FAULTS_REMEDY: &str = "for example \"loss=0.01,dropout@1.5s+20ms\"";
 
 /// Checks `tracker.faults` of a rig file.
 ///

@@ -3,7 +3,7 @@
 use crate::calibrated::{calibrated_camera, measured, measured_camera, told_of_measured, CameraFileError};
 use crate::config::{
     BodyConfig, BuiltinScene, EnvironmentConfig, FileAxis, GazeConfig, LiveSource, PictureSource,
-    ProjectorBackend, RigConfig, Tracing, TrackerConfig, TracksUse, MAX_TRACKED,
+    ProjectorBackend, RigConfig, Tracing, TracksUse, MAX_TRACKED,
 };
 use crate::drive::{albedo_of, drive, DriveError, MAX_PICTURE_BYTES};
 use crate::mock::{Motion, MotionError, MotionSpec};
@@ -558,7 +558,7 @@ fn default_motion(index: usize) -> MotionSpec {
 fn rig_bodies(config: &RigConfig, scene: &Scene) -> Result<Vec<RigBody>, RigError> {
     let named = &config.scene.bodies;
     let count = scene.bodies.iter().filter_map(|b| b.tracked).map(|i| usize::from(i) + 1).max().unwrap_or(0);
-    let mock = matches!(config.tracker, TrackerConfig::Mock(_));
+    let mock = config.tracker.is_mock();
     (0..count.max(named.len()))
         .map(|i| {
             let first = scene.bodies.iter().find(|b| b.tracked == Some(i as u16));
@@ -591,7 +591,7 @@ fn rig_bodies(config: &RigConfig, scene: &Scene) -> Result<Vec<RigBody>, RigErro
 
 /// What people wear, as it is tracked. The observer's is at rest where the eye is without it.
 fn rig_worn(config: &RigConfig) -> Result<Vec<RigBody>, RigError> {
-    let mock = matches!(config.tracker, TrackerConfig::Mock(_));
+    let mock = config.tracker.is_mock();
     let observer = &config.observer;
     let eye = DVec3::from_array(observer.position) - DVec3::from_array(observer.eye_offset);
     let worn = config.worn();

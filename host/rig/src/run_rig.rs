@@ -10,7 +10,7 @@ use crate::rig::{Rig, RigError};
 use crate::telemetry::monitor::RunMonitor;
 use crate::telemetry::report::Report;
 use crate::telemetry::trace::write_trace;
-use crate::tracks::SourceError;
+use crate::trackers::SourceError;
 use dpm_common::files::{check_folder, write_atomically};
 use dpm_device::planes::{Channel, Raster};
 use dpm_render::gpu::{validation_messages, Gpu, GpuError};
@@ -246,7 +246,7 @@ impl From<SourceError> for Failure {
     fn from(error: SourceError) -> Self {
         let kind = match error {
             SourceError::Tracker(_) => FailureKind::Device,
-            _ => FailureKind::BadInput,
+            SourceError::Key { .. } => FailureKind::BadInput,
         };
         Self::new(kind, error)
     }

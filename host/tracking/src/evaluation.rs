@@ -32,11 +32,7 @@ impl EvaluationConfig {
     /// 500 Hz, 2 ms of tracker latency, 947 fps, 20 s; noise as standard deviation per axis, m and rad.
     pub(crate) fn with_noise(position_noise_m: f64, rotation_noise_rad: f64) -> Self {
         Self {
-            tracker: MockTrackerConfig {
-                position_noise_m,
-                rotation_noise_rad,
-                ..MockTrackerConfig::default()
-            },
+            tracker: MockTrackerConfig { position_noise_m, rotation_noise_rad, ..Default::default() },
             frame_rate: FrameRate::new(947, 1).expect("not zero"),
             latch_to_light_ns: 2_800_000,
             frames: 20 * 947,

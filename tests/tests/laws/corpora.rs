@@ -158,6 +158,13 @@ fn made() -> Vec<(&'static str, &'static str, Vec<u8>)> {
     seeds.extend(dpm_tests::conversations::recorded());
     seeds.extend(words());
     seeds.extend(files());
+    // The first byte names the decoder: those of the kinds in their order.
+    let of = |target: &str| seeds.iter().find(|seed| seed.0 == target).expect("made above").2.clone();
+    let names = ["natnet_datagram", "vrpn_stream", "serial_pose", "recording"];
+    let bytes = names.map(of);
+    for (k, (name, bytes)) in (0u8..).zip(names.into_iter().zip(bytes)) {
+        seeds.push(("tracker_kinds", name, [&[k][..], &bytes].concat()));
+    }
     seeds
 }
 

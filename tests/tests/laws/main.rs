@@ -36,5 +36,6 @@ mod scene_files;
 mod security;
 mod stability_on_gpu;
 mod structure;
+mod tracker_kinds;
 mod tracks;
 mod warp_on_gpu;

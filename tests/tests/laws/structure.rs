@@ -132,10 +132,11 @@ const ON_THE_WAY: [&str; 7] =
 /// The files in them that name a lock of the standard library, and why no frame waits for it. All others use
 /// `dpm_handoff::path::Lock`, which counts where it is locked on the frame path; the tests of the frame path
 /// (`tests/tests/laws/frame_law/`) demand that it never is.
-const LOCKS: [(&str, &str); 6] = [
+const LOCKS: [(&str, &str); 7] = [
     ("device/src/dlpc900/driver.rs", "a projector that takes no frames of this path"),
     ("device/src/dlpc900/port.rs", "a projector that takes no frames of this path"),
     ("host/handoff/src/path.rs", "the lock that counts"),
+    ("host/common/src/keys/rows.rs", "the table of kinds, which is read with the rig file"),
     ("host/common/src/realtime/standstill.rs", "control threads and the collector"),
     ("host/render/src/gpu/instance.rs", "messages of the validation layer, which no rig loads"),
     ("host/rig/src/control/orders.rs", "threads that serve clients"),

@@ -28,13 +28,10 @@ macro_rules! section {
             }
         }
 
-        impl $section {
-            /// Names of the section's keys.
-            #[allow(dead_code)]
-            pub(crate) const KEYS: &'static [&'static str] = &[$( stringify!($name) ),*];
+        impl $crate::keys::rows::Section for $section {
+            const KEYS: &'static [&'static str] = &[$( stringify!($name) ),*];
 
-            /// Replaces the defaults by the keys that are present. Ignores `kind` and keys of other sections.
-            pub(crate) fn read_keys(
+            fn read_keys(
                 table: &std::collections::BTreeMap<String, $crate::keys::source::Entry>,
                 reader: &mut $crate::keys::read::Reader,
                 section: &str,
@@ -67,8 +64,7 @@ macro_rules! section {
                 out
             }
 
-            /// The section's keys for the manual.
-            pub(crate) fn document(section: &str, out: &mut Vec<$crate::keys::read::KeyDoc>) {
+            fn document(section: &str, out: &mut Vec<$crate::keys::read::KeyDoc>) {
                 #[allow(unused_imports)]
                 use $crate::keys::read::{join, ConfigValue, KeyDoc, Limit};
                 let default = Self::default();
@@ -102,6 +98,7 @@ macro_rules! section {
                 key: &str,
             ) -> Option<Self> {
                 let table = reader.table(node, key)?;
+                use $crate::keys::rows::Section;
                 reader.unknown_keys(table, key, Self::KEYS);
                 Some(Self::read_keys(table, reader, key))
             }
@@ -109,7 +106,7 @@ macro_rules! section {
                 "{}".into()
             }
             fn docs(key: &str, out: &mut Vec<$crate::keys::read::KeyDoc>) {
-                Self::document(key, out);
+                <Self as $crate::keys::rows::Section>::document(key, out);
             }
         }
     };
@@ -182,6 +179,10 @@ macro_rules! kinds {
         }
 
         impl $name {
+            const ROWS: &'static [$crate::keys::rows::KindWord] = &[$(
+                $crate::keys::rows::KindWord::of::<$section>($word, concat!($($doc),+)),
+            )+];
+
             /// The kind's word in the rig file and in reports.
             pub const fn word(&self) -> &'static str {
                 match self { $( Self::$variant(_) => $word, )+ }
@@ -197,56 +198,10 @@ macro_rules! kinds {
                 reader: &mut $crate::keys::read::Reader,
                 key: &str,
             ) -> Option<Self> {
-                use $crate::keys::read::join;
-                use $crate::keys::source::Value;
-                let table = reader.table(node, key)?;
-                let words: &[&str] = &[$( $word ),+];
+                use $crate::keys::rows::{read_kind, Section};
                 let default = Self::default();
-                if let Some(entry) = table.get("kind") {
-                    reader.mark(&join(key, "kind"), &entry.node.origin);
-                }
-                let word = match table.get("kind") {
-                    None => default.word(),
-                    Some(entry) => match &entry.node.value {
-                        Value::String(s) if words.contains(&s.as_str()) => {
-                            words.iter().find(|w| **w == s).copied().unwrap_or(default.word())
-                        }
-                        other => {
-                            let shown = match other {
-                                Value::String(s) => format!("{s:?}"),
-                                other => other.kind().to_string(),
-                            };
-                            let quoted: Vec<String> = words.iter().map(|w| format!("{w:?}")).collect();
-                            let problem = format!("is {shown}, must be one of {}", quoted.join(" | "));
-                            reader.refuse(&entry.node.origin, &join(key, "kind"), problem, "");
-                            return None;
-                        }
-                    },
-                };
-                let known = match word { $( $word => <$section>::KEYS, )+ _ => &[] };
-                for (name, entry) in table {
-                    if name == "kind" || known.contains(&name.as_str()) {
-                        continue;
-                    }
-                    let owners: Vec<&str> = [$( ($word, <$section>::KEYS) ),+]
-                        .iter()
-                        .filter(|(_, keys)| keys.contains(&name.as_str()))
-                        .map(|(w, _)| *w)
-                        .collect();
-                    if owners.is_empty() {
-                        let all: Vec<&str> = known.iter().copied().chain(["kind"]).collect();
-                        let only = std::collections::BTreeMap::from([(name.clone(), entry.clone())]);
-                        reader.unknown_keys(&only, key, &all);
-                    } else {
-                        reader.refuse(
-                            &entry.key_origin,
-                            &join(key, name),
-                            format!("does not belong to kind = {word:?}"),
-                            format!("remove it or choose kind = {:?}", owners.join(" or ")),
-                        );
-                    }
-                }
-                match word {
+                let (index, table) = read_kind(Self::ROWS, default.word(), node, reader, key)?;
+                match Self::ROWS[index].word {
                     $( $word => Some(Self::$variant(<$section>::read_keys(table, reader, key))), )+
                     _ => None,
                 }
@@ -255,16 +210,7 @@ macro_rules! kinds {
                 format!("{{ kind = {:?} }}", self.word())
             }
             fn docs(key: &str, out: &mut Vec<$crate::keys::read::KeyDoc>) {
-                use $crate::keys::read::{join, KeyDoc};
-                out.push(KeyDoc {
-                    key: join(key, "kind"),
-                    kind: [$( concat!("\"", $word, "\"") ),+].join(" | "),
-                    unit: "",
-                    default: format!("{:?}", Self::default().word()),
-                    range: String::new(),
-                    doc: [$( format!("`{}`: {}", $word, [$($doc),+].map(str::trim).join(" ")) ),+].join(" "),
-                });
-                $( <$section>::document(&format!("{key}({})", $word), out); )+
+                $crate::keys::rows::document_kinds(Self::ROWS, Self::default().word(), key, out);
             }
         }
     };

@@ -8,6 +8,7 @@ mod declare;
 mod error;
 mod frame_rate;
 pub mod read;
+pub mod rows;
 pub mod source;
 
 pub use error::{ConfigError, ConfigErrors, Origin};

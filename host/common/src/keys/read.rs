@@ -84,6 +84,30 @@ impl Reader {
     }
 }
 
+/// Refuses several keys that contradict each other, at the first of them that was written. The message names all of
+/// them with their values, so that nobody must guess which other key is involved. `problem` itself names the keys
+/// with an empty value.
+pub fn contradict(reader: &mut Reader, keys: &[(&str, String)], problem: &str, remedy: String) {
+    let at = keys.iter().position(|(key, _)| reader.is_written(key)).unwrap_or(0);
+    let (key, value) = &keys[at];
+    let others = keys.iter().enumerate().filter(|(i, _)| *i != at);
+    let others: Vec<String> = others.map(|(_, (key, value))| format!("`{key}` = {value}")).collect();
+    let origin = reader.origin_of(key);
+    reader.refuse(&origin, key, format!("is {value}, with {}: {problem}", others.join(" and ")), remedy);
+}
+
+/// A value as written in the rig file.
+pub fn shown(value: impl ConfigValue) -> String {
+    value.show()
+}
+
+/// Refuses at the first of `keys` that was written.
+pub fn refuse(reader: &mut Reader, keys: &[&str], problem: String, remedy: String) {
+    let key = keys.iter().find(|k| reader.is_written(k)).unwrap_or(&keys[0]);
+    let origin = reader.origin_of(key);
+    reader.refuse(&origin, key, problem, remedy);
+}
+
 /// `section.key`, or `key` at the top.
 pub fn join(section: &str, key: &str) -> String {
     if section.is_empty() {

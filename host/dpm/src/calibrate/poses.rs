@@ -4,7 +4,7 @@ use dpm_calibration::trajectory::Stamped;
 use dpm_common::clock::{Clock, MonotonicClock};
 use dpm_common::so3::{so3_between, so3_exp};
 use dpm_device::tracker::BodyKey;
-use dpm_rig::config::{RigConfig, TrackerConfig};
+use dpm_rig::config::RigConfig;
 use dpm_rig::failure::{Failure, FailureKind};
 use dpm_rig::tracks::open_in_world;
 use glam::{DAffine3, DQuat, DVec3};
@@ -48,7 +48,7 @@ impl Poses {
     /// # Errors
     /// The tracker is the one in this process, or it cannot be opened.
     pub fn start(config: &RigConfig, names: &[String], clock: MonotonicClock) -> Result<Self, Failure> {
-        if matches!(config.tracker, TrackerConfig::Mock(_)) {
+        if config.tracker.is_mock() {
             return Err(Failure::new(
                 FailureKind::BadInput,
                 "tracker.kind = \"mock\" has no wand: set the tracker of your rig, or start `hil-mock serve sensor-wand` and \

@@ -4,7 +4,7 @@ use super::doctor::serial_ports;
 use super::session::Runner;
 use dpm_page::calibration::{Act, Guide, Session};
 use dpm_rig::calibration_steps::{calibration_file, About, Step, Steps};
-use dpm_rig::config::{ProjectorBackend, RigConfig, TrackerConfig};
+use dpm_rig::config::{ProjectorBackend, RigConfig};
 use dpm_rig::control::rig_name;
 use std::path::Path;
 use std::time::SystemTime;
@@ -82,14 +82,12 @@ impl Guide for RigGuide {
 
     fn ports(&self) -> Vec<String> {
         let projector = match &self.config.projector.backend {
-            ProjectorBackend::Serial(serial) => Some(&serial.port),
+            ProjectorBackend::Serial(serial) => Some(&*serial.port),
             _ => None,
         };
-        let tracker = match &self.config.tracker {
-            TrackerConfig::Serial(serial) => Some(&serial.port),
-            _ => None,
-        };
-        serial_ports().into_iter().filter(|port| ![projector, tracker].contains(&Some(port))).collect()
+        let tracker = self.config.tracker.port();
+        let is_taken = |port: &String| [projector, tracker].contains(&Some(port));
+        serial_ports().into_iter().filter(|port| !is_taken(port)).collect()
     }
 }
 

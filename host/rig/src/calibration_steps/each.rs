@@ -2,7 +2,7 @@
 
 use super::judged::{day, Judged, Part};
 use super::{State, Step, Way, SENSOR};
-use crate::config::{PlaneTiming, TrackerConfig};
+use crate::config::PlaneTiming;
 use dpm_calibration::file::{CheckSection, Provenance};
 use std::path::Path;
 
@@ -63,13 +63,7 @@ fn wand_name<'a>(judged: &'a Judged) -> &'a str {
 
 /// The wand, and where it is tracked.
 fn need_wand(judged: &Judged) -> String {
-    let from = match &judged.about.config.tracker {
-        TrackerConfig::Natnet(c) => format!("NatNet at {}", c.server),
-        TrackerConfig::Vrpn(c) => format!("VRPN at {}", c.server),
-        TrackerConfig::Serial(c) => format!("the tracker on {}", c.port),
-        // Neither has steps.
-        TrackerConfig::Mock(_) | TrackerConfig::Replay(_) => "the tracker".into(),
-    };
+    let from = judged.about.config.tracker.place();
     format!("the wand, which {from} reports as \"{}\"", wand_name(judged))
 }
 

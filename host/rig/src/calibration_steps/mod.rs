@@ -7,7 +7,8 @@ pub mod age;
 mod each;
 mod judged;
 
-use crate::config::{ProjectorBackend, RigConfig, TrackerConfig};
+use crate::config::{ProjectorBackend, RigConfig};
+use crate::trackers::PoseOrigin;
 use dpm_calibration::file::{self, CalibrationFile};
 use judged::Judged;
 use serde::Serialize;
@@ -26,8 +27,7 @@ pub fn calibration_file(rig: &Path, config: &RigConfig) -> PathBuf {
 
 /// True for a rig with a mock in it, which needs no calibration.
 pub fn is_simulated(config: &RigConfig) -> bool {
-    matches!(config.projector.backend, ProjectorBackend::Mock(_))
-        || matches!(config.tracker, TrackerConfig::Mock(_))
+    matches!(config.projector.backend, ProjectorBackend::Mock(_)) || config.tracker.is_mock()
 }
 
 /// How it stands with a step.
@@ -189,7 +189,7 @@ fn none(config: &RigConfig) -> Option<String> {
                     name its file in projector.calibration.";
         return Some(told.into());
     }
-    if let TrackerConfig::Replay(_) = config.tracker {
+    if config.tracker.kind().origin == PoseOrigin::Recorded {
         return Some("This rig plays a recording. Only a live tracker can be calibrated.".into());
     }
     None

@@ -1,13 +1,16 @@
 //! Contradictions between keys. Each is reported at a key that was written, with what would resolve it.
 
 use super::check_projector::projector;
-use super::world::{EnvironmentConfig, GazeConfig, TrackerConfig};
+use super::world::{EnvironmentConfig, GazeConfig};
 use super::{
     LiveSource, Pace, PictureSource, ProjectorBackend, Purpose, ResponseConfig, RigConfig, Wearable,
     WearableConfig,
 };
 use crate::mock::{self, FaultError};
-use dpm_common::keys::read::{ConfigValue, Reader};
+use crate::trackers::PoseOrigin;
+use dpm_common::keys::read::Reader;
+pub(super) use dpm_common::keys::read::{contradict, refuse, shown};
+use dpm_common::keys::rows::OfKind;
 use dpm_device::regular_file;
 use std::collections::HashMap;
 use std::path::{Path, PathBuf};
@@ -19,37 +22,13 @@ pub(crate) const MAX_TRACKED: usize = 256;
 /// The maximum number of heads that are guarded: each costs every frame a look at all mirrors.
 const MAX_HEADS: usize = 16;
 
-/// Refuses several keys that contradict each other, at the first of them that was written. The message names all of
-/// them with their values, so that nobody must guess which other key is involved. `problem` itself names the keys
-/// with an empty value.
-pub(super) fn contradict(reader: &mut Reader, keys: &[(&str, String)], problem: &str, remedy: String) {
-    let at = keys.iter().position(|(key, _)| reader.is_written(key)).unwrap_or(0);
-    let (key, value) = &keys[at];
-    let others = keys.iter().enumerate().filter(|(i, _)| *i != at);
-    let others: Vec<String> = others.map(|(_, (key, value))| format!("`{key}` = {value}")).collect();
-    let origin = reader.origin_of(key);
-    reader.refuse(&origin, key, format!("is {value}, with {}: {problem}", others.join(" and ")), remedy);
-}
-
-/// A value as written in the rig file.
-pub(super) fn shown(value: impl ConfigValue) -> String {
-    value.show()
-}
-
-/// Refuses at the first of `keys` that was written.
-pub(super) fn refuse(reader: &mut Reader, keys: &[&str], problem: String, remedy: String) {
-    let key = keys.iter().find(|k| reader.is_written(k)).unwrap_or(&keys[0]);
-    let origin = reader.origin_of(key);
-    reader.refuse(&origin, key, problem, remedy);
-}
-
 pub(super) fn check(rig: &RigConfig, purpose: Purpose, reader: &mut Reader) {
     projector(rig, reader);
     bodies(rig, reader);
     render(rig, reader);
     time(rig, purpose, reader);
     faults(rig, reader);
-    addresses(rig, reader);
+    rig.tracker.check(reader);
     transforms(rig, reader);
     super::safety::check(rig, reader);
     super::page::check(rig, reader);
@@ -75,43 +54,12 @@ fn transforms(rig: &RigConfig, reader: &mut Reader) {
     }
 }
 
-pub(super) fn addresses(rig: &RigConfig, reader: &mut Reader) {
-    let TrackerConfig::Natnet(natnet) = &rig.tracker else { return };
-    let multicast = natnet.multicast.as_deref();
-    let named =
-        [("server", Some(&*natnet.server)), ("local", Some(&*natnet.local)), ("multicast", multicast)];
-    for (key, text) in named {
-        let Some(text) = text else { continue };
-        let parsed = text.trim().parse::<std::net::Ipv4Addr>();
-        let key = format!("tracker.{key}");
-        match parsed {
-            Err(_) => {
-                let problem = format!("{text:?} is not an IPv4 address");
-                refuse(reader, &[&key], problem, "write for example \"192.168.1.10\"".into());
-            }
-            Ok(group) if key == "tracker.multicast" && !group.is_multicast() => {
-                let problem = format!("{text} is not a multicast group");
-                refuse(
-                    reader,
-                    &[&key],
-                    problem,
-                    "groups are 224.0.0.0 to 239.255.255.255; Motive's is 239.255.42.99".into(),
-                );
-            }
-            Ok(_) => {}
-        }
-    }
-}
-
 fn faults(rig: &RigConfig, reader: &mut Reader) {
     let mut check = |key: &str, plan: Result<(), FaultError>| {
         if let Err(e) = plan {
             refuse(reader, &[key], e.to_string(), "for example \"loss=0.01,dropout@1.5s+20ms\"".into());
         }
     };
-    if let TrackerConfig::Mock(mock) = &rig.tracker {
-        check("tracker.faults", mock::check_tracker_faults(&mock.faults));
-    }
     if let ProjectorBackend::Mock(mock) = &rig.projector.backend {
         check("projector.backend.faults", mock::check_projector_faults(&mock.faults));
     }
@@ -148,7 +96,7 @@ fn bodies(rig: &RigConfig, reader: &mut Reader) {
         names.entry(body.name.as_str()).or_insert(i);
         nodes.entry(body.node_name()).or_insert(i);
         body.id.map(|id| ids.entry(id).or_insert(i));
-        if body.motion.0.is_some() && !matches!(rig.tracker, TrackerConfig::Mock(_)) {
+        if body.motion.0.is_some() && !rig.tracker.is_mock() {
             refuse(
                 reader,
                 &[&format!("{key}.motion")],
@@ -241,7 +189,7 @@ fn worn(rig: &RigConfig, ids: &HashMap<i64, usize>, reader: &mut Reader) {
         }
         worn.id.map(|id| seen.insert(id, &worn.name));
         let moves = worn.motion.0.is_some() || worn.position.is_some();
-        if moves && !matches!(rig.tracker, TrackerConfig::Mock(_)) {
+        if moves && !rig.tracker.is_mock() {
             refuse(
                 reader,
                 &[&key],
@@ -294,7 +242,7 @@ fn time(rig: &RigConfig, purpose: Purpose, reader: &mut Reader) {
                 "use real_time.pace = \"real\"".into(),
             );
         }
-        if !matches!(rig.tracker, TrackerConfig::Mock(_) | TrackerConfig::Replay(_)) {
+        if rig.tracker.kind().origin == PoseOrigin::Measured {
             refuse(
                 reader,
                 &["tracker.kind", "real_time.pace"],
@@ -429,8 +377,8 @@ pub(super) fn resolve_files(rig: &mut RigConfig, base: &Path, purpose: Purpose, 
     if let EnvironmentConfig::Image(image) = &mut rig.scene.environment {
         input(&mut image.file, "scene.environment.file", false);
     }
-    if let TrackerConfig::Replay(replay) = &mut rig.tracker {
-        input(&mut replay.file, "tracker.file", false);
+    if let Some(keys) = rig.tracker.placed(&mut |file, key| input(file, key, false)) {
+        rig.tracker = OfKind::new(rig.tracker.kind(), keys);
     }
     let is_there = rig.calibration.file.as_ref().is_some_and(|file| file.exists());
     if reader.errors.is_empty() && (is_there || !purpose.calibrates) {

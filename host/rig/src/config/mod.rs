@@ -22,6 +22,7 @@ mod world;
 #[cfg(test)]
 mod tests;
 
+pub use crate::trackers::{PoseConfig, TrackerConfig, TrackerTransformConfig};
 pub use backend::*;
 pub use calibration::CalibrationConfig;
 pub(crate) use check::MAX_TRACKED;
@@ -36,12 +37,13 @@ pub use safety::{
     EyesConfig, InterlockConfig, InterlockSignal, KeyInterlockConfig, LimitsConfig, LineInterlockConfig,
     NoInterlockConfig, ProcessInterlockConfig, Restart, SafetyConfig,
 };
-pub use values::{Axes, BitOrder, LiveSource, PerChannel, PictureSource};
+pub use values::{BitOrder, LiveSource, PerChannel, PictureSource};
 pub use wearable::{Wearable, WearableConfig};
 pub use world::*;
 
 use crate::mock::MotionSpec;
 use dpm_common::keys::read::{Any, ConfigValue, Reader};
+use dpm_common::keys::rows::Section;
 use dpm_common::keys::source;
 use dpm_common::section;
 use dpm_device::regular_file;
@@ -59,7 +61,7 @@ section! {
         /// The projector that emits the light.
         projector: ProjectorConfig = ProjectorConfig::default(), "", Any;
         /// Where poses come from.
-        tracker: TrackerConfig = TrackerConfig::default(), "", Any;
+        tracker: TrackerConfig = Default::default(), "", Any;
         /// The eye for which the picture is computed.
         observer: ObserverConfig = ObserverConfig::default(), "", Any;
         /// What is shown.
@@ -169,10 +171,8 @@ impl RigConfig {
     /// Replaces a real tracker (or a recording) and a real projector by the mocks. The mock tracker has the sample
     /// rate of the real one, and moves bodies by `scene.bodies[].motion`, or by its defaults if that is left out.
     pub fn simulate(&mut self) {
-        if !matches!(self.tracker, TrackerConfig::Mock(_)) {
-            let default = MockTrackerConfig::default();
-            let rate_hz = self.tracker.rate_hz().unwrap_or(default.rate_hz);
-            self.tracker = TrackerConfig::Mock(MockTrackerConfig { rate_hz, ..default });
+        if !self.tracker.is_mock() {
+            self.tracker = crate::trackers::simulated(self.tracker.rate_hz());
         }
         if !matches!(self.projector.backend, ProjectorBackend::Mock(_)) {
             self.projector.backend = ProjectorBackend::default();
@@ -187,7 +187,7 @@ impl RigConfig {
         let is_tracked = old.tracked.is_some() || old.body.is_some();
         let projector = &mut self.projector;
         if heads.is_empty() {
-            self.tracker = TrackerConfig::default();
+            self.tracker = Default::default();
             self.calibration = CalibrationConfig::default();
             (projector.calibration, projector.calibration_unit) = (None, None);
             (projector.calibration_camera, projector.calibration_region) = (None, None);
@@ -335,7 +335,9 @@ impl RigConfig {
         if reader.errors.is_empty() {
             if purpose.simulate {
                 // The keys of the replaced parts are not used, but must still make sense.
-                check::addresses(&rig, &mut reader);
+                if !rig.tracker.is_mock() {
+                    rig.tracker.check(&mut reader);
+                }
                 rig.simulate();
             }
             if purpose.projector_only {
@@ -390,7 +392,7 @@ impl RigConfig {
 
 const MANUAL_HEAD: &str = "# The rig file
 
-This page is generated from the declarations in `host/rig/src/config/`. To renew it, run
+This page is generated from the declarations in `host/rig/src/config/` and beside it. To renew it, run
 `DPM_UPDATE_MANUAL=1 cargo test -p dpm-rig --lib manual`.
 
 A rig file is TOML. Keys that it leaves out have their defaults. Environment variables override the file

@@ -2,7 +2,7 @@
 
 use super::backend::{AlpWeights, DisplayEncoding, ProjectorBackend};
 use super::values::{BitOrder, Each, PerChannel};
-use super::world::PoseConfig;
+use crate::trackers::PoseConfig;
 use dpm_common::keys::read::{Any, Limit, NotEmpty, Within};
 use dpm_common::keys::Rate;
 use dpm_common::{kinds, section, words};

@@ -2,7 +2,7 @@
 
 use super::connect::ConnectError;
 use crate::rig::RigError;
-use crate::tracks::SourceError;
+use crate::trackers::SourceError;
 use dpm_render::gpu::GpuError;
 use dpm_render::RenderError;
 

@@ -1,7 +1,7 @@
 //! Combines finished frames and light into a report. It runs on its own thread beside the frame path, so it may
 //! allocate.
 
-use crate::config::{Pace, ProjectorBackend, TrackerConfig};
+use crate::config::{Pace, ProjectorBackend};
 use crate::frame::job::{Fate, FrameNote};
 use crate::frame::slots::OrderedDark;
 use crate::frame::{FrameTimeline, Stage, STAGES};
@@ -129,7 +129,7 @@ impl Collector {
         // A tenth of a run of known length, but enough frames for a 99th percentile.
         let frames = rig.config.run.frames.max(rig.config.slots_to_run());
         let batch_frames = (frames / 10).clamp(100, 10_000);
-        let is_mock_tracker = matches!(rig.config.tracker, TrackerConfig::Mock(_));
+        let is_mock_tracker = rig.config.tracker.is_mock();
         let is_mock_projector = matches!(rig.config.projector.backend, ProjectorBackend::Mock(_));
         let profiler =
             Profiler::new(rig.rate(), measured, batch_frames).with_mocks(is_mock_tracker, is_mock_projector);

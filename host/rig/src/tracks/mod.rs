@@ -9,5 +9,5 @@ mod tracker_frame;
 
 pub use seen::{SeenBodies, Unseen};
 pub(crate) use source::NoTracker;
-pub use source::{open_for, open_for_names, open_in_world, SourceError};
+pub use source::{open_for, open_for_names, open_in_world};
 pub use stage::{TrackSnapshot, TrackingStage};

@@ -3,7 +3,7 @@
 use super::keys::KeyWatch;
 use super::seen::{SeenBodies, Unseen};
 use super::tracker_frame::TrackerFrame;
-use crate::config::{PredictionConfig, TrackerConfig, MAX_TRACKED};
+use crate::config::{PredictionConfig, MAX_TRACKED};
 use crate::rig::Rig;
 use crate::tracks::gauges::{AddedCounts, TrackerGauges};
 use dpm_device::time::HostTime;
@@ -75,23 +75,6 @@ const ADD_EVERY_NS: i64 = 50_000_000;
 /// Time within which every body should have been seen once. A working tracker reports within milliseconds, and one
 /// that must be reconnected within half a second.
 const SEEN_WITHIN_NS: i64 = 1_000_000_000;
-
-/// What the operator should check first if a tracker does not report a body.
-const fn remedy(tracker: &TrackerConfig) -> &'static str {
-    match tracker {
-        TrackerConfig::Mock(_) => "`tracker.faults` and `tracker.drop_out` may silence the mock",
-        TrackerConfig::Natnet(_) => {
-            "is streaming on in the tracking software, are tracker.server and tracker.local right, and do bodies have the same names there?"
-        }
-        TrackerConfig::Vrpn(_) => {
-            "is the server running, are tracker.server and tracker.tracker right, and do bodies have the same names or ids there?"
-        }
-        TrackerConfig::Serial(_) => {
-            "is the device on and plugged in, are tracker.port and tracker.baud right, and do bodies have its numbers as ids?"
-        }
-        TrackerConfig::Replay(_) => "does tracker.file hold these bodies, by name or id, from its beginning on?",
-    }
-}
 
 /// How much more acceleration the filters expect whose tracks correct the light between frames: a correction that comes at
 /// once is worth more noise, which [`crate::engine::follow`] keeps out by its gate.
@@ -280,7 +263,7 @@ impl TrackingStage {
             all().filter(|(i, _)| self.is_unseen(*i)).map(|(_, body)| format!("{:?}", body.name)).collect();
         (!names.is_empty()).then(|| {
             let (names, status) = (names.join(", "), self.tracker.status());
-            let (tracker, remedy) = (self.tracker.name(), remedy(&rig.config.tracker));
+            let (tracker, remedy) = (self.tracker.name(), rig.config.tracker.remedy());
             format!("the {tracker} tracker {verb} {names}, {consequence}: {status}; {remedy}")
         })
     }

@@ -1,7 +1,7 @@
 //! From the tracker's coordinates and time stamps to the world's: `tracker.transform` and `tracker.latency_us`.
 
-use crate::config::TrackerConfig;
 use crate::rig::pose_of;
+use crate::trackers::TrackerConfig;
 use dpm_device::pose::Pose;
 use dpm_device::tracker::TrackerSample;
 use glam::{DAffine3, DMat3, DQuat, DVec3};

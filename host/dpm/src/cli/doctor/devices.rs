@@ -9,7 +9,7 @@ use dpm_device::dlpc900::usb::{describe, UsbHid, UsbPlace};
 use dpm_device::link::{faults, DeviceHello, HostLink, LinkState};
 use dpm_device::tracker::BodyKey;
 use dpm_device::transport::Transport;
-use dpm_rig::config::{Dlpc900Config, ProjectorBackend, RigConfig, TrackerConfig};
+use dpm_rig::config::{Dlpc900Config, ProjectorBackend, RigConfig};
 use dpm_rig::pipeline::projector::{self, Surroundings};
 use dpm_rig::pipeline::{alp_library, connect};
 use dpm_rig::presence;
@@ -46,7 +46,8 @@ pub(super) type Heard = Vec<(String, u32)>;
 /// was heard, if anybody listened.
 pub(super) fn tracker(config: &RigConfig, rig: Option<&Rig>) -> (Finding, Option<Heard>) {
     let name = "tracker";
-    if matches!(config.tracker, TrackerConfig::Mock(_)) {
+    let page = format!("see {}", config.tracker.kind().page);
+    if config.tracker.is_mock() {
         return (Finding::new(name, State::Info, "the mock in this process", ""), None);
     }
     let Some(bodies) = bodies(config, rig) else {
@@ -64,7 +65,7 @@ pub(super) fn tracker(config: &RigConfig, rig: Option<&Rig>) -> (Finding, Option
     let mut tracker = match opened {
         Ok(tracker) => tracker,
         Err(e) => {
-            let finding = Finding::new(name, State::Missing, e.to_string(), "see docs/TRACKERS.md");
+            let finding = Finding::new(name, State::Missing, e.to_string(), page);
             return (finding, None);
         }
     };
@@ -91,7 +92,7 @@ pub(super) fn tracker(config: &RigConfig, rig: Option<&Rig>) -> (Finding, Option
     });
     let found = told.collect::<Vec<_>>().join(", ");
     let finding = match failed {
-        Some(why) => Finding::new(name, State::Missing, format!("{found}; {why}"), "see docs/TRACKERS.md"),
+        Some(why) => Finding::new(name, State::Missing, format!("{found}; {why}"), page),
         None if seen.contains(&0) => {
             let state = if seen.iter().all(|count| *count == 0) { State::Missing } else { State::Warning };
             let remedy = format!("{}; a body that is not seen stays dark", tracker.status());

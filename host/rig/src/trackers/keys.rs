@@ -1,0 +1,86 @@
+//! `[tracker]`: a kind with the values of its keys, and what the program asks of it.
+
+use super::kind::TrackerKind;
+use super::transform::TrackerTransformConfig;
+use crate::mock::Motion;
+use dpm_common::keys::read::Reader;
+use dpm_common::keys::rows::{KeyValues, OfKind};
+use dpm_device::time::{HostClock, HostTime};
+use dpm_device::tracker::{BodyKey, Tracker, TrackerError};
+use std::error::Error;
+use std::path::PathBuf;
+use std::sync::Arc;
+
+/// Why a tracker cannot be opened.
+#[derive(Debug, thiserror::Error)]
+pub enum SourceError {
+    /// A key whose value cannot be used.
+    #[error("{key}: {source}")]
+    Key {
+        /// The key of the rig file.
+        key: &'static str,
+        /// What is wrong with its value.
+        source: Box<dyn Error + Send + Sync>,
+    },
+    /// The device or the network cannot be opened.
+    #[error("tracker: {0}")]
+    Tracker(#[from] TrackerError),
+}
+
+impl SourceError {
+    /// The value of `key` cannot be used.
+    pub fn of_key(key: &'static str, source: impl Into<Box<dyn Error + Send + Sync>>) -> Self {
+        Self::Key { key, source: source.into() }
+    }
+}
+
+/// What a tracker is opened with.
+pub struct TrackerPlace {
+    /// The rig's bodies in their order.
+    pub bodies: Vec<BodyKey>,
+    /// Their true motions, which only a simulated tracker needs.
+    pub motions: Vec<Motion>,
+    /// The clock that stamps polls.
+    pub clock: Arc<dyn HostClock>,
+    /// The instant at which a recording starts. Time 0 of motions is instant 0 of the clock.
+    pub start: HostTime,
+}
+
+/// The keys of a kind of trackers. A [`section!`](dpm_common::section) implements the rest of it.
+pub trait TrackerKeys: KeyValues {
+    /// Expected samples per second; `None` if only the recording knows.
+    fn rate_hz(&self) -> Option<u32>;
+
+    /// From the tracker's coordinates to the world's, and by how many microseconds samples are older than they say. `None`
+    /// for a tracker that knows the world.
+    fn frame(&self) -> Option<(&TrackerTransformConfig, i64)>;
+
+    /// What and where it is, for example "NatNet at 192.168.1.10".
+    fn place(&self) -> String;
+
+    /// What the operator should check first if it does not report a body.
+    fn remedy(&self) -> &'static str;
+
+    /// The serial port that it opens.
+    fn port(&self) -> Option<&str> {
+        None
+    }
+
+    /// Refuses values that make no sense.
+    fn check(&self, _reader: &mut Reader) {}
+
+    /// The same keys with each input file placed by `place`, which gets the file and its key; `None` without files.
+    fn placed(&self, _place: &mut dyn FnMut(&mut PathBuf, &str)) -> Option<Arc<dyn TrackerKeys>> {
+        None
+    }
+
+    /// Opens the tracker. Network and serial trackers connect while they are polled, and reconnect after every loss, so it
+    /// is no error if nothing answers yet.
+    ///
+    /// # Errors
+    /// Settings, addresses or files cannot be used, or the system refuses a socket.
+    fn open(&self, place: TrackerPlace) -> Result<Box<dyn Tracker>, SourceError>;
+}
+
+/// `[tracker]` of a rig file.
+pub type TrackerConfig = OfKind<TrackerKind>;
