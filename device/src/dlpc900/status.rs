@@ -2,6 +2,7 @@
 
 use super::lut::{DisplayMode, Dmd};
 use super::sequence::Version;
+use std::fmt;
 
 /// Everything that one poll of the controller yields.
 #[derive(Clone, Debug, PartialEq, Eq)]
@@ -54,5 +55,24 @@ impl Status {
         ];
         let found: Vec<_> = bits.iter().filter(|b| b.0).map(|b| b.1).collect();
         (!found.is_empty()).then(|| found.join(", "))
+    }
+}
+
+/// One fact per line, for the operator.
+impl fmt::Display for Status {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let raster = self.dmd.raster();
+        let word = |yes: bool| if yes { "yes" } else { "no" };
+        let mode = self.mode.map_or("unknown".to_owned(), |m| format!("{m:?}"));
+        writeln!(f, "dmd          {} ({} x {})", self.dmd.name(), raster.width(), raster.height())?;
+        writeln!(f, "firmware     {} ({})", self.firmware, self.tag)?;
+        if self.firmware.locks_blocks() {
+            writeln!(f, "             this firmware locks mirror blocks after a mode switch; dpm parks and unparks to free them")?;
+        }
+        writeln!(f, "mode         {mode}")?;
+        writeln!(f, "running      {}", word(self.is_running()))?;
+        writeln!(f, "parked       {}", word(self.is_parked()))?;
+        writeln!(f, "video locked {}", word(self.is_locked()))?;
+        writeln!(f, "hardware     {}", self.complaint().unwrap_or_else(|| "ok".into()))
     }
 }

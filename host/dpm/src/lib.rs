@@ -5,7 +5,5 @@ pub mod cli;
 mod dlpc900;
 mod keep_parameters;
 mod notify;
-mod pattern_dlpc900;
-mod rest_dlpc900;
-mod run_dlpc900;
+mod own_run;
 pub mod signals;

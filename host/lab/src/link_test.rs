@@ -12,11 +12,12 @@ use dpm_handoff::wake::WaitPolicy;
 use dpm_render::gpu::Gpu;
 use dpm_render::pack::{pack, BitPlaneFrame, Kernel};
 use dpm_render::{RenderError, Renderer};
-use dpm_rig::config::{Compaction, ProjectorBackend, RigConfig};
+use dpm_rig::config::RigConfig;
 use dpm_rig::failure::{Failure, FailureKind};
 use dpm_rig::pack::prepared::PreparedFrames;
 use dpm_rig::pipeline::projector::{self, Surroundings};
 use dpm_rig::pipeline::{connect, renderer_settings, PipelineError, ENDED_WITH_THE_LAST_RUN};
+use dpm_rig::projectors::{Cable, Compaction};
 use dpm_rig::rig::Rig;
 use dpm_rig::telemetry::monitor::RunMonitor;
 use hil_mock::projector::{serve_cable, EmulatedProjector, MockConfig, GREATEST_SHIFT};
@@ -146,7 +147,7 @@ impl Far {
             medium.transport.set_clock(clock_of());
             return Ok(Self::Outside(medium.transport));
         }
-        let ProjectorBackend::Mock(mock) = &config.projector.backend else {
+        let Some(mock) = config.projector.backend.as_mock() else {
             let word = config.projector.backend.word();
             let told = format!("projector.backend.kind = {word:?} takes no frames over a link");
             return Err(Failure::new(FailureKind::BadInput, told));
@@ -191,11 +192,10 @@ pub fn judge_projector(
     let clock = MonotonicClock::new(0);
     let raster = config.projector.raster();
     let mut far = Far::open(config, raster, clock)?;
-    let (kind, bytes_per_s) = match &config.projector.backend {
-        ProjectorBackend::Usb(_) => (MediumKind::Usb, None),
-        // Ten bits a byte.
-        ProjectorBackend::Serial(serial) => (MediumKind::Serial, Some(serial.baud / 10)),
-        _ => (MediumKind::InProcess, None),
+    let (kind, bytes_per_s) = match config.projector.backend.cable() {
+        Cable::Usb => (MediumKind::Usb, None),
+        Cable::Serial { bytes_per_s } => (MediumKind::Serial, Some(bytes_per_s)),
+        Cable::InProcess => (MediumKind::InProcess, None),
     };
     let medium = Medium { transport: far.transport(), kind, bytes_per_s, clock: &|| clock.now(), stop };
     Ok(conformance::judge(medium, extent))
@@ -216,11 +216,8 @@ pub fn link_test(
     let mut far = Far::open(&rig.config, rig.camera.raster, clock)?;
     let settings = projector::link_settings(&rig.config, rig.camera.raster);
     let mut ways = vec![("raw".to_owned(), Codec::Raw.mask())];
-    let allowed = match &rig.config.projector.backend {
-        ProjectorBackend::Usb(c) => Some(c.compaction),
-        ProjectorBackend::Serial(c) => Some(c.compaction),
-        _ => None,
-    };
+    let backend = &rig.config.projector.backend;
+    let allowed = backend.compaction().filter(|_| !backend.is_mock());
     // The mock is measured both ways, too: its default is raw.
     let word = match allowed {
         Some(Compaction::RAW) => None,

@@ -54,13 +54,13 @@ impl Drop for Viewer {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use dpm_rig::config::{MockProjectorConfig, ProjectorBackend};
+    use dpm_rig::projectors::backend;
     use dpm_rig::standing::{Identity, OrderFile};
 
     #[test]
     fn there_are_so_many_viewers_and_no_more() {
         let monitor = Arc::new(RunMonitor::default());
-        let identity = Identity::of(&ProjectorBackend::Mock(MockProjectorConfig::default()));
+        let identity = Identity::of(&backend("mock").unwrap());
         let (file, _, _) = OrderFile::open(None, identity);
         let orders = Arc::new(Orders::start(monitor.clone(), file, false, None).unwrap());
         let pictures = Pictures::start(monitor.clone()).unwrap();

@@ -48,6 +48,7 @@ pub mod pictures;
 pub mod pipeline;
 pub mod plan;
 pub mod presence;
+pub mod projectors;
 mod render;
 pub mod rig;
 pub mod run_rig;

@@ -2,8 +2,8 @@
 
 use crate::calibrated::{calibrated_camera, measured, measured_camera, told_of_measured, CameraFileError};
 use crate::config::{
-    BodyConfig, BuiltinScene, EnvironmentConfig, FileAxis, GazeConfig, LiveSource, PictureSource,
-    ProjectorBackend, RigConfig, Tracing, TracksUse, MAX_TRACKED,
+    BodyConfig, BuiltinScene, EnvironmentConfig, FileAxis, GazeConfig, LiveSource, PictureSource, RigConfig,
+    Tracing, TracksUse, MAX_TRACKED,
 };
 use crate::drive::{albedo_of, drive, DriveError, MAX_PICTURE_BYTES};
 use crate::mock::{Motion, MotionError, MotionSpec};
@@ -397,8 +397,7 @@ impl Rig {
     /// on a serial line tracks would wait behind planes.
     pub(crate) fn wants_tracks(&self) -> bool {
         let config = &self.config;
-        let carries =
-            matches!(config.projector.backend, ProjectorBackend::Mock(_) | ProjectorBackend::Usb(_));
+        let carries = config.projector.backend.carries_tracks();
         config.projector.tracks == TracksUse::Auto && config.prediction.on && carries
     }
 

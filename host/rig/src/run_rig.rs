@@ -1,7 +1,7 @@
 //! `dpm run` and `dpm demo`: from a configuration to a report and pictures.
 
 use super::pictures::{pictures, to_srgb};
-use crate::config::{ProjectorBackend, RigConfig};
+use crate::config::RigConfig;
 use crate::engine::connect::ConnectError;
 use crate::failure::{Ended, Failure, FailureKind};
 use crate::pipeline::{self, PipelineError, RunOptions, RunOutcome};
@@ -38,7 +38,7 @@ pub fn run_rig(config: &RigConfig, monitor: &Arc<RunMonitor>) -> Result<Ended<Re
     let rig = Arc::new(Rig::build(config, raster)?);
     let output = &config.output;
     // The pictures show the light itself, which only the mock observes.
-    let has_light = matches!(config.projector.backend, ProjectorBackend::Mock(_));
+    let has_light = config.projector.backend.is_mock();
     if output.images && !has_light {
         notes.push(
             "output.images: no pictures are written, because the light of a real projector cannot be observed".into(),
@@ -194,7 +194,7 @@ pub fn traced_raster(config: &RigConfig, gpu: &Gpu, notes: &mut Vec<String>) -> 
     if !gpu.summary().software || small.pixel_count() >= full.pixel_count() {
         return None;
     }
-    if !matches!(config.projector.backend, ProjectorBackend::Mock(_)) {
+    if !config.projector.backend.is_mock() {
         // A real panel has a fixed number of mirrors.
         notes.push(format!(
             "no GPU: software Vulkan ({}) traces all {} x {} mirrors of the projector, which is slow",

@@ -9,6 +9,7 @@
 //! Nothing but ARM lets light through, so an order is kept even where the disk has filled up since the start: its bytes
 //! were allocated before the first light, in the reserve.
 
+mod edid;
 mod identity;
 mod port;
 
@@ -24,6 +25,7 @@ use std::fmt;
 use std::io;
 use std::net::IpAddr;
 use std::path::{Path, PathBuf};
+use std::sync::atomic::{AtomicU64, Ordering};
 use std::time::{SystemTime, UNIX_EPOCH};
 
 /// Version of the files' content. Version 1 had neither `port` nor `lifted`.
@@ -62,6 +64,8 @@ pub enum By {
     Projector,
     /// The interlock, which has opened and is reset by hand.
     Interlock,
+    /// An order that stands for the same projector under another name.
+    SerialNumber,
 }
 
 impl fmt::Display for By {
@@ -74,6 +78,9 @@ impl fmt::Display for By {
             Self::Signal => write!(f, "a signal"),
             Self::Projector => write!(f, "the projector, which had it latched"),
             Self::Interlock => write!(f, "safety.interlock, which opened"),
+            Self::SerialNumber => {
+                write!(f, "an order that stands for the projector with this serial number")
+            }
         }
     }
 }
@@ -90,6 +97,9 @@ struct Content {
     /// The port behind the projector.
     #[serde(default)]
     port: Option<Port>,
+    /// The serial number that the projector gave in HELLO, in hexadecimal digits.
+    #[serde(default)]
+    serial: Option<String>,
     /// Other projectors that a person has armed although this order might have been for them.
     #[serde(default)]
     lifted: Vec<String>,
@@ -106,8 +116,13 @@ impl Content {
             process: std::process::id(),
             projector: cut(projector),
             port,
+            serial: None,
             lifted: Vec::new(),
         }
+    }
+
+    fn serial(&self) -> Option<u64> {
+        u64::from_str_radix(self.serial.as_deref()?, 16).ok()
     }
 
     /// Exactly [`BYTES`] bytes.
@@ -242,6 +257,8 @@ impl StateFolder for Folder {
 #[derive(Debug)]
 pub struct OrderFile {
     identity: Identity,
+    /// The serial number that the projector gave in HELLO; 0 before.
+    device: AtomicU64,
     folder: Option<Box<dyn StateFolder>>,
     path: PathBuf,
 }
@@ -254,7 +271,7 @@ impl OrderFile {
             let source =
                 io::Error::new(io::ErrorKind::NotFound, "this user has no home directory; set DPM_STATE_DIR");
             let error = FolderError::Io { path: "(no state folder)".into(), source };
-            return (Self { identity, folder: None, path: PathBuf::new() }, Some(error), None);
+            return (Self::without_folder(identity, PathBuf::new()), Some(error), None);
         };
         let stands = standing_in(&path, &identity);
         match Folder::make(&path, Owner::OwnOrAnyForRoot) {
@@ -262,7 +279,7 @@ impl OrderFile {
                 let (file, error) = Self::in_folder(Box::new(folder), identity);
                 (file, error, stands)
             }
-            Err(e) => (Self { identity, folder: None, path }, Some(e), stands),
+            Err(e) => (Self::without_folder(identity, path), Some(e), stands),
         }
     }
 
@@ -270,9 +287,34 @@ impl OrderFile {
     pub(crate) fn in_folder(folder: Box<dyn StateFolder>, identity: Identity) -> (Self, Option<FolderError>) {
         let path = folder.path().to_owned();
         match reserve(&*folder, &identity) {
-            Ok(()) => (Self { identity, folder: Some(folder), path }, None),
-            Err(e) => (Self { identity, folder: None, path }, Some(e)),
+            Ok(()) => (Self { folder: Some(folder), ..Self::without_folder(identity, path) }, None),
+            Err(e) => (Self::without_folder(identity, path), Some(e)),
         }
+    }
+
+    fn without_folder(identity: Identity, path: PathBuf) -> Self {
+        Self { identity, device: AtomicU64::new(0), folder: None, path }
+    }
+
+    /// The projector said HELLO with this serial number: orders are kept for it and lifted for it from now on.
+    pub(crate) fn hear(&self, device: Option<u64>) {
+        self.device.store(device.unwrap_or(0), Ordering::Relaxed);
+    }
+
+    fn device(&self) -> Option<u64> {
+        Some(self.device.load(Ordering::Relaxed)).filter(|serial| *serial != 0)
+    }
+
+    /// The orders on the disk that name a projector by its serial number, whatever else they name.
+    pub(crate) fn by_serial_number(&self) -> Vec<(u64, Order)> {
+        let Some(folder) = &self.folder else { return Vec::new() };
+        let names = folder.names().unwrap_or_default().into_iter().filter(|name| name.ends_with(ENDING));
+        let read = |name: String| {
+            let bytes = folder.read(&name, BYTES as u64).map_err(|e| e.to_string());
+            let (stands, content) = stands_in(bytes, &name);
+            Some((content?.serial()?, stands.order))
+        };
+        names.filter_map(read).collect()
     }
 
     /// The file in which orders for this projector are kept.
@@ -296,7 +338,8 @@ impl OrderFile {
             return Err(FolderError::Io { path: self.path.clone(), source });
         };
         let (identity, name) = (&self.identity, self.identity.order_name());
-        let content = Content::new(order, &by.to_string(), identity.what(), identity.port().cloned());
+        let mut content = Content::new(order, &by.to_string(), identity.what(), identity.port().cloned());
+        content.serial = self.device().map(|serial| format!("{serial:016x}"));
         let bytes = content.to_bytes().map_err(|source| FolderError::Io { path: self.path(), source })?;
         let reserve = identity.stem() + RESERVE;
         folder
@@ -316,7 +359,7 @@ impl OrderFile {
     /// An error of the operating system; an order then still stands.
     pub(crate) fn forget(&self) -> Result<(), FolderError> {
         let Some(folder) = &self.folder else { return Ok(()) };
-        for Held { name, is_same, stands, content } in holding(&**folder, &self.identity)? {
+        for Held { name, is_same, stands, content } in holding(&**folder, &self.identity, self.device())? {
             let failed = |source| FolderError::Io { path: folder.path().join(&name), source };
             if !is_same {
                 let mut content = content
@@ -368,8 +411,12 @@ struct Held {
     content: Option<Content>,
 }
 
-/// The files that hold the projector of `identity`.
-fn holding(folder: &dyn StateFolder, identity: &Identity) -> Result<Vec<Held>, FolderError> {
+/// The files that hold the projector of `identity`. `device`: its serial number, if it has given one by now.
+fn holding(
+    folder: &dyn StateFolder,
+    identity: &Identity,
+    device: Option<u64>,
+) -> Result<Vec<Held>, FolderError> {
     let mut all = Vec::new();
     for name in folder.names()?.into_iter().filter(|name| name.ends_with(ENDING)) {
         let path = folder.path().join(&name).display().to_string();
@@ -377,10 +424,19 @@ fn holding(folder: &dyn StateFolder, identity: &Identity) -> Result<Vec<Held>, F
         let (mut stands, content) = stands_in(bytes, &path);
         let (projector, port) =
             content.as_ref().map_or(("", None), |c| (c.projector.as_str(), c.port.as_ref()));
-        let meant = identity.is_meant_by(&name, projector, port);
+        let by_name = identity.is_meant_by(&name, projector, port);
+        // A serial number proves that it is the same one. That it is another one, with a name that this one may have, is
+        // for a person to say by ARM, which then lifts the order for this one alone.
+        let meant = match content.as_ref().and_then(Content::serial).zip(device) {
+            Some((then, now)) if then == now => Match::Same,
+            Some(_) if by_name == Match::Same => Match::Doubtful,
+            _ => by_name,
+        };
         let is_same = meant == Match::Same;
         let is_lifted = content.as_ref().is_some_and(|c| c.lifted.contains(&identity.instance()));
-        if meant == Match::Other || is_lifted && !is_same {
+        // Lifted for this port, and given again where its own projector says HELLO.
+        let waits_for_hello = device.is_none() && content.as_ref().is_some_and(|c| c.serial.is_some());
+        if meant == Match::Other || is_lifted && (!is_same || waits_for_hello) {
             continue;
         }
         stands.is_on_disk = is_same;
@@ -405,7 +461,7 @@ pub fn standing_in(path: &Path, identity: &Identity) -> Option<Stands> {
 
 /// The same for a folder that is open.
 pub(crate) fn standing_in_folder(folder: &dyn StateFolder, identity: &Identity) -> Option<Stands> {
-    match holding(folder, identity) {
+    match holding(folder, identity, None) {
         Ok(all) => {
             let stands = all.into_iter().map(|held| held.stands);
             stands.max_by_key(|stands| (stands.order.strength(), stands.is_on_disk))

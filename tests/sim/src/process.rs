@@ -7,10 +7,10 @@ use crate::port::SimPorts;
 use dpm_device::time::HostTime;
 use dpm_device::transport::serial::{SerialSettings, SerialTransport};
 use dpm_device::transport::{Transport, TransportError};
-use dpm_rig::config::ProjectorBackend;
 use dpm_rig::failure::{Failure, FailureKind};
 use dpm_rig::pipeline::projector::frame_bytes;
 use dpm_rig::pipeline::stepped::{SteppedEnd, SteppedOrders, SteppedRun};
+use dpm_rig::projectors::Cable as RigCable;
 use dpm_rig::rig::Rig;
 use dpm_rig::standing::Identity;
 use dpm_rig::telemetry::monitor::{ProjectorHealth, RunMonitor};
@@ -37,11 +37,12 @@ pub enum Exit {
 
 /// Opens the way to the projector.
 fn medium(rig: &Rig, cable: &Arc<Mutex<Cable>>) -> Result<Box<dyn Transport>, TransportError> {
-    let ProjectorBackend::Serial(serial) = &rig.config.projector.backend else {
+    let backend = &rig.config.projector.backend;
+    let (Some(port), RigCable::Serial { bytes_per_s }) = (backend.port(), backend.cable()) else {
         return Ok(Box::new(HostEnd::open(cable)?));
     };
     let frame_bytes = frame_bytes(rig.camera.raster, rig.config.projector.schedule().len());
-    let settings = SerialSettings { path: serial.port.clone(), baud: serial.baud, frame_bytes };
+    let settings = SerialSettings { path: port.to_owned(), baud: 10 * bytes_per_s, frame_bytes };
     Ok(Box::new(SerialTransport::open_from(settings, Box::new(SimPorts::new(cable.clone())))?))
 }
 

@@ -8,9 +8,10 @@
 use dpm_common::keys::read::ConfigValue;
 use dpm_device::planes::{PlaneSchedule, Raster};
 use dpm_render::gpu::{Gpu, GpuOptions};
-use dpm_rig::config::{DisplayEncoding, Overrides, Pace, ProjectorBackend, RigConfig};
-use dpm_rig::pipeline::projector::display_settings;
+use dpm_rig::config::{Overrides, Pace, RigConfig};
+use dpm_rig::pipeline::projector::panel;
 use dpm_rig::pipeline::{self, RunOptions};
+use dpm_rig::projectors::display::{DisplayConfig, DisplayEncoding};
 use dpm_rig::rig::Rig;
 use dpm_rig::telemetry::live::SeenLight;
 use dpm_rig::telemetry::monitor::RunMonitor;
@@ -45,10 +46,9 @@ fn case(name: String, settings: &[&str]) -> Result<Case, String> {
     let flags = SETTINGS.iter().chain(settings).map(|s| (*s).to_owned()).collect();
     let mut config = RigConfig::demo(&Overrides { variables: vec![], flags }).map_err(|e| e.to_string())?;
     let raster = Raster::new(SIZE.0, SIZE.1).ok_or("no raster")?;
-    let ProjectorBackend::Display(display) = &config.projector.backend else {
-        return Err(format!("{name}: no display"));
-    };
-    let settings = display_settings(&config, display, raster).map_err(|e| e.to_string())?;
+    let display: Option<&DisplayConfig> = config.projector.backend.keys();
+    let display = display.ok_or(format!("{name}: no display"))?;
+    let settings = display.settings(&panel(&config, raster)).map_err(|e| e.to_string())?;
     config.simulate();
     config.real_time.pace = Pace::Virtual;
     let rig = Rig::build(&config, Some(raster)).map_err(|e| e.to_string())?;

@@ -28,6 +28,7 @@ mod live_pictures;
 mod many_bodies;
 mod methods;
 mod packing_on_gpu;
+mod projector_kinds;
 mod real_pace;
 mod recoveries;
 mod references;

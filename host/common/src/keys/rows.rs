@@ -208,6 +208,11 @@ impl<R: Row> OfKind<R> {
         self.kind.word().word
     }
 
+    /// The keys of the kind that has `K`; `None` for another kind.
+    pub fn keys<K: Section>(&self) -> Option<&K> {
+        self.keys.as_any().downcast_ref()
+    }
+
     /// True for a stand-in in this process.
     pub fn is_mock(&self) -> bool {
         self.kind.is_mock()

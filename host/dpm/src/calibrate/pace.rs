@@ -2,8 +2,9 @@
 
 use dpm_device::link::faults;
 use dpm_device::time::FrameRate;
-use dpm_rig::config::{ProjectorBackend, RigConfig};
+use dpm_rig::config::RigConfig;
 use dpm_rig::failure::{Failure, FailureKind};
+use dpm_rig::projectors::SlotClock;
 use dpm_rig::telemetry::monitor::{ProjectorHealth, RunMonitor};
 use std::collections::VecDeque;
 use std::time::{Duration, Instant};
@@ -176,7 +177,7 @@ fn went_off(why: &str) -> Failure {
 /// There is none (exit code 3).
 pub fn slower(config: &RigConfig, carried_hz: f64) -> Result<RigConfig, Failure> {
     let hz = (ROOM * carried_hz) as u32;
-    if let ProjectorBackend::Display(_) | ProjectorBackend::Window(_) = config.projector.backend {
+    if config.projector.backend.kind().slots == SlotClock::Blanks {
         let told = format!(
             "only {carried_hz:.1} of {:.0} frames/s reached the display in time; end other programs, or take a mode with \
              fewer pixels or frames",
@@ -225,7 +226,7 @@ mod tests {
     #[test]
     fn a_display_keeps_the_rate_of_its_mode() {
         let mut config = RigConfig::default();
-        config.projector.backend = ProjectorBackend::Display(Default::default());
+        config.projector.backend = dpm_rig::projectors::backend("display").unwrap();
         assert!(slower(&config, 30.0).unwrap_err().message.contains("mode"));
     }
 

@@ -1,23 +1,22 @@
 //! `dpm dlpc900`: passes the command line to the DLPC900 driver.
 
 use super::watch::{print, refuse_where_dark_stands};
-use crate::dlpc900::{sequence_of, status_text, PatternFileError, ShowAs};
-use crate::rest_dlpc900::put_to_rest;
+use crate::dlpc900::pictures::{sequence_of, PatternFileError, ShowAs};
+use crate::dlpc900::rest::put_to_rest;
 use crate::signals;
 use clap::ValueEnum;
-use dpm_common::guardian::{self, Guardian};
+use dpm_common::guardian;
 use dpm_device::dlpc900::driver::{Dlpc900, UploadProgress};
 use dpm_device::dlpc900::image::{Compression, PlaneOrder};
 use dpm_device::dlpc900::lut::{led, LutEntry};
 use dpm_device::dlpc900::sequence::{LedSetup, Repeat};
 use dpm_device::dlpc900::usb::{self, describe, list, UsbHid, UsbPlace};
 use dpm_device::dlpc900::video::{share_us, Receiver, VideoPatterns};
-use dpm_rig::config::{Dlpc900Config, ProjectorBackend};
 use dpm_rig::failure::{Failure, FailureKind};
+use dpm_rig::projectors;
 use dpm_rig::standing::Identity;
 use std::io::Write;
 use std::path::PathBuf;
-use std::process::Stdio;
 
 /// Flags of `dpm dlpc900`.
 #[derive(clap::Args, Clone, Debug)]
@@ -205,12 +204,13 @@ pub(super) fn execute(args: &Dlpc900Args) -> Result<(), Failure> {
         _ => false,
     };
     if lights {
-        refuse_where_dark_stands(&Identity::of(&ProjectorBackend::Dlpc900(Dlpc900Config::default())))?;
+        // Whichever it is: its place on the bus says nothing of it.
+        projectors::backend("dlpc900").map_or(Ok(()), |any| refuse_where_dark_stands(&Identity::of(&any)))?;
     }
     let mut d = open(args)?;
     match &args.action {
         Action::Guard => {}
-        Action::Status => print(&status_text(&d.status()?)),
+        Action::Status => print(&d.status()?.to_string()),
         Action::Upload(upload) => execute_upload(&mut d, upload)?,
         Action::VideoPattern(video) => execute_video(&mut d, video)?,
         Action::Start => {
@@ -260,51 +260,6 @@ fn guard(place: Option<UsbPlace>) -> Result<(), Failure> {
     let _ =
         writeln!(std::io::stderr(), "the run was killed: its DLPC900 is stopped and exercises its mirrors");
     Ok(())
-}
-
-/// A process that watches this one; see [`Action::Guard`]. It acts if this process ends, or drops this value, without
-/// [`Guard::dismiss`].
-pub(super) struct Guard(Option<Guardian>);
-
-impl Guard {
-    /// The guard of a run on `backend`; `None` if no DLPC900 is part of it.
-    pub(super) fn of(backend: &ProjectorBackend) -> Option<Self> {
-        let device = match backend {
-            ProjectorBackend::Dlpc900(controller) => &controller.device,
-            ProjectorBackend::Display(display) => &display.dlpc900.as_ref()?.device,
-            _ => return None,
-        };
-        Some(Self::start(device.as_deref()))
-    }
-
-    /// Starts it. If that fails, the run continues without this precaution.
-    fn start(device: Option<&str>) -> Self {
-        let start = || {
-            let mut command = std::process::Command::new(std::env::current_exe()?);
-            command.args(["dlpc900", "guard"]).stdout(Stdio::null());
-            if let Some(place) = device {
-                command.args(["--device", place]);
-            }
-            Guardian::start(command)
-        };
-        match start() {
-            Ok(guardian) => Self(Some(guardian)),
-            Err(e) => {
-                let _ = writeln!(
-                    std::io::stderr(),
-                    "cannot start the process that stops the DLPC900 if this run is killed: {e}"
-                );
-                Self(None)
-            }
-        }
-    }
-
-    /// Ends it, because the run has ended by itself and has put the controller to rest.
-    pub(super) fn dismiss(self) {
-        if let Some(guardian) = self.0 {
-            guardian.dismiss();
-        }
-    }
 }
 
 fn execute_upload(d: &mut Dlpc900<UsbHid>, u: &UploadArgs) -> Result<(), Failure> {

@@ -4,7 +4,7 @@ use super::doctor::serial_ports;
 use super::session::Runner;
 use dpm_page::calibration::{Act, Guide, Session};
 use dpm_rig::calibration_steps::{calibration_file, About, Step, Steps};
-use dpm_rig::config::{ProjectorBackend, RigConfig};
+use dpm_rig::config::RigConfig;
 use dpm_rig::control::rig_name;
 use std::path::Path;
 use std::time::SystemTime;
@@ -81,10 +81,7 @@ impl Guide for RigGuide {
     }
 
     fn ports(&self) -> Vec<String> {
-        let projector = match &self.config.projector.backend {
-            ProjectorBackend::Serial(serial) => Some(&*serial.port),
-            _ => None,
-        };
+        let projector = self.config.projector.backend.port();
         let tracker = self.config.tracker.port();
         let is_taken = |port: &String| [projector, tracker].contains(&Some(port));
         serial_ports().into_iter().filter(|port| !is_taken(port)).collect()

@@ -1,11 +1,11 @@
 //! `dpm pattern KIND RIG.toml`: shows a pattern on the rig's projector, or writes it as pictures.
 
+use super::own_runs;
 use super::rig_args::RigArgs;
 use super::watch::{print, run_and_report, watch};
-use crate::pattern_dlpc900::run_pattern_dlpc900;
 use clap::ValueEnum;
 use dpm_device::planes::Channel;
-use dpm_rig::config::{ProjectorBackend, RigConfig};
+use dpm_rig::config::RigConfig;
 use dpm_rig::failure::{Failure, FailureKind};
 use dpm_rig::pattern::{
     flashes, run_pattern, shortest_hold_ms, Axis, Ink, Pattern, PatternError, PatternShow,
@@ -201,9 +201,9 @@ pub(super) fn execute(args: &PatternArgs) -> Result<(), Failure> {
         return write_pictures(&show, file, args.json);
     }
     refuse_flashes(&rig, &show)?;
-    if let ProjectorBackend::Dlpc900(_) = &rig.projector.backend {
-        let report = watch(rig, move |rig, monitor| run_pattern_dlpc900(rig, &show, monitor))?;
-        print(&if args.json { to_json(&report) + "\n" } else { report.to_table() });
+    if let Some(own) = own_runs::of(&rig)? {
+        let report = watch(rig, move |rig, monitor| (own.pattern)(rig, &show, monitor))?;
+        print(&if args.json { report.json() + "\n" } else { report.table() });
         return Ok(());
     }
     run_and_report(rig, args.json, move |rig, monitor| run_pattern(rig, Arc::new(show), monitor))

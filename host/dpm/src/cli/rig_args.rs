@@ -182,7 +182,6 @@ fn number(text: &str) -> Option<u64> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use dpm_rig::config::ProjectorBackend;
     use dpm_rig::rig::Rig;
     use dpm_scene::geometry::projector::ProjectorCamera;
     use glam::DVec3;
@@ -250,7 +249,7 @@ mod tests {
                 RigArgs { simulate: true, frames: Some(4), pace: Some(pace.into()), ..RigArgs::default() };
             let rig = args.rig(Some(&path)).unwrap();
             assert!(rig.tracker.is_mock() && rig.tracker.rate_hz() == Some(240));
-            assert!(matches!(rig.projector.backend, ProjectorBackend::Mock(_)));
+            assert!(rig.projector.backend.is_mock());
             assert_eq!(rig.real_time.pace.word(), pace);
             args.set = vec!["scene.bodies.0.motion={kind=\"still\"}".into()];
             args.rig(Some(&path)).unwrap();

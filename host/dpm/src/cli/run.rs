@@ -1,13 +1,12 @@
 //! `dpm run RIG.toml` and `dpm demo`: run a rig from its file to light.
 
+use super::own_runs;
 use super::rig_args::RigArgs;
-use super::watch::{check_out, print, run_and_report, watch, write_out};
+use super::watch::{check_out, print, run_and_report, watch, write_text};
 use crate::keep_parameters;
-use crate::run_dlpc900::run_dlpc900;
-use dpm_rig::config::{ProjectorBackend, DEFAULT_PAGE};
+use dpm_rig::config::DEFAULT_PAGE;
 use dpm_rig::failure::Failure;
 use dpm_rig::run_rig::run_rig;
-use dpm_rig::telemetry::report::to_json;
 use std::path::{Path, PathBuf};
 
 /// Flags of `dpm run`.
@@ -73,11 +72,12 @@ pub(crate) fn execute_demo(args: &DemoArgs) -> Result<(), Failure> {
 
 fn start(path: Option<&Path>, flags: &RigArgs, json: bool) -> Result<(), Failure> {
     let rig = flags.rig(path)?;
-    if let ProjectorBackend::Dlpc900(_) = &rig.projector.backend {
+    if let Some(own) = own_runs::of(&rig)? {
         check_out(flags.out.as_deref())?;
-        let report = watch(rig, |rig, monitor| run_dlpc900(rig, monitor))?;
-        print(&if json { to_json(&report) + "\n" } else { report.to_table() });
-        return write_out(flags.out.as_deref(), "report.json", &report);
+        let report = watch(rig, |rig, monitor| (own.run)(rig, monitor))?;
+        let text = report.json() + "\n";
+        print(&if json { text.clone() } else { report.table() });
+        return flags.out.as_deref().map_or(Ok(()), |out| write_text(&out.join("report.json"), &text));
     }
     let saver = path.map_or_else(keep_parameters::no_file, |path| keep_parameters::saver(path.into()));
     run_and_report(rig, json, move |rig, monitor| {

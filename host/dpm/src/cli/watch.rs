@@ -5,7 +5,7 @@
 //! The watching thread itself writes nothing. A pipe without a reader or a stopped terminal blocks only the thread
 //! that writes.
 
-use super::dlpc900::Guard;
+use super::guard::Guard;
 use super::keys::Keys;
 use super::live_page;
 use super::osc;
@@ -75,7 +75,14 @@ pub(super) fn write_out<T: serde::Serialize>(
 /// # Errors
 /// The file cannot be written.
 pub(super) fn write_json<T: serde::Serialize>(path: &Path, report: &T) -> Result<(), Failure> {
-    let text = to_json(report) + "\n";
+    write_text(path, &(to_json(report) + "\n"))
+}
+
+/// Writes `text` to `path`.
+///
+/// # Errors
+/// The file cannot be written.
+pub(super) fn write_text(path: &Path, text: &str) -> Result<(), Failure> {
     write_atomically(path, |file| file.write_all(text.as_bytes())).map_err(|e| cannot_write(path, &e))
 }
 
@@ -155,7 +162,7 @@ fn watch_with<T: Send + 'static>(
             .spawn(move || {
                 // Only the instance that has the projector's lock starts it. A panic ends without a message to the guard,
                 // like a SIGKILL.
-                let guard = Guard::of(&rig.projector.backend);
+                let guard = rig.projector.backend.guardian().map(|words| Guard::start(&words));
                 let result = run(&rig, &monitor);
                 if let Some(guard) = guard {
                     guard.dismiss();

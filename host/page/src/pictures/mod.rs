@@ -9,7 +9,6 @@ mod eye;
 mod mesh;
 
 use dpm_common::realtime::os::{give_way, thread_cpu_ns};
-use dpm_rig::config::ProjectorBackend;
 use dpm_rig::pictures::to_srgb;
 use dpm_rig::rig::Rig;
 use dpm_rig::telemetry::live::{Live, SeenLight};
@@ -181,7 +180,7 @@ impl Maker {
         let table: Vec<Vec3> = (0..=TABLE).map(|k| Vec3::splat(k as f32 / TABLE as f32)).collect();
         Self {
             eye: Eye::new(rig),
-            has_light: matches!(rig.config.projector.backend, ProjectorBackend::Mock(_)),
+            has_light: rig.config.projector.backend.is_mock(),
             light: SeenLight::default(),
             white: 0.0,
             srgb: to_srgb(&table, 1.0).chunks_exact(3).map(|c| c[0]).collect(),

@@ -7,7 +7,7 @@ pub mod age;
 mod each;
 mod judged;
 
-use crate::config::{ProjectorBackend, RigConfig};
+use crate::config::RigConfig;
 use crate::trackers::PoseOrigin;
 use dpm_calibration::file::{self, CalibrationFile};
 use judged::Judged;
@@ -27,7 +27,7 @@ pub fn calibration_file(rig: &Path, config: &RigConfig) -> PathBuf {
 
 /// True for a rig with a mock in it, which needs no calibration.
 pub fn is_simulated(config: &RigConfig) -> bool {
-    matches!(config.projector.backend, ProjectorBackend::Mock(_)) || config.tracker.is_mock()
+    config.projector.backend.is_mock() || config.tracker.is_mock()
 }
 
 /// How it stands with a step.
@@ -184,10 +184,13 @@ fn none(config: &RigConfig) -> Option<String> {
                     docs/CALIBRATION.md says how to try all steps without hardware.";
         return Some(told.into());
     }
-    if let ProjectorBackend::Dlpc900(_) = config.projector.backend {
-        let told = "A DLPC900 cannot show the pictures of a calibration. Measure lens and pose with another program, and \
-                    name its file in projector.calibration.";
-        return Some(told.into());
+    let kind = config.projector.backend.kind();
+    if kind.is_loaded() {
+        return Some(format!(
+            "A {} cannot show the pictures of a calibration. Measure lens and pose with another program, and name its file in \
+             projector.calibration.",
+            kind.name
+        ));
     }
     if config.tracker.kind().origin == PoseOrigin::Recorded {
         return Some("This rig plays a recording. Only a live tracker can be calibrated.".into());

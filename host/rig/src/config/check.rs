@@ -2,11 +2,7 @@
 
 use super::check_projector::projector;
 use super::world::{EnvironmentConfig, GazeConfig};
-use super::{
-    LiveSource, Pace, PictureSource, ProjectorBackend, Purpose, ResponseConfig, RigConfig, Wearable,
-    WearableConfig,
-};
-use crate::mock::{self, FaultError};
+use super::{LiveSource, Pace, PictureSource, Purpose, ResponseConfig, RigConfig, Wearable, WearableConfig};
 use crate::trackers::PoseOrigin;
 use dpm_common::keys::read::Reader;
 pub(super) use dpm_common::keys::read::{contradict, refuse, shown};
@@ -27,7 +23,6 @@ pub(super) fn check(rig: &RigConfig, purpose: Purpose, reader: &mut Reader) {
     bodies(rig, reader);
     render(rig, reader);
     time(rig, purpose, reader);
-    faults(rig, reader);
     rig.tracker.check(reader);
     transforms(rig, reader);
     super::safety::check(rig, reader);
@@ -51,17 +46,6 @@ fn transforms(rig: &RigConfig, reader: &mut Reader) {
     for (i, body) in rig.scene.bodies.iter().enumerate() {
         let pose = &body.mesh_to_body;
         check(format!("scene.bodies.{i}.mesh_to_body"), pose.to_affine().is_some(), pose.rotation.is_some());
-    }
-}
-
-fn faults(rig: &RigConfig, reader: &mut Reader) {
-    let mut check = |key: &str, plan: Result<(), FaultError>| {
-        if let Err(e) = plan {
-            refuse(reader, &[key], e.to_string(), "for example \"loss=0.01,dropout@1.5s+20ms\"".into());
-        }
-    };
-    if let ProjectorBackend::Mock(mock) = &rig.projector.backend {
-        check("projector.backend.faults", mock::check_projector_faults(&mock.faults));
     }
 }
 
@@ -201,12 +185,14 @@ fn worn(rig: &RigConfig, ids: &HashMap<i64, usize>, reader: &mut Reader) {
             );
         }
     }
-    if !rig.heads().is_empty() && matches!(rig.projector.backend, ProjectorBackend::Dlpc900(_)) {
+    if !rig.heads().is_empty() && rig.projector.backend.kind().is_loaded() {
         let keys = ["safety.eyes.heads", "observer.tracked", "observer.body"];
-        let problem = "names a head, and a DLPC900 cannot spare it: its patterns are loaded before anybody knows where \
-                       the head will be";
+        let problem = format!(
+            "names a head, and a {} cannot spare it: its patterns are loaded before anybody knows where the head will be",
+            rig.projector.backend.kind().name
+        );
         let remedy = "keep people out of the beam, and set safety.eyes.guard = false";
-        refuse(reader, &keys, problem.into(), remedy.into());
+        refuse(reader, &keys, problem, remedy.into());
     }
     if rig.heads().len() > MAX_HEADS {
         let problem =
@@ -234,7 +220,7 @@ fn render(rig: &RigConfig, reader: &mut Reader) {
 
 fn time(rig: &RigConfig, purpose: Purpose, reader: &mut Reader) {
     if rig.real_time.pace == Pace::Virtual {
-        if !matches!(rig.projector.backend, ProjectorBackend::Mock(_)) {
+        if !rig.projector.backend.is_mock() {
             refuse(
                 reader,
                 &["projector.backend.kind", "real_time.pace"],
@@ -272,8 +258,8 @@ fn time(rig: &RigConfig, purpose: Purpose, reader: &mut Reader) {
 /// were not written adapt to these by themselves, so each problem names first the key that was written.
 fn horizon(rig: &RigConfig, reader: &mut Reader) {
     let (frame_ms, rate) = (rig.frame_ms(), rig.projector.frame_rate.hz());
-    // A DLPC900 has no watchdog.
-    let has_watchdog = !matches!(rig.projector.backend, ProjectorBackend::Dlpc900(_));
+    // What shows loaded frames has no watchdog.
+    let has_watchdog = !rig.projector.backend.kind().is_loaded();
     if let Some(ms) = rig.safety.watchdog_ms.filter(|ms| has_watchdog && f64::from(*ms) < 2.0 * frame_ms) {
         refuse(
             reader,

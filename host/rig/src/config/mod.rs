@@ -4,7 +4,6 @@
 //! reported at once, each with file, line and column. `docs/CONFIG.md` lists the keys; it is generated from their
 //! declarations here.
 
-mod backend;
 mod calibration;
 mod check;
 mod check_projector;
@@ -22,8 +21,8 @@ mod world;
 #[cfg(test)]
 mod tests;
 
+pub use crate::projectors::{PlaneTiming, PlaneWeights, ProjectorBackend};
 pub use crate::trackers::{PoseConfig, TrackerConfig, TrackerTransformConfig};
-pub use backend::*;
 pub use calibration::CalibrationConfig;
 pub(crate) use check::MAX_TRACKED;
 pub(crate) use dpm_common::keys::read::KeyDoc;
@@ -174,8 +173,8 @@ impl RigConfig {
         if !self.tracker.is_mock() {
             self.tracker = crate::trackers::simulated(self.tracker.rate_hz());
         }
-        if !matches!(self.projector.backend, ProjectorBackend::Mock(_)) {
-            self.projector.backend = ProjectorBackend::default();
+        if !self.projector.backend.is_mock() {
+            self.projector.backend = Default::default();
         }
     }
 

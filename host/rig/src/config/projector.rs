@@ -1,7 +1,7 @@
 //! `[projector]`: the projector, its position, and its connection.
 
-use super::backend::{AlpWeights, DisplayEncoding, ProjectorBackend};
 use super::values::{BitOrder, Each, PerChannel};
+use crate::projectors::{FrameKeys, PlaneTiming, PlaneWeights, ProjectorBackend};
 use crate::trackers::PoseConfig;
 use dpm_common::keys::read::{Any, Limit, NotEmpty, Within};
 use dpm_common::keys::Rate;
@@ -95,7 +95,7 @@ section! {
         /// a 1024 x 768 panel at 44.0 us per plane, which is 947 frames of 24 planes.
         max_planes_per_second: u32 = 22_728, "planes/s", Within(1, 10_000_000);
         /// How the program reaches the projector.
-        backend: ProjectorBackend = ProjectorBackend::default(), "", Any;
+        backend: ProjectorBackend = Default::default(), "", Any;
     }
 }
 
@@ -115,31 +115,14 @@ impl ProjectorConfig {
 
     /// How the light of a frame is shared out over its exposure.
     pub fn plane_timing(&self) -> PlaneTiming {
-        match &self.backend {
-            ProjectorBackend::Display(display) if display.dlpc900.is_some() => {
-                match display.encoding.video_bits().depth() {
-                    1 => PlaneTiming::Equal,
-                    planes => PlaneTiming::Together { planes },
-                }
-            }
-            ProjectorBackend::Display(display) if display.encoding == DisplayEncoding::Rgb8 => {
-                PlaneTiming::Held
-            }
-            ProjectorBackend::Window(_) => PlaneTiming::Held,
-            ProjectorBackend::Alp(alp) if alp.weights == AlpWeights::Binary => PlaneTiming::ByWeight,
-            _ => PlaneTiming::Equal,
-        }
+        self.backend.plane_timing()
     }
 
     /// How much of a frame its planes are lit, one right after the other from the first on: a time and the time of the
     /// frame, nanoseconds.
     pub fn lit_of_frame_ns(&self) -> [i64; 2] {
         let frame_ns = self.frame_rate.slot_len_ns(0);
-        let lit_ns = match &self.backend {
-            ProjectorBackend::Display(display) => display.lit_ns(self.frame_rate).unwrap_or(frame_ns),
-            _ => frame_ns,
-        };
-        [lit_ns, frame_ns]
+        [self.backend.lit_ns(self.frame_rate).unwrap_or(frame_ns), frame_ns]
     }
 
     /// True if the light of a frame has no gap: what the codes of a light sensor are made for.
@@ -157,40 +140,28 @@ impl ProjectorConfig {
     /// `schedule` as this projector lights it: a light source that is not dimmed from plane to plane gives full white where
     /// all planes are on, whatever their bits.
     pub fn lit_by(&self, schedule: PlaneSchedule) -> PlaneSchedule {
-        match &self.backend {
-            ProjectorBackend::Display(_) | ProjectorBackend::Window(_) | ProjectorBackend::Alp(_) => {
-                schedule.filled()
-            }
-            _ => schedule,
+        if self.backend.is_lit_fully() {
+            schedule.filled()
+        } else {
+            schedule
         }
     }
 
-    /// From the start of a slot on the projector's clock to the light of its frame, nanoseconds: `latency_us`, and for a
-    /// display or a window the time until the vertical blank and until the middle row. A DLPC900 behind a display shows a
-    /// frame from the vertical pulse on that follows it.
+    /// From the start of a slot on the projector's clock to the light of its frame, nanoseconds: `latency_us`, and what the
+    /// kind of projector adds.
     pub fn light_delay_ns(&self) -> i64 {
-        let frame_ns = self.frame_rate.slot_len_ns(0);
-        let commit_ns = match &self.backend {
-            // From the vertical pulse before the first row to the one after the last row is a whole frame.
-            ProjectorBackend::Display(display) if display.dlpc900.is_some() => {
-                display.commit_ns(frame_ns) + frame_ns / 2
-            }
-            ProjectorBackend::Display(display) => display.commit_ns(frame_ns),
-            ProjectorBackend::Window(window) => window.commit_ns(frame_ns),
-            _ => return i64::from(self.latency_us) * 1000,
-        };
-        // The blank comes `commit_us` and half of the time without rows later, the middle row half of the rows after it:
-        // together half a frame, whatever the mode.
-        i64::from(self.latency_us) * 1000 + commit_ns + frame_ns / 2
+        i64::from(self.latency_us) * 1000 + self.backend.light_delay_ns(self.frame_rate.slot_len_ns(0))
     }
 
     /// The planes of a frame in the order in which they are shown.
     pub fn schedule(&self) -> PlaneSchedule {
-        let of_encoding = match &self.backend {
-            ProjectorBackend::Display(display) => display.schedule(),
-            _ => None,
-        };
-        of_encoding.unwrap_or_else(|| self.lit_by(self.schedule_of_keys()))
+        self.backend.schedule().unwrap_or_else(|| self.lit_by(self.schedule_of_keys()))
+    }
+
+    /// What the kind of projector has to know of frames to judge its keys.
+    pub(super) fn frame_keys(&self) -> FrameKeys {
+        let size = [self.width, self.height];
+        FrameKeys { size, rate: self.frame_rate, planes: self.planes, weights: self.weights }
     }
 
     /// The planes that `planes`, `weights` and `plane_order` describe.
@@ -276,22 +247,6 @@ impl CalibrationCameraConfig {
     }
 }
 
-/// How the light of a frame is shared out over its exposure.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum PlaneTiming {
-    /// Every plane is lit equally long, with the light of its bit.
-    Equal,
-    /// Every plane is lit for as long as its bit weighs, always with the same light: an ALP with `weights = "binary"`.
-    ByWeight,
-    /// So many planes are lit together, as a number of as many bits, and the next ones after them: the patterns of a DLPC900.
-    Together {
-        /// Planes of a pattern.
-        planes: u8,
-    },
-    /// There are no planes: code values are shown for the whole frame, by a display that is given them.
-    Held,
-}
-
 words! {
     /// The instant for which each bit plane shows the bodies.
     pub enum PlanePoses {
@@ -309,16 +264,6 @@ words! {
         Auto = "auto",
         /// Never.
         Off = "off",
-    }
-}
-
-words! {
-    /// How much light the planes of a channel give.
-    pub enum PlaneWeights {
-        /// Half as much from plane to plane.
-        Binary = "binary",
-        /// All the same.
-        Equal = "equal",
     }
 }
 

@@ -1,7 +1,7 @@
 //! `[safety]` with its limits and interlock: what happens when something fails, how much light is permitted, and what else
 //! must permit it.
 
-use super::{Origin, ProjectorBackend, RigConfig, Wearable};
+use super::{Origin, RigConfig, Wearable};
 use dpm_common::keys::read::{Any, NotEmpty, Reader, Within};
 use dpm_common::{kinds, section, words};
 use dpm_device::link::{LightLimits, MAX_LIMIT_MS, MIN_LIMIT_MS};
@@ -210,12 +210,15 @@ pub(super) fn check(rig: &RigConfig, reader: &mut Reader) {
         let remedy = "at least 0.5 s, or 0 to switch it off";
         refuse("safety.limits.full_white_s", "is too short to be distinguished from a flash", remedy);
     }
-    if !limits.limits().is_off() && matches!(rig.projector.backend, ProjectorBackend::Dlpc900(_)) {
+    if !limits.limits().is_off() && rig.projector.backend.kind().is_loaded() {
         let key =
             if limits.mean_level > 0.0 { "safety.limits.mean_level" } else { "safety.limits.full_white_s" };
         refuse(
             key,
-            "cannot be kept on a DLPC900: its light comes from its own memory or a video input, which this program does not count",
+            &format!(
+                "cannot be kept on a {}: its light comes from its own memory or a video input, which this program does not count",
+                rig.projector.backend.kind().name
+            ),
             "limit its light by the LED currents, or remove the key",
         );
     }
@@ -242,9 +245,9 @@ pub(super) fn check(rig: &RigConfig, reader: &mut Reader) {
             if is_relative(&l.file) {
                 refuse("safety.interlock.file", "is a relative path", "write an absolute path");
             }
-            if let (Some(ours), ProjectorBackend::Serial(serial)) = (&l.port, &rig.projector.backend) {
+            if let (Some(ours), Some(port)) = (&l.port, rig.projector.backend.port()) {
                 let device = |path: &str| std::fs::canonicalize(path).unwrap_or_else(|_| path.into());
-                if device(ours) == device(&serial.port) {
+                if device(ours) == device(port) {
                     let remedy = "a port can be opened once; use another";
                     refuse("safety.interlock.port", "is the projector's own port", remedy);
                 }

@@ -51,11 +51,14 @@ pub(crate) struct Given {
     changes: bool,
     /// What became of the order before it.
     before: Option<Kept>,
+    /// The projector's serial number, if it has given one.
+    device: Option<u64>,
 }
 
 impl Given {
     /// Writes the order down, or forgets what stands. This may take as long as the disk takes.
     pub(crate) fn write(&self, file: &OrderFile, keeps: bool) -> Kept {
+        file.hear(self.device);
         match &self.before {
             Some(kept @ Kept::In(_)) if !self.changes => return kept.clone(),
             _ if !keeps => return Kept::Nowhere,
@@ -116,7 +119,7 @@ impl Desk {
             waiting => {
                 let (order, changes) = standing.map_or((order, true), |standing| (standing, false));
                 let signals = stopping::orders();
-                *waiting = Some(Given { number, order, by, signals, changes, before: None });
+                *waiting = Some(Given { number, order, by, signals, changes, before: None, device: None });
             }
         }
         Ticket(number)
@@ -137,6 +140,17 @@ impl Desk {
             self.newest += 1;
             self.queue(Order::Safe, By::Projector);
         }
+        let found = self.monitor.take_found_held();
+        if let Some(order) =
+            found.filter(|order| self.stands.is_none_or(|stands| stands.strength() < order.strength()))
+        {
+            self.newest += 1;
+            self.monitor.note(format!(
+                "projector: {} stands for the one with this serial number, wherever it is plugged in; it stays dark until ARM",
+                order.word()
+            ));
+            self.queue(order, By::SerialNumber);
+        }
         // The interlock itself keeps this run dark; the order keeps the next one dark.
         if self.monitor.interlock_awaits_reset() && self.stands.is_none() {
             self.newest += 1;
@@ -148,7 +162,7 @@ impl Desk {
     pub(crate) fn next(&mut self) -> Option<Given> {
         self.absorb();
         let given = self.waiting.take()?;
-        Some(Given { before: self.outcome.take(), ..given })
+        Some(Given { before: self.outcome.take(), device: self.monitor.device(), ..given })
     }
 
     /// `given` was written with this outcome.
@@ -158,6 +172,9 @@ impl Desk {
             // An order that came while the disk was busy is newer than this one.
             if self.newest == given.number {
                 self.stands = None;
+                if let Some(device) = given.device {
+                    self.monitor.lift_held(device);
+                }
                 self.monitor.reset_interlock();
                 self.monitor.arm_unless_darkened(given.signals);
             }
@@ -226,6 +243,7 @@ impl Orders {
         keeps: bool,
         stands: Option<&Stands>,
     ) -> std::io::Result<Self> {
+        monitor.hold_devices(file.by_serial_number());
         let desk = Desk::new(monitor, stands, file.path());
         let state = Mutex::new(State { desk, closing: false, closed: false });
         let inner = Arc::new(Inner { file, keeps, state, changed: Condvar::new() });
@@ -314,8 +332,9 @@ impl Inner {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::config::{MockProjectorConfig, ProjectorBackend, Restart, UsbProjectorConfig};
+    use crate::config::{ProjectorBackend, Restart};
     use crate::interlock::{Contact, Interlock};
+    use crate::projectors::backend;
     use crate::standing::{standing_in, Identity};
     use std::sync::atomic::{AtomicBool, Ordering};
     use std::time::Instant;
@@ -328,7 +347,7 @@ mod tests {
 
     impl Rig {
         fn new(name: &str) -> Self {
-            Self::with(name, &ProjectorBackend::Mock(MockProjectorConfig::default()))
+            Self::with(name, &backend("mock").unwrap())
         }
 
         fn with(name: &str, backend: &ProjectorBackend) -> Self {
@@ -395,7 +414,7 @@ mod tests {
     /// Found in use, R3: a restart of the service brought light back that somebody had ended by BLACK.
     #[test]
     fn r3_no_end_lifts_an_order_but_that_of_a_mock_and_then_only_what_is_no_safe() {
-        let real = ProjectorBackend::Usb(UsbProjectorConfig::default());
+        let real = backend("usb").unwrap();
         let [mut mock, mut real] = [Rig::new("end"), Rig::with("end-real", &real)];
         let (black, safe) = (Some(Order::Black), Some(Order::Safe));
         // What is left of a mock's order and of a real projector's.
@@ -457,7 +476,7 @@ mod tests {
     /// An interlock that is reset by hand and has opened: dark after it has closed, and in the next run.
     #[test]
     fn an_interlock_that_is_reset_by_hand_waits_for_arm_over_restarts() {
-        let rig = Rig::with("reset", &ProjectorBackend::Usb(UsbProjectorConfig::default()));
+        let rig = Rig::with("reset", &backend("usb").unwrap());
         let contact = Arc::new(AtomicBool::new(true));
         let interlock = Interlock::with_contact("a switch", Switch(contact.clone())).unwrap();
         rig.monitor.set_interlock(interlock.reset_by(Restart::ByHand));

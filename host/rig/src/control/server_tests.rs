@@ -1,7 +1,8 @@
 use super::*;
-use crate::config::{MockProjectorConfig, Overrides, ProjectorBackend, RigConfig};
+use crate::config::{Overrides, RigConfig};
 use crate::control::change::{self, ChangeError};
 use crate::control::client;
+use crate::projectors::backend;
 use crate::standing::{Identity, OrderFile};
 use crate::telemetry::monitor::ProjectorHealth;
 use dpm_common::folder::Owner;
@@ -41,7 +42,7 @@ impl Rig {
     fn new(name: &str) -> Self {
         let dir = std::env::temp_dir().join(format!("dpm-control-{}-{name}", std::process::id()));
         let _ = std::fs::remove_dir_all(&dir);
-        let identity = Identity::of(&ProjectorBackend::Mock(MockProjectorConfig::default()));
+        let identity = Identity::of(&backend("mock").unwrap());
         let (file, error, _) = OrderFile::open(Some(dir.join("state")), identity);
         assert!(error.is_none(), "{error:?}");
         let monitor = Arc::new(RunMonitor::default());

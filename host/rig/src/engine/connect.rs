@@ -80,6 +80,9 @@ impl Connecting {
             self.session = link.counters().sessions;
             (self.best, self.echoes) = (None, 0);
         }
+        if let Some(hello) = link.device() {
+            monitor.meet_device(hello.serial);
+        }
         link.take_echoes(|e| {
             self.echoes += 1;
             let round_trip = e.host_received_at.ns_since(e.host_sent_at);

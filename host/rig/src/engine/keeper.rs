@@ -130,6 +130,9 @@ impl LinkKeeper {
         if link.counters().sessions != self.session {
             self.session = link.counters().sessions;
             (self.is_timed, self.map) = (false, None);
+            if let Some(hello) = link.device() {
+                monitor.meet_device(hello.serial);
+            }
             if let Some(reports) = &mut self.reports {
                 reports.new_session();
             }

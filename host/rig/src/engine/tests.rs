@@ -21,7 +21,7 @@ use crate::plan::link_time::LinkTime;
 use crate::rig::Rig;
 use crate::telemetry::monitor::RunMonitor;
 use crate::tracks::TrackSnapshot;
-use dpm_device::link::{DeviceState, HostLink, Packet, SendOutcome};
+use dpm_device::link::{DeviceState, HostLink, LinkState, Packet, SendOutcome};
 use dpm_device::planes::Raster;
 use dpm_device::time::HostTime;
 use dpm_device::transport::inproc::Direct;
@@ -56,11 +56,20 @@ fn bench(flags: &[&str], options: RunOptions) -> Bench {
 
 /// The same with a mock that holds so many frames.
 fn bench_with(flags: &[&str], options: RunOptions, frame_buffers: u8) -> Bench {
+    bench_of(flags, options, |setup| setup.frame_buffers = frame_buffers, Arc::default())
+}
+
+/// The same with any mock and monitor.
+fn bench_of(
+    flags: &[&str],
+    options: RunOptions,
+    change: impl Fn(&mut MockConfig),
+    monitor: Arc<RunMonitor>,
+) -> Bench {
     let rig = rig(flags);
-    let monitor = Arc::new(RunMonitor::default());
     let mut now = HostTime(5 * MS);
     let mut setup = MockConfig::new(rig.camera.raster);
-    setup.frame_buffers = frame_buffers;
+    change(&mut setup);
     let mock = EmulatedProjector::new(setup, "", 1, now).expect("no faults");
     let mut cable = Direct::new(mock);
     let mut link = HostLink::new(projector::link_settings(&rig.config, rig.camera.raster));
@@ -99,6 +108,30 @@ impl Bench {
         stage.plan(&latch, &mut note, &self.time, &nothing, self.now);
         stage.submitted(&mut note, self.now);
         Some(note)
+    }
+}
+
+/// Issue 51: a projector is known by the serial number in HELLO. An order that stands for it is obeyed before it is armed.
+#[test]
+fn a_projector_for_which_an_order_stands_is_never_armed_wherever_it_is_plugged_in() {
+    for (serial, held, stays_dark) in [(7, 7, true), (7, 8, false), (1, 1, false), (0, 0, false)] {
+        let monitor = Arc::new(RunMonitor::default());
+        monitor.hold_devices(vec![(held, Order::Black), (held, Order::Safe), (9, Order::Black)]);
+        let options = RunOptions::default();
+        let bench = bench_of(&[], options, |setup| setup.serial = serial, monitor.clone());
+        let (link, _) = bench.link.expect("a link");
+        assert_eq!(link.state() == LinkState::Streaming, !stays_dark, "{serial}, {held}");
+        assert_eq!(monitor.take_found_held(), stays_dark.then_some(Order::Safe));
+        assert_eq!(monitor.take_order(), stays_dark.then_some(Order::Safe));
+        assert_eq!(monitor.device(), Some(serial).filter(|s| *s > 1));
+        // A HELLO that is repeated, and one after a person has armed it, gives no order again.
+        monitor.meet_device(serial);
+        monitor.lift_held(serial);
+        monitor.meet_device(3);
+        monitor.meet_device(serial);
+        assert_eq!(monitor.take_order(), None);
+        monitor.meet_device(9);
+        assert_eq!(monitor.take_order(), Some(Order::Black), "another one, for which one stands too");
     }
 }
 

@@ -1,7 +1,7 @@
 //! Combines finished frames and light into a report. It runs on its own thread beside the frame path, so it may
 //! allocate.
 
-use crate::config::{Pace, ProjectorBackend};
+use crate::config::Pace;
 use crate::frame::job::{Fate, FrameNote};
 use crate::frame::slots::OrderedDark;
 use crate::frame::{FrameTimeline, Stage, STAGES};
@@ -130,7 +130,7 @@ impl Collector {
         let frames = rig.config.run.frames.max(rig.config.slots_to_run());
         let batch_frames = (frames / 10).clamp(100, 10_000);
         let is_mock_tracker = rig.config.tracker.is_mock();
-        let is_mock_projector = matches!(rig.config.projector.backend, ProjectorBackend::Mock(_));
+        let is_mock_projector = rig.config.projector.backend.is_mock();
         let profiler =
             Profiler::new(rig.rate(), measured, batch_frames).with_mocks(is_mock_tracker, is_mock_projector);
         let lead_ns = i64::from(rig.config.real_time.stage_costs_us.total()) * 1000;
@@ -514,7 +514,7 @@ impl Collector {
     /// process can tell. For another projector the time of light comes from the host's own map of its clock, so the
     /// comparison would be meaningless.
     fn measure_clock(&mut self, note: &LightNote, record: &FrameRecord) {
-        let knows = matches!(self.rig.config.projector.backend, ProjectorBackend::Mock(_));
+        let knows = self.rig.config.projector.backend.is_mock();
         if knows && self.rig.config.real_time.pace == Pace::Real {
             let rate = self.rig.rate();
             let slots_ns = rate.slot_start_ns(note.event.slot) - rate.slot_start_ns(record.slot);

@@ -1,6 +1,5 @@
 //! Registration of the light of a run: how far it fell from the points that it belongs to.
 
-use crate::config::ProjectorBackend;
 use crate::frame::FrameTimeline;
 use crate::light::record::FrameRecord;
 use crate::light::registration::{PlaneLight, RegistrationMeter};
@@ -46,7 +45,7 @@ pub(crate) struct RegistrationMeasures {
 impl RegistrationMeasures {
     /// For a run of `rig` that has not begun.
     pub(crate) fn new(rig: Arc<Rig>) -> Self {
-        let is_mock = matches!(rig.config.projector.backend, ProjectorBackend::Mock(_));
+        let is_mock = rig.config.projector.backend.is_mock();
         Self {
             tracks: (is_mock && rig.wants_tracks()).then(VecDeque::new),
             meter: RegistrationMeter::new(&rig),

@@ -14,7 +14,6 @@
 //! One frame is one [`crate::frame::job::FrameJob`]: memory and a note, boxed once and recycled. In the steady state
 //! no stage allocates, locks or logs, and every wait is bounded. All hand-offs are those of `dpm_handoff`.
 
-pub mod alp_library;
 mod crew;
 mod link;
 mod outcome;

@@ -2,7 +2,7 @@
 //! cable.
 
 use super::settings::{budget_controller, output, renderer_settings};
-use crate::config::{MockProjectorConfig, RenderMethod};
+use crate::config::RenderMethod;
 use crate::engine::connect::{connect, ENDED_WITH_THE_LAST_RUN};
 use crate::engine::error::PipelineError;
 use crate::engine::options::RunOptions;
@@ -16,6 +16,7 @@ use crate::pack::Packer;
 use crate::pipeline::projector;
 use crate::plan::budget::BudgetController;
 use crate::plan::link_time::LinkTime;
+use crate::projectors::MockProjectorConfig;
 use crate::render::WarmUp;
 use crate::rig::{Rig, RigError};
 use crate::telemetry::monitor::RunMonitor;

@@ -10,7 +10,6 @@ use super::run::Ran;
 use super::settings::lead_estimator;
 use super::supervisor::{join_within, Maker, Supervisor, Workshop, Wreckage};
 use super::threads::{policy, Shared, STAGE_THREADS};
-use crate::config::ProjectorBackend;
 use crate::engine::error::PipelineError;
 use crate::engine::facts::Facts;
 use crate::engine::keeper::LinkKeeper;
@@ -221,7 +220,7 @@ fn open_far_end(
 ) -> Result<FarEnd, PipelineError> {
     let (config, raster) = (&rig.config, rig.camera.raster);
     let backend = &config.projector.backend;
-    if let ProjectorBackend::Mock(mock) = backend {
+    if let Some(mock) = backend.as_mock() {
         let (mock, recorder) = mock_projector(rig, mock, lights, options, marked, clock.now())?;
         let recorder = recorder.seen_by(monitor);
         let frame_bytes = projector::frame_bytes(raster, rig.schedule.len());

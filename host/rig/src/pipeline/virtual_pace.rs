@@ -6,7 +6,6 @@ use super::run::Ran;
 use super::settings::lead_estimator;
 use super::supervisor::leave_behind;
 use super::threads::{enter_frame_path, may_stall, read_tracker, rendered, WARM_UP_FRAMES};
-use crate::config::ProjectorBackend;
 use crate::engine::error::PipelineError;
 use crate::engine::facts::{CrewFacts, Facts};
 use crate::engine::keeper::LinkKeeper;
@@ -53,7 +52,7 @@ pub(super) fn run_at_virtual_pace(
     // The link comes up just before the first frame. The filters need the time before that.
     let mut now = HostTime(LISTEN_NS);
     let (lights_in, lights) = light_channel();
-    let ProjectorBackend::Mock(mock) = &rig.config.projector.backend else {
+    let Some(mock) = rig.config.projector.backend.as_mock() else {
         let told = "real_time.pace = \"virtual\" works only with the mock projector";
         return Err(RigError::Unsupported(told.into()).into());
     };

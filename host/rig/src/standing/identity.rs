@@ -2,14 +2,13 @@
 
 use super::port::{Port, System, THIS_MACHINE};
 use super::ENDING;
-use crate::config::ProjectorBackend;
+use crate::projectors::{kinds, DeviceName, ProjectorBackend};
 use std::fmt;
 
 /// The longest file name without its extension. A longer one is cut and made unique by a hash.
 const MAX_STEM: usize = 160;
-/// Families of which one may be another: a projector at a connector is shown on by a window too, and a DLPC900 is reached
-/// by USB and by its video input.
-const VIDEO: [&str; 3] = ["display", "window", "DLPC900"];
+/// How the name of a display begins that has told its serial number.
+const EDID: &str = "edid-";
 /// The family of all serial ports.
 const SERIAL: &str = "projector on";
 
@@ -21,9 +20,11 @@ pub struct Identity {
     family: String,
     /// What names it among others of the kind in files; `None` if the rig file accepts any.
     key: Option<String>,
-    /// Names of its kind prove that two projectors differ. A serial number that the projector itself tells would be such
-    /// a name.
+    /// Names of its kind prove that two projectors differ.
     is_proof: bool,
+    /// Of all kinds that video reaches, one may be another: a window is on the display at a connector, and a controller with
+    /// a video input has a connection of its own.
+    is_video: bool,
     /// The port behind a serial projector, if it is there now.
     port: Option<Port>,
     system: System,
@@ -49,35 +50,17 @@ impl Identity {
 
     /// The same on any machine.
     pub(super) fn on(system: System, backend: &ProjectorBackend) -> Self {
-        let mut port = None;
-        let (family, named, is_proof) = match backend {
-            ProjectorBackend::Mock(_) => ("mock projector".into(), None, false),
-            ProjectorBackend::Usb(usb) => {
-                let family = format!("USB projector {:04x}:{:04x}", usb.vendor_id, usb.product_id);
-                (family, usb.serial_number.clone(), true)
-            }
-            ProjectorBackend::Serial(serial) => {
-                port = system.port(&serial.port);
-                (SERIAL.into(), Some(serial.port.clone()), false)
-            }
-            ProjectorBackend::Display(display) => ("display".into(), display.connector.clone(), false),
-            ProjectorBackend::Window(_) => ("window".into(), None, false),
-            ProjectorBackend::Alp(alp) => {
-                let number = Some(alp.device_number).filter(|n| *n > 0).map(|n| n.to_string());
-                ("ALP".into(), number, true)
-            }
-            ProjectorBackend::Dlpc900(dlpc) => ("DLPC900".into(), dlpc.device.clone(), false),
+        let DeviceName { family, named, connector, is_proof, is_lasting, is_single } = backend.device();
+        let port = backend.port().and_then(|path| system.port(path));
+        let display = connector.and_then(|connector| system.display(connector.as_deref()));
+        let what = match &named {
+            Some(name) => format!("{family} {name}"),
+            None if is_single => family.clone(),
+            None => format!("{family} any"),
         };
-        let what = match (&named, backend) {
-            (Some(name), _) => format!("{family} {name}"),
-            (None, ProjectorBackend::Mock(_) | ProjectorBackend::Window(_)) => family.clone(),
-            (None, _) => format!("{family} any"),
-        };
-        // The place of a DLPC900 on the bus changes with every re-plug.
-        let named = named.filter(|_| family != "DLPC900");
-        let key = port.as_ref().map(Port::key).or(named);
-        let is_mock = matches!(backend, ProjectorBackend::Mock(_));
-        Self { what, family, key, is_proof, port, system, is_mock }
+        let key = port.as_ref().map(Port::key).or(display).or(named.filter(|_| is_lasting));
+        let is_video = backend.kind().is_video;
+        Self { what, family, key, is_proof, is_video, port, system, is_mock: backend.is_mock() }
     }
 
     /// Its name in messages: as the rig file words it.
@@ -133,9 +116,8 @@ impl Identity {
             let stem = name.strip_suffix(ENDING)?;
             Some(stem.strip_prefix(&plain(family))?.strip_prefix('-')?.to_owned())
         };
-        let is_video = VIDEO.contains(&&*self.family);
-        let Some(key) = key_after(&self.family)
-            .or_else(|| VIDEO.iter().filter(|_| is_video).find_map(|family| key_after(family)))
+        let others = || kinds().into_iter().filter(|kind| kind.is_video && self.is_video);
+        let Some(key) = key_after(&self.family).or_else(|| others().find_map(|kind| key_after(kind.name)))
         else {
             return Match::Other;
         };
@@ -144,7 +126,9 @@ impl Identity {
         if name == self.order_name() || is_worded_alike {
             return Match::Same;
         }
-        let are_both_named = self.is_proof && self.key.is_some() && key != "any";
+        let is_edid = |key: &str| key.starts_with(EDID);
+        let are_both_named = (self.is_proof && self.key.is_some() && key != "any")
+            || self.key.as_deref().is_some_and(|own| is_edid(&plain(own)) && is_edid(&key));
         let mut ports = port.zip(self.port.as_ref()).into_iter();
         match are_both_named || ports.any(|(then, now)| then.is_certainly_not(now, &self.system)) {
             true => Match::Other,

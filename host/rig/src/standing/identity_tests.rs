@@ -2,7 +2,8 @@
 
 use super::room_tests::Disk;
 use super::*;
-use crate::config::{DisplayConfig, Dlpc900Config, ProjectorBackend, SerialProjectorConfig, WindowConfig};
+use crate::config::{Overrides, RigConfig};
+use crate::projectors::ProjectorBackend;
 use port::{Node, System};
 use std::fs;
 use std::os::unix::fs::symlink;
@@ -18,6 +19,19 @@ fn node(file: &Path) -> Option<Node> {
     let mut numbers = text.split_whitespace().map(|n| n.parse::<u32>().unwrap());
     let mut next = || numbers.next();
     Some(Node { number: [next()?, next()?], since: [next()?.into(), 0] })
+}
+
+/// A projector of a rig file.
+pub(super) fn backend(text: &str) -> ProjectorBackend {
+    let overrides = Overrides {
+        variables: vec![],
+        flags: vec![
+            format!("projector={{backend={text},width=1920,height=1080,frame_rate=60}}"),
+            "real_time.pace=\"real\"".into(),
+        ],
+    };
+    let rig = RigConfig::parse("rig.toml", "", Path::new(""), &overrides);
+    rig.unwrap_or_else(|e| panic!("{e}")).projector.backend
 }
 
 impl Machine {
@@ -70,8 +84,12 @@ impl Machine {
 
     /// The projector at a path, as a program that starts now sees it.
     fn projector(&self, path: &str) -> Identity {
-        let port = SerialProjectorConfig { port: format!("/dev/{path}"), ..Default::default() };
-        Identity::on(System { root: self.root, node }, &ProjectorBackend::Serial(port))
+        let port = backend(&format!("{{ kind = \"serial\", port = \"/dev/{path}\" }}"));
+        Identity::on(self.system(), &port)
+    }
+
+    fn system(&self) -> System {
+        System { root: self.root, node }
     }
 
     fn safe_at(&self, path: &str) {
@@ -233,14 +251,14 @@ fn an_order_of_version_1_holds_every_port_and_goes_when_its_own_is_armed() {
 
 #[test]
 fn an_order_for_one_display_holds_all_and_windows_and_a_dlpc900_too() {
-    let display = |name: &str| DisplayConfig { connector: Some(name.into()), ..Default::default() };
+    let machine = Machine::new("displays");
     let [hdmi, dp, window, dlpc900] = [
-        ProjectorBackend::Display(display("HDMI-A-1")),
-        ProjectorBackend::Display(display("DP-1")),
-        ProjectorBackend::Window(WindowConfig::default()),
-        ProjectorBackend::Dlpc900(Dlpc900Config::default()),
+        "{ kind = \"display\", connector = \"HDMI-A-1\" }",
+        "{ kind = \"display\", connector = \"DP-1\" }",
+        "{ kind = \"window\" }",
+        "{ kind = \"dlpc900\" }",
     ]
-    .map(|backend| Identity::of(&backend));
+    .map(|text| Identity::on(machine.system(), &backend(text)));
     let disk = Disk::default();
     let of = |identity: &Identity| OrderFile::in_folder(Box::new(disk.clone()), identity.clone()).0;
     let all = [&hdmi, &dp, &window, &dlpc900];
@@ -255,4 +273,62 @@ fn an_order_for_one_display_holds_all_and_windows_and_a_dlpc900_too() {
     of(&window).forget().unwrap();
     let held = all.map(|identity| standing_in_folder(&disk, identity).is_some());
     assert_eq!(held, [true, true, false, true]);
+}
+
+/// Two displays that tell their serial numbers are two, whatever the connector; one that tells none may be either.
+#[test]
+fn a_display_is_known_by_its_edid_at_any_connector() {
+    let machine = Machine::new("edid");
+    let plug = |connector: &str, edid: &[u8]| {
+        let folder = machine.at("sys/class/drm").join(format!("card0-{connector}"));
+        fs::create_dir_all(&folder).unwrap();
+        fs::write(folder.join("edid"), edid).unwrap();
+    };
+    let display = |connector: &str| {
+        let at = backend(&format!("{{ kind = \"display\", connector = {connector:?} }}"));
+        Identity::on(machine.system(), &at)
+    };
+    let any = || Identity::on(machine.system(), &backend("{ kind = \"display\" }"));
+    let holds = |identity: &Identity| standing_in_folder(&machine.disk, identity).is_some();
+    let file = |identity: Identity| OrderFile::in_folder(Box::new(machine.disk.clone()), identity).0;
+    let (a, b) = (edid::tests::edid(7, None), edid::tests::edid(8, None));
+    plug("HDMI-A-1", &a);
+    plug("DP-1", &[]);
+    file(display("HDMI-A-1")).keep(Order::Safe, By::Key).unwrap();
+    assert!(holds(&display("HDMI-A-1")) && holds(&any()));
+    // It moves to the other connector, and another one takes its place.
+    plug("HDMI-A-1", &b);
+    plug("DP-1", &a);
+    assert!(!holds(&display("HDMI-A-1")) && holds(&display("DP-1")));
+    // Nothing says which one a rig file means that names none; and one without a number may be the one.
+    assert!(holds(&any()));
+    plug("HDMI-A-1", &edid::tests::edid(0, None));
+    assert!(holds(&display("HDMI-A-1")));
+    file(display("DP-1")).forget().unwrap();
+    assert!(!holds(&display("DP-1")) && !holds(&display("HDMI-A-1")));
+}
+
+/// A projector that has told its serial number takes its order along to any port, and leaves none to another one.
+#[test]
+fn an_order_goes_with_the_serial_number_of_the_projector() {
+    let machine = Machine::new("hello");
+    machine.plugged(0, 10, "1-1", Some("A"));
+    machine.plugged(1, 11, "1-2", Some("B"));
+    let (one, other) = (0x1234_5678_9abc_def0_u64, 0xfeed_u64);
+    let first = machine.file("ttyUSB0");
+    first.hear(Some(one));
+    first.keep(Order::Safe, By::Key).unwrap();
+    // At another port nothing says so before it is asked; then it does.
+    let second = machine.file("ttyUSB1");
+    assert!(!machine.holds("ttyUSB1"));
+    assert_eq!(second.by_serial_number(), [(one, Order::Safe)]);
+    // Another projector at the first port: who arms it lifts the order for this port, and not for the projector.
+    first.hear(Some(other));
+    first.forget().unwrap();
+    assert!(!machine.holds("ttyUSB0"));
+    assert_eq!(second.by_serial_number(), [(one, Order::Safe)]);
+    // Who arms the projector itself lifts it, wherever it is.
+    second.hear(Some(one));
+    second.forget().unwrap();
+    assert!(second.by_serial_number().is_empty() && !machine.holds("ttyUSB0"));
 }

@@ -1,7 +1,7 @@
 //! An order is kept whatever else fills the disk: a disk in memory whose operations fail.
 
+use super::identity_tests::backend;
 use super::*;
-use crate::config::{ProjectorBackend, UsbProjectorConfig};
 use std::collections::BTreeMap;
 use std::sync::{Arc, Mutex};
 
@@ -25,8 +25,7 @@ fn error(code: i32) -> FolderError {
 }
 
 fn projector() -> Identity {
-    let usb = UsbProjectorConfig { serial_number: Some("A".into()), ..Default::default() };
-    Identity::of(&ProjectorBackend::Usb(usb))
+    Identity::of(&backend("{ kind = \"usb\", serial_number = \"A\" }"))
 }
 
 impl Disk {

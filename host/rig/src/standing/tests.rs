@@ -1,5 +1,5 @@
 use super::*;
-use crate::config::{Overrides, ProjectorBackend, RigConfig};
+use crate::config::{Overrides, RigConfig};
 use std::fs;
 use std::os::unix::fs::PermissionsExt;
 use std::time::Duration;
@@ -115,10 +115,9 @@ fn an_order_for_any_projector_of_a_kind_is_for_each_and_the_other_way_round() {
     assert!(stands(&long) && !stands(&longer));
     // The place on the bus does not identify a DLPC900.
     let [one, two] = ["1:4", "1:5"].map(|place| {
-        Identity::of(&ProjectorBackend::Dlpc900(crate::config::Dlpc900Config {
-            device: Some(place.into()),
-            ..Default::default()
-        }))
+        Identity::of(&super::identity_tests::backend(&format!(
+            "{{ kind = \"dlpc900\", device = {place:?} }}"
+        )))
     });
     assert_ne!(one.lock_name(), two.lock_name());
     opened(&dir, &one).0.keep(Order::Safe, By::Key).unwrap();

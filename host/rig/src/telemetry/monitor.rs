@@ -18,7 +18,7 @@ use dpm_device::link::{faults, LimitReached};
 use dpm_handoff::path::Lock;
 use std::collections::{BTreeMap, VecDeque};
 use std::fmt;
-use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
+use std::sync::atomic::{AtomicBool, AtomicU64, AtomicU8, Ordering};
 use std::sync::{OnceLock, PoisonError};
 
 /// Notes that wait for the observing thread; further ones are only counted.
@@ -164,6 +164,14 @@ pub struct RunMonitor {
     order: AtomicU64,
     /// The projector had SAFE latched when the link came up.
     found_safe: AtomicBool,
+    /// The serial number that the projector gave in HELLO; 0 before.
+    device: AtomicU64,
+    /// Orders that stand for projectors by their serial numbers.
+    held: OnceLock<Vec<(u64, Order)>>,
+    /// The serial number of the projector that a person has armed since: its order is lifted.
+    armed_device: AtomicU64,
+    /// The order that was found for the projector's serial number, as a code.
+    found_held: AtomicU8,
     projector: AtomicU64,
     /// What is seen of the light: written by the link's thread and the supervisor.
     light: LightGauge,
@@ -330,6 +338,42 @@ impl RunMonitor {
     /// True once after [`RunMonitor::find_safe`].
     pub fn take_found_safe(&self) -> bool {
         self.found_safe.swap(false, Ordering::Relaxed)
+    }
+
+    /// Orders that stand for projectors with these serial numbers, wherever they are plugged in. A second list is dropped. Set
+    /// it before the run begins.
+    pub(crate) fn hold_devices(&self, held: Vec<(u64, Order)>) {
+        let _ = self.held.set(held);
+    }
+
+    /// The projector has said HELLO with this serial number. An order that stands for it is given, before anything arms it.
+    /// 0, and 1, which is that of mocks and of firmware that has drawn none, name no projector.
+    pub(crate) fn meet_device(&self, serial: u64) {
+        let serial = if serial > 1 { serial } else { 0 };
+        let is_known = self.device.swap(serial, Ordering::Relaxed) == serial;
+        if is_known || self.armed_device.load(Ordering::Relaxed) == serial {
+            return;
+        }
+        let held = self.held.get().into_iter().flatten().filter(|(device, _)| *device == serial);
+        if let Some((_, order)) = held.max_by_key(|(_, order)| order.strength()) {
+            self.found_held.store(*order as u8, Ordering::Relaxed);
+            self.give_order(*order);
+        }
+    }
+
+    /// The serial number of the projector, if it has given one that names it.
+    pub(crate) fn device(&self) -> Option<u64> {
+        Some(self.device.load(Ordering::Relaxed)).filter(|serial| *serial != 0)
+    }
+
+    /// Once: the order that was found for the projector's serial number.
+    pub(crate) fn take_found_held(&self) -> Option<Order> {
+        Order::from_code(self.found_held.swap(0, Ordering::Relaxed))
+    }
+
+    /// A person has armed the projector with this serial number.
+    pub(crate) fn lift_held(&self, device: u64) {
+        self.armed_device.store(device, Ordering::Relaxed);
     }
 
     /// Sets the projector's state.

@@ -10,8 +10,9 @@ use dpm_device::time::HostTime;
 use dpm_display::encoding::PixelMap;
 use dpm_lab::reference::Sampler;
 use dpm_render::pack::{halftone, pack, BitPlaneFrame, Halftone, Kernel};
-use dpm_rig::config::{Overrides, ProjectorBackend, ProjectorConfig, RigConfig};
-use dpm_rig::pipeline::projector::display_settings;
+use dpm_rig::config::{Overrides, ProjectorConfig, RigConfig};
+use dpm_rig::pipeline::projector::panel;
+use dpm_rig::projectors::display::DisplayConfig;
 use hil_mock::dlpc900::{Dlpc900Model, VirtualHid};
 
 /// Every encoding of a DLPC900.
@@ -50,13 +51,13 @@ fn picture(raster: Raster) -> Vec<u32> {
 /// share of the light of a full pattern of the whole table.
 fn light_of(config: &RigConfig, codes: &[u32]) -> Vec<[f64; 3]> {
     let projector: &ProjectorConfig = &config.projector;
-    let ProjectorBackend::Display(display) = &projector.backend else { panic!("a display") };
+    let display: &DisplayConfig = projector.backend.keys().expect("a display");
     let (raster, schedule) = (projector.raster(), projector.schedule());
     let model = Arc::new(Mutex::new(Dlpc900Model::default()));
     let mut driver = Dlpc900::new(VirtualHid::new(model.clone())).unwrap();
     let video = display.video_patterns(projector.frame_rate, &schedule).unwrap().unwrap();
     driver.start_video_patterns(&video).unwrap();
-    let map = PixelMap::new(display_settings(config, display, raster).unwrap().encoding, &schedule).unwrap();
+    let map = PixelMap::new(display.settings(&panel(config, raster)).unwrap().encoding, &schedule).unwrap();
     let mut light = vec![[0; 3]; raster.pixel_count()];
     for number in 0..2 {
         let mut words = codes.to_vec();

@@ -15,9 +15,10 @@ use dpm_display::kms::Kms;
 use dpm_display::mode::Timing;
 use dpm_display::transport::{on_card, DisplayTransport};
 use dpm_handoff::path::Lock;
-use dpm_rig::config::{DisplayConfig, Overrides, ProjectorBackend, RigConfig};
-use dpm_rig::pipeline::projector::{display_settings, Medium, OpenMedium};
+use dpm_rig::config::{Overrides, RigConfig};
+use dpm_rig::pipeline::projector::{panel, Medium, OpenMedium};
 use dpm_rig::pipeline::{self, RunOptions};
+use dpm_rig::projectors::display::DisplayConfig;
 use dpm_rig::rig::Rig;
 use dpm_rig::telemetry::monitor::RunMonitor;
 use dpm_tests::files::container;
@@ -97,8 +98,7 @@ fn rig(folder: &Path, settings: &[&str]) -> Arc<Rig> {
 }
 
 fn display_of(config: &RigConfig) -> &DisplayConfig {
-    let ProjectorBackend::Display(display) = &config.projector.backend else { panic!("a display") };
-    display
+    config.projector.backend.keys().expect("a display")
 }
 
 fn video_of(rig: &Rig) -> VideoPatterns {
@@ -110,7 +110,7 @@ fn sent(rig: &Arc<Rig>, gpu: &Arc<dpm_render::gpu::Gpu>) -> (Vec<Scanned>, u64) 
     let card = Arc::new(Lock::new(display(&[MODE])));
     let (shared, video) = (card.clone(), video_of(rig));
     let open: Box<OpenMedium> = Box::new(move |config, raster, surroundings| {
-        let settings = display_settings(config, display_of(config), raster).unwrap();
+        let settings = display_of(config).settings(&panel(config, raster)).unwrap();
         let (card, clock) = (shared.clone(), surroundings.clock.clone());
         let kms = move || Ok(Box::new(FakeKms::new(card.clone(), clock.clone())) as Box<dyn Kms>);
         let model = Arc::new(Mutex::new(Dlpc900Model::default()));

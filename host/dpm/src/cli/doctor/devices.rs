@@ -4,14 +4,12 @@
 use super::super::watch::take_locks;
 use super::{Finding, State};
 use dpm_common::clock::{Clock, MonotonicClock};
-use dpm_device::dlpc900::driver::Dlpc900;
-use dpm_device::dlpc900::usb::{describe, UsbHid, UsbPlace};
 use dpm_device::link::{faults, DeviceHello, HostLink, LinkState};
 use dpm_device::tracker::BodyKey;
 use dpm_device::transport::Transport;
-use dpm_rig::config::{Dlpc900Config, ProjectorBackend, RigConfig};
+use dpm_rig::config::RigConfig;
+use dpm_rig::pipeline::connect;
 use dpm_rig::pipeline::projector::{self, Surroundings};
-use dpm_rig::pipeline::{alp_library, connect};
 use dpm_rig::presence;
 use dpm_rig::rig::Rig;
 use dpm_rig::standing::Identity;
@@ -116,22 +114,15 @@ pub(super) fn projector(config: &RigConfig, loads: bool) -> Finding {
     if let Err(missing) = presence::PROJECTOR.look(config) {
         return failed(missing.message);
     }
-    let answered = match &config.projector.backend {
-        ProjectorBackend::Mock(_) => {
-            return Finding::new("projector", State::Info, "the mock in this process", "");
-        }
-        ProjectorBackend::Alp(alp) if !loads => match alp_library::find(alp.library.as_deref()) {
-            Ok((file, doubt)) => {
-                let found = format!("ALP: {} is a library for this machine{doubt}", file.display());
-                let state = if doubt.is_empty() { State::Ok } else { State::Warning };
-                let remedy =
-                    "`dpm doctor --load-libraries RIG.toml` runs it, and asks the device what it can show";
-                return Finding::new("projector", state, found, remedy);
-            }
-            Err(why) => Err(why),
-        },
-        ProjectorBackend::Dlpc900(dlpc900) => controller(dlpc900),
-        _ => linked(config),
+    if config.projector.backend.is_mock() {
+        return Finding::new("projector", State::Info, "the mock in this process", "");
+    }
+    let answered = match config.projector.backend.examine(loads) {
+        Some(look) => look.map(|look| {
+            let state = if look.is_doubtful { State::Warning } else { State::Ok };
+            (state, look.found, look.remedy)
+        }),
+        None => linked(config),
     };
     match answered {
         Ok((state, found, remedy)) => {
@@ -143,20 +134,6 @@ pub(super) fn projector(config: &RigConfig, loads: bool) -> Finding {
 
 /// State, what was found, and what to do.
 type Answer = (State, String, String);
-
-fn controller(config: &Dlpc900Config) -> Result<Answer, String> {
-    let place = match &config.device {
-        None => None,
-        Some(text) => Some(text.parse::<UsbPlace>().map_err(|e| format!("{text}: {e}"))?),
-    };
-    let named = |e: String| format!("{}: {e}", describe(place));
-    let port = UsbHid::open(place).map_err(|e| named(e.to_string()))?;
-    let mut controller = Dlpc900::new(port).map_err(|e| named(e.to_string()))?;
-    let status = controller.status().map_err(|e| named(e.to_string()))?;
-    let lines: Vec<String> =
-        crate::dlpc900::status_text(&status).lines().map(|l| l.trim().to_owned()).collect();
-    Ok((State::Ok, lines.join("; "), String::new()))
-}
 
 /// Says HELLO and CONFIG to a projector of the link, and ends the session before it was armed.
 fn linked(config: &RigConfig) -> Result<Answer, String> {

@@ -13,7 +13,7 @@ use dpm_common::realtime::{self, Refusal};
 use dpm_display::kms::Connector;
 use dpm_render::gpu::{DeviceSummary, GpuOptions};
 use dpm_rig::failure::{Failure, FailureKind};
-use dpm_rig::pipeline::alp_library;
+use dpm_rig::projectors::alp_library;
 use dpm_rig::telemetry::report::to_json;
 use std::fs;
 use std::path::{Path, PathBuf};

@@ -1,6 +1,7 @@
 //! What a rig file says of its projector: instants and planes of displays and of controllers behind them, and refusals.
 
 use crate::config::*;
+use crate::projectors::display::{DisplayConfig, DisplayEncoding, DisplayLease};
 use dpm_device::dlpc900::lut::led;
 use dpm_device::planes::{Channel, PlaneSchedule};
 use std::path::Path;
@@ -18,14 +19,14 @@ fn template(name: &str, keys: &[&str]) -> Result<RigConfig, ConfigErrors> {
 fn the_light_of_a_display_is_later_than_its_slots() {
     let parsed = |keys: &[&str]| template("display.toml", keys);
     let rig = parsed(&[]).unwrap_or_else(|e| panic!("{e}"));
-    let ProjectorBackend::Display(display) = &rig.projector.backend else { panic!("a display") };
+    let display: &DisplayConfig = rig.projector.backend.keys().expect("a display");
     assert_eq!((display.encoding, display.commit_us), (DisplayEncoding::Rgb8, None));
     assert_eq!(display.lease, DisplayLease::Auto);
     for (word, lease) in
         [("off", DisplayLease::Off), ("x11", DisplayLease::X11), ("wayland", DisplayLease::Wayland)]
     {
         let rig = parsed(&[&format!("projector.backend.lease={word}")]).unwrap_or_else(|e| panic!("{e}"));
-        let ProjectorBackend::Display(display) = &rig.projector.backend else { panic!("a display") };
+        let display: &DisplayConfig = rig.projector.backend.keys().expect("a display");
         assert_eq!(display.lease, lease);
     }
     let told = parsed(&["projector.backend.lease=mir"]).unwrap_err().to_string();
@@ -93,7 +94,7 @@ fn a_controller_behind_a_display_shows_frames_that_have_arrived() {
         assert_eq!(p.lit_of_frame_ns(), [patterns * exposure_us * 1000, 16_666_666], "{encoding}");
         assert_eq!(schedule.planes().iter().all(|p| p.channel == Channel::White), white, "{encoding}");
         assert_eq!((schedule.len(), schedule.fills(), p.full_light()), (24, true, 255), "{encoding}");
-        let ProjectorBackend::Display(display) = &p.backend else { panic!() };
+        let display: &DisplayConfig = p.backend.keys().expect("a display");
         let video = display.video_patterns(p.frame_rate, &schedule).unwrap().unwrap();
         assert_eq!(video.entries.len() as i64, patterns, "{encoding}");
         let lit_us: u32 = video.entries.iter().map(|e| e.exposure_us).sum();

@@ -1,5 +1,6 @@
 use super::*;
-use crate::config::{MockProjectorConfig, Overrides, ProjectorBackend, RigConfig};
+use crate::config::{Overrides, RigConfig};
+use crate::projectors::backend;
 use crate::rig::Rig;
 use crate::standing::{Identity, OrderFile};
 use dpm_device::planes::Raster;
@@ -18,7 +19,7 @@ impl Bench {
         let rig = Arc::new(Rig::build(&config, Raster::new(8, 8)).unwrap());
         let monitor = Arc::new(RunMonitor::default());
         let _ = monitor.parameters().follow(&rig);
-        let identity = Identity::of(&ProjectorBackend::Mock(MockProjectorConfig::default()));
+        let identity = Identity::of(&backend("mock").unwrap());
         let (file, _, _) = OrderFile::open(None, identity);
         let orders = Arc::new(Orders::start(monitor.clone(), file, false, None).unwrap());
         let osc = {
@@ -141,7 +142,7 @@ fn a_sender_that_is_not_listed_is_not_heard() {
         token: None,
         monitor: bench.monitor.clone(),
         orders: {
-            let identity = Identity::of(&ProjectorBackend::Mock(MockProjectorConfig::default()));
+            let identity = Identity::of(&backend("mock").unwrap());
             let (file, _, _) = OrderFile::open(None, identity);
             Arc::new(Orders::start(bench.monitor.clone(), file, false, None).unwrap())
         },

@@ -41,6 +41,7 @@ impl SteppedOrders {
         if let Some(e) = error {
             return Err(e.to_string());
         }
+        monitor.hold_devices(file.by_serial_number());
         let desk = Desk::new(monitor, stands.as_ref(), file.path());
         Ok(Self { desk, file, keeps: true, writes: None })
     }

@@ -1,16 +1,17 @@
 //! `dpm pattern` on a DLPC900: the pattern's pictures are uploaded as a sequence, as `dpm dlpc900 upload` does, and
 //! supervised as in `dpm run`.
 
-use crate::dlpc900::planes_of;
-use crate::run_dlpc900::{check_panel, opener, present, Dlpc900Report, Show};
+use super::pictures::planes_of;
+use super::run::{check_panel, opener, present, Dlpc900Report, Show};
 use dpm_device::dlpc900::image::PlaneOrder;
 use dpm_device::dlpc900::lut::{led, Dmd};
 use dpm_device::dlpc900::sequence::{Pattern as Plates, PatternSequence, Repeat, SequenceBuilder};
 use dpm_device::dlpc900::usb::UsbPlace;
 use dpm_device::planes::Channel;
-use dpm_rig::config::{ProjectorBackend, RigConfig};
+use dpm_rig::config::RigConfig;
 use dpm_rig::failure::{Failure, FailureKind};
 use dpm_rig::pattern::{Pattern, PatternShow};
+use dpm_rig::projectors::dlpc900::NO_WATCHDOG;
 use dpm_rig::telemetry::monitor::RunMonitor;
 
 /// Shows the pattern on the controller that `config` names until its run is over or `monitor` requests a stop.
@@ -22,9 +23,7 @@ pub(crate) fn run_pattern_dlpc900(
     show: &PatternShow,
     monitor: &RunMonitor,
 ) -> Result<Dlpc900Report, Failure> {
-    let ProjectorBackend::Dlpc900(backend) = &config.projector.backend else {
-        return Err(Failure::new(FailureKind::BadInput, "projector.backend.kind is not \"dlpc900\""));
-    };
+    let backend = super::keys(&config.projector.backend)?;
     let place = backend.device.as_deref().map(str::parse::<UsbPlace>).transpose();
     let place =
         place.map_err(|e| Failure::new(FailureKind::BadInput, format!("projector.backend.device: {e}")))?;
@@ -41,7 +40,7 @@ pub(crate) fn run_pattern_dlpc900(
     let pictures = show.pictures().len();
     let mut report = present(&mut open, &Show::Preloaded(sequence), seconds, monitor)?;
     report.frames_loaded = Some(pictures);
-    report.warnings = vec![dpm_rig::pipeline::projector::NO_WATCHDOG.to_owned()];
+    report.warnings = vec![NO_WATCHDOG.to_owned()];
     Ok(report)
 }
 

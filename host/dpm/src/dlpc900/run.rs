@@ -22,12 +22,12 @@ use dpm_device::planes::{Channel, PlaneSchedule};
 use dpm_lab::sequence::{draw, poses_at};
 use dpm_render::pack::{pack, BitPlaneFrame, Kernel};
 use dpm_render::{RenderError, Renderer};
-use dpm_rig::config::{Dlpc900Config, Dlpc900Mode, ProjectorBackend, RigConfig, VideoInput};
+use dpm_rig::config::RigConfig;
 use dpm_rig::failure::{Failure, FailureKind};
 use dpm_rig::order::Order;
-use dpm_rig::pipeline::projector::NO_WATCHDOG;
 use dpm_rig::pipeline::{renderer_settings, PipelineError};
 use dpm_rig::presence;
+use dpm_rig::projectors::dlpc900::{Dlpc900Config, Dlpc900Mode, VideoInput, NO_WATCHDOG};
 use dpm_rig::rig::Rig;
 use dpm_rig::run_rig::open_gpu;
 use dpm_rig::telemetry::monitor::{ProjectorHealth, RunMonitor};
@@ -174,9 +174,7 @@ pub(crate) fn preload(
 /// # Errors
 /// A bad scene or a broken rule of the controller (exit code 2), a controller that fails (3), or no GPU (4).
 pub(crate) fn run_dlpc900(config: &RigConfig, monitor: &RunMonitor) -> Result<Dlpc900Report, Failure> {
-    let ProjectorBackend::Dlpc900(backend) = &config.projector.backend else {
-        return Err(Failure::new(FailureKind::BadInput, "projector.backend.kind is not \"dlpc900\""));
-    };
+    let backend = super::keys(&config.projector.backend)?;
     let place = backend.device.as_deref().map(str::parse::<UsbPlace>).transpose();
     let place =
         place.map_err(|e| Failure::new(FailureKind::BadInput, format!("projector.backend.device: {e}")))?;
@@ -600,5 +598,5 @@ fn look<P: HidPort>(d: &mut Dlpc900<P>, standing: Option<Order>, word: &Word) ->
 }
 
 #[cfg(test)]
-#[path = "run_dlpc900_tests.rs"]
+#[path = "run_tests.rs"]
 mod tests;

@@ -1,13 +1,11 @@
-//! Converts picture files to DLPC900 patterns, and the controller's state to text for the operator.
+//! Converts picture files to DLPC900 patterns.
 
-use dpm_device::dlpc900::driver::Status;
 use dpm_device::dlpc900::image::{Compression, PlaneOrder};
 use dpm_device::dlpc900::lut::Dmd;
 use dpm_device::dlpc900::sequence::{Pattern, PatternSequence, Repeat, SequenceBuilder, SequenceError};
 use dpm_device::planes::Raster;
 use dpm_device::regular_file;
 use image::ImageFormat;
-use std::fmt::Write as _;
 use std::path::{Path, PathBuf};
 
 /// Why pictures cannot be made into a sequence.
@@ -133,25 +131,6 @@ pub(crate) fn sequence_of(
         });
     }
     Ok(builder.finish(show.repeat, show.order, show.compression)?)
-}
-
-/// The controller's state, one fact per line.
-pub(crate) fn status_text(status: &Status) -> String {
-    let mut s = String::new();
-    let raster = status.dmd.raster();
-    let word = |yes: bool| if yes { "yes" } else { "no" };
-    let mode = status.mode.map_or("unknown".to_owned(), |m| format!("{m:?}"));
-    let _ = writeln!(s, "dmd          {} ({} x {})", status.dmd.name(), raster.width(), raster.height());
-    let _ = writeln!(s, "firmware     {} ({})", status.firmware, status.tag);
-    if status.firmware.locks_blocks() {
-        let _ = writeln!(s, "             this firmware locks mirror blocks after a mode switch; dpm parks and unparks to free them");
-    }
-    let _ = writeln!(s, "mode         {mode}");
-    let _ = writeln!(s, "running      {}", word(status.is_running()));
-    let _ = writeln!(s, "parked       {}", word(status.is_parked()));
-    let _ = writeln!(s, "video locked {}", word(status.is_locked()));
-    let _ = writeln!(s, "hardware     {}", status.complaint().unwrap_or_else(|| "ok".into()));
-    s
 }
 
 #[cfg(test)]

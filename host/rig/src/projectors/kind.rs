@@ -1,0 +1,115 @@
+//! The row of a kind of projectors.
+
+use super::keys::ProjectorKeys;
+use dpm_common::keys::read::Reader;
+use dpm_common::keys::rows::{KindWord, Registry, Row, Section};
+use dpm_common::keys::source::Entry;
+use std::collections::BTreeMap;
+use std::sync::Arc;
+
+/// On which road frames come to the light.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum FrameRoad {
+    /// Into the mock of this process.
+    Mock,
+    /// Over the bit-plane link, each in its time.
+    Fed,
+    /// Loaded before their time into a device that then shows them by itself. It has no watchdog, nothing counts its light,
+    /// and nobody knows when it is loaded where a head will be. A program of its own drives it.
+    Loaded,
+}
+
+/// Whose clock the slots follow.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum SlotClock {
+    /// That of the projector's firmware, from the handshake on, at the rate of the rig file.
+    Firmware,
+    /// Vertical blanks, counted from 0, at the rate of a mode.
+    Blanks,
+}
+
+/// A kind of projectors: a row of the table.
+pub struct ProjectorKind {
+    /// Its word and its keys in the rig file.
+    pub word: KindWord,
+    /// What it is called in messages, and in the names of files where the keys say no more.
+    pub name: &'static str,
+    /// The road of its frames.
+    pub road: FrameRoad,
+    /// Its slots.
+    pub slots: SlotClock,
+    /// A picture on a video cable reaches it, so another kind of which this is true may be the same projector.
+    pub is_video: bool,
+    /// The page of the manual about it, with a heading: `docs/ALP.md#...`.
+    pub page: &'static str,
+    read: fn(&BTreeMap<String, Entry>, &mut Reader, &str) -> Arc<dyn ProjectorKeys>,
+}
+
+impl ProjectorKind {
+    /// A kind on the bit-plane link with the keys of `K`, called `word` in the rig file and `name` in messages. `about`: what
+    /// it is, the end of a sentence.
+    pub const fn of<K: ProjectorKeys + Section>(
+        word: &'static str,
+        name: &'static str,
+        about: &'static str,
+        page: &'static str,
+    ) -> Self {
+        Self {
+            word: KindWord::of::<K>(word, about),
+            name,
+            road: FrameRoad::Fed,
+            slots: SlotClock::Firmware,
+            is_video: false,
+            page,
+            read: read::<K>,
+        }
+    }
+
+    /// The same on another road.
+    pub const fn on(self, road: FrameRoad) -> Self {
+        Self { road, ..self }
+    }
+
+    /// The same on a video cable; with `slots` that follow its blanks or not.
+    pub const fn by_video(self, slots: SlotClock) -> Self {
+        Self { is_video: true, slots, ..self }
+    }
+
+    /// True if its frames are loaded before their time.
+    pub fn is_loaded(&self) -> bool {
+        self.road == FrameRoad::Loaded
+    }
+}
+
+impl Row for ProjectorKind {
+    type Keys = dyn ProjectorKeys;
+
+    fn registry() -> &'static Registry<Self> {
+        &super::KINDS
+    }
+
+    fn word(&self) -> &KindWord {
+        &self.word
+    }
+
+    fn is_mock(&self) -> bool {
+        self.road == FrameRoad::Mock
+    }
+
+    fn read(
+        &self,
+        table: &BTreeMap<String, Entry>,
+        reader: &mut Reader,
+        section: &str,
+    ) -> Arc<dyn ProjectorKeys> {
+        (self.read)(table, reader, section)
+    }
+}
+
+fn read<K: ProjectorKeys + Section>(
+    table: &BTreeMap<String, Entry>,
+    reader: &mut Reader,
+    section: &str,
+) -> Arc<dyn ProjectorKeys> {
+    Arc::new(K::read_keys(table, reader, section))
+}
