@@ -134,6 +134,13 @@ pub fn exposure_us(
     }
 }
 
+/// How long it is dark after each pattern that is lit for `exposure_us`, microseconds: an equal part of what the frame has left,
+/// so that no gap is longer than [`FRAME_REST_US`] and this. One long gap flickers at the frame rate.
+pub fn dark_us(bits: VideoBits, rate: FrameRate, exposure_us: u32) -> u32 {
+    let frame_us = u32::try_from(rate.slot_len_ns(0) / 1000).unwrap_or(u32::MAX);
+    share_us(frame_us, bits.patterns()).saturating_sub(exposure_us)
+}
+
 /// The LEDs of planes of a channel.
 const fn led_of(channel: Channel) -> u8 {
     match channel {
@@ -163,7 +170,7 @@ pub struct VideoPatterns {
 
 impl VideoPatterns {
     /// The patterns of frames that a rig sends, whose 24 planes are those of `schedule`: each pattern shows as many planes as
-    /// `bits` says, lowest bit first, and is lit by the LED of their channel for `exposure_us`, one right after the other.
+    /// `bits` says, lowest bit first, is lit by the LED of their channel for `exposure_us`, and is dark for [`dark_us`] then.
     pub fn of_rig(
         dmd: Dmd,
         receiver: Receiver,
@@ -172,13 +179,16 @@ impl VideoPatterns {
         bits: VideoBits,
         exposure_us: u32,
     ) -> Self {
-        let depth = bits.depth();
+        let (depth, dark_us) = (bits.depth(), dark_us(bits, rate, exposure_us));
         let entry = |(i, planes): (usize, &[PlaneSpec])| LutEntry {
             leds: led_of(planes[0].channel),
             depth,
+            dark_us,
             ..LutEntry::one_bit(i as u16, 0, i as u8 * depth, exposure_us)
         };
-        let entries = schedule.planes().chunks(depth.into()).enumerate().map(entry).collect();
+        let mut entries: Vec<_> = schedule.planes().chunks(depth.into()).enumerate().map(entry).collect();
+        // Behind the last pattern it is dark in any case, and what the table leaves out is a reserve for early frames.
+        entries.last_mut().into_iter().for_each(|last| last.dark_us = 0);
         // The table is checked against whole frames a second: rounded up, so that nothing is longer than the frame.
         let frame_hz = rate.num().div_ceil(rate.den());
         Self { dmd, receiver, ports: Some(PixelPorts::Both), frame_hz, entries, leds: LedSetup::default() }
@@ -312,6 +322,26 @@ mod tests {
                 let schedule = PlaneSchedule::equal_rgb24();
                 let v = VideoPatterns::of_rig(Dmd::Dlp6500, Receiver::Hdmi, rate(n), &schedule, bits, us);
                 assert!(v.steps(NEW).is_ok());
+            }
+        }
+    }
+
+    /// Every gap of a frame is as long as the others, but for the rest at its end, and a frame that comes half a percent early
+    /// still finds the patterns over.
+    #[test]
+    fn gaps_are_shared_among_the_patterns() {
+        let schedule = PlaneSchedule::equal_rgb24();
+        for n in 24..=120 {
+            let rate = FrameRate::new(n, 1).unwrap();
+            for bits in (1..=8).filter_map(VideoBits::new) {
+                let Ok(us) = exposure_us(bits, Dmd::Dlp6500, rate, None) else { continue };
+                let v = VideoPatterns::of_rig(Dmd::Dlp6500, Receiver::Hdmi, rate, &schedule, bits, us);
+                let (last, others) = v.entries.split_last().unwrap();
+                let pitch_us = u32::try_from(rate.slot_len_ns(0) / 1000).unwrap() - FRAME_REST_US;
+                assert!(others.iter().all(|e| e.exposure_us + e.dark_us == pitch_us / bits.patterns()));
+                assert_eq!((last.exposure_us, last.dark_us), (us, 0));
+                let whole_us: u32 = v.entries.iter().map(|e| e.exposure_us + e.dark_us).sum();
+                assert!(f64::from(whole_us) < 0.995e6 / f64::from(n), "{n} Hz, {bits:?}: {whole_us} us");
             }
         }
     }

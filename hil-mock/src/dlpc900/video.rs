@@ -123,7 +123,7 @@ mod tests {
     use super::*;
     use dpm_device::dlpc900::driver::Dlpc900;
     use dpm_device::dlpc900::lut::Dmd;
-    use dpm_device::dlpc900::video::{Receiver, VideoBits, VideoPatterns};
+    use dpm_device::dlpc900::video::{exposure_us, Receiver, VideoBits, VideoPatterns};
     use dpm_device::planes::PlaneSchedule;
     use dpm_device::time::FrameRate;
     use std::sync::{Arc, Mutex, MutexGuard};
@@ -160,10 +160,11 @@ mod tests {
         let place =
             |m: &mut Dlpc900Model, us: i64| m.showing(sync.plus_ns(us * 1000)).map(|(place, _)| place);
         for k in 0..24 {
-            assert_eq!(place(&mut m, 620 * k), Some(k as usize));
-            assert_eq!(place(&mut m, 620 * k + 619), Some(k as usize));
+            // 620 us lit, and 64 us dark.
+            assert_eq!(place(&mut m, 684 * k), Some(k as usize));
+            assert_eq!(place(&mut m, 684 * k + 619), Some(k as usize));
+            assert_eq!(place(&mut m, 684 * k + 620), None, "a gap after each");
         }
-        assert_eq!(place(&mut m, 24 * 620), None, "dark until the next frame");
         for (plane, byte) in [(3, 1), (12, 2), (23, 0)] {
             let mirrors = m.projected_plane(plane).unwrap();
             for i in (0..1920 * 1080).step_by(997) {
@@ -185,6 +186,31 @@ mod tests {
         let m = lock(&model);
         let parked = m.executed().iter().filter(|c| c.opcode == Opcode::DMD_PARK).count();
         assert_eq!((parked, m.dark_because()), (2, None), "parked and unparked once, and lit");
+    }
+
+    /// A source that is half a percent fast, as graphics cards may be, aborts no sequence, whatever the encoding. One that is
+    /// ten percent fast does.
+    #[test]
+    fn frames_that_come_half_a_percent_early_abort_nothing() {
+        let schedule = PlaneSchedule::equal_rgb24();
+        for (hz, depth) in [(60, 1), (60, 2), (60, 4), (60, 8), (120, 1)] {
+            let (rate, bits) = (FrameRate::new(hz, 1).unwrap(), VideoBits::new(depth).unwrap());
+            let us = exposure_us(bits, Dmd::Dlp6500, rate, None).unwrap();
+            let video = VideoPatterns::of_rig(Dmd::Dlp6500, Receiver::Hdmi, rate, &schedule, bits, us);
+            let model = Arc::new(Mutex::new(Dlpc900Model::default()));
+            let mut d = Dlpc900::new(VirtualHid::new(model.clone())).unwrap();
+            d.start_video_patterns(&video).unwrap();
+            let mut at = d.into_port().now().plus_ns(1_000_000);
+            let mut after = |share: f64| {
+                at = at.plus_ns((share * 1e9 / f64::from(hz)) as i64);
+                lock(&model).video_frame(at, SIZE, &[]);
+                let mut d = Dlpc900::new(VirtualHid::starting_at(model.clone(), at)).unwrap();
+                d.status().unwrap().is_aborted()
+            };
+            let aborted = (0..20).any(|_| after(0.995));
+            assert!(!aborted, "{hz} Hz, {depth} bits");
+            assert!(hz != 60 || after(0.9), "{hz} Hz, {depth} bits");
+        }
     }
 
     /// A crop that another program left cuts the picture; a start takes it away.

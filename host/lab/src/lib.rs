@@ -35,4 +35,5 @@ mod sobol;
 pub mod stability;
 pub mod stamp;
 mod statistics;
+pub mod temporal_light;
 pub mod twins;

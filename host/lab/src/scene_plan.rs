@@ -1,6 +1,7 @@
 //! `dpm plan`: a rig into what its scene and method need of the renderer, what is left out of it and how, and what that saves.
 
 use super::plan_savings::{changed, compare, flipped, keeping, Saving, Side};
+use super::temporal_light::TemporalLight;
 use dpm_common::clock::Stopwatch;
 use dpm_device::planes::Channel;
 use dpm_render::method::{Method, SamplerKind};
@@ -46,6 +47,8 @@ pub struct PlanReport {
     pub together: Option<Saving>,
     /// Bytes that each pass moves for a pixel, where the GPU packs.
     pub traffic: Vec<Traffic>,
+    /// The course of the projector's light, and what a person notices of it; none if another program decides it.
+    pub temporal_light: Option<TemporalLight>,
     /// What differs from a run on the rig.
     pub warnings: Vec<String>,
 }
@@ -342,7 +345,9 @@ pub fn scene_plan(config: &RigConfig, measure: bool) -> Result<PlanReport, Failu
     entries.extend(rig_entries(&rig));
     let packs = RendererSettings { output: Output::Planes(rig.schedule), ..renderer_settings(&rig) };
     let traffic = traffic(&packs, Keep::default());
-    let mut report = PlanReport { method: word.to_owned(), entries, together: None, traffic, warnings };
+    let temporal_light = TemporalLight::of(&config.projector);
+    let mut report =
+        PlanReport { method: word.to_owned(), entries, together: None, traffic, temporal_light, warnings };
     let Some(gpu) = gpu else { return Ok(report) };
     let (own, lean) = (renderer_settings(&rig), Keep::default());
     let mine = Side { scene: &rig.scene, settings: &own, keep: lean };

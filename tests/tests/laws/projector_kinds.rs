@@ -8,7 +8,7 @@ use dpm_rig::calibration_steps::is_simulated;
 use dpm_rig::config::{Overrides, Purpose, RigConfig};
 use dpm_rig::pipeline::projector::{link_settings, look, panel};
 use dpm_rig::projectors::{
-    add, backend, kinds, Cable, DeviceName, FrameRoad, ProjectorKeys, ProjectorKind, SlotClock,
+    add, backend, kinds, Cable, DeviceName, FrameRoad, LitTime, ProjectorKeys, ProjectorKind, SlotClock,
 };
 use dpm_rig::standing::Identity;
 use std::path::Path;
@@ -59,8 +59,9 @@ fn has_light_in_its_time(kind: &ProjectorKind) {
     for rate in ["60", "120"] {
         let p =
             rig(kind, &[&format!("projector.frame_rate={rate}")]).unwrap_or_else(|e| panic!("{e}")).projector;
-        let [lit_ns, frame_ns] = p.lit_of_frame_ns();
-        assert!(0 < lit_ns && lit_ns <= frame_ns, "{lit_ns} of {frame_ns} ns");
+        let LitTime { whole_ns, dark_ns, frame_ns } = p.lit_time();
+        assert!(0 < whole_ns && whole_ns <= frame_ns, "{whole_ns} of {frame_ns} ns");
+        assert!((0..whole_ns).contains(&dark_ns), "{dark_ns} of {whole_ns} ns");
         assert!((0..1_000_000_000).contains(&p.light_delay_ns()), "{} ns", p.light_delay_ns());
         assert!([8, 24].contains(&p.schedule().len()));
         assert!((1..=255).contains(&p.full_light()), "{}", p.full_light());

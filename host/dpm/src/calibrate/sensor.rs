@@ -199,8 +199,8 @@ fn sweep(
     let raster = config.projector.raster();
     if !config.projector.is_lit_without_gap() {
         return Err(refused(
-            "the codes of a light sensor need light without gaps, and a DLPC900 behind a display is dark at the end of \
-             every frame; calibrate by hand: leave --sensor out",
+            "the codes of a light sensor need light without gaps, and this projector is dark for a part of every frame; \
+             calibrate by hand: leave --sensor out",
         ));
     }
     let settings = |timing: Timing, poses: &[Stamped]| {

@@ -4,6 +4,7 @@ use super::rig_args::RigArgs;
 use super::watch::{check_out, print, write_out};
 use dpm_lab::plan_savings::Saving;
 use dpm_lab::scene_plan::scene_plan;
+use dpm_lab::temporal_light::{mend, TemporalLight, NO_MEND};
 use dpm_render::Traffic;
 use dpm_rig::failure::Failure;
 use dpm_rig::telemetry::report::to_json;
@@ -54,6 +55,16 @@ fn moved(traffic: &[Traffic]) -> String {
     format!("bytes a listed pixel moves on a GPU: {} in all ({})\n", sum, each.join(", "))
 }
 
+/// What a person notices of the course of the light, and what to do about it.
+fn seen(light: &TemporalLight, args: &PlanArgs) -> String {
+    let mut text = format!("light for eyes: {}\n", light.told());
+    if !light.noticed().is_empty() {
+        let remedy = mend(light, |keys| args.flags.with_keys(args.rig.as_deref(), keys));
+        text += &format!("{:15} {}\n", "", remedy.map_or(NO_MEND.to_owned(), |mend| mend.told()));
+    }
+    text
+}
+
 /// Prints the plan.
 ///
 /// # Errors
@@ -85,6 +96,7 @@ pub(super) fn execute(args: &PlanArgs) -> Result<(), Failure> {
         text += &format!("all that is left out and can be put back, together: {}\n", saved(s));
     }
     text += &moved(&report.traffic);
+    text += &report.temporal_light.as_ref().map_or(String::new(), |light| seen(light, args));
     print(&text);
     write_out(args.flags.out.as_deref(), "plan.json", &report)
 }

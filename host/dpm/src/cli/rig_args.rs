@@ -120,6 +120,13 @@ impl RigArgs {
         self.rig_for(path, Purpose { at_rest: true, ..Purpose::default() })
     }
 
+    /// The same with other `keys`, as `--set` takes them; `None` if the rig file refuses them.
+    pub(super) fn with_keys(&self, path: Option<&Path>, keys: &[&str]) -> Option<RigConfig> {
+        let mut other = self.clone();
+        other.set.extend(keys.iter().map(|key| (*key).to_owned()));
+        other.rig_at_rest(path).ok()
+    }
+
     /// The same for a command that measures what the calibration file will hold.
     ///
     /// # Errors

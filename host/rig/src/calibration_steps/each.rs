@@ -126,9 +126,7 @@ fn projector(judged: &Judged) -> Step {
     );
     let how = match config.plane_timing() {
         PlaneTiming::Equal => "With the wand's light sensor: move it through the whole volume for 30 s.",
-        PlaneTiming::ByWeight | PlaneTiming::Together { .. } | PlaneTiming::Held => {
-            "With the wand's light sensor: hold it still at 8 to 20 places, near and far, for 75 s in all."
-        }
+        _ => "With the wand's light sensor: hold it still at 8 to 20 places, near and far, for 75 s in all.",
     };
     step.needs = vec![need_wand(judged), "its light sensor, or 12 crosses to aim at by hand".into()];
     let by_sensor = calibrate(judged, how, "projector", &["--sensor", SENSOR]);

@@ -21,7 +21,7 @@ mod world;
 #[cfg(test)]
 mod tests;
 
-pub use crate::projectors::{PlaneTiming, PlaneWeights, ProjectorBackend};
+pub use crate::projectors::{LitTime, PlaneTiming, PlaneWeights, ProjectorBackend};
 pub use crate::trackers::{PoseConfig, TrackerConfig, TrackerTransformConfig};
 pub use calibration::CalibrationConfig;
 pub(crate) use check::MAX_TRACKED;

@@ -1,7 +1,7 @@
 //! `[projector]`: the projector, its position, and its connection.
 
 use super::values::{BitOrder, Each, PerChannel};
-use crate::projectors::{FrameKeys, PlaneTiming, PlaneWeights, ProjectorBackend};
+use crate::projectors::{FrameKeys, LitTime, PlaneTiming, PlaneWeights, ProjectorBackend};
 use crate::trackers::PoseConfig;
 use dpm_common::keys::read::{Any, Limit, NotEmpty, Within};
 use dpm_common::keys::Rate;
@@ -118,17 +118,20 @@ impl ProjectorConfig {
         self.backend.plane_timing()
     }
 
-    /// How much of a frame its planes are lit, one right after the other from the first on: a time and the time of the
-    /// frame, nanoseconds.
-    pub fn lit_of_frame_ns(&self) -> [i64; 2] {
-        let frame_ns = self.frame_rate.slot_len_ns(0);
-        [self.backend.lit_ns(self.frame_rate).unwrap_or(frame_ns), frame_ns]
+    /// Which part of a frame its planes take.
+    pub fn lit_time(&self) -> LitTime {
+        self.backend.lit_time(&self.frame_keys())
     }
 
-    /// True if the light of a frame has no gap: what the codes of a light sensor are made for.
+    /// True if the projector's video input, and not this program, decides what is lit.
+    pub fn is_lit_by_video_input(&self) -> bool {
+        self.backend.is_lit_by_video_input()
+    }
+
+    /// True if less than a hundredth of a frame is dark: what the codes of a light sensor are made for.
     pub fn is_lit_without_gap(&self) -> bool {
-        let [lit_ns, frame_ns] = self.lit_of_frame_ns();
-        lit_ns == frame_ns
+        let LitTime { whole_ns, dark_ns, frame_ns } = self.lit_time();
+        100 * (frame_ns - whole_ns) < frame_ns && dark_ns == 0
     }
 
     /// Light of a mirror that is on in all planes, as a code value of which 255 is full light. It is less where planes of

@@ -4,9 +4,9 @@
 //! bits come first, most of the light is over long before the middle of the exposure. An eye that follows a body sees
 //! the picture where the centre of the light puts it.
 
-use crate::config::{PlanePoses, PlaneTiming};
+use crate::config::{LitTime, PlanePoses, PlaneTiming, ProjectorConfig};
 use crate::rig::Rig;
-use dpm_device::planes::{PlaneSchedule, PlaneSpec};
+use dpm_device::planes::{Channel, PlaneSchedule, PlaneSpec};
 use dpm_device::time::HostTime;
 use dpm_render::pack::{source_bits, Halftone};
 use dpm_render::warp::plane_groups;
@@ -72,26 +72,28 @@ const SHARE_IS_OF_NS: f64 = 1e9 / 947.0;
 
 /// When the planes of a frame are lit, and how much light they give.
 #[derive(Clone, Copy)]
-struct Lights<'a> {
-    schedule: &'a PlaneSchedule,
-    timing: PlaneTiming,
-    /// How long the planes are lit together, and how long the frame lasts, nanoseconds.
-    lit: [i64; 2],
+pub(super) struct Lights<'a> {
+    pub(super) schedule: &'a PlaneSchedule,
+    pub(super) timing: PlaneTiming,
+    pub(super) lit: LitTime,
 }
 
 impl<'a> Lights<'a> {
     fn of(rig: &'a Rig) -> Self {
-        let projector = &rig.config.projector;
-        Self { schedule: &rig.schedule, timing: projector.plane_timing(), lit: projector.lit_of_frame_ns() }
+        Self::of_projector(&rig.config.projector, &rig.schedule)
+    }
+
+    pub(super) fn of_projector(projector: &ProjectorConfig, schedule: &'a PlaneSchedule) -> Self {
+        Self { schedule, timing: projector.plane_timing(), lit: projector.lit_time() }
     }
 
     /// How far planes go on the way from the centre of the light to their own instant, if those of a projector at 947 frames/s
     /// that shows bits go the share `told`. In longer frames the same time is left of the way: it is worth while as long as
     /// bodies move by few pixels in it. Halftones, and patterns of several bits, which are lit whole, go all of it.
     fn follow(self, told: f64) -> f64 {
-        let is_lit_by_bits = !matches!(self.timing, PlaneTiming::Together { .. });
+        let is_lit_by_bits = !matches!(self.timing, PlaneTiming::Together { .. } | PlaneTiming::ByChannel);
         if is_lit_by_bits && Halftone::of(self.schedule).is_none() {
-            1.0 - (1.0 - told) * (SHARE_IS_OF_NS / self.lit[1] as f64).min(1.0)
+            1.0 - (1.0 - told) * (SHARE_IS_OF_NS / self.lit.frame_ns as f64).min(1.0)
         } else {
             1.0
         }
@@ -101,15 +103,28 @@ impl<'a> Lights<'a> {
     fn length_of(self, plane: PlaneSpec) -> i128 {
         match self.timing {
             PlaneTiming::ByWeight => 1 << plane.bit,
-            PlaneTiming::Equal | PlaneTiming::Held | PlaneTiming::Together { .. } => 1,
+            _ => 1,
         }
     }
 
-    /// The light of a plane.
-    fn light_of(self, plane: PlaneSpec) -> u32 {
+    /// How long the pattern lasts that shows a plane, with its dark time, in the units of [`Self::length_of`].
+    fn pattern_length_of(self, plane: PlaneSpec) -> i128 {
         match self.timing {
-            PlaneTiming::ByWeight | PlaneTiming::Equal | PlaneTiming::Together { .. } => 1 << plane.bit,
+            PlaneTiming::Together { planes } => planes.into(),
+            PlaneTiming::ByChannel => self.count_of(plane.channel),
+            _ => self.length_of(plane),
+        }
+    }
+
+    fn count_of(self, channel: Channel) -> i128 {
+        self.schedule.planes().iter().filter(|plane| plane.channel == channel).count() as i128
+    }
+
+    /// The light of a plane.
+    pub(super) fn light_of(self, plane: PlaneSpec) -> u32 {
+        match self.timing {
             PlaneTiming::Held => 1,
+            _ => 1 << plane.bit,
         }
     }
 
@@ -118,7 +133,8 @@ impl<'a> Lights<'a> {
         self.schedule.planes().iter().map(|plane| self.length_of(*plane)).sum()
     }
 
-    /// Every plane with twice the time from the first photon to its middle, in the units of [`Self::length_of`].
+    /// Every plane with twice the time from the first photon to the middle of its pattern, dark time included, in the units of
+    /// [`Self::length_of`].
     fn planes(self) -> impl Iterator<Item = (PlaneSpec, i128)> + 'a {
         self.schedule.planes().iter().scan(0, move |begin, plane| {
             let length = self.length_of(*plane);
@@ -127,10 +143,25 @@ impl<'a> Lights<'a> {
                 PlaneTiming::Together { planes } => {
                     2 * (*begin - *begin % i128::from(planes)) + i128::from(planes)
                 }
+                PlaneTiming::ByChannel => {
+                    let channels = [Channel::Red, Channel::Green, Channel::Blue, Channel::White];
+                    let before = channels.into_iter().take_while(|c| *c != plane.channel);
+                    2 * before.map(|c| self.count_of(c)).sum::<i128>() + self.count_of(plane.channel)
+                }
                 _ => 2 * *begin + length,
             };
             *begin += length;
             Some((*plane, halves))
+        })
+    }
+
+    /// When each plane is lit, nanoseconds from the first photon on.
+    pub(super) fn spans(self) -> impl Iterator<Item = (PlaneSpec, [f64; 2])> + 'a {
+        let unit_ns = self.lit.whole_ns as f64 / (2 * self.whole()) as f64;
+        self.planes().map(move |(plane, halves)| {
+            let length = self.pattern_length_of(plane);
+            let end_ns = (halves + length) as f64 * unit_ns - self.lit.dark_ns as f64;
+            (plane, [(halves - length) as f64 * unit_ns, end_ns])
         })
     }
 
@@ -146,8 +177,7 @@ impl<'a> Lights<'a> {
     fn shares(self) -> impl Iterator<Item = f64> + 'a {
         let [moments, light] = self.moments();
         let centre = moments as f64 / light as f64;
-        let [lit, frame] = self.lit.map(|ns| ns as f64);
-        let share = lit / frame / (2 * self.whole()) as f64;
+        let share = self.lit.whole_ns as f64 / self.lit.frame_ns as f64 / (2 * self.whole()) as f64;
         self.planes().map(move |(_, halves)| (halves as f64 - centre) * share)
     }
 
@@ -158,10 +188,12 @@ impl<'a> Lights<'a> {
         self.instant_ns(moments, light, exposure_ns)
     }
 
-    /// Time from the first photon to `halves / over`, in units as [`Self::planes`] gives them, for a frame of `exposure_ns`.
+    /// Time from the first photon to the middle of the light of patterns whose middle is at `halves / over`, in units as
+    /// [`Self::planes`] gives them, for a frame of `exposure_ns`. Every pattern's light is over half a dark time sooner.
     fn instant_ns(self, halves: i128, over: i128, exposure_ns: i64) -> i64 {
-        let [lit, frame] = self.lit.map(i128::from);
-        (i128::from(exposure_ns.max(0)) * lit * halves / (2 * self.whole() * over * frame)) as i64
+        let [whole, dark, frame] = [self.lit.whole_ns, self.lit.dark_ns, self.lit.frame_ns].map(i128::from);
+        let units = self.whole() * over;
+        (i128::from(exposure_ns.max(0)) * (whole * halves - dark * units) / (2 * units * frame)) as i64
     }
 }
 
@@ -173,14 +205,18 @@ mod tests {
     const SLOT: i64 = 1_055_966;
 
     fn centre_ns(schedule: &PlaneSchedule, timing: PlaneTiming, exposure_ns: i64) -> i64 {
-        Lights { schedule, timing, lit: [1, 1] }.centre_ns(exposure_ns)
+        Lights { schedule, timing, lit: LIT }.centre_ns(exposure_ns)
     }
+
+    /// Lit from the first photon to the last.
+    const LIT: LitTime = LitTime { whole_ns: 1, dark_ns: 0, frame_ns: 1 };
 
     /// A plane is left behind its own instant by no more time in a long frame than in one of 947 a second.
     #[test]
     fn planes_of_bits_follow_by_a_share_that_leaves_no_more_time_in_longer_frames() {
         let follow = |schedule: &PlaneSchedule, timing, frame_ns| {
-            Lights { schedule, timing, lit: [frame_ns, frame_ns] }.follow(0.8)
+            let lit = LitTime { whole_ns: frame_ns, dark_ns: 0, frame_ns };
+            Lights { schedule, timing, lit }.follow(0.8)
         };
         let bits = PlaneSchedule::rgb24();
         let left_us =
@@ -212,7 +248,7 @@ mod tests {
     /// The middles of planes that last as long as they weigh: the first of `7 6 5 ...` takes half of the exposure.
     #[test]
     fn planes_follow_one_another_without_gaps() {
-        let lights = Lights { schedule: &PlaneSchedule::mono8(), timing: PlaneTiming::ByWeight, lit: [1, 1] };
+        let lights = Lights { schedule: &PlaneSchedule::mono8(), timing: PlaneTiming::ByWeight, lit: LIT };
         let mut end = 0;
         for (plane, halves) in lights.planes() {
             assert_eq!(halves - end, 1 << plane.bit);
@@ -243,36 +279,52 @@ mod tests {
         assert_eq!(centre_ns(&PlaneSchedule::mono8(), timing, -5), 0);
     }
 
-    /// 24 patterns of 620 us in a sixtieth of a second, or three of 4960 us: the instants are those at which a DLPC900 shows
+    /// 24 patterns of 620 us in a sixtieth of a second, with or without a dark time, or three of 4960 us: the instants are those at which a DLPC900 shows
     /// them, whatever is left of the frame.
     #[test]
     fn planes_of_a_controller_behind_a_display_have_its_instants() {
         let frame_ns = 16_666_667;
-        let middles = |schedule: &PlaneSchedule, timing, lit_ns| -> Vec<i64> {
-            let lights = Lights { schedule, timing, lit: [lit_ns, frame_ns] };
+        let lit = |whole_ns, dark_ns| LitTime { whole_ns, dark_ns, frame_ns };
+        let middles = |schedule: &PlaneSchedule, timing, whole_ns, dark_ns| -> Vec<i64> {
+            let lights = Lights { schedule, timing, lit: lit(whole_ns, dark_ns) };
             let centre = lights.centre_ns(frame_ns);
             let from_shares = lights.shares().map(|s| centre + (s * frame_ns as f64) as i64);
             let all = lights.planes().map(|(_, halves)| lights.instant_ns(halves, 1, frame_ns));
             assert!(all.zip(from_shares).all(|(a, b)| (a - b).abs() <= 2));
-            lights.planes().map(|(_, halves)| lights.instant_ns(halves, 1, frame_ns)).collect()
+            // A plane is lit about its middle.
+            let spans = lights.spans().map(|(_, [begin, end])| ((begin + end) / 2.0) as i64);
+            let all: Vec<i64> =
+                lights.planes().map(|(_, halves)| lights.instant_ns(halves, 1, frame_ns)).collect();
+            assert!(all.iter().zip(spans).all(|(a, b)| (a - b).abs() <= 2));
+            all
         };
-        let planes = middles(&PlaneSchedule::equal_rgb24(), PlaneTiming::Equal, 24 * 620_000);
-        assert!(
-            planes.iter().zip(0..).all(|(at, k)| (at - (620_000 * k + 310_000)).abs() <= 1),
-            "{planes:?}"
-        );
+        for dark_ns in [0, 64_000] {
+            let pitch_ns = 620_000 + dark_ns;
+            let planes = middles(&PlaneSchedule::equal_rgb24(), PlaneTiming::Equal, 24 * pitch_ns, dark_ns);
+            assert!(
+                planes.iter().zip(0..).all(|(at, k)| (at - (pitch_ns * k + 310_000)).abs() <= 1),
+                "{planes:?}"
+            );
+        }
+        // Loaded patterns: red, green and blue in turn, whatever the order of the bits.
+        let third = frame_ns / 3;
+        let loaded = middles(&PlaneSchedule::rgb24(), PlaneTiming::ByChannel, 3 * third, 100_000);
+        for (plane, at) in PlaneSchedule::rgb24().planes().iter().zip(loaded) {
+            let wanted = third * plane.channel as i64 + (third - 100_000) / 2;
+            assert!((at - wanted).abs() <= 2, "{plane:?}: {at}");
+        }
         for (count, depth, white) in [(1, 8, false), (3, 8, true), (4, 6, true), (2, 4, false), (12, 2, true)]
         {
             let schedule = PlaneSchedule::of_parts(Parts { count, depth, white }).unwrap();
             let timing = PlaneTiming::Together { planes: depth };
             let pattern_ns = 24 / i64::from(depth) * 100_000;
             let lit_ns = pattern_ns * 24 / i64::from(depth);
-            let middles = middles(&schedule, timing, lit_ns);
+            let middles = middles(&schedule, timing, lit_ns, 0);
             for (i, at) in middles.iter().enumerate() {
                 let wanted = pattern_ns * (i as i64 / i64::from(depth)) + pattern_ns / 2;
                 assert!((at - wanted).abs() <= 1, "{count} x {depth}, plane {i}: {at}");
             }
-            let all = Lights { schedule: &schedule, timing, lit: [lit_ns, frame_ns] };
+            let all = Lights { schedule: &schedule, timing, lit: lit(lit_ns, 0) };
             assert!((all.centre_ns(frame_ns) - lit_ns / 2).abs() <= 1, "the middle of all");
             // Planes that are lit together follow together: a pattern is a group, at its own instant.
             let groups = plane_groups(&schedule, &all.shares().collect::<Vec<_>>());

@@ -8,4 +8,5 @@ pub mod frame;
 pub mod horizon;
 pub mod lead;
 pub(crate) mod light_centre;
+pub mod light_course;
 pub(crate) mod link_time;

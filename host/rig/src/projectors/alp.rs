@@ -3,7 +3,7 @@
 use super::alp_library;
 use super::keys::{DeviceName, FrameKeys, Look, Medium, Opening, Panel, ProjectorKeys};
 use super::kind::ProjectorKind;
-use super::light::{PlaneTiming, PlaneWeights};
+use super::light::{LitTime, PlaneTiming, PlaneWeights};
 use dpm_common::keys::read::{contradict, shown, Any, NotEmpty, Reader, Within};
 use dpm_common::{section, words};
 use dpm_device::alp::{AlpSettings, AlpTransport, Showing, Weights};
@@ -30,6 +30,9 @@ section! {
         max_celsius: Option<f64> = None, "degC", Within(0.0, 150.0);
     }
 }
+
+/// The shortest picture of a V-7001, nanoseconds; the device is asked for its own when it is opened.
+const SHORTEST_NS: i64 = 44_000;
 
 words! {
     /// How the planes of a frame share its time on an ALP.
@@ -104,6 +107,16 @@ impl ProjectorKeys for AlpConfig {
             AlpWeights::Binary => PlaneTiming::ByWeight,
             AlpWeights::Equal => PlaneTiming::Equal,
         }
+    }
+
+    /// A dark picture ends every frame: as long as a plane, or as the shortest.
+    fn lit_time(&self, frames: &FrameKeys) -> LitTime {
+        let whole = LitTime::all_of(frames.rate);
+        let dark_ns = match self.weights {
+            AlpWeights::Equal => whole.frame_ns / (i64::from(frames.planes) + 1),
+            AlpWeights::Binary => SHORTEST_NS.min(whole.frame_ns / 2),
+        };
+        LitTime { whole_ns: whole.frame_ns - dark_ns, ..whole }
     }
 
     fn is_lit_fully(&self) -> bool {

@@ -3,11 +3,11 @@
 use super::dlpc900::{check_panel, guardian_of, Dlpc900Panel, VideoInput, NO_WATCHDOG};
 use super::keys::{DeviceName, FrameKeys, Medium, Opening, Panel, ProjectorKeys, Surroundings};
 use super::kind::{ProjectorKind, SlotClock};
-use super::light::{PlaneTiming, PlaneWeights};
+use super::light::{LitTime, PlaneTiming, PlaneWeights};
 use dpm_common::keys::read::{contradict, refuse, shown, Any, NotEmpty, Reader, Within};
 use dpm_common::{section, words};
 use dpm_device::dlpc900::usb::{self, UsbPlace};
-use dpm_device::dlpc900::video::{exposure_us, BadExposure, VideoBits, VideoPatterns};
+use dpm_device::dlpc900::video::{dark_us, exposure_us, BadExposure, VideoBits, VideoPatterns};
 use dpm_device::planes::{Parts, PlaneSchedule};
 use dpm_device::time::FrameRate;
 use dpm_device::transport::TransportError;
@@ -62,7 +62,7 @@ section! {
         /// The controller, as BUS:ADDRESS in `lsusb`; needed if several are plugged in.
         device: Option<String> = None, "", NotEmpty;
         /// Exposure of each pattern. If left out, nine tenths of what a frame has for it: 620 of at most 684 for 24
-        /// patterns at 60 frames/s.
+        /// patterns at 60 frames/s. What is left is dark after each pattern, so that no long gap flickers.
         exposure_us: Option<u32> = None, "us", Within(24, 40_000);
     }
 }
@@ -256,9 +256,17 @@ impl ProjectorKeys for DisplayConfig {
         }
     }
 
-    fn lit_ns(&self, rate: FrameRate) -> Option<i64> {
-        let exposure_us = self.exposure_us(rate)?.ok()?;
-        Some(i64::from(exposure_us * self.encoding.video_bits().patterns()) * 1000)
+    fn lit_time(&self, frames: &FrameKeys) -> LitTime {
+        let Some(Ok(exposure_us)) = self.exposure_us(frames.rate) else {
+            return LitTime::all_of(frames.rate);
+        };
+        let patterns = self.encoding.video_bits().patterns();
+        let dark_us = dark_us(self.encoding.video_bits(), frames.rate, exposure_us);
+        LitTime {
+            whole_ns: i64::from((exposure_us + dark_us) * patterns) * 1000,
+            dark_ns: i64::from(dark_us) * 1000,
+            ..LitTime::all_of(frames.rate)
+        }
     }
 
     fn schedule(&self) -> Option<PlaneSchedule> {

@@ -3,7 +3,7 @@
 
 use super::keys::{DeviceName, FrameKeys, Look, ProjectorKeys};
 use super::kind::{FrameRoad, ProjectorKind, SlotClock};
-use super::light::PlaneWeights;
+use super::light::{LitTime, PlaneTiming, PlaneWeights};
 use dpm_common::keys::read::{contradict, shown, Any, NotEmpty, Reader, Within};
 use dpm_common::{section, words};
 use dpm_device::dlpc900::driver::Dlpc900;
@@ -124,6 +124,25 @@ impl ProjectorKeys for Dlpc900Config {
                 "lower `projector.frame_rate` to 120 or choose another backend".into(),
             );
         }
+    }
+
+    fn plane_timing(&self) -> PlaneTiming {
+        match self.mode {
+            Dlpc900Mode::Preloaded => PlaneTiming::ByChannel,
+            Dlpc900Mode::Video => PlaneTiming::Equal,
+        }
+    }
+
+    /// One loaded pattern for each colour.
+    fn lit_time(&self, frames: &FrameKeys) -> LitTime {
+        let whole = LitTime::all_of(frames.rate);
+        let share_ns = whole.frame_ns / i64::from((frames.planes / 8).max(1));
+        let lit_ns = self.exposure_us.map_or(share_ns, |us| (i64::from(us) * 1000).min(share_ns));
+        LitTime { dark_ns: share_ns - lit_ns, ..whole }
+    }
+
+    fn is_lit_by_video_input(&self) -> bool {
+        self.mode == Dlpc900Mode::Video
     }
 
     fn guardian(&self) -> Option<Vec<String>> {

@@ -2,7 +2,7 @@
 
 use super::compaction::Compaction;
 use super::kind::ProjectorKind;
-use super::light::{PlaneTiming, PlaneWeights};
+use super::light::{LitTime, PlaneTiming, PlaneWeights};
 use super::mock::MockProjectorConfig;
 use dpm_common::keys::read::Reader;
 use dpm_common::keys::rows::{KeyValues, OfKind};
@@ -171,9 +171,14 @@ pub trait ProjectorKeys: KeyValues {
         PlaneTiming::Equal
     }
 
-    /// How long the planes of a frame are lit together, nanoseconds; `None` for the whole frame.
-    fn lit_ns(&self, _rate: FrameRate) -> Option<i64> {
-        None
+    /// Which part of a frame its planes take.
+    fn lit_time(&self, frames: &FrameKeys) -> LitTime {
+        LitTime::all_of(frames.rate)
+    }
+
+    /// A video input, and not this program, decides what is lit.
+    fn is_lit_by_video_input(&self) -> bool {
+        false
     }
 
     /// The planes of a frame, if these keys decide them.

@@ -1,6 +1,7 @@
 //! How a projector lights the planes of a frame.
 
 use dpm_common::words;
+use dpm_device::time::FrameRate;
 
 /// How the light of a frame is shared out over its exposure.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -14,8 +15,31 @@ pub enum PlaneTiming {
         /// Planes of a pattern.
         planes: u8,
     },
+    /// All planes of a channel are lit together, as a number of as many bits, and the next channel after them: red, green, blue,
+    /// white. The loaded patterns of a DLPC900.
+    ByChannel,
     /// There are no planes: code values are shown for the whole frame, by a display that is given them.
     Held,
+}
+
+/// Which part of a frame its planes take: patterns of one or more planes follow one another from the first photon on, each
+/// lit and then dark, and what is left of the frame is dark.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct LitTime {
+    /// All patterns with their dark times, nanoseconds; above 0.
+    pub whole_ns: i64,
+    /// The dark time at the end of each pattern, nanoseconds; 0 where planes last as long as they weigh.
+    pub dark_ns: i64,
+    /// The frame, nanoseconds.
+    pub frame_ns: i64,
+}
+
+impl LitTime {
+    /// Light without a gap.
+    pub fn all_of(rate: FrameRate) -> Self {
+        let frame_ns = rate.slot_len_ns(0);
+        Self { whole_ns: frame_ns, dark_ns: 0, frame_ns }
+    }
 }
 
 words! {

@@ -24,7 +24,7 @@ pub use keys::{
     Surroundings,
 };
 pub use kind::{FrameRoad, ProjectorKind, SlotClock};
-pub use light::{PlaneTiming, PlaneWeights};
+pub use light::{LitTime, PlaneTiming, PlaneWeights};
 pub use mock::MockProjectorConfig;
 
 use dpm_common::keys::rows::{Registry, Row};

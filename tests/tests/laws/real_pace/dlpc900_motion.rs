@@ -201,7 +201,7 @@ fn seen(rig: &Rig, scanned: &[Scanned]) -> Vec<Seen> {
             if let Some(centre) = centre(&model, place, entry.depth) {
                 off.push(centre - true_centre(rig, at_ns + exposure_ns / 2));
             }
-            at_ns += exposure_ns;
+            at_ns += exposure_ns + i64::from(entry.dark_us) * 1000;
         }
         if off.len() == video.entries.len() {
             let mean = off.iter().sum::<DVec2>() / off.len() as f64;

@@ -106,7 +106,8 @@ pub(super) fn execute(args: &DoctorArgs) -> Result<(), Failure> {
     findings.push(system.serial_ports());
     findings.extend(displays(&display::look()));
     findings.push(alp_libraries(&system.root));
-    let of_rig = config.as_ref().map(|config| rig::findings(config, args.load_libraries));
+    let with = |keys: &[&str]| args.flags.with_keys(args.rig.as_deref(), keys);
+    let of_rig = config.as_ref().map(|config| rig::findings(config, args.load_libraries, &with));
     let missing = |of: &[Finding]| {
         of.iter().filter(|f| f.state == State::Missing).map(|f| f.name.clone()).collect::<Vec<_>>()
     };

@@ -5,6 +5,7 @@ use super::super::os;
 use super::devices;
 use super::{Finding, State};
 use dpm_calibration::file;
+use dpm_lab::temporal_light::{mend, TemporalLight, NO_MEND};
 use dpm_rig::calibration_steps::age::{aged, days_since, OLD_DAYS};
 use dpm_rig::calibration_steps::is_simulated;
 use dpm_rig::config::{BodyConfig, LiveSource, PictureSource, RigConfig};
@@ -21,8 +22,13 @@ const LITTLE_SPACE: u64 = 1 << 30;
 /// Most warnings of a scene that are told.
 const MOST_WARNINGS: usize = 4;
 
-/// Everything that can be said of the rig of `config`. `loads`: the code of libraries that it names may run.
-pub(super) fn findings(config: &RigConfig, loads: bool) -> Vec<Finding> {
+/// Everything that can be said of the rig of `config`. `loads`: the code of libraries that it names may run. `with` reads the
+/// same rig file with other keys.
+pub(super) fn findings(
+    config: &RigConfig,
+    loads: bool,
+    with: &dyn Fn(&[&str]) -> Option<RigConfig>,
+) -> Vec<Finding> {
     let mut all = vec![set_up(config)];
     let rig = Rig::build(config, None);
     match &rig {
@@ -41,6 +47,7 @@ pub(super) fn findings(config: &RigConfig, loads: bool) -> Vec<Finding> {
     all.push(calibration(config));
     all.extend(standing_order(config));
     all.push(devices::projector(config, loads));
+    all.extend(light_for_eyes(config, with));
     all.extend(gpu(config));
     all.extend(page(config));
     all.push(output(&config.output.dir));
@@ -130,6 +137,18 @@ fn observer(config: &RigConfig, heard: Option<&devices::Heard>) -> Finding {
         return Finding::new(name, State::Warning, found, "set safety.eyes.guard = true");
     }
     Finding::new(name, State::Info, eye, "")
+}
+
+/// What a person notices of the course of the projector's light, and the keys that mend it.
+fn light_for_eyes(config: &RigConfig, with: &dyn Fn(&[&str]) -> Option<RigConfig>) -> Option<Finding> {
+    let light = TemporalLight::of(&config.projector)?;
+    let found = light.told();
+    let name = "light for eyes";
+    if light.noticed().is_empty() {
+        return Some(Finding::new(name, State::Ok, found, ""));
+    }
+    let remedy = mend(&light, with).map_or(NO_MEND.to_owned(), |mend| mend.told());
+    Some(Finding::new(name, State::Warning, found, remedy))
 }
 
 /// The bodies that show what another program makes. Without it they are black, and all else works.

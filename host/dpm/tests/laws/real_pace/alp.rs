@@ -13,6 +13,16 @@ use std::time::{Duration, Instant};
 const LONG: Duration = Duration::from_secs(60);
 const RIG: &str = concat!(env!("CARGO_MANIFEST_DIR"), "/../../rigs/alp.toml");
 
+/// The keys of an example whose planes are lit by their weights.
+const BINARY: [&str; 6] = [
+    "--set",
+    "projector.weights=\"binary\"",
+    "--set",
+    "projector.backend.weights=\"binary\"",
+    "--set",
+    "projector.frame_rate=80",
+];
+
 /// One program at a time drives the first ALP.
 static FIRST: Mutex<()> = Mutex::new(());
 
@@ -100,7 +110,7 @@ fn field<'a>(line: &'a str, name: &str) -> Option<&'a str> {
 
 /// The example rig on the fake panel at its full size, as a process of its own.
 fn of_example<'a>(words: &[&'a str], library: &'a str) -> Vec<&'a str> {
-    [&["pattern", "ramp", RIG, "--set", library], words].concat()
+    [&["pattern", "ramp", RIG, "--set", library], &BINARY[..], words].concat()
 }
 
 #[test]
@@ -200,7 +210,8 @@ fn what_cannot_be_is_refused_with_figures_and_doctor_says_so() {
         dpm(&of_example(&["--set", "projector.backend.library=\"/no/libalp44.so\""], &library), &NO_DRIVER);
     assert!(code(&output) == 3 && err(&output).contains("/no/libalp44.so"), "{}", err(&output));
     let doctor = |more: &[&str]| {
-        let args = [&["doctor", RIG, "--load-libraries", "--json", "--set", &library], more].concat();
+        let args =
+            [&["doctor", RIG, "--load-libraries", "--json", "--set", &library], &BINARY[..], more].concat();
         out(&dpm(&args, &NO_DRIVER))
     };
     let good = doctor(&[]);

@@ -35,6 +35,12 @@ fn the_light_of_a_display_is_later_than_its_slots() {
     assert_eq!(rig.projector.light_delay_ns(), 24_000_000 + 8_333_333);
     assert!(rig.projector.plane_timing() == PlaneTiming::Held);
     let alp = template("alp.toml", &[]).unwrap_or_else(|e| panic!("{e}"));
+    // Eight planes and a dark picture.
+    assert_eq!(alp.projector.plane_timing(), PlaneTiming::Equal);
+    let LitTime { whole_ns, frame_ns, .. } = alp.projector.lit_time();
+    assert_eq!(whole_ns, frame_ns - frame_ns / 9);
+    let binary = ["projector.weights=binary", "projector.backend.weights=binary", "projector.frame_rate=80"];
+    let alp = template("alp.toml", &binary).unwrap_or_else(|e| panic!("{e}"));
     assert_eq!(alp.projector.plane_timing(), PlaneTiming::ByWeight);
     let window = template("window.toml", &[]).unwrap_or_else(|e| panic!("{e}"));
     // Three quarters of a sixtieth of a second, and half of it.
@@ -66,7 +72,8 @@ fn a_controller_behind_a_display_shows_frames_that_have_arrived() {
     let projector = parsed(&[]).unwrap_or_else(|e| panic!("{e}")).projector;
     assert_eq!(projector.light_delay_ns(), 8_000_000 + 2 * (16_666_667 / 2));
     assert_eq!(projector.plane_timing(), PlaneTiming::Equal);
-    assert_eq!(projector.lit_of_frame_ns(), [24 * 620_000, 16_666_666]);
+    let lit = LitTime { whole_ns: 24 * 684_000, dark_ns: 64_000, frame_ns: 16_666_666 };
+    assert_eq!(projector.lit_time(), lit);
     assert!(!projector.is_lit_without_gap());
     assert_eq!(projector.schedule(), PlaneSchedule::equal_rgb24().filled());
     // The encoding says everything of the planes: their number of bits, their LEDs, their instants, their weights.
@@ -91,13 +98,24 @@ fn a_controller_behind_a_display_shows_frames_that_have_arrived() {
             24 => assert_eq!(timing, PlaneTiming::Equal),
             _ => assert_eq!(timing, PlaneTiming::Together { planes: 24 / patterns as u8 }),
         }
-        assert_eq!(p.lit_of_frame_ns(), [patterns * exposure_us * 1000, 16_666_666], "{encoding}");
+        // What the patterns leave of the frame is a gap after each of them, and 250 us at its end.
+        let LitTime { whole_ns, dark_ns, frame_ns } = p.lit_time();
+        assert_eq!(whole_ns, patterns * (exposure_us * 1000 + dark_ns), "{encoding}");
+        assert!(
+            (250_000..250_000 + patterns * 1000).contains(&(frame_ns - whole_ns)),
+            "{encoding}: {whole_ns}"
+        );
         assert_eq!(schedule.planes().iter().all(|p| p.channel == Channel::White), white, "{encoding}");
         assert_eq!((schedule.len(), schedule.fills(), p.full_light()), (24, true, 255), "{encoding}");
         let display: &DisplayConfig = p.backend.keys().expect("a display");
         let video = display.video_patterns(p.frame_rate, &schedule).unwrap().unwrap();
         assert_eq!(video.entries.len() as i64, patterns, "{encoding}");
         let lit_us: u32 = video.entries.iter().map(|e| e.exposure_us).sum();
+        let (last, others) = video.entries.split_last().unwrap();
+        assert!(
+            others.iter().all(|e| i64::from(e.dark_us) * 1000 == dark_ns) && last.dark_us == 0,
+            "{encoding}"
+        );
         assert!(video.entries.iter().all(|e| e.leds == led::WHITE) == white && lit_us < 16_417, "{encoding}");
     }
     for (keys, names) in [
