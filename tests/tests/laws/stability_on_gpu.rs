@@ -3,7 +3,7 @@
 
 use dpm_lab::stability::gpu::cases;
 use dpm_lab::stability::gpu_shot::{Picture, Shot};
-use dpm_lab::stability::{CaseVerdict, StabilityReport, SEED};
+use dpm_lab::stability::{StabilityReport, SEED};
 use dpm_render::gpu::{Gpu, GpuOptions};
 use dpm_scene::shapes::*;
 use dpm_scene::Material;
@@ -42,7 +42,7 @@ fn cases_pass(part: usize) {
         });
     }
     assert!(report.cases.len() * PARTS + PARTS > all.len() - SLOW.len(), "{} cases", report.cases.len());
-    let failed: Vec<_> = report.cases.iter().filter(|c| c.verdict != CaseVerdict::Pass).collect();
+    let failed: Vec<_> = report.cases.iter().filter(|c| !c.verdict.is_as_known()).collect();
     assert!(failed.is_empty(), "{failed:#?}");
 }
 

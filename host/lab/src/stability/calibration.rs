@@ -135,6 +135,24 @@ fn exact(seed: u64) -> f64 {
     [7, 8, 12, 40].into_iter().map(error).fold(0.0, f64::max)
 }
 
+/// Exact pairs of points whose relief is so many times less than their width. Infinite where they are refused.
+pub(super) fn flattened_by(ratio: f64, seed: u64) -> f64 {
+    let c = truth();
+    let flat: Vec<DVec3> = cloud(40, seed).iter().map(|p| DVec3::new(p.x, p.y, p.z / ratio)).collect();
+    let got = calibrate(c.raster, &pairs(&c, &flat, 0.0, 0), &Default::default());
+    got.map_or(f64::INFINITY, |g| off(&g.camera, &c))
+}
+
+/// A lens at a place where it bends so much that the condition number of its inverse is `condition`, above 1. Infinite where it
+/// has no answer.
+pub(super) fn bent_to(condition: f64, _: u64) -> f64 {
+    let Ok(lens) = Lens::opencv(&[-0.5, 0.0, 0.0, 0.0]) else { return f64::NAN };
+    // The slope of r - r^3 / 2 is 1 - 3 r^2 / 2.
+    let p = DVec2::X * ((1.0 - 1.0 / condition) / 1.5).sqrt();
+    let back = lens.distort(p).and_then(|bent| lens.undistort(bent));
+    back.map_or(f64::INFINITY, |back| (back - p).length())
+}
+
 fn degenerate(seed: u64) -> f64 {
     let c = truth();
     let base = cloud(30, seed);

@@ -260,8 +260,13 @@ fn frequencies(seed: u64) -> f64 {
 }
 
 fn uptime(seed: u64) -> f64 {
+    up_for(400.0 * 86_400e9 / PERIOD_NS as f64, seed)
+}
+
+/// Devices that have been up for so many intervals of exchanges.
+pub(super) fn up_for(intervals: f64, seed: u64) -> f64 {
     let device = Device { ppm: 0.0, ..Device::new(10_000_000_000) };
-    track(&device, &mut Line::new(seed), 400 * 86_400_000_000_000, 600, 30, 0.0).0 * 1e-3
+    track(&device, &mut Line::new(seed), (intervals * PERIOD_NS as f64) as i64, 600, 30, 0.0).0 * 1e-3
 }
 
 fn impossible(seed: u64) -> f64 {

@@ -67,7 +67,7 @@ pub(crate) const CASES: &[GpuCase] = &[
     GpuCase(
         "gpu-mean-in-motion",
         "the demo's hare at 1 m/s and its turning bust through a window as dense as the full raster, two samples requested, method dpm",
-        "path tracing: mean of the picture; the bound is today's error, not a goal",
+        "path tracing: mean of the picture; less than a hundredth, which is hardly seen",
         "relative",
         0.005,
         mean_in_motion,
@@ -75,17 +75,17 @@ pub(crate) const CASES: &[GpuCase] = &[
     GpuCase(
         "gpu-mean-in-motion-matte",
         "a matte faceted ball that glides at 1 m/s and turns by 540 deg/s where a sun grazes it, seen and drawn in the same way",
-        "path tracing: mean of the picture; the bound is today's error, not a goal",
+        "path tracing: mean of the picture; a hundredth is hardly seen",
         "relative",
-        0.14,
+        0.01,
         matte_in_the_sun,
     ),
     GpuCase(
         "gpu-mean-in-motion-metal",
         "the same ball of rough metal",
-        "path tracing: mean of the picture; the bound is today's error, not a goal",
+        "path tracing: mean of the picture; a hundredth is hardly seen",
         "relative",
-        0.18,
+        0.01,
         metal_in_the_sun,
     ),
     GpuCase(

@@ -208,8 +208,13 @@ fn constant_spin(_: u64) -> f64 {
     so3_between(rotation(&p), truth).length() / (w.length() * 5e-3)
 }
 
-fn screw(_: u64) -> f64 {
-    let w = DVec3::Z * (12.0 * std::f64::consts::PI);
+fn screw(seed: u64) -> f64 {
+    screw_of(12.0 * std::f64::consts::PI * STEP_NS as f64 * 1e-9, seed)
+}
+
+/// A screw that turns by so many radians from sample to sample.
+pub(super) fn screw_of(angle: f64, _: u64) -> f64 {
+    let w = DVec3::Z * (angle / (STEP_NS as f64 * 1e-9));
     let motion = |t: f64| {
         let q = so3_exp(w * t);
         (q * DVec3::X * 0.05 + DVec3::Z * t, q)
@@ -326,30 +331,42 @@ fn least_minor(c: &dpm_tracking::imm::Covariance) -> f64 {
     least
 }
 
+/// The largest negative part of the covariances of a filter, over all that it held so far; infinite if one was no number.
+fn negative_part(imm: &Imm<Translations>, worst: f64) -> f64 {
+    let covariances = imm.covariances();
+    let least = covariances.iter().flatten().map(least_minor);
+    least.fold(worst, |worst, least| if least.is_finite() { worst.max(-least) } else { f64::INFINITY })
+}
+
+/// A prior of variance `first`, and measurements of variance `r`, at steps of 1 ns to 10 s.
+fn covariance_between(first: f64, r: f64, s: &mut Sampler) -> f64 {
+    let config = models_for(5.0);
+    let mut imm = Imm::<Translations>::new(&config, DVec3::ZERO, first);
+    (0..300).fold(0.0, |worst, i| {
+        imm.advance(&config, [0.002, 0.0, 1e-9, 10.0][i % 4], None);
+        imm.update(DVec3::splat(1e-3 * s.uniform()), r);
+        negative_part(&imm, worst)
+    })
+}
+
+/// A prior whose variance is so many times that of the measurements.
+pub(super) fn covariance_of(ratio: f64, seed: u64) -> f64 {
+    covariance_between(ratio.sqrt(), 1.0 / ratio.sqrt(), &mut Sampler::new(seed, 0))
+}
+
 fn covariance(seed: u64) -> f64 {
     let config = models_for(5.0);
     let mut s = Sampler::new(seed, 0);
     let mut worst: f64 = 0.0;
-    let mut look = |imm: &Imm<Translations>| {
-        for c in imm.covariances().iter().flatten() {
-            let least = least_minor(c);
-            worst = if least.is_finite() { worst.max(-least) } else { f64::INFINITY };
-        }
-    };
     for (first, r) in [(1e12, 1e-12), (1e12, 1e-24), (1e-12, 1e12), (1e24, 1e-24), (1e12, 0.0), (0.0, 0.0)] {
-        let mut imm = Imm::<Translations>::new(&config, DVec3::ZERO, first);
-        for i in 0..300 {
-            imm.advance(&config, [0.002, 0.0, 1e-9, 10.0][i % 4], None);
-            imm.update(DVec3::splat(1e-3 * s.uniform()), r);
-            look(&imm);
-        }
+        worst = worst.max(covariance_between(first, r, &mut s));
     }
     let mut imm = Imm::<Translations>::new(&config, DVec3::ZERO, 1e-8);
     for i in 0..100_000 {
         imm.advance(&config, 0.002, None);
         imm.update(DVec3::splat(1e-4 * s.uniform()), 1e-8);
         if i % 100 == 0 {
-            look(&imm);
+            worst = negative_part(&imm, worst);
         }
     }
     worst
@@ -396,24 +413,25 @@ fn innovations(seed: u64) -> f64 {
     (mean.mean() / 3.0).max(3.0 / mean.mean())
 }
 
-fn a_day(_: u64) -> f64 {
-    let mut worst: f64 = 0.0;
-    for start in [86_400_000_000_000i64, 400 * 86_400_000_000_000] {
-        let w = DVec3::new(1.0, 2.0, -0.5);
-        let mut filter = PoseFilter::new(config());
-        let mut at = start;
-        for i in 0..50_000i64 {
-            at = start + i * STEP_NS;
-            let t = (at - start) as f64 * 1e-9;
-            filter.update(&sample(at, DVec3::X * 0.01 * t, so3_exp(w * t)));
-        }
-        let Some(p) = filter.predict(HostTime(at + STEP_NS)) else { return f64::NAN };
-        let t = (at + STEP_NS - start) as f64 * 1e-9;
-        worst = worst.max((rotation(&p).length() - 1.0).abs());
-        worst = worst.max((position(&p) - DVec3::X * 0.01 * t).length());
-        worst = worst.max(so3_between(rotation(&p), so3_exp(w * t)).length());
+fn a_day(seed: u64) -> f64 {
+    [1.0, 400.0].map(|days| up_for(days * 86_400e9 / STEP_NS as f64, seed)).into_iter().fold(0.0, f64::max)
+}
+
+/// A machine that has been up for so many intervals of samples.
+pub(super) fn up_for(intervals: f64, _: u64) -> f64 {
+    let start = (intervals * STEP_NS as f64) as i64;
+    let w = DVec3::new(1.0, 2.0, -0.5);
+    let mut filter = PoseFilter::new(config());
+    let mut at = start;
+    for i in 0..50_000i64 {
+        at = start + i * STEP_NS;
+        let t = (at - start) as f64 * 1e-9;
+        filter.update(&sample(at, DVec3::X * 0.01 * t, so3_exp(w * t)));
     }
-    worst
+    let Some(p) = filter.predict(HostTime(at + STEP_NS)) else { return f64::NAN };
+    let t = (at + STEP_NS - start) as f64 * 1e-9;
+    let turned = so3_between(rotation(&p), so3_exp(w * t)).length();
+    (rotation(&p).length() - 1.0).abs().max((position(&p) - DVec3::X * 0.01 * t).length()).max(turned)
 }
 
 fn horizon(_: u64) -> f64 {

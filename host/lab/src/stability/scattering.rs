@@ -1,6 +1,7 @@
 //! Hard cases of scattering: every lobe's energy, reciprocity and sampler, Fresnel's law, and what the reference shares with the GPU (the albedo
 //! table, compensation).
 
+use super::interval::Interval;
 use super::CpuCase;
 use crate::reference::bsdf::Bsdf;
 use crate::reference::microfacet::fresnel_dielectric;
@@ -26,7 +27,7 @@ pub(super) const CASES: &[CpuCase] = &[
         CpuCase("tracer-grazing-and-zero-vectors", "directions at 90 deg, denormal cosines, u = 0 and 1 - 2^-53", "finite, not negative", "faults", 0.0, grazing),
         CpuCase("albedo-table-f32", "0..1 in both, ior 1.0001 to 3", "f64 look-up", "albedo", 2e-6, albedo_f32),
         CpuCase("compensation-extremes", "cos 0 and 1e-38, distance 0 and 1e18, radiance NaN, infinite, negative, denormal", "0..1, never NaN; NaN becomes black", "faults", 0.0, compensation_extremes),
-        CpuCase("compensation-f32", "distance 1 mm to 50 m, cos 1 to 1e-3", "f64", "relative", 6e-7, compensation_f32),
+        CpuCase("compensation-f32", "distance 1 mm to 50 m, cos 1 to 1e-3", "an interval that holds the exact result; six roundings of half a unit, each of which may count double where the last place of the result is finer", "ulp", 6.0, compensation_f32),
 ];
 
 /// The point in the middle of a patch of the material.
@@ -330,19 +331,28 @@ fn compensation_extremes(_: u64) -> f64 {
     f64::from(faults)
 }
 
-fn compensation_f32(_: u64) -> f64 {
-    let Some(k) = Compensation::new([0.8, 0.5, 1.0], [10.0, 200.0, 1e4], [0.0; 3]) else { return f64::NAN };
+fn compensation_f32(seed: u64) -> f64 {
+    compensation_over(2.5e12, seed)
+}
+
+/// Surfaces of which the farthest and most slanted has `contrast` times the distance^2 / cos of the nearest, which is a millimetre
+/// away: the error of their drive in units of the last place.
+pub(super) fn compensation_over(contrast: f64, _: u64) -> f64 {
+    let (albedo, intensity) = ([0.8, 0.5, 1.0], [10.0, 200.0, 1e4]);
+    let Some(k) = Compensation::new(albedo, intensity, [0.0; 3]) else { return f64::NAN };
     let mut worst: f64 = 0.0;
     for i in 0..4000 {
         let t = f64::from(i) / 4000.0;
-        let (distance, cos) = (1e-3 + 50.0 * t, 1.0 - 0.999 * t);
-        let radiance = [0.3 * t, 1e-4 + t, 3.0 * t];
-        let a = k.drive(radiance.map(|x| x as f32), distance as f32, cos as f32);
-        let b = k.drive_f64(radiance, distance, cos);
-        for c in 0..3 {
-            if b[c] > 0.0 {
-                worst = worst.max((f64::from(a[c]) / b[c] - 1.0).abs());
-            }
+        let cos = (1.0 - 0.999 * (f64::from(i) * 0.618_034).fract()) as f32;
+        let distance = (1e-6 * contrast.powf(t) * f64::from(cos)).sqrt() as f32;
+        let radiance = [0.3 * t, 1e-4 + t, 3.0 * t].map(|x| x as f32);
+        let own = k.unlimited_drive(radiance, distance, cos);
+        let [cos, distance] = [cos, distance].map(Interval::from);
+        let geometry = distance.times(distance).over(cos);
+        for c in (0..3).filter(|c| radiance[*c] > 0.0) {
+            let gain = Interval::PI.over(Interval::exactly(albedo[c]).times(Interval::exactly(intensity[c])));
+            let exact = Interval::from(radiance[c]).times(gain.times(geometry));
+            worst = worst.max(exact.ulps_from(own[c])[1]);
         }
     }
     worst

@@ -282,16 +282,29 @@ fn difference(a: &ReferenceImage, b: &ReferenceImage) -> f64 {
 }
 
 fn scale(seed: u64) -> f64 {
+    [1e4, 1e5, 1e6].into_iter().map(|ratio| scaled_by(ratio, seed)).fold(0.0, f64::max)
+}
+
+/// A scene that is so many times as large, or as small.
+pub(super) fn scaled_by(ratio: f64, seed: u64) -> f64 {
     let base = view_of(1.0, DVec3::ZERO, seed);
-    [1e-6, 1e-4, 1e5, 1e6]
+    let off = |scale: f64| difference(&view_of(scale, DVec3::ZERO, seed), &base);
+    [off(ratio), off(1.0 / ratio)]
         .into_iter()
-        .map(|s| difference(&view_of(s, DVec3::ZERO, seed), &base))
-        .fold(0.0, f64::max)
+        .fold(0.0, |worst: f64, e| if e.is_nan() { e } else { worst.max(e) })
 }
 
 fn far_from_origin(seed: u64) -> f64 {
+    as_far_as(AWAY.length(), seed)
+}
+
+/// Where a scene of a metre lies that is far from the origin, metres.
+const AWAY: DVec3 = DVec3::new(1e5, -3e4, 7e4);
+
+/// A scene that is so many metres from the origin.
+pub(super) fn as_far_as(distance: f64, seed: u64) -> f64 {
     let base = view_of(1.0, DVec3::ZERO, seed);
-    difference(&view_of(1.0, DVec3::new(1e5, -3e4, 7e4), seed), &base)
+    difference(&view_of(1.0, AWAY.normalize() * distance, seed), &base)
 }
 
 fn self_hits(seed: u64) -> f64 {
@@ -488,11 +501,23 @@ fn invalid_rays(_: u64) -> f64 {
 }
 
 fn lamp_at_a_micrometre(seed: u64) -> f64 {
+    lamp_as_near_as(2e6, seed)
+}
+
+/// A lamp of two metres whose width is so many times its distance from the floor.
+pub(super) fn lamp_as_near_as(ratio: f64, seed: u64) -> f64 {
+    let height = 2.0 / ratio;
     let mut s = scene_of(floor(2.0, 0.0), diffuse(Vec3::splat(0.5)));
-    add(&mut s, quad(Vec3::new(-1.0, 1e-6, -1.0), Vec3::X * 2.0, Vec3::Z * 2.0), emitter(Vec3::splat(1e-3)));
+    add(
+        &mut s,
+        quad(Vec3::new(-1.0, height as f32, -1.0), Vec3::X * 2.0, Vec3::Z * 2.0),
+        emitter(Vec3::splat(1e-3)),
+    );
     s.lights.push(light(PunctualKind::Directional, Vec3::ZERO, Vec3::NEG_Y, 1e5));
     let r = Reference::new(&s, &[]);
-    let Some(point) = r.trace(DVec3::new(0.1, 5e-7, 0.1), -DVec3::Y, 1.0, false) else { return f64::NAN };
+    let Some(point) = r.trace(DVec3::new(0.1, height / 2.0, 0.1), -DVec3::Y, 1.0, false) else {
+        return f64::NAN;
+    };
     let mut sampler = Sampler::new(seed, 3);
     let mut mean = Mean::default();
     // A millionth of the samples counts as much as a quarter of the light: enough of them that one does not matter.

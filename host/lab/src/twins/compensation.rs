@@ -51,6 +51,7 @@ impl Compensation {
     }
 
     /// The same in f64.
+    #[cfg(test)]
     pub(crate) fn drive_f64(&self, radiance: [f64; 3], distance: f64, cos: f64) -> [f64; 3] {
         let geometry = distance * distance / cos.abs().max(LEAST_COS);
         std::array::from_fn(|c| {
