@@ -278,6 +278,19 @@ impl Theatre {
         (!degrees.is_empty()).then(|| 1.0 / median(degrees))
     }
 
+    /// Median way of the probes over the raster in the last frame, pixels.
+    pub(crate) fn speed_px(&self) -> f64 {
+        let last = self.span.last_slot;
+        let [before, now] = [last.saturating_sub(1), last].map(|slot| poses_at(&self.rig, slot));
+        let at = |poses: &Placed, p: &Probe| self.rig.camera.project(poses[p.body].transform_point3(p.point));
+        let moved = self.probes.iter().filter_map(|p| Some(at(&now, p)?.distance(at(&before, p)?)));
+        let moved: Vec<f64> = moved.collect();
+        if moved.is_empty() {
+            return 0.0;
+        }
+        median(moved)
+    }
+
     /// Shown radiance at every probe, bilinear over the pixels of its own body.
     fn look(&self, poses: &[DAffine3], shown: &[[f32; 4]], surfaces: &[Surface]) -> Vec<Vec3> {
         let camera = &self.rig.camera;

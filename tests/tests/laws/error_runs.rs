@@ -6,6 +6,7 @@ use dpm_lab::error::export::FrameIndex;
 use dpm_lab::error::plan::Setting;
 use dpm_lab::error::reference::Reference;
 use dpm_lab::error::runs::{is_other, ErrorOptions, ErrorRuns, Extent, AT_EQUAL_TIME, EYE_FRAMES, RACES};
+use dpm_lab::error::seen::{measure, measure_beside, SeenGroup, SeenRow};
 use dpm_lab::sequence::{eye_mean, rmse, Span, Theatre};
 use dpm_render::gpu::Gpu;
 use dpm_render::method::Method;
@@ -82,12 +83,51 @@ mod breadth {
         assert!(biased > 0.5 * error, "what is lost is bias, not noise: {biased} of {error}");
     }
 
+    /// Path tracing beside itself has no bias that people or tests notice; where it loses indirect light, the mean falls and the
+    /// p-values of the tiles are no longer even.
+    #[test]
+    fn what_people_notice_moves_with_what_is_wrong() {
+        let cache = std::env::temp_dir().join(format!("dpm-seen-{}", std::process::id()));
+        let extent = Extent { warm_up: 8, kept: 48, reference_spp: 256 };
+        let runs = |settings: &[&str]| {
+            let (rig, gpu) = stage(settings);
+            let cache = cache.clone();
+            let options = ErrorOptions { extent, ablation: false, seeds: 8, window: None, cache };
+            ErrorRuns::new(rig, gpu, Setting::plain(false, 4.0), options)
+        };
+        let row = |group: &SeenGroup, name: &str| -> SeenRow {
+            group.rows.iter().find(|r| r.method == name).unwrap().clone()
+        };
+        let whole = runs(&[]);
+        let fair = measure(&whole, &mut |_| ()).unwrap();
+        for r in &fair.rows {
+            for e in [r.jod, r.flicker, r.fast, r.mean_percent, r.flip, r.perceived_rmse] {
+                assert!(e.interval[0] <= e.mean && e.mean <= e.interval[1] && e.mean.is_finite(), "{r:?}");
+            }
+            assert!(r.jod.mean > 0.0 && r.jod.mean < 10.0 && r.misaligned.is_none(), "{r:?}");
+            assert!(
+                r.flicker.mean > 0.0 && r.bias.histogram.iter().sum::<u32>() as usize == r.bias.tiles,
+                "{r:?}"
+            );
+        }
+        let full = row(&fair, "full");
+        println!("{full:?}");
+        let reach = full.mean_percent.interval[1] - full.mean_percent.mean;
+        // Four and more standard errors, and as much of the reference.
+        assert!(full.mean_percent.mean.abs() < 3.0 * reach, "{full:?}");
+        assert!(full.bias.p_even > 1e-4, "{full:?}");
+        let lost = row(&measure_beside(&runs(&["render.depth=2"]), &whole, &mut |_| ()).unwrap(), "full");
+        println!("{lost:?}");
+        assert!(lost.mean_percent.interval[1] < full.mean_percent.interval[0], "{lost:?}");
+        assert!(lost.bias.p_even < 1e-4 && lost.bias.histogram[0] > full.bias.histogram[0], "{lost:?}");
+    }
+
     #[test]
     fn a_group_is_measured_at_equal_rays_and_tells_bias_from_noise() {
         let (rig, gpu) = stage(&[]);
         let cache = std::env::temp_dir().join(format!("dpm-error-{}", std::process::id()));
         let extent = Extent { warm_up: 8, kept: 48, reference_spp: 16 };
-        let options = ErrorOptions { extent, ablation: false, cache: cache.clone() };
+        let options = ErrorOptions { extent, ablation: false, seeds: 4, window: None, cache: cache.clone() };
         let runs = ErrorRuns::new(rig, gpu, Setting::plain(false, 4.0), options);
         let mut drawn = Vec::new();
         let measured = runs.measure(&mut |what| drawn.push(what.to_owned())).unwrap();

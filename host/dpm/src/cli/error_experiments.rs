@@ -1,6 +1,6 @@
 //! The experiments of `dpm error`: what each measures of a setting, what that takes, and what it reports. One loop runs them all.
 
-use super::error::{chosen, folder, list, options, stage, ErrorArgs};
+use super::error::{chosen, folder, list, options, rig_of, stage, ErrorArgs};
 use super::error_files::{known, known_or, report, show};
 use super::progress::Progress;
 use dpm_lab::error::figure3::{self, Figure3Group, SPP};
@@ -11,12 +11,12 @@ use dpm_lab::error::runs::{
     is_other, key_of, ErrorOptions, ErrorRunError, ErrorRuns, Extent, GroupResult, Measured, AT_EQUAL_TIME,
     EYE_FRAMES, RACES,
 };
+use dpm_lab::error::seen::{self, SeenGroup};
 use dpm_lab::error::table::{self, TableGroup};
 use dpm_lab::stamp::Stamp;
 use dpm_rig::config::RenderConfig;
 use dpm_rig::failure::{Failure, FailureKind};
 use dpm_rig::pipeline::PipelineError;
-use dpm_rig::rig::Rig;
 use serde::de::DeserializeOwned;
 use serde::Serialize;
 
@@ -142,6 +142,34 @@ impl Experiment for TableGroup {
     }
 }
 
+impl Experiment for SeenGroup {
+    const PREFIX: &'static str = "seen";
+    const REPORT: &'static str = "seen";
+
+    fn setting(&self) -> Setting {
+        self.setting()
+    }
+
+    fn origin(&self) -> Origin<'_> {
+        Origin { key: &self.key, stamp: &self.stamp, extent: Some(self.extent) }
+    }
+
+    fn key(stamp: &Stamp, setting: Setting, options: &ErrorOptions) -> String {
+        seen::key(stamp, setting, options)
+    }
+
+    fn measure(
+        runs: &ErrorRuns,
+        each: &mut dyn FnMut(&str),
+    ) -> Result<(Self, Option<Measured>), ErrorRunError> {
+        Ok((seen::measure(runs, each)?, None))
+    }
+
+    fn markdown(groups: &[Self]) -> String {
+        seen::markdown(groups)
+    }
+}
+
 impl Experiment for Figure3Group {
     const PREFIX: &'static str = "figure3";
     const REPORT: &'static str = "figure3";
@@ -243,7 +271,7 @@ pub(super) fn run<T: Experiment>(args: &ErrorArgs, all: &[Setting]) -> Result<()
     for &setting in &chosen {
         let name = setting.name();
         let runs = || {
-            let own = Rig::build(&rig.config, Some(rig.camera.raster))?;
+            let own = rig_of(args, &rig.config, Some(rig.camera.raster))?;
             Ok::<_, Failure>(ErrorRuns::new(own, gpu.clone(), setting, options.clone()))
         };
         let mut each = |what: &str| progress.step(&format!("{name} {what}"), of(what, setting));

@@ -8,6 +8,7 @@ use dpm_device::regular_file;
 use dpm_lab::error::figure3::Figure3Group;
 use dpm_lab::error::plan::Setting;
 use dpm_lab::error::runs::{GroupResult, Measured};
+use dpm_lab::error::seen::SeenGroup;
 use dpm_lab::error::sheet::{stack, strip};
 use dpm_lab::error::table::TableGroup;
 use dpm_lab::snapshot::paint::Canvas;
@@ -98,10 +99,12 @@ pub(super) fn merge(out: &Path, json: bool) -> Result<(), Failure> {
 fn merged(out: &Path, json: bool) -> Result<String, Failure> {
     let (groups, settings, cells) =
         (joined::<GroupResult>(out)?, joined::<Figure3Group>(out)?, joined::<TableGroup>(out)?);
+    let seen = joined::<SeenGroup>(out)?;
     let (mut objects, mut tables) = (serde_json::Map::new(), String::new());
     add(out, &settings, &mut objects, &mut tables)?;
     add(out, &cells, &mut objects, &mut tables)?;
     add(out, &groups, &mut objects, &mut tables)?;
+    add(out, &seen, &mut objects, &mut tables)?;
     if objects.is_empty() {
         let out = out.display();
         let told = format!("{out}: no measured groups; run dpm error RIG.toml --index N --out {out} first");

@@ -10,6 +10,7 @@ pub mod plot;
 pub mod reference;
 pub mod report;
 pub mod runs;
+pub mod seen;
 pub mod sheet;
 pub mod table;
 mod verdict;

@@ -4,11 +4,15 @@
 //! so at one budget, with the first tracked body in four materials, looked at and looked past. The third is the preliminary experiment of
 //! \[paper\] section 3: one method at rising samples, on one body in four materials.
 
+use dpm_device::planes::Raster;
 use dpm_render::method::{Method, SamplerKind};
 use dpm_rig::config::{EffectsConfig, RenderConfig, RenderMethod};
 use dpm_rig::rig::Rig;
 use dpm_scene::Material;
 use glam::{DQuat, DVec3, Vec3};
+use serde::{Deserialize, Serialize};
+use std::str::FromStr;
+use std::sync::Arc;
 
 /// A method to be measured.
 #[derive(Clone, Debug)]
@@ -91,6 +95,73 @@ pub(crate) fn looks() -> [Material; 4] {
         of("rough-metal", [242, 163, 138], 1.0, 0.35),
         of("mirror", [242, 237, 224], 1.0, 0.02),
     ]
+}
+
+/// A part of the projector's raster, which is drawn at the density of the whole.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub struct Window {
+    /// Its left column.
+    pub x: u32,
+    /// Its upper row.
+    pub y: u32,
+    /// Columns, at least 16.
+    pub width: u32,
+    /// Rows, at least 16.
+    pub height: u32,
+}
+
+impl std::fmt::Display for Window {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        write!(f, "{},{},{}x{}", self.x, self.y, self.width, self.height)
+    }
+}
+
+impl FromStr for Window {
+    type Err = String;
+
+    fn from_str(text: &str) -> Result<Self, String> {
+        let number = |part: Option<&str>| part.and_then(|part| part.trim().parse::<u32>().ok());
+        let mut parts = text.split([',', 'x', 'X']);
+        let all = [(); 4].map(|()| number(parts.next()));
+        match (all, parts.next()) {
+            ([Some(x), Some(y), Some(width @ 16..), Some(height @ 16..)], None) => {
+                Ok(Self { x, y, width, height })
+            }
+            _ => {
+                Err("write X,Y,WxH in pixels of the projector, 16x16 or more, for example 400,300,160x120"
+                    .into())
+            }
+        }
+    }
+}
+
+impl Window {
+    /// The rig whose projector has these mirrors alone.
+    ///
+    /// # Errors
+    /// It reaches beyond the raster.
+    pub fn of(self, mut rig: Rig) -> Result<Rig, String> {
+        let whole = rig.camera.raster;
+        let fits = |begin: u32, size: u32, of: u32| begin.checked_add(size).is_some_and(|end| end <= of);
+        let raster = Raster::new(self.width, self.height)
+            .filter(|_| fits(self.x, self.width, whole.width()) && fits(self.y, self.height, whole.height()));
+        let Some(raster) = raster else {
+            return Err(format!(
+                "--window {self} reaches beyond the projector's {} x {} pixels",
+                whole.width(),
+                whole.height()
+            ));
+        };
+        rig.camera.raster = raster;
+        rig.camera.cx -= f64::from(self.x);
+        rig.camera.cy -= f64::from(self.y);
+        if let Some(field) = &rig.drive.flat_field {
+            let row =
+                |y: u32| &field[((self.y + y) * whole.width() + self.x) as usize..][..self.width as usize];
+            rig.drive.flat_field = Some(Arc::new((0..self.height).flat_map(row).copied().collect()));
+        }
+        Ok(rig)
+    }
 }
 
 /// One condition of an experiment: bodies, gaze and budget.
@@ -219,6 +290,28 @@ mod tests {
             let names: std::collections::BTreeSet<String> = all.into_iter().map(Setting::name).collect();
             assert_eq!(names.len(), count);
         }
+    }
+
+    /// A pixel of a window sees what that pixel of the whole raster sees.
+    #[test]
+    fn a_window_is_a_part_of_the_raster() {
+        use dpm_rig::config::{Overrides, RigConfig};
+        use glam::DVec2;
+        let config = RigConfig::demo(&Overrides::default()).unwrap();
+        let whole = Rig::build(&config, None).unwrap();
+        let window: Window = "400,300,160x120".parse().unwrap();
+        assert_eq!(window.to_string(), "400,300,160x120");
+        let part = window.of(Rig::build(&config, None).unwrap()).unwrap();
+        assert_eq!((part.camera.raster.width(), part.camera.raster.height()), (160, 120));
+        for at in [DVec2::new(0.5, 0.5), DVec2::new(80.0, 119.5)] {
+            let (a, b) = (part.camera.ray(at), whole.camera.ray(at + DVec2::new(400.0, 300.0)));
+            assert!(a.direction.distance(b.direction) < 1e-12 && a.origin == b.origin);
+        }
+        for text in ["1,2", "1,2,8x40", "a,2,20x20", "1,2,20x20x3", "-1,0,20x20"] {
+            assert!(text.parse::<Window>().is_err(), "{text}");
+        }
+        let beyond: Window = "1000,0,100x100".parse().unwrap();
+        assert!(beyond.of(whole).err().unwrap().contains("1024 x 768"));
     }
 
     #[test]

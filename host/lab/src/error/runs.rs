@@ -8,7 +8,7 @@
 
 use super::equal::{corrected, least_spp, nearest, off_equal, where_equal, with_samples, Trial};
 use super::parts::Part;
-use super::plan::{contenders, looks, paper_at, Contender, Setting};
+use super::plan::{contenders, looks, paper_at, Contender, Setting, Window};
 use super::reference::{mean_of, Reference};
 use crate::metrics::error::compare;
 use crate::metrics::flicker::TileSeries;
@@ -45,6 +45,10 @@ pub struct ErrorOptions {
     pub extent: Extent,
     /// Dpm with each part off in turn is measured too.
     pub ablation: bool,
+    /// Runs of each method where figures have intervals: an even number, at least 4.
+    pub seeds: u32,
+    /// The part of the raster that the rig has; all of it if none.
+    pub window: Option<Window>,
     /// Folder for references, and for methods whose group is not complete yet.
     pub cache: PathBuf,
 }
@@ -214,6 +218,9 @@ pub fn key_of(stamp: &Stamp, setting: Setting, options: &ErrorOptions, more: &st
     let look = setting.look.map(|look| looks()[look].clone());
     // Writing into a hash cannot fail.
     let _ = write!(hash, "{stamp:?}{setting:?}{look:?}{:?}{}{more}", o.extent, o.ablation);
+    if let Some(window) = o.window {
+        let _ = write!(hash, "{window}");
+    }
     hash.text()
 }
 
@@ -256,6 +263,7 @@ impl ErrorRuns {
     pub(super) fn reference(&self, each: &mut dyn FnMut(&str)) -> Result<Reference, ErrorRunError> {
         let (o, stamp, setting) = (&self.options, &self.stamp, self.setting);
         let look = setting.look.map(|look| format!(" {:?}", looks()[look])).unwrap_or_default();
+        let look = o.window.map_or(look.clone(), |window| format!("{look} {window}"));
         let what = format!("{}{look}{:?}{}{LAST_SLOT}", stamp.config_hash, stamp.raster, setting.moving);
         let short = self.theatre(0, EYE_FRAMES as u32)?;
         Reference::new(&short, o.extent.reference_spp, &what, &o.cache, each)
@@ -398,14 +406,14 @@ impl ErrorRuns {
     }
 
     /// Rays of a frame with so many samples, from a short sequence.
-    fn rays_at(&self, method: &Method, spp: f32) -> Result<f64, RenderError> {
+    pub(super) fn rays_at(&self, method: &Method, spp: f32) -> Result<f64, RenderError> {
         const FRAMES: u32 = 6;
         let short = self.theatre(FRAMES, FRAMES)?;
         Ok(short.play(method, spp, 77, &mut |_, _| ())?.rays as f64 / f64::from(FRAMES))
     }
 
     /// Samples with which a method takes `rays` a frame: a frame without samples tells the fixed part, a short sequence the rest.
-    fn spp_for(&self, method: &Method, rays: f64) -> Result<f32, RenderError> {
+    pub(super) fn spp_for(&self, method: &Method, rays: f64) -> Result<f32, RenderError> {
         const TRIAL: f32 = 4.0;
         let (base, trial) = (self.rays_at(method, 0.0)?, self.rays_at(method, TRIAL)?);
         Ok(corrected(TRIAL, base, trial, rays).max(least_spp(method)))
@@ -554,7 +562,7 @@ impl ErrorRuns {
     }
 
     /// FLIP over the lit pixels; white is the reference's brightest hundredth.
-    fn flip(&self, theatre: &Theatre, test: &[Vec3], truth: &[Vec3]) -> Result<f64, MetricError> {
+    pub(super) fn flip(&self, theatre: &Theatre, test: &[Vec3], truth: &[Vec3]) -> Result<f64, MetricError> {
         let raster = theatre.raster();
         let (width, height) = (raster.width() as usize, raster.height() as usize);
         let white = white_of(truth);

@@ -1,12 +1,22 @@
-//! A sequence of pictures into the power with which their tiles flicker at the rates an eye can see, 1 to 60 Hz.
+//! A sequence of pictures into the power with which their tiles change, by frequency, and from 1 to 60 Hz in one figure.
 
 use super::MetricError;
 
 /// The slowest change that counts as flicker, Hz.
 pub(crate) const LOWEST_HZ: f64 = 1.0;
 
-/// Critical flicker fusion: the fastest that is seen, Hz.
+/// The end of the band that is summed up in one figure, Hz. Faster changes are seen too, but not where this program's methods make
+/// most of theirs; [`super::sensitivity`] says how well.
 pub(crate) const HIGHEST_HZ: f64 = 60.0;
+
+/// A frequency, and the power that each tile has at it, row by row.
+#[derive(Clone, Debug, PartialEq)]
+pub(crate) struct Line {
+    /// The frequency.
+    pub hz: f64,
+    /// Mean squares, in the square of the values' unit: half of the squared amplitude.
+    pub power: Vec<f64>,
+}
 
 /// Means of square tiles over time.
 #[derive(Clone, Debug)]
@@ -87,18 +97,27 @@ impl TileSeries {
     /// # Errors
     /// [`MetricError::Parameter`] when the sequence is too short to hold a frequency of the band: 250 ms is a sensible least.
     pub(crate) fn power(&self) -> Result<Vec<f64>, MetricError> {
-        let n = self.frames;
-        let duration_s = n as f64 * self.frame_period_s;
-        let band: Vec<usize> =
-            (1..=n / 2).filter(|&k| (LOWEST_HZ..=HIGHEST_HZ).contains(&(k as f64 / duration_s))).collect();
-        if band.is_empty() {
+        let lines = self.lines(LOWEST_HZ, HIGHEST_HZ);
+        let Some((first, others)) = lines.split_first() else {
             return Err(MetricError::Parameter(
                 "the number of frames (no frequency from 1 to 60 Hz fits in)",
             ));
+        };
+        let mut power = first.power.clone();
+        for line in others {
+            power.iter_mut().zip(&line.power).for_each(|(sum, p)| *sum += p);
         }
+        Ok(power)
+    }
+
+    /// The spectrum of every tile from `lowest_hz` to `highest_hz`, as far as half of the frame rate: see [`Self::power`].
+    pub(crate) fn lines(&self, lowest_hz: f64, highest_hz: f64) -> Vec<Line> {
+        let n = self.frames;
+        let hz = |k: usize| k as f64 / (n as f64 * self.frame_period_s);
+        let band = (1..=n / 2).filter(|&k| (lowest_hz..=highest_hz).contains(&hz(k)));
         let (across, down) = self.tiles();
         let tiles = across * down;
-        let mut power = vec![0.0; tiles];
+        let mut lines = Vec::new();
         let (mut re, mut im) = (vec![0.0; tiles], vec![0.0; tiles]);
         for k in band {
             re.fill(0.0);
@@ -113,11 +132,10 @@ impl TileSeries {
             }
             // The line at half the frame rate stands for itself, every other also for its negative frequency.
             let sides = if 2 * k == n { 1.0 } else { 2.0 };
-            for ((p, re), im) in power.iter_mut().zip(&re).zip(&im) {
-                *p += sides * (re * re + im * im) / (n as f64 * n as f64);
-            }
+            let of = |(re, im): (&f64, &f64)| sides * (re * re + im * im) / (n as f64 * n as f64);
+            lines.push(Line { hz: hz(k), power: re.iter().zip(&im).map(of).collect() });
         }
-        Ok(power)
+        lines
     }
 }
 

@@ -1,12 +1,13 @@
 //! Two sequences of light into how different they are to a camera and to an eye.
 //!
 //! Pictures of what an eye sees are compared ([`error`], [`flip`]), and tiles are watched over time ([`flicker`]). What people
-//! notice of light that changes in time is in [`sensitivity`]; [`modulation`] is how much the light of a schedule changes.
+//! notice of light that changes in time is in [`sensitivity`]; [`jod`] is the quality of a video beside another; [`modulation`] is how much the light of a schedule changes.
 //! Judging single frames would be wrong: at 947 fps the eye never sees one.
 
 pub(crate) mod error;
 pub(crate) mod flicker;
 pub(crate) mod flip;
+pub(crate) mod jod;
 pub(crate) mod modulation;
 pub(crate) mod sensitivity;
 
