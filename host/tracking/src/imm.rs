@@ -97,11 +97,24 @@ impl Covariance {
         }
     }
 
-    /// That of a motion by `model` after `h` seconds.
-    pub(crate) fn after(&self, model: &MotionModel, h: f64) -> Self {
-        let mut after = self.propagated(&model.transition(h));
-        after.add_scaled(&model.process_noise(h), 1.0);
-        after
+    /// That of a motion of constant acceleration after `h` seconds, which nothing drives.
+    pub(crate) fn accelerated(&self, h: f64) -> Self {
+        let half = 0.5 * h * h;
+        // M = F P, without its zeros; then M F^T.
+        let m0 = [
+            self.pp + h * self.pv + half * self.pa,
+            self.pv + h * self.vv + half * self.va,
+            self.pa + h * self.va + half * self.aa,
+        ];
+        let m1 = [self.vv + h * self.va, self.va + h * self.aa];
+        Self {
+            pp: m0[0] + m0[1] * h + m0[2] * half,
+            pv: m0[1] + m0[2] * h,
+            pa: m0[2],
+            vv: m1[0] + m1[1] * h,
+            va: m1[1],
+            aa: self.aa,
+        }
     }
 
     /// Joseph form for one position measurement of variance `r`; returns the gains too. 1 - K is computed as R / S, because
@@ -154,7 +167,7 @@ impl Covariance {
         mixed
     }
 
-    fn add_scaled(&mut self, o: &Self, w: f64) {
+    pub(crate) fn add_scaled(&mut self, o: &Self, w: f64) {
         self.pp += w * o.pp;
         self.pv += w * o.pv;
         self.pa += w * o.pa;
@@ -206,6 +219,9 @@ impl MotionModel {
             return Transition { p: [1.0, h, 0.0], v: [0.0, 1.0, 0.0], a: [0.0; 3] };
         }
         let w = self.swing_rad_s;
+        if w == 0.0 {
+            return Transition { p: [1.0, h, 0.5 * h * h], v: [0.0, 1.0, h], a: [0.0, 0.0, 1.0] };
+        }
         let x = w * h;
         let (sin, cos) = libm::sincos(x);
         // (1 - cos x) / w^2 by the half angle: no cancellation; both quotients have their limits at w = 0.
@@ -219,7 +235,7 @@ impl MotionModel {
     }
 
     /// The noise collected in `h` seconds; the swing's feedback changes it by O((w h)^2) and is left out.
-    fn process_noise(&self, h: f64) -> Covariance {
+    pub(crate) fn process_noise(&self, h: f64) -> Covariance {
         let q = self.noise;
         let (h2, h3) = (h * h, h * h * h);
         if self.accelerates {

@@ -36,14 +36,20 @@ const SETTLES: u32 = 32;
 /// A filter of constant acceleration. Its position is an offset from the ladder's base.
 #[derive(Clone, Copy, Debug, Default)]
 struct Rung {
-    offset: DVec3,
-    velocity: DVec3,
-    acceleration: DVec3,
+    mean: Accelerated,
     /// Of each axis.
     covariance: Covariance,
 }
 
-impl Rung {
+/// A motion of constant acceleration, from the ladder's base.
+#[derive(Clone, Copy, Debug, Default)]
+struct Accelerated {
+    offset: DVec3,
+    velocity: DVec3,
+    acceleration: DVec3,
+}
+
+impl Accelerated {
     fn offset_after(&self, h: f64) -> DVec3 {
         self.offset + (self.velocity + self.acceleration * (0.5 * h)) * h
     }
@@ -55,6 +61,13 @@ struct Past<P> {
     at_ns: i64,
     bank: Motion<P>,
     base: P,
+    rungs: [Accelerated; RUNGS],
+}
+
+/// What a step of time changes, which a sample that cannot be true takes back.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct Present<C: Chart> {
+    bank: Imm<C>,
     rungs: [Rung; RUNGS],
 }
 
@@ -78,9 +91,8 @@ pub(crate) struct Learner<C: Chart> {
     acceleration: f64,
     learns: bool,
     recall_after_s: f64,
-    bank: Imm<C>,
+    now: Present<C>,
     base: C::Point,
-    rungs: [Rung; RUNGS],
     best: usize,
     errors: Errors,
     past: [Option<Past<C::Point>>; KEPT],
@@ -102,9 +114,11 @@ impl<C: Chart> Learner<C> {
             acceleration,
             learns: true,
             recall_after_s,
-            bank: Imm::new(&config, z, r),
+            now: Present {
+                bank: Imm::new(&config, z, r),
+                rungs: [Rung { covariance, ..Rung::default() }; RUNGS],
+            },
             base: z,
-            rungs: [Rung { covariance, ..Rung::default() }; RUNGS],
             best: (MIDDLE as i32 + level).clamp(0, RUNGS as i32 - 1) as usize,
             errors: Errors::default(),
             past: [None; KEPT],
@@ -142,19 +156,29 @@ impl<C: Chart> Learner<C> {
 
     /// The bank, which judges whether a sample can be true.
     pub(crate) fn bank(&self) -> &Imm<C> {
-        &self.bank
+        &self.now.bank
+    }
+
+    /// What [`Learner::advance`] will change.
+    pub(crate) fn present(&self) -> Present<C> {
+        self.now
+    }
+
+    /// Undoes [`Learner::advance`].
+    pub(crate) fn back_to(&mut self, present: Present<C>) {
+        self.now = present;
     }
 
     /// Mean and covariance of the motion.
     pub(crate) fn combined(&self) -> Kinematics<C::Point> {
-        let (bank, rung) = (self.bank.combined(), &self.rungs[self.best]);
+        let (bank, rung) = (self.now.bank.combined(), &self.now.rungs[self.best]);
         let w = self.errors.share_of_rung(self.best);
-        let apart = C::between(bank.mean.point, C::moved(self.base, rung.offset));
+        let apart = C::between(bank.mean.point, C::moved(self.base, rung.mean.offset));
         Kinematics {
             mean: Motion {
                 point: C::moved(bank.mean.point, apart * w),
-                velocity: bank.mean.velocity.lerp(rung.velocity, w),
-                acceleration: bank.mean.acceleration.lerp(rung.acceleration, w),
+                velocity: bank.mean.velocity.lerp(rung.mean.velocity, w),
+                acceleration: bank.mean.acceleration.lerp(rung.mean.acceleration, w),
             },
             covariance: bank.covariance.map(|covariance| covariance.mixed(&rung.covariance, w)),
         }
@@ -162,43 +186,46 @@ impl<C: Chart> Learner<C> {
 
     /// Advances all filters by `h` >= 0 seconds, the bank according to `recalled`.
     pub(crate) fn advance(&mut self, h: f64, recalled: Option<Recalled>) {
-        self.bank.advance(&self.config(), h, recalled);
+        let config = self.config();
+        self.now.bank.advance(&config, h, recalled);
         if !self.learns {
             return;
         }
-        for (k, rung) in self.rungs.iter_mut().enumerate() {
-            let acceleration = self.acceleration * f64::from(k as i32 - MIDDLE as i32).exp2();
-            let noise = JERK * acceleration * acceleration;
-            rung.offset = rung.offset_after(h);
-            rung.velocity += rung.acceleration * h;
-            rung.covariance =
-                rung.covariance.after(&MotionModel { accelerates: true, swing_rad_s: 0.0, noise }, h);
+        // What a noise of 1 makes of a step, of which each rung has its share.
+        let unit = MotionModel { accelerates: true, swing_rad_s: 0.0, noise: 1.0 }.process_noise(h);
+        let mut noise = JERK * (self.acceleration * f64::from(-(MIDDLE as i32)).exp2()).powi(2);
+        for rung in &mut self.now.rungs {
+            rung.mean.offset = rung.mean.offset_after(h);
+            rung.mean.velocity += rung.mean.acceleration * h;
+            rung.covariance = rung.covariance.accelerated(h);
+            rung.covariance.add_scaled(&unit, noise);
+            noise *= 4.0;
         }
     }
 
     /// Updates all filters with a measurement of variance `r` at `at_ns`, to which they were advanced. Returns the
     /// normalised innovation squared of the bank.
     pub(crate) fn update(&mut self, at_ns: i64, z: C::Point, r: f64) -> f64 {
-        let nis = self.bank.update(z, r);
+        let nis = self.now.bank.update(z, r);
         if !self.learns {
             return nis;
         }
         let measured = C::between(self.base, z);
-        for rung in &mut self.rungs {
+        for rung in &mut self.now.rungs {
             let (covariance, [kp, kv, ka]) = rung.covariance.updated(r);
-            let innovation = measured - rung.offset;
+            let innovation = measured - rung.mean.offset;
             rung.covariance = covariance;
-            rung.offset += innovation * kp;
-            rung.velocity += innovation * kv;
-            rung.acceleration += innovation * ka;
+            rung.mean.offset += innovation * kp;
+            rung.mean.velocity += innovation * kv;
+            rung.mean.acceleration += innovation * ka;
         }
         self.judge(at_ns, z, r);
         // The base follows, so that offsets stay small against the chart's curvature.
-        let moved = self.rungs[self.best].offset;
+        let moved = self.now.rungs[self.best].mean.offset;
         self.base = C::moved(self.base, moved);
-        self.rungs.iter_mut().for_each(|rung| rung.offset -= moved);
-        self.past[self.next] =
-            Some(Past { at_ns, bank: self.bank.mean(), base: self.base, rungs: self.rungs });
+        self.now.rungs.iter_mut().for_each(|rung| rung.mean.offset -= moved);
+        let (bank, rungs) = (self.now.bank.mean(), self.now.rungs.map(|rung| rung.mean));
+        self.past[self.next] = Some(Past { at_ns, bank, base: self.base, rungs });
         self.next = (self.next + 1) % KEPT;
         nis
     }

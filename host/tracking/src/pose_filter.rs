@@ -391,8 +391,8 @@ impl PoseFilter {
             }
             if gap_ns <= carried_for_ns {
                 let h = gap_ns as f64 * 1e-9;
-                let mut position = track.position;
-                let mut rotation = track.rotation;
+                let (position, rotation) = (&mut track.position, &mut track.rotation);
+                let before = (position.present(), rotation.present());
                 let (from_ns, to_ns) = (track.newest.at.0, z.at.0);
                 let (most, most_turn) = (position.greatest_recalled(), rotation.greatest_recalled());
                 position.advance(h, self.position_recall.between(from_ns, to_ns, most));
@@ -409,8 +409,6 @@ impl PoseFilter {
                         position.update(to_ns, z.position, rp),
                         rotation.update(to_ns, z.rotation, rr),
                     ]);
-                    track.position = position;
-                    track.rotation = rotation;
                     self.candidates = [None; ACQUIRE_SAMPLES];
                     self.position_noise.push(z.at.0, z.position);
                     self.rotation_noise.push(z.at.0, z.rotation);
@@ -419,6 +417,8 @@ impl PoseFilter {
                     self.rotation_recall.push(to_ns, z.rotation, r.point, r.velocity, rr.sqrt());
                     return track.accept(z, c.stuck_after);
                 }
+                position.back_to(before.0);
+                rotation.back_to(before.1);
             }
         }
         self.acquire(z, rp, rr)

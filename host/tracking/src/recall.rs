@@ -12,16 +12,17 @@ use glam::DVec3;
 
 /// Samples kept to smooth from; at least [`MARGIN_NS`] to either side of a point, at [`SAMPLE_NS`].
 const SAMPLES: usize = 192;
-/// Samples closer than this to the last one kept are skipped, ns: trackers above 1 kHz.
-const SAMPLE_NS: i64 = 900_000;
+/// Samples closer than this to the last one kept are skipped, ns: of a tracker at 1 kHz every other one is kept.
+const SAMPLE_NS: i64 = 1_800_000;
 /// Points of the past kept: five seconds at [`POINT_NS`].
 const POINTS: usize = 1280;
 /// Least time between two of them, ns.
 const POINT_NS: i64 = 3_500_000;
 /// Neighbours further apart than this have a gap between them, ns.
 const GAP_NS: i64 = 20_000_000;
-/// Points compared with the present for each sample: the whole past in 20 samples.
+/// Points compared with the present in [`SCAN_S`], and for each sample at most: the whole past in 40 ms.
 const SCAN: usize = 64;
+const SCAN_S: f64 = 2e-3;
 /// Shortest period of a repetition, ns.
 const LEAST_LAG_NS: i64 = 300_000_000;
 /// The offered acceleration is the mean over this time, ns: about the horizon of a rig.
@@ -65,8 +66,10 @@ struct Point<P> {
 /// The motion of one body in the last seconds, and which part of it the body is repeating.
 #[derive(Clone, Debug)]
 pub(crate) struct Recall<C: Chart> {
-    /// Oldest first; `None` only before the first samples of a track.
-    samples: [Option<(i64, C::Point)>; SAMPLES],
+    /// The last [`SAMPLES`] up to `end`, oldest first; `None` only before the first samples of a track. They move to the
+    /// front when the end is reached, and not with every sample.
+    samples: Box<[Option<(i64, C::Point)>; 2 * SAMPLES]>,
+    end: usize,
     /// A ring: point `i` lies at `i` modulo [`POINTS`].
     points: Box<[Option<Point<C::Point>>]>,
     written: usize,
@@ -87,7 +90,8 @@ impl<C: Chart> Recall<C> {
     /// An empty recall. Allocates all that it will ever need (about 0.2 MB).
     pub(crate) fn new() -> Self {
         Self {
-            samples: [None; SAMPLES],
+            samples: Box::new([None; 2 * SAMPLES]),
+            end: SAMPLES,
             points: vec![None; POINTS].into_boxed_slice(),
             written: 0,
             begins: true,
@@ -108,7 +112,7 @@ impl<C: Chart> Recall<C> {
 
     /// The next samples belong to another track.
     pub(crate) fn break_track(&mut self) {
-        self.samples = [None; SAMPLES];
+        self.samples.fill(None);
         self.lag_ns = None;
         self.begins = true;
     }
@@ -138,17 +142,24 @@ impl<C: Chart> Recall<C> {
     /// Adds a sample with `sigma` standard deviation per axis, captured after the previous ones, and the bank's
     /// estimate of the motion.
     pub(crate) fn push(&mut self, at_ns: i64, z: C::Point, point: C::Point, velocity: DVec3, sigma: f64) {
-        let [.., newest] = &self.samples;
+        let newest = self.samples[self.end - 1];
         if newest.is_none_or(|(last_ns, _)| at_ns.saturating_sub(last_ns) >= SAMPLE_NS) {
-            self.samples.rotate_left(1);
-            self.samples[SAMPLES - 1] = Some((at_ns, z));
+            if self.end == self.samples.len() {
+                self.samples.copy_within(SAMPLES.., 0);
+                self.end = SAMPLES;
+            }
+            self.samples[self.end] = Some((at_ns, z));
+            self.end += 1;
             self.remember(at_ns, sigma);
         }
         let since_s = at_ns.saturating_sub(self.newest_ns).max(0) as f64 * 1e-9;
         self.newest_ns = at_ns;
         match self.lag_ns {
             Some(lag) => self.follow(at_ns.saturating_sub(lag), since_s, z, sigma),
-            None => self.search(at_ns, point, velocity, sigma),
+            None => {
+                let scan = (SCAN as f64 * since_s / SCAN_S).round().clamp(1.0, SCAN as f64) as usize;
+                self.search(at_ns, scan, point, velocity, sigma);
+            }
         }
     }
 
@@ -199,12 +210,16 @@ impl<C: Chart> Recall<C> {
     /// Adds the newest point that can be smoothed, unless the last one is too near.
     fn remember(&mut self, now_ns: i64, sigma: f64) {
         let last_ns = self.written.checked_sub(1).and_then(|i| self.get(i)).map(|p| p.at_ns);
+        if last_ns.is_some_and(|last| now_ns.saturating_sub(last) < MARGIN_NS + POINT_NS) {
+            return;
+        }
         let due = |t: i64| {
             now_ns.saturating_sub(t) >= MARGIN_NS
                 && last_ns.is_none_or(|last| t.saturating_sub(last) >= POINT_NS)
         };
-        let Some(middle) = self.samples.iter().rposition(|s| s.is_some_and(|(t, _)| due(t))) else { return };
-        let Some((at_ns, motion)) = smoothed::<C>(&self.samples, middle, sigma) else { return };
+        let samples = &self.samples[self.end - SAMPLES..self.end];
+        let Some(middle) = samples.iter().rposition(|s| s.is_some_and(|(t, _)| due(t))) else { return };
+        let Some((at_ns, motion)) = smoothed::<C>(samples, middle, sigma) else { return };
         let begins = std::mem::take(&mut self.begins);
         let mut new = Point { at_ns, motion, passes: 1.0, begins, matters: [false; 3], exact: [true; 3] };
         for axis in 0..3 {
@@ -262,18 +277,19 @@ impl<C: Chart> Recall<C> {
     }
 
     /// Searches a part of the past for the present; the next sample continues the search.
-    fn search(&mut self, at_ns: i64, point: C::Point, velocity: DVec3, sigma: f64) {
+    fn search(&mut self, at_ns: i64, scan: usize, point: C::Point, velocity: DVec3, sigma: f64) {
         let speed = velocity.length();
         let count = self.written - self.oldest();
         if speed < TELLING_SPEED * sigma || count == 0 {
             return;
         }
         let mut best: Option<(f64, i64)> = None;
-        for _ in 0..SCAN.min(count) {
+        for _ in 0..scan.min(count) {
             self.scanned = (self.scanned + 1) % count;
             let Some(past) = self.get(self.oldest() + self.scanned) else { continue };
             let age_ns = at_ns.saturating_sub(past.at_ns);
-            if age_ns < LEAST_LAG_NS || (past.motion.velocity - velocity).length() > 0.1 * speed {
+            let other = (past.motion.velocity - velocity).length_squared() > 0.01 * speed * speed;
+            if age_ns < LEAST_LAG_NS || other {
                 continue;
             }
             let (across, later) = Self::mismatch(&past.motion, point, sigma);

@@ -25,6 +25,8 @@ const WINDOWS_MS: [[f64; 2]; 9] = [
     [10.0, 10.0],
 ];
 
+/// Most samples within the margins on both sides; more make no point.
+const MOST_SAMPLES: usize = 192;
 /// Least number of samples in a window.
 const LEAST_SAMPLES: usize = 6;
 /// Least number of samples within the margins on both sides. With fewer, turns fall between them: trackers under 150
@@ -58,22 +60,27 @@ pub(crate) fn smoothed<C: Chart>(
     sigma: f64,
 ) -> Option<(i64, Smoothed<C::Point>)> {
     let (at_ns, origin) = (*samples.get(middle)?)?;
-    let around = samples.iter().flatten().filter(|(t, _)| t.abs_diff(at_ns) <= MARGIN_NS as u64);
-    if around.clone().count() < LEAST_AROUND
-        || around.clone().any(|(_, z)| C::between(origin, *z).length() > C::FLAT)
-    {
+    // Each tangent is taken once, for all windows.
+    let (mut tangents, mut around) = ([(0.0, DVec3::ZERO); MOST_SAMPLES], 0);
+    for (t, z) in samples.iter().flatten().filter(|(t, _)| t.abs_diff(at_ns) <= MARGIN_NS as u64) {
+        let tangent = C::between(origin, *z);
+        if tangent.length_squared() > C::FLAT * C::FLAT {
+            return None;
+        }
+        // Milliseconds, so that fourth powers stay small.
+        *tangents.get_mut(around)? = (t.saturating_sub(at_ns) as f64 * 1e-6, tangent);
+        around += 1;
+    }
+    let around = &tangents[..around];
+    if around.len() < LEAST_AROUND {
         return None;
     }
     let mut chosen: [Option<Parabola>; 3] = [None; 3];
     let mut least: [Option<(f64, Parabola)>; 3] = [None; 3];
     for [before, after] in WINDOWS_MS {
-        let near = |s: &Option<(i64, C::Point)>| {
-            let (t, z) = (*s)?;
-            // Milliseconds, so that fourth powers stay small.
-            let t = t.saturating_sub(at_ns) as f64 * 1e-6;
-            (-before..=after).contains(&t).then(|| (t, C::between(origin, z)))
-        };
-        let Some((parabola, n)) = Parabola::through(samples.iter().filter_map(near)) else { continue };
+        let begin = around.partition_point(|(t, _)| *t < -before);
+        let end = around.partition_point(|(t, _)| *t <= after);
+        let Some((parabola, n)) = Parabola::through(&around[begin..end]) else { continue };
         let freedom = n as f64 - 3.0;
         for axis in 0..3 {
             let ratio = parabola.residual[axis] / (freedom * sigma * sigma);
@@ -116,11 +123,10 @@ struct Parabola {
 
 impl Parabola {
     /// The parabola through the points (t, y), and their number.
-    fn through(points: impl Iterator<Item = (f64, DVec3)>) -> Option<(Self, usize)> {
-        let mut n = 0;
+    fn through(points: &[(f64, DVec3)]) -> Option<(Self, usize)> {
+        let n = points.len();
         let (mut s, mut d, mut total) = ([0.0; 5], [DVec3::ZERO; 3], DVec3::ZERO);
-        for (t, y) in points {
-            n += 1;
+        for &(t, y) in points {
             total += y * y;
             let mut power = 1.0;
             for (k, s) in s.iter_mut().enumerate() {
