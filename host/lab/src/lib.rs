@@ -16,6 +16,7 @@ pub mod bench;
 pub mod blue_noise;
 pub mod conformance;
 pub mod error;
+pub mod film;
 pub mod gpu_model;
 pub mod handoff_cost;
 pub mod lanes;

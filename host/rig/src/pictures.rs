@@ -10,7 +10,9 @@ use crate::light::FrameRecord;
 use crate::pipeline::renderer_settings;
 use crate::plan::light_centre::{light_centre_at, true_poses_at_centre};
 use crate::rig::Rig;
+use crate::telemetry::live::SeenLight;
 use dpm_device::planes::Raster;
+use dpm_device::projector::light_of_planes;
 use dpm_render::drive::Drive;
 use dpm_render::gpu::{Gpu, GpuError};
 use dpm_render::method::Method;
@@ -56,6 +58,43 @@ fn window<'a>(rig: &Rig, light: &'a [LightFrame], records: &[FrameRecord]) -> Wi
         window.tracked = tracked;
     }
     window
+}
+
+/// The light of a slot of a rig whose tracker is the mock, where it fell.
+pub struct FallenLight {
+    /// The light.
+    pub light: LightFrame,
+    /// world-from-mesh of every body of the scene at the centre of the light.
+    pub poses: Vec<DAffine3>,
+    /// The centre of the light, nanoseconds on the host's clock.
+    pub centre_ns: i64,
+}
+
+impl FallenLight {
+    /// The light of the planes `seen`. `None`: the projector was dark, or the true poses are not known.
+    pub fn of(rig: &Rig, seen: &SeenLight) -> Option<Self> {
+        let raster = rig.camera.raster;
+        let tracked = true_poses_at_centre(rig, seen.first_photon_at).filter(|_| !seen.planes.is_empty())?;
+        let centre_ns = light_centre_at(rig, seen.first_photon_at).0;
+        let mut codes = vec![[0; 3]; raster.pixel_count()];
+        light_of_planes(raster, &rig.schedule, &seen.planes, &mut codes);
+        let mut poses = Vec::new();
+        rig.scene_poses(&tracked, centre_ns, &mut poses);
+        let (frame, first_photon_at) = (seen.frame.unwrap_or(0), seen.first_photon_at);
+        let light = LightFrame { frame, first_photon_at, codes, is_moved: seen.is_moved };
+        Some(Self { light, poses, centre_ns })
+    }
+
+    /// Drive from 0 to 1 that fell on the point `in_mesh` of a body, if nothing was in between.
+    pub fn on(&self, rig: &Rig, body: usize, in_mesh: DVec3) -> Vec3 {
+        self.at(rig, self.poses[body].transform_point3(in_mesh))
+    }
+
+    /// Drive from 0 to 1 in the projector's ray through the point `world`.
+    pub fn at(&self, rig: &Rig, world: DVec3) -> Vec3 {
+        let pixel = rig.camera.project(world);
+        pixel.map_or(Vec3::ZERO, |p| sample(&rig.drive, &self.light, rig.camera.raster, p))
+    }
 }
 
 /// Mean of the frames for each pixel, 0 to 1.

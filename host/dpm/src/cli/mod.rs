@@ -2,6 +2,7 @@
 
 mod bench;
 mod calibrate;
+mod completion;
 mod display;
 mod dlpc900;
 mod doctor;
@@ -140,6 +141,7 @@ enum Command {
 /// [`dpm_common::commit::get`].
 pub fn main(commit: &'static str) -> ExitCode {
     dpm_common::commit::set(commit);
+    completion::answer();
     // https://no-color.org: set and not empty.
     let plain = std::env::var_os("NO_COLOR").is_some_and(|v| !v.is_empty());
     let command = command().color(if plain { ColorChoice::Never } else { ColorChoice::Auto });

@@ -75,6 +75,45 @@ fn the_demo_prints_one_object_with_the_agreed_keys_and_leaves_its_files() {
 }
 
 #[test]
+fn a_film_shows_the_planes_of_the_run_and_lies_beside_a_strip() {
+    let folder = Folder::new("film");
+    let film = folder.path("film.gif");
+    let path = film.to_str().expect("text");
+    let small = ["--json", "--raster", "48x32", "--out", folder.text()];
+    let done = dpm(&[&["demo", "--film", path, "--film-seconds", "1"], &small[..]].concat(), &[]);
+    assert_eq!(code(&done), 0, "{}", err(&done));
+    let json: serde_json::Value = serde_json::from_str(&out(&done)).expect("one JSON object");
+    let files = json["files"].to_string();
+    assert!(files.contains("film.gif") && files.contains("film-strip.png"), "{files}");
+    let bytes = std::fs::read(&film).expect("the film");
+    assert!(bytes.starts_with(b"GIF89a") && bytes.len() < 3_000_000, "{}", bytes.len());
+    let strip = image::open(folder.path("film-strip.png")).expect("the strip").to_rgb8();
+    let (width, height) = (strip.width() / 2, strip.height() / 2);
+    // The mirrors are dark while the objects are bare, and one plane of one colour is shown in the end.
+    let inset = |column: u32, row: u32| {
+        let mut lit = [0u32; 3];
+        for y in row * height + height * 6 / 10..(row + 1) * height - 6 {
+            for x in column * width + width * 7 / 10..column * width + width * 9 / 10 {
+                let pixel = strip.get_pixel(x, y).0;
+                (0..3).for_each(|c| lit[c] += u32::from(pixel[c] > 128));
+            }
+        }
+        lit
+    };
+    // Nothing but the label is bright.
+    let [bare, lit] = [inset(0, 0), inset(0, 1)];
+    assert!(lit[1] > bare[1] + 20, "{bare:?} {lit:?}");
+    for (args, word) in [
+        (&["--film", "film.avi"][..], "ends in .gif"),
+        (&["--film", path, "--film-seconds", "0.01"], "lasts 1 to 60 s"),
+        (&["--film", path, "--frames", "3"], "--frames"),
+    ] {
+        let refused = dpm(&[&["demo"], args].concat(), &[]);
+        assert!(code(&refused) == 2 && err(&refused).contains(word), "{args:?}: {}", err(&refused));
+    }
+}
+
+#[test]
 fn the_rig_file_is_the_demo_and_the_same_seed_gives_the_same_light() {
     let folder = Folder::new("hash");
     let rig = concat!(env!("CARGO_MANIFEST_DIR"), "/../../rigs/demo.toml");

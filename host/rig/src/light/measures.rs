@@ -158,6 +158,7 @@ impl RegistrationMeasures {
         report.registration_error_in_time_px = spread(&self.in_time);
         [report.followed_offset_px, report.followed_smear_px] = self.followed.each_ref().map(spread);
         report.registration_error_unpredicted_px = spread(&self.unpredicted);
+        report.pixel_mm = self.meter.pixel_mm(&self.rig);
         report.registration_error_at = report.registration_error_px.map(|_| "light centre");
         report.followed_light =
             report.followed_offset_px.map(|_| match (&self.tracks, self.rig.wants_tracks()) {

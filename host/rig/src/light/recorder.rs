@@ -17,6 +17,7 @@ use dpm_device::time::HostTime;
 use dpm_handoff::channel::{channel, Receiver, Sender};
 use dpm_handoff::wake::WaitPolicy;
 use std::collections::VecDeque;
+use std::sync::mpsc::SyncSender;
 use std::sync::Arc;
 
 /// Capacity for light events between the projector and the collector: eight seconds at 947 Hz.
@@ -122,6 +123,8 @@ pub(crate) struct LightRecorder {
     lit_at: HostTime,
     /// Those who look at the light while the run goes on.
     observer: Option<Arc<RunMonitor>>,
+    /// Who is to see the light of every slot; `None` if nobody is.
+    follower: Option<SyncSender<SeenLight>>,
 }
 
 impl LightRecorder {
@@ -150,12 +153,13 @@ impl LightRecorder {
             light_hash: 0,
             lit_at: HostTime(0),
             observer: None,
+            follower: None,
         }
     }
 
     /// Shows the light to those who ask for it through `monitor`.
     pub(crate) fn seen_by(self, monitor: &Arc<RunMonitor>) -> Self {
-        Self { observer: Some(monitor.clone()), ..self }
+        Self { observer: Some(monitor.clone()), follower: monitor.live().take_follower(), ..self }
     }
 
     /// Advances the mock to `now`, one slot at a time, and records all light.
@@ -194,6 +198,11 @@ impl LightRecorder {
             if event.kind == LightKind::Lit {
                 self.lit_at = event.first_photon_at;
             }
+            if self.follower.is_some() && event.kind == LightKind::Lit && !mock.follows_tracks() {
+                let mut light = SeenLight::default();
+                show(mock, event.first_photon_at, &mut light);
+                self.send(light);
+            }
             let torn = event.kind == LightKind::Lit && self.is_torn(mock, event.frame);
             let note = LightNote { event, hash, torn, wall_ns: watch.elapsed_ns(), unseen: 0 };
             if self.lights.as_mut().is_none_or(|lights| lights.notes.push(note).is_err()) {
@@ -203,10 +212,18 @@ impl LightRecorder {
         self.remember(mock);
     }
 
+    /// Sends the light of a slot to whoever follows.
+    fn send(&mut self, light: SeenLight) {
+        if self.follower.as_ref().is_some_and(|follower| follower.send(light).is_err()) {
+            self.follower = None;
+        }
+    }
+
     /// Keeps the planes on the mirrors if somebody will want to know what tracks made of them.
     fn remember(&mut self, mock: &MockProjector) {
         let is_wanted = self.hash
             || self.keep > 0
+            || self.follower.is_some()
             || self.observer.as_ref().is_some_and(|monitor| monitor.live().is_light_wanted());
         let generation = mock.lit_generation();
         if !is_wanted || !mock.follows_tracks() || generation == self.sent.generation {
@@ -244,11 +261,21 @@ impl LightRecorder {
         let sent = &mut self.sent;
         let live = self.observer.as_ref().map(|monitor| monitor.live()).filter(|live| live.is_light_wanted());
         let is_known = sent.frame == Some(moves.frame) && !sent.planes.is_empty();
-        if !is_known || !(moves.is_any() || live.is_some()) {
+        if !is_known || !(moves.is_any() || live.is_some() || self.follower.is_some()) {
             return;
         }
         sent.moved.resize(sent.planes.len(), 0);
         moves.move_planes(raster, &sent.planes, &mut sent.moved);
+        if let Some(follower) = &self.follower {
+            let light = SeenLight {
+                frame: Some(moves.frame),
+                first_photon_at: moves.first_photon_at,
+                is_moved: moves.is_any(),
+                planes: sent.moved.clone(),
+            };
+            // Whoever no longer follows has seen enough.
+            let _ = follower.send(light);
+        }
         if let Some(live) = live {
             live.show_light(|light| {
                 (light.frame, light.first_photon_at) = (Some(moves.frame), moves.first_photon_at);

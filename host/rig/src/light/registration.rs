@@ -60,6 +60,16 @@ impl RegistrationMeter {
         &self.points
     }
 
+    /// How wide a pixel is at the bodies of `rig` at rest, on average, millimetres; `None` if no body is before the projector.
+    pub(crate) fn pixel_mm(&self, rig: &Rig) -> Option<f64> {
+        let depths = rig
+            .bodies
+            .iter()
+            .map(|body| self.camera.to_projector_space(DVec3::from_array(body.rest.position_m)).z);
+        let (sum, count) = depths.filter(|z| *z > 0.0).fold((0.0, 0u32), |(sum, n), z| (sum + z, n + 1));
+        (count > 0).then(|| sum / f64::from(count) / self.camera.fx * 1e3)
+    }
+
     /// For each point of the tracked body `body`: how far apart the world-from-body poses `used` and `truth` place it
     /// in the picture, pixels. Points that either pose places behind the projector are left out.
     pub fn errors<'a>(

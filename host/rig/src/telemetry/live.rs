@@ -17,6 +17,7 @@ use glam::DAffine3;
 use std::collections::VecDeque;
 use std::fmt;
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
+use std::sync::mpsc::SyncSender;
 use std::sync::{Arc, MutexGuard, OnceLock, PoisonError};
 
 /// How long a look lasts, nanoseconds: an observer looks again before that.
@@ -126,6 +127,7 @@ pub struct Live {
     drawn: Lock<VecDeque<Drawn>>,
     light_wanted: AtomicBool,
     light: Lock<SeenLight>,
+    follower: Lock<Option<SyncSender<SeenLight>>>,
 }
 
 impl fmt::Debug for Live {
@@ -227,6 +229,17 @@ impl Live {
         }
         std::mem::swap(&mut *held(&self.light), into);
         true
+    }
+
+    /// Sends the light of every slot of the run that begins next to `to`, whose receiver holds the run up as long as it has no
+    /// room: for runs at virtual pace. The channel closes when the mock projector of the run is gone.
+    pub fn follow(&self, to: SyncSender<SeenLight>) {
+        *held(&self.follower) = Some(to);
+    }
+
+    /// Where the light of every slot is to go, from now on for the caller alone to send; `None` if nobody follows it.
+    pub fn take_follower(&self) -> Option<SyncSender<SeenLight>> {
+        held(&self.follower).take()
     }
 
     /// Calls `see` with the place for the light, if it is asked for.

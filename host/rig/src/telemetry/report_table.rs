@@ -7,7 +7,7 @@ use crate::telemetry::projector::ProjectorReport;
 use crate::telemetry::report::Spread;
 
 impl Report {
-    /// The report as a table of at most 100 columns.
+    /// The report as one sentence and a table of at most 100 columns.
     pub fn to_table(&self) -> String {
         let mut table = Table::default();
         self.state_row(&mut table);
@@ -27,7 +27,41 @@ impl Report {
         self.light_rows(&mut table);
         let warnings = self.warnings.iter().map(|warning| format!("warning: {warning}\n"));
         let files = self.files.iter().map(|file| format!("see {}\n", file.display()));
-        std::iter::once(table.to_text()).chain(warnings).chain(files).collect()
+        let sentence = format!("{}\n\n", self.sentence());
+        std::iter::once(sentence).chain([table.to_text()]).chain(warnings).chain(files).collect()
+    }
+
+    /// What a newcomer asks first: did it work, how late was the light, how far off?
+    fn sentence(&self) -> String {
+        let lit = if self.frames_lit + self.frames_unrecorded == 0 {
+            return match self.nothing_lit() {
+                Some(_) => "It did not work: nothing was lit.".into(),
+                None => "Nothing was lit, and nothing was to be.".into(),
+            };
+        } else if self.exceeded().is_some() {
+            "It did not work throughout: a limit on light was latched".to_owned()
+        } else if self.missed_share > 0.05 {
+            format!(
+                "It worked in part: {:.0} % of the slots had no frame of their own",
+                100.0 * self.missed_share
+            )
+        } else if self.pace == "virtual" {
+            format!("It worked: {} frames were lit", self.frames_lit)
+        } else {
+            format!(
+                "It worked: {:.1} % of the slots had a frame of their own",
+                100.0 * (1.0 - self.missed_share)
+            )
+        };
+        let late = self.motion_to_light_centre_ms.map(|latency| {
+            let modelled = if latency.modelled { " by the model of the stages" } else { "" };
+            format!("; the light followed the motion by {:.1} ms{modelled}", latency.spread.p50)
+        });
+        let off = self.registration_error_px.map(|error| {
+            let mm = self.pixel_mm.map_or(String::new(), |mm| format!("{} mm, ", few_digits(error.p99 * mm)));
+            format!("; 99 of 100 points lay within {mm}{} px of their places", few_digits(error.p99))
+        });
+        [Some(lit), late, off].into_iter().flatten().collect::<String>() + "."
     }
 
     fn state_row(&self, table: &mut Table) {
@@ -213,6 +247,12 @@ fn projector_rows(p: &ProjectorReport, table: &mut Table) {
         let times = p.sessions.saturating_sub(1);
         table.row("  came back", format!("{times} times, armed again {} times after a fault", p.rearmed));
     }
+}
+
+/// Two digits that say something.
+fn few_digits(x: f64) -> String {
+    let decimals = if x > 0.0 { (1.0 - x.log10().floor()).clamp(0.0, 4.0) } else { 1.0 };
+    format!("{x:.*}", decimals as usize)
 }
 
 /// Rows of a name and a text.
