@@ -11,7 +11,7 @@ use dpm_lab::error::runs::{GroupResult, Measured};
 use dpm_lab::error::seen::SeenGroup;
 use dpm_lab::error::sheet::{stack, strip};
 use dpm_lab::error::table::TableGroup;
-use dpm_lab::snapshot::paint::Canvas;
+use dpm_lab::paint::Canvas;
 use dpm_rig::failure::{Failure, FailureKind};
 use dpm_rig::telemetry::report::to_json;
 use serde_json::Value;

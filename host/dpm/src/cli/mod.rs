@@ -29,6 +29,7 @@ mod report;
 mod rig_args;
 mod rigs;
 pub mod run;
+mod scene;
 mod session;
 mod set;
 mod snapshot;
@@ -119,6 +120,8 @@ enum Command {
     Report(report::ReportArgs),
     /// Write pictures of everything that one frame was made from: rates, errors, samples, history, motion, light
     Snapshot(snapshot::SnapshotArgs),
+    /// Write the room of a rig for other programs
+    Scene(scene::SceneArgs),
     /// Measure rays, samples and milliseconds per pass of every method on this device
     Bench(bench::BenchArgs),
     /// Measure error against cost of every method: perceived error, bias, noise and flicker at equal rays
@@ -221,6 +224,7 @@ fn dispatch(command: &Command) -> Result<(), Failure> {
         Command::Stability(args) => stability::execute(args),
         Command::Report(args) => report::execute(args),
         Command::Snapshot(args) => snapshot::execute(args),
+        Command::Scene(args) => scene::execute(args),
         Command::Bench(args) => bench::execute(args),
         Command::Error(args) => error::execute(args),
         Command::Plan(args) => plan::execute(args),

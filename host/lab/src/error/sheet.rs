@@ -2,8 +2,8 @@
 
 use super::runs::Measured;
 use crate::metrics::white_of;
-use crate::snapshot::glyphs::{ADVANCE, LINE};
-use crate::snapshot::paint::{Canvas, DOT, NOT_FINITE};
+use crate::paint::glyphs::{ADVANCE, LINE};
+use crate::paint::{Canvas, DOT, NOT_FINITE};
 use dpm_rig::pictures::to_srgb;
 use glam::Vec3;
 

@@ -3,7 +3,7 @@
 //! Both share one palette for the whole film, and both store only what changes. A pixel whose colour differs from the one that
 //! is shown by less than the eye finds in noise stays, which is what makes a film of path-traced pictures small.
 
-use crate::snapshot::paint::Canvas;
+use crate::paint::Canvas;
 use color_quant::NeuQuant;
 use dpm_common::files::write_atomically;
 use std::borrow::Cow;

@@ -5,16 +5,13 @@
 
 mod encode;
 mod picture;
-mod room;
 mod stages;
-mod view;
 
 pub use encode::FilmFormat;
 
-use crate::snapshot::paint::Canvas;
-use dpm_device::planes::Raster;
+use crate::paint::Canvas;
 use dpm_render::RenderError;
-use dpm_rig::config::{Pace, RigConfig, TrackerConfig};
+use dpm_rig::config::{Pace, RigConfig};
 use dpm_rig::failure::{Ended, Failure, FailureKind};
 use dpm_rig::pictures::FallenLight;
 use dpm_rig::pipeline::PipelineError;
@@ -83,8 +80,7 @@ impl FilmRequest {
     /// # Errors
     /// Tracker or projector are not mocks: nobody else could say where light and bodies were.
     pub fn rig(&self, config: &RigConfig) -> Result<RigConfig, Failure> {
-        let is_mock = matches!(config.projector.backend, ProjectorBackend::Mock(_))
-            && matches!(config.tracker, TrackerConfig::Mock(_));
+        let is_mock = config.projector.backend.is_mock() && config.tracker.is_mock();
         if !is_mock {
             let text = "--film: a film is made from the light of the mock projector and the truth of the mock tracker; \
                         add --simulate";
@@ -199,9 +195,4 @@ impl Window {
     fn seen(&mut self) -> &[FallenLight] {
         self.slots.make_contiguous()
     }
-}
-
-/// A raster of the film; the sides are constants above 0.
-fn raster([width, height]: [u32; 2]) -> Raster {
-    Raster::new(width, height).unwrap_or_else(|| unreachable!("the sides of a part of the film"))
 }

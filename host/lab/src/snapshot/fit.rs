@@ -22,6 +22,8 @@ pub enum SnapshotView {
     Auto,
     /// From the rig's projector.
     Rig,
+    /// From a corner of the room: projector, observer and bodies in the light that falls on them.
+    Room,
     /// From a place in front of the bodies that shows all of them, whatever the rig file says of projector and eye.
     Fit,
 }
@@ -71,7 +73,7 @@ impl SnapshotView {
     pub(crate) fn is_fitted(self, rig: &RigConfig) -> bool {
         match self {
             Self::Auto => rig.scene.file.is_some() && !places_projector(rig),
-            Self::Rig => false,
+            Self::Rig | Self::Room => false,
             Self::Fit => true,
         }
     }

@@ -3,13 +3,14 @@
 //! True poses, no tracker and no link: frame N is drawn after the N frames before it, so histories are what they are in a run.
 
 mod fit;
-pub(crate) mod glyphs;
-pub mod paint;
 pub mod views;
 
 pub use fit::{FittedView, SnapshotView};
 
 use super::sequence::{draw, poses_at, Placed};
+use crate::paint::Canvas;
+use crate::room::furniture::Bounds;
+use crate::room::{raster, RoomPicture};
 use dpm_common::files::{check_folder, write_atomically};
 use dpm_device::time::HostTime;
 use dpm_render::gpu::Gpu;
@@ -19,13 +20,12 @@ use dpm_rig::config::{BodyConfig, MotionValue, RenderConfig, RigConfig};
 use dpm_rig::failure::{Failure, FailureKind};
 use dpm_rig::light::recorder::LightFrame;
 use dpm_rig::picture_stream::PictureStreams;
-use dpm_rig::pictures::pictures;
+use dpm_rig::pictures::{pictures, FallenLight};
 use dpm_rig::pipeline::{renderer_settings, PipelineError};
 use dpm_rig::rig::Rig;
 use dpm_rig::run_rig::{open_gpu, traced_raster};
 use dpm_rig::telemetry::monitor::RunMonitor;
 use glam::Vec3;
-use paint::Canvas;
 use serde::Serialize;
 use std::collections::VecDeque;
 use std::io::Write;
@@ -158,6 +158,9 @@ pub fn snapshot(
     warnings.extend(keep_live(&mut rig));
     let (rig, view) = stage(rig, request, &gpu)?;
     warnings.extend(rig.scene.warnings.iter().cloned());
+    if request.view == SnapshotView::Room {
+        return room(rig, request, &gpu, dir, warnings);
+    }
     let mut player = Player::new(&rig, &gpu)?;
     let what = &request.what;
     // Without names all that the method has; of a name that it has not, the request was refused.
@@ -181,6 +184,42 @@ pub fn snapshot(
         player.save(image, dir, &mut report)?;
     }
     Ok(report)
+}
+
+/// Columns and rows of a picture of the room.
+const ROOM: [u32; 2] = [960, 640];
+/// Light of the room in it, 1 where it is bright: the projector's light is seen, and what it does not meet, too.
+const ROOM_IS: f32 = 0.2;
+
+/// Writes the picture of the room with the bodies of frame `request.frame` in the light of the frames before it.
+fn room(
+    rig: Rig,
+    request: &SnapshotRequest,
+    gpu: &Arc<Gpu>,
+    dir: &Path,
+    warnings: Vec<String>,
+) -> Result<SnapshotReport, Failure> {
+    let rig = Arc::new(rig);
+    let mut player = Player::new(&rig, gpu)?;
+    player.play(request.frame, true)?;
+    let fallen = |light: LightFrame| {
+        let placed = poses_at(&rig, u64::from(light.frame));
+        FallenLight { light, poses: placed.poses, centre_ns: placed.animated_at_ns }
+    };
+    let window: Vec<FallenLight> = player.light.drain(..).map(fallen).collect();
+    let bounds = Bounds::of_run(&rig, rig.rate().slot_start_ns(u64::from(request.frame) + 1));
+    let mut picture = RoomPicture::new(&rig, gpu, bounds, raster(ROOM)).map_err(gpu_failure)?;
+    let canvas = picture.draw_by_itself(&window, ROOM_IS).map_err(gpu_failure)?;
+    check_folder(dir).map_err(|e| Failure::new(FailureKind::BadInput, e.to_string()))?;
+    Ok(SnapshotReport {
+        method: rig.config.render.method.word().to_owned(),
+        frame: request.frame,
+        raster: ROOM,
+        files: vec![save_png(&dir.join("room.png"), &canvas)?],
+        not_made: Vec::new(),
+        view: None,
+        warnings,
+    })
 }
 
 /// How long to wait for the first picture of another program.

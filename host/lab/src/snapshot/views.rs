@@ -1,7 +1,7 @@
 //! One frame's buffers into pictures.
 
-use super::paint::{self, Canvas, Scale};
 use super::SnapshotImage;
+use crate::paint::{self, Canvas, Scale};
 use crate::twins::rate_map::{estimate, PixelGuide, RateConstants};
 use dpm_device::planes::Raster;
 use dpm_render::method::Method;

@@ -16,7 +16,7 @@ const WAIT_NS: u64 = 60_000_000_000;
 
 /// A surface point that a pixel shows.
 #[derive(Clone, Copy, Debug)]
-pub(super) struct SeenPoint {
+pub(crate) struct SeenPoint {
     /// Body of the scene.
     pub body: usize,
     /// World coordinates.
@@ -34,7 +34,7 @@ pub(super) struct SeenPoint {
 }
 
 /// A camera of the film with its renderer.
-pub(super) struct View {
+pub(crate) struct View {
     /// The camera.
     pub camera: ProjectorCamera,
     renderer: Renderer,
@@ -46,7 +46,7 @@ impl View {
     ///
     /// # Errors
     /// The renderer's.
-    pub(super) fn new(rig: &Rig, gpu: &Arc<Gpu>, camera: ProjectorCamera) -> Result<Self, RenderError> {
+    pub(crate) fn new(rig: &Rig, gpu: &Arc<Gpu>, camera: ProjectorCamera) -> Result<Self, RenderError> {
         // Only the surfaces are asked for, so the simplest method is enough.
         let settings = RendererSettings {
             raster: camera.raster,
@@ -66,7 +66,7 @@ impl View {
     ///
     /// # Errors
     /// The renderer's.
-    pub(super) fn points(
+    pub(crate) fn points(
         &mut self,
         poses: &[DAffine3],
         animated_at_ns: i64,

@@ -1,6 +1,8 @@
 //! Numbers per pixel into pictures with a legend beside them.
 
-use super::glyphs::{for_each_dot, ADVANCE, LINE};
+pub(crate) mod glyphs;
+
+use self::glyphs::{for_each_dot, ADVANCE, LINE};
 use dpm_common::files::write_atomically;
 use dpm_device::planes::Raster;
 use std::io::{self, Write};
@@ -67,6 +69,13 @@ impl Canvas {
     /// Writes text, three pixels a dot.
     pub(crate) fn text(&mut self, x: usize, y: usize, text: &str) {
         for_each_dot(text, |dx, dy| self.block(x + dx * DOT, y + dy * DOT, DOT, DOT, INK));
+    }
+
+    /// Writes text of `dot` pixels a dot at column and row, on a dark edge.
+    pub(crate) fn write(&mut self, [x, y]: [usize; 2], dot: usize, text: &str, colour: [u8; 3]) {
+        let edge = |at: usize, i: usize| (at + i * dot).saturating_sub(1);
+        for_each_dot(text, |i, j| self.block(edge(x, i), edge(y, j), dot + 2, dot + 2, [0; 3]));
+        for_each_dot(text, |i, j| self.block(x + i * dot, y + j * dot, dot, dot, colour));
     }
 
     /// Copies a picture in, every pixel as a square of `m`; what lies outside is cut off.

@@ -1,7 +1,7 @@
-//! The room of a rig: where a camera stands that shows projector, observer and bodies, and what is drawn of them.
+//! Where a camera stands that shows projector, observer and bodies, and what stands in the room besides the bodies.
 
 use dpm_device::planes::Raster;
-use dpm_rig::rig::Rig;
+use dpm_rig::rig::{affine, Rig};
 use dpm_scene::geometry::projector::ProjectorCamera;
 use glam::{DAffine3, DVec2, DVec3, Vec3};
 
@@ -11,6 +11,8 @@ const ASIDE_DEG: f64 = 58.0;
 const ABOVE_DEG: f64 = 20.0;
 /// Its horizontal angle of view, degrees.
 const FOV_DEG: f64 = 36.0;
+/// Instants of a run at which the bodies' reach is measured.
+const INSTANTS: i64 = 24;
 /// Share of the picture that is filled.
 const FILL: f64 = 0.94;
 
@@ -22,7 +24,7 @@ const IRIS: Vec3 = Vec3::new(0.12, 0.22, 0.30);
 
 /// A sphere.
 #[derive(Clone, Copy, Debug)]
-pub(super) struct Ball {
+pub(crate) struct Ball {
     /// World coordinates.
     pub centre: DVec3,
     /// Metres.
@@ -31,18 +33,19 @@ pub(super) struct Ball {
 
 /// The box around the bodies that are lit, over all instants of the film.
 #[derive(Clone, Copy, Debug)]
-pub(super) struct Bounds {
+pub(crate) struct Bounds {
     lower: DVec3,
     upper: DVec3,
 }
 
 impl Bounds {
     /// Around the meshes of `rig` at each of `instants`, nanoseconds. `None`: the scene has no body that light falls on.
-    pub(super) fn around(rig: &Rig, instants: impl Iterator<Item = i64>) -> Option<Self> {
+    pub(crate) fn around(rig: &Rig, instants: impl Iterator<Item = i64>) -> Option<Self> {
         let (mut lower, mut upper) = (DVec3::INFINITY, DVec3::NEG_INFINITY);
         let mut poses: Vec<DAffine3> = Vec::new();
         for t_ns in instants {
-            rig.scene_poses(&rig.true_poses(t_ns)?, t_ns, &mut poses);
+            let rest = || rig.bodies.iter().map(|body| affine(&body.rest)).collect();
+            rig.scene_poses(&rig.true_poses(t_ns).unwrap_or_else(rest), t_ns, &mut poses);
             for (body, pose) in rig.scene.bodies.iter().zip(&poses).filter(|(b, _)| b.projected) {
                 // Some thousand points of a mesh show how far it reaches.
                 let step = (body.mesh.positions.len() / 2048).max(1);
@@ -55,8 +58,17 @@ impl Bounds {
         lower.is_finite().then_some(Self { lower, upper })
     }
 
+    /// Around the bodies of a run of `length_ns`; at rest, where nobody knows where they are, and before the projector where
+    /// there are none.
+    pub(crate) fn of_run(rig: &Rig, length_ns: i64) -> Self {
+        let ray = rig.camera.ray(middle(rig.camera.raster));
+        let nothing = Ball { centre: ray.origin + ray.direction, radius: 0.1 };
+        let instants = (0..INSTANTS).map(|i| i * length_ns / INSTANTS);
+        Self::around(rig, instants).unwrap_or_else(|| Self::of_ball(nothing))
+    }
+
     /// The box around a sphere.
-    pub(super) fn of_ball(ball: Ball) -> Self {
+    pub(crate) fn of_ball(ball: Ball) -> Self {
         Self {
             lower: ball.centre - DVec3::splat(ball.radius),
             upper: ball.centre + DVec3::splat(ball.radius),
@@ -64,12 +76,13 @@ impl Bounds {
     }
 
     /// The sphere through its corners.
-    pub(super) fn ball(&self) -> Ball {
+    pub(crate) fn ball(&self) -> Ball {
         let radius = ((self.upper - self.lower).length() * 0.5).max(1e-6);
         Ball { centre: (self.lower + self.upper) * 0.5, radius }
     }
 
-    fn corners(&self) -> [DVec3; 8] {
+    /// Its corners; bit i of a corner's number says which end of axis i.
+    pub(crate) fn corners(&self) -> [DVec3; 8] {
         std::array::from_fn(|i| {
             let side = |axis: usize| if i >> axis & 1 == 0 { self.lower[axis] } else { self.upper[axis] };
             DVec3::new(side(0), side(1), side(2))
@@ -115,7 +128,7 @@ fn reach(camera: &ProjectorCamera, shown: &[DVec3]) -> Option<(DVec2, DVec2)> {
 }
 
 /// A camera at the observer's eye that shows the bodies.
-pub(super) fn observer_camera(bodies: Bounds, eye: DVec3, raster: Raster) -> Option<ProjectorCamera> {
+pub(crate) fn observer_camera(bodies: Bounds, eye: DVec3, raster: Raster) -> Option<ProjectorCamera> {
     let ball = bodies.ball();
     let size = DVec2::new(f64::from(raster.width()), f64::from(raster.height()));
     let mut look_at = ball.centre;
@@ -135,13 +148,17 @@ pub(super) fn observer_camera(bodies: Bounds, eye: DVec3, raster: Raster) -> Opt
     found
 }
 
+fn middle(raster: Raster) -> DVec2 {
+    DVec2::new(f64::from(raster.width()), f64::from(raster.height())) * 0.5
+}
+
 /// A direction across `axis`, or +Z where that is upright.
 fn level(axis: DVec3) -> DVec3 {
     DVec3::new(axis.x, 0.0, axis.z).try_normalize().unwrap_or(DVec3::Z)
 }
 
 /// A camera that shows the bodies, the projector and the observer's eye.
-pub(super) fn camera(rig: &Rig, bodies: Bounds, eye: DVec3, raster: Raster) -> Option<ProjectorCamera> {
+pub(crate) fn camera(rig: &Rig, bodies: Bounds, eye: DVec3, raster: Raster) -> Option<ProjectorCamera> {
     let (projector, ball) = (rig.camera.position(), bodies.ball());
     let axis = level(projector - ball.centre);
     let right = DVec3::Y.cross(axis);
@@ -157,7 +174,7 @@ pub(super) fn camera(rig: &Rig, bodies: Bounds, eye: DVec3, raster: Raster) -> O
 
 /// A thing of the room that a ray meets: how far, its normal, and what colour it has.
 #[derive(Clone, Copy, Debug)]
-pub(super) struct Furniture {
+pub(crate) struct Furniture {
     /// Metres along the ray.
     pub distance: f64,
     /// Reflectance, 0 to 1.
@@ -167,7 +184,7 @@ pub(super) struct Furniture {
 }
 
 /// The projector's case, the observer's head and the floor.
-pub(super) struct Room {
+pub(crate) struct Room {
     projector_from_world: DAffine3,
     /// Half of the case's sides, metres; its front is at the lens.
     case: DVec3,
@@ -179,7 +196,7 @@ pub(super) struct Room {
 }
 
 impl Room {
-    pub(super) fn new(rig: &Rig, bodies: Ball, eye: DVec3) -> Self {
+    pub(crate) fn new(rig: &Rig, bodies: Ball, eye: DVec3) -> Self {
         let reach = (rig.camera.position() - bodies.centre).length().max(bodies.radius);
         let case = DVec3::new(0.055, 0.035, 0.075) * reach;
         // Ten lines or so across the bodies, at a distance that a ruler has.
@@ -197,12 +214,12 @@ impl Room {
     }
 
     /// Where the observer's head is now.
-    pub(super) fn see_from(&mut self, eye: DVec3) {
+    pub(crate) fn see_from(&mut self, eye: DVec3) {
         self.head.centre = eye;
     }
 
     /// The nearest thing on the ray from `origin`; `gaze` is where the observer looks.
-    pub(super) fn meet(&self, origin: DVec3, direction: DVec3, gaze: DVec3) -> Option<Furniture> {
+    pub(crate) fn meet(&self, origin: DVec3, direction: DVec3, gaze: DVec3) -> Option<Furniture> {
         let things =
             [self.case(origin, direction), self.head(origin, direction, gaze), self.floor(origin, direction)];
         things.into_iter().flatten().min_by(|a, b| a.distance.total_cmp(&b.distance))
