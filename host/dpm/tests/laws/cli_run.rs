@@ -55,6 +55,9 @@ fn the_demo_prints_one_object_with_the_agreed_keys_and_leaves_its_files() {
         assert_eq!(json[key]["source"], "from real_time.stage_costs_us, not measured", "{key}");
     }
     assert_eq!(json["registration_error_at"], "light centre");
+    // 48 columns in 30 degrees: a pixel is 11.2 mm wide at a metre, and the bodies are 1.1 m away.
+    let pixel_mm = json["pixel_mm"].as_f64().expect("bodies before the projector");
+    assert!((11.5..14.0).contains(&pixel_mm), "{pixel_mm}");
     assert_eq!(
         (&json["frames_dark"], &json["slots"], &json["missed_slots"]),
         (&0.into(), &6.into(), &0.into())

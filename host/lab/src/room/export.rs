@@ -140,10 +140,10 @@ impl Glb {
         self.accessors.len() - 1
     }
 
-    /// A box with half sides `half` whose front is at the origin of `pose`, on the side of its third axis.
+    /// A box with half sides `half` whose front is at the origin of `pose`, against its third axis.
     fn cuboid(&mut self, name: &str, pose: DAffine3, half: DVec3) {
         let corners = Bounds::of_ball(Ball { centre: DVec3::ZERO, radius: 1.0 }).corners();
-        let positions = corners.map(|corner| (corner * half - DVec3::Z * half.z).as_vec3());
+        let positions = corners.map(|corner| (corner * half + DVec3::Z * half.z).as_vec3());
         let faces = [[0, 4, 6, 2], [1, 3, 7, 5], [0, 1, 5, 4], [2, 6, 7, 3], [0, 2, 3, 1], [4, 5, 7, 6]];
         let indices: Vec<u32> = faces.iter().flat_map(|[a, b, c, d]| [*a, *b, *c, *a, *c, *d]).collect();
         self.node(name, pose, TRIANGLES, CASE, &positions, None, &indices);

@@ -226,9 +226,9 @@ impl Room {
     }
 
     fn case(&self, origin: DVec3, direction: DVec3) -> Option<Furniture> {
-        // In the projector's space light leaves along its third axis.
+        // In the projector's space light leaves against its third axis.
         let (o, d) = (
-            self.projector_from_world.transform_point3(origin) + DVec3::Z * self.case.z,
+            self.projector_from_world.transform_point3(origin) - DVec3::Z * self.case.z,
             self.projector_from_world.transform_vector3(direction),
         );
         let (a, b) = ((-self.case - o) / d, (self.case - o) / d);
@@ -245,7 +245,7 @@ impl Room {
         } else {
             DVec3::Z * at.z.signum()
         };
-        let is_lens = face.z > 0.5 && DVec2::new(at.x * self.case.x / self.case.y, at.y).length() < 0.6;
+        let is_lens = face.z < -0.5 && DVec2::new(at.x * self.case.x / self.case.y, at.y).length() < 0.6;
         let normal = self.projector_from_world.inverse().transform_vector3(face);
         Some(Furniture { distance: enter, albedo: if is_lens { LENS } else { CASE }, normal })
     }

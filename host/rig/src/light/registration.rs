@@ -1,7 +1,7 @@
 //! Registration: the distance between where the light of a body's points fell and where the points were, in pixels of
 //! the projector.
 
-use crate::rig::Rig;
+use crate::rig::{Rig, RigBody};
 use dpm_device::link::Moves;
 use dpm_render::warp::LEAST_MOTION_PX;
 use dpm_scene::geometry::projector::ProjectorCamera;
@@ -62,10 +62,9 @@ impl RegistrationMeter {
 
     /// How wide a pixel is at the bodies of `rig` at rest, on average, millimetres; `None` if no body is before the projector.
     pub(crate) fn pixel_mm(&self, rig: &Rig) -> Option<f64> {
-        let depths = rig
-            .bodies
-            .iter()
-            .map(|body| self.camera.to_projector_space(DVec3::from_array(body.rest.position_m)).z);
+        let at_rest = |body: &RigBody| DVec3::from_array(body.rest.position_m);
+        // Light leaves against the third axis.
+        let depths = rig.bodies.iter().map(|body| -self.camera.to_projector_space(at_rest(body)).z);
         let (sum, count) = depths.filter(|z| *z > 0.0).fold((0.0, 0u32), |(sum, n), z| (sum + z, n + 1));
         (count > 0).then(|| sum / f64::from(count) / self.camera.fx * 1e3)
     }

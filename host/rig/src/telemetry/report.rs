@@ -524,6 +524,7 @@ mod tests {
         let told = Report {
             frames_lit: 9,
             pixel_mm: Some(0.5),
+            pace: "real",
             motion_to_light_centre_ms: Some(latency),
             ..report.clone()
         };
@@ -553,7 +554,7 @@ mod tests {
         };
         let table = report.to_table();
         let lines: Vec<&str> = table.lines().collect();
-        assert_eq!(lines[0], "Nothing was lit, and nothing was to be.", "{table}");
+        assert_eq!(lines[0], "It did not work: nothing was lit.", "{table}");
         assert!(
             lines[2].ends_with("84 of 22728 (0.370 %); 68 of them while the machine itself stood still"),
             "{table}"
