@@ -116,7 +116,7 @@ impl Mean {
     }
 }
 
-/// Logarithm of the gamma function of `x` above 0. \[Abramowitz64, 6.1.41, after steps up to 8\]
+/// Logarithm of the gamma function of `x` above 0. \[Abramowitz64 6.1.41 after steps up to 8\]
 fn ln_gamma(mut x: f64) -> f64 {
     let mut below = 0.0;
     while x < 8.0 {
@@ -128,7 +128,7 @@ fn ln_gamma(mut x: f64) -> f64 {
     (x - 0.5) * x.ln() - x + 0.5 * (2.0 * PI).ln() + series - below
 }
 
-/// The incomplete beta function `I_x(a, b)`, by its continued fraction. \[Abramowitz64, 26.5.8\]
+/// The incomplete beta function `I_x(a, b)`, by its continued fraction. \[Abramowitz64 26.5.8\]
 fn incomplete_beta(x: f64, a: f64, b: f64) -> f64 {
     if x <= 0.0 || x >= 1.0 {
         return x.clamp(0.0, 1.0);
@@ -150,7 +150,7 @@ fn incomplete_beta(x: f64, a: f64, b: f64) -> f64 {
     front / fraction
 }
 
-/// Probability that Student's t with so many degrees of freedom is farther from 0 than `t`, either way. \[Abramowitz64, 26.7\]
+/// Probability that Student's t with so many degrees of freedom is farther from 0 than `t`, either way. \[Abramowitz64 26.7\]
 pub(crate) fn student_p(t: f64, freedom: f64) -> f64 {
     incomplete_beta(freedom / (freedom + t * t), freedom / 2.0, 0.5)
 }
@@ -245,7 +245,7 @@ mod tests {
         assert!(wrong.p_value < 1e-4 && wrong.integral_error.abs() < 1e-3, "{wrong:?}");
     }
 
-    /// Student's distribution at values of tables \[Abramowitz64, table 26.10\], and by its closed form with one degree of
+    /// Student's distribution at values of tables \[Abramowitz64 table 26.10\], and by its closed form with one degree of
     /// freedom.
     #[test]
     fn students_distribution_is_that_of_the_tables() {

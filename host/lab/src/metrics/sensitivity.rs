@@ -17,7 +17,7 @@ pub struct Field {
     pub luminance: f64,
 }
 
-/// Nodes and weights of Gauss and Legendre's rule for -1 to 1, the positive half of 16 points. \[Abramowitz64, table 25.4\]
+/// Nodes and weights of Gauss and Legendre's rule for -1 to 1, the positive half of 16 points. \[Abramowitz64 table 25.4\]
 const GAUSS: [[f64; 2]; 8] = [
     [0.095_012_509_837_637_44, 0.189_450_610_455_068_5],
     [0.281_603_550_779_258_9, 0.182_603_415_044_923_6],
@@ -42,7 +42,7 @@ fn difference_of_low_passes([a, m]: [f64; 2], [b, n]: [f64; 2], scale: f64) -> f
     (ra * ra + (scale * rb).powi(2) - 2.0 * ra * scale * rb * (pa - pb).cos()).max(0.0).sqrt()
 }
 
-/// Sensitivity of a place of the retina: the part of elaTCSF without area. \[Cai24, `TCSF`, `S_ecc` and `S_lum` of its public
+/// Sensitivity of a place of the retina: the part of elaTCSF without area. \[Cai24 `TCSF`, `S_ecc` and `S_lum` of its public
 /// program\]
 fn sensitivity_at(eccentricity_deg: f64, luminance: f64, hz: f64) -> f64 {
     const SHIFT_HZ: f64 = 2.0;
@@ -57,7 +57,7 @@ fn sensitivity_at(eccentricity_deg: f64, luminance: f64, hz: f64) -> f64 {
 }
 
 /// Sensitivity to flicker at `hz`, from 0 on: 1 over the amplitude of a sine, as a share of the mean, that is just seen on a
-/// disk. elaTCSF sums over the disk with an exponent. \[Cai24, `spatial_summation_disk`\]
+/// disk. elaTCSF sums over the disk with an exponent. \[Cai24 `spatial_summation_disk`\]
 pub(crate) fn flicker_sensitivity(field: Field, hz: f64) -> f64 {
     const EXPONENT: f64 = 3.800_22;
     const THRESHOLD_ENERGY: f64 = 6.528_01;

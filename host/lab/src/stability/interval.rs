@@ -68,7 +68,8 @@ mod tests {
         assert!(third.low * 3.0 <= 1.0 && third.high * 3.0 >= 1.0 && third.high - third.low < 3e-16);
         let one = third.times(Interval::exactly(3.0));
         assert!(one.low < 1.0 && one.high > 1.0 && one.high - one.low < 3e-15);
-        assert!(Interval::PI.low < Interval::PI.high && Interval::PI.high - Interval::PI.low < 1e-15);
+        let pi = Interval::exactly(1.0).times(Interval::PI);
+        assert!(pi.low < std::f64::consts::PI && pi.high - pi.low < 3e-15);
     }
 
     /// A f32 next to the exact one is one unit off, and the nearest is half of one at most.
