@@ -286,7 +286,7 @@ pub fn texts(bytes: &[u8]) {
 fn calibrations(bytes: &[u8]) {
     let raster = Raster::new(64, 48).expect("not zero");
     for lens in [LensKind::Auto, LensKind::Fisheye] {
-        let options = ReadOptions { raster, unit: LengthUnit::Metre, lens, region: None };
+        let options = ReadOptions { raster, unit: LengthUnit::Metre, lens, region: None, device: None };
         let stored = match camera_files::read(bytes, &options) {
             Ok(stored) => stored,
             Err(refused) => {

@@ -43,17 +43,27 @@ pub(crate) fn calibrated_camera(
     };
     let bytes = regular_file::read(path, camera_files::MAX_BYTES as u64).map_err(|e| wrong(e.to_string()))?;
     let (lens, region) = (p.calibration_lens.lens(), p.calibration_region.as_deref());
-    let options = ReadOptions { raster: p.calibrated_raster(), unit, lens, region };
+    let device = p.calibration_device.as_deref();
+    let options = ReadOptions { raster: p.calibrated_raster(), unit, lens, region, device };
     let stored = camera_files::read(&bytes, &options).map_err(|e| wrong(e.to_string()))?;
     if !stored.unread.is_empty() {
         let names = stored.unread.join(", ");
         warnings.push(format!("projector.calibration: {}: was not read: {names}", path.display()));
     }
+    let told = |note: &String| format!("projector.calibration: {}: {note}", path.display());
+    warnings.extend(stored.notes.iter().map(told));
     let place = p.calibration_camera.as_ref().map(|pose| pose.to_affine());
     let camera = match (&stored.frame, place) {
         (Frame::World, None) => stored.camera,
+        (Frame::WorldOfCamera { name }, None) => {
+            warnings.push(told(&format!(
+                "the origin of its world is {name:?}; if the tracker's is another, set projector.calibration_camera to the \
+                 camera's pose in the tracker's world"
+            )));
+            stored.camera
+        }
         // A quaternion of length zero was refused when the configuration was read.
-        (Frame::Camera { .. }, Some(place)) => stored.seen_from(place.unwrap_or_default()),
+        (Frame::Camera { .. } | Frame::WorldOfCamera { .. }, Some(place)) => stored.seen_from(place.unwrap_or_default()),
         (Frame::Camera { name }, None) => {
             return Err(wrong(format!(
                 "its origin is the camera that calibrated it ({name:?} shows that), so the projector's place in the world is \

@@ -8,6 +8,7 @@ use super::results::Results;
 use dpm_calibration::file::ProjectorSection;
 use dpm_calibration::projector::{Options, Session, Sight, Solved, Volume};
 use dpm_device::planes::Raster;
+use dpm_device::regular_file;
 use dpm_rig::config::RigConfig;
 use dpm_rig::failure::{Failure, FailureKind};
 use glam::{DVec2, DVec3};
@@ -124,11 +125,64 @@ pub fn keep(results: &mut Results, config: &RigConfig, solved: &Solved, bias_m: 
     results.file.projector = Some(section.assuming(&solved.predicted, bias_m));
 }
 
+/// Largest file of points that is read.
+const MAX_POINTS_BYTES: u64 = 1 << 20;
+
 /// Solves a file of points that others measured: `x y z column row` a line, metres and pixels.
 ///
 /// # Errors
 /// The file cannot be read, or its points do not make a projector.
 pub fn solve_file(path: &Path, raster: Raster, options: Options) -> Result<Solved, Failure> {
-    let points = Points::resume(path.to_path_buf())?;
-    session(raster, options, &sights(&points)).solve().map_err(|e| Failure::new(FailureKind::BadInput, e))
+    let bad = |e: String| Failure::new(FailureKind::BadInput, format!("{}: {e}", path.display()));
+    let text = regular_file::read_text(path, MAX_POINTS_BYTES).map_err(|e| bad(e.to_string()))?;
+    let sights = read_points(&text).map_err(bad)?;
+    session(raster, options, &sights).solve().map_err(|e| Failure::new(FailureKind::BadInput, e))
+}
+
+/// The points of a text. Headings and comments (`#`) are passed over; blanks, commas and semicolons separate.
+fn read_points(text: &str) -> Result<Vec<Sight>, String> {
+    let mut points: Vec<[f64; 5]> = Vec::new();
+    let text = text.trim_start_matches('\u{feff}');
+    for (number, line) in text.lines().enumerate() {
+        let line = line.split(['#', '%']).next().unwrap_or("").trim();
+        let separators = |c: char| c.is_whitespace() || matches!(c, ',' | ';');
+        let words: Vec<&str> = line.split(separators).filter(|w| !w.is_empty()).collect();
+        // A heading names the columns before any number.
+        let is_heading = points.is_empty() && words.iter().all(|w| w.parse::<f64>().is_err());
+        if words.is_empty() || is_heading {
+            continue;
+        }
+        let numbers: Option<Vec<f64>> = words.iter().map(|w| w.parse().ok()).collect();
+        let numbers = numbers.and_then(|n| <[f64; 5]>::try_from(n).ok());
+        let finite = numbers.filter(|n| n.iter().all(|v| v.is_finite()));
+        points.push(finite.ok_or_else(|| {
+            format!("line {} is not 5 numbers: x y z in metres, column and row in pixels", number + 1)
+        })?);
+    }
+    let is_within_one = |p: &[f64; 5]| p[3].abs() <= 1.5 && p[4].abs() <= 1.5;
+    if points.len() > 3 && points.iter().all(is_within_one) {
+        return Err("all pixels lie within 1 of the corner: normalised coordinates? Give columns and rows in pixels, from the \
+                    raster's upper left corner"
+            .into());
+    }
+    let sight = |[x, y, z, column, row]: &[f64; 5]| {
+        Sight::at_rest(DVec3::new(*x, *y, *z), DVec2::new(*column, *row))
+    };
+    Ok(points.iter().map(sight).collect())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::read_points;
+
+    #[test]
+    fn points_are_read_with_headings_and_refused_when_they_are_normalised() {
+        let body = "2.3, 0, -1.1, 100.5, 20\n\n2.3;0.9;-1.1;500;24 # held twice\n2 0 -1\t7 8\n1 1 1 9 9\n";
+        let read = read_points(&format!("x,y,z,u,v\n# by hand\n{body}")).unwrap();
+        assert_eq!((read.len(), read[0].pixel.x, read[1].world.y), (4, 100.5, 0.9));
+        assert!(read_points("x y z\n1 2 3 4\n").unwrap_err().contains("line 2 is not 5 numbers"));
+        assert!(read_points("1 2 3 4 5\nx y z u v\n").is_err());
+        let told = read_points(include_str!("../../../../tests/assets/cases/c13-points-normalised.txt"));
+        assert!(told.unwrap_err().contains("normalised coordinates?"));
+    }
 }

@@ -129,6 +129,7 @@ impl FittedView {
         // A measured projector stands where it was measured.
         (projector.calibration, projector.calibration_unit) = (None, None);
         (projector.calibration_camera, projector.calibration_region) = (None, None);
+        projector.calibration_device = None;
         config.calibration = CalibrationConfig::default();
         if asked == SnapshotView::Fit || config.observer == ObserverConfig::default() {
             config.observer = ObserverConfig {

@@ -65,7 +65,7 @@ pub(super) fn projector(rig: &RigConfig, reader: &mut Reader) {
 /// The keys that say how to read the calibration file.
 fn calibration(p: &ProjectorConfig, reader: &mut Reader) {
     if p.calibration.is_none() {
-        for key in ["calibration_lens", "calibration_region", "calibration_camera"] {
+        for key in ["calibration_lens", "calibration_region", "calibration_device", "calibration_camera"] {
             let key = format!("projector.{key}");
             if reader.is_written(&key) {
                 let problem = "says how to read a calibration file, but there is none".to_owned();

@@ -190,6 +190,7 @@ impl RigConfig {
             self.calibration = CalibrationConfig::default();
             (projector.calibration, projector.calibration_unit) = (None, None);
             (projector.calibration_camera, projector.calibration_region) = (None, None);
+            projector.calibration_device = None;
         } else if is_tracked {
             self.observer.tracked = heads.first().cloned();
             (self.observer.position, self.observer.eye_offset) = (old.position, old.eye_offset);

@@ -61,8 +61,8 @@ section! {
         /// Full angle of view across the raster's width. Change it to match the lens.
         horizontal_fov_deg: f64 = 30.0, "deg", Within(0.1, 170.0);
         /// A calibration file that replaces `position`, `look_at`, `up` and `horizontal_fov_deg`: OpenCV FileStorage
-        /// XML, YAML or JSON (also as mapamok, procam-calibration and ROS name the entries), or the XML of MPCDI with
-        /// profile sl. If the file names a raster, it must have this one's shape; the view is scaled. Use it for every
+        /// XML, YAML or JSON (also as mapamok, ProCamCalib, procam-calibration, scan3d-capture, slstudio, kalibr and ROS
+        /// name the entries, also in gzip), or MPCDI with profile sl. If the file names a raster, it must have this one's shape; the view is scaled. Use it for every
         /// real rig.
         calibration: Option<PathBuf> = None, "", NotEmpty;
         /// Unit of the lengths in the calibration file; its numbers do not show it. Required with `calibration`.
@@ -72,6 +72,9 @@ section! {
         calibration_lens: CalibrationLens = CalibrationLens::Auto, "", Any;
         /// The region of an MPCDI file that is this projector; needed if the file has several.
         calibration_region: Option<String> = None, "", NotEmpty;
+        /// The device of a calibration file that is this projector, by the name of its section or "projector"; needed if
+        /// the file describes several devices, for example a camera and a projector.
+        calibration_device: Option<String> = None, "", NotEmpty;
         /// Pose in the world of the camera that made the calibration file.
         calibration_camera: Option<CalibrationCameraConfig> = None, "", Any;
         /// Columns and rows of the raster that the calibration file refers to; the projector's own if left out. The

@@ -1,8 +1,8 @@
-//! What a file of OpenCV's `FileStorage` holds, by name: matrices, lists, numbers and texts at any depth. The readers of
+//! What a calibration file holds, by section and name: matrices, lists, numbers and texts at any depth. The readers of
 //! XML, YAML and JSON fill it.
 
 use super::StorageError;
-use std::collections::{BTreeMap, BTreeSet};
+use std::collections::BTreeMap;
 
 /// A matrix, rows first.
 #[derive(Clone, Debug, PartialEq)]
@@ -15,66 +15,96 @@ pub struct Matrix {
     pub data: Vec<f64>,
 }
 
-/// Everything that a file holds. Of equal names the first counts.
-#[derive(Clone, Debug, Default, PartialEq)]
-pub struct Entries {
-    /// Entries of the type `opencv-matrix`.
-    pub matrices: BTreeMap<String, Matrix>,
-    /// Plain lists of numbers, and lists of equally long lists.
-    pub(super) lists: BTreeMap<String, Matrix>,
-    pub(super) numbers: BTreeMap<String, f64>,
-    pub(super) texts: BTreeMap<String, String>,
-    /// Every name, whatever it names.
-    pub(super) names: BTreeSet<String>,
+/// What stands under a name.
+#[derive(Clone, Debug, PartialEq)]
+pub enum Entry {
+    /// A matrix, a list of numbers (one row), or a list of equally long lists.
+    Matrix(Matrix),
+    /// A number.
+    Number(f64),
+    /// A word or a text without its quotes.
+    Text(String),
+    /// Anything else: a list of texts, rows of different lengths.
+    Other,
 }
 
+/// Everything that a file holds. A section is the path of the names around an entry, joined by '/'; that of the file itself
+/// is empty.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct Entries {
+    /// Sections with their entries.
+    pub sections: BTreeMap<String, BTreeMap<String, Entry>>,
+    /// Paths of entries that stand in the file twice with different values, of which the first counts.
+    pub repeated: Vec<String>,
+}
+
+/// Names that a message lists at most.
+const SHOWN: usize = 24;
+
 impl Entries {
-    /// The matrix or list of a name.
-    pub(super) fn matrix(&self, name: &str) -> Option<&Matrix> {
-        self.matrices.get(name).or_else(|| self.lists.get(name))
-    }
-
-    pub(super) fn add_matrix(&mut self, name: &str, matrix: Matrix) {
-        if self.add_name(name) {
-            self.matrices.entry(name.into()).or_insert(matrix);
-        }
-    }
-
-    /// Adds a list of lists of numbers; ignores rows of different lengths.
-    pub(super) fn add_list(&mut self, name: &str, rows: Vec<Vec<f64>>) {
-        let columns = rows.first().map_or(0, Vec::len);
-        if self.add_name(name) && rows.iter().all(|r| r.len() == columns) {
-            let matrix = Matrix { rows: rows.len(), columns, data: rows.concat() };
-            self.lists.entry(name.into()).or_insert(matrix);
-        }
-    }
-
-    /// Adds a number, or a text if it is none.
-    pub(super) fn add_word(&mut self, name: &str, word: &str) {
-        if !self.add_name(name) {
+    /// Adds what stands under a name. The nameless members of a sequence are passed over.
+    pub(super) fn add(&mut self, section: &str, name: &str, entry: Entry) {
+        if matches!(name, "" | "_") {
             return;
         }
-        if let Some(value) = number(word) {
-            self.numbers.entry(name.into()).or_insert(value);
-        } else {
-            self.texts.entry(name.into()).or_insert_with(|| word.trim_matches('"').into());
+        if !self.sections.contains_key(section) {
+            self.sections.insert(section.to_owned(), BTreeMap::new());
+        }
+        let Some(inside) = self.sections.get_mut(section) else { return };
+        match inside.get(name) {
+            None => {
+                inside.insert(name.to_owned(), entry);
+            }
+            Some(first) if *first != entry && self.repeated.len() < SHOWN => {
+                self.repeated.push(joined(section, name));
+            }
+            Some(_) => {}
         }
     }
 
-    /// Notes a name. False for the nameless members of a sequence.
-    pub(super) fn add_name(&mut self, name: &str) -> bool {
-        let named = !matches!(name, "" | "_");
-        if named && !self.names.contains(name) {
-            self.names.insert(name.into());
+    /// A list of lists of numbers; rows of different lengths are no matrix.
+    pub(super) fn list(rows: Vec<Vec<f64>>) -> Entry {
+        let columns = rows.first().map_or(0, Vec::len);
+        match rows.iter().all(|r| r.len() == columns) {
+            true => Entry::Matrix(Matrix { rows: rows.len(), columns, data: rows.concat() }),
+            false => Entry::Other,
         }
-        named
     }
+
+    /// A number, or a text if it is none.
+    pub(super) fn word(word: &str) -> Entry {
+        number(word)
+            .map_or_else(|| Entry::Text(word.trim_matches(['"', '\'']).into()), Entry::Number)
+    }
+
+    /// The paths of all matrices, for a message.
+    pub(super) fn matrices(&self) -> String {
+        let all = self.sections.iter().flat_map(|(section, inside)| {
+            let matrices = inside.iter().filter(|(_, entry)| matches!(entry, Entry::Matrix(_)));
+            matrices.map(move |(name, _)| joined(section, name))
+        });
+        let names: Vec<String> = all.take(SHOWN).collect();
+        if names.is_empty() {
+            return "no matrix".into();
+        }
+        names.join(", ")
+    }
+}
+
+/// The path of an entry.
+pub(super) fn joined(section: &str, name: &str) -> String {
+    if section.is_empty() {
+        return name.into();
+    }
+    format!("{section}/{name}")
 }
 
 /// A number as OpenCV writes it. Infinities and NaN become NaN.
 pub(super) fn number(word: &str) -> Option<f64> {
     match word {
-        ".Inf" | ".inf" | "-.Inf" | "-.inf" | ".Nan" | ".NaN" | ".nan" => Some(f64::NAN),
+        ".Inf" | ".inf" | "-.Inf" | "-.inf" | ".Nan" | ".NaN" | ".nan" | "NaN" => Some(f64::NAN),
+        // Words that Rust takes for numbers, and no calibration means so.
+        "inf" | "infinity" | "nan" => None,
         _ => word.parse().ok(),
     }
 }

@@ -1,6 +1,6 @@
 //! Reads OpenCV's JSON, which is not quite JSON: it has comments, `.Nan` and `.Inf`.
 
-use super::entries::{number, Entries, Parts};
+use super::entries::{joined, number, Entries, Entry, Parts};
 use super::StorageError;
 
 /// Deepest nesting that is read.
@@ -85,7 +85,7 @@ impl<'a> Parser<'a> {
                 let mut map = Vec::new();
                 let mut go = self.peek() != Some('}');
                 while go {
-                    let key = self.string()?;
+                    let key = self.key()?;
                     self.expect(':')?;
                     map.push((key, self.value(depth + 1)?));
                     go = self.more('}')?;
@@ -103,6 +103,19 @@ impl<'a> Parser<'a> {
                 self.at += length;
                 Ok(Value::Word(&rest[..length]))
             }
+        }
+    }
+
+    /// The name of a member of a map; in YAML it has no quotes.
+    fn key(&mut self) -> Result<String, StorageError> {
+        match self.peek() {
+            Some(c) if c.is_alphabetic() || c == '_' => {
+                let rest = self.rest();
+                let length = rest.find(|c: char| ":,{}[]\"\n".contains(c)).unwrap_or(rest.len());
+                self.at += length;
+                Ok(rest[..length].trim_end().into())
+            }
+            _ => self.string(),
         }
     }
 
@@ -125,6 +138,19 @@ impl<'a> Parser<'a> {
     }
 }
 
+/// Adds the map in braces at the start of `text`, as YAML also has them; gives its length.
+pub(super) fn add_map(
+    found: &mut Entries,
+    section: &str,
+    name: &str,
+    text: &str,
+) -> Result<usize, StorageError> {
+    let mut parser = Parser { text, at: 0 };
+    let value = parser.value(0)?;
+    add(found, section, name, &value)?;
+    Ok(parser.at)
+}
+
 /// Everything in a text.
 pub(super) fn entries(text: &str) -> Result<Entries, StorageError> {
     let mut parser = Parser { text, at: 0 };
@@ -133,30 +159,43 @@ pub(super) fn entries(text: &str) -> Result<Entries, StorageError> {
         return parser.wrong("something follows the end");
     }
     let mut found = Entries::default();
-    add(&mut found, "", &value)?;
+    add(&mut found, "", "", &value)?;
     Ok(found)
 }
 
-fn add(found: &mut Entries, name: &str, value: &Value) -> Result<(), StorageError> {
+fn add(found: &mut Entries, section: &str, name: &str, value: &Value) -> Result<(), StorageError> {
     match value {
-        Value::Word(word) => found.add_word(name, word),
-        Value::Text(text) => found.add_word(name, text),
+        Value::Word(word) => found.add(section, name, Entries::word(word)),
+        Value::Text(text) => found.add(section, name, Entry::Text(text.clone())),
         Value::List(list) => match rows(list) {
-            Some(rows) => found.add_list(name, rows),
+            Some(rows) => found.add(section, name, Entries::list(rows)),
             None => {
-                found.add_name(name);
-                list.iter().try_for_each(|v| add(found, "", v))?;
+                let inside = inner(section, name);
+                for (i, value) in list.iter().enumerate() {
+                    match value {
+                        Value::Map(_) | Value::List(_) => add(found, &inside, &i.to_string(), value)?,
+                        Value::Word(_) | Value::Text(_) => found.add(section, name, Entry::Other),
+                    }
+                }
             }
         },
         Value::Map(map) => match matrix(name, map)? {
-            Some(matrix) => found.add_matrix(name, matrix),
+            Some(matrix) => found.add(section, name, Entry::Matrix(matrix)),
             None => {
-                found.add_name(name);
-                map.iter().try_for_each(|(key, v)| add(found, key, v))?;
+                let inside = inner(section, name);
+                map.iter().try_for_each(|(key, v)| add(found, &inside, key, v))?;
             }
         },
     }
     Ok(())
+}
+
+/// The section inside a name.
+fn inner(section: &str, name: &str) -> String {
+    if name.is_empty() {
+        return section.into();
+    }
+    joined(section, name)
 }
 
 /// The matrix that a map describes, if it describes one.

@@ -1,21 +1,25 @@
 //! Calibration files of other programs into the projector that they describe, and back.
 //!
-//! Read are OpenCV's `FileStorage` as XML, YAML and JSON, with the names that OpenCV's own samples, procam-calibration,
-//! ProCamToolkit (mapamok, ofxCv) and ROS give to the entries, and the profile `sl` of MPCDI. The text itself bounds all
-//! sizes: nothing is allocated ahead of the data.
+//! Read are OpenCV's `FileStorage` as XML, YAML and JSON, also compressed by gzip, with the names that calibration programs
+//! give to the entries (`names.rs` has the table of dialects), and the profile `sl` of MPCDI, also in its archive. The text
+//! itself bounds all sizes: nothing is allocated ahead of the data.
 
+mod archive;
+mod devices;
 mod entries;
 mod export;
 mod json;
 mod mpcdi;
-mod opencv;
+mod names;
 mod xml;
 mod yaml;
 
 #[cfg(test)]
+mod dialect_tests;
+#[cfg(test)]
 mod tests;
 
-pub use entries::{Entries, Matrix};
+pub use entries::{Entries, Entry, Matrix};
 pub use export::{export, Form};
 
 use crate::geometry::lens::LensError;
@@ -67,6 +71,8 @@ pub struct ReadOptions<'a> {
     pub lens: LensKind,
     /// The region of an MPCDI file, which may hold several projectors.
     pub region: Option<&'a str>,
+    /// The device of a file that describes several.
+    pub device: Option<&'a str>,
 }
 
 /// In what the pose of a file's projector is told.
@@ -77,6 +83,12 @@ pub enum Frame {
     /// In the frame of the camera that calibrated it: +X right, +Y down, looking along +Z.
     Camera {
         /// The entry of the file that shows it.
+        name: String,
+    },
+    /// In a world in which this camera of the file stands at the origin, with the axes of [`Self::Camera`]. It may be the
+    /// rig's world, and the file does not say so.
+    WorldOfCamera {
+        /// The camera.
         name: String,
     },
 }
@@ -92,8 +104,10 @@ pub struct StoredCalibration {
     pub image_size: Option<(u32, u32)>,
     /// Names under which the parts were found, for the operator.
     pub found: Vec<String>,
-    /// Names of the matrices and maps that are unknown and were not read, for the operator.
+    /// Paths of the entries, devices and maps that were not used, for the operator.
     pub unread: Vec<String>,
+    /// What may be wrong with the file, one sentence each, for the operator.
+    pub notes: Vec<String>,
 }
 
 impl StoredCalibration {
@@ -114,8 +128,8 @@ pub enum StorageError {
     TooLarge(usize),
     /// No form is recognised.
     #[error(
-        "calibration file is neither OpenCV YAML (first line %YAML:1.0) nor OpenCV XML (<opencv_storage>), OpenCV JSON \
-         or MPCDI (<MPCDI>)"
+        "calibration file is neither YAML of OpenCV, ROS or kalibr nor OpenCV XML (<opencv_storage>), JSON or MPCDI (<MPCDI>); \
+         save the matrix K, the coefficients dist, rvec and tvec as JSON"
     )]
     UnknownForm,
     /// A known form that is not read.
@@ -207,14 +221,20 @@ pub fn entries(text: &str) -> Result<Entries, StorageError> {
         xml::Document::parse(text)?.entries()
     } else if text.starts_with(['{', '[']) || text.starts_with("//") {
         json::entries(text)
-    } else if text.starts_with("%YAML")
-        || text.contains("!!opencv-matrix")
-        || text.lines().any(|line| line.trim_start().starts_with("rows:"))
-    {
+    } else if text.starts_with("%YAML") || text.contains("!!opencv-matrix") || has_names(text) {
         yaml::entries(text)
     } else {
         Err(StorageError::UnknownForm)
     }
+}
+
+/// Whether a text without a mark of its form has a line that names something known, as YAML does.
+fn has_names(text: &str) -> bool {
+    let is_known = |line: &str| {
+        let (key, _) = line.trim_start().trim_start_matches("- ").split_once(':')?;
+        names::meaning(key.trim().trim_matches('"'))
+    };
+    text.lines().take(10_000).any(|line| is_known(line).is_some() || line.trim_start().starts_with("rows:"))
 }
 
 /// Reads a calibration file of any known form.
@@ -227,24 +247,57 @@ pub fn read(bytes: &[u8], options: &ReadOptions) -> Result<StoredCalibration, St
         return Err(StorageError::TooLarge(bytes.len()));
     }
     if bytes.starts_with(b"PK\x03\x04") {
-        return Err(StorageError::Refused(
-            "it is a ZIP archive, as MPCDI uses; unpack it and give the file mpcdi.xml that is in it".into(),
-        ));
+        return mpcdi::read(&archive::mpcdi(bytes)?, options);
     }
-    if bytes.starts_with(b"vwf") {
-        return Err(StorageError::Refused(
-            "it is a warp file of VIOSO (.vwf), which holds the picture's warp and not the projector's lens and place; \
-             export MPCDI with the profile sl, or OpenCV XML, YAML or JSON"
-                .into(),
-        ));
+    if bytes.starts_with(&[0x1f, 0x8b]) {
+        return read(archive::unpacked(bytes)?.as_slice(), options);
+    }
+    if let Some((_, told)) = REFUSED.iter().find(|(start, _)| bytes.starts_with(start)) {
+        return Err(StorageError::Refused((*told).into()));
     }
     let text = std::str::from_utf8(bytes)
         .map_err(|_| StorageError::Refused("it is not a text file (UTF-8)".into()))?;
     if text.contains("<MPCDI") {
         return mpcdi::read(text, options);
     }
-    opencv::read(&entries(text)?, options)
+    if text.contains("<ProjectorCameraEnsemble") {
+        return Err(StorageError::Refused(
+            "it is an ensemble of RoomAlive Toolkit, whose poses are told from its depth camera; save the projector's \
+             cameraMatrix, lensDistortion and pose as K, dist, rvec and tvec in JSON"
+                .into(),
+        ));
+    }
+    devices::read(&entries(text)?, options)
 }
+
+/// First bytes of forms that are not read, with what to give instead.
+const REFUSED: &[(&[u8], &str)] = &[
+    (
+        b"vwf",
+        "it is a warp file of VIOSO (.vwf), which holds the picture's warp and not the projector's lens and place; export \
+         MPCDI with the profile sl, or OpenCV XML, YAML or JSON",
+    ),
+    (
+        b"\x93NUMPY",
+        "it is one array of numpy (.npy); save mtx, dist, rvec and tvec as JSON: json.dump({\"K\": mtx.tolist(), ...}, file)",
+    ),
+    (b"\x80\x02", PICKLE),
+    (b"\x80\x03", PICKLE),
+    (b"\x80\x04", PICKLE),
+    (b"\x80\x05", PICKLE),
+    (
+        b"MATLAB",
+        "it is a .mat file of MATLAB; save the intrinsic matrix (transposed if it has the principal point in its last row), the \
+         distortion, the rotation and the translation as JSON with the names K, dist, R and T",
+    ),
+    (
+        b"\x89HDF",
+        "it is an HDF5 file, perhaps a .mat of MATLAB 7.3; save K, dist, R and T of the projector as JSON",
+    ),
+];
+const PICKLE: &str = "it is a pickle of Python, which only a program may read; save mtx, dist, rvec and tvec as JSON: \
+                      json.dump({\"K\": mtx.tolist(), ...}, file)";
+
 
 /// Intrinsics in this project's pixels: the raster's corner is at (0, 0), and pixel centres are at halves.
 struct Intrinsics {

@@ -30,9 +30,13 @@ pub(super) fn read(text: &str, options: &ReadOptions) -> Result<StoredCalibratio
     let root = document.named("MPCDI").next().ok_or(StorageError::UnknownForm)?;
     let profile = document.attribute(root, "profile").unwrap_or_default();
     if !profile.eq_ignore_ascii_case("sl") {
+        let all = regions(&document);
+        let names: Vec<String> = all.iter().take(16).map(|i| format!("{:?}", id(&document, *i))).collect();
         return Err(StorageError::Refused(format!(
             "its MPCDI profile is {profile:?}, which tells the view of a picture and not the projector's lens and place; \
-             export it with the profile \"sl\""
+             export it with the profile \"sl\" (it has {} regions: {})",
+            all.len(),
+            names.join(", ")
         )));
     }
     let region = region(&document, options.region)?;
@@ -53,18 +57,27 @@ pub(super) fn read(text: &str, options: &ReadOptions) -> Result<StoredCalibratio
         image_size: Some(size),
         found: vec![format!("region: {}", region.id)],
         unread,
+        notes: vec![],
     })
 }
 
-fn region<'d, 'a>(document: &'d Document<'a>, wanted: Option<&str>) -> Result<Region<'d, 'a>, StorageError> {
-    // Extensions have elements of the same name outside `display`.
+/// The regions of the displays. Extensions have elements of the same name outside `display`.
+fn regions(document: &Document) -> Vec<usize> {
+    let above = |i: usize| document.elements[i].parent;
     let shown = |i: &usize| {
-        let above = |i: usize| document.elements[i].parent;
         let display = above(*i).and_then(above);
         display.is_some_and(|d| document.elements[d].name.eq_ignore_ascii_case("display"))
     };
-    let id = |i: usize| document.attribute(i, "id").unwrap_or_default();
-    let all: Vec<usize> = document.named("region").filter(shown).collect();
+    document.named("region").filter(shown).collect()
+}
+
+fn id(document: &Document, region: usize) -> String {
+    document.attribute(region, "id").unwrap_or_default()
+}
+
+fn region<'d, 'a>(document: &'d Document<'a>, wanted: Option<&str>) -> Result<Region<'d, 'a>, StorageError> {
+    let id = |i: usize| id(document, i);
+    let all = regions(document);
     let hit = match (wanted, all.as_slice()) {
         (Some(wanted), all) => all.iter().copied().find(|i| id(*i) == wanted),
         (None, [only]) => Some(*only),

@@ -8,7 +8,7 @@ use std::path::{Path, PathBuf};
 const YAML: &str = "%YAML:1.0\n---\nproj_K: !!opencv-matrix\n   rows: 3\n   cols: 3\n   dt: d\n   data: [ 1.2e+03, 0., 511.5,\n       0., 1.1e+03, 383.5, 0., 0., 1. ]\nproj_kc: !!opencv-matrix\n   rows: 1\n   cols: 5\n   dt: d\n   data: [ -0.1, 0.01, 0., 0., 0. ]\nroration: !!opencv-matrix\n   rows: 3\n   cols: 3\n   dt: d\n   data: [ 0., -1., 0., 1., 0., 0., 0., 0., 1. ]\nT: !!opencv-matrix\n   rows: 3\n   cols: 1\n   dt: d\n   data: [ 100., 200., 300. ]\nerror: 0.4\n";
 
 fn options(unit: LengthUnit) -> ReadOptions<'static> {
-    ReadOptions { raster: Raster::new(1024, 768).unwrap(), unit, lens: LensKind::Auto, region: None }
+    ReadOptions { raster: Raster::new(1024, 768).unwrap(), unit, lens: LensKind::Auto, region: None, device: None }
 }
 
 fn read_text(text: &str, unit: LengthUnit) -> Result<StoredCalibration, StorageError> {
@@ -182,7 +182,7 @@ fn a_file_of_procam_calibration_is_in_its_cameras_frame() {
     ];
     let stored = read_text(&storage(&inside.concat()), LengthUnit::Millimetre).unwrap();
     assert_eq!(stored.frame, Frame::Camera { name: "roration".into() });
-    assert!(stored.unread.is_empty() && stored.image_size.is_none(), "{stored:?}");
+    assert!(stored.unread == ["the device camera"] && stored.image_size.is_none(), "{stored:?}");
     // The camera's picture is not the projector's raster, and its lens is not the projector's.
     assert!(matches!(stored.camera.lens.model(), LensModel::Brown(c) if c[0] == -0.09));
     // A point of the camera's frame, and the same point of the world in which the camera stands at (1, 2, 3) and looks
@@ -245,10 +245,10 @@ fn a_file_of_opencvs_own_sample_says_what_it_lacks() {
     );
     // A matrix that nobody knows is named.
     let other = read_text(
-        &format!("{text}{}", views.replace("extrinsic_parameters", "dist_coef")),
+        &format!("{text}{}", views.replace("extrinsic_parameters", "dist_extra")),
         LengthUnit::Metre,
     );
-    assert_eq!(other.unwrap().unread, ["dist_coef"]);
+    assert_eq!(other.unwrap().unread, ["dist_extra"]);
 }
 
 #[test]
@@ -296,7 +296,7 @@ fn faults_are_named() {
         fault("%YAML:1.0\n---\n").contains("no intrinsics")
             && fault("%YAML:1.0\n---\n").contains("no matrix")
     );
-    assert!(fault(&YAML.replace("roration", "rot")).contains("no rotation"));
+    assert!(fault(&YAML.replace("roration", "turn")).contains("no rotation"));
     assert!(fault(&YAML.replace("   rows: 3\n   cols: 1", "   rows: 9\n   cols: 1"))
         .contains("9 x 1 but 3 numbers"));
     assert!(fault(&YAML.replace("   rows: 3\n   cols: 1", "   rows: 3000000000\n   cols: 1"))
@@ -314,7 +314,7 @@ fn faults_are_named() {
     assert!(fault(&YAML.replace("-0.1, 0.01", "-9.0, 0.0")).contains("cannot be inverted"));
     assert!(fault(&"x".repeat(MAX_BYTES + 1)).contains("at most"));
     let bytes = |bytes: &[u8]| read(bytes, &options(LengthUnit::Metre)).unwrap_err().to_string();
-    assert!(bytes(b"PK\x03\x04....").contains("mpcdi.xml"));
+    assert!(bytes(b"PK\x03\x04....").contains("damaged or cut off"));
     assert!(bytes(b"vwf1....").contains("VIOSO"));
     assert!(bytes(b"\xff\xfe").contains("UTF-8"));
     let xml = made_by_opencv("brown5.xml");

@@ -1,7 +1,7 @@
 //! A small reader of XML: the elements of a text with their attributes and texts. No entities are fetched, no document
 //! type is followed, and the depth is bounded.
 
-use super::entries::{Entries, Parts};
+use super::entries::{joined, Entries, Entry, Parts};
 use super::StorageError;
 
 /// Deepest nesting that is read.
@@ -104,25 +104,42 @@ impl<'a> Document<'a> {
     /// What an `opencv_storage` holds.
     pub(super) fn entries(&self) -> Result<Entries, StorageError> {
         let mut found = Entries::default();
+        // Path of the section inside each element. Members of a sequence, which OpenCV calls `_`, are numbered.
+        let mut inside: Vec<String> = Vec::with_capacity(self.elements.len());
+        let mut members = vec![0u32; self.elements.len()];
         for (i, element) in self.elements.iter().enumerate() {
-            if element.parent.is_some_and(|p| self.elements[p].is_matrix) {
+            let Some(parent) = element.parent else {
+                inside.push(String::new());
+                continue;
+            };
+            let number = members[parent];
+            members[parent] += 1;
+            let section = inside[parent].clone();
+            let name = if element.name == "_" { number.to_string() } else { element.name.to_owned() };
+            // A matrix is entered by itself, and only what has children needs a path: so a text of any shape takes no square
+            // of its length.
+            let path = if element.children.is_empty() || element.is_matrix {
+                String::new()
+            } else {
+                joined(&section, &name)
+            };
+            inside.push(path);
+            if self.elements[parent].is_matrix {
                 continue;
             }
             if element.is_matrix {
                 let text = |name| self.child_text(i, name);
                 let parts = Parts { rows: text("rows"), columns: text("cols"), kind: text("dt") };
                 let data = text("data").ok_or_else(|| StorageError::matrix(element.name, "no data"))?;
-                found.add_matrix(element.name, parts.matrix(element.name, data)?);
+                found.add(&section, &name, Entry::Matrix(parts.matrix(element.name, data)?));
                 continue;
             }
             let words: Vec<&str> = element.text.split_whitespace().collect();
             let numbers: Option<Vec<f64>> = words.iter().map(|w| super::entries::number(w)).collect();
             match (numbers, words.len()) {
-                (_, 0) => {
-                    found.add_name(element.name);
-                }
-                (Some(numbers), 2..) => found.add_list(element.name, vec![numbers]),
-                _ => found.add_word(element.name, element.text.trim()),
+                (_, 0) => {}
+                (Some(numbers), 2..) => found.add(&section, &name, Entries::list(vec![numbers])),
+                _ => found.add(&section, &name, Entries::word(element.text.trim())),
             }
         }
         Ok(found)

@@ -1,42 +1,104 @@
 //! Reads OpenCV's YAML.
 //!
-//! `%YAML:1.0` is not valid YAML, and tools misspell and rename the entries. So this is a small tolerant reader of
-//! exactly the parts that calibrations use: matrices, lists, numbers and words by name at any depth. Files without the
-//! tag `!!opencv-matrix` (ROS writes such) are read as well.
+//! `%YAML:1.0` is not valid YAML, and tools misspell and rename the entries, so no library of YAML reads what calibration
+//! programs write. This is a small tolerant reader of exactly the parts that calibrations use: matrices, lists, numbers and
+//! words by name in nested sections. Files without the tag `!!opencv-matrix` (ROS writes such), lists of lists line by line
+//! (kalibr and PyYAML) and maps in braces are read as well.
 
-use super::entries::{number, Entries, Parts};
-use super::StorageError;
+use super::entries::{joined, number, Entries, Entry, Parts};
+use super::{json, StorageError};
 
-/// A matrix of which some parts have been met.
+/// Deepest nesting that is read.
+const DEEPEST: usize = 64;
+
+/// A name at its column, inside of which the lines after it stand.
 struct Open<'a> {
-    name: &'a str,
     indent: usize,
+    name: &'a str,
+    /// Section that the name stands in.
+    section: String,
     tagged: bool,
     parts: Parts<'a>,
+    /// Members of a sequence whose lines follow, and what they are.
+    sequence: Sequence,
 }
 
-/// One `key: value`, at its column.
-struct Item<'a> {
+/// The members of a sequence, one a line.
+#[derive(Default)]
+struct Sequence {
+    rows: Vec<Vec<f64>>,
+    /// Column of the first line.
     indent: usize,
-    key: &'a str,
+    nested: bool,
+    other: bool,
+}
+
+impl Sequence {
+    fn is_empty(&self) -> bool {
+        self.rows.is_empty() && !self.other
+    }
+
+    /// Takes one number or word, which stands at a column behind a number of dashes.
+    fn take(&mut self, word: &str, indent: usize, dashes: usize) {
+        let Some(value) = number(word) else {
+            self.other = true;
+            return;
+        };
+        if self.rows.is_empty() {
+            (self.indent, self.nested) = (indent, dashes > 1);
+            self.rows.push(vec![value]);
+        } else if self.nested && indent <= self.indent {
+            self.rows.push(vec![value]);
+        } else if let Some(row) = self.rows.last_mut() {
+            row.push(value);
+        }
+    }
+
+    fn entry(self) -> Entry {
+        if self.other {
+            return Entry::Other;
+        }
+        Entries::list(self.rows)
+    }
+}
+
+/// One line: its value, behind its key if it has one.
+struct Item<'a> {
+    /// Column of the line.
+    indent: usize,
+    /// Column of the key or of the value.
+    inner: usize,
+    /// Dashes before it.
+    dashes: usize,
+    key: Option<&'a str>,
     value: &'a str,
 }
 
-/// The item of a line; `None` for comments, markers and bare values.
+/// The item of a line; `None` for comments, directives and markers.
 fn item(line: &str) -> Option<Item<'_>> {
     let mut rest = line.trim_start();
+    let indent = line.len() - rest.len();
+    let mut dashes = 0;
+    if rest.starts_with("---") || rest.starts_with("...") {
+        return None;
+    }
     while let Some(after) = rest.strip_prefix("- ") {
         rest = after.trim_start();
+        dashes += 1;
     }
-    let indent = line.len() - rest.len();
+    let inner = line.len() - rest.len();
     let rest = rest.trim_end();
-    if rest.starts_with("!!opencv-matrix") {
-        return Some(Item { indent, key: "", value: rest });
+    if rest.is_empty() || rest.starts_with(['#', '%']) {
+        return None;
     }
-    let (key, value) = rest.split_once(':')?;
-    let key = key.trim().trim_matches('"');
+    let bare = Item { indent, inner, dashes, key: None, value: rest };
+    if rest.starts_with(['[', '{']) || rest.starts_with("!!opencv-matrix") {
+        return Some(bare);
+    }
+    let Some((key, value)) = rest.split_once(':') else { return Some(bare) };
+    let key = key.trim().trim_matches(['"', '\'']);
     let is_key = !key.is_empty() && !key.contains(['[', ']', '{', '}', ',', '#', '%']);
-    is_key.then(|| Item { indent, key, value: value.trim() })
+    is_key.then(|| Item { key: Some(key), value: value.trim(), ..bare })
 }
 
 /// Length of the list at the start of `text`, with its brackets; `None` if it does not end.
@@ -72,7 +134,7 @@ fn rows(list: &str) -> Option<Vec<Vec<f64>>> {
 /// Everything in a text.
 pub(super) fn entries(text: &str) -> Result<Entries, StorageError> {
     let mut found = Entries::default();
-    let mut open: Option<Open> = None;
+    let mut open: Vec<Open> = Vec::new();
     let mut at = 0;
     while at < text.len() {
         let line_end = text[at..].find('\n').map_or(text.len(), |i| at + i + 1);
@@ -80,58 +142,105 @@ pub(super) fn entries(text: &str) -> Result<Entries, StorageError> {
         let start = at;
         at = line_end;
         let Some(item) = item(line) else { continue };
-        if let Some(o) = open.take_if(|o| item.indent <= o.indent) {
-            unfinished(&o)?;
+        // A sequence may stand at the column of its own name.
+        let is_inside = |o: &Open| o.indent < item.indent || (item.dashes > 0 && o.indent == item.indent);
+        while open.last().is_some_and(|o| !is_inside(o)) {
+            close(&mut open, &mut found)?;
         }
-        if item.key == "data" {
-            if let Some(o) = open.take_if(|o| o.tagged || o.parts.rows.is_some()) {
-                let error = |what: &str| StorageError::matrix(o.name, what);
-                // The list may start on the next line.
-                let colon = start + line.find(':').map_or(0, |i| i + 1);
-                let list = text[colon..].trim_start();
-                let list = list.strip_prefix('[').ok_or_else(|| error("data does not start with ["))?;
-                let end = list.find(']').ok_or_else(|| error("data does not end with ]"))?;
-                found.add_matrix(o.name, o.parts.matrix(o.name, &list[..end])?);
-                at = at.max(text.len() - list.len() + end + 1);
-                continue;
+        // Where the value begins, also behind the end of the line.
+        let value_at = start + line.rfind(item.value).unwrap_or(0);
+        let value_at = if item.value.is_empty() { line_end } else { value_at };
+        let Some(key) = item.key else {
+            let Some(o) = open.last_mut() else { continue };
+            if item.value.starts_with('[') {
+                let length = list_length(&text[value_at..])
+                    .ok_or_else(|| StorageError::matrix(o.name, "the list does not end with ]"))?;
+                match rows(&text[value_at..value_at + length]) {
+                    Some(rows) => o.sequence.rows.extend(rows),
+                    None => o.sequence.other = true,
+                }
+                at = at.max(value_at + length);
+            } else {
+                o.sequence.take(item.value, item.indent, item.dashes);
             }
-        }
-        if let Some(o) = &mut open {
-            match item.key {
+            continue;
+        };
+        if let Some(o) = open.last_mut() {
+            let is_matrix = o.tagged || o.parts.rows.is_some();
+            match key {
                 "rows" => o.parts.rows = Some(item.value),
                 "cols" => o.parts.columns = Some(item.value),
                 "dt" => o.parts.kind = Some(item.value),
+                // Numbers line by line follow as a sequence, which has a name of its own.
+                "data" if is_matrix && !text[value_at..].trim_start().starts_with("- ") => {
+                    let error = |what: &str| StorageError::matrix(o.name, what);
+                    // The list may start on the next line.
+                    let list = text[value_at..].trim_start();
+                    let list = list.strip_prefix('[').ok_or_else(|| error("data does not start with ["))?;
+                    let end = list.find(']').ok_or_else(|| error("data does not end with ]"))?;
+                    let matrix = o.parts.matrix(o.name, &list[..end])?;
+                    found.add(&o.section, o.name, Entry::Matrix(matrix));
+                    (o.tagged, o.parts) = (false, Parts::default());
+                    at = at.max(text.len() - list.len() + end + 1);
+                    continue;
+                }
                 _ => {}
             }
+            if matches!(key, "rows" | "cols" | "dt") {
+                continue;
+            }
         }
+        let section = open.last().map_or(String::new(), |o| joined(&o.section, o.name));
         if item.value.is_empty() || item.value.starts_with("!!opencv-matrix") {
-            if let Some(o) = open.take() {
-                unfinished(&o)?;
+            if open.len() == DEEPEST {
+                let what = format!("sections are nested more than {DEEPEST} deep");
+                let line = text[..start].matches('\n').count() + 1;
+                return Err(StorageError::Syntax { form: "YAML", line, what });
             }
-            found.add_name(item.key);
             let tagged = !item.value.is_empty();
-            open = Some(Open { name: item.key, indent: item.indent, tagged, parts: Parts::default() });
+            let (parts, sequence) = (Parts::default(), Sequence::default());
+            open.push(Open { indent: item.inner, name: key, section, tagged, parts, sequence });
         } else if item.value.starts_with('[') {
-            let from = start + line.find('[').unwrap_or(0);
-            found.add_name(item.key);
-            let length = list_length(&text[from..])
-                .ok_or_else(|| StorageError::matrix(item.key, "the list does not end with ]"))?;
-            if let Some(rows) = rows(&text[from..from + length]) {
-                found.add_list(item.key, rows);
-            }
-            at = at.max(from + length);
+            let length = list_length(&text[value_at..])
+                .ok_or_else(|| StorageError::matrix(key, "the list does not end with ]"))?;
+            let list = rows(&text[value_at..value_at + length]);
+            found.add(&section, key, list.map_or(Entry::Other, Entries::list));
+            at = at.max(value_at + length);
+        } else if item.value.starts_with('{') {
+            at = at.max(value_at + json::add_map(&mut found, &section, key, &text[value_at..])?);
         } else {
-            found.add_word(item.key, item.value.split(" #").next().unwrap_or("").trim_end());
+            let word = item.value.split(" #").next().unwrap_or("").trim_end();
+            found.add(&section, key, Entries::word(word));
         }
     }
-    open.iter().try_for_each(unfinished)?;
+    while !open.is_empty() {
+        close(&mut open, &mut found)?;
+    }
     Ok(found)
 }
 
-/// A matrix that ends before its numbers.
-fn unfinished(open: &Open) -> Result<(), StorageError> {
-    if open.tagged {
-        return Err(StorageError::matrix(open.name, "no data"));
+/// Ends the innermost name: a matrix must have had its numbers, and the members of a sequence are its value.
+fn close<'a>(open: &mut Vec<Open<'a>>, found: &mut Entries) -> Result<(), StorageError> {
+    let Some(Open { name, section, tagged, parts, sequence, .. }) = open.pop() else { return Ok(()) };
+    if let Some(around) = open.last_mut().filter(|o| name == "data" && o.parts.rows.is_some()) {
+        let matrix = around.parts.matrix_of(around.name, sequence.rows.concat())?;
+        found.add(&around.section, around.name, Entry::Matrix(matrix));
+        (around.tagged, around.parts) = (false, Parts::default());
+        return Ok(());
+    }
+    if tagged {
+        return Err(StorageError::matrix(name, "no data"));
+    }
+    if !sequence.is_empty() {
+        found.add(&section, name, sequence.entry());
+        return Ok(());
+    }
+    // A section that counts rows and columns without being a matrix.
+    let inside = joined(&section, name);
+    for (key, word) in [("rows", parts.rows), ("cols", parts.columns), ("dt", parts.kind)] {
+        if let Some(word) = word {
+            found.add(&inside, key, Entries::word(word));
+        }
     }
     Ok(())
 }

@@ -344,6 +344,9 @@ fn write_opencv(args: &ExportArgs) -> Result<(), Failure> {
     let text = export(&rig.camera, form);
     dpm_common::files::write_atomically(&args.out, |out| std::io::Write::write_all(out, text.as_bytes()))
         .map_err(|e| Failure::new(FailureKind::BadInput, format!("{}: {e}", args.out.display())))?;
+    // What was not read of the rig's calibration is not in the new file either.
+    let of_calibration = rig.scene.warnings.iter().filter(|told| told.starts_with("projector.calibration"));
+    of_calibration.for_each(|told| print(&format!("note: {told}\n")));
     print(&format!("written: {} (lengths in metres)\n", args.out.display()));
     Ok(())
 }

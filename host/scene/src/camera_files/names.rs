@@ -1,0 +1,189 @@
+//! The one table of dialects: what the name of an entry means in the files of calibration programs.
+//!
+//! Known are OpenCV and its samples, mapamok and ofxCv (ProCamToolkit), ProCamCalib, procam-calibration, scan3d-capture,
+//! slstudio, kalibr, ROS (`camera_info`, both spellings), RealSense, and what people name variables in Python. Spellings
+//! differ in case, blanks and underscores, which do not count, and in a device's name before or behind the word.
+
+/// Whose an entry is, by its name alone.
+#[derive(Clone, Debug, PartialEq, Eq, PartialOrd, Ord)]
+pub(super) enum Owner {
+    /// That of the section's only device.
+    Own,
+    /// A projector's.
+    Projector,
+    /// A camera's.
+    Camera,
+    /// One of several of a kind: "1" in `cameraMatrix1`, "left".
+    Other(String),
+}
+
+impl Owner {
+    /// Its name for a message and for `calibration_device`.
+    pub(super) fn label(&self) -> &str {
+        match self {
+            Self::Own => "",
+            Self::Projector => "projector",
+            Self::Camera => "camera",
+            Self::Other(label) => label,
+        }
+    }
+}
+
+/// What an entry is.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(super) enum Role {
+    /// The matrix of focal lengths and principal point, or these four numbers in a row.
+    Intrinsics,
+    /// One number of the intrinsics: 0 to 3 for fx, fy, cx, cy.
+    Intrinsic(usize),
+    /// The lens's coefficients in OpenCV's order.
+    Distortion,
+    /// One of them by its place there.
+    Coefficient(usize),
+    /// A rotation matrix or vector from the world to the device.
+    Rotation,
+    /// The translation that belongs to it.
+    Translation,
+    /// Both as a matrix of four columns, from the world to the device.
+    Pose,
+    /// The same from the device to the world.
+    Placement,
+    /// A matrix of four columns whose name does not say which of the two it is.
+    EitherPose,
+    /// Columns of the raster.
+    Width,
+    /// Rows of the raster.
+    Height,
+    /// Columns and rows in a list.
+    Size,
+    /// Rows and columns, and perhaps channels, as numpy has them.
+    Shape,
+    /// Words that say which lens it is.
+    LensModel,
+    /// What says nothing more of the projector: other forms of what was read, and how the calibration was made.
+    ByProduct,
+}
+
+/// What a name means; `None` if it is unknown.
+pub(super) fn meaning(name: &str) -> Option<(Owner, Role, bool)> {
+    let exact = EXACT.iter().find(|(known, ..)| *known == name);
+    if let Some((_, owner, role, from_camera)) = exact {
+        return Some((owner.clone(), *role, *from_camera));
+    }
+    let plain: String = name.chars().filter(|c| c.is_alphanumeric()).flat_map(char::to_lowercase).collect();
+    if let Some(role) = role(&plain) {
+        return Some((Owner::Own, role, false));
+    }
+    let (owner, rest) = owner(&plain)?;
+    Some((owner, role(rest)?, false))
+}
+
+/// Names whose case or meaning is their dialect's own. The last column: the pose leads from a camera to the projector.
+const EXACT: &[(&str, Owner, Role, bool)] = &[
+    ("roration", Owner::Own, Role::Rotation, true),
+    ("R_cp", Owner::Own, Role::Rotation, true),
+    ("T_cp", Owner::Own, Role::Translation, true),
+    ("cam_proj_rotation", Owner::Own, Role::Rotation, true),
+    ("cam_proj_translation", Owner::Own, Role::Translation, true),
+    ("Kc", Owner::Camera, Role::Intrinsics, false),
+    ("kc", Owner::Camera, Role::Distortion, false),
+    ("Kp", Owner::Projector, Role::Intrinsics, false),
+    ("kp", Owner::Projector, Role::Distortion, false),
+    ("Rp", Owner::Projector, Role::Rotation, true),
+    ("Tp", Owner::Projector, Role::Translation, true),
+    ("screenResX", Owner::Projector, Role::Width, false),
+    ("screenResY", Owner::Projector, Role::Height, false),
+    ("frameWidth", Owner::Camera, Role::Width, false),
+    ("frameHeight", Owner::Camera, Role::Height, false),
+    ("img_shape", Owner::Camera, Role::Shape, false),
+];
+
+/// Words before and behind which a name names its device.
+fn owner(plain: &str) -> Option<(Owner, &str)> {
+    const DEVICES: [(&str, Owner); 5] = [
+        ("projector", Owner::Projector),
+        ("proj", Owner::Projector),
+        ("prj", Owner::Projector),
+        ("camera", Owner::Camera),
+        ("cam", Owner::Camera),
+    ];
+    for (word, device) in DEVICES {
+        if let Some(rest) = plain.strip_prefix(word) {
+            let number = rest.len() - rest.trim_start_matches(|c: char| c.is_ascii_digit()).len();
+            // "cameraMatrix1" is the matrix of device 1, and "cam1K" the K of camera 1.
+            if number > 0 && role(&rest[number..]).is_some() {
+                return Some((Owner::Other(plain[..word.len() + number].into()), &rest[number..]));
+            }
+            if role(rest).is_some() {
+                return Some((device, rest));
+            }
+        }
+        if let Some(rest) = plain.strip_suffix(word).filter(|rest| role(rest).is_some()) {
+            return Some((device, rest));
+        }
+    }
+    for side in ["left", "right"] {
+        let rest = plain.strip_prefix(side).or_else(|| plain.strip_suffix(side));
+        if let Some(rest) = rest.filter(|rest| role(rest).is_some()) {
+            return Some((Owner::Other(side.into()), rest));
+        }
+    }
+    let rest = plain.trim_end_matches(|c: char| c.is_ascii_digit());
+    let is_numbered = rest.len() < plain.len() && role(rest).is_some();
+    // R1, P1 and Q are of a stereo rectification, and not a pose.
+    let is_pose = matches!(rest, "r" | "p");
+    (is_numbered && !is_pose).then(|| (Owner::Other(plain[rest.len()..].into()), rest))
+}
+
+/// What a name without its device's means: lower case, letters and digits alone.
+fn role(plain: &str) -> Option<Role> {
+    Some(match plain {
+        "cameramatrix" | "k" | "mtx" | "m" | "intrinsicmatrix" | "intrinsics" | "intrinsic" | "int"
+        | "matrix" | "intrinsicsmatrix" | "kmatrix" | "intrinsicparameters" | "cammatrix" => Role::Intrinsics,
+        "fx" | "focalx" | "focallengthx" => Role::Intrinsic(0),
+        "fy" | "focaly" | "focallengthy" => Role::Intrinsic(1),
+        "cx" | "ppx" | "principalpointx" => Role::Intrinsic(2),
+        "cy" | "ppy" | "principalpointy" => Role::Intrinsic(3),
+        "distortioncoefficients" | "distcoeffs" | "distortioncoeffs" | "distcoeff" | "distortion" | "dist"
+        | "d" | "distcoefs" | "distcoef" | "lensdistortion" | "distortioncoef" | "kc" | "coeffs"
+        | "distortionparameters" | "distortionvector" => Role::Distortion,
+        "k1" => Role::Coefficient(0),
+        "k2" => Role::Coefficient(1),
+        "p1" => Role::Coefficient(2),
+        "p2" => Role::Coefficient(3),
+        "k3" => Role::Coefficient(4),
+        "k4" => Role::Coefficient(5),
+        "k5" => Role::Coefficient(6),
+        "k6" => Role::Coefficient(7),
+        "r" | "rotation" | "rotationmatrix" | "rotationvector" | "rvec" | "rot" | "rmat" | "rotmat"
+        | "rmatrix" | "rotvec" => Role::Rotation,
+        "t" | "translation" | "translationvector" | "tvec" | "trans" | "transvec" => Role::Translation,
+        "extrinsics" | "extrinsic" | "extrinsicmatrix" | "rt" | "worldtocamera" | "worldtocam" | "w2c"
+        | "worldtoprojector" | "worldtoproj" | "tcamimu" | "tcamworld" | "tcw" | "tprojworld"
+        | "tprojectorworld" | "tcameraworld" | "camerafromworld" | "projectorfromworld" => Role::Pose,
+        "cameratoworld" | "camtoworld" | "c2w" | "twc" | "tworldcam" | "tworldproj" | "tworldprojector"
+        | "tworldcamera" | "projectortoworld" | "projtoworld" | "timucam" | "worldfromcamera"
+        | "worldfromprojector" => Role::Placement,
+        "pose" | "posematrix" | "transform" | "transformmatrix" | "transformation"
+        | "transformationmatrix" => Role::EitherPose,
+        "imagewidth" | "width" | "imagesizewidth" | "imgwidth" | "screenwidth" | "screenresx"
+        | "resolutionx" | "resx" | "xres" | "xresolution" | "rasterwidth" | "w" => Role::Width,
+        "imageheight" | "height" | "imagesizeheight" | "imgheight" | "screenheight" | "screenresy"
+        | "resolutiony" | "resy" | "yres" | "yresolution" | "rasterheight" | "h" => Role::Height,
+        "resolution" | "imagesize" | "size" | "imgsize" | "rastersize" | "screenresolution" | "screensize"
+        | "imageresolution" | "res" => Role::Size,
+        "shape" | "imageshape" | "imgshape" => Role::Shape,
+        "fisheyemodel" | "distortionmodel" | "cameramodel" | "lensmodel" | "cameratype" => Role::LensModel,
+        "e" | "f" | "essentialmatrix" | "fundamentalmatrix" | "rotationaxis" | "euler" | "fov"
+        | "rotationangleradians" | "rotationangledegrees" | "focallength" | "principalpoint"
+        | "perviewreprojectionerrors" | "perviewerrors" | "imagepoints" | "gridpoints" | "objectpoints"
+        | "projectionmatrix" | "p" | "calibrationtime" | "boardwidth" | "boardheight" | "squaresize"
+        | "markersize" | "nframes" | "nrofframes" | "numberofframes" | "flags" | "flagvalue" | "fixaspectratio"
+        | "aspectratio" | "avgreprojectionerror" | "avgreprojerr" | "maxreprojerr" | "reprojectionerror"
+        | "rms" | "rmserror" | "stereorms" | "error" | "camerror" | "projerror" | "stereoerror" | "caliberror"
+        | "cameraname" | "name" | "camoverlaps" | "rostopic" | "timeshiftcamimu" | "calibrationdate"
+        | "fixprincipalpoint" | "assumezerotangentialdistortion" | "fixk1" | "fixk2" | "fixk3"
+        | "calibrationpattern" | "fisheyecalibration" | "typeid" => Role::ByProduct,
+        _ => return None,
+    })
+}
