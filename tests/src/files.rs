@@ -93,7 +93,7 @@ pub fn container(document: &[u8], binary: &[u8]) -> Vec<u8> {
 
 /// An environment of any format: whatever is read has as many texels as it says, and light that is a number.
 pub fn environment(bytes: &[u8]) {
-    match decode_environment(bytes, 0.5, 2.0) {
+    match decode_environment(bytes, 0.5, 2.0).map(|sky| sky.environment) {
         Ok(dpm_scene::Environment::Equirect { width, height, texels, .. }) => {
             assert_eq!(texels.len(), width as usize * height as usize);
             assert!(texels.iter().all(|t| t.is_finite() && t.min_element() >= 0.0));

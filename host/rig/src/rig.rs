@@ -243,7 +243,7 @@ impl Rig {
         show_pictures(config, &mut scene)?;
         let features = SceneFeatures::of(&scene);
         let has_lights = features.lamp_triangles + features.punctual_lights > 0;
-        let (fitted, told) = environment(config, has_lights)?.unwrap_or(scene.environment).fitted();
+        let (fitted, told) = environment(config, has_lights, &mut scene.warnings)?.unwrap_or(scene.environment).fitted();
         scene.environment = fitted;
         scene.warnings.extend(told.map(|t| format!("scene.environment: {t}")));
         if config.render.tracing == Tracing::Query && scene.bodies.iter().any(|b| b.deforms.is_some()) {
@@ -492,8 +492,12 @@ fn show_pictures(config: &RigConfig, scene: &mut Scene) -> Result<(), RigError> 
 const FILE_SCENE_RADIANCE: f32 = 0.25;
 
 /// The environment that the rig file asks for, for a scene with or without lights. `None` keeps the scene's own; the
-/// built-in scene has one.
-fn environment(config: &RigConfig, has_lights: bool) -> Result<Option<Environment>, RigError> {
+/// built-in scene has one. Adds to `warnings` what was changed of a file.
+fn environment(
+    config: &RigConfig,
+    has_lights: bool,
+    warnings: &mut Vec<String>,
+) -> Result<Option<Environment>, RigError> {
     let even = |[r, g, b]: [f64; 3]| Environment::Constant(Vec3::new(r as f32, g as f32, b as f32));
     Ok(match &config.scene.environment {
         EnvironmentConfig::Auto(_) if config.scene.file.is_none() => None,
@@ -502,7 +506,10 @@ fn environment(config: &RigConfig, has_lights: bool) -> Result<Option<Environmen
         EnvironmentConfig::Auto(_) => Some(Environment::Constant(Vec3::splat(FILE_SCENE_RADIANCE))),
         EnvironmentConfig::Constant(c) => Some(even(c.radiance)),
         EnvironmentConfig::Image(c) => {
-            Some(dpm_scene::load_environment(&c.file, c.rotation_deg.to_radians() as f32, c.scale as f32)?)
+            let turn = c.rotation_deg.to_radians() as f32;
+            let sky = dpm_scene::load_environment(&c.file, turn, c.scale as f32)?;
+            warnings.extend(sky.warnings.iter().map(|told| format!("scene.environment: {told}")));
+            Some(sky.environment)
         }
     })
 }

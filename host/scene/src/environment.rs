@@ -1,4 +1,8 @@
-//! Reads a latitude-longitude image file (PFM, Radiance RGBE, OpenEXR, PNG, JPEG) as an [`Environment`].
+//! Reads a latitude-longitude image file (PFM, Radiance RGBE or XYZE, OpenEXR, PNG, JPEG, TIFF, WebP, BMP) as an
+//! [`Environment`].
+//!
+//! Radiance pictures are read here and not by the crate `image`, which reads one of the eight orders of their texels and no
+//! XYZE.
 
 #[cfg(feature = "exr")]
 mod exr_picture;
@@ -11,6 +15,7 @@ use image::{ImageFormat, ImageReader};
 use super::gltf_file::read_file;
 use super::limits::Limits;
 use super::load::contained;
+use super::primaries::Primaries;
 use super::srgb::to_linear;
 use super::{Environment, SceneError};
 #[cfg(feature = "exr")]
@@ -18,9 +23,9 @@ use exr_picture::read_exr;
 
 /// The formats that this program reads.
 const FORMATS: &str = if cfg!(feature = "exr") {
-    "give a .pfm, a Radiance .hdr, an .exr, a .png or a .jpg"
+    "give a .pfm, a Radiance .hdr, an .exr, .png, .jpg, .tif, .webp or .bmp"
 } else {
-    "give a .pfm, a Radiance .hdr, a .png or a .jpg (this program was built without its feature \"exr\", which reads an .exr)"
+    "give a .pfm, a Radiance .hdr, a .png, .jpg, .tif, .webp or .bmp (this program was built without its feature \"exr\", which reads an .exr)"
 };
 
 /// Maximum number of texels of an environment: 8192 x 4096.
@@ -28,15 +33,47 @@ const MAX_TEXELS: u64 = 1 << 25;
 
 /// Radiance beyond this counts as damage; the sun's disc is near 10^5 times the sky.
 const MAX_RADIANCE: f32 = 1.0e9;
+/// What infinite light is taken for: the greatest number of half precision, in which skies overflow.
+const OVERFLOWN: f32 = 65_504.0;
+/// Share of texels that may be no light at all; with more the picture is damaged.
+const MOST_CLAMPED: f64 = 0.1;
 
-/// Reads an environment image: `.pfm` (linear, "PF" or "Pf"), Radiance `.hdr` (linear), OpenEXR (linear), PNG or JPEG
-/// (sRGB, decoded to linear); the first bytes identify the format. Row 0 is up; the middle column looks along -Z turned by `rotation_rad`
-/// about +Y. Texels are multiplied by `scale`.
+/// A sky that was read.
+#[derive(Clone, Debug)]
+pub struct Sky {
+    /// The light.
+    pub environment: Environment,
+    /// What was changed or is not used, one line each, for the operator.
+    pub warnings: Vec<String>,
+}
+
+/// A picture before it is checked.
+#[derive(Clone, Debug, Default, PartialEq)]
+struct Read {
+    width: u32,
+    height: u32,
+    texels: Vec<Vec3>,
+    /// Of its colours; `None`: sRGB's.
+    primaries: Option<Primaries>,
+    warnings: Vec<String>,
+}
+
+impl From<Pixels> for Read {
+    fn from((width, height, texels): Pixels) -> Self {
+        Self { width, height, texels, ..Self::default() }
+    }
+}
+
+/// Reads an environment image: `.pfm` (linear, "PF" or "Pf"), Radiance `.hdr` (linear), OpenEXR (linear), PNG, JPEG, WebP or
+/// BMP (sRGB, decoded to linear), or TIFF (sRGB, linear where it holds floats); the first bytes identify the format. Row 0 is
+/// up; the middle column looks along -Z turned by `rotation_rad` about +Y. Texels are multiplied by `scale`.
+///
+/// A few texels that are negative, infinite or no numbers are clamped and counted.
 ///
 /// # Errors
-/// [`SceneError::InFile`] if the file cannot be read, is larger than 8192 x 4096 texels, or holds a value that is
-/// negative, not finite or beyond 10^9.
-pub fn load_environment(path: &Path, rotation_rad: f32, scale: f32) -> Result<Environment, SceneError> {
+/// [`SceneError::InFile`] if the file cannot be read, is larger than 8192 x 4096 texels, or holds many values that are no
+/// light.
+pub fn load_environment(path: &Path, rotation_rad: f32, scale: f32) -> Result<Sky, SceneError> {
     let limits = Limits::default();
     let owned = path.to_path_buf();
     let work = move |_: &_| {
@@ -125,36 +162,88 @@ fn box_filtered(texels: &[Vec3], from: (u32, u32), to: (u32, u32)) -> Vec<Vec3> 
 
 /// [`load_environment`] of bytes, in this thread: for fuzzers.
 #[doc(hidden)]
-pub fn decode_environment(bytes: &[u8], rotation_rad: f32, scale: f32) -> Result<Environment, SceneError> {
+pub fn decode_environment(bytes: &[u8], rotation_rad: f32, scale: f32) -> Result<Sky, SceneError> {
     if !(rotation_rad.is_finite() && scale.is_finite() && scale >= 0.0) {
         return Err(SceneError::broken(
             "environment",
             format!("rotation {rotation_rad} and scale {scale} must be finite, the scale not negative"),
         ));
     }
-    let (width, height, mut texels) = match bytes {
-        [b'P', b'F' | b'f', ..] => read_pfm(bytes)?,
+    let mut read: Read = match bytes {
+        [b'P', b'F' | b'f', ..] => read_pfm(bytes)?.into(),
         [b'#', b'?', ..] => read_rgbe(bytes)?,
         [0x76, 0x2f, 0x31, 0x01, ..] => read_exr(bytes)?,
-        [0x89, b'P', b'N', b'G', ..] => read_srgb(bytes, ImageFormat::Png)?,
-        [0xff, 0xd8, ..] => read_srgb(bytes, ImageFormat::Jpeg)?,
-        _ => return Err(SceneError::unsupported("this image format", FORMATS)),
+        _ => match image::guess_format(bytes) {
+            Ok(ImageFormat::Tiff) => read_tiff(bytes)?.into(),
+            Ok(format @ (ImageFormat::Png | ImageFormat::Jpeg | ImageFormat::WebP | ImageFormat::Bmp)) => {
+                read_srgb(bytes, format)?.into()
+            }
+            _ => return Err(SceneError::unsupported("this image format", FORMATS)),
+        },
     };
-    for (i, texel) in texels.iter_mut().enumerate() {
-        if !(texel.is_finite()
-            && texel.min_element() >= 0.0
-            && (*texel * scale).max_element() <= MAX_RADIANCE)
-        {
-            let (x, y) = (i % width as usize, i / width as usize);
-            let problem = format!(
-                "is {:?}; radiance must be finite, not negative and at most {MAX_RADIANCE:e} after scaling",
-                texel.to_array()
-            );
-            return Err(SceneError::broken(format!("texel {x}, {y}"), problem));
-        }
-        *texel *= scale;
+    if let Some(primaries) = read.primaries {
+        read.warnings.extend(primaries.convert(&mut read.texels));
     }
-    Ok(Environment::Equirect { width, height, texels, rotation_rad })
+    clamp(&mut read, scale)?;
+    let Read { width, height, texels, warnings, .. } = read;
+    Ok(Sky { environment: Environment::Equirect { width, height, texels, rotation_rad }, warnings })
+}
+
+/// Scales the texels, and makes light of those that are none.
+fn clamp(read: &mut Read, scale: f32) -> Result<(), SceneError> {
+    let (mut negative, mut infinite, mut none, mut bright) = (0usize, 0usize, 0usize, 0usize);
+    let mut first: Option<usize> = None;
+    for (i, texel) in read.texels.iter_mut().enumerate() {
+        let is_light =
+            texel.is_finite() && texel.min_element() >= 0.0 && (*texel * scale).max_element() <= MAX_RADIANCE;
+        if is_light {
+            *texel *= scale;
+            continue;
+        }
+        first = first.or(Some(i));
+        let mut counts = [false; 4];
+        for x in texel.as_mut() {
+            let (is, value) = match *x {
+                v if v.is_nan() => (2, 0.0),
+                f32::INFINITY => (1, OVERFLOWN),
+                f32::NEG_INFINITY => (0, 0.0),
+                v if v < 0.0 => (0, 0.0),
+                v if v * scale > MAX_RADIANCE => (3, MAX_RADIANCE / scale),
+                v => {
+                    *x = v * scale;
+                    continue;
+                }
+            };
+            counts[is] = true;
+            *x = (value * scale).min(MAX_RADIANCE);
+        }
+        negative += usize::from(counts[0]);
+        infinite += usize::from(counts[1]);
+        none += usize::from(counts[2]);
+        bright += usize::from(counts[3]);
+    }
+    let Some(first) = first else { return Ok(()) };
+    let (x, y) = (first % read.width as usize, first / read.width as usize);
+    let count = read.texels.len();
+    if (infinite + none + bright) as f64 > MOST_CLAMPED * count as f64 && infinite + none + bright > 1 {
+        let problem = format!(
+            "is the first of {} of {count} texels that are infinite, no numbers or beyond {MAX_RADIANCE:e} after scaling: the \
+             picture is damaged",
+            infinite + none + bright
+        );
+        return Err(SceneError::broken(format!("texel {x}, {y}"), problem));
+    }
+    for (count, what) in [
+        (negative, "negative ones are taken for 0".to_owned()),
+        (infinite, format!("infinite ones are taken for {OVERFLOWN}")),
+        (none, "ones that are no numbers are taken for 0".to_owned()),
+        (bright, format!("ones beyond {MAX_RADIANCE:e} are taken for that")),
+    ] {
+        if count > 0 {
+            read.warnings.push(format!("{count} texels of the environment are no light (the first at {x}, {y}): {what}"));
+        }
+    }
+    Ok(())
 }
 
 pub(crate) type Pixels = (u32, u32, Vec<Vec3>);
@@ -181,16 +270,19 @@ fn header(problem: &str) -> SceneError {
     SceneError::broken("image header", problem)
 }
 
-/// Takes a line (without its end) off the front of `rest`; lines of a header are short.
-fn line<'a>(rest: &mut &'a [u8]) -> Result<&'a str, SceneError> {
+/// Longest line of a header. Some programs keep the history of a picture there.
+const MAX_LINE: usize = 65_536;
+
+/// Takes a line (without its end) off the front of `rest`. A comment may have any bytes.
+fn line<'a>(rest: &mut &'a [u8]) -> Result<std::borrow::Cow<'a, str>, SceneError> {
     let end = rest
         .iter()
-        .take(1000)
+        .take(MAX_LINE)
         .position(|&b| b == b'\n')
         .ok_or_else(|| header("is cut off or has a line without end"))?;
-    let text = std::str::from_utf8(&rest[..end]).map_err(|_| header("is not text"))?;
+    let text = &rest[..end];
     *rest = &rest[end + 1..];
-    Ok(text.trim_end_matches('\r'))
+    Ok(String::from_utf8_lossy(text.strip_suffix(b"\r").unwrap_or(text)))
 }
 
 pub(crate) fn read_pfm(bytes: &[u8]) -> Result<Pixels, SceneError> {
@@ -232,10 +324,15 @@ pub(crate) fn read_pfm(bytes: &[u8]) -> Result<Pixels, SceneError> {
     Ok((width, height, (0..texels).map(texel).collect()))
 }
 
-/// Radiance pictures \[Ward91\]: rows from the top, plain or with each component run-length coded.
-fn read_rgbe(bytes: &[u8]) -> Result<Pixels, SceneError> {
+/// Radiance pictures \[Ward91\]: in any order of rows and columns, plain or with each component run-length coded, as RGBE or
+/// XYZE.
+fn read_rgbe(bytes: &[u8]) -> Result<Read, SceneError> {
     let mut rest = bytes;
     let mut exposure = 1.0f32;
+    let mut correction = Vec3::ONE;
+    let mut primaries: Option<Primaries> = None;
+    let mut warnings = vec![];
+    let mut is_xyz = false;
     line(&mut rest)?;
     let mut lines = 0;
     loop {
@@ -247,46 +344,91 @@ fn read_rgbe(bytes: &[u8]) -> Result<Pixels, SceneError> {
         if lines > 1000 {
             return Err(header("has more than 1000 lines"));
         }
-        if let Some(format) = text.strip_prefix("FORMAT=") {
-            if format.trim() != "32-bit_rle_rgbe" {
-                return Err(SceneError::unsupported(
-                    format!("the pixel format {}", format.trim()),
-                    "save it as RGBE",
-                ));
+        let Some((name, value)) = text.split_once('=') else { continue };
+        let numbers: Vec<f32> = value.split_ascii_whitespace().map_while(|w| w.parse().ok()).collect();
+        match (name.trim(), &numbers[..]) {
+            ("FORMAT", _) => match value.trim() {
+                "32-bit_rle_rgbe" => {}
+                "32-bit_rle_xyze" => is_xyz = true,
+                other => {
+                    return Err(SceneError::unsupported(format!("the pixel format {other}"), "save it as RGBE"))
+                }
+            },
+            ("EXPOSURE", [value, ..]) => exposure *= value,
+            ("EXPOSURE", []) => return Err(header("has an EXPOSURE that is not a number")),
+            ("COLORCORR", [r, g, b, ..]) => correction *= Vec3::new(*r, *g, *b),
+            ("PRIMARIES", [rx, ry, gx, gy, bx, by, wx, wy, ..]) => {
+                let at = |x: &f32, y: &f32| glam::DVec2::new(f64::from(*x), f64::from(*y));
+                primaries = Some(Primaries { rgb: [at(rx, ry), at(gx, gy), at(bx, by)], white: at(wx, wy) });
             }
+            ("COLORCORR" | "PRIMARIES", _) => warnings.push(format!("its {} has too few numbers: it is left out", name.trim())),
+            ("VIEW", _) if value.contains("-vt") && !value.contains("-vta") => {
+                warnings.push(format!("its VIEW is {}: it is read as latitude and longitude", value.trim()));
+            }
+            _ => {}
         }
-        if let Some(value) = text.strip_prefix("EXPOSURE=") {
-            exposure *=
-                value.trim().parse::<f32>().map_err(|_| header("has an EXPOSURE that is not a number"))?;
-        }
+    }
+    let gain = correction * exposure;
+    if !(gain.is_finite() && gain.min_element() > 0.0) {
+        return Err(header("has an EXPOSURE or COLORCORR that is not above zero"));
     }
     let size = line(&mut rest)?;
     let words: Vec<&str> = size.split_ascii_whitespace().collect();
-    let ["-Y", height, "+X", width] = words[..] else {
-        return Err(header("must give the size as '-Y height +X width': rows from the top, left to right"));
+    let wrong = || {
+        header("must give the size as '-Y height +X width' or in one of the seven other orders of rows and columns")
     };
+    let [first, outer, second, inner] = words[..] else { return Err(wrong()) };
     let side = |s: &str| s.parse::<u32>().map_err(|_| header("gives a size that is not a number"));
-    let (width, height) = (side(width)?, side(height)?);
+    let (outer, inner) = (side(outer)?, side(inner)?);
+    let axis = |word: &str| Some((word.strip_prefix(['+', '-'])?.to_owned(), word.starts_with('+')));
+    let ((outer_axis, outer_rises), (inner_axis, inner_rises)) =
+        axis(first).zip(axis(second)).ok_or_else(wrong)?;
+    let by_rows = match (outer_axis.as_str(), inner_axis.as_str()) {
+        ("Y", "X") => true,
+        ("X", "Y") => false,
+        _ => return Err(wrong()),
+    };
+    let (width, height) = if by_rows { (inner, outer) } else { (outer, inner) };
     check_size(width, height)?;
-    // No encoding of a row is shorter than one texel.
-    if (rest.len() as u64) < 4 * u64::from(height) {
+    // No encoding of a scan line is shorter than one texel.
+    if (rest.len() as u64) < 4 * u64::from(outer) / 2 {
         return Err(SceneError::broken("image", "has fewer bytes than its size needs: it is cut off"));
     }
     let mut texels = vec![];
-    let mut row = vec![[0u8; 4]; width as usize];
-    for y in 0..height {
-        let cut = || SceneError::broken(format!("row {y}"), "is cut off or damaged");
-        read_rgbe_row(&mut rest, &mut row).ok_or_else(cut)?;
+    let mut row = vec![[0u8; 4]; inner as usize];
+    for y in 0..outer {
+        if read_rgbe_row(&mut rest, &mut row).is_none() {
+            // Light that is missing at the end is told; a picture that is mostly missing is none.
+            if y < outer / 2 {
+                return Err(SceneError::broken(format!("row {y}"), "is cut off or damaged"));
+            }
+            warnings.push(format!("it is cut off or damaged from scan line {y} of {outer} on: the rest is black"));
+            texels.resize(inner as usize * outer as usize, Vec3::ZERO);
+            break;
+        }
         texels.extend(row.iter().map(|&[r, g, b, e]| {
-            let unit = if e == 0 { 0.0 } else { (f64::from(e) - 136.0).exp2() / f64::from(exposure) };
-            Vec3::new(
-                (f64::from(r) * unit) as f32,
-                (f64::from(g) * unit) as f32,
-                (f64::from(b) * unit) as f32,
-            )
+            let unit = if e == 0 { 0.0 } else { (f64::from(e) - 136.0).exp2() };
+            let scaled = |x: u8, gain: f32| (f64::from(x) * unit / f64::from(gain)) as f32;
+            Vec3::new(scaled(r, gain.x), scaled(g, gain.y), scaled(b, gain.z))
         }));
     }
-    Ok((width, height, texels))
+    // Up is +Y and right is +X: the upper left texel comes first here.
+    if !(by_rows && !outer_rises && inner_rises) {
+        let stored = texels;
+        let at = |x: u32, y: u32| {
+            let (x_rises, y_rises) = if by_rows { (inner_rises, outer_rises) } else { (outer_rises, inner_rises) };
+            let x = if x_rises { x } else { width - 1 - x };
+            let y = if y_rises { height - 1 - y } else { y };
+            let (outer_at, inner_at) = if by_rows { (y, x) } else { (x, y) };
+            stored[outer_at as usize * inner as usize + inner_at as usize]
+        };
+        texels = (0..height).flat_map(|y| (0..width).map(move |x| (x, y))).map(|(x, y)| at(x, y)).collect();
+    }
+    if is_xyz {
+        let white = primaries.map_or(Primaries::XYZ.white, |p| p.white);
+        primaries = Some(Primaries { white, ..Primaries::XYZ });
+    }
+    Ok(Read { width, height, texels, primaries, warnings })
 }
 
 /// Reads one row in any of the three encodings.
@@ -341,7 +483,7 @@ fn read_rgbe_row(rest: &mut &[u8], row: &mut [[u8; 4]]) -> Option<()> {
 
 /// Refuses OpenEXR in a program that was built without it.
 #[cfg(not(feature = "exr"))]
-fn read_exr(_: &[u8]) -> Result<Pixels, SceneError> {
+fn read_exr(_: &[u8]) -> Result<Read, SceneError> {
     Err(SceneError::unsupported(
         "OpenEXR",
         "this program was built without its feature \"exr\"; convert the picture to Radiance .hdr, or build the program with that feature",
@@ -375,12 +517,23 @@ fn read_srgb(bytes: &[u8], format: ImageFormat) -> Result<Pixels, SceneError> {
     Ok((rgb.width(), rgb.height(), texels))
 }
 
+/// TIFF of whole numbers is a picture for a display, and one of floats is light.
+fn read_tiff(bytes: &[u8]) -> Result<Pixels, SceneError> {
+    use image::DynamicImage::{ImageRgb32F, ImageRgba32F};
+    let picture = decode_bounded(bytes, ImageFormat::Tiff, 32)?;
+    let is_linear = matches!(picture, ImageRgb32F(_) | ImageRgba32F(_));
+    let rgb = picture.into_rgb32f();
+    let of = |x: f32| if is_linear { x } else { to_linear(x) };
+    let texels = rgb.as_raw().chunks_exact(3).map(|c| Vec3::new(of(c[0]), of(c[1]), of(c[2]))).collect();
+    Ok((rgb.width(), rgb.height(), texels))
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
 
     fn texels(bytes: &[u8]) -> Pixels {
-        match decode_environment(bytes, 0.0, 1.0).unwrap() {
+        match decode_environment(bytes, 0.0, 1.0).unwrap().environment {
             Environment::Equirect { width, height, texels, .. } => (width, height, texels),
             Environment::Constant(_) => unreachable!("an image never decodes to a constant"),
         }
@@ -444,14 +597,9 @@ mod tests {
 
     #[test]
     fn hostile_images_are_refused_with_reasons() {
-        let nan = pfm("1 1", "-1", &[1.0, f32::NAN, 1.0].map(f32::to_le_bytes));
-        let negative = pfm("1 1", "-1", &[1.0, -0.5, 1.0].map(f32::to_le_bytes));
-        let huge = pfm("1 1", "-1", &[1.0, 1e30, 1.0].map(f32::to_le_bytes));
-        assert!(
-            refused(&nan).contains("texel 0, 0")
-                && refused(&negative).contains("negative")
-                && refused(&huge).contains("1e9")
-        );
+        let of = |value: f32| pfm("1 2", "-1", &[1.0, value, 1.0, 1.0, value, 2.0].map(f32::to_le_bytes));
+        assert!(refused(&of(f32::NAN)).contains("texel 0, 0") && refused(&of(1e30)).contains("2 of 2"));
+        assert!(refused(&of(f32::INFINITY)).contains("damaged"));
         assert!(refused(&pfm("65535 65535", "-1", &[])).contains("limit"));
         assert!(refused(&pfm("4 4", "-1", &[])).contains("cut off"));
         assert!(refused(&pfm("0 4", "-1", &[])).contains("at least 1"));
@@ -459,8 +607,8 @@ mod tests {
         assert!(refused(b"PF\n1 1").contains("cut off"));
         assert!(refused(b"#?RADIANCE\n\n-Y 70000 +X 70000\n").contains("limit"));
         assert!(refused(b"#?RADIANCE\n\n-Y 4000 +X 4000\n\x02\x02").contains("cut off"));
-        assert!(refused(b"#?RADIANCE\n\n+Y 2 +X 2\n").contains("-Y height"));
-        assert!(refused(b"#?RADIANCE\nFORMAT=32-bit_rle_xyze\n\n-Y 2 +X 2\n").contains("xyze"));
+        assert!(refused(b"#?RADIANCE\n\n+Y 2 +Y 2\n").contains("-Y height"));
+        assert!(refused(b"#?RADIANCE\nFORMAT=32-bit_luv\n\n-Y 2 +X 2\n").contains("luv"));
         assert!(refused(b"#?RADIANCE\n\n-Y 1 +X 8\n\x02\x02\x00\x08\xff\x01").contains("row 0"));
         assert!(refused(b"#?RADIANCE\n\n-Y 1 +X 2\n\x01\x01\x01\x01").contains("row 0"));
         assert!(refused(b"GIF89a").contains("format") && refused(b"").contains("format"));
@@ -546,11 +694,71 @@ mod tests {
     fn scale_multiplies_and_rotation_is_kept() {
         let bytes = pfm("1 1", "-1", &[1.0f32, 2.0, 3.0].map(f32::to_le_bytes));
         let Environment::Equirect { texels, rotation_rad, .. } =
-            decode_environment(&bytes, 0.5, 2.0).unwrap()
+            decode_environment(&bytes, 0.5, 2.0).unwrap().environment
         else {
             panic!()
         };
         assert_eq!((texels[0], rotation_rad), (Vec3::new(2.0, 4.0, 6.0), 0.5));
+    }
+
+    /// The same picture in every order of rows and columns.
+    #[test]
+    fn radiance_pictures_are_read_in_all_eight_orders() {
+        // Three columns, two rows; red says which texel it is.
+        let texel = |x: u32, y: u32| [(10 * (1 + x + 3 * y)) as u8, 7, 9, 130];
+        let upright = |bytes: &[u8]| texels(bytes).2;
+        let file = |size: &str, list: Vec<[u8; 4]>| {
+            [format!("#?RADIANCE\n\n{size}\n").into_bytes(), list.concat()].concat()
+        };
+        let rows = |ys: [u32; 2], xs: [u32; 3]| {
+            ys.into_iter().flat_map(|y| xs.into_iter().map(move |x| texel(x, y))).collect::<Vec<_>>()
+        };
+        let columns = |xs: [u32; 3], ys: [u32; 2]| {
+            xs.into_iter().flat_map(|x| ys.into_iter().map(move |y| texel(x, y))).collect::<Vec<_>>()
+        };
+        let (right, left, down, up) = ([0, 1, 2], [2, 1, 0], [0, 1], [1, 0]);
+        let first = upright(&file("-Y 2 +X 3", rows(down, right)));
+        for (size, list) in [
+            ("-Y 2 -X 3", rows(down, left)),
+            ("+Y 2 +X 3", rows(up, right)),
+            ("+Y 2 -X 3", rows(up, left)),
+            ("+X 3 -Y 2", columns(right, down)),
+            ("+X 3 +Y 2", columns(right, up)),
+            ("-X 3 -Y 2", columns(left, down)),
+            ("-X 3 +Y 2", columns(left, up)),
+        ] {
+            assert_eq!(upright(&file(size, list)), first, "{size}");
+        }
+    }
+
+    #[test]
+    fn headers_of_other_programs_are_read_and_light_that_is_none_is_counted() {
+        let case = |name: &str| {
+            let folder = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../tests/assets/cases");
+            decode_environment(&std::fs::read(folder.join(name)).unwrap(), 0.0, 1.0).unwrap()
+        };
+        assert_eq!(case("e06-latin1-header.hdr").warnings, [] as [String; 0]);
+        let told = case("e09-primaries.hdr").warnings;
+        assert!(told.len() == 1 && told[0].contains("converted from the primaries (0.7347, 0.2653)"), "{told:?}");
+        case("e05-plus-y.hdr");
+        let mut values = vec![1.0f32; 60];
+        (values[4], values[30], values[50]) = (-0.5, f32::INFINITY, f32::NAN);
+        let bytes: Vec<[u8; 4]> = values.iter().map(|v| v.to_le_bytes()).collect();
+        let sky = decode_environment(&pfm("20 1", "-1", &bytes), 0.0, 2.0).unwrap();
+        let Environment::Equirect { texels, .. } = sky.environment else { panic!() };
+        assert_eq!((texels[1], texels[10]), (Vec3::new(2.0, 0.0, 2.0), Vec3::new(131_008.0, 2.0, 2.0)));
+        assert_eq!(texels[16].z, 0.0);
+        let told = sky.warnings.join("; ");
+        assert!(["1 texels", "negative", "infinite", "no numbers", "at 1, 0"].iter().all(|w| told.contains(w)), "{told}");
+        // XYZE: white of equal energy is white here.
+        let xyze = b"#?RADIANCE\nFORMAT=32-bit_rle_xyze\n\n-Y 1 +X 1\n\x80\x80\x80\x81".to_vec();
+        let white = super::tests::texels(&xyze).2[0];
+        assert!((white - Vec3::ONE).abs().max_element() < 1e-3, "{white}");
+        // The end of a picture may be missing, and not most of it.
+        let line = [128u8, 64, 0, 129];
+        let cut = [b"#?RADIANCE\n\n-Y 4 +X 1\n".to_vec(), line.repeat(3)].concat();
+        let sky = decode_environment(&cut, 0.0, 1.0).unwrap();
+        assert!(sky.warnings[0].contains("scan line 3 of 4"), "{:?}", sky.warnings);
     }
 
     proptest::proptest! {

@@ -1,17 +1,188 @@
-//! Reads an OpenEXR picture: the first layer with red, green and blue, of half or single precision, with any of the usual
-//! compressions. Its alpha is left out.
+//! Reads an OpenEXR picture: of its layers the one with light, of half, single or whole numbers, with any of the usual
+//! compressions, and with the primaries that it names. Its alpha is left out.
 
+use super::super::primaries::Primaries;
 use super::super::SceneError;
-use super::{decode_bounded, Pixels};
-use glam::Vec3;
-use image::ImageFormat;
+use super::{check_size, Read, MAX_TEXELS};
+use exr::image::{AnyChannel, AnyChannels, FlatSamples, Layer};
+use exr::prelude::{read, ReadChannels, ReadLayers};
+use glam::{DVec2, Vec3};
+use std::collections::BTreeMap;
+use std::io::Cursor;
+
+/// Bytes that all channels of all layers may take.
+const MAX_BYTES: u64 = MAX_TEXELS * 32;
+/// Words in the names of layers that hold the whole light of a picture.
+const WHOLE: [&str; 5] = ["combined", "beauty", "rgba", "main", "composite"];
+
+/// What the channels of one name in front are together.
+#[derive(Clone, Copy)]
+enum Colour {
+    Rgb([usize; 3]),
+    /// Luminance, and the differences of red and blue to it as shares of it.
+    LumaChroma([usize; 3]),
+    Grey(usize),
+}
+
+/// A group of channels with the same name in front of theirs.
+struct Group {
+    layer: usize,
+    name: String,
+    colour: Colour,
+}
+
+fn failed(e: exr::error::Error) -> SceneError {
+    SceneError::broken("image", format!("cannot be decoded: {e}"))
+}
 
 /// Reads a picture; its sides are checked before its texels are.
-pub(crate) fn read_exr(bytes: &[u8]) -> Result<Pixels, SceneError> {
-    // Decoding makes four floats of a texel, and the conversion three more.
-    let rgb = decode_bounded(bytes, ImageFormat::OpenExr, 32)?.into_rgb32f();
-    let texels = rgb.as_raw().chunks_exact(3).map(Vec3::from_slice).collect();
-    Ok((rgb.width(), rgb.height(), texels))
+pub(super) fn read_exr(bytes: &[u8]) -> Result<Read, SceneError> {
+    let meta = exr::meta::MetaData::read_from_buffered(Cursor::new(bytes), false).map_err(failed)?;
+    let mut total = 0u64;
+    for header in &meta.headers {
+        let side = |n: usize| u32::try_from(n).unwrap_or(u32::MAX);
+        let texels = check_size(side(header.layer_size.width()), side(header.layer_size.height()))?;
+        total = total.saturating_add(texels as u64 * header.channels.bytes_per_pixel as u64);
+        if header.channels.list.iter().any(|c| c.sampling.width() * c.sampling.height() != 1) {
+            return Err(SceneError::unsupported(
+                "OpenEXR with colours of fewer texels than its luminance",
+                "convert it to RGB",
+            ));
+        }
+    }
+    SceneError::check_limit("the bytes of all layers of the environment", total, MAX_BYTES, "keep one layer")?;
+    let picture = read()
+        .no_deep_data()
+        .largest_resolution_level()
+        .all_channels()
+        .all_layers()
+        .all_attributes()
+        .non_parallel()
+        .from_buffered(Cursor::new(bytes))
+        .map_err(failed)?;
+    let window = picture.attributes.display_window;
+    let side = |n: usize| u32::try_from(n).unwrap_or(u32::MAX);
+    let (width, height) = (side(window.size.width()), side(window.size.height()));
+    check_size(width, height)?;
+    let groups = groups(&picture.layer_data);
+    let Some(chosen) = choose(&groups) else {
+        let names: Vec<String> = channels(&picture.layer_data).take(12).collect();
+        return Err(SceneError::broken(
+            "image",
+            format!(
+                "cannot be decoded: no layer has R, G and B, or Y; it has the channels {}",
+                names.join(", ")
+            ),
+        ));
+    };
+    let mut warnings = vec![];
+    if groups.len() > 1 {
+        let others = groups.iter().filter(|g| !std::ptr::eq(*g, chosen)).map(|g| shown(&g.name));
+        let others = others.take(12).collect::<Vec<_>>().join(", ");
+        warnings.push(format!("of its layers {} is the light; {others} are not used", shown(&chosen.name)));
+    }
+    let primaries = picture.attributes.chromaticities.map(|c| {
+        let at = |v: exr::math::Vec2<f32>| DVec2::new(f64::from(v.x()), f64::from(v.y()));
+        Primaries { rgb: [at(c.red), at(c.green), at(c.blue)], white: at(c.white) }
+    });
+    let layer = &picture.layer_data[chosen.layer];
+    let list = &layer.channel_data.list;
+    let value = |channel: usize, i: usize| number(&list[channel], i);
+    let colour = |i: usize| match chosen.colour {
+        Colour::Rgb(c) => Vec3::from(c.map(|c| value(c, i))),
+        Colour::Grey(c) => Vec3::splat(value(c, i)),
+        Colour::LumaChroma(c) => {
+            // By the weights of Rec. 709, as OpenEXR does without primaries.
+            let [y, ry, by] = c.map(|c| value(c, i));
+            let (r, b) = ((ry + 1.0) * y, (by + 1.0) * y);
+            Vec3::new(r, (y - 0.2126 * r - 0.0722 * b) / 0.7152, b)
+        }
+    };
+    // The picture is what the display window shows; data may lie anywhere.
+    let offset = |axis: fn(exr::math::Vec2<i32>) -> i32| {
+        i64::from(axis(layer.attributes.layer_position)) - i64::from(axis(window.position))
+    };
+    let (left, top) = (offset(|v| v.x()), offset(|v| v.y()));
+    let mut texels = vec![Vec3::ZERO; width as usize * height as usize];
+    let columns = layer.size.width();
+    let mut outside = 0usize;
+    for i in 0..columns * layer.size.height() {
+        let (x, y) = ((i % columns) as i64 + left, (i / columns) as i64 + top);
+        if (0..i64::from(width)).contains(&x) && (0..i64::from(height)).contains(&y) {
+            texels[y as usize * width as usize + x as usize] = colour(i);
+        } else {
+            outside += 1;
+        }
+    }
+    if outside > 0 {
+        warnings.push(format!("{outside} texels outside of its display window are left out"));
+    }
+    Ok(Read { width, height, texels, primaries, warnings })
+}
+
+fn shown(name: &str) -> String {
+    if name.is_empty() { "the one without a name".into() } else { format!("'{name}'") }
+}
+
+fn number(channel: &AnyChannel<FlatSamples>, i: usize) -> f32 {
+    match &channel.sample_data {
+        FlatSamples::F16(list) => list.get(i).map_or(0.0, |v| v.to_f32()),
+        FlatSamples::F32(list) => list.get(i).copied().unwrap_or(0.0),
+        FlatSamples::U32(list) => list.get(i).map_or(0.0, |v| *v as f32),
+    }
+}
+
+type Layers = [Layer<AnyChannels<FlatSamples>>];
+
+/// The names of all channels, with that of their layer.
+fn channels(layers: &Layers) -> impl Iterator<Item = String> + '_ {
+    let of = |layer: &Layer<AnyChannels<FlatSamples>>| {
+        layer.attributes.layer_name.as_ref().map_or(String::new(), |name| format!("{name}."))
+    };
+    layers.iter().flat_map(move |layer| {
+        let front = of(layer);
+        layer.channel_data.list.iter().map(move |c| format!("{front}{}", c.name))
+    })
+}
+
+/// The groups of channels that are colours or grey.
+fn groups(layers: &Layers) -> Vec<Group> {
+    let mut out = vec![];
+    for (i, layer) in layers.iter().enumerate() {
+        let mut by_name = BTreeMap::<String, BTreeMap<String, usize>>::new();
+        for (k, channel) in layer.channel_data.list.iter().enumerate() {
+            let name = channel.name.to_string();
+            let (front, own) = name.rsplit_once('.').unwrap_or(("", &name));
+            by_name.entry(front.to_owned()).or_default().insert(own.to_ascii_uppercase(), k);
+        }
+        for (front, own) in by_name {
+            let one = |names: &[&str]| names.iter().find_map(|n| own.get(*n).copied());
+            let rgb = [one(&["R", "RED"]), one(&["G", "GREEN"]), one(&["B", "BLUE"])];
+            let colour = match (rgb, own.get("Y"), own.get("RY"), own.get("BY")) {
+                ([Some(r), Some(g), Some(b)], ..) => Colour::Rgb([r, g, b]),
+                (_, Some(y), Some(ry), Some(by)) => Colour::LumaChroma([*y, *ry, *by]),
+                (_, Some(y), ..) => Colour::Grey(*y),
+                _ => match one(&["L", "I", "LUMINANCE", "GRAY", "GREY"]) {
+                    Some(grey) => Colour::Grey(grey),
+                    None => continue,
+                },
+            };
+            let layer = layer.attributes.layer_name.as_ref().map_or(String::new(), ToString::to_string);
+            let name = [layer, front].into_iter().filter(|part| !part.is_empty()).collect::<Vec<_>>().join(".");
+            out.push(Group { layer: i, name, colour });
+        }
+    }
+    out
+}
+
+/// The group with the light: colours before grey, then one without a name, then one whose name says that it is all of it.
+fn choose(groups: &[Group]) -> Option<&Group> {
+    let rank = |group: &&Group| {
+        let name = group.name.to_lowercase();
+        let is_whole = WHOLE.iter().any(|word| name.contains(word));
+        (matches!(group.colour, Colour::Grey(_)), !name.is_empty(), !is_whole)
+    };
+    groups.iter().min_by_key(rank)
 }
 
 #[cfg(test)]
@@ -70,7 +241,7 @@ mod tests {
 
     #[test]
     fn golden_bytes_are_read_linear_and_from_the_top() {
-        let (width, height, texels) = read_exr(&small()).unwrap();
+        let Read { width, height, texels, .. } = read_exr(&small()).unwrap();
         let expected =
             [[4.0, 2.0, 0.5], [70_000.0, 3.0, 1.0], [0.25, 0.0, 0.0], [10.0, 9.0, 8.0]].map(Vec3::from_array);
         assert_eq!((width, height, texels.as_slice()), (2, 2, &expected[..]));
@@ -79,12 +250,49 @@ mod tests {
 
     #[test]
     fn compressed_half_floats_and_alpha_are_read() {
+        use exr::prelude::*;
         let mut file = std::io::Cursor::new(vec![]);
-        let picture =
-            image::Rgba32FImage::from_fn(37, 5, |x, y| image::Rgba([x as f32, y as f32, 0.5, 0.25]));
-        image::DynamicImage::ImageRgba32F(picture).write_to(&mut file, ImageFormat::OpenExr).unwrap();
-        let (width, height, texels) = read_exr(file.get_ref()).unwrap();
+        let texel = |at: Vec2<usize>| {
+            let half = |x: f32| f16::from_f32(x);
+            (half(at.x() as f32), half(at.y() as f32), half(0.5), half(0.25))
+        };
+        let encoding = Encoding::SMALL_LOSSLESS;
+        let channels = SpecificChannels::rgba(texel);
+        let layer = Layer::new((37, 5), LayerAttributes::named("light"), encoding, channels);
+        Image::from_layer(layer).write().to_buffered(&mut file).unwrap();
+        let Read { width, height, texels, .. } = read_exr(file.get_ref()).unwrap();
         assert_eq!((width, height, texels[37 + 3]), (37, 5, Vec3::new(3.0, 1.0, 0.5)));
+    }
+
+    /// Layers by name, grey and luminance with chroma; what is not used is told.
+    #[test]
+    fn layers_and_kinds_of_colour_are_read_by_their_names() {
+        let one = |channels: &[&str], values: &[f32]| {
+            exr(channels, 1, &[values.iter().map(|v| vec![*v]).collect::<Vec<_>>()])
+        };
+        let read = |bytes: &[u8]| read_exr(bytes).unwrap();
+        assert_eq!(read(&one(&["Y"], &[0.5])).texels, [Vec3::splat(0.5)]);
+        let layers = ["depth.Z", "diffuse.B", "diffuse.G", "diffuse.R", "sky.Combined.B", "sky.Combined.G", "sky.Combined.R"];
+        let several = read(&one(&layers, &[9.0, 1.0, 1.0, 1.0, 0.3, 0.2, 0.1]));
+        assert_eq!(several.texels, [Vec3::new(0.1, 0.2, 0.3)]);
+        assert!(several.warnings[0].contains("'diffuse'") && several.warnings[0].contains("'sky.Combined' is the light"));
+        // Luminance 1 with red 1.5 and blue 0.5.
+        let chroma = read(&one(&["BY", "RY", "Y"], &[-0.5, 0.5, 1.0])).texels[0];
+        let green = (1.0 - 0.2126 * 1.5 - 0.0722 * 0.5) / 0.7152;
+        assert!((chroma - Vec3::new(1.5, green, 0.5)).abs().max_element() < 1e-6, "{chroma}");
+    }
+
+    fn case(name: &str) -> Vec<u8> {
+        let folder = std::path::Path::new(env!("CARGO_MANIFEST_DIR")).join("../../tests/assets/cases");
+        std::fs::read(folder.join(name)).unwrap()
+    }
+
+    #[test]
+    fn single_texels_that_are_no_light_are_clamped_and_primaries_are_converted() {
+        for (name, told) in [("e02-negative.exr", "negative"), ("e03-inf-sun.exr", "65504"), ("e08-aces.exr", "0.7347")] {
+            let sky = decode_environment(&case(name), 0.0, 1.0).unwrap();
+            assert!(sky.warnings.iter().any(|w| w.contains(told)), "{name}: {:?}", sky.warnings);
+        }
     }
 
     #[test]
@@ -110,9 +318,8 @@ mod tests {
             huge[at..at + 8].copy_from_slice(&[side, side].concat());
         }
         assert!(refused(&huge).contains("limit"), "{}", refused(&huge));
-        let row = |v: f32| [vec![vec![v], vec![1.0], vec![1.0]]];
-        assert!(refused(&exr(&["B", "G", "R"], 1, &row(f32::NAN))).contains("texel 0, 0"));
-        assert!(refused(&exr(&["B", "G", "R"], 1, &row(-1.0))).contains("negative"));
+        let row = |v: f32| [vec![vec![v; 9], vec![1.0; 9], vec![1.0; 9]]];
+        assert!(refused(&exr(&["B", "G", "R"], 9, &row(f32::NAN))).contains("texel 0, 0"));
         let depth = [vec![vec![1.0]]];
         assert!(refused(&exr(&["Z"], 1, &depth)).contains("cannot be decoded"));
     }

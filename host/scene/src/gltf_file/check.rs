@@ -13,7 +13,7 @@ use super::json::{shorten, Item};
 use super::ktx2_image;
 
 /// Extensions that this program understands, or may ignore without a wrong picture.
-const UNDERSTOOD: [&str; 16] = [
+const UNDERSTOOD: [&str; 17] = [
     compressed::DRACO,
     compressed::MESHOPT[0],
     compressed::MESHOPT[1],
@@ -27,6 +27,7 @@ const UNDERSTOOD: [&str; 16] = [
     "KHR_materials_variants",
     "KHR_materials_volume",
     "KHR_mesh_quantization",
+    super::flatten::VISIBILITY,
     ktx2_image::BASISU,
     "KHR_texture_transform",
     "KHR_xmp_json_ld",

@@ -6,6 +6,7 @@ use std::path::{Component, Path, PathBuf};
 use dpm_device::regular_file;
 use serde_json::Value;
 
+use super::super::names::composed;
 use super::super::{Limits, SceneError};
 use super::compressed::is_placeholder;
 use super::json::{parse, shorten, Item};
@@ -20,6 +21,8 @@ pub(crate) struct Container {
     pub root: Value,
     /// The binary chunk of a `.glb`.
     pub binary: Option<Vec<u8>>,
+    /// What was wrong with the container, for the operator.
+    pub told: Option<String>,
 }
 
 /// Reads a whole regular file of at most `limit` bytes.
@@ -35,7 +38,8 @@ pub(crate) fn read_file(path: &Path, limit: u64) -> Result<Vec<u8>, SceneError> 
 
 /// Splits a file into JSON and binary chunk.
 pub(super) fn split(bytes: &[u8], limits: &Limits) -> Result<Container, SceneError> {
-    let (text, binary) = if bytes.starts_with(b"glTF") { split_glb(bytes)? } else { (bytes, None) };
+    let (text, binary, told) =
+        if bytes.starts_with(b"glTF") { split_glb(bytes)? } else { (bytes, None, None) };
     if text.is_empty() {
         return Err(SceneError::broken("file", "is empty: no glTF document in it"));
     }
@@ -61,14 +65,14 @@ pub(super) fn split(bytes: &[u8], limits: &Limits) -> Result<Container, SceneErr
         "keep bulk data in buffers",
     )?;
     let root = parse(text, limits.json_values)?;
-    Ok(Container { root, binary: binary.map(<[u8]>::to_vec) })
+    Ok(Container { root, binary: binary.map(<[u8]>::to_vec), told })
 }
 
 fn word(bytes: &[u8], at: usize) -> Option<u32> {
     Some(u32::from_le_bytes(bytes.get(at..at.checked_add(4)?)?.try_into().ok()?))
 }
 
-type Chunks<'a> = (&'a [u8], Option<&'a [u8]>);
+type Chunks<'a> = (&'a [u8], Option<&'a [u8]>, Option<String>);
 
 fn split_glb(bytes: &[u8]) -> Result<Chunks<'_>, SceneError> {
     let header = |problem: String| SceneError::broken("GLB header", problem);
@@ -78,22 +82,37 @@ fn split_glb(bytes: &[u8]) -> Result<Chunks<'_>, SceneError> {
     if version != 2 {
         return Err(header(format!("is of version {version}; re-export as glTF 2.0")));
     }
-    if length as usize != bytes.len() {
-        return Err(header(format!(
-            "promises {length} bytes, the file has {}: it is cut off or damaged",
-            bytes.len()
-        )));
-    }
+    // The header's length is a hint: what counts is whether the chunks are there.
+    let (length, there) = (length as usize, bytes.len());
+    let told = match length.cmp(&there) {
+        std::cmp::Ordering::Equal => None,
+        std::cmp::Ordering::Less => Some(format!("{} bytes behind the end of the GLB are left out", there - length)),
+        std::cmp::Ordering::Greater => {
+            Some(format!("the GLB header promises {length} bytes, the file has {there}: it is damaged"))
+        }
+    };
+    let whole = bytes;
+    let bytes = &bytes[..length.clamp(12, there)];
     let (mut text, mut binary) = (None, None);
     let (mut at, mut index) = (12usize, 0);
     while at < bytes.len() {
         let name = format!("GLB chunk {index}");
-        let (Some(size), Some(kind)) = (word(bytes, at), word(bytes, at + 4)) else {
+        let (Some(size), Some(kind)) = (word(whole, at), word(whole, at + 4)) else {
+            // Padding behind the chunks.
+            if text.is_some() {
+                break;
+            }
             return Err(SceneError::broken(name, "has no room for its header"));
         };
-        let left = bytes.len() - at - 8;
-        let Some(content) = bytes[at + 8..].get(..size as usize) else {
-            return Err(SceneError::broken(name, format!("promises {size} bytes, the file has {left} left")));
+        let left = whole.len() - at - 8;
+        let Some(content) = whole[at + 8..].get(..size as usize) else {
+            if text.is_some() && !matches!(kind, JSON_CHUNK | BIN_CHUNK) {
+                break;
+            }
+            return Err(SceneError::broken(
+                name,
+                format!("promises {size} bytes, the file has {left} left: it is cut off"),
+            ));
         };
         match (index, kind) {
             (0, JSON_CHUNK) => text = Some(content),
@@ -109,7 +128,7 @@ fn split_glb(bytes: &[u8]) -> Result<Chunks<'_>, SceneError> {
     }
     let Some(text) = text else { return Err(SceneError::broken("GLB", "has no JSON chunk")) };
     let end = text.iter().rposition(|&b| b != 0).map_or(0, |i| i + 1); // some writers pad with zeros
-    Ok((&text[..end], binary))
+    Ok((&text[..end], binary, told))
 }
 
 /// The folder in which side files may lie.
@@ -134,13 +153,43 @@ impl Folder {
         if !plain {
             return Err(refused_uri(uri));
         }
-        let resolved = self.0.join(path).canonicalize().map_err(SceneError::Read)?;
+        let resolved = match self.0.join(path).canonicalize() {
+            Err(e) if e.kind() == std::io::ErrorKind::NotFound => {
+                self.alike(path).ok_or(SceneError::Read(e))?.canonicalize().map_err(SceneError::Read)?
+            }
+            other => other.map_err(SceneError::Read)?,
+        };
         if !resolved.starts_with(&self.0) {
             return Err(refused_uri(uri));
         }
         read_file(&resolved, limit)
     }
+
+    /// The file of this path with its letters in another case or composed otherwise: other systems find it.
+    fn alike(&self, path: &Path) -> Option<PathBuf> {
+        let fold = |name: &str| composed(name).to_lowercase();
+        let mut at = self.0.clone();
+        for component in path.components() {
+            let wanted = component.as_os_str();
+            if at.join(wanted).exists() {
+                at.push(wanted);
+                continue;
+            }
+            let wanted = fold(wanted.to_str()?);
+            let names = std::fs::read_dir(&at).ok()?.take(MAX_NAMES).flatten().map(|entry| entry.file_name());
+            let mut alike = names.filter(|name| name.to_str().is_some_and(|name| fold(name) == wanted));
+            let (first, second) = (alike.next()?, alike.next());
+            if second.is_some() {
+                return None;
+            }
+            at.push(first);
+        }
+        Some(at)
+    }
 }
+
+/// Names of a folder that are looked through.
+const MAX_NAMES: usize = 10_000;
 
 fn refused_uri(uri: &str) -> SceneError {
     SceneError::unsupported(

@@ -5,7 +5,7 @@ mod claims;
 mod deforming;
 mod skinned;
 
-use std::collections::{BTreeMap, HashMap};
+use std::collections::{BTreeMap, HashMap, HashSet};
 use std::sync::Arc;
 
 use glam::{DAffine3, DMat3, DMat4, DVec3, Vec3};
@@ -24,7 +24,7 @@ use super::look::Look;
 use super::primitive::read_primitive;
 use super::vertex_paint::Paint;
 use claims::roots;
-pub(crate) use claims::{choose_bodies, Claims};
+pub(crate) use claims::{choose_bodies, hidden, Claims, VISIBILITY};
 use skinned::AtRest;
 
 /// Most parts that an animation may move.
@@ -95,6 +95,8 @@ pub(super) struct Source<'a> {
     pub animation: &'a Animation,
     /// Morph targets and skins.
     pub deformations: &'a Deformations,
+    /// Nodes that are not shown.
+    pub hidden: &'a HashSet<usize>,
     /// The world's unit and axes from those of the file.
     pub world: DAffine3,
 }
@@ -206,6 +208,9 @@ impl<'a> Gatherer<'a> {
         while let Some(Step { node: index, world, place, mut group, mut resizes }) = walk.pop() {
             self.cancel.check(self.limits)?;
             let Some(node) = document.nodes().nth(index) else { continue };
+            if self.source.hidden.contains(&index) {
+                continue;
+            }
             let channels = self.source.animation.nodes.get(&index);
             let local = local_transform(&node, channels);
             let above = self.place_at(group, &world, &place);

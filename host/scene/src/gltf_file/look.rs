@@ -84,8 +84,8 @@ struct Reader<'a> {
     folder: Option<&'a Folder>,
     limits: &'a Limits,
     cancel: &'a Cancel,
-    /// Decoded images.
-    images: HashMap<usize, Picture>,
+    /// Decoded images; `None`: one that cannot be read, which is told.
+    images: HashMap<usize, Option<Picture>>,
     /// (image, sampler, sRGB, with heights) to index in `textures`: textures of a file may differ in their names alone.
     known: HashMap<(usize, Option<usize>, bool, bool), u32>,
     textures: Vec<Texture>,
@@ -163,7 +163,7 @@ impl Reader<'_> {
         let mut references = [None; 5];
         for (reference, u) in references.iter_mut().zip(&uses) {
             if let Some(u) = u {
-                *reference = Some(self.reference(u, warnings)?);
+                *reference = self.reference(u, warnings)?;
             }
         }
         [
@@ -179,9 +179,11 @@ impl Reader<'_> {
         Ok((out, uv_set))
     }
 
-    fn reference(&mut self, u: &Use, warnings: &mut Vec<String>) -> Result<TextureRef, SceneError> {
+    /// `None`: its image cannot be read. The shape of a body is worth more than its picture.
+    fn reference(&mut self, u: &Use, warnings: &mut Vec<String>) -> Result<Option<TextureRef>, SceneError> {
         let image = self.image(u, warnings)?;
-        let heights = u.slot == NORMAL && self.images[&image].red_green_only;
+        let Some(Some(picture)) = self.images.get(&image) else { return Ok(None) };
+        let heights = u.slot == NORMAL && picture.red_green_only;
         let sampler = self.document.textures().nth(u.texture).and_then(|t| t.sampler().index());
         let key = (image, sampler, u.srgb, heights);
         let texture = match self.known.get(&key) {
@@ -194,12 +196,12 @@ impl Reader<'_> {
                 index
             }
         };
-        Ok(TextureRef {
+        Ok(Some(TextureRef {
             texture,
             offset: Vec2::from(u.offset),
             rotation: u.rotation,
             scale: Vec2::from(u.scale),
-        })
+        }))
     }
 
     /// The index of the image of a texture, which is decoded by then.
@@ -207,8 +209,16 @@ impl Reader<'_> {
         let image = self.document.as_json().textures[u.texture].source.value();
         if !self.images.contains_key(&image) {
             self.cancel.check(self.limits)?;
-            let decoded = self.decode(image)?;
-            if decoded.cut_off {
+            let decoded = match self.decode(image) {
+                Ok(decoded) => Some(decoded),
+                // A limit is not left out: what it guards would be asked for by the next file as well.
+                Err(e @ (SceneError::TooLarge { .. } | SceneError::TimedOut(_))) => return Err(e),
+                Err(e) => {
+                    warnings.push(format!("the {} texture is left out: {e}", u.slot));
+                    None
+                }
+            };
+            if decoded.as_ref().is_some_and(|d| d.cut_off) {
                 warnings.push(format!(
                     "{}: it holds numbers outside of 0 to 1, which a texture does not hold: they are cut off there",
                     self.image_items[image].name
@@ -227,7 +237,9 @@ impl Reader<'_> {
         heights: bool,
         warnings: &mut Vec<String>,
     ) -> Result<Texture, SceneError> {
-        let picture = &self.images[&image];
+        let Some(Some(picture)) = self.images.get(&image) else {
+            return Err(SceneError::Internal(format!("image {image} was not decoded")));
+        };
         let (Size { width, height }, srgb) = (picture.size, picture.srgb);
         if srgb.is_some_and(|srgb| srgb != u.srgb) {
             let (said, used) =
@@ -282,7 +294,8 @@ impl Reader<'_> {
             })?,
             (None, None) => return Err(item.error("has no data")),
         };
-        picture::decode(item, bytes, self.texels, self.limits)
+        let name = item.text("mimeType")?.or(item.text("uri")?).unwrap_or_default();
+        picture::decode(item, bytes, name, self.texels, self.limits)
     }
 }
 

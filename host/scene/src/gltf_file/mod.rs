@@ -34,6 +34,12 @@ pub(super) fn fetch_beside(uri: &str, beside: Option<&Path>, limit: u64) -> Resu
     container::fetch(uri, beside.map(Folder::of).transpose()?.as_ref(), limit)
 }
 
+/// `Ok` if an image, which `name` may tell more of, is of a format that is read and has no more texels than the limits allow.
+pub(super) fn check_image(bytes: &[u8], name: &str, limits: &Limits) -> Result<(), SceneError> {
+    let nothing = Value::Object(serde_json::Map::new());
+    picture::check(&Item::new(&nothing, "picture".into())?, bytes, name, limits)
+}
+
 /// A picture of colours that is not part of a file, PNG, JPEG or KTX2, or an animated PNG; it repeats. `texels_so_far` counts
 /// those of the scene.
 pub(super) fn decode_picture(
@@ -46,7 +52,7 @@ pub(super) fn decode_picture(
     if let Some(clip) = clip::decode(&item, bytes, texels_so_far, limits)? {
         return Ok(clip);
     }
-    let picture = picture::decode(&item, bytes, texels_so_far, limits)?;
+    let picture = picture::decode(&item, bytes, "", texels_so_far, limits)?;
     let picture::Size { width, height } = picture.size;
     Ok(Texture::repeated([width, height], picture.texels, picture.srgb.unwrap_or(true)))
 }
@@ -71,7 +77,7 @@ pub(super) fn read(
 ) -> Result<Scene, SceneError> {
     let limits = &options.limits;
     let folder = beside.map(Folder::of).transpose()?;
-    let container::Container { root: mut tree, binary } = container::split(bytes, limits)?;
+    let container::Container { root: mut tree, binary, told } = container::split(bytes, limits)?;
     let root = Item::new(&tree, "document".into())?;
     check::check_asset(&root)?;
     let mut buffers = container::load_buffers(&root, binary, folder.as_ref(), limits)?;
@@ -82,6 +88,7 @@ pub(super) fn read(
     let limits = &limits.of_file(all_bytes as u64);
     let data = accessor::Data::new(&root, buffers, limits)?;
     let check::Checked { mut warnings, instances } = check::check(&root, &data, limits)?;
+    warnings.extend(told);
     let nodes = root.list("nodes", "node", limits.objects)?;
     let animation = animation::read(&root, &data, &nodes, options, &mut warnings)?;
     let deformations = deform::Deformations::read(&root, &data, &nodes, limits, &mut warnings)?;
@@ -90,7 +97,11 @@ pub(super) fn read(
     let typed: gltf::json::Root =
         serde_json::from_value(reduced(&tree)).map_err(|e| SceneError::broken("JSON", e.to_string()))?;
     let document = gltf::Document::from_json_without_validation(typed);
-    let claims = flatten::choose_bodies(&document, options, &mut warnings)?;
+    let hidden = flatten::hidden(&document, &nodes)?;
+    if !hidden.is_empty() {
+        warnings.push(format!("{} nodes that the file hides ({}) are left out", hidden.len(), flatten::VISIBILITY));
+    }
+    let claims = flatten::choose_bodies(&document, &hidden, options, &mut warnings)?;
     let mut look = look::read_look(&document, &root, &data, folder.as_ref(), limits, cancel, &mut warnings)?;
     let world = flatten::world_from_file(options);
     let source = flatten::Source {
@@ -100,6 +111,7 @@ pub(super) fn read(
         instances: &instances,
         animation: &animation,
         deformations: &deformations,
+        hidden: &hidden,
         world,
     };
     let (flat, paint) = flatten::flatten(&source, &claims, limits, cancel, &mut warnings)?;

@@ -1,4 +1,4 @@
-//! Decodes an image of a glTF file, PNG, JPEG or KTX2, to 8-bit RGBA; checks its size before anything of that size is
+//! Decodes an image of a scene, PNG, JPEG, KTX2, WebP, TIFF, BMP or TGA, to 8-bit RGBA; checks its size before anything of that size is
 //! taken.
 
 use std::io::Cursor;
@@ -51,33 +51,22 @@ impl Picture {
     }
 }
 
-/// Decodes PNG, JPEG or KTX2. `texels_so_far` counts those of the scene's other textures.
+/// Decodes a picture. `name`, its URI or media type, tells a TGA, whose bytes do not. `texels_so_far` counts those of the scene's
+/// other textures.
 ///
 /// # Errors
 /// Another format, damaged data, and sizes beyond the limits; the text names `item`.
 pub(super) fn decode(
     item: &Item,
     bytes: &[u8],
+    name: &str,
     texels_so_far: u64,
     limits: &Limits,
 ) -> Result<Picture, SceneError> {
     if ktx2_image::is_ktx2(bytes) {
         return ktx2_image::decode(item, bytes, texels_so_far, limits);
     }
-    let format = match image::guess_format(bytes) {
-        Ok(format @ (ImageFormat::Png | ImageFormat::Jpeg)) => format,
-        Ok(other) => {
-            return Err(SceneError::unsupported(
-                format!("{}: an image of format {other:?}", item.name),
-                "re-export with PNG or JPEG textures",
-            ))
-        }
-        Err(_) => {
-            return Err(
-                item.error("is neither PNG nor JPEG nor KTX2: re-export with PNG, JPEG or KTX2 textures")
-            )
-        }
-    };
+    let format = format_of(item, bytes, name)?;
     let reader = || ImageReader::with_format(Cursor::new(bytes), format);
     let failed = |e: image::ImageError| item.error(format!("cannot be decoded: {e}"));
     let (width, height) = reader().into_dimensions().map_err(failed)?;
@@ -93,6 +82,40 @@ pub(super) fn decode(
     let rgba = bounded.decode().map_err(failed)?.into_rgba8();
     let texels = rgba.as_raw().chunks_exact(4).map(|c| [c[0], c[1], c[2], c[3]]).collect();
     Ok(Picture { size, texels, srgb: None, red_green_only: false, cut_off: false })
+}
+
+/// The format of an image by its first bytes. TGA has none of its own: its header, its last bytes or its name show it.
+fn format_of(item: &Item, bytes: &[u8], name: &str) -> Result<ImageFormat, SceneError> {
+    use ImageFormat::{Bmp, Jpeg, Png, Tga, Tiff, WebP};
+    match image::guess_format(bytes) {
+        Ok(format @ (Png | Jpeg | Bmp | Tiff | WebP)) => Ok(format),
+        Ok(other) => Err(SceneError::unsupported(
+            format!("{}: an image of format {other:?}", item.name),
+            "convert it to PNG",
+        )),
+        Err(_) => {
+            let name = name.to_ascii_lowercase();
+            let is_named = name.ends_with(".tga") || name.contains("image/x-tga") || name.contains("image/tga");
+            // Kind of palette, kind of image, bits of a texel.
+            let is_plausible = matches!(bytes, [_, 0 | 1, 1..=3 | 9..=11, ..])
+                && matches!(bytes.get(16), Some(8 | 15 | 16 | 24 | 32));
+            if is_plausible && (is_named || bytes.ends_with(b"TRUEVISION-XFILE.\0") || name.is_empty()) {
+                return Ok(Tga);
+            }
+            Err(item.error("is no PNG, JPEG, KTX2, WebP, TIFF, BMP or TGA: convert it to PNG"))
+        }
+    }
+}
+
+/// Checks format and size of a picture that is decoded later.
+pub(super) fn check(item: &Item, bytes: &[u8], name: &str, limits: &Limits) -> Result<(), SceneError> {
+    if ktx2_image::is_ktx2(bytes) {
+        return Ok(());
+    }
+    let format = format_of(item, bytes, name)?;
+    let sides = ImageReader::with_format(Cursor::new(bytes), format).into_dimensions();
+    let (width, height) = sides.map_err(|e| item.error(format!("cannot be decoded: {e}")))?;
+    check_size(item, Size { width, height }, 0, limits)
 }
 
 /// Refuses a picture without texels, or with more than the limits allow.

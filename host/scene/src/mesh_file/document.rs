@@ -38,6 +38,8 @@ pub(super) struct Document {
     pub materials: Vec<Value>,
     /// URIs of images, one for each texture.
     pub textures: Vec<String>,
+    /// What was taken off all positions, in the file's own unit and axes.
+    pub offset: [f64; 3],
     /// What is not reproduced, for the operator.
     pub warnings: Vec<String>,
 }

@@ -1,8 +1,14 @@
 //! Reads OBJ, PLY and STL files as a [`Scene`]: each into a [`document::Document`], and that through the reader of glTF.
 //!
-//! These formats name no unit and no upward axis; [`units`] guesses both, and the rig file corrects them.
+//! These formats name no unit and no upward axis; [`units`] guesses both, and the rig file corrects them. They store no side
+//! either: surfaces without a material reflect on both.
+//!
+//! No library takes the place of these readers. `tobj` ends at the first line that it cannot read, and readers of PLY build a
+//! map of names for every vertex, whose memory no length of a file bounds; binary STL that begins with the word of a text, and
+//! lengths that are wrong, are read by none. What a part of a file lacks is left out here and counted.
 
 mod document;
+mod far;
 mod mtl;
 mod obj;
 mod ply;
@@ -38,11 +44,21 @@ impl MeshFormat {
         match (bytes, ending.as_deref()) {
             ([b'g', b'l', b'T', b'F', ..], _) => None,
             ([b'p', b'l', b'y', b'\r' | b'\n', ..], _) => Some(Self::Ply),
+            // Some programs write one format under the ending of another.
+            (_, Some("obj" | "ply" | "gltf" | "glb")) if stl::is_binary(bytes) && !is_text(bytes) => {
+                Some(Self::Stl)
+            }
+            (_, Some("ply" | "gltf" | "glb" | "stl")) if !begins_json(bytes) && obj::is_likely(bytes) => {
+                Some(Self::Obj)
+            }
+            (_, Some("obj" | "ply" | "glb")) if stl::is_text(bytes) => Some(Self::Stl),
+            (_, Some("obj" | "ply" | "stl")) if begins_json(bytes) => None,
             (_, Some("obj")) => Some(Self::Obj),
             (_, Some("ply")) => Some(Self::Ply),
             (_, Some("stl")) => Some(Self::Stl),
             (_, Some("glb" | "gltf")) => None,
-            _ => (bytes.starts_with(b"solid") || stl::is_binary(bytes)).then_some(Self::Stl),
+            _ if stl::is_text(bytes) || stl::is_binary(bytes) => Some(Self::Stl),
+            _ => obj::is_likely(bytes).then_some(Self::Obj),
         }
     }
 
@@ -53,6 +69,17 @@ impl MeshFormat {
             Self::Stl => "STL",
         }
     }
+}
+
+/// Whether the beginning of a file is text.
+fn is_text(bytes: &[u8]) -> bool {
+    bytes.iter().take(1024).all(|b| *b >= b' ' || b.is_ascii_whitespace())
+}
+
+/// Whether a file begins as a document of glTF.
+fn begins_json(bytes: &[u8]) -> bool {
+    let bytes = bytes.strip_prefix(b"\xef\xbb\xbf").unwrap_or(bytes);
+    bytes.trim_ascii_start().first() == Some(&b'{')
 }
 
 /// Reads `bytes`, the content of a file of `format`; files that it names are searched in the folder of `beside`.
@@ -78,6 +105,9 @@ pub(super) fn read(
         document.objects = vec![document::Object { name, parts }];
     }
     let (axes, told) = units::axes(&document, format, options);
+    if let Some(told) = far::centre(&mut document, axes.scale) {
+        document.warnings.push(told);
+    }
     let warnings = std::mem::take(&mut document.warnings);
     let glb = document.to_glb();
     drop::<Document>(document);
@@ -87,8 +117,16 @@ pub(super) fn read(
     Ok(scene)
 }
 
-/// The text of a file, line by line with numbers from 1; what is no UTF-8 is replaced, since only names hold such bytes. A
-/// backslash at the end of a line joins it with the next.
+/// Text as UTF-8, or as Latin-1 where it is none.
+fn text_of(bytes: &[u8]) -> std::borrow::Cow<'_, str> {
+    match std::str::from_utf8(bytes) {
+        Ok(text) => text.into(),
+        Err(_) => bytes.iter().map(|b| char::from(*b)).collect::<String>().into(),
+    }
+}
+
+/// The text of a file, line by line with numbers from 1; a line that is no UTF-8 is Latin-1, since only names hold such bytes.
+/// Lines end as on any system. A backslash at the end of a line joins it with the next.
 fn lines(bytes: &[u8]) -> impl Iterator<Item = (usize, std::borrow::Cow<'_, str>)> {
     let mut number = 0;
     let mut rest = Some(bytes);
@@ -98,11 +136,13 @@ fn lines(bytes: &[u8]) -> impl Iterator<Item = (usize, std::borrow::Cow<'_, str>
         let mut joined = Vec::new();
         loop {
             number += 1;
-            let (line, after) = match text.iter().position(|&b| b == b'\n') {
-                Some(end) => (&text[..end], Some(&text[end + 1..])),
+            let (line, after) = match text.iter().position(|&b| b == b'\n' || b == b'\r') {
+                Some(end) => {
+                    let both = text[end..].starts_with(b"\r\n");
+                    (&text[..end], Some(&text[end + 1 + usize::from(both)..]))
+                }
                 None => (text, None),
             };
-            let line = line.strip_suffix(b"\r").unwrap_or(line);
             rest = after;
             match (line.strip_suffix(b"\\"), after) {
                 (Some(part), Some(next)) => {
@@ -110,10 +150,10 @@ fn lines(bytes: &[u8]) -> impl Iterator<Item = (usize, std::borrow::Cow<'_, str>
                     joined.push(b' ');
                     text = next;
                 }
-                _ if joined.is_empty() => return Some((first, String::from_utf8_lossy(line))),
+                _ if joined.is_empty() => return Some((first, text_of(line))),
                 _ => {
                     joined.extend_from_slice(line);
-                    return Some((first, String::from_utf8_lossy(&joined).into_owned().into()));
+                    return Some((first, text_of(&joined).into_owned().into()));
                 }
             }
         }
@@ -125,7 +165,7 @@ fn numbers<'a, const N: usize>(
     line: usize,
     words: &mut impl Iterator<Item = &'a str>,
     what: &str,
-) -> Result<[f32; N], SceneError> {
+) -> Result<[f64; N], SceneError> {
     let mut out = [0.0; N];
     for slot in &mut out {
         // "nan" and "inf" are numbers here: the reader leaves out the triangles that have them.

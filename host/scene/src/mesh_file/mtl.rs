@@ -5,21 +5,23 @@ use crate::gltf_file;
 use crate::limits::Limits;
 use crate::SceneError;
 use serde_json::{json, Value};
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 use std::path::Path;
 
-/// A matt material of full albedo.
+/// Names that a message shows.
+const SHOWN: usize = 8;
+
+/// A matt material of full albedo on both sides.
 pub(super) fn plain(name: &str) -> Value {
-    json!({"name": name, "pbrMetallicRoughness": {"metallicFactor": 0.0, "roughnessFactor": 1.0}})
+    json!({
+        "name": name, "doubleSided": true, "pbrMetallicRoughness": {"metallicFactor": 0.0, "roughnessFactor": 1.0}
+    })
 }
 
-/// `Ok` if the picture that a URI names can be read and is PNG or JPEG; else why not.
+/// `Ok` if the picture that a URI names can be read; else why not.
 pub(super) fn picture(uri: &str, beside: Option<&Path>, limits: &Limits) -> Result<(), String> {
     let bytes = gltf_file::fetch_beside(uri, beside, limits.bytes).map_err(|e| e.to_string())?;
-    match image::guess_format(&bytes) {
-        Ok(image::ImageFormat::Png | image::ImageFormat::Jpeg) => Ok(()),
-        _ => Err("it is neither PNG nor JPEG".into()),
-    }
+    gltf_file::check_image(&bytes, uri, limits).map_err(|e| e.to_string())
 }
 
 /// What a statement of a material may say.
@@ -97,19 +99,41 @@ pub(super) struct Library {
     ignored: BTreeMap<&'static str, usize>,
     /// Files that cannot be read, and why.
     missing: Vec<String>,
+    /// Names of materials that no file has declared before.
+    undeclared: BTreeSet<String>,
+    /// More for the operator.
+    pub told: Vec<String>,
 }
 
 impl Library {
-    /// Reads the file `name` beside the OBJ file. One that cannot be read is noted: its materials are white.
-    pub(super) fn add_file(
+    /// Reads the files that `names` gives, which may be one name with blanks or several names, beside the OBJ file. One that
+    /// cannot be read is noted: its materials are white.
+    pub(super) fn add_files(
         &mut self,
-        name: &str,
+        names: &str,
         beside: Option<&Path>,
         limits: &Limits,
     ) -> Result<(), SceneError> {
-        match gltf_file::fetch_beside(&uri_of(name), beside, limits.json_bytes) {
+        let fetch = |name: &str| gltf_file::fetch_beside(&uri_of(name), beside, limits.json_bytes);
+        let several: Vec<&str> = names.split_ascii_whitespace().collect();
+        let whole = fetch(names);
+        if several.len() < 2 || whole.is_ok() {
+            return self.add_file(names, whole, beside, limits);
+        }
+        several.into_iter().take(64).try_for_each(|name| self.add_file(name, fetch(name), beside, limits))
+    }
+
+    fn add_file(
+        &mut self,
+        name: &str,
+        content: Result<Vec<u8>, SceneError>,
+        beside: Option<&Path>,
+        limits: &Limits,
+    ) -> Result<(), SceneError> {
+        match content {
             Ok(bytes) => {
-                self.add(&bytes, beside, limits).map_err(|e| SceneError::broken(name, e.to_string()))
+                let bytes = bytes.strip_prefix(b"\xef\xbb\xbf").unwrap_or(&bytes);
+                self.add(bytes, beside, limits).map_err(|e| SceneError::broken(name, e.to_string()))
             }
             Err(e) => {
                 self.missing.push(format!("{name} ({e})"));
@@ -118,12 +142,23 @@ impl Library {
         }
     }
 
-    /// Number of the material of a name; a name that no file has declared is white.
+    /// Number of the material of a name; a name that no file has declared is white. Where no file has its letters, one that
+    /// has them in another case is meant.
     pub(super) fn material(&mut self, name: &str) -> usize {
         if let Some(&number) = self.numbers.get(name) {
             return number;
         }
+        let mut near = self.numbers.iter().filter(|(known, _)| known.to_lowercase() == name.to_lowercase());
+        if let (Some((_, &number)), None) = (near.next(), near.next()) {
+            return number;
+        }
+        self.undeclared.insert(name.to_owned());
         self.declare(name)
+    }
+
+    /// Number of the material of faces that name none.
+    pub(super) fn white(&mut self) -> usize {
+        self.declare("white")
     }
 
     fn declare(&mut self, name: &str) -> usize {
@@ -140,7 +175,11 @@ impl Library {
             let Some(word) = words.next() else { continue };
             let rest = text.trim_start()[word.len()..].trim();
             if word == "newmtl" {
-                current = Some(self.declare(rest));
+                // One that the mesh has named before is described now.
+                current = Some(match self.numbers.get(rest) {
+                    Some(&known) if self.undeclared.remove(rest) => known,
+                    _ => self.declare(rest),
+                });
                 SceneError::check_limit(
                     "the number of materials",
                     self.looks.len() as u64,
@@ -154,7 +193,10 @@ impl Library {
             if word.starts_with("map_") || matches!(word, "bump" | "norm" | "disp" | "decal" | "refl") {
                 self.texture(number, word, rest, beside, limits);
             } else {
-                self.statement(number, word, line, words)?;
+                let is_read = self.statement(number, word, line, words).is_ok();
+                if !is_read {
+                    *self.ignored.entry("statements without their numbers").or_default() += 1;
+                }
             }
         }
         Ok(())
@@ -173,7 +215,7 @@ impl Library {
             if words.peek().is_some_and(|w| matches!(*w, "spectral" | "xyz")) {
                 return Ok([1.0; 3]);
             }
-            let [first] = numbers::<1>(line, &mut words, what)?;
+            let [first] = numbers::<1>(line, &mut words, what)?.map(|x| x as f32);
             // One number stands for all three.
             let rest: Vec<f32> = words.map_while(|w| w.parse().ok()).collect();
             let all = [first, *rest.first().unwrap_or(&first), *rest.get(1).unwrap_or(&first)];
@@ -191,6 +233,9 @@ impl Library {
             }
             "Tr" if colour("Tr").is_ok_and(|t| t[0] > 0.0) => {
                 *self.ignored.entry("transparency (Tr)").or_default() += 1
+            }
+            "Pc" | "Pcr" | "Ps" | "aniso" | "anisor" | "Tf" => {
+                *self.ignored.entry("coats, sheen and filters").or_default() += 1;
             }
             _ => {}
         }
@@ -238,7 +283,12 @@ impl Library {
 
     /// What is not reproduced, each kind once.
     pub(super) fn warnings(&self) -> Vec<String> {
-        let mut told = vec![];
+        let mut told = self.told.clone();
+        if !self.undeclared.is_empty() {
+            let names = self.undeclared.iter().take(SHOWN).map(|name| super::shortened(name));
+            let names = names.collect::<Vec<_>>().join(", ");
+            told.push(format!("materials that no file describes are white: {names}"));
+        }
         if let Some(first) = self.missing.first() {
             let more = if self.missing.len() > 1 {
                 format!(" and {} more", self.missing.len() - 1)

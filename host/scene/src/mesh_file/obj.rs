@@ -3,70 +3,106 @@
 use super::document::{smooth_normals, Document, Object, Part};
 use super::mtl::Library;
 use super::ply::add_fan;
-use super::{linear, lines, numbers};
+use super::{far, linear, lines, numbers};
 use crate::limits::{Cancel, Limits};
 use crate::SceneError;
 use std::collections::{BTreeMap, HashMap};
 use std::path::Path;
 
-/// A corner of a face: position, and texture coordinates and normal if it names them.
-type Corner = (u32, Option<u32>, Option<u32>);
+/// Number of a list's member that a corner does not name.
+const NONE: u32 = u32::MAX;
+
+/// A corner of a face: numbers of its position, texture coordinates and normal, or [`NONE`].
+type Corner = [u32; 3];
 
 /// The lists that faces refer to.
 #[derive(Default)]
 struct Lists {
-    positions: Vec<[f32; 3]>,
+    positions: Vec<[f64; 3]>,
     /// Colours after the positions; those before the first one that has a colour are white.
     colours: Vec<[f32; 3]>,
     uvs: Vec<[f32; 2]>,
     normals: Vec<[f32; 3]>,
 }
 
-/// Faces of one material in one object.
+/// Faces of one material in one object, as the file has them: what they name may stand behind them.
 #[derive(Default)]
 struct Faces {
-    part: Part,
-    known: HashMap<Corner, u32>,
-    has_uvs: bool,
-    has_normals: bool,
+    corners: Vec<Corner>,
+    /// Number of corners of each face.
+    sizes: Vec<u32>,
     is_smooth: bool,
 }
 
-impl Faces {
-    fn corner(&mut self, lists: &Lists, corner: Corner) -> u32 {
-        if let Some(&known) = self.known.get(&corner) {
-            return known;
-        }
-        let (position, uv, normal) = corner;
-        let part = &mut self.part;
-        part.positions.push(lists.positions[position as usize]);
-        if let Some(colour) = lists.colours.get(position as usize) {
-            part.colours.push(*colour);
-        }
-        part.uvs.push(uv.map_or([0.0; 2], |i| lists.uvs[i as usize]));
-        // Zero is repaired by the reader of glTF.
-        part.normals.push(normal.map_or([0.0; 3], |i| lists.normals[i as usize]));
-        self.has_uvs |= uv.is_some();
-        self.has_normals |= normal.is_some();
-        let number = part.positions.len() as u32 - 1;
-        self.known.insert(corner, number);
-        number
-    }
+/// What is left out of the faces, with how often.
+#[derive(Default)]
+struct Lost {
+    faces: usize,
+    uvs: usize,
+    normals: usize,
+}
 
-    fn into_part(self) -> Part {
-        let Self { mut part, has_uvs, has_normals, is_smooth, .. } = self;
+impl Faces {
+    /// The triangles of the faces whose vertices are there; `near` are the positions in single precision.
+    fn into_part(self, lists: &Lists, near: &[[f32; 3]], lost: &mut Lost) -> Part {
+        let mut part = Part::default();
+        let mut known: HashMap<Corner, u32> = HashMap::new();
+        let (mut has_uvs, mut has_normals) = (false, false);
+        let mut rest = &self.corners[..];
+        let mut fan = vec![];
+        for size in self.sizes {
+            let (face, after) = rest.split_at(size as usize);
+            rest = after;
+            if face.iter().any(|c| c[0] as usize >= near.len()) {
+                lost.faces += 1;
+                continue;
+            }
+            fan.clear();
+            for &[position, uv, normal] in face {
+                let (has_uv, has_normal) =
+                    ((uv as usize) < lists.uvs.len(), (normal as usize) < lists.normals.len());
+                lost.uvs += usize::from(uv != NONE && !has_uv);
+                lost.normals += usize::from(normal != NONE && !has_normal);
+                let corner =
+                    [position, if has_uv { uv } else { NONE }, if has_normal { normal } else { NONE }];
+                fan.push(*known.entry(corner).or_insert_with(|| {
+                    part.positions.push(near[position as usize]);
+                    if !lists.colours.is_empty() {
+                        part.colours.push(lists.colours.get(position as usize).copied().unwrap_or([1.0; 3]));
+                    }
+                    part.uvs.push(if has_uv { lists.uvs[uv as usize] } else { [0.0; 2] });
+                    // Zero is repaired by the reader of glTF.
+                    part.normals.push(if has_normal { lists.normals[normal as usize] } else { [0.0; 3] });
+                    part.positions.len() as u32 - 1
+                }));
+                (has_uvs, has_normals) = (has_uvs | has_uv, has_normals | has_normal);
+            }
+            add_fan(&fan, &mut part.triangles);
+        }
         if !has_uvs {
             part.uvs.clear();
         }
         if !has_normals {
-            part.normals = if is_smooth { smooth_normals(&part.positions, &part.triangles) } else { vec![] };
-        }
-        // Corners before the first coloured vertex have none.
-        if part.colours.len() < part.positions.len() {
-            part.colours.clear();
+            part.normals =
+                if self.is_smooth { smooth_normals(&part.positions, &part.triangles) } else { vec![] };
         }
         part
     }
+}
+
+/// Whether a file of no known ending is one: vertices and faces stand in it line by line.
+pub(super) fn is_likely(bytes: &[u8]) -> bool {
+    let begin = &bytes[..bytes.len().min(65_536)];
+    let is_line = |line: &[u8]| {
+        let line = line.trim_ascii_start();
+        ["v ", "v\t", "vt ", "vn ", "f ", "mtllib ", "usemtl "].iter().any(|w| line.starts_with(w.as_bytes()))
+    };
+    let lines = begin.split(|b| matches!(b, b'\n' | b'\r'));
+    let (mut known, mut other) = (0, 0);
+    for line in lines.filter(|l| !l.trim_ascii().is_empty() && !l.trim_ascii_start().starts_with(b"#")).take(200) {
+        *(if is_line(line) { &mut known } else { &mut other }) += 1;
+    }
+    known > 3 && known > 4 * other
 }
 
 /// What is read line by line.
@@ -81,6 +117,8 @@ struct Reader<'a> {
     is_smooth: bool,
     triangles: u64,
     ignored: BTreeMap<&'static str, usize>,
+    /// Colours that ZBrush writes into comments, for the vertices in their order.
+    of_comments: Vec<[f32; 3]>,
     beside: Option<&'a Path>,
     limits: &'a Limits,
 }
@@ -96,7 +134,8 @@ pub(super) fn read(
     if bytes.starts_with(&[0xfe, 0xff]) || bytes.starts_with(&[0xff, 0xfe]) {
         return Err(SceneError::unsupported("text in UTF-16", "save the file as UTF-8"));
     }
-    let has_objects = bytes.split(|&b| b == b'\n').any(|line| line.trim_ascii_start().starts_with(b"o "));
+    let bytes = bytes.strip_prefix(b"\xef\xbb\xbf").unwrap_or(bytes);
+    let has_objects = bytes.split(|&b| matches!(b, b'\n' | b'\r')).any(|line| line.trim_ascii_start().starts_with(b"o "));
     let mut reader = Reader {
         lists: Lists::default(),
         library: Library::default(),
@@ -106,6 +145,7 @@ pub(super) fn read(
         is_smooth: false,
         triangles: 0,
         ignored: BTreeMap::new(),
+        of_comments: vec![],
         beside,
         limits,
     };
@@ -120,29 +160,50 @@ pub(super) fn read(
 
 impl Reader<'_> {
     fn line(&mut self, line: usize, text: &str) -> Result<(), SceneError> {
+        if let Some(colours) = text.trim_start().strip_prefix("#MRGB") {
+            return self.comment(colours);
+        }
         let text = text.split('#').next().unwrap_or_default();
         let mut words = text.split_ascii_whitespace();
         let Some(word) = words.next() else { return Ok(()) };
         let rest = || text.trim_start()[word.len()..].trim();
         match word {
-            "v" => self.vertex(line, &mut words)?,
+            "v" => self.vertex(line, &mut words),
             "vt" => {
-                let [u] = numbers::<1>(line, &mut words, "vt")?;
-                let v = words.next().and_then(|w| w.parse().ok()).unwrap_or(0.0);
+                let mut number = || words.next().and_then(|w| w.parse().ok()).unwrap_or(0.0);
                 // v points up here and down in glTF.
-                self.lists.uvs.push([u, 1.0 - v]);
+                self.lists.uvs.push([number(), 1.0 - number()]);
             }
-            "vn" => self.lists.normals.push(numbers(line, &mut words, "vn")?),
-            "f" | "fo" => self.face(line, &mut words)?,
+            // Zero is repaired by the reader of glTF.
+            "vn" => self.lists.normals.push(
+                numbers::<3>(line, &mut words, "vn").map_or([0.0; 3], |n| n.map(|x| x as f32)),
+            ),
+            "f" | "fo" => self.face(&mut words)?,
             "o" | "g" if word == self.begins => self.begin(rest()),
             "usemtl" => self.material = Some(self.library.material(rest())),
-            "mtllib" => self.library.add_file(rest(), self.beside, self.limits)?,
+            "mtllib" => self.library.add_files(rest(), self.beside, self.limits)?,
             "s" => self.is_smooth = !matches!(words.next(), None | Some("off" | "0")),
             "l" | "p" => *self.ignored.entry("points and lines").or_default() += 1,
             "vp" | "curv" | "curv2" | "surf" | "cstype" => {
                 *self.ignored.entry("curves and surfaces").or_default() += 1;
             }
-            _ => {}
+            "call" | "csh" | "ctech" | "stech" | "surf2" | "deg" | "bmat" | "hole" | "trim" => {
+                *self.ignored.entry("curves and surfaces").or_default() += 1;
+            }
+            "g" | "o" | "mg" | "lod" | "bevel" | "c_interp" | "d_interp" | "shadow_obj" | "trace_obj"
+            | "end" | "parm" | "con" | "sp" | "usemap" | "maplib" => {}
+            _ => *self.ignored.entry("lines that begin with no word of the format").or_default() += 1,
+        }
+        Ok(())
+    }
+
+    /// Colours of ZBrush: for each vertex two digits of a mask and six of its colour.
+    fn comment(&mut self, colours: &str) -> Result<(), SceneError> {
+        for word in colours.trim().as_bytes().chunks_exact(8) {
+            let word = std::str::from_utf8(word).ok().and_then(|w| u32::from_str_radix(w, 16).ok());
+            let Some(word) = word else { break };
+            let byte = |shift: u32| linear((word >> shift & 255) as f32 / 255.0);
+            self.of_comments.push([byte(16), byte(8), byte(0)]);
         }
         Ok(())
     }
@@ -155,55 +216,83 @@ impl Reader<'_> {
         }
     }
 
-    fn vertex<'a>(
-        &mut self,
-        line: usize,
-        words: &mut impl Iterator<Item = &'a str>,
-    ) -> Result<(), SceneError> {
-        self.lists.positions.push(numbers(line, words, "v")?);
+    fn vertex<'a>(&mut self, line: usize, words: &mut impl Iterator<Item = &'a str>) {
+        // Faces count the vertices: one that is damaged keeps its number, and the reader of glTF leaves out what has it.
+        let at = numbers(line, words, "v").unwrap_or_else(|_| {
+            *self.ignored.entry("vertices that are no three numbers").or_default() += 1;
+            [f64::NAN; 3]
+        });
+        self.lists.positions.push(at);
         let more: Vec<f32> = words.map_while(|w| w.parse().ok()).take(4).collect();
         // x y z r g b, or x y z w r g b; a fourth number alone is the weight of a curve.
         let colour = match more[..] {
             [r, g, b] => [r, g, b],
             [_, r, g, b] => [r, g, b],
-            _ if self.lists.colours.is_empty() => return Ok(()),
+            _ if self.lists.colours.is_empty() => return,
             _ => [1.0; 3],
         };
         self.lists.colours.resize(self.lists.positions.len() - 1, [1.0; 3]);
         self.lists.colours.push(colour.map(linear));
-        Ok(())
     }
 
-    fn face<'a>(&mut self, line: usize, words: &mut impl Iterator<Item = &'a str>) -> Result<(), SceneError> {
-        let corners: Vec<Corner> =
-            words.map(|word| corner(line, word, &self.lists)).collect::<Result<_, _>>()?;
-        if corners.len() < 3 {
+    fn face<'a>(&mut self, words: &mut impl Iterator<Item = &'a str>) -> Result<(), SceneError> {
+        let Some((_, faces)) = self.objects.last_mut() else { return Ok(()) };
+        let faces = faces.entry(self.material).or_default();
+        let begin = faces.corners.len();
+        for word in words {
+            let corner = corner(word, &self.lists);
+            // A corner that is none damages its face, which is counted as the others are.
+            faces.corners.push(corner.unwrap_or([NONE; 3]));
+        }
+        let size = faces.corners.len() - begin;
+        if size < 3 {
+            faces.corners.truncate(begin);
             *self.ignored.entry("faces of less than 3 corners").or_default() += 1;
             return Ok(());
         }
-        self.triangles += corners.len() as u64 - 2;
+        self.triangles += size as u64 - 2;
         let limit = self.limits.triangles;
         SceneError::check_limit("the number of triangles", self.triangles, limit, "decimate the mesh")?;
-        let Some((_, faces)) = self.objects.last_mut() else { return Ok(()) };
-        let faces = faces.entry(self.material).or_default();
         faces.is_smooth |= self.is_smooth;
-        let corners: Vec<u32> = corners.into_iter().map(|corner| faces.corner(&self.lists, corner)).collect();
-        add_fan(&corners, &mut faces.part.triangles);
+        faces.sizes.push(size as u32);
         Ok(())
     }
 
     fn into_document(mut self) -> Result<Document, SceneError> {
         let white = self.objects.iter().any(|(_, faces)| faces.contains_key(&None));
-        let white = white.then(|| self.library.material("white"));
+        let white = white.then(|| self.library.white());
+        if self.lists.colours.is_empty() && self.of_comments.len() >= self.lists.positions.len() {
+            self.lists.colours = std::mem::take(&mut self.of_comments);
+        }
+        let (near, offset) = far::single(&self.lists.positions);
+        let mut lost = Lost::default();
         let objects = self.objects.into_iter().map(|(name, faces)| {
-            let parts = faces
-                .into_iter()
-                .map(|(material, faces)| Part { material: material.or(white), ..faces.into_part() });
+            let parts = faces.into_iter().map(|(material, faces)| Part {
+                material: material.or(white),
+                ..faces.into_part(&self.lists, &near, &mut lost)
+            });
             Object { name, parts: parts.collect() }
         });
-        let objects: Vec<Object> = objects.filter(|object| !object.parts.is_empty()).collect();
+        let has_triangles = |object: &Object| object.parts.iter().any(|part| !part.triangles.is_empty());
+        let objects: Vec<Object> = objects.filter(has_triangles).collect();
+        for (count, what) in [
+            (lost.faces, "faces name vertices that are not there"),
+            (lost.uvs, "corners name texture coordinates that are not there"),
+            (lost.normals, "corners name normals that are not there"),
+        ] {
+            if count > 0 {
+                self.library.told.push(format!("{count} {what}: they are left out"));
+            }
+        }
+        if !self.of_comments.is_empty() {
+            self.library.told.push("comments of ZBrush colour not all vertices: they are left out".into());
+        }
         if objects.is_empty() {
-            return Err(SceneError::broken("file", "has no faces ('f'): is this an OBJ file of a mesh?"));
+            let why = match lost.faces {
+                0 => "has no faces ('f'): is this an OBJ file of a mesh?".to_owned(),
+                n => format!("has no face whose vertices are there: {n} name others"),
+            };
+            return Err(SceneError::broken("file", why));
         }
         let mut warnings = self.library.warnings();
         if !self.ignored.is_empty() {
@@ -211,28 +300,25 @@ impl Reader<'_> {
                 self.ignored.iter().map(|(what, times)| format!("{what} ({times} times)")).collect();
             warnings.push(format!("the file has what reflects no light: {}", all.join(", ")));
         }
-        Ok(Document { objects, materials: self.library.materials(), textures: self.library.uris, warnings })
+        let materials = self.library.materials();
+        Ok(Document { objects, materials, textures: self.library.uris, offset, warnings })
     }
 }
 
-/// `1`, `1/2`, `1//3` or `1/2/3`; numbers below zero count from the end of their list.
-fn corner(line: usize, word: &str, lists: &Lists) -> Result<Corner, SceneError> {
-    let wrong = |problem: String| SceneError::broken(format!("line {line}"), problem);
-    let index = |part: &str, length: usize, what: &str| -> Result<u32, SceneError> {
-        let number: i64 = part
-            .parse()
-            .map_err(|_| wrong(format!("has the corner '{}', which is none", super::shortened(word))))?;
+/// `1`, `1/2`, `1//3` or `1/2/3`; numbers below zero count from the end of their list. `None` if it is none of these. What it
+/// names may still come.
+fn corner(word: &str, lists: &Lists) -> Option<Corner> {
+    let index = |part: &str, length: usize| -> Option<u32> {
+        let number: i64 = part.parse().ok()?;
         let index = if number < 0 { length as i64 + number } else { number - 1 };
-        u32::try_from(index)
-            .ok()
-            .filter(|&i| (i as usize) < length)
-            .ok_or_else(|| wrong(format!("names {what} {number}, but there are {length} before it")))
+        u32::try_from(index).ok().filter(|i| *i != NONE)
     };
     let mut parts = word.split('/');
-    let position = index(parts.next().unwrap_or_default(), lists.positions.len(), "vertex")?;
-    let uv = parts.next().filter(|part| !part.is_empty());
-    let normal = parts.next().filter(|part| !part.is_empty());
-    let uv = uv.map(|part| index(part, lists.uvs.len(), "texture coordinate")).transpose()?;
-    let normal = normal.map(|part| index(part, lists.normals.len(), "normal")).transpose()?;
-    Ok((position, uv, normal))
+    let position = index(parts.next().unwrap_or_default(), lists.positions.len())?;
+    // A number that is none names nothing, and is counted with those that are not there.
+    let mut other = |length: usize| match parts.next().filter(|part| !part.is_empty()) {
+        Some(part) => index(part, length).unwrap_or(NONE - 1),
+        None => NONE,
+    };
+    Some([position, other(lists.uvs.len()), other(lists.normals.len())])
 }

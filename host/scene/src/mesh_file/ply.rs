@@ -1,7 +1,7 @@
 //! PLY: a header that declares elements and their properties, then their values as text or as bytes of either order.
 
 use super::document::{smooth_normals, Document, Object, Part};
-use super::{linear, mtl, uri_of};
+use super::{far, linear, mtl, uri_of};
 use crate::limits::{Cancel, Limits};
 use crate::SceneError;
 use serde_json::json;
@@ -10,6 +10,7 @@ use std::path::Path;
 /// Elements and properties of a header beyond which it counts as damage.
 const MAX_ELEMENTS: usize = 64;
 const MAX_PROPERTIES: usize = 256;
+const MAX_TEXTURES: usize = 256;
 /// Corners of one face beyond which it counts as damage.
 const MAX_CORNERS: usize = 65_536;
 
@@ -82,7 +83,7 @@ struct Element {
 struct Header {
     form: Form,
     elements: Vec<Element>,
-    texture: Option<String>,
+    textures: Vec<String>,
 }
 
 fn broken(problem: impl Into<String>) -> SceneError {
@@ -91,7 +92,7 @@ fn broken(problem: impl Into<String>) -> SceneError {
 
 /// The header, and the bytes after it.
 fn read_header(bytes: &[u8]) -> Result<(Header, &[u8]), SceneError> {
-    let mut header = Header { form: Form::Text, elements: vec![], texture: None };
+    let mut header = Header { form: Form::Text, elements: vec![], textures: vec![] };
     let mut has_form = false;
     let mut rest = bytes;
     for number in 1.. {
@@ -103,8 +104,8 @@ fn read_header(bytes: &[u8]) -> Result<(Header, &[u8]), SceneError> {
         rest = &rest[end + 1 + usize::from(both)..];
         let words: Vec<&str> = line.split_ascii_whitespace().collect();
         match words[..] {
-            ["end_header"] if has_form => return Ok((header, rest)),
-            ["format", form, _] => {
+            ["end_header", ..] if has_form => return Ok((header, rest)),
+            ["format", form, ..] => {
                 has_form = true;
                 header.form = match form {
                     "ascii" => Form::Text,
@@ -113,7 +114,9 @@ fn read_header(bytes: &[u8]) -> Result<(Header, &[u8]), SceneError> {
                     other => return Err(broken(format!("names the format '{other}', which is none of PLY"))),
                 };
             }
-            ["comment", "TextureFile", ..] => header.texture = Some(words[2..].join(" ")),
+            ["comment", "TextureFile", ..] if header.textures.len() < MAX_TEXTURES => {
+                header.textures.push(words[2..].join(" "));
+            }
             ["element" | "property", ..] => declare(&words, &mut header.elements).ok_or_else(|| {
                 broken(format!("line {number} is no declaration: {}", super::shortened(&line)))
             })?,
@@ -193,17 +196,11 @@ impl Values<'_> {
         self.rest = &self.rest[end..];
     }
 
-    /// One element; lists are given to `list` with the number of their property.
-    fn element(
-        &mut self,
-        element: &Element,
-        row: &mut Vec<f64>,
-        list: &mut Vec<f64>,
-        wanted: Option<usize>,
-    ) -> Option<()> {
+    /// One element; `lists` get the members of its lists, one for each property.
+    fn element(&mut self, element: &Element, row: &mut Vec<f64>, lists: &mut [Vec<f64>]) -> Option<()> {
         row.clear();
-        list.clear();
-        for (i, property) in element.properties.iter().enumerate() {
+        for (property, list) in element.properties.iter().zip(lists) {
+            list.clear();
             let Some(count) = property.count else {
                 row.push(self.next(property.kind)?);
                 continue;
@@ -211,35 +208,51 @@ impl Values<'_> {
             row.push(0.0);
             let count = self.next(count).filter(|n| *n >= 0.0)?;
             for _ in 0..count as u64 {
-                let value = self.next(property.kind)?;
-                if wanted == Some(i) {
-                    list.push(value);
-                }
+                list.push(self.next(property.kind)?);
             }
         }
         Some(())
     }
 
-    /// An error unless the rest of the file can hold all of an element.
-    fn check_room(&self, element: &Element) -> Result<(), SceneError> {
+    /// How many of an element the rest of the file can hold at most.
+    fn room(&self, element: &Element) -> usize {
         let size = |p: &Property| match (self.form, p.count) {
             // A digit, and a blank before the next one.
             (Form::Text, _) => 2,
             (_, Some(count)) => count.bytes(),
             (_, None) => p.kind.bytes(),
         };
-        let needed = element.properties.iter().map(size).sum::<usize>().saturating_mul(element.count);
-        if needed > self.rest.len() + 1 {
-            return Err(broken(format!(
-                "promises {} elements '{}', for which {} bytes are not enough: the file is cut off",
-                element.count,
-                element.name,
-                self.rest.len()
-            )));
-        }
-        Ok(())
+        let each = element.properties.iter().map(size).sum::<usize>().max(1);
+        (self.rest.len() + 1) / each
     }
 }
+
+/// The vertices of a file.
+#[derive(Default)]
+struct Vertices {
+    positions: Vec<[f64; 3]>,
+    normals: Vec<[f32; 3]>,
+    uvs: Vec<[f32; 2]>,
+    colours: Vec<[f32; 3]>,
+}
+
+/// The faces of a file as triangles, before it is known which vertices there are.
+#[derive(Default)]
+struct Faces {
+    /// Numbers of vertices.
+    triangles: Vec<[u32; 3]>,
+    /// Linear colour of each triangle, if faces have colours.
+    colours: Vec<[f32; 3]>,
+    /// Texture coordinates of each triangle's corners, if faces have them.
+    uvs: Vec<[[f32; 2]; 3]>,
+    /// Texture of each triangle, if the file has several.
+    textures: Vec<u32>,
+    /// Faces whose corners are no numbers of vertices.
+    damaged: usize,
+}
+
+/// Number of a corner that is none: no file has so many vertices.
+const NO_VERTEX: u32 = u32::MAX;
 
 /// Reads a file as one object.
 pub(super) fn read(
@@ -251,30 +264,28 @@ pub(super) fn read(
 ) -> Result<Document, SceneError> {
     let (header, rest) = read_header(bytes)?;
     let mut values = Values { form: header.form, rest, too_long: 0 };
-    let (mut part, mut document) = (Part::default(), Document::default());
-    let mut corners_of_texture = 0;
+    let (mut vertices, mut faces, mut document) = (Vertices::default(), Faces::default(), Document::default());
+    let mut unused: Vec<String> = vec![];
     for element in header.elements.iter().filter(|element| !element.properties.is_empty()) {
-        values.check_room(element)?;
-        let mut reader = Reader { element, limits, cancel, values: &mut values };
-        match element.name.as_str() {
-            "vertex" => reader.vertices(&mut part)?,
-            "face" | "tristrips" => {
-                corners_of_texture += usize::from(element.properties.iter().any(|p| p.name == "texcoord"));
-                reader.faces(&mut part)?;
-            }
-            _ => reader.each(None, |_, _, _| Ok(()))?,
-        }
-    }
-    if part.triangles.is_empty() {
-        let why = if part.positions.is_empty() {
-            "is empty: it has no vertices and no faces"
-        } else {
-            "has no faces: a cloud of points reflects no light, make a mesh of it"
+        let mut reader =
+            Reader { element, limits, cancel, values: &mut values, used: vec![false; element.properties.len()] };
+        let read = match element.name.as_str() {
+            "vertex" => reader.vertices(&mut vertices)?,
+            "face" | "tristrips" => reader.faces(&mut faces)?,
+            _ => reader.each(|_, _| Ok(()))?,
         };
-        return Err(SceneError::broken("file", why));
-    }
-    if part.normals.is_empty() {
-        part.normals = smooth_normals(&part.positions, &part.triangles);
+        let of_element = element.properties.iter().zip(&reader.used);
+        let names = of_element.filter(|(p, used)| !**used && p.name != "alpha");
+        unused.extend(names.map(|(p, _)| format!("{} {}", element.name, p.name)));
+        if read < element.count {
+            document.warnings.push(format!(
+                "the file is cut off or damaged: {} of {} elements '{}' are left out, and what follows them",
+                element.count - read,
+                element.count,
+                super::shortened(&element.name)
+            ));
+            break;
+        }
     }
     if values.too_long > 0 {
         let lines = values.too_long;
@@ -282,27 +293,147 @@ pub(super) fn read(
             .warnings
             .push(format!("{lines} lines hold more than the header declares: the rest of them is ignored"));
     }
-    if corners_of_texture > 0 {
-        document.warnings.push("texture coordinates of faces are ignored: save them for vertices".into());
+    if !unused.is_empty() {
+        unused.truncate(12);
+        document.warnings.push(format!("properties that reflect no light are not used: {}", unused.join(", ")));
     }
-    if let Some(texture) = header.texture.filter(|_| !part.uvs.is_empty()) {
-        let uri = uri_of(&texture);
-        match mtl::picture(&uri, beside, limits) {
-            Ok(()) => {
-                let look = json!({"baseColorTexture": {"index": 0}, "metallicFactor": 0.0});
-                document.textures.push(uri);
-                document.materials.push(json!({"name": texture, "pbrMetallicRoughness": look}));
-                (part.material, part.colours) = (Some(0), vec![]);
-            }
-            Err(why) => document.warnings.push(format!("the texture '{texture}' is left out: {why}")),
-        }
-    }
-    if part.material.is_none() {
-        document.materials.push(mtl::plain("PLY"));
-        part.material = Some(0);
-    }
-    document.objects.push(Object { name: name.to_owned(), parts: vec![part] });
+    let parts = parts(vertices, faces, &header.textures, (beside, limits), &mut document)?;
+    document.objects.push(Object { name: name.to_owned(), parts });
     Ok(document)
+}
+
+/// The surfaces, each with one material.
+fn parts(
+    mut vertices: Vertices,
+    mut faces: Faces,
+    textures: &[String],
+    (beside, limits): (Option<&Path>, &Limits),
+    document: &mut Document,
+) -> Result<Vec<Part>, SceneError> {
+    let count = vertices.positions.len();
+    let is_there: Vec<bool> =
+        faces.triangles.iter().map(|t| t.iter().all(|i| (*i as usize) < count)).collect();
+    let lost = is_there.iter().filter(|there| !**there).count();
+    if lost > 0 {
+        let mut keep = is_there.iter();
+        faces.triangles.retain(|_| *keep.next().unwrap_or(&false));
+        let mut keep = is_there.iter();
+        faces.colours.retain(|_| *keep.next().unwrap_or(&false));
+        let mut keep = is_there.iter();
+        faces.uvs.retain(|_| *keep.next().unwrap_or(&false));
+        let mut keep = is_there.iter();
+        faces.textures.retain(|_| *keep.next().unwrap_or(&false));
+    }
+    if faces.triangles.is_empty() {
+        let why = match (count, lost + faces.damaged) {
+            (0, 0) => "is empty: it has no vertices and no faces".into(),
+            (_, 0) => "has no faces: a cloud of points reflects no light, make a mesh of it".into(),
+            (_, n) => format!("has no face whose vertices are there ({n} name others, of {count}): it is cut off"),
+        };
+        let noted = document.warnings.join("; ");
+        let noted = if noted.is_empty() { noted } else { format!(" ({noted})") };
+        return Err(SceneError::broken("file", format!("{why}{noted}")));
+    }
+    if lost + faces.damaged > 0 {
+        let told = format!("{} faces name vertices that are not there: they are left out", lost + faces.damaged);
+        document.warnings.push(told);
+    }
+    let (near, offset) = far::single(&vertices.positions);
+    vertices.positions = vec![];
+    document.offset = offset;
+    let has_normals = !vertices.normals.is_empty();
+    let mut part = Part {
+        normals: if has_normals { vertices.normals } else { smooth_normals(&near, &faces.triangles) },
+        positions: near,
+        uvs: vertices.uvs,
+        colours: vertices.colours,
+        ..Part::default()
+    };
+    // What faces have of their own is said of each corner.
+    if !faces.colours.is_empty() || !faces.uvs.is_empty() {
+        let corners = faces.triangles.as_flattened();
+        let apart = |list: &[[f32; 3]]| corners.iter().filter_map(|i| list.get(*i as usize).copied()).collect();
+        part.positions = apart(&part.positions);
+        part.normals = apart(&part.normals);
+        part.colours = match faces.colours.is_empty() {
+            true => apart(&part.colours),
+            false => faces.colours.iter().flat_map(|c| [*c; 3]).collect(),
+        };
+        part.uvs = match faces.uvs.is_empty() {
+            true => corners.iter().filter_map(|i| part.uvs.get(*i as usize).copied()).collect(),
+            false => faces.uvs.as_flattened().to_vec(),
+        };
+        faces.triangles = (0..faces.triangles.len() as u32).map(|t| [3 * t, 3 * t + 1, 3 * t + 2]).collect();
+    }
+    let mut numbers: Vec<Option<usize>> = vec![];
+    for texture in textures {
+        let uri = uri_of(texture);
+        let made = match mtl::picture(&uri, beside, limits) {
+            _ if part.uvs.is_empty() => Err("no vertex and no face has texture coordinates".into()),
+            Ok(()) => Ok(uri),
+            Err(why) => Err(why),
+        };
+        numbers.push(match made {
+            Ok(uri) => {
+                let look = json!({"baseColorTexture": {"index": document.textures.len()}, "metallicFactor": 0.0});
+                document.textures.push(uri);
+                document.materials.push(
+                    json!({"name": texture, "doubleSided": true, "pbrMetallicRoughness": look}),
+                );
+                Some(document.materials.len() - 1)
+            }
+            Err(why) => {
+                document.warnings.push(format!("the texture '{texture}' is left out: {why}"));
+                None
+            }
+        });
+    }
+    let plain = document.materials.len();
+    let of = |texture: u32| numbers.get(texture as usize).copied().flatten().unwrap_or(plain);
+    let several = faces.textures.iter().any(|t| *t != 0) && numbers.len() > 1;
+    let mut all: Vec<(usize, Vec<[u32; 3]>)> = vec![];
+    if several {
+        let mut by_material = std::collections::BTreeMap::<usize, Vec<[u32; 3]>>::new();
+        for (triangle, texture) in faces.triangles.iter().zip(&faces.textures) {
+            by_material.entry(of(*texture)).or_default().push(*triangle);
+        }
+        all.extend(by_material);
+    } else {
+        all.push((of(0), faces.triangles));
+    }
+    document.materials.push(mtl::plain("PLY"));
+    let is_textured = all.iter().any(|(material, _)| *material != plain);
+    if is_textured && !part.colours.is_empty() {
+        part.colours = vec![];
+        document.warnings.push("colours of vertices or faces are not used beside the texture".into());
+    }
+    // Each part has all vertices: the reader of glTF keeps those that its triangles name.
+    let last = all.len() - 1;
+    let mut out = Vec::with_capacity(all.len());
+    for (i, (material, triangles)) in all.into_iter().enumerate() {
+        let whole = if i == last { std::mem::take(&mut part) } else { compact(&part, &triangles) };
+        let own = Part { material: Some(material), ..whole };
+        let triangles = if i == last {
+            triangles
+        } else {
+            (0..triangles.len() as u32).map(|t| [3 * t, 3 * t + 1, 3 * t + 2]).collect()
+        };
+        out.push(Part { triangles, ..own });
+    }
+    Ok(out)
+}
+
+/// The corners of some triangles of a part, one after the other.
+fn compact(part: &Part, triangles: &[[u32; 3]]) -> Part {
+    let corners = triangles.as_flattened();
+    let apart = |list: &[[f32; 3]]| corners.iter().filter_map(|i| list.get(*i as usize).copied()).collect();
+    Part {
+        positions: apart(&part.positions),
+        normals: apart(&part.normals),
+        colours: apart(&part.colours),
+        uvs: corners.iter().filter_map(|i| part.uvs.get(*i as usize).copied()).collect(),
+        ..Part::default()
+    }
 }
 
 struct Reader<'a, 'b> {
@@ -310,96 +441,116 @@ struct Reader<'a, 'b> {
     limits: &'a Limits,
     cancel: &'a Cancel,
     values: &'a mut Values<'b>,
+    /// Which properties are of use.
+    used: Vec<bool>,
 }
 
 impl Reader<'_, '_> {
-    /// Calls `take` with the number, the values and the wanted list of every element.
+    /// Calls `take` with the values and the lists of every element; gives how many are there.
     fn each(
         &mut self,
-        wanted: Option<usize>,
-        mut take: impl FnMut(usize, &[f64], &[f64]) -> Result<(), SceneError>,
-    ) -> Result<(), SceneError> {
-        let (mut row, mut list) = (vec![], vec![]);
+        mut take: impl FnMut(&[f64], &[Vec<f64>]) -> Result<(), SceneError>,
+    ) -> Result<usize, SceneError> {
+        let mut row = vec![];
+        let mut lists = vec![vec![]; self.element.properties.len()];
         for i in 0..self.element.count {
             if i % 65_536 == 0 {
                 self.cancel.check(self.limits)?;
             }
-            let read = self.values.element(self.element, &mut row, &mut list, wanted);
-            read.ok_or_else(|| {
-                let what = format!("{} {i} of {}", self.element.name, self.element.count);
-                SceneError::broken(what, "is cut off, or holds what is no number")
-            })?;
+            if self.values.element(self.element, &mut row, &mut lists).is_none() {
+                return Ok(i);
+            }
             self.values.end_line();
-            take(i, &row, &list)?;
+            take(&row, &lists)?;
         }
-        Ok(())
+        Ok(self.element.count)
     }
 
     /// The first of the properties that has one of these names.
-    fn find(&self, names: &[&str]) -> Option<usize> {
-        self.element.properties.iter().position(|p| names.contains(&p.name.as_str()))
+    fn find(&mut self, names: &[&str], is_list: bool) -> Option<usize> {
+        let is_it = |p: &Property| names.contains(&p.name.as_str()) && p.count.is_some() == is_list;
+        let found = self.element.properties.iter().position(is_it)?;
+        self.used[found] = true;
+        Some(found)
     }
 
-    fn all<const N: usize>(&self, names: [&[&str]; N]) -> Option<[usize; N]> {
-        let found: Vec<usize> = names.iter().filter_map(|names| self.find(names)).collect();
+    fn all<const N: usize>(&mut self, names: [&[&str]; N]) -> Option<[usize; N]> {
+        let found: Vec<usize> = names.iter().filter_map(|names| self.find(names, false)).collect();
         found.try_into().ok()
     }
 
-    fn vertices(&mut self, part: &mut Part) -> Result<(), SceneError> {
-        let at =
-            self.all([&["x"], &["y"], &["z"]]).ok_or_else(|| broken("has vertices without x, y and z"))?;
-        let normal = self.all([&["nx"], &["ny"], &["nz"]]);
-        let uv = self.all([&["u", "s", "texture_u"], &["v", "t", "texture_v"]]);
+    /// The properties of a colour, and what stands for full light in each.
+    fn colour(&mut self) -> Option<([usize; 3], [f32; 3])> {
         let colour = self.all([
             &["red", "r", "diffuse_red"],
             &["green", "g", "diffuse_green"],
             &["blue", "b", "diffuse_blue"],
-        ]);
-        let full = colour.map(|c| c.map(|i| self.element.properties[i].kind.full()));
+        ])?;
+        Some((colour, colour.map(|i| self.element.properties[i].kind.full())))
+    }
+
+    fn vertices(&mut self, vertices: &mut Vertices) -> Result<usize, SceneError> {
+        let at =
+            self.all([&["x"], &["y"], &["z"]]).ok_or_else(|| broken("has vertices without x, y and z"))?;
+        let normal = self.all([&["nx"], &["ny"], &["nz"]]);
+        let uv = self.all([&["u", "s", "texture_u"], &["v", "t", "texture_v"]]);
+        let colour = self.colour();
         let pick = |row: &[f64], i: usize| row[i] as f32;
-        self.each(None, |_, row, _| {
-            part.positions.push(at.map(|i| pick(row, i)));
-            part.normals.extend(normal.map(|n| n.map(|i| pick(row, i))));
+        vertices.positions.reserve(self.element.count.min(self.values.room(self.element)));
+        self.each(|row, _| {
+            vertices.positions.push(at.map(|i| row[i]));
+            vertices.normals.extend(normal.map(|n| n.map(|i| pick(row, i))));
             // The first row of the picture is the highest v.
-            part.uvs.extend(uv.map(|[u, v]| [pick(row, u), 1.0 - pick(row, v)]));
-            part.colours.extend(
-                colour.zip(full).map(|(c, full)| [0, 1, 2].map(|k| linear(pick(row, c[k]) / full[k]))),
-            );
+            vertices.uvs.extend(uv.map(|[u, v]| [pick(row, u), 1.0 - pick(row, v)]));
+            vertices
+                .colours
+                .extend(colour.map(|(c, full)| [0, 1, 2].map(|k| linear(pick(row, c[k]) / full[k]))));
             Ok(())
         })
     }
 
-    fn faces(&mut self, part: &mut Part) -> Result<(), SceneError> {
-        let Some(indices) = self.find(&["vertex_indices", "vertex_index"]) else {
-            return self.each(None, |_, _, _| Ok(()));
+    fn faces(&mut self, faces: &mut Faces) -> Result<usize, SceneError> {
+        let Some(indices) = self.find(&["vertex_indices", "vertex_index"], true) else {
+            return self.each(|_, _| Ok(()));
         };
         let is_strip = self.element.name == "tristrips";
-        let (vertices, limit) = (part.positions.len(), self.limits.triangles);
+        let colour = self.colour();
+        let uvs = if is_strip { None } else { self.find(&["texcoord"], true) };
+        let texture = self.find(&["texnumber"], false);
+        let limit = self.limits.triangles;
         let mut corners = vec![];
-        self.each(Some(indices), |face, _, list| {
-            let strip_ends = |i: f64| is_strip && i < 0.0;
-            if let Some(wrong) = list.iter().find(|&&i| !(strip_ends(i) || i >= 0.0 && i < vertices as f64)) {
-                return Err(SceneError::broken(
-                    format!("face {face}"),
-                    format!("names vertex {wrong} of {vertices}"),
-                ));
-            }
-            if !is_strip && list.len() > MAX_CORNERS {
-                return Err(SceneError::broken(
-                    format!("face {face}"),
-                    format!("has {} corners", list.len()),
-                ));
-            }
+        let number = |i: f64| if (0.0..f64::from(NO_VERTEX)).contains(&i) { i as u32 } else { NO_VERTEX };
+        self.each(|row, lists| {
+            let list = &lists[indices];
+            let before = faces.triangles.len();
             if is_strip {
-                list.split(|&i| i < 0.0).for_each(|strip| add_strip(strip, &mut part.triangles));
+                list.split(|&i| i < 0.0).for_each(|strip| add_strip(strip, &mut faces.triangles));
+            } else if list.len() > MAX_CORNERS {
+                faces.damaged += 1;
             } else {
                 corners.clear();
-                corners.extend(list.iter().map(|&i| i as u32));
-                add_fan(&corners, &mut part.triangles);
+                corners.extend(list.iter().map(|i| number(*i)));
+                add_fan(&corners, &mut faces.triangles);
+            }
+            let made = faces.triangles.len() - before;
+            if let Some((c, full)) = colour {
+                let colour = [0, 1, 2].map(|k| linear(row[c[k]] as f32 / full[k]));
+                faces.colours.extend(std::iter::repeat_n(colour, made));
+            }
+            if let Some(uvs) = uvs {
+                let uv = |corner: usize| {
+                    let at = |k: usize| lists[uvs].get(2 * corner + k).copied().unwrap_or(0.0) as f32;
+                    // The first row of the picture is the highest v.
+                    [at(0), 1.0 - at(1)]
+                };
+                faces.uvs.extend((0..made).map(|t| [uv(0), uv(t + 1), uv(t + 2)]));
+            }
+            if let Some(texture) = texture {
+                faces.textures.extend(std::iter::repeat_n(number(row[texture]), made));
             }
             SceneError::check_limit(
                 "the number of triangles",
-                part.triangles.len() as u64,
+                faces.triangles.len() as u64,
                 limit,
                 "decimate the mesh",
             )
@@ -415,7 +566,8 @@ pub(super) fn add_fan(corners: &[u32], triangles: &mut Vec<[u32; 3]>) {
 
 fn add_strip(strip: &[f64], triangles: &mut Vec<[u32; 3]>) {
     triangles.extend(strip.windows(3).enumerate().map(|(i, c)| {
-        let [a, b, c] = [c[0] as u32, c[1] as u32, c[2] as u32];
+        let number = |i: f64| if i < f64::from(NO_VERTEX) { i as u32 } else { NO_VERTEX };
+        let [a, b, c] = [number(c[0]), number(c[1]), number(c[2])];
         if i % 2 == 0 {
             [a, b, c]
         } else {

@@ -30,6 +30,10 @@ fn corners(scene: &Scene) -> Vec<Vec3> {
     scene.bodies.iter().flat_map(of_body).collect()
 }
 
+fn told(scene: &Scene) -> String {
+    scene.warnings.join("\n")
+}
+
 const QUAD: &str = "v 0 0 0\nv 1 0 0\nv 1 1 0\nv 0 1 0\n";
 
 #[test]
@@ -219,11 +223,11 @@ fn units_and_the_upward_axis_are_guessed_told_and_corrected() {
 fn what_is_wrong_is_named_with_its_line() {
     use MeshFormat::{Obj, Ply, Stl};
     for (bytes, format, told) in [
-        ("v 0 0\n", Obj, "line 1: v needs 3 numbers"),
-        ("v 0 0 0\n\nf 1 2 3\n", Obj, "line 3: names vertex 2, but there are 1 before it"),
-        ("v 0 0 0\nf 1 1 0\n", Obj, "line 2: names vertex 0"),
-        ("v 0 0 0\nf 1 1 -2\n", Obj, "names vertex -2"),
-        ("v 0 0 0\nf 1 1 a\n", Obj, "has the corner 'a'"),
+        ("v 0 0\n", Obj, "has no faces"),
+        ("v 0 0 0\n\nf 1 2 3\n", Obj, "no face whose vertices are there: 1 name others"),
+        ("v 0 0 0\nf 1 1 0\n", Obj, "1 name others"),
+        ("v 0 0 0\nf 1 1 -2\n", Obj, "1 name others"),
+        ("v 0 0 0\nf 1 1 a\n", Obj, "1 name others"),
         ("v 0 0 0\n", Obj, "has no faces"),
         ("\u{feff}hello\n", Obj, "has no faces"),
         ("ply\nformat ascii 1.0\n", Ply, "end_header"),
@@ -232,15 +236,16 @@ fn what_is_wrong_is_named_with_its_line() {
         ("ply\nformat ascii 1.0\nelement vertex 4000000000\nproperty float x\nproperty float y\nproperty float z\nend_header\n1 2 3", Ply, "cut off"),
         ("ply\nformat ascii 1.0\nelement vertex 1\nproperty float x\nproperty float y\nproperty float z\nend_header\n1 2 3\n", Ply, "a cloud of points"),
         ("ply\nformat ascii 1.0\nelement none 4000000000\nend_header\n", Ply, "is empty: it has no vertices"),
-        ("solid\nvertex 0 0\n", Stl, "line 2: a vertex needs 3 numbers"),
-        ("solid\nfacet\nvertex 0 0 0\nendfacet\n", Stl, "line 4: ends a facet of 1 vertices"),
+        ("solid\nfacet\nvertex 0 0 0\nendfacet\n", Stl, "no facet that is whole (1 are damaged or cut off)"),
         ("short", Stl, "too few for STL"),
     ] {
         let why = refusal(bytes.as_bytes(), format);
         assert!(why.contains(told), "{bytes:?}: {why}");
     }
+    // What is there of a file that is cut off is shown, and the rest is counted.
     let cut = &stl_binary(3)[..150];
-    assert!(refusal(&[b"binar", &cut[5..]].concat(), Stl).contains("promises 3 triangles, 1 are there"));
+    let scene = load(&[b"binar", &cut[5..]].concat(), Stl).unwrap();
+    assert!(corners(&scene).len() == 3 && told(&scene).contains("promises 3 triangles, 1 are there"));
 }
 
 #[test]
@@ -308,4 +313,128 @@ fn damage_anywhere_is_a_refusal_or_a_scene() {
             }
         }
     }
+}
+
+fn case(name: &str) -> std::path::PathBuf {
+    Path::new(env!("CARGO_MANIFEST_DIR")).join("../../tests/assets/cases").join(name)
+}
+
+/// Lengths of the sides of the box around all corners.
+fn sides(scene: &Scene) -> Vec3 {
+    let all = corners(scene);
+    let low = all.iter().fold(Vec3::INFINITY, |low, p| low.min(*p));
+    all.iter().fold(Vec3::NEG_INFINITY, |high, p| high.max(*p)) - low
+}
+
+/// The colour of the first corner of a triangle of the first body, as sRGB.
+fn colour(scene: &Scene, triangle: usize) -> Option<[u8; 3]> {
+    let mesh = &scene.bodies[0].mesh;
+    let used = scene.materials[mesh.materials[triangle] as usize].base_color_texture?;
+    let texture = &scene.textures[used.texture as usize];
+    let uv = used.apply(mesh.uvs[mesh.triangles[triangle][0] as usize]);
+    let (x, y) = ((uv.x * texture.width as f32) as usize, (uv.y * texture.height as f32) as usize);
+    let [r, g, b, _] = texture.texels[y * texture.width as usize + x];
+    Some([r, g, b])
+}
+
+/// Files that other programs write, each with what is right.
+#[test]
+fn files_of_other_programs_are_opened_and_what_is_left_out_is_told() {
+    let solid = Vec3::new(0.6, 0.6, 0.4);
+    let ball = Vec3::splat(0.6);
+    for (name, triangles, size, note) in [
+        ("a01-utm.obj", 36, solid, "5212.0 km from the origin"),
+        ("a06-bom.stl", 36, solid, ""),
+        ("a07-solid-binary-trailing.stl", 36, solid, "bytes behind the last triangle"),
+        ("a09-faces-before-vertices.ply", 36, solid, ""),
+        ("a10-face-colours.ply", 36, solid, ""),
+        ("a12-two-mtllibs.obj", 36, solid, "nothing.mtl"),
+        ("a13-uv-and-normals-missing.obj", 1, Vec3::ZERO, "texture coordinates that are not there"),
+        ("a15-tiff.obj", 36, solid, ""),
+        ("a18-zbrush-mrgb.obj", 36, solid, ""),
+        ("a24-tga-texture.glb", 36, solid, ""),
+        ("a25-zero-scale-root.glb", 36, Vec3::ZERO, ""),
+        ("a27-inside-out.stl", 528, ball, ""),
+        ("a28-451-km.ply", 0, ball, "451.2 km from the origin"),
+    ] {
+        let options = LoadOptions { up: Some(crate::UpAxis::Y), ..LoadOptions::default() };
+        let scene = crate::load(&case(name), &options).unwrap_or_else(|e| panic!("{name}: {e}"));
+        let count = corners(&scene).len() / 3;
+        assert!(triangles == 0 || count == triangles, "{name}: {count} triangles");
+        let got = sides(&scene);
+        assert!(size == Vec3::ZERO || (got - size).abs().max_element() < 2e-3, "{name}: {got}");
+        assert!(told(&scene).contains(note), "{name}: {}", told(&scene));
+    }
+    let read = |name: &str| crate::load(&case(name), &LoadOptions::default()).unwrap();
+    let reds = ["a10-face-colours.ply", "a18-zbrush-mrgb.obj"].map(|name| colour(&read(name), 0).unwrap());
+    assert!(reds[0].iter().zip([220u8, 40, 40]).all(|(a, b)| a.abs_diff(b) < 2), "{reds:?}");
+    assert!(reds[1][0] > 100 && reds[1][1] < 100, "{reds:?}");
+    for name in ["a12-two-mtllibs.obj", "a15-tiff.obj"] {
+        assert!(colour(&read(name), 0).is_some(), "{name}: {}", told(&read(name)));
+    }
+    // Formats without a side reflect on both.
+    for name in ["a27-inside-out.stl", "a28-451-km.ply", "a10-face-colours.ply", "a13-uv-and-normals-missing.obj"] {
+        let scene = read(name);
+        let used = scene.bodies[0].mesh.materials[0];
+        assert!(scene.materials[used as usize].double_sided, "{name}");
+    }
+    // The ball is round, 451 km away.
+    let far = corners(&read("a28-451-km.ply"));
+    let middle = far.iter().sum::<Vec3>() / far.len() as f32;
+    let off = far.iter().map(|p| ((*p - middle).length() - 0.3).abs()).fold(0.0, f32::max);
+    assert!(off < 2e-3, "{off}");
+}
+
+#[test]
+fn nodes_are_found_by_their_letters_and_hidden_ones_are_left_out() {
+    let named = |node: &str| LoadOptions {
+        bodies: vec![crate::BodySelector { name: "hare".into(), node: Some(node.into()), projected: true }],
+        ..LoadOptions::default()
+    };
+    assert!(crate::load(&case("a21-name-nfd.glb"), &named("K\u{f6}rper")).is_ok());
+    let near = crate::load(&case("a21-name-nfd.glb"), &named("k\u{f6}rper ")).unwrap_err().to_string();
+    assert!(near.contains("did you mean"), "{near}");
+    let scene = crate::load(&case("a22-hidden-node.glb"), &LoadOptions::default()).unwrap();
+    assert!(scene.bodies.len() == 1 && told(&scene).contains("hides"), "{}", told(&scene));
+}
+
+/// Damage of a part is left out and counted, and the order of lines does not matter.
+#[test]
+fn damaged_parts_are_left_out_and_counted() {
+    let text = format!("usemtl a\nf 1 2 3\nf 1 2 9\nf 1 x 3\nvn a b\n{QUAD}v 0 0\nhello\n");
+    let scene = load_with(text.as_bytes(), MeshFormat::Obj, plain()).unwrap();
+    assert_eq!(corners(&scene), [Vec3::ZERO, Vec3::X, Vec3::new(1.0, 1.0, 0.0)]);
+    for what in ["2 faces name vertices", "no word of the format (1 times)", "no three numbers (1 times)", "are white: a"] {
+        assert!(told(&scene).contains(what), "{what}: {}", told(&scene));
+    }
+    // A PLY with the texture of its corners, two faces of which one is damaged, and cut off in the third.
+    let ply = "ply\nformat ascii 1.0\nelement vertex 3\nproperty double x\nproperty double y\nproperty double z\n\
+               property float quality\nelement face 3\nproperty list uchar int vertex_indices\n\
+               property list uchar float texcoord\nend_header\n0 0 0 1\n1 0 0 1\n0 1 0 1\n3 0 1 2 6 0 0 1 0 0 1\n\
+               3 0 1 7 6 0 0 1 0 0 1\n3 0 1";
+    let scene = load_with(ply.as_bytes(), MeshFormat::Ply, plain()).unwrap();
+    let mesh = &scene.bodies[0].mesh;
+    let uvs: Vec<glam::Vec2> = mesh.triangles[0].iter().map(|i| mesh.uvs[*i as usize]).collect();
+    assert_eq!(uvs, [glam::Vec2::new(0.0, 1.0), glam::Vec2::new(1.0, 1.0), glam::Vec2::new(0.0, 0.0)]);
+    for what in ["1 faces name vertices", "1 of 3 elements 'face'", "vertex quality"] {
+        assert!(told(&scene).contains(what), "{what}: {}", told(&scene));
+    }
+}
+
+/// The two bytes behind the triangles of a binary STL as VisCAM and as Magics write colours.
+#[test]
+fn colours_of_an_stl_are_read() {
+    let with = |head: &[u8], words: [u16; 2]| {
+        let mut bytes = stl_binary(2);
+        bytes[..head.len()].copy_from_slice(head);
+        for (i, word) in words.iter().enumerate() {
+            bytes[84 + 50 * i + 48..84 + 50 * (i + 1)].copy_from_slice(&word.to_le_bytes());
+        }
+        load_with(&bytes, MeshFormat::Stl, plain()).unwrap()
+    };
+    let red_of_viscam = 1 << 15 | 31 << 10;
+    assert_eq!(colour(&with(b"", [red_of_viscam; 2]), 0), Some([255, 0, 0]));
+    assert_eq!(colour(&with(b"", [7, 9]), 0), None, "anything else is no colour");
+    let magics = with(b"COLOR=\x00\xff\x00\xff", [31, 1 << 15]);
+    assert_eq!((colour(&magics, 0), colour(&magics, 1)), (Some([255, 0, 0]), Some([0, 255, 0])));
 }

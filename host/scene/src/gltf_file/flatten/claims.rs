@@ -5,8 +5,9 @@ use std::collections::HashSet;
 use dpm_common::keys::read::nearest;
 use glam::Vec3;
 
+use super::super::super::names::{composed, nearly};
 use super::super::super::{BodySelector, LoadOptions, SceneError};
-use super::super::json::shorten;
+use super::super::json::{shorten, Item};
 
 /// Bodies that [`choose_bodies`] makes movable when the rig file names none.
 const AUTO_BODIES: usize = 2;
@@ -38,6 +39,29 @@ pub(super) fn roots(document: &gltf::Document) -> Vec<usize> {
     }
 }
 
+fn is_scaled_to_nothing(node: &gltf::Node) -> bool {
+    let m = node.transform().matrix();
+    let columns = [m[0], m[1], m[2]].map(|c| Vec3::new(c[0], c[1], c[2]));
+    let size: f32 = columns.iter().map(|c| c.length()).product();
+    let volume = columns[0].cross(columns[1]).dot(columns[2]);
+    !(size > 1e-30 && volume.abs() > 1e-12 * size)
+}
+
+/// Nodes that KHR_node_visibility hides, with all below them.
+pub(crate) fn hidden(document: &gltf::Document, nodes: &[Item]) -> Result<HashSet<usize>, SceneError> {
+    let mut hidden = HashSet::new();
+    for (i, node) in nodes.iter().enumerate() {
+        let Some(extension) = node.extension(VISIBILITY)? else { continue };
+        if extension.get("visible").and_then(serde_json::Value::as_bool) == Some(false) {
+            hidden.extend(descendants(document, &[i]));
+        }
+    }
+    Ok(hidden)
+}
+
+/// The extension that hides nodes.
+pub(crate) const VISIBILITY: &str = "KHR_node_visibility";
+
 /// Nodes of the scene from the roots down, parents before children.
 fn descendants(document: &gltf::Document, roots: &[usize]) -> Vec<usize> {
     let mut order = roots.to_vec();
@@ -54,6 +78,7 @@ fn descendants(document: &gltf::Document, roots: &[usize]) -> Vec<usize> {
 /// Resolves the names of the rig file; without selectors the first two objects of the scene become movable.
 pub(crate) fn choose_bodies(
     document: &gltf::Document,
+    hidden: &HashSet<usize>,
     options: &LoadOptions,
     warnings: &mut Vec<String>,
 ) -> Result<Claims, SceneError> {
@@ -65,10 +90,10 @@ pub(crate) fn choose_bodies(
     let of_virtual = |(i, name): (usize, &String)| find(format!("scene.virtual_nodes.{i}"), name);
     let mut virtual_nodes =
         options.virtual_nodes.iter().enumerate().map(of_virtual).collect::<Result<Vec<_>, _>>()?;
-    let known: HashSet<&str> = names.iter().copied().flatten().collect();
-    let named = |name: &str| known.contains(name);
+    let known: HashSet<String> = names.iter().flatten().map(|name| composed(name)).collect();
+    let named = |name: &str| known.contains(&composed(name));
     if options.bodies.iter().all(|b| b.node.is_none() && !named(&b.name)) {
-        return Ok(choose_automatically(document, roots, virtual_nodes, &options.bodies, warnings));
+        return Ok(choose_automatically(document, hidden, roots, virtual_nodes, &options.bodies, warnings));
     }
     let mut bodies: Vec<Claim> = vec![];
     for (i, BodySelector { name, node, projected }) in options.bodies.iter().enumerate() {
@@ -94,15 +119,21 @@ fn find_node(
     key: String,
     name: &str,
 ) -> Result<usize, SceneError> {
-    let matching: Vec<usize> =
-        present.iter().zip(names).filter(|(_, n)| **n == Some(name)).map(|(i, _)| *i).collect();
+    let of = |is_it: &dyn Fn(&str) -> bool| -> Vec<usize> {
+        present.iter().zip(names).filter(|(_, n)| n.is_some_and(is_it)).map(|(i, _)| *i).collect()
+    };
+    let mut matching = of(&|n| n == name);
+    if matching.is_empty() {
+        // Systems compose letters differently, and show both alike.
+        matching = of(&|n| composed(n) == composed(name));
+    }
     if let [one] = matching[..] {
         return Ok(one);
     }
     let known: Vec<String> = names.iter().flatten().take(30).map(|n| shorten(n)).collect();
     let all: Vec<&str> = names.iter().flatten().copied().collect();
     let problem = match matching.len() {
-        0 => match nearest(name, &all) {
+        0 => match nearly(name, all.iter().copied()).or_else(|| nearest(name, &all)) {
             Some(near) => format!("the scene has no node '{name}', did you mean '{near}'?"),
             None => format!("the scene has no node '{name}'"),
         },
@@ -121,6 +152,7 @@ fn find_node(
 /// the names of their nodes; lamps (all materials emit) become virtual.
 fn choose_automatically(
     document: &gltf::Document,
+    hidden: &HashSet<usize>,
     mut roots: Vec<usize>,
     mut virtual_nodes: Vec<usize>,
     given: &[BodySelector],
@@ -154,7 +186,8 @@ fn choose_automatically(
             .nth(root)
             .and_then(|n| n.name())
             .map_or_else(|| format!("node {root}"), str::to_owned);
-        if materials.is_empty() || known_virtual.contains(&root) {
+        let is_nothing = document.nodes().nth(root).is_some_and(|n| is_scaled_to_nothing(&n));
+        if materials.is_empty() || known_virtual.contains(&root) || hidden.contains(&root) || is_nothing {
             continue;
         }
         if materials.iter().all(|&emits| emits) {
