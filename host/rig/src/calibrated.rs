@@ -38,6 +38,7 @@ pub(crate) fn calibrated_camera(
     };
     let unit = match p.calibration_unit {
         Some(CalibrationUnit::Metre) => LengthUnit::Metre,
+        Some(CalibrationUnit::Centimetre) => LengthUnit::Centimetre,
         Some(CalibrationUnit::Millimetre) => LengthUnit::Millimetre,
         None => return Err(wrong("projector.calibration_unit is missing".into())),
     };

@@ -47,6 +47,7 @@ pub mod picture_stream;
 pub mod pictures;
 pub mod pipeline;
 pub mod plan;
+pub mod plausible;
 pub mod presence;
 pub mod projectors;
 mod render;

@@ -1,5 +1,6 @@
 //! Builds the parts of a rig from a checked configuration: scene, projector, bodies with their motions, tracker.
 
+use crate::plausible;
 use crate::calibrated::{calibrated_camera, measured, measured_camera, told_of_measured, CameraFileError};
 use crate::config::{
     BodyConfig, BuiltinScene, EnvironmentConfig, FileAxis, GazeConfig, LiveSource, PictureSource, RigConfig,
@@ -301,7 +302,7 @@ impl Rig {
         let calibration = told_of_measured(&measured, config, &placed);
         let schedule = config.projector.schedule();
         let config = config.clone();
-        Ok(Self {
+        let mut rig = Self {
             config,
             scene,
             camera,
@@ -313,7 +314,15 @@ impl Rig {
             drive,
             latency_ns,
             calibration,
-        })
+        };
+        for doubt in plausible::doubts(&rig) {
+            let told = doubt.to_string();
+            // A rig that is built anew with the same scene has them already.
+            if !rig.scene.warnings.contains(&told) {
+                rig.scene.warnings.push(told);
+            }
+        }
+        Ok(rig)
     }
 
     /// The projector of a rig alone, without scene and bodies: for light that nothing is traced for. It is measured only

@@ -125,7 +125,12 @@ fn texts(r: &mut Reader<'_>, what: &'static str) -> Result<(), WireError> {
 }
 
 fn rigid_body(r: &mut Reader<'_>, version: Version) -> Result<BodyModel, WireError> {
-    let name = String::from_utf8_lossy(r.text("body name")?).into_owned();
+    let name = r.text("body name")?;
+    // Some tracking software writes names in the code page of its system: Latin-1 shows and matches most of them.
+    let name = match core::str::from_utf8(name) {
+        Ok(name) => name.to_owned(),
+        Err(_) => name.iter().map(|b| char::from(*b)).collect(),
+    };
     let id = r.i32("body number")?;
     r.i32("body parent")?;
     r.take(12, "body offset")?;

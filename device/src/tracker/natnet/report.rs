@@ -1,6 +1,8 @@
 //! Describes the state of a NatNet client in one line for people: what works, or why no pose arrives and what to try.
 
 use super::client::{NatNetClient, Silence};
+use super::wire::Version;
+use crate::tracker::BodyKey;
 use std::fmt::Write;
 use std::net::Ipv4Addr;
 
@@ -16,12 +18,20 @@ pub(super) fn status(client: &NatNetClient) -> String {
                 if client.version().has_section_sizes() { "4.1 and later" } else { "3.0 to 4.0" }
             ),
         },
+        None if matches!(client.silence(), Some(Silence::Version(_))) => "a server answers".into(),
         None => "no server".into(),
     };
     if let Some(reason) = client.silence() {
         text.push_str("; ");
         explain(&mut text, client, &reason);
+        // That none is there is explained with all names.
+        if !matches!(reason, Silence::NoKnownBody) {
+            text.extend(missing(client).map(|told| format!("; {told}")));
+        }
+    } else {
+        text.extend(missing(client).map(|told| format!("; {told}")));
     }
+    text.extend(doubles(client).into_iter().map(|told| format!("; {told}")));
     match client.clock_map() {
         Some(map) => {
             let (ppb, _) = map.skew_ppb();
@@ -54,6 +64,68 @@ pub(super) fn status(client: &NatNetClient) -> String {
     text
 }
 
+/// The server's names with their numbers.
+fn names(client: &NatNetClient) -> String {
+    let names: Vec<String> =
+        client.models().iter().take(16).map(|m| format!("{} = {}", quoted(&m.name), m.id)).collect();
+    if names.is_empty() { "none".into() } else { names.join(", ") }
+}
+
+/// A name without what a reader does not see: case, and blanks at its ends or doubled.
+fn folded(name: &str) -> String {
+    name.split(|c: char| c.is_whitespace() || matches!(c, '_' | '-')).filter(|p| !p.is_empty()).fold(
+        String::new(),
+        |all, part| all + " " + &part.to_lowercase(),
+    )
+}
+
+/// The rig's bodies that the server does not have, and what it has; `None` if it has all, or has told nothing yet.
+fn missing(client: &NatNetClient) -> Option<String> {
+    let models = client.models();
+    let is_known = |body: &&BodyKey| body.id.is_some() || models.iter().any(|m| m.name == body.name);
+    let bodies = &client.inside().config.bodies;
+    let missing: Vec<&BodyKey> = bodies.iter().filter(|body| !is_known(body)).take(16).collect();
+    if models.is_empty() || missing.is_empty() {
+        return None;
+    }
+    let told = missing.iter().map(|body| {
+        let near = models.iter().find(|m| folded(&m.name) == folded(&body.name));
+        let near = near.map_or(String::new(), |m| format!(" (did you mean {}?)", quoted(&m.name)));
+        format!("{}{near}", quoted(&body.name))
+    });
+    let told: Vec<String> = told.collect();
+    Some(format!("{} is not there; the server has {}", told.join(", "), names(client)))
+}
+
+/// Bodies of the rig that the server has twice, by name or by number.
+fn doubles(client: &NatNetClient) -> Vec<String> {
+    let mut told = Vec::new();
+    let models = client.models();
+    for body in client.inside().config.bodies.iter().take(64) {
+        let of_name: Vec<i32> = models.iter().filter(|m| m.name == body.name).map(|m| m.id).collect();
+        if of_name.len() > 1 {
+            let ids: Vec<String> = of_name.iter().take(8).map(i32::to_string).collect();
+            told.push(format!(
+                "{} bodies of the server are named {} ({}): which one moves it is chance, rename the others",
+                of_name.len(),
+                quoted(&body.name),
+                ids.join(", ")
+            ));
+        }
+        let Some(id) = of_name.first() else { continue };
+        let of_id: Vec<String> = models.iter().filter(|m| m.id == *id).map(|m| quoted(&m.name)).take(8).collect();
+        let is_told = told.iter().any(|t| t.contains(&format!("have number {id}:")));
+        if of_id.len() > 1 && of_name.len() == 1 && !is_told {
+            told.push(format!(
+                "{} bodies of the server have number {id}: {}, of which only one can be followed; give each a number of its own",
+                of_id.len(),
+                of_id.join(", ")
+            ));
+        }
+    }
+    told
+}
+
 fn refused_ports(client: &NatNetClient) -> Option<String> {
     let (refused, inside) = (client.counters().packets.foreign_port, client.inside());
     (refused > 0).then(|| {
@@ -73,6 +145,7 @@ pub(super) fn warning(client: &NatNetClient) -> Option<String> {
         let server = client.inside().config.server;
         all.push(format!("{elsewhere} packets came from other addresses than {server} and were refused"));
     }
+    all.extend(doubles(client));
     if let Some(announced) = client.contradicted() {
         all.push(format!(
             "the server announces NatNet {announced}, and its frames have another layout, which is followed: update the tracking \
@@ -91,6 +164,11 @@ fn explain(text: &mut String, client: &NatNetClient, reason: &Silence) {
             "{}:{} did not answer {} attempts to connect: check the address, the firewall and that streaming is switched on",
             config.server, config.command_port, inside.connects_sent
         ),
+        Silence::Version(version) if *version > Version::V4_2 => write!(
+            text,
+            "the server speaks NatNet {version}, which is newer than this program; 3.0 to 4.2 are understood: choose bit stream 4.1 in \
+             the tracking software"
+        ),
         Silence::Version(version) => write!(
             text,
             "the server speaks NatNet {version}; 3.0 to 4.2 are understood: update the tracking software"
@@ -108,15 +186,13 @@ fn explain(text: &mut String, client: &NatNetClient, reason: &Silence) {
             )
         }
         Silence::NoKnownBody => {
-            let names: Vec<String> =
-                client.models().iter().take(16).map(|m| format!("{} = {}", quoted(&m.name), m.id)).collect();
             let wanted: Vec<String> = config.bodies.iter().take(16).map(|b| quoted(&b.name)).collect();
             write!(
                 text,
                 "none of the rig's bodies ({}) is in the frames: numbers seen {:?}, names known to the server {}",
                 wanted.join(", "),
                 inside.strangers,
-                if names.is_empty() { "none".into() } else { names.join(", ") }
+                names(client)
             )
         }
         Silence::NotTracked => write!(text, "the server sees none of the rig's bodies: occluded, or outside the volume?"),

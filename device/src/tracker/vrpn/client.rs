@@ -597,6 +597,12 @@ impl Tracker for VrpnClient {
         if let Some(problem) = &self.problem {
             text.push_str(&format!("; {problem}"));
         }
+        let is_there = |name: &String| self.names_seen.contains(name);
+        let is_alone = is_there(&self.config.tracker);
+        let missing = !is_alone && self.config.bodies.iter().any(|body| !is_there(&body.name));
+        if self.is_connected() && c.samples.used > 0 && missing {
+            text.push_str(&format!("; the server's devices are {:?}", self.names_seen));
+        }
         if self.is_connected() && c.samples.used == 0 {
             let wanted = &self.config.tracker;
             text.push_str(&format!(

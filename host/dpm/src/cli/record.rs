@@ -57,6 +57,7 @@ pub(super) fn execute(args: &RecordArgs) -> Result<(), Failure> {
     let start = clock.now();
     let tracker = dpm_rig::tracks::open_for(&rig, Arc::new(move || clock.now()), start)?;
     let bodies: Vec<_> = rig.tracked().map(|b| BodyKey { name: b.name.clone(), id: None }).collect();
+    let mut seen = vec![false; bodies.len()];
     let mut recorder = Recorder::create(tracker, &args.out, &bodies, start)?;
     let mut say_at = start.plus_ns(SAY_EVERY_NS);
     let failed = loop {
@@ -65,7 +66,12 @@ pub(super) fn execute(args: &RecordArgs) -> Result<(), Failure> {
         if over || signals::received().is_some() || recorder.has_failed() {
             break None;
         }
-        if let Err(e) = recorder.poll(now, &mut |_| {}) {
+        let polled = recorder.poll(now, &mut |sample| {
+            if let Some(seen) = seen.get_mut(usize::from(sample.body.0)) {
+                *seen = true;
+            }
+        });
+        if let Err(e) = polled {
             break Some(e);
         }
         if now >= say_at {
@@ -96,7 +102,14 @@ pub(super) fn execute(args: &RecordArgs) -> Result<(), Failure> {
     if written == 0 {
         return Err(Failure::new(FailureKind::Device, format!("the tracker delivered no sample: {status}")));
     }
-    print(&format!("{written} samples of {} bodies in {}\n", bodies.len(), args.out.display()));
+    let there = seen.iter().filter(|seen| **seen).count();
+    let of = if there == bodies.len() { format!("{there}") } else { format!("{there} of {}", bodies.len()) };
+    print(&format!("{written} samples of {of} bodies in {}\n", args.out.display()));
+    if there < bodies.len() {
+        let missing = bodies.iter().zip(&seen).filter(|(_, seen)| !**seen);
+        let missing: Vec<String> = missing.map(|(body, _)| format!("{:?}", body.name)).collect();
+        print(&format!("warning: no sample of {}: {status}\n", missing.join(", ")));
+    }
     if unrecorded > 0 {
         print(&format!(
             "warning: {unrecorded} samples came faster than they could be written, and are not in it\n"

@@ -79,7 +79,7 @@ fn calibration(p: &ProjectorConfig, reader: &mut Reader) {
             reader,
             &["projector.calibration"],
             "the file does not state the unit of its lengths".into(),
-            "set projector.calibration_unit to \"metre\" or \"millimetre\"".into(),
+            "set projector.calibration_unit to \"metre\", \"centimetre\" or \"millimetre\"".into(),
         );
     }
     let Some(camera) = &p.calibration_camera else { return };

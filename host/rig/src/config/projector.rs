@@ -278,6 +278,8 @@ words! {
     pub enum CalibrationUnit {
         /// 1 m.
         Metre = "metre",
+        /// 0.01 m.
+        Centimetre = "centimetre",
         /// 0.001 m.
         Millimetre = "millimetre",
     }

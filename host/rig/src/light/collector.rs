@@ -384,7 +384,10 @@ impl Collector {
             &job.plan.sampled_poses,
             &job.plan.seen,
             self.registration.points(),
+            job.timeline.due_at,
         );
+        let names = self.rig.bodies.iter().map(|b| b.name.as_str());
+        self.placement.news(names, |told| monitor.note(told));
         let sent = job.is_sent();
         let refused = !sent && !matches!(job.fate, Fate::Overtaken | Fate::Stopped);
         self.slots.planned(job.plan.slot, &job.timeline, refused, job.held_up_by);

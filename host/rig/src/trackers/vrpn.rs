@@ -13,7 +13,7 @@ use std::io;
 section! {
     /// A VRPN server.
     pub struct VrpnConfig {
-        /// `host` or `host:port`.
+        /// `host` or `host:port`, or as VRPN's own programs write it, `NAME@host` with the tracker's name.
         server: String = "127.0.0.1:3883".into(), "", NotEmpty;
         /// Name of the tracker on the server.
         tracker: String = "Tracker0".into(), "", NotEmpty;
@@ -36,6 +36,22 @@ pub(super) static KIND: TrackerKind = TrackerKind::of::<VrpnConfig>(
     mock,
 );
 
+impl VrpnConfig {
+    /// Server and tracker, also where one of the two keys has both as `NAME@host`.
+    fn address(&self) -> (String, String) {
+        let plain = |text: &str| {
+            let schemes = ["x-vrpn://", "vrpn://", "x-vrsh://", "tcp://"];
+            let rest = schemes.iter().find_map(|scheme| text.trim().strip_prefix(scheme));
+            rest.unwrap_or(text.trim()).to_owned()
+        };
+        match (self.server.split_once('@'), self.tracker.split_once('@')) {
+            (Some((name, host)), _) => (plain(host), name.trim().to_owned()),
+            (None, Some((name, host))) => (plain(host), name.trim().to_owned()),
+            (None, None) => (plain(&self.server), self.tracker.clone()),
+        }
+    }
+}
+
 impl TrackerKeys for VrpnConfig {
     fn rate_hz(&self) -> Option<u32> {
         Some(self.rate_hz)
@@ -46,7 +62,7 @@ impl TrackerKeys for VrpnConfig {
     }
 
     fn place(&self) -> String {
-        format!("VRPN at {}", self.server)
+        format!("VRPN at {}", self.address().0)
     }
 
     fn remedy(&self) -> &'static str {
@@ -54,7 +70,7 @@ impl TrackerKeys for VrpnConfig {
     }
 
     fn open(&self, place: TrackerPlace) -> Result<Box<dyn Tracker>, SourceError> {
-        let (server, tracker) = (self.server.clone(), self.tracker.clone());
+        let (server, tracker) = self.address();
         let config = client::VrpnConfig { server, tracker, bodies: place.bodies };
         Ok(Box::new(client::VrpnClient::open(config, place.clock)?))
     }
@@ -79,5 +95,23 @@ fn any_stream(mut bytes: &[u8]) {
         let (back, all) = wire::split(&out).expect("own encoding").expect("whole");
         assert_eq!((back, all), (message, out.len()));
         bytes = &bytes[taken..];
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn an_address_as_vrpns_programs_write_it_is_read() {
+        let of = |server: &str, tracker: &str| {
+            let config = VrpnConfig { server: server.into(), tracker: tracker.into(), ..VrpnConfig::default() };
+            let (server, tracker) = config.address();
+            format!("{tracker} at {server}")
+        };
+        assert_eq!(of("10.0.0.2:3884", "Head"), "Head at 10.0.0.2:3884");
+        assert_eq!(of("Head@10.0.0.2:3884", "Tracker0"), "Head at 10.0.0.2:3884");
+        assert_eq!(of("Head@tcp://10.0.0.2", "Tracker0"), "Head at 10.0.0.2");
+        assert_eq!(of("127.0.0.1:3883", "Head@lab"), "Head at lab");
     }
 }

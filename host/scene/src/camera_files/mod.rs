@@ -36,6 +36,8 @@ pub const MAX_BYTES: usize = 1 << 20;
 pub enum LengthUnit {
     /// 1 m.
     Metre,
+    /// 1e-2 m.
+    Centimetre,
     /// 1e-3 m.
     Millimetre,
 }
@@ -45,6 +47,7 @@ impl LengthUnit {
     pub const fn metres(self) -> f64 {
         match self {
             Self::Metre => 1.0,
+            Self::Centimetre => 1e-2,
             Self::Millimetre => 1e-3,
         }
     }

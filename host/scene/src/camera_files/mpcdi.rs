@@ -172,12 +172,13 @@ impl Region<'_, '_> {
             let told = warp.and_then(|i| document.child_text(i, "geometricUnit")).unwrap_or("unknown");
             let wanted = match unit {
                 LengthUnit::Metre => "m",
+                LengthUnit::Centimetre => "cm",
                 LengthUnit::Millimetre => "mm",
             };
             if !told.is_empty() && !told.eq_ignore_ascii_case("unknown") && told != wanted {
                 return Err(self.wrong(format!(
                     "has lengths in {told:?}, but the rig file's calibration_unit means {wanted:?}; \
-                     metre (\"m\") and millimetre (\"mm\") are known"
+                     metre (\"m\"), centimetre (\"cm\") and millimetre (\"mm\") are known"
                 )));
             }
             for map in ["geometryWarpFile", "distortionMap", "alphaMap", "betaMap"] {

@@ -5,15 +5,18 @@ use super::super::watch::take_locks;
 use super::{Finding, State};
 use dpm_common::clock::{Clock, MonotonicClock};
 use dpm_device::link::{faults, DeviceHello, HostLink, LinkState};
+use dpm_device::pose::Pose;
 use dpm_device::tracker::BodyKey;
 use dpm_device::transport::Transport;
 use dpm_rig::config::RigConfig;
 use dpm_rig::pipeline::connect;
 use dpm_rig::pipeline::projector::{self, Surroundings};
+use dpm_rig::plausible::Exchanges;
 use dpm_rig::presence;
 use dpm_rig::rig::Rig;
 use dpm_rig::standing::Identity;
 use dpm_rig::telemetry::monitor::RunMonitor;
+use glam::DVec3;
 use std::sync::Arc;
 use std::time::Duration;
 
@@ -37,8 +40,18 @@ fn bodies(config: &RigConfig, rig: Option<&Rig>) -> Option<Vec<BodyKey>> {
     }
 }
 
-/// What the tracker told of each body while it was listened to: its name, and how many samples.
-pub(super) type Heard = Vec<(String, u32)>;
+/// What the tracker told of each body while it was listened to.
+pub(super) struct HeardBody {
+    /// Its name.
+    pub name: String,
+    /// How many samples.
+    pub count: u32,
+    /// The newest pose.
+    pub last: Option<Pose>,
+}
+
+/// What was heard of all bodies, in their order.
+pub(super) type Heard = Vec<HeardBody>;
 
 /// Which bodies the tracker reports, and how often. `rig`: the rig of `config`, if its scene could be read. With it what
 /// was heard, if anybody listened.
@@ -68,14 +81,19 @@ pub(super) fn tracker(config: &RigConfig, rig: Option<&Rig>) -> (Finding, Option
         }
     };
     let mut seen = vec![0u32; bodies.len()];
+    let mut last: Vec<Option<Pose>> = vec![None; bodies.len()];
+    let mut exchanges = Exchanges::default();
     let failed = loop {
         let now = clock.now();
         if now.ns_since(start) > LISTEN_NS {
             break None;
         }
         let polled = tracker.poll(now, &mut |sample| {
-            if let Some(count) = seen.get_mut(usize::from(sample.body.0)).filter(|_| sample.tracked) {
+            let body = usize::from(sample.body.0);
+            if let Some(count) = seen.get_mut(body).filter(|_| sample.tracked) {
                 *count += 1;
+                last[body] = Some(sample.pose);
+                exchanges.observe(body, DVec3::from_array(sample.pose.position_m));
             }
         });
         if let Err(e) = polled {
@@ -96,9 +114,27 @@ pub(super) fn tracker(config: &RigConfig, rig: Option<&Rig>) -> (Finding, Option
             let remedy = format!("{}; a body that is not seen stays dark", tracker.status());
             Finding::new(name, state, found, remedy)
         }
-        None => Finding::new(name, State::Ok, found, ""),
+        None => match tracker.warning() {
+            Some(warning) => Finding::new(name, State::Warning, format!("{found}; {warning}"), page),
+            None => Finding::new(name, State::Ok, found, ""),
+        },
     };
-    (finding, Some(bodies.into_iter().map(|body| body.name).zip(seen).collect()))
+    let swaps = exchanges.pairs.iter().map(|([a, b], count)| {
+        let times = if *count == 1 { "once".into() } else { format!("{count} times") };
+        format!("\"{}\" and \"{}\" changed places {times}", bodies[*a].name, bodies[*b].name)
+    });
+    let swaps: Vec<String> = swaps.collect();
+    let finding = if swaps.is_empty() {
+        finding
+    } else {
+        let state = if finding.state == State::Ok { State::Warning } else { finding.state };
+        let remedy = "their markers are too alike: give each body an arrangement of its own";
+        let remedy = if finding.remedy.is_empty() { remedy.into() } else { format!("{}; {remedy}", finding.remedy) };
+        Finding { state, found: format!("{}; {}", finding.found, swaps.join(", ")), remedy, ..finding }
+    };
+    let heard = bodies.into_iter().zip(seen).zip(last);
+    let heard = heard.map(|((body, count), last)| HeardBody { name: body.name, count, last });
+    (finding, Some(heard.collect()))
 }
 
 /// Whether the projector answers, and whether it can show the rig's frames. `loads`: the code of a library that the rig

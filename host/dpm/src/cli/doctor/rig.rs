@@ -10,8 +10,9 @@ use dpm_rig::calibration_steps::age::{aged, days_since, OLD_DAYS};
 use dpm_rig::calibration_steps::is_simulated;
 use dpm_rig::config::{BodyConfig, LiveSource, PictureSource, RigConfig};
 use dpm_rig::picture_stream::look_at;
+use dpm_rig::plausible;
 use dpm_rig::presence;
-use dpm_rig::rig::{Rig, RigError};
+use dpm_rig::rig::{affine, Rig, RigError};
 use dpm_rig::standing::{standing_in, state_folder, Identity};
 use std::net::{SocketAddr, TcpListener};
 use std::path::Path;
@@ -20,7 +21,7 @@ use std::time::SystemTime;
 /// Less free space than this, bytes, is soon used up by pictures and traces.
 const LITTLE_SPACE: u64 = 1 << 30;
 /// Most warnings of a scene that are told.
-const MOST_WARNINGS: usize = 4;
+const MOST_WARNINGS: usize = 16;
 
 /// Everything that can be said of the rig of `config`. `loads`: the code of libraries that it names may run. `with` reads the
 /// same rig file with other keys.
@@ -43,6 +44,7 @@ pub(super) fn findings(
     }
     let (tracker, heard) = devices::tracker(config, rig.as_ref().ok());
     all.extend([tracker, observer(config, heard.as_ref())]);
+    all.extend(rig.as_ref().ok().and_then(|rig| reach(rig, heard.as_ref())));
     all.extend(pictures(config));
     all.push(calibration(config));
     all.extend(standing_order(config));
@@ -107,6 +109,40 @@ fn scene(rig: &Rig) -> Finding {
     Finding::new("scene", State::Warning, format!("{found}; {}{more}", told.join("; ")), remedy)
 }
 
+/// Where the bodies are in the projector's light: by what was `heard` of the tracker, or by the motions of a mock.
+fn reach(rig: &Rig, heard: Option<&devices::Heard>) -> Option<Finding> {
+    let name = "reach";
+    let Some(heard) = heard else {
+        // Doubts about known motions are among the scene's notes.
+        let told = plausible::coverage(rig, &rig.true_poses(0)?);
+        return (!told.is_empty()).then(|| Finding::new(name, State::Info, told.join(", "), ""));
+    };
+    let poses: Vec<_> = heard.iter().map(|body| body.last.as_ref().map(affine)).collect();
+    // A body that is not seen is judged by the tracker's finding: it lies nowhere.
+    let mut doubts = Vec::new();
+    let mut covered = Vec::new();
+    for (tracked, pose) in poses.iter().enumerate() {
+        let Some(pose) = pose else { continue };
+        let mut places = vec![*pose; tracked + 1];
+        places[tracked] = *pose;
+        let of_body = format!("\"{}\"", heard[tracked].name);
+        let is_of = |told: &str| told.contains(&of_body);
+        covered.extend(plausible::coverage(rig, &places).into_iter().filter(|told| is_of(told)));
+        let all = plausible::of_places(rig, &[places]);
+        doubts.extend(all.into_iter().filter(|d| is_of(&d.about) || d.about == "projector"));
+    }
+    doubts.dedup();
+    if covered.is_empty() {
+        return None;
+    }
+    let Some(first) = doubts.first() else {
+        return Some(Finding::new(name, State::Ok, covered.join(", "), ""));
+    };
+    let remedy = first.remedy.clone();
+    let told: Vec<String> = doubts.iter().map(|d| format!("{}: {}", d.about, d.told)).collect();
+    Some(Finding::new(name, State::Warning, told.join("; "), remedy))
+}
+
 /// Whose eyes the rig follows and spares, and whether the tracker tells of them, if it was `heard`.
 fn observer(config: &RigConfig, heard: Option<&devices::Heard>) -> Finding {
     let name = "observer";
@@ -118,7 +154,7 @@ fn observer(config: &RigConfig, heard: Option<&devices::Heard>) -> Finding {
     };
     let named = |heads: Vec<&str>| heads.iter().map(|h| format!("{h:?}")).collect::<Vec<_>>().join(", ");
     let is_unheard = |head: &&str| {
-        heard.is_some_and(|heard| !heard.iter().any(|(name, count)| name == head && *count > 0))
+        heard.is_some_and(|heard| !heard.iter().any(|h| h.name == *head && h.count > 0))
     };
     let missing: Vec<&str> = heads.iter().copied().filter(is_unheard).collect();
     let spared = format!("the eye guard spares {} by {} m", named(heads.clone()), eyes.radius);
