@@ -69,6 +69,8 @@ pub const ALL: [(&str, Entry); 37] = [
     ("gltf_parts", crate::files::gltf_parts),
     ("mesh", crate::files::mesh),
     ("environment", crate::files::environment),
+    ("picture", crate::files::picture),
+    ("calibration", calibration),
 ];
 
 #[derive(Default)]
@@ -273,9 +275,8 @@ pub fn usbip_stream(bytes: &[u8]) {
     }
 }
 
-/// A rig file and a calibration file. What a calibration file yields is finite, and its export has no fault of form.
+/// A rig file.
 pub fn texts(bytes: &[u8]) {
-    calibrations(bytes);
     let Ok(text) = std::str::from_utf8(bytes) else { return };
     if let Err(errors) = RigConfig::parse("seed.toml", text, Path::new("/nonexistent"), &Overrides::default())
     {
@@ -283,7 +284,8 @@ pub fn texts(bytes: &[u8]) {
     }
 }
 
-fn calibrations(bytes: &[u8]) {
+/// A calibration file in any dialect, plain or in an archive. What it yields is finite, and its export has no fault of form.
+pub fn calibration(bytes: &[u8]) {
     let raster = Raster::new(64, 48).expect("not zero");
     for lens in [LensKind::Auto, LensKind::Fisheye] {
         let options = ReadOptions { raster, unit: LengthUnit::Metre, lens, region: None, device: None };

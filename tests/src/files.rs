@@ -4,7 +4,7 @@
 use dpm_scene::bvh::{BodyBvh, Refit};
 use dpm_scene::mesh::MAX_COORDINATE_M;
 use dpm_scene::{
-    decode_environment, load_bytes_here, load_mesh_here, Deformed, DeformingMesh, LoadOptions, MeshFormat,
+    decode_environment, decode_picture_here, load_bytes_here, load_mesh_here, Deformed, DeformingMesh, LoadOptions, MeshFormat,
     Scene, SceneError, TriangleMesh,
 };
 
@@ -89,6 +89,18 @@ pub fn container(document: &[u8], binary: &[u8]) -> Vec<u8> {
         body.extend(chunk(b"BIN\0", binary, 0));
     }
     [&b"glTF\x02\0\0\0"[..], &(body.len() as u32 + 12).to_le_bytes(), &body].concat()
+}
+
+/// An image of any format that textures have: it has as many texels as it says.
+pub fn picture(bytes: &[u8]) {
+    match decode_picture_here(bytes) {
+        Ok(texture) => {
+            let pictures = texture.ends_ns.len().max(1);
+            assert_eq!(texture.texels.len(), pictures * texture.picture_len());
+        }
+        Err(e @ (SceneError::Internal(_) | SceneError::TimedOut(_))) => panic!("{e}"),
+        Err(e) => assert!(!e.to_string().is_empty()),
+    }
 }
 
 /// An environment of any format: whatever is read has as many texels as it says, and light that is a number.

@@ -33,6 +33,9 @@ const ENCLOSED: f64 = 1e-3;
 /// Units with their names in metres, in the order in which they are tried.
 const UNITS: [(f64, &str); 4] = [(1e-3, "millimetres"), (1e-2, "centimetres"), (0.0254, "inches"), (1e3, "kilometres")];
 
+/// How the text of every doubt begins: those of a rig that is built anew take the place of the old ones.
+pub(crate) const MARK: &str = "doubtful: ";
+
 /// Something that makes light unlikely.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Doubt {
@@ -46,7 +49,7 @@ pub struct Doubt {
 
 impl fmt::Display for Doubt {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        write!(f, "{}: {}; {}", self.about, self.told, self.remedy)
+        write!(f, "{MARK}{}: {}; {}", self.about, self.told, self.remedy)
     }
 }
 
@@ -176,7 +179,10 @@ fn of_shape(shape: &Shape) -> Vec<Doubt> {
 
 /// Bodies whose surfaces are closed, have one side, and show their backs.
 fn inside_out(rig: &Rig) -> Vec<Doubt> {
-    let is_out = |body: &&dpm_scene::Body| body.projected && body.is_whole() && turned(rig, &body.mesh);
+    // A room that does not move is seen from its inside.
+    let is_out = |body: &&dpm_scene::Body| {
+        body.projected && body.tracked.is_some() && body.is_whole() && turned(rig, &body.mesh)
+    };
     let told = |body: &dpm_scene::Body| Doubt {
         about: format!("body \"{}\"", body.name),
         told: "its mesh is turned inside out and single-sided: all light falls on its back, and it stays black".into(),

@@ -315,13 +315,10 @@ impl Rig {
             latency_ns,
             calibration,
         };
-        for doubt in plausible::doubts(&rig) {
-            let told = doubt.to_string();
-            // A rig that is built anew with the same scene has them already.
-            if !rig.scene.warnings.contains(&told) {
-                rig.scene.warnings.push(told);
-            }
-        }
+        // Those of a rig that was built before with the same scene may hold no more.
+        rig.scene.warnings.retain(|told| !told.starts_with(plausible::MARK));
+        let doubts = plausible::doubts(&rig);
+        rig.scene.warnings.extend(doubts.iter().map(ToString::to_string));
         Ok(rig)
     }
 

@@ -6,7 +6,7 @@ use std::path::Path;
 
 use super::limits::{Cancel, Limits};
 use super::mesh_file::MeshFormat;
-use super::{gltf_file, mesh_file, Scene, SceneError};
+use super::{gltf_file, mesh_file, Scene, SceneError, Texture};
 
 /// The node of the file for a rigid body of the rig file. The node and its descendants move as one.
 #[derive(Clone, Debug, PartialEq, Eq)]
@@ -122,6 +122,15 @@ pub fn load_bytes_here(bytes: &[u8], options: &LoadOptions) -> Result<Scene, Sce
 #[doc(hidden)]
 pub fn load_mesh_here(bytes: &[u8], format: MeshFormat, options: &LoadOptions) -> Result<Scene, SceneError> {
     mesh_file::read(bytes, format, None, options, &Cancel::default())
+}
+
+/// The texture of an image of any format in this thread, as [`load_bytes_here`].
+///
+/// # Errors
+/// It cannot be decoded, or has more than a million texels.
+#[doc(hidden)]
+pub fn decode_picture_here(bytes: &[u8]) -> Result<Texture, SceneError> {
+    gltf_file::decode_picture(bytes, 0, &Limits { texels: 1 << 20, ..Limits::default() })
 }
 
 fn read(

@@ -175,10 +175,10 @@ fn calibrations() -> Vec<(&'static str, &'static str, Vec<u8>)> {
         std::fs::read(assets.join(name)).expect("an asset")
     };
     vec![
-        ("texts", "opencv.xml", of("opencv/fisheye.xml")),
-        ("texts", "opencv.yml", of("opencv/tilted14.yml")),
-        ("texts", "opencv.json", of("opencv/brown5.json")),
-        ("texts", "mpcdi.xml", of("mpcdi/shader_lamp.mpcdi.xml")),
+        ("calibration", "opencv.xml", of("opencv/fisheye.xml")),
+        ("calibration", "opencv.yml", of("opencv/tilted14.yml")),
+        ("calibration", "opencv.json", of("opencv/brown5.json")),
+        ("calibration", "mpcdi.xml", of("mpcdi/shader_lamp.mpcdi.xml")),
     ]
 }
 
@@ -335,6 +335,30 @@ fn files() -> Vec<(&'static str, &'static str, Vec<u8>)> {
             .write_to(&mut exr, ::image::ImageFormat::OpenExr)
             .unwrap();
         seeds.push(("environment", "exr", exr.into_inner()));
+    }
+    for (name, format) in [
+        ("png", ::image::ImageFormat::Png),
+        ("tga", ::image::ImageFormat::Tga),
+        ("bmp", ::image::ImageFormat::Bmp),
+        ("tiff", ::image::ImageFormat::Tiff),
+        ("webp", ::image::ImageFormat::WebP),
+    ] {
+        let mut file = std::io::Cursor::new(Vec::new());
+        let picture = ::image::RgbImage::from_fn(3, 2, |x, y| ::image::Rgb([40 * x as u8, 90 * y as u8, 7]));
+        picture.write_to(&mut file, format).unwrap();
+        seeds.push(("picture", name, file.into_inner()));
+    }
+    for (name, file) in [
+        ("sections", "c01-two-devices-procamcalib.yml"),
+        ("nested", "c02-two-devices.json"),
+        ("xml", "c04-slstudio-names.xml"),
+        ("kalibr", "c05-kalibr.yaml"),
+        ("mpcdi", "c10-mpcdi-zip-3d.mpcdi"),
+        ("numpy", "c11-numpy.npz"),
+        ("gzip", "c14-opencv.yml.gz"),
+    ] {
+        let folder = PathBuf::from(concat!(env!("CARGO_MANIFEST_DIR"), "/assets/cases"));
+        seeds.push(("calibration", name, std::fs::read(folder.join(file)).unwrap()));
     }
     seeds
 }

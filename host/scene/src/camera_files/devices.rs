@@ -10,7 +10,7 @@ use crate::geometry::lens::Lens;
 use crate::geometry::projector::ProjectorCamera;
 use dpm_device::planes::Raster;
 use glam::{DMat3, DVec3};
-use std::collections::BTreeSet;
+use std::collections::{BTreeMap, BTreeSet};
 
 /// Poses of many views, of which none is the projector's.
 const VIEWS: &[&str] = &["extrinsic_parameters", "Extrinsic_Parameters", "rvecs", "tvecs"];
@@ -18,6 +18,10 @@ const VIEWS: &[&str] = &["extrinsic_parameters", "Extrinsic_Parameters", "rvecs"
 const LEAST_FOCAL: f64 = 0.05;
 /// A principal point farther from the middle of the columns than this share of the width is rare: lenses shift up and down.
 const RARE_SHIFT: f64 = 0.2;
+
+/// Entries with known names, and devices, beyond which a file is no calibration.
+const MOST_KNOWN: usize = 4096;
+const MOST_DEVICES: usize = 64;
 
 /// One entry whose name is known.
 struct Known<'a> {
@@ -580,10 +584,11 @@ fn unread(all: &Entries, known: &[Known], devices: &[Device], parts: &Parts, use
         devices.iter().find(|d| of(d)).map(|d| d.label.clone())
     };
     let mut out: Vec<String> = Vec::new();
+    let by_name: BTreeMap<(&str, &str), &Known> = known.iter().map(|k| ((k.section, k.name), k)).collect();
     for (section, inside) in &all.sections {
         for (name, entry) in inside {
             let path = joined(section, name);
-            let hit = known.iter().find(|k| k.section == section && k.name == name);
+            let hit = by_name.get(&(section.as_str(), name.as_str()));
             let owner = hit.map_or(Owner::Own, |k| k.owner.clone());
             if let Some(label) = is_others(section, &owner) {
                 let told = format!("the device {label}");
@@ -647,7 +652,13 @@ fn is_within(told: &Told, parts: &Parts) -> bool {
 /// projector's space: `x_proj = R x + T`, looking along +Z with y down, as in OpenCV.
 pub(super) fn read(all: &Entries, options: &ReadOptions) -> Result<StoredCalibration, StorageError> {
     let known = known(all);
+    if known.len() > MOST_KNOWN {
+        return Err(StorageError::Refused(format!("it has more than {MOST_KNOWN} entries of a calibration")));
+    }
     let devices = devices(&known);
+    if devices.len() > MOST_DEVICES {
+        return Err(StorageError::Refused(format!("it has {} devices, at most {MOST_DEVICES} are read", devices.len())));
+    }
     let device = choose(all, &devices, options.device)?;
     let parts = Parts::of(&device, &devices, &known);
     let mut used = Used::default();

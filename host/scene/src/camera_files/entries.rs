@@ -91,10 +91,22 @@ impl Entries {
     }
 }
 
+/// Longest path of a section, bytes. Each section keeps its own.
+const LONGEST: usize = 512;
+
+/// The path of a section inside another.
+pub(super) fn inner(section: &str, name: &str) -> Result<String, StorageError> {
+    if section.len() + name.len() > LONGEST {
+        let what = format!("names around it are longer than {LONGEST} bytes together");
+        return Err(StorageError::Refused(what));
+    }
+    Ok(joined(section, name))
+}
+
 /// The path of an entry.
 pub(super) fn joined(section: &str, name: &str) -> String {
-    if section.is_empty() {
-        return name.into();
+    if section.is_empty() || name.is_empty() {
+        return format!("{section}{name}");
     }
     format!("{section}/{name}")
 }

@@ -1,6 +1,6 @@
 //! Reads OpenCV's JSON, which is not quite JSON: it has comments, `.Nan` and `.Inf`.
 
-use super::entries::{joined, number, Entries, Entry, Parts};
+use super::entries::{inner, number, Entries, Entry, Parts};
 use super::StorageError;
 
 /// Deepest nesting that is read.
@@ -170,7 +170,7 @@ fn add(found: &mut Entries, section: &str, name: &str, value: &Value) -> Result<
         Value::List(list) => match rows(list) {
             Some(rows) => found.add(section, name, Entries::list(rows)),
             None => {
-                let inside = inner(section, name);
+                let inside = inner(section, name)?;
                 for (i, value) in list.iter().enumerate() {
                     match value {
                         Value::Map(_) | Value::List(_) => add(found, &inside, &i.to_string(), value)?,
@@ -182,20 +182,12 @@ fn add(found: &mut Entries, section: &str, name: &str, value: &Value) -> Result<
         Value::Map(map) => match matrix(name, map)? {
             Some(matrix) => found.add(section, name, Entry::Matrix(matrix)),
             None => {
-                let inside = inner(section, name);
+                let inside = inner(section, name)?;
                 map.iter().try_for_each(|(key, v)| add(found, &inside, key, v))?;
             }
         },
     }
     Ok(())
-}
-
-/// The section inside a name.
-fn inner(section: &str, name: &str) -> String {
-    if name.is_empty() {
-        return section.into();
-    }
-    joined(section, name)
 }
 
 /// The matrix that a map describes, if it describes one.

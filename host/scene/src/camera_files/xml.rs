@@ -1,7 +1,7 @@
 //! A small reader of XML: the elements of a text with their attributes and texts. No entities are fetched, no document
 //! type is followed, and the depth is bounded.
 
-use super::entries::{joined, Entries, Entry, Parts};
+use super::entries::{inner, Entries, Entry, Parts};
 use super::StorageError;
 
 /// Deepest nesting that is read.
@@ -121,7 +121,7 @@ impl<'a> Document<'a> {
             let path = if element.children.is_empty() || element.is_matrix {
                 String::new()
             } else {
-                joined(&section, &name)
+                inner(&section, &name)?
             };
             inside.push(path);
             if self.elements[parent].is_matrix {

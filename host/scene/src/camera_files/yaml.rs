@@ -5,7 +5,7 @@
 //! words by name in nested sections. Files without the tag `!!opencv-matrix` (ROS writes such), lists of lists line by line
 //! (kalibr and PyYAML) and maps in braces are read as well.
 
-use super::entries::{joined, number, Entries, Entry, Parts};
+use super::entries::{inner, number, Entries, Entry, Parts};
 use super::{json, StorageError};
 
 /// Deepest nesting that is read.
@@ -190,7 +190,7 @@ pub(super) fn entries(text: &str) -> Result<Entries, StorageError> {
                 continue;
             }
         }
-        let section = open.last().map_or(String::new(), |o| joined(&o.section, o.name));
+        let section = open.last().map_or(Ok(String::new()), |o| inner(&o.section, o.name))?;
         if item.value.is_empty() || item.value.starts_with("!!opencv-matrix") {
             if open.len() == DEEPEST {
                 let what = format!("sections are nested more than {DEEPEST} deep");
@@ -236,7 +236,7 @@ fn close<'a>(open: &mut Vec<Open<'a>>, found: &mut Entries) -> Result<(), Storag
         return Ok(());
     }
     // A section that counts rows and columns without being a matrix.
-    let inside = joined(&section, name);
+    let inside = inner(&section, name)?;
     for (key, word) in [("rows", parts.rows), ("cols", parts.columns), ("dt", parts.kind)] {
         if let Some(word) = word {
             found.add(&inside, key, Entries::word(word));

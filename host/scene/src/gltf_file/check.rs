@@ -13,7 +13,7 @@ use super::json::{shorten, Item};
 use super::ktx2_image;
 
 /// Extensions that this program understands, or may ignore without a wrong picture.
-const UNDERSTOOD: [&str; 17] = [
+const UNDERSTOOD: [&str; 18] = [
     compressed::DRACO,
     compressed::MESHOPT[0],
     compressed::MESHOPT[1],
@@ -29,6 +29,7 @@ const UNDERSTOOD: [&str; 17] = [
     "KHR_mesh_quantization",
     super::flatten::VISIBILITY,
     ktx2_image::BASISU,
+    ktx2_image::WEBP,
     "KHR_texture_transform",
     "KHR_xmp_json_ld",
 ];
@@ -117,9 +118,7 @@ pub(crate) fn check_asset(root: &Item) -> Result<(), SceneError> {
             continue;
         }
         let remedy = match name {
-            "EXT_texture_webp" | "EXT_texture_avif" | "MSFT_texture_dds" => {
-                "re-export with PNG, JPEG or KTX2 textures"
-            }
+            "EXT_texture_avif" | "MSFT_texture_dds" => "re-export with PNG, JPEG, WebP or KTX2 textures",
             "KHR_materials_pbrSpecularGlossiness" => "convert the materials to metallic-roughness",
             _ => "re-export without it, or list it only in extensionsUsed if the scene can do without",
         };

@@ -193,6 +193,12 @@ fn reduced(tree: &Value) -> Value {
         lists(&mut top, list, &mut |object| strip(object, &["extras"]));
     }
     lists(&mut top, "textures", &mut |texture| strip(texture, &["extensions"]));
+    // A scene may have no nodes, and the crate wants the list.
+    lists(&mut top, "scenes", &mut |scene| {
+        if let Some(scene) = scene.as_object_mut() {
+            scene.entry("nodes").or_insert_with(|| serde_json::json!([]));
+        }
+    });
     if let Some(extensions) = top.get_mut("extensions").and_then(Value::as_object_mut) {
         extensions.retain(|key, _| key == "KHR_lights_punctual");
     }

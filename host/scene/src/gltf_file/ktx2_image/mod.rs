@@ -27,6 +27,8 @@ use super::picture::{check_size, Picture, Size};
 
 /// The extension, at textures.
 pub(super) const BASISU: &str = "KHR_texture_basisu";
+/// The extension by which a texture names an image in WebP.
+pub(super) const WEBP: &str = "EXT_texture_webp";
 
 /// What to do about an image that cannot be shown.
 const REMEDY: &str = "encode it as ETC1S or UASTC, or export PNG or JPEG textures";
@@ -55,6 +57,9 @@ pub(super) fn make_plain(tree: &mut Value, limits: &Limits) -> Result<(), SceneE
             if let Some(source) = extension.index("source", images, "image")? {
                 sources.push((i, source));
             }
+        } else if let Some(extension) = texture.extension(WEBP)?.filter(|_| texture.get("source").is_none()) {
+            // An image for all programs is taken where there is one.
+            sources.extend(extension.index("source", images, "image")?.map(|source| (i, source)));
         }
     }
     for (texture, source) in sources {

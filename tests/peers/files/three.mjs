@@ -1,0 +1,48 @@
+// Reads mesh files with the loaders of three.js, one path a line on standard input; prints an object a line: triangles and
+// sides, or why it cannot. Textures need a browser and are left out.
+import { readFileSync } from 'node:fs';
+import { createInterface } from 'node:readline';
+import { Box3, Vector3 } from 'three';
+import { GLTFLoader } from 'three/examples/jsm/loaders/GLTFLoader.js';
+import { OBJLoader } from 'three/examples/jsm/loaders/OBJLoader.js';
+import { PLYLoader } from 'three/examples/jsm/loaders/PLYLoader.js';
+import { STLLoader } from 'three/examples/jsm/loaders/STLLoader.js';
+
+globalThis.self = globalThis;
+globalThis.ProgressEvent ??= class {};
+
+const count = (geometry) => (geometry.index ?? geometry.getAttribute('position')).count / 3;
+
+function ofGeometry(geometry) {
+  geometry.computeBoundingBox();
+  return { triangles: count(geometry), sides: geometry.boundingBox.getSize(new Vector3()).toArray() };
+}
+
+function ofObject(object) {
+  object.updateMatrixWorld(true);
+  let triangles = 0;
+  object.traverse((part) => { if (part.isMesh) triangles += count(part.geometry); });
+  const sides = new Box3().setFromObject(object, true).getSize(new Vector3()).toArray();
+  return { triangles, sides };
+}
+
+async function read(path) {
+  const bytes = readFileSync(path);
+  const buffer = bytes.buffer.slice(bytes.byteOffset, bytes.byteOffset + bytes.length);
+  const ending = path.toLowerCase().split('.').pop();
+  if (ending === 'stl') return ofGeometry(new STLLoader().parse(buffer));
+  if (ending === 'ply') return ofGeometry(new PLYLoader().parse(buffer));
+  if (ending === 'obj') return ofObject(new OBJLoader().parse(bytes.toString('utf8')));
+  return ofObject((await new GLTFLoader().parseAsync(ending === 'glb' ? buffer : bytes.toString('utf8'), '')).scene);
+}
+
+for await (const path of createInterface({ input: process.stdin })) {
+  let told;
+  try {
+    told = await read(path);
+    if (!(told.triangles > 0)) told = { refused: 'no triangles' };
+  } catch (e) {
+    told = { refused: String(e.message ?? e).slice(0, 200) };
+  }
+  console.log(JSON.stringify({ file: path, read: told }));
+}
