@@ -10,12 +10,12 @@ use std::fmt;
 
 /// Sizes of bodies before a projector, metres: the longest side.
 const SIZES_M: std::ops::RangeInclusive<f64> = 0.002..=20.0;
-/// Sizes that a unit must make of a mesh to be named as the right one.
-const USUAL_SIZES_M: std::ops::RangeInclusive<f64> = 0.03..=4.0;
+/// Sizes that a unit must make of a mesh to be named as the right one, and the most usual of them.
+const USUAL_SIZES_M: (std::ops::RangeInclusive<f64>, f64) = (0.03..=4.0, 0.3);
 /// Distances between a projector and what it lights.
 const DISTANCES_M: std::ops::RangeInclusive<f64> = 0.03..=30.0;
-/// Distances that a unit must make to be named as the right one.
-const USUAL_DISTANCES_M: std::ops::RangeInclusive<f64> = 0.25..=10.0;
+/// Distances that a unit must make to be named as the right one, and the most usual of them.
+const USUAL_DISTANCES_M: (std::ops::RangeInclusive<f64>, f64) = (0.25..=10.0, 1.2);
 /// A mesh lies far from its body's origin beyond so many of its own sizes, and beyond so many metres.
 const FAR: (f64, f64) = (10.0, 3.0);
 /// Pixels across, below which nothing can be seen on a body.
@@ -30,7 +30,7 @@ const OPEN: f64 = 0.02;
 /// Share of a box's volume that a closed surface encloses at least.
 const ENCLOSED: f64 = 1e-3;
 
-/// Units with their names in metres, in the order in which they are tried.
+/// Units with their names in metres.
 const UNITS: [(f64, &str); 4] = [(1e-3, "millimetres"), (1e-2, "centimetres"), (0.0254, "inches"), (1e3, "kilometres")];
 
 /// How the text of every doubt begins: those of a rig that is built anew take the place of the old ones.
@@ -123,9 +123,14 @@ fn view(camera: &ProjectorCamera, points: &[DVec3], place: &DAffine3) -> View {
     View { distance, size_px, is_near }
 }
 
-/// The unit that makes a length usual, and its metres.
-fn fitting(length: f64, usual: &std::ops::RangeInclusive<f64>) -> Option<(f64, &'static str)> {
-    UNITS.into_iter().find(|(metres, _)| usual.contains(&(length * metres)))
+/// The unit that makes a length the most usual one, with its metres; `None` if none makes it usual.
+fn fitting(
+    length: impl Fn(f64) -> Option<f64>,
+    (usual, best): &(std::ops::RangeInclusive<f64>, f64),
+) -> Option<(f64, &'static str)> {
+    let off = |metres: f64| Some((length(metres).filter(|l| usual.contains(l))? / best).ln().abs());
+    let fitting = UNITS.into_iter().filter_map(|(metres, name)| Some((off(metres)?, (metres, name))));
+    fitting.min_by(|a, b| a.0.total_cmp(&b.0)).map(|(_, unit)| unit)
 }
 
 fn metres(length: f64) -> String {
@@ -141,8 +146,7 @@ fn metres(length: f64) -> String {
 pub fn doubts(rig: &Rig) -> Vec<Doubt> {
     let mut all: Vec<Doubt> = Vec::new();
     for tracked in 0..rig.bodies.len() {
-        let Some(shape) = shape(rig, tracked) else { continue };
-        all.extend(of_shape(&shape));
+        all.extend(shape(rig, tracked).iter().flat_map(of_shape));
     }
     all.extend(inside_out(rig));
     let instants = (0..INSTANTS).map(|i| rig.true_poses(i * INSTANT_NS));
@@ -157,7 +161,7 @@ fn of_shape(shape: &Shape) -> Vec<Doubt> {
     let about = format!("body \"{}\"", shape.name);
     let size = shape.longest();
     if !SIZES_M.contains(&size) {
-        let (told, remedy) = match fitting(size, &USUAL_SIZES_M) {
+        let (told, remedy) = match fitting(|unit| Some(size * unit), &USUAL_SIZES_M) {
             Some((unit, name)) => (
                 format!("it is {} long, and no raster covers that: {name}?", metres(size)),
                 format!("set scene.scale = {unit} if they are"),
@@ -226,7 +230,8 @@ pub fn of_places(rig: &Rig, places: &[Vec<DAffine3>]) -> Vec<Doubt> {
     let scale = f64::from(rig.config.projector.width) / f64::from(camera.raster.width());
     let mut all: Vec<Doubt> = Vec::new();
     for tracked in 0..rig.bodies.len() {
-        let Some(shape) = shape(rig, tracked) else { continue };
+        // A mesh of a doubtful size or place says nothing of where its body is.
+        let Some(shape) = shape(rig, tracked).filter(|shape| of_shape(shape).is_empty()) else { continue };
         let of_body: Vec<&DAffine3> = places.iter().filter_map(|at| at.get(tracked)).collect();
         let seen: Vec<(View, &DAffine3)> =
             of_body.iter().map(|place| (view(camera, &shape.points, place), *place)).collect();
@@ -272,7 +277,9 @@ pub fn of_places(rig: &Rig, places: &[Vec<DAffine3>]) -> Vec<Doubt> {
             },
         });
     }
-    all.dedup();
+    // The projector's place is one, whichever body shows it.
+    let mut is_first = true;
+    all.retain(|doubt| doubt.about != "projector" || std::mem::take(&mut is_first));
     all
 }
 
@@ -283,15 +290,16 @@ fn at_place(place: &DAffine3) -> String {
 
 /// The unit in which the projector's place would make sense, if it is too far away.
 fn projector_unit(rig: &Rig, shape: &Shape, place: &DAffine3, distance: f64) -> Option<(f64, &'static str)> {
-    if distance < *DISTANCES_M.end() || !USUAL_DISTANCES_M.contains(&place.translation.length().max(0.25)) {
+    if distance < *DISTANCES_M.end() || place.translation.length() > *USUAL_DISTANCES_M.0.end() {
         return None;
     }
-    UNITS.into_iter().filter(|(unit, _)| *unit < 1.0).find(|(unit, _)| {
+    let distance_by = |unit: f64| {
         let mut camera = rig.camera;
-        camera.world_from_projector.translation *= *unit;
+        camera.world_from_projector.translation *= unit;
         let view = view(&camera, &shape.points, place);
-        view.is_near && USUAL_DISTANCES_M.contains(&view.distance)
-    })
+        (view.is_near && unit < 1.0).then_some(view.distance)
+    };
+    fitting(distance_by, &USUAL_DISTANCES_M)
 }
 
 /// The unit in which a body's place would be within reach.
@@ -299,12 +307,13 @@ fn tracker_unit(rig: &Rig, shape: &Shape, place: &DAffine3) -> Option<(f64, &'st
     if place.translation.length() < 10.0 {
         return None;
     }
-    UNITS.into_iter().filter(|(unit, _)| *unit < 1.0).find(|(unit, _)| {
+    let distance_by = |unit: f64| {
         let mut place = *place;
-        place.translation *= *unit;
+        place.translation *= unit;
         let view = view(&rig.camera, &shape.points, &place);
-        view.is_near && DISTANCES_M.contains(&view.distance)
-    })
+        (view.is_near && unit < 1.0).then_some(view.distance)
+    };
+    fitting(distance_by, &USUAL_DISTANCES_M)
 }
 
 /// How the raster covers each body at the given places, one part of a sentence each.

@@ -343,7 +343,7 @@ fn files_of_other_programs_are_opened_and_what_is_left_out_is_told() {
     let solid = Vec3::new(0.6, 0.6, 0.4);
     let ball = Vec3::splat(0.6);
     for (name, triangles, size, note) in [
-        ("a01-utm.obj", 36, solid, "5212.0 km from the origin"),
+        ("a01-utm.obj", 36, solid, "(451234.5, 98.3, 5212345.25) of the file is its origin"),
         ("a06-bom.stl", 36, solid, ""),
         ("a07-solid-binary-trailing.stl", 36, solid, "bytes behind the last triangle"),
         ("a09-faces-before-vertices.ply", 36, solid, ""),
@@ -355,7 +355,7 @@ fn files_of_other_programs_are_opened_and_what_is_left_out_is_told() {
         ("a24-tga-texture.glb", 36, solid, ""),
         ("a25-zero-scale-root.glb", 36, Vec3::ZERO, ""),
         ("a27-inside-out.stl", 528, ball, ""),
-        ("a28-451-km.ply", 0, ball, "451.2 km from the origin"),
+        ("a28-451-km.ply", 0, ball, "451.3 km from the origin"),
     ] {
         let options = LoadOptions { up: Some(crate::UpAxis::Y), ..LoadOptions::default() };
         let scene = crate::load(&case(name), &options).unwrap_or_else(|e| panic!("{name}: {e}"));
