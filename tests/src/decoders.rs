@@ -31,7 +31,7 @@ use std::path::Path;
 pub type Entry = fn(&[u8]);
 
 /// Every entry with the name of its fuzz target, which is also the name of its folder of seeds.
-pub const ALL: [(&str, Entry); 37] = [
+pub const ALL: [(&str, Entry); 39] = [
     ("link_stream", link_stream),
     ("link_rle", link_rle),
     ("link_tracks", link_tracks),

@@ -4,8 +4,8 @@
 use dpm_scene::bvh::{BodyBvh, Refit};
 use dpm_scene::mesh::MAX_COORDINATE_M;
 use dpm_scene::{
-    decode_environment, decode_picture_here, load_bytes_here, load_mesh_here, Deformed, DeformingMesh, LoadOptions, MeshFormat,
-    Scene, SceneError, TriangleMesh,
+    decode_environment, decode_picture_here, load_bytes_here, load_mesh_here, Deformed, DeformingMesh,
+    LoadOptions, MeshFormat, Scene, SceneError, TriangleMesh,
 };
 
 /// A glTF file as it is.

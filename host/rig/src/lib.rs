@@ -47,7 +47,6 @@ pub mod picture_stream;
 pub mod pictures;
 pub mod pipeline;
 pub mod plan;
-pub mod plausible;
 pub mod presence;
 pub mod projectors;
 mod render;

@@ -1,6 +1,7 @@
 //! Builds the parts of a rig from a checked configuration: scene, projector, bodies with their motions, tracker.
 
-use crate::plausible;
+pub mod plausible;
+
 use crate::calibrated::{calibrated_camera, measured, measured_camera, told_of_measured, CameraFileError};
 use crate::config::{
     BodyConfig, BuiltinScene, EnvironmentConfig, FileAxis, GazeConfig, LiveSource, PictureSource, RigConfig,
@@ -244,7 +245,8 @@ impl Rig {
         show_pictures(config, &mut scene)?;
         let features = SceneFeatures::of(&scene);
         let has_lights = features.lamp_triangles + features.punctual_lights > 0;
-        let (fitted, told) = environment(config, has_lights, &mut scene.warnings)?.unwrap_or(scene.environment).fitted();
+        let (fitted, told) =
+            environment(config, has_lights, &mut scene.warnings)?.unwrap_or(scene.environment).fitted();
         scene.environment = fitted;
         scene.warnings.extend(told.map(|t| format!("scene.environment: {t}")));
         if config.render.tracing == Tracing::Query && scene.bodies.iter().any(|b| b.deforms.is_some()) {

@@ -65,9 +65,7 @@ fn of_scene(scene: &Scene) -> Value {
 }
 
 fn corners(body: &Body) -> impl Iterator<Item = (DVec3, DVec3, DVec3)> + '_ {
-    let at = |i: u32| {
-        body.world_from_body_rest.transform_point3(body.mesh.positions[i as usize].as_dvec3())
-    };
+    let at = |i: u32| body.world_from_body_rest.transform_point3(body.mesh.positions[i as usize].as_dvec3());
     body.mesh.triangles.iter().map(move |&[a, b, c]| (at(a), at(b), at(c)))
 }
 
@@ -99,7 +97,13 @@ fn albedo(scene: &Scene, material: &Material, body: &Body, triangle: usize) -> V
         let pick = |t: f32, n: u32| ((t.rem_euclid(1.0) * n as f32) as u32).min(n - 1) as usize;
         let (x, y) = (pick(uv.x, texture.width), pick(uv.y, texture.height));
         let [r, g, b, _] = texture.texels[y * texture.width as usize + x];
-        Vec3::from([r, g, b].map(|c| if texture.srgb { to_linear(f32::from(c) / 255.0) } else { f32::from(c) / 255.0 }))
+        Vec3::from([r, g, b].map(|c| {
+            if texture.srgb {
+                to_linear(f32::from(c) / 255.0)
+            } else {
+                f32::from(c) / 255.0
+            }
+        }))
     };
     let middle = (uvs[0] + uvs[1] + uvs[2]) / 3.0;
     base * uvs.map(|uv| at(uv.lerp(middle, 0.02))).iter().sum::<Vec3>() / 3.0

@@ -240,7 +240,9 @@ fn clamp(read: &mut Read, scale: f32) -> Result<(), SceneError> {
         (bright, format!("ones beyond {MAX_RADIANCE:e} are taken for that")),
     ] {
         if count > 0 {
-            read.warnings.push(format!("{count} texels of the environment are no light (the first at {x}, {y}): {what}"));
+            read.warnings.push(format!(
+                "{count} texels of the environment are no light (the first at {x}, {y}): {what}"
+            ));
         }
     }
     Ok(())
@@ -351,7 +353,10 @@ fn read_rgbe(bytes: &[u8]) -> Result<Read, SceneError> {
                 "32-bit_rle_rgbe" => {}
                 "32-bit_rle_xyze" => is_xyz = true,
                 other => {
-                    return Err(SceneError::unsupported(format!("the pixel format {other}"), "save it as RGBE"))
+                    return Err(SceneError::unsupported(
+                        format!("the pixel format {other}"),
+                        "save it as RGBE",
+                    ))
                 }
             },
             ("EXPOSURE", [value, ..]) => exposure *= value,
@@ -361,7 +366,9 @@ fn read_rgbe(bytes: &[u8]) -> Result<Read, SceneError> {
                 let at = |x: &f32, y: &f32| glam::DVec2::new(f64::from(*x), f64::from(*y));
                 primaries = Some(Primaries { rgb: [at(rx, ry), at(gx, gy), at(bx, by)], white: at(wx, wy) });
             }
-            ("COLORCORR" | "PRIMARIES", _) => warnings.push(format!("its {} has too few numbers: it is left out", name.trim())),
+            ("COLORCORR" | "PRIMARIES", _) => {
+                warnings.push(format!("its {} has too few numbers: it is left out", name.trim()))
+            }
             ("VIEW", _) if value.contains("-vt") && !value.contains("-vta") => {
                 warnings.push(format!("its VIEW is {}: it is read as latitude and longitude", value.trim()));
             }
@@ -402,7 +409,9 @@ fn read_rgbe(bytes: &[u8]) -> Result<Read, SceneError> {
             if y <= outer / 2 {
                 return Err(SceneError::broken(format!("row {y}"), "is cut off or damaged"));
             }
-            warnings.push(format!("it is cut off or damaged from scan line {y} of {outer} on: the rest is black"));
+            warnings.push(format!(
+                "it is cut off or damaged from scan line {y} of {outer} on: the rest is black"
+            ));
             texels.resize(inner as usize * outer as usize, Vec3::ZERO);
             break;
         }
@@ -416,7 +425,8 @@ fn read_rgbe(bytes: &[u8]) -> Result<Read, SceneError> {
     if !(by_rows && !outer_rises && inner_rises) {
         let stored = texels;
         let at = |x: u32, y: u32| {
-            let (x_rises, y_rises) = if by_rows { (inner_rises, outer_rises) } else { (outer_rises, inner_rises) };
+            let (x_rises, y_rises) =
+                if by_rows { (inner_rises, outer_rises) } else { (outer_rises, inner_rises) };
             let x = if x_rises { x } else { width - 1 - x };
             let y = if y_rises { height - 1 - y } else { y };
             let (outer_at, inner_at) = if by_rows { (y, x) } else { (x, y) };
@@ -749,7 +759,10 @@ mod tests {
         assert_eq!((texels[1], texels[10]), (Vec3::new(2.0, 0.0, 2.0), Vec3::new(131_008.0, 2.0, 2.0)));
         assert_eq!(texels[16].z, 0.0);
         let told = sky.warnings.join("; ");
-        assert!(["1 texels", "negative", "infinite", "no numbers", "at 1, 0"].iter().all(|w| told.contains(w)), "{told}");
+        assert!(
+            ["1 texels", "negative", "infinite", "no numbers", "at 1, 0"].iter().all(|w| told.contains(w)),
+            "{told}"
+        );
         // XYZE: white of equal energy is white here.
         let xyze = b"#?RADIANCE\nFORMAT=32-bit_rle_xyze\n\n-Y 1 +X 1\n\x80\x80\x80\x81".to_vec();
         let white = super::tests::texels(&xyze).2[0];

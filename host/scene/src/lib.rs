@@ -58,9 +58,9 @@ pub use error::SceneError;
 pub use limits::Limits;
 pub use linear_picture::{load_linear_picture, LinearPicture};
 pub use live_pictures::{LivePicture, LivePictures};
-pub use load::{load, load_bytes, AnimationChoice, BodySelector, LoadOptions, UpAxis};
 #[doc(hidden)]
 pub use load::{decode_picture_here, load_bytes_here, load_mesh_here};
+pub use load::{load, load_bytes, AnimationChoice, BodySelector, LoadOptions, UpAxis};
 #[doc(hidden)]
 pub use mesh_file::MeshFormat;
 pub use part_motion::PartMotion;

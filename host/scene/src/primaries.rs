@@ -20,9 +20,8 @@ fn xyz(c: DVec2) -> DVec3 {
 }
 
 /// Responses of the cones by Bradford.
-const CONES: DMat3 = DMat3::from_cols_array(&[
-    0.8951, -0.7502, 0.0389, 0.2664, 1.7135, -0.0685, -0.1614, 0.0367, 1.0296,
-]);
+const CONES: DMat3 =
+    DMat3::from_cols_array(&[0.8951, -0.7502, 0.0389, 0.2664, 1.7135, -0.0685, -0.1614, 0.0367, 1.0296]);
 
 impl Primaries {
     /// Those of sRGB and Rec. 709.
@@ -60,9 +59,8 @@ impl Primaries {
     pub(crate) fn to_srgb(self) -> Option<DMat3> {
         let (from, to) = (self.to_xyz()?, Self::SRGB.to_xyz()?);
         let cones = |white: DVec2| CONES * xyz(white);
-        let adapt = CONES.inverse()
-            * DMat3::from_diagonal(cones(Self::SRGB.white) / cones(self.white))
-            * CONES;
+        let adapt =
+            CONES.inverse() * DMat3::from_diagonal(cones(Self::SRGB.white) / cones(self.white)) * CONES;
         let all = to.inverse() * adapt * from;
         all.is_finite().then_some(all)
     }

@@ -68,15 +68,18 @@ pub(super) fn status(client: &NatNetClient) -> String {
 fn names(client: &NatNetClient) -> String {
     let names: Vec<String> =
         client.models().iter().take(16).map(|m| format!("{} = {}", quoted(&m.name), m.id)).collect();
-    if names.is_empty() { "none".into() } else { names.join(", ") }
+    if names.is_empty() {
+        "none".into()
+    } else {
+        names.join(", ")
+    }
 }
 
 /// A name without what a reader does not see: case, and blanks at its ends or doubled.
 fn folded(name: &str) -> String {
-    name.split(|c: char| c.is_whitespace() || matches!(c, '_' | '-')).filter(|p| !p.is_empty()).fold(
-        String::new(),
-        |all, part| all + " " + &part.to_lowercase(),
-    )
+    name.split(|c: char| c.is_whitespace() || matches!(c, '_' | '-'))
+        .filter(|p| !p.is_empty())
+        .fold(String::new(), |all, part| all + " " + &part.to_lowercase())
 }
 
 /// The rig's bodies that the server does not have, and what it has; `None` if it has all, or has told nothing yet.
@@ -113,7 +116,8 @@ fn doubles(client: &NatNetClient) -> Vec<String> {
             ));
         }
         let Some(id) = of_name.first() else { continue };
-        let of_id: Vec<String> = models.iter().filter(|m| m.id == *id).map(|m| quoted(&m.name)).take(8).collect();
+        let of_id: Vec<String> =
+            models.iter().filter(|m| m.id == *id).map(|m| quoted(&m.name)).take(8).collect();
         let is_told = told.iter().any(|t| t.contains(&format!("have number {id}:")));
         if of_id.len() > 1 && of_name.len() == 1 && !is_told {
             told.push(format!(

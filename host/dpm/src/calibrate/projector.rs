@@ -165,9 +165,8 @@ fn read_points(text: &str) -> Result<Vec<Sight>, String> {
                     raster's upper left corner"
             .into());
     }
-    let sight = |[x, y, z, column, row]: &[f64; 5]| {
-        Sight::at_rest(DVec3::new(*x, *y, *z), DVec2::new(*column, *row))
-    };
+    let sight =
+        |[x, y, z, column, row]: &[f64; 5]| Sight::at_rest(DVec3::new(*x, *y, *z), DVec2::new(*column, *row));
     Ok(points.iter().map(sight).collect())
 }
 

@@ -136,7 +136,8 @@ fn judge(light: &image::RgbImage, triangles: &[Triangle], shift: DVec2) -> Verdi
 fn light_of(model: &str, form: &str, method: &str, triangles: &[Triangle]) -> image::RgbImage {
     let calibration = asset(&format!("{model}.{form}"));
     let raster = dpm_device::planes::Raster::new(WIDTH, HEIGHT).expect("not zero");
-    let options = ReadOptions { raster, unit: LengthUnit::Metre, lens: LensKind::Auto, region: None, device: None };
+    let options =
+        ReadOptions { raster, unit: LengthUnit::Metre, lens: LensKind::Auto, region: None, device: None };
     let bytes = std::fs::read(&calibration).expect("an asset");
     let camera = camera_files::read(&bytes, &options).expect("a calibration").camera;
     // The wall only tells the picture's writer that there is a surface; it is far and wide.

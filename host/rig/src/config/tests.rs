@@ -380,7 +380,7 @@ const BAD: &[(&str, usize, usize, &str, &str)] = &[
         2,
         20,
         "projector.calibration_unit",
-        "\"metre\" | \"millimetre\"",
+        "\"metre\" | \"centimetre\" | \"millimetre\"",
     ),
     ("[tracker]\nkind = \"natnet\"\nserver = \"motive.lab\"", 3, 10, "tracker.server", "not an IPv4 address"),
     (

@@ -1,8 +1,8 @@
 //! Warns about a body that the tracker never reports where the projector's light can fall: the tracker may send
 //! millimetres instead of metres, exchange axes, or have another origin than the camera calibration.
 
-use dpm_scene::geometry::projector::ProjectorCamera;
 use dpm_device::time::HostTime;
+use dpm_scene::geometry::projector::ProjectorCamera;
 use glam::{DAffine3, DVec3};
 
 /// Number of frames with a reported body before the body is judged. Frames in which the body was too old to be lit

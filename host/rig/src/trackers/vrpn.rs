@@ -105,7 +105,8 @@ mod tests {
     #[test]
     fn an_address_as_vrpns_programs_write_it_is_read() {
         let of = |server: &str, tracker: &str| {
-            let config = VrpnConfig { server: server.into(), tracker: tracker.into(), ..VrpnConfig::default() };
+            let config =
+                VrpnConfig { server: server.into(), tracker: tracker.into(), ..VrpnConfig::default() };
             let (server, tracker) = config.address();
             format!("{tracker} at {server}")
         };

@@ -96,7 +96,11 @@ pub(super) fn mpcdi(bytes: &[u8]) -> Result<String, StorageError> {
     let content = match member.method {
         0 => bounded(member.data),
         8 => bounded(flate2::read::DeflateDecoder::new(member.data)),
-        _ => return refused("its mpcdi.xml is compressed in an unusual way; unpack it and give mpcdi.xml".into()),
+        _ => {
+            return refused(
+                "its mpcdi.xml is compressed in an unusual way; unpack it and give mpcdi.xml".into(),
+            )
+        }
     };
     let content = match content {
         Ok(content) if content.len() > MAX_BYTES => return Err(StorageError::TooLarge(content.len())),

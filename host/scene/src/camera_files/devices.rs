@@ -74,9 +74,10 @@ fn known(all: &Entries) -> Vec<Known<'_>> {
                 },
                 // A matrix F is fundamental, a number is not.
                 (Entry::Number(_), Role::ByProduct) if name.len() == 1 => continue,
-                (Entry::Text(_), Role::Intrinsics | Role::Distortion | Role::Rotation | Role::Translation) => {
-                    continue
-                }
+                (
+                    Entry::Text(_),
+                    Role::Intrinsics | Role::Distortion | Role::Rotation | Role::Translation,
+                ) => continue,
                 _ => (owner, role),
             };
             out.push(Known { section, name, owner, role, from_camera, entry });
@@ -303,7 +304,8 @@ fn intrinsics(parts: &Parts, used: &mut Used) -> Result<(String, Intrinsics), St
         first = Some((fx.0, [fx.1, fy.1, cx.1, cy.1]));
     }
     let Some((k, [fx, fy, cx, cy])) = first else {
-        let names = "camera_matrix, cameraMatrix, K, mtx, proj_int, proj_K, Kp, intrinsics, or all of fx, fy, cx, cy";
+        let names =
+            "camera_matrix, cameraMatrix, K, mtx, proj_int, proj_K, Kp, intrinsics, or all of fx, fy, cx, cy";
         let has = numbers.iter().map(|(k, _)| k.path()).collect::<Vec<_>>().join(", ");
         return Err(StorageError::Missing { part: "intrinsics", names, has });
     };
@@ -436,7 +438,11 @@ fn missing(parts: &Parts, part: &'static str) -> StorageError {
     };
     let matrices = parts.scope.iter().filter(|k| matches!(k.entry, Entry::Matrix(_)));
     let has: Vec<String> = matrices.take(24).map(|k| k.path()).collect();
-    StorageError::Missing { part, names, has: if has.is_empty() { "no matrix".into() } else { has.join(", ") } }
+    StorageError::Missing {
+        part,
+        names,
+        has: if has.is_empty() { "no matrix".into() } else { has.join(", ") },
+    }
 }
 
 /// Why there is no pose, with what to do.
@@ -460,7 +466,8 @@ fn says_fisheye(parts: &Parts, used: &mut Used) -> Result<Option<(String, bool)>
     let mut said: Option<(String, bool)> = None;
     for k in parts.with(Role::LensModel) {
         used.paths.insert(k.path());
-        let is_model = k.name.eq_ignore_ascii_case("camera_model") || k.name.eq_ignore_ascii_case("camera_type");
+        let is_model =
+            k.name.eq_ignore_ascii_case("camera_model") || k.name.eq_ignore_ascii_case("camera_type");
         let fisheye = match k.entry {
             Entry::Number(flag) => Some(*flag != 0.0),
             Entry::Text(word) => match word.to_ascii_lowercase().as_str() {
@@ -625,16 +632,16 @@ fn frame(told: &Told, parts: &Parts, devices: &[Device], known: &[Known]) -> Fra
     let mut others = devices.iter().filter(|d| *d != parts.device);
     let other = others.clone().find(|d| d.section == parts.device.section || !is_within(told, parts));
     if let Some(other) = other.filter(|_| is_between && (parts.is_shared || !is_within(told, parts))) {
-        let is_its = |k: &&Known| {
-            k.section == other.section && k.owner == other.owner && k.role == Role::Intrinsics
-        };
+        let is_its =
+            |k: &&Known| k.section == other.section && k.owner == other.owner && k.role == Role::Intrinsics;
         let name = known.iter().find(is_its);
         return Frame::Camera { name: name.map_or(other.label.clone(), Known::path) };
     }
     let is_origin = |d: &&Device| {
         let theirs = Parts::of(d, devices, known);
         told_pose(&theirs, &mut Used::default()).ok().flatten().is_some_and(|t| {
-            t.translation == DVec3::ZERO && (t.rotation - DMat3::IDENTITY).to_cols_array().iter().all(|v| *v == 0.0)
+            t.translation == DVec3::ZERO
+                && (t.rotation - DMat3::IDENTITY).to_cols_array().iter().all(|v| *v == 0.0)
         })
     };
     match others.find(is_origin) {
@@ -657,7 +664,10 @@ pub(super) fn read(all: &Entries, options: &ReadOptions) -> Result<StoredCalibra
     }
     let devices = devices(&known);
     if devices.len() > MOST_DEVICES {
-        return Err(StorageError::Refused(format!("it has {} devices, at most {MOST_DEVICES} are read", devices.len())));
+        return Err(StorageError::Refused(format!(
+            "it has {} devices, at most {MOST_DEVICES} are read",
+            devices.len()
+        )));
     }
     let device = choose(all, &devices, options.device)?;
     let parts = Parts::of(&device, &devices, &known);
@@ -683,7 +693,9 @@ pub(super) fn read(all: &Entries, options: &ReadOptions) -> Result<StoredCalibra
         ));
     }
     let k_at = k.at(size, options.raster)?;
-    if matches!(&device.owner, Owner::Other(label) if label == "1") && parts.own(Role::Rotation).next().is_none() {
+    if matches!(&device.owner, Owner::Other(label) if label == "1")
+        && parts.own(Role::Rotation).next().is_none()
+    {
         let shared = parts.with(Role::Rotation).next();
         if let Some(shared) = shared.filter(|_| parts.is_shared) {
             let what = "leads from device 1 to device 2, so device 1 has no pose in a world; calibrate so that the projector is \

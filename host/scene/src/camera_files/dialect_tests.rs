@@ -6,7 +6,8 @@ use glam::DVec2;
 use std::path::{Path, PathBuf};
 
 const K: &str = "1500, 0, 512, 0, 1500, 700, 0, 0, 1";
-const R: &str = "1, 0, 0, 0, -0.97513285579145981, 0.22162110358896811, 0, -0.22162110358896811, -0.97513285579145981";
+const R: &str =
+    "1, 0, 0, 0, -0.97513285579145981, 0.22162110358896811, 0, -0.22162110358896811, -0.97513285579145981";
 const T: &str = "0, 0.097513285579145972, 1.1502135276267447";
 const POSE: &str = "[[1, 0, 0, 0], [0, -0.97513285579145981, 0.22162110358896811, 0.097513285579145972], \
                     [0, -0.22162110358896811, -0.97513285579145981, 1.1502135276267447], [0, 0, 0, 1]]";
@@ -129,11 +130,17 @@ fn several_devices_are_a_question_whose_answer_is_the_projector() {
         let bytes = case(name);
         let told = read(&bytes, &options(unit)).unwrap_err().to_string();
         assert!(told.contains("2 devices") && told.contains("calibration_device"), "{told}");
-        assert!(told.to_lowercase().contains("camera") && told.to_lowercase().contains("projector"), "{told}");
+        assert!(
+            told.to_lowercase().contains("camera") && told.to_lowercase().contains("projector"),
+            "{told}"
+        );
         let stored = read(&bytes, &ReadOptions { device: Some(answer), ..options(unit) }).unwrap();
         check(&stored, lens, name);
         assert!(matches!(stored.frame, Frame::WorldOfCamera { .. }), "{:?}", stored.frame);
-        assert!(stored.unread.iter().any(|u| u.starts_with("the device") && u.to_lowercase().contains("camera")));
+        assert!(stored
+            .unread
+            .iter()
+            .any(|u| u.starts_with("the device") && u.to_lowercase().contains("camera")));
         let other = read(&bytes, &ReadOptions { device: Some("nobody"), ..options(unit) }).unwrap_err();
         assert!(other.to_string().contains("\"nobody\""), "{other}");
     }
@@ -182,17 +189,25 @@ fn what_is_ambiguous_is_not_guessed() {
         (format!("{{{k}, \"rvec\": [1, 0, 0], \"R\": [{R}], \"T\": [{T}]}}"), "different rotations"),
         (format!("{{{k}, \"extrinsics\": {POSE}, \"w2c\": {pose}}}"), "different poses"),
         (format!("{{{k}, \"rvec\": [-90, 0, 0], \"tvec\": [{T}]}}"), "in degrees"),
-        (format!("{{\"fx\": 1.46, \"fy\": 1.95, \"cx\": 0.5, \"cy\": 0.9, \"R\": [{R}], \"T\": [{T}]}}"), "normalised"),
+        (
+            format!("{{\"fx\": 1.46, \"fy\": 1.95, \"cx\": 0.5, \"cy\": 0.9, \"R\": [{R}], \"T\": [{T}]}}"),
+            "normalised",
+        ),
         (
             format!("{{\"K\": [[1500, 0, 0], [0, 1500, 0], [512, 700, 1]], \"R\": [{R}], \"T\": [{T}]}}"),
             "transpose",
         ),
         (format!("{{{k}, \"mtx\": [900, 900, 327, 235], \"R\": [{R}], \"T\": [{T}]}}"), "different lenses"),
         (
-            format!("{{{k}, \"R\": [{R}], \"T\": [{T}], \"width\": 1024, \"height\": 768, \"size\": [640, 480]}}"),
+            format!(
+                "{{{k}, \"R\": [{R}], \"T\": [{T}], \"width\": 1024, \"height\": 768, \"size\": [640, 480]}}"
+            ),
             "different sizes",
         ),
-        (format!("{{\"camera\": {{{k}}}, \"projector\": {{\"lens\": 3, \"R\": [{R}], \"T\": [{T}]}}}}"), "\"projector\""),
+        (
+            format!("{{\"camera\": {{{k}}}, \"projector\": {{\"lens\": 3, \"R\": [{R}], \"T\": [{T}]}}}}"),
+            "\"projector\"",
+        ),
         (format!("{{{k}, \"distortion_model\": \"fov\", \"R\": [{R}], \"T\": [{T}]}}"), "\"fov\""),
     ] {
         let got = fault(&text);
@@ -204,7 +219,8 @@ fn what_is_ambiguous_is_not_guessed() {
     let text = format!("{{{k}, \"camera_to_world\": {inverse}}}");
     let stored = read(text.as_bytes(), &options(LengthUnit::Metre)).unwrap();
     check(&stored, [0.0; 2], "camera to world");
-    let far = format!("{{\"K\": [1500, 0, 960, 0, 1500, 540, 0, 0, 1], \"R\": [{R}], \"T\": [{T}], \"gain\": 3}}");
+    let far =
+        format!("{{\"K\": [1500, 0, 960, 0, 1500, 540, 0, 0, 1], \"R\": [{R}], \"T\": [{T}], \"gain\": 3}}");
     let stored = read(far.as_bytes(), &options(LengthUnit::Metre)).unwrap();
     assert!(stored.notes.iter().any(|n| n.contains("calibration_raster")), "{:?}", stored.notes);
     assert_eq!(stored.unread, ["gain"]);

@@ -73,8 +73,7 @@ impl Entries {
 
     /// A number, or a text if it is none.
     pub(super) fn word(word: &str) -> Entry {
-        number(word)
-            .map_or_else(|| Entry::Text(word.trim_matches(['"', '\'']).into()), Entry::Number)
+        number(word).map_or_else(|| Entry::Text(word.trim_matches(['"', '\'']).into()), Entry::Number)
     }
 
     /// The paths of all matrices, for a message.

@@ -298,9 +298,9 @@ const REFUSED: &[(&[u8], &str)] = &[
         "it is an HDF5 file, perhaps a .mat of MATLAB 7.3; save K, dist, R and T of the projector as JSON",
     ),
 ];
-const PICKLE: &str = "it is a pickle of Python, which only a program may read; save mtx, dist, rvec and tvec as JSON: \
+const PICKLE: &str =
+    "it is a pickle of Python, which only a program may read; save mtx, dist, rvec and tvec as JSON: \
                       json.dump({\"K\": mtx.tolist(), ...}, file)";
-
 
 /// Intrinsics in this project's pixels: the raster's corner is at (0, 0), and pixel centres are at halves.
 struct Intrinsics {

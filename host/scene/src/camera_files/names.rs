@@ -138,15 +138,38 @@ fn owner(plain: &str) -> Option<(Owner, &str)> {
 /// What a name without its device's means: lower case, letters and digits alone.
 fn role(plain: &str) -> Option<Role> {
     Some(match plain {
-        "cameramatrix" | "k" | "mtx" | "m" | "intrinsicmatrix" | "intrinsics" | "intrinsic" | "int"
-        | "matrix" | "intrinsicsmatrix" | "kmatrix" | "intrinsicparameters" | "cammatrix" => Role::Intrinsics,
+        "cameramatrix"
+        | "k"
+        | "mtx"
+        | "m"
+        | "intrinsicmatrix"
+        | "intrinsics"
+        | "intrinsic"
+        | "int"
+        | "matrix"
+        | "intrinsicsmatrix"
+        | "kmatrix"
+        | "intrinsicparameters"
+        | "cammatrix" => Role::Intrinsics,
         "fx" | "focalx" | "focallengthx" => Role::Intrinsic(0),
         "fy" | "focaly" | "focallengthy" => Role::Intrinsic(1),
         "cx" | "ppx" | "principalpointx" => Role::Intrinsic(2),
         "cy" | "ppy" | "principalpointy" => Role::Intrinsic(3),
-        "distortioncoefficients" | "distcoeffs" | "distortioncoeffs" | "distcoeff" | "distortion" | "dist"
-        | "d" | "distcoefs" | "distcoef" | "lensdistortion" | "distortioncoef" | "kc" | "coeffs"
-        | "distortionparameters" | "distortionvector" => Role::Distortion,
+        "distortioncoefficients"
+        | "distcoeffs"
+        | "distortioncoeffs"
+        | "distcoeff"
+        | "distortion"
+        | "dist"
+        | "d"
+        | "distcoefs"
+        | "distcoef"
+        | "lensdistortion"
+        | "distortioncoef"
+        | "kc"
+        | "coeffs"
+        | "distortionparameters"
+        | "distortionvector" => Role::Distortion,
         "k1" => Role::Coefficient(0),
         "k2" => Role::Coefficient(1),
         "p1" => Role::Coefficient(2),
@@ -164,26 +187,76 @@ fn role(plain: &str) -> Option<Role> {
         "cameratoworld" | "camtoworld" | "c2w" | "twc" | "tworldcam" | "tworldproj" | "tworldprojector"
         | "tworldcamera" | "projectortoworld" | "projtoworld" | "timucam" | "worldfromcamera"
         | "worldfromprojector" => Role::Placement,
-        "pose" | "posematrix" | "transform" | "transformmatrix" | "transformation"
+        "pose"
+        | "posematrix"
+        | "transform"
+        | "transformmatrix"
+        | "transformation"
         | "transformationmatrix" => Role::EitherPose,
         "imagewidth" | "width" | "imagesizewidth" | "imgwidth" | "screenwidth" | "screenresx"
         | "resolutionx" | "resx" | "xres" | "xresolution" | "rasterwidth" | "w" => Role::Width,
         "imageheight" | "height" | "imagesizeheight" | "imgheight" | "screenheight" | "screenresy"
         | "resolutiony" | "resy" | "yres" | "yresolution" | "rasterheight" | "h" => Role::Height,
-        "resolution" | "imagesize" | "size" | "imgsize" | "rastersize" | "screenresolution" | "screensize"
-        | "imageresolution" | "res" => Role::Size,
+        "resolution" | "imagesize" | "size" | "imgsize" | "rastersize" | "screenresolution"
+        | "screensize" | "imageresolution" | "res" => Role::Size,
         "shape" | "imageshape" | "imgshape" => Role::Shape,
         "fisheyemodel" | "distortionmodel" | "cameramodel" | "lensmodel" | "cameratype" => Role::LensModel,
-        "e" | "f" | "essentialmatrix" | "fundamentalmatrix" | "rotationaxis" | "euler" | "fov"
-        | "rotationangleradians" | "rotationangledegrees" | "focallength" | "principalpoint"
-        | "perviewreprojectionerrors" | "perviewerrors" | "imagepoints" | "gridpoints" | "objectpoints"
-        | "projectionmatrix" | "p" | "calibrationtime" | "boardwidth" | "boardheight" | "squaresize"
-        | "markersize" | "nframes" | "nrofframes" | "numberofframes" | "flags" | "flagvalue" | "fixaspectratio"
-        | "aspectratio" | "avgreprojectionerror" | "avgreprojerr" | "maxreprojerr" | "reprojectionerror"
-        | "rms" | "rmserror" | "stereorms" | "error" | "camerror" | "projerror" | "stereoerror" | "caliberror"
-        | "cameraname" | "name" | "camoverlaps" | "rostopic" | "timeshiftcamimu" | "calibrationdate"
-        | "fixprincipalpoint" | "assumezerotangentialdistortion" | "fixk1" | "fixk2" | "fixk3"
-        | "calibrationpattern" | "fisheyecalibration" | "typeid" => Role::ByProduct,
+        "e"
+        | "f"
+        | "essentialmatrix"
+        | "fundamentalmatrix"
+        | "rotationaxis"
+        | "euler"
+        | "fov"
+        | "rotationangleradians"
+        | "rotationangledegrees"
+        | "focallength"
+        | "principalpoint"
+        | "perviewreprojectionerrors"
+        | "perviewerrors"
+        | "imagepoints"
+        | "gridpoints"
+        | "objectpoints"
+        | "projectionmatrix"
+        | "p"
+        | "calibrationtime"
+        | "boardwidth"
+        | "boardheight"
+        | "squaresize"
+        | "markersize"
+        | "nframes"
+        | "nrofframes"
+        | "numberofframes"
+        | "flags"
+        | "flagvalue"
+        | "fixaspectratio"
+        | "aspectratio"
+        | "avgreprojectionerror"
+        | "avgreprojerr"
+        | "maxreprojerr"
+        | "reprojectionerror"
+        | "rms"
+        | "rmserror"
+        | "stereorms"
+        | "error"
+        | "camerror"
+        | "projerror"
+        | "stereoerror"
+        | "caliberror"
+        | "cameraname"
+        | "name"
+        | "camoverlaps"
+        | "rostopic"
+        | "timeshiftcamimu"
+        | "calibrationdate"
+        | "fixprincipalpoint"
+        | "assumezerotangentialdistortion"
+        | "fixk1"
+        | "fixk2"
+        | "fixk3"
+        | "calibrationpattern"
+        | "fisheyecalibration"
+        | "typeid" => Role::ByProduct,
         _ => return None,
     })
 }

@@ -8,7 +8,13 @@ use std::path::{Path, PathBuf};
 const YAML: &str = "%YAML:1.0\n---\nproj_K: !!opencv-matrix\n   rows: 3\n   cols: 3\n   dt: d\n   data: [ 1.2e+03, 0., 511.5,\n       0., 1.1e+03, 383.5, 0., 0., 1. ]\nproj_kc: !!opencv-matrix\n   rows: 1\n   cols: 5\n   dt: d\n   data: [ -0.1, 0.01, 0., 0., 0. ]\nroration: !!opencv-matrix\n   rows: 3\n   cols: 3\n   dt: d\n   data: [ 0., -1., 0., 1., 0., 0., 0., 0., 1. ]\nT: !!opencv-matrix\n   rows: 3\n   cols: 1\n   dt: d\n   data: [ 100., 200., 300. ]\nerror: 0.4\n";
 
 fn options(unit: LengthUnit) -> ReadOptions<'static> {
-    ReadOptions { raster: Raster::new(1024, 768).unwrap(), unit, lens: LensKind::Auto, region: None, device: None }
+    ReadOptions {
+        raster: Raster::new(1024, 768).unwrap(),
+        unit,
+        lens: LensKind::Auto,
+        region: None,
+        device: None,
+    }
 }
 
 fn read_text(text: &str, unit: LengthUnit) -> Result<StoredCalibration, StorageError> {

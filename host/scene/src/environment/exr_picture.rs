@@ -50,7 +50,12 @@ pub(super) fn read_exr(bytes: &[u8]) -> Result<Read, SceneError> {
             ));
         }
     }
-    SceneError::check_limit("the bytes of all layers of the environment", total, MAX_BYTES, "keep one layer")?;
+    SceneError::check_limit(
+        "the bytes of all layers of the environment",
+        total,
+        MAX_BYTES,
+        "keep one layer",
+    )?;
     let picture = read()
         .no_deep_data()
         .largest_resolution_level()
@@ -121,7 +126,11 @@ pub(super) fn read_exr(bytes: &[u8]) -> Result<Read, SceneError> {
 }
 
 fn shown(name: &str) -> String {
-    if name.is_empty() { "the one without a name".into() } else { format!("'{name}'") }
+    if name.is_empty() {
+        "the one without a name".into()
+    } else {
+        format!("'{name}'")
+    }
 }
 
 fn number(channel: &AnyChannel<FlatSamples>, i: usize) -> f32 {
@@ -168,7 +177,8 @@ fn groups(layers: &Layers) -> Vec<Group> {
                 },
             };
             let layer = layer.attributes.layer_name.as_ref().map_or(String::new(), ToString::to_string);
-            let name = [layer, front].into_iter().filter(|part| !part.is_empty()).collect::<Vec<_>>().join(".");
+            let name =
+                [layer, front].into_iter().filter(|part| !part.is_empty()).collect::<Vec<_>>().join(".");
             out.push(Group { layer: i, name, colour });
         }
     }
@@ -272,10 +282,21 @@ mod tests {
         };
         let read = |bytes: &[u8]| read_exr(bytes).unwrap();
         assert_eq!(read(&one(&["Y"], &[0.5])).texels, [Vec3::splat(0.5)]);
-        let layers = ["depth.Z", "diffuse.B", "diffuse.G", "diffuse.R", "sky.Combined.B", "sky.Combined.G", "sky.Combined.R"];
+        let layers = [
+            "depth.Z",
+            "diffuse.B",
+            "diffuse.G",
+            "diffuse.R",
+            "sky.Combined.B",
+            "sky.Combined.G",
+            "sky.Combined.R",
+        ];
         let several = read(&one(&layers, &[9.0, 1.0, 1.0, 1.0, 0.3, 0.2, 0.1]));
         assert_eq!(several.texels, [Vec3::new(0.1, 0.2, 0.3)]);
-        assert!(several.warnings[0].contains("'diffuse'") && several.warnings[0].contains("'sky.Combined' is the light"));
+        assert!(
+            several.warnings[0].contains("'diffuse'")
+                && several.warnings[0].contains("'sky.Combined' is the light")
+        );
         // Luminance 1 with red 1.5 and blue 0.5.
         let chroma = read(&one(&["BY", "RY", "Y"], &[-0.5, 0.5, 1.0])).texels[0];
         let green = (1.0 - 0.2126 * 1.5 - 0.0722 * 0.5) / 0.7152;
@@ -289,7 +310,9 @@ mod tests {
 
     #[test]
     fn single_texels_that_are_no_light_are_clamped_and_primaries_are_converted() {
-        for (name, told) in [("e02-negative.exr", "negative"), ("e03-inf-sun.exr", "65504"), ("e08-aces.exr", "0.7347")] {
+        for (name, told) in
+            [("e02-negative.exr", "negative"), ("e03-inf-sun.exr", "65504"), ("e08-aces.exr", "0.7347")]
+        {
             let sky = decode_environment(&case(name), 0.0, 1.0).unwrap();
             assert!(sky.warnings.iter().any(|w| w.contains(told)), "{name}: {:?}", sky.warnings);
         }

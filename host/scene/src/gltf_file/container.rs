@@ -86,7 +86,9 @@ fn split_glb(bytes: &[u8]) -> Result<Chunks<'_>, SceneError> {
     let (length, there) = (length as usize, bytes.len());
     let told = match length.cmp(&there) {
         std::cmp::Ordering::Equal => None,
-        std::cmp::Ordering::Less => Some(format!("{} bytes behind the end of the GLB are left out", there - length)),
+        std::cmp::Ordering::Less => {
+            Some(format!("{} bytes behind the end of the GLB are left out", there - length))
+        }
         std::cmp::Ordering::Greater => {
             Some(format!("the GLB header promises {length} bytes, the file has {there}: it is damaged"))
         }

@@ -99,7 +99,11 @@ pub(super) fn read(
     let document = gltf::Document::from_json_without_validation(typed);
     let hidden = flatten::hidden(&document, &nodes)?;
     if !hidden.is_empty() {
-        warnings.push(format!("{} nodes that the file hides ({}) are left out", hidden.len(), flatten::VISIBILITY));
+        warnings.push(format!(
+            "{} nodes that the file hides ({}) are left out",
+            hidden.len(),
+            flatten::VISIBILITY
+        ));
     }
     let claims = flatten::choose_bodies(&document, &hidden, options, &mut warnings)?;
     let mut look = look::read_look(&document, &root, &data, folder.as_ref(), limits, cancel, &mut warnings)?;

@@ -95,7 +95,8 @@ fn format_of(item: &Item, bytes: &[u8], name: &str) -> Result<ImageFormat, Scene
         )),
         Err(_) => {
             let name = name.to_ascii_lowercase();
-            let is_named = name.ends_with(".tga") || name.contains("image/x-tga") || name.contains("image/tga");
+            let is_named =
+                name.ends_with(".tga") || name.contains("image/x-tga") || name.contains("image/tga");
             // Kind of palette, kind of image, bits of a texel.
             let is_plausible = matches!(bytes, [_, 0 | 1, 1..=3 | 9..=11, ..])
                 && matches!(bytes.get(16), Some(8 | 15 | 16 | 24 | 32));

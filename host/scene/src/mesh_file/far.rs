@@ -51,5 +51,9 @@ pub(super) fn centre(document: &mut Document, scale: f64) -> Option<String> {
 
 /// A distance with the unit that suits it.
 fn distance(metres: f64) -> String {
-    if metres < 1e4 { format!("{metres:.0} m") } else { format!("{:.1} km", 1e-3 * metres) }
+    if metres < 1e4 {
+        format!("{metres:.0} m")
+    } else {
+        format!("{:.1} km", 1e-3 * metres)
+    }
 }

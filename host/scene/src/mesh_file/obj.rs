@@ -99,7 +99,9 @@ pub(super) fn is_likely(bytes: &[u8]) -> bool {
     };
     let lines = begin.split(|b| matches!(b, b'\n' | b'\r'));
     let (mut known, mut other) = (0, 0);
-    for line in lines.filter(|l| !l.trim_ascii().is_empty() && !l.trim_ascii_start().starts_with(b"#")).take(200) {
+    for line in
+        lines.filter(|l| !l.trim_ascii().is_empty() && !l.trim_ascii_start().starts_with(b"#")).take(200)
+    {
         *(if is_line(line) { &mut known } else { &mut other }) += 1;
     }
     known > 3 && known > 4 * other
@@ -135,7 +137,8 @@ pub(super) fn read(
         return Err(SceneError::unsupported("text in UTF-16", "save the file as UTF-8"));
     }
     let bytes = bytes.strip_prefix(b"\xef\xbb\xbf").unwrap_or(bytes);
-    let has_objects = bytes.split(|&b| matches!(b, b'\n' | b'\r')).any(|line| line.trim_ascii_start().starts_with(b"o "));
+    let has_objects =
+        bytes.split(|&b| matches!(b, b'\n' | b'\r')).any(|line| line.trim_ascii_start().starts_with(b"o "));
     let mut reader = Reader {
         lists: Lists::default(),
         library: Library::default(),
@@ -175,9 +178,10 @@ impl Reader<'_> {
                 self.lists.uvs.push([number(), 1.0 - number()]);
             }
             // Zero is repaired by the reader of glTF.
-            "vn" => self.lists.normals.push(
-                numbers::<3>(line, &mut words, "vn").map_or([0.0; 3], |n| n.map(|x| x as f32)),
-            ),
+            "vn" => self
+                .lists
+                .normals
+                .push(numbers::<3>(line, &mut words, "vn").map_or([0.0; 3], |n| n.map(|x| x as f32))),
             "f" | "fo" => self.face(&mut words)?,
             "o" | "g" if word == self.begins => self.begin(rest()),
             "usemtl" => self.material = Some(self.library.material(rest())),

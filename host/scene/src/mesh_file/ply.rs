@@ -264,11 +264,17 @@ pub(super) fn read(
 ) -> Result<Document, SceneError> {
     let (header, rest) = read_header(bytes)?;
     let mut values = Values { form: header.form, rest, too_long: 0 };
-    let (mut vertices, mut faces, mut document) = (Vertices::default(), Faces::default(), Document::default());
+    let (mut vertices, mut faces, mut document) =
+        (Vertices::default(), Faces::default(), Document::default());
     let mut unused: Vec<String> = vec![];
     for element in header.elements.iter().filter(|element| !element.properties.is_empty()) {
-        let mut reader =
-            Reader { element, limits, cancel, values: &mut values, used: vec![false; element.properties.len()] };
+        let mut reader = Reader {
+            element,
+            limits,
+            cancel,
+            values: &mut values,
+            used: vec![false; element.properties.len()],
+        };
         let read = match element.name.as_str() {
             "vertex" => reader.vertices(&mut vertices)?,
             "face" | "tristrips" => reader.faces(&mut faces)?,
@@ -295,7 +301,9 @@ pub(super) fn read(
     }
     if !unused.is_empty() {
         unused.truncate(12);
-        document.warnings.push(format!("properties that reflect no light are not used: {}", unused.join(", ")));
+        document
+            .warnings
+            .push(format!("properties that reflect no light are not used: {}", unused.join(", ")));
     }
     let parts = parts(vertices, faces, &header.textures, (beside, limits), &mut document)?;
     document.objects.push(Object { name: name.to_owned(), parts });
@@ -328,14 +336,17 @@ fn parts(
         let why = match (count, lost + faces.damaged) {
             (0, 0) => "is empty: it has no vertices and no faces".into(),
             (_, 0) => "has no faces: a cloud of points reflects no light, make a mesh of it".into(),
-            (_, n) => format!("has no face whose vertices are there ({n} name others, of {count}): it is cut off"),
+            (_, n) => {
+                format!("has no face whose vertices are there ({n} name others, of {count}): it is cut off")
+            }
         };
         let noted = document.warnings.join("; ");
         let noted = if noted.is_empty() { noted } else { format!(" ({noted})") };
         return Err(SceneError::broken("file", format!("{why}{noted}")));
     }
     if lost + faces.damaged > 0 {
-        let told = format!("{} faces name vertices that are not there: they are left out", lost + faces.damaged);
+        let told =
+            format!("{} faces name vertices that are not there: they are left out", lost + faces.damaged);
         document.warnings.push(told);
     }
     let (near, offset) = far::single(&vertices.positions);
@@ -352,7 +363,8 @@ fn parts(
     // What faces have of their own is said of each corner.
     if !faces.colours.is_empty() || !faces.uvs.is_empty() {
         let corners = faces.triangles.as_flattened();
-        let apart = |list: &[[f32; 3]]| corners.iter().filter_map(|i| list.get(*i as usize).copied()).collect();
+        let apart =
+            |list: &[[f32; 3]]| corners.iter().filter_map(|i| list.get(*i as usize).copied()).collect();
         part.positions = apart(&part.positions);
         part.normals = apart(&part.normals);
         part.colours = match faces.colours.is_empty() {
@@ -375,11 +387,12 @@ fn parts(
         };
         numbers.push(match made {
             Ok(uri) => {
-                let look = json!({"baseColorTexture": {"index": document.textures.len()}, "metallicFactor": 0.0});
+                let look =
+                    json!({"baseColorTexture": {"index": document.textures.len()}, "metallicFactor": 0.0});
                 document.textures.push(uri);
-                document.materials.push(
-                    json!({"name": texture, "doubleSided": true, "pbrMetallicRoughness": look}),
-                );
+                document
+                    .materials
+                    .push(json!({"name": texture, "doubleSided": true, "pbrMetallicRoughness": look}));
                 Some(document.materials.len() - 1)
             }
             Err(why) => {

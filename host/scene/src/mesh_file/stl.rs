@@ -27,9 +27,9 @@ pub(super) fn is_text(bytes: &[u8]) -> bool {
     // A name may have any bytes, what follows its line may not.
     let after = bytes.iter().position(|b| matches!(b, b'\n' | b'\r')).map_or(&[][..], |end| &bytes[end..]);
     let next = after.trim_ascii_start();
-    let goes_on = ["facet", "endsolid", "color"].iter().any(|word| {
-        next.get(..word.len()).is_some_and(|start| start.eq_ignore_ascii_case(word.as_bytes()))
-    });
+    let goes_on = ["facet", "endsolid", "color"]
+        .iter()
+        .any(|word| next.get(..word.len()).is_some_and(|start| start.eq_ignore_ascii_case(word.as_bytes())));
     begins && !is_binary(bytes) && (goes_on || bytes.len() < HEAD)
 }
 

@@ -373,7 +373,9 @@ fn files_of_other_programs_are_opened_and_what_is_left_out_is_told() {
         assert!(colour(&read(name), 0).is_some(), "{name}: {}", told(&read(name)));
     }
     // Formats without a side reflect on both.
-    for name in ["a27-inside-out.stl", "a28-451-km.ply", "a10-face-colours.ply", "a13-uv-and-normals-missing.obj"] {
+    for name in
+        ["a27-inside-out.stl", "a28-451-km.ply", "a10-face-colours.ply", "a13-uv-and-normals-missing.obj"]
+    {
         let scene = read(name);
         let used = scene.bodies[0].mesh.materials[0];
         assert!(scene.materials[used as usize].double_sided, "{name}");
@@ -404,7 +406,12 @@ fn damaged_parts_are_left_out_and_counted() {
     let text = format!("usemtl a\nf 1 2 3\nf 1 2 9\nf 1 x 3\nvn a b\n{QUAD}v 0 0\nhello\n");
     let scene = load_with(text.as_bytes(), MeshFormat::Obj, plain()).unwrap();
     assert_eq!(corners(&scene), [Vec3::ZERO, Vec3::X, Vec3::new(1.0, 1.0, 0.0)]);
-    for what in ["2 faces name vertices", "no word of the format (1 times)", "no three numbers (1 times)", "are white: a"] {
+    for what in [
+        "2 faces name vertices",
+        "no word of the format (1 times)",
+        "no three numbers (1 times)",
+        "are white: a",
+    ] {
         assert!(told(&scene).contains(what), "{what}: {}", told(&scene));
     }
     // A PLY with the texture of its corners, two faces of which one is damaged, and cut off in the third.

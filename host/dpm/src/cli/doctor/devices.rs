@@ -11,8 +11,8 @@ use dpm_device::transport::Transport;
 use dpm_rig::config::RigConfig;
 use dpm_rig::pipeline::connect;
 use dpm_rig::pipeline::projector::{self, Surroundings};
-use dpm_rig::plausible::Exchanges;
 use dpm_rig::presence;
+use dpm_rig::rig::plausible::Exchanges;
 use dpm_rig::rig::Rig;
 use dpm_rig::standing::Identity;
 use dpm_rig::telemetry::monitor::RunMonitor;
@@ -129,7 +129,8 @@ pub(super) fn tracker(config: &RigConfig, rig: Option<&Rig>) -> (Finding, Option
     } else {
         let state = if finding.state == State::Ok { State::Warning } else { finding.state };
         let remedy = "their markers are too alike: give each body an arrangement of its own";
-        let remedy = if finding.remedy.is_empty() { remedy.into() } else { format!("{}; {remedy}", finding.remedy) };
+        let remedy =
+            if finding.remedy.is_empty() { remedy.into() } else { format!("{}; {remedy}", finding.remedy) };
         Finding { state, found: format!("{}; {}", finding.found, swaps.join(", ")), remedy, ..finding }
     };
     let heard = bodies.into_iter().zip(seen).zip(last);

@@ -10,9 +10,8 @@ use dpm_rig::calibration_steps::age::{aged, days_since, OLD_DAYS};
 use dpm_rig::calibration_steps::is_simulated;
 use dpm_rig::config::{BodyConfig, LiveSource, PictureSource, RigConfig};
 use dpm_rig::picture_stream::look_at;
-use dpm_rig::plausible;
 use dpm_rig::presence;
-use dpm_rig::rig::{affine, Rig, RigError};
+use dpm_rig::rig::{affine, plausible, Rig, RigError};
 use dpm_rig::standing::{standing_in, state_folder, Identity};
 use std::net::{SocketAddr, TcpListener};
 use std::path::Path;
@@ -153,9 +152,8 @@ fn observer(config: &RigConfig, heard: Option<&devices::Heard>) -> Finding {
         None => format!("the eye is at {:?} m and is not tracked", observer.position),
     };
     let named = |heads: Vec<&str>| heads.iter().map(|h| format!("{h:?}")).collect::<Vec<_>>().join(", ");
-    let is_unheard = |head: &&str| {
-        heard.is_some_and(|heard| !heard.iter().any(|h| h.name == *head && h.count > 0))
-    };
+    let is_unheard =
+        |head: &&str| heard.is_some_and(|heard| !heard.iter().any(|h| h.name == *head && h.count > 0));
     let missing: Vec<&str> = heads.iter().copied().filter(is_unheard).collect();
     let spared = format!("the eye guard spares {} by {} m", named(heads.clone()), eyes.radius);
     if !missing.is_empty() {

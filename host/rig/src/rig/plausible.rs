@@ -2,7 +2,7 @@
 //! mesh that lies kilometres from its body, one that is turned inside out, a projector or a body that is out of reach because
 //! somebody gave centimetres. What is told names the unit that would fit.
 
-use crate::rig::Rig;
+use super::Rig;
 use dpm_scene::geometry::projector::ProjectorCamera;
 use dpm_scene::TriangleMesh;
 use glam::{DAffine3, DVec3};
@@ -31,7 +31,8 @@ const OPEN: f64 = 0.02;
 const ENCLOSED: f64 = 1e-3;
 
 /// Units with their names in metres.
-const UNITS: [(f64, &str); 4] = [(1e-3, "millimetres"), (1e-2, "centimetres"), (0.0254, "inches"), (1e3, "kilometres")];
+const UNITS: [(f64, &str); 4] =
+    [(1e-3, "millimetres"), (1e-2, "centimetres"), (0.0254, "inches"), (1e3, "kilometres")];
 
 /// How the text of every doubt begins: those of a rig that is built anew take the place of the old ones.
 pub(crate) const MARK: &str = "doubtful: ";
@@ -115,10 +116,8 @@ fn view(camera: &ProjectorCamera, points: &[DVec3], place: &DAffine3) -> View {
         low = [low[0].min(at.x), low[1].min(at.y)];
         high = [high[0].max(at.x), high[1].max(at.y)];
     }
-    let is_near = high[0] > -0.5 * width
-        && low[0] < 1.5 * width
-        && high[1] > -0.5 * height
-        && low[1] < 1.5 * height;
+    let is_near =
+        high[0] > -0.5 * width && low[0] < 1.5 * width && high[1] > -0.5 * height && low[1] < 1.5 * height;
     let size_px = [0, 1].map(|i| (high[i] - low[i]).max(0.0));
     View { distance, size_px, is_near }
 }
@@ -174,8 +173,12 @@ fn of_shape(shape: &Shape) -> Vec<Doubt> {
     if far > FAR.0 * size && far > FAR.1 {
         all.push(Doubt {
             about,
-            told: format!("its mesh lies {} from its body's origin, about which the tracker turns it", metres(far)),
-            remedy: "move the mesh to its origin where it was made, or set scene.bodies[].mesh_to_body".into(),
+            told: format!(
+                "its mesh lies {} from its body's origin, about which the tracker turns it",
+                metres(far)
+            ),
+            remedy: "move the mesh to its origin where it was made, or set scene.bodies[].mesh_to_body"
+                .into(),
         });
     }
     all
@@ -189,7 +192,9 @@ fn inside_out(rig: &Rig) -> Vec<Doubt> {
     };
     let told = |body: &dpm_scene::Body| Doubt {
         about: format!("body \"{}\"", body.name),
-        told: "its mesh is turned inside out and single-sided: all light falls on its back, and it stays black".into(),
+        told:
+            "its mesh is turned inside out and single-sided: all light falls on its back, and it stays black"
+                .into(),
         remedy: "flip its faces where it was made, or make its material double-sided".into(),
     };
     rig.scene.bodies.iter().filter(is_out).map(told).collect()
@@ -198,9 +203,8 @@ fn inside_out(rig: &Rig) -> Vec<Doubt> {
 /// Whether a mesh is closed, encloses a negative volume, and has one side.
 fn turned(rig: &Rig, mesh: &TriangleMesh) -> bool {
     let materials = &rig.scene.materials;
-    let is_single = |m: &u32| {
-        materials.get(*m as usize).is_some_and(|m| !m.double_sided && m.transmission == 0.0)
-    };
+    let is_single =
+        |m: &u32| materials.get(*m as usize).is_some_and(|m| !m.double_sided && m.transmission == 0.0);
     if mesh.triangles.is_empty() || !mesh.materials.iter().all(is_single) {
         return false;
     }
@@ -247,35 +251,40 @@ pub fn of_places(rig: &Rig, places: &[Vec<DAffine3>]) -> Vec<Doubt> {
         if best.is_near && !far && across >= LEAST_PX {
             continue;
         }
-        all.push(match (projector_unit(rig, &shape, place, best.distance), tracker_unit(rig, &shape, place)) {
-            (Some((unit, name)), _) => Doubt {
-                about: "projector".into(),
-                told: format!(
-                    "it stands {} from the bodies, {} times too far: {name}?",
-                    metres(best.distance),
-                    (1.0 / unit).round()
-                ),
-                remedy: match rig.config.projector.calibration {
-                    Some(_) => "correct projector.calibration_unit".into(),
-                    None => "give projector.position in metres".into(),
+        all.push(
+            match (projector_unit(rig, &shape, place, best.distance), tracker_unit(rig, &shape, place)) {
+                (Some((unit, name)), _) => Doubt {
+                    about: "projector".into(),
+                    told: format!(
+                        "it stands {} from the bodies, {} times too far: {name}?",
+                        metres(best.distance),
+                        (1.0 / unit).round()
+                    ),
+                    remedy: match rig.config.projector.calibration {
+                        Some(_) => "correct projector.calibration_unit".into(),
+                        None => "give projector.position in metres".into(),
+                    },
+                },
+                (None, Some((_, name))) => Doubt {
+                    about,
+                    told: format!("{}, out of the projector's reach: {name}?", at_place(place)),
+                    remedy: "set the tracking software to metres".into(),
+                },
+                (None, None) if !best.is_near => Doubt {
+                    about,
+                    told: format!("{}, out of the projector's reach", at_place(place)),
+                    remedy: "check the tracker's axes, units and handedness, and the projector's pose".into(),
+                },
+                (None, None) => Doubt {
+                    about,
+                    told: format!(
+                        "the projector covers it with {across:.1} pixels from {}",
+                        metres(best.distance)
+                    ),
+                    remedy: "check the projector's pose and the size of the mesh (scene.scale)".into(),
                 },
             },
-            (None, Some((_, name))) => Doubt {
-                about,
-                told: format!("{}, out of the projector's reach: {name}?", at_place(place)),
-                remedy: "set the tracking software to metres".into(),
-            },
-            (None, None) if !best.is_near => Doubt {
-                about,
-                told: format!("{}, out of the projector's reach", at_place(place)),
-                remedy: "check the tracker's axes, units and handedness, and the projector's pose".into(),
-            },
-            (None, None) => Doubt {
-                about,
-                told: format!("the projector covers it with {across:.1} pixels from {}", metres(best.distance)),
-                remedy: "check the projector's pose and the size of the mesh (scene.scale)".into(),
-            },
-        });
+        );
     }
     // The projector's place is one, whichever body shows it.
     let mut is_first = true;
@@ -441,9 +450,10 @@ mod tests {
             let seen = view(&camera, &points, &DAffine3::from_translation(centre));
             assert!(seen.is_near && DISTANCES_M.contains(&seen.distance), "{i}: {seen:?}");
             assert!(seen.size_px[0].max(seen.size_px[1]) >= LEAST_PX, "{i}: {seen:?}");
-            // In millimetres it is told, with the unit.
+            // In millimetres it is told, with the unit; small things in millimetres may be large ones in centimetres.
             let large = Shape { low: scaled.low * 1000.0, high: scaled.high * 1000.0, ..scaled };
-            assert!(of_shape(&large).iter().any(|d| d.told.contains("millimetres")), "{i}: {size}");
+            let word = if size > 0.12 { "millimetres?" } else { "metres?" };
+            assert!(of_shape(&large).iter().any(|d| d.told.contains(word)), "{i}: {size}");
         }
     }
 
@@ -451,10 +461,14 @@ mod tests {
     fn wrong_units_offsets_and_sides_are_told_with_what_would_fit() {
         let key = |key: &str, file: PathBuf| format!("{key}={:?}", file.display().to_string());
         let scene = |name: &str| {
-            told(&demo(&[key("scene.file", case(name)), "scene.bodies=[{name=\"hare\", node=\"thing\"}]".into()]))
+            told(&demo(&[
+                key("scene.file", case(name)),
+                "scene.bodies=[{name=\"hare\", node=\"thing\"}]".into(),
+            ]))
         };
         let calibration = |name: &str| {
-            let raster = ["projector.width=1024", "projector.height=768", "projector.calibration_unit=\"metre\""];
+            let raster =
+                ["projector.width=1024", "projector.height=768", "projector.calibration_unit=\"metre\""];
             let mut flags: Vec<String> = raster.iter().map(|f| (*f).to_owned()).collect();
             flags.push(key("projector.calibration", case(name)));
             told(&demo(&flags))
