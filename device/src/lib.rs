@@ -51,6 +51,9 @@
 //! ```
 #![cfg_attr(not(feature = "std"), no_std)]
 
+#[cfg(feature = "alloc")]
+extern crate alloc;
+
 #[cfg(feature = "alp")]
 pub mod alp;
 pub mod clock_map;
@@ -63,7 +66,7 @@ pub mod link;
 mod packet;
 pub mod planes;
 pub mod pose;
-#[cfg(feature = "std")]
+#[cfg(feature = "alloc")]
 pub mod projector;
 #[cfg(feature = "std")]
 pub mod regular_file;
@@ -75,7 +78,7 @@ mod stream;
 pub mod time;
 #[cfg(feature = "std")]
 pub mod tracker;
-#[cfg(feature = "std")]
+#[cfg(feature = "alloc")]
 pub mod transport;
 #[cfg(feature = "serial")]
 pub mod tty;

@@ -4,7 +4,6 @@ use crate::light::LightEvent;
 use crate::link::{Codec, DeviceState, LightLimits, MAX_FLASHES_PER_S, VERSION};
 use crate::planes::{PlaneSchedule, Raster};
 use crate::time::HostTime;
-use std::sync::Arc;
 
 use super::DeviceClock;
 
@@ -48,7 +47,19 @@ pub struct FirmwareConfig {
     /// Lit slots of which the shifts are kept for [`super::ProjectorFirmware::next_moves`]; when full, the oldest are
     /// dropped and counted with the light events.
     pub moves_kept: usize,
+    /// Changes of light or state that are kept for [`super::ProjectorFirmware::next_change`]; when full, the oldest are
+    /// dropped and counted with the light events.
+    pub changes_kept: usize,
 }
+
+/// Planes that slots which show the same frame share; a processor that cannot count references between threads (Cortex-M0)
+/// copies them.
+#[cfg(target_has_atomic = "ptr")]
+pub type ShownPlanes = alloc::sync::Arc<[u8]>;
+/// Planes that slots which show the same frame share; a processor that cannot count references between threads (Cortex-M0)
+/// copies them.
+#[cfg(not(target_has_atomic = "ptr"))]
+pub type ShownPlanes = alloc::boxed::Box<[u8]>;
 
 /// A lit slot that is over: what was on the mirrors, and when.
 #[derive(Clone, Debug)]
@@ -62,7 +73,7 @@ pub struct Shown {
     pub schedule: PlaneSchedule,
     /// The planes as they arrived, one after the other; [`super::ProjectorFirmware::next_moves`] says by how much tracks moved
     /// them.
-    pub planes: Arc<[u8]>,
+    pub planes: ShownPlanes,
 }
 
 impl FirmwareConfig {
@@ -87,6 +98,7 @@ impl FirmwareConfig {
             greatest_shift: None,
             measures_timing: true,
             moves_kept: 0,
+            changes_kept: 1024,
         }
     }
 }

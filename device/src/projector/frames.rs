@@ -1,5 +1,7 @@
 //! Assembles planes into whole frames that wait to be lit, in a fixed set of buffers.
 
+use alloc::{boxed::Box, vec, vec::Vec};
+
 use crate::time::DeviceTicks;
 
 /// A frame of which something has arrived.

@@ -5,6 +5,8 @@
 //! the code value. Where planes share the full light among them ([`PlaneSchedule::filling`]), it is their sum as a share of
 //! the sum of all, out of 255.
 
+use alloc::{vec, vec::Vec};
+
 use crate::planes::{Channel, PlaneSchedule, Raster, MAX_PLANES};
 
 /// Eight rows of 64 bits, read as eight 8 x 8 bit matrices side by side, one in each byte: transposes all of them, so that bit `i` of

@@ -18,9 +18,11 @@ mod receive;
 mod session;
 mod slots;
 mod status;
+#[cfg(feature = "std")]
 mod thread;
 
-use std::collections::VecDeque;
+use alloc::collections::VecDeque;
+use alloc::{vec, vec::Vec};
 
 use crate::link::{
     faults, packet_bytes, Codec, Config, Decoder, DecoderCounters, DeviceMessage, DeviceState, Echo, Fault,
@@ -33,13 +35,14 @@ use crate::transport::{Lane, LinkDevice};
 pub use crate::light::{LightEvent, LightKind};
 pub use ahead::WaitingFrame;
 pub use clock::DeviceClock;
-pub use config::{FirmwareConfig, LightChange, Shown};
+pub use config::{FirmwareConfig, LightChange, Shown, ShownPlanes};
 use following::Following;
 pub use following::SlotMoves;
 use frames::FrameStore;
 use guard::LightGuard;
 pub use light::{gather_bits, light_of_planes, Exposure, Run};
 use status::summed;
+#[cfg(feature = "std")]
 pub use thread::{serve_cable, Served};
 
 /// Echo answers that may wait; later requests are dropped, as a busy device would.
@@ -48,9 +51,6 @@ const ECHOES_KEPT: usize = 16;
 const CHECKSUM_STORM: u32 = 1000;
 /// A target further ahead than this is refused, seconds: it would occupy a buffer too long.
 const MAX_LEAD_S: u64 = 2;
-
-/// Changes of light or state that are kept; older ones are dropped and counted with the light events.
-const CHANGES_KEPT: usize = 1024;
 
 /// Whether the projector is armed, and how.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -177,7 +177,7 @@ impl ProjectorFirmware {
                 following: Following::default(),
                 moves: VecDeque::with_capacity(setup.moves_kept),
                 at: HostTime(i64::MIN),
-                changes: VecDeque::with_capacity(CHANGES_KEPT),
+                changes: VecDeque::with_capacity(setup.changes_kept),
                 before: (false, DeviceState::Idle),
                 light: Vec::new(),
                 light_is_of: None,
@@ -387,7 +387,7 @@ impl ProjectorFirmware {
         let present = self.core.present;
         self.core.disarm();
         self.core.note_change();
-        let changes = std::mem::take(&mut self.core.changes);
+        let changes = core::mem::take(&mut self.core.changes);
         let setup = FirmwareConfig {
             clock: DeviceClock { power_on_at: now, ..self.core.setup.clock },
             ..self.core.setup
@@ -404,7 +404,7 @@ impl LinkDevice for ProjectorFirmware {
         self.core.advance(now);
         let mut sink = receive::LaneSink { core: &mut self.core, lane };
         self.decoders[lane as usize].push(bytes, &mut sink);
-        if std::mem::take(&mut self.core.counters_due) {
+        if core::mem::take(&mut self.core.counters_due) {
             // Earlier packets, including the HELLO, do not belong to this session.
             self.core.counted_before = summed(&self.decoders);
         }
@@ -451,7 +451,7 @@ impl LinkDevice for ProjectorFirmware {
             send(session, &DeviceMessage::Echo(Echo { device_sent: now_ticks, ..echo }));
         }
         let may_tell = !(self.core.panel_busy && self.core.untaken.is_some());
-        if may_tell && std::mem::take(&mut self.core.status_due) {
+        if may_tell && core::mem::take(&mut self.core.status_due) {
             let status = self.core.status_now(&self.decoders);
             send(session, &DeviceMessage::Status(status));
         }
@@ -486,9 +486,12 @@ impl Core {
             shown.event.last_photon_at = shown.event.last_photon_at.min(self.at);
         }
         let settle = if self.lit_now { i64::from(self.setup.settle_ns) } else { 0 };
-        if self.changes.len() >= CHANGES_KEPT {
+        if self.changes.len() >= self.setup.changes_kept {
             self.changes.pop_front();
             self.events_lost += 1;
+        }
+        if self.setup.changes_kept == 0 {
+            return;
         }
         self.changes.push_back(LightChange {
             at: self.at.plus_ns(settle),

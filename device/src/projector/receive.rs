@@ -53,7 +53,7 @@ impl PacketSink for LaneSink<'_> {
 
     fn payload(&mut self, bytes: &[u8]) {
         // Taken out during processing, because it acts on the rest of the core.
-        let mut incoming = std::mem::take(&mut self.core.incoming[self.lane as usize]);
+        let mut incoming = core::mem::take(&mut self.core.incoming[self.lane as usize]);
         match &mut incoming {
             Incoming::Control(assembly) => assembly.push(bytes),
             Incoming::Plane { plane, frame, buffer, form } => {
@@ -65,7 +65,7 @@ impl PacketSink for LaneSink<'_> {
     }
 
     fn end(&mut self, intact: bool) {
-        match std::mem::take(&mut self.core.incoming[self.lane as usize]) {
+        match core::mem::take(&mut self.core.incoming[self.lane as usize]) {
             Incoming::Control(assembly) if intact => self.core.control(&assembly),
             Incoming::Plane { plane, frame, buffer, form } if intact => {
                 // Only now: an intact header in front of a damaged payload does not count as a sign of life.
@@ -238,7 +238,7 @@ impl Core {
         if !self.is_assembling(frame, buffer) {
             return;
         }
-        let staging = std::mem::take(&mut self.staging);
+        let staging = core::mem::take(&mut self.staging);
         let whole = self.share(plane, buffer).is_some_and(|share| match form {
             Form::Raw { filled } => *filled == share.len(),
             Form::Rle { decoder, failed } => !failed && decoder.finish(share.len()).is_ok(),

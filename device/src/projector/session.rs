@@ -20,7 +20,7 @@ impl Core {
 
     /// Notes the number of damaged packets so far; if there are too many since a frame was whole, light ends.
     pub(super) fn damaged(&mut self, total: u32) {
-        if std::mem::take(&mut self.whole_since) || self.mode == Mode::Disarmed {
+        if core::mem::take(&mut self.whole_since) || self.mode == Mode::Disarmed {
             self.damaged_at_whole = total;
         }
         if total.wrapping_sub(self.damaged_at_whole) >= CHECKSUM_STORM {

@@ -16,7 +16,7 @@ use serialport::{ClearBuffer, SerialPort};
 
 use super::{Lane, SendError, Transport, TransportError};
 use crate::cobs::{encode, encoded_bytes, Deframer};
-use crate::packet::{packet_bytes, Packet, MAX_CONTROL_BYTES};
+use crate::packet::{packet_bytes, Packet, MAGIC, MAX_CONTROL_BYTES};
 use crate::planes::MAX_PLANES;
 use crate::time::{HostClock, HostTime};
 use crate::tty::{self, Refusal};
@@ -121,6 +121,8 @@ pub struct SerialTransport {
     reader: Option<Box<dyn Arrivals>>,
     clock: SharedClock,
     deframer: Deframer<[u8; DEFRAMED]>,
+    /// No frame has ended since the port was opened.
+    is_fresh: bool,
     /// Encoded packets of the frame that is going out, and where each ends.
     data: Vec<u8>,
     ends: [usize; MAX_PLANES + 1],
@@ -182,6 +184,7 @@ impl SerialTransport {
             reader: None,
             clock: Arc::new(OnceLock::new()),
             deframer: Deframer::new([0; DEFRAMED]),
+            is_fresh: true,
             data: vec![0; room],
             ends: [0; MAX_PLANES + 1],
             packets: 0,
@@ -331,10 +334,16 @@ impl Transport for SerialTransport {
         sink: &mut dyn FnMut(Lane, HostTime, &[u8]),
     ) -> Result<(), TransportError> {
         self.flush()?;
+        let (deframer, is_fresh) = (&mut self.deframer, &mut self.is_fresh);
+        let mut pass = |at: HostTime, frame: &[u8]| {
+            // A port that is opened amid a packet gives the rest of it: those bytes are no fault of the device's.
+            if !std::mem::take(is_fresh) || frame.starts_with(&MAGIC) {
+                sink(Lane::Control, at, frame);
+            }
+        };
         if let Some(reader) = &mut self.reader {
-            let deframer = &mut self.deframer;
             let taken = reader.take(now, &mut |at, bytes| {
-                deframer.push(bytes, &mut |frame| sink(Lane::Control, at, frame));
+                deframer.push(bytes, &mut |frame| pass(at, frame));
             });
             let Some(bytes) = taken else { return Err(self.gone()) };
             self.counters.bytes_in += bytes as u64;
@@ -350,7 +359,7 @@ impl Transport for SerialTransport {
                 Ok(n) => {
                     self.counters.bytes_in += n as u64;
                     left = left.saturating_sub(n);
-                    self.deframer.push(&bytes[..n], &mut |frame| sink(Lane::Control, now, frame));
+                    deframer.push(&bytes[..n], &mut |frame| pass(now, frame));
                 }
                 Err(e) => match e.kind() {
                     ErrorKind::WouldBlock | ErrorKind::TimedOut | ErrorKind::Interrupted => break,
@@ -384,6 +393,7 @@ impl Transport for SerialTransport {
         self.reader = self.ports.arrivals(&*port, &self.clock);
         self.port = Some(port);
         self.deframer.reset();
+        self.is_fresh = true;
         self.control.clear();
         (self.packets, self.next_packet, self.going) = (0, 0, None);
         self.counters.opened += 1;

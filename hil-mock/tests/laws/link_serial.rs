@@ -270,6 +270,28 @@ fn a_line_that_nobody_reads_never_holds_the_caller() {
     ended.recv_timeout(LONG).expect("nobody waits for a full line");
 }
 
+/// A device that talks while the port is opened is heard from its next packet on, and the rest of the one before is no fault
+/// of its own. Noise later on is passed on, and counted.
+#[test]
+fn a_port_that_is_opened_amid_a_packet_begins_with_the_next_one() {
+    let (mut far, slave) = pair();
+    let mut line = SerialTransport::with_port(settings("pty"), slave);
+    let whole = Packet::new(Header::control(MessageType::Stop, 7, 0), &[]).to_vec();
+    let mut frame = vec![0; dpm_device::cobs::encoded_bytes(whole.len())];
+    let n = dpm_device::cobs::encode(&[&whole], &mut frame).unwrap();
+    frame.truncate(n);
+    let mut rest = vec![2, 9];
+    rest.extend(&frame[n - 4..]);
+    let noise = [3, 8, 8, 0];
+    far.write_all(&[&rest[..], &frame, &noise, &frame].concat()).unwrap();
+    let (mut heard, end) = (Vec::new(), Instant::now() + LONG);
+    while heard.len() < 3 && Instant::now() < end {
+        line.receive(HostTime(0), &mut |_, _, bytes| heard.push(bytes.to_vec())).unwrap();
+        std::thread::sleep(Duration::from_millis(1));
+    }
+    assert_eq!(heard, [whole.clone(), vec![8, 8], whole]);
+}
+
 /// Found in use, section 2b of the second look at latency: a reply that waits for the next poll is stamped when it arrived.
 #[test]
 fn replies_are_stamped_when_they_arrive() {
