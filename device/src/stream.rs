@@ -3,12 +3,27 @@
 #[cfg(any(feature = "serial", feature = "net"))]
 use crossbeam::channel::{Receiver, TryRecvError};
 use std::io::{Read, Write};
+use std::net::TcpStream;
+use std::os::fd::{AsRawFd, RawFd};
 
 /// What a device's bytes come over: a socket, a port, or a conversation in memory. Reads and writes MUST NOT block;
 /// what is not there yet is [`std::io::ErrorKind::WouldBlock`].
-pub trait Stream: Read + Write + Send {}
+pub trait Stream: Read + Write + Send {
+    /// The descriptor whose readability announces bytes; `None` if there is none, or none that may be waited for.
+    fn descriptor(&self) -> Option<RawFd> {
+        None
+    }
+}
 
-impl<T: Read + Write + Send> Stream for T {}
+impl Stream for TcpStream {
+    fn descriptor(&self) -> Option<RawFd> {
+        Some(self.as_raw_fd())
+    }
+}
+
+/// A serial port is not waited for: see [`crate::tty`], which says what the kernel waits for then.
+#[cfg(feature = "serial")]
+impl Stream for Box<dyn serialport::SerialPort> {}
 
 /// Opens a [`Stream`] for a client that must never wait. The clients bring one that asks the operating system on a
 /// helper thread; a simulator brings its own. There is one attempt at a time.
@@ -63,6 +78,8 @@ impl<F: Fn() -> Result<Box<dyn Stream>, String> + Clone + Send + 'static> Opener
 mod tests {
     use super::*;
     use std::time::{Duration, Instant};
+
+    impl Stream for std::io::Cursor<Vec<u8>> {}
 
     fn wait(opener: &mut impl Opener) -> Result<Box<dyn Stream>, String> {
         let begin = Instant::now();

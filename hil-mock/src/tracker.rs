@@ -445,6 +445,12 @@ impl Tracker for MockTracker {
         text
     }
 
+    fn due_at(&self) -> Option<HostTime> {
+        // Nothing of a capture arrives before it.
+        let captured_at = self.source.at(self.source.captured_ns(self.next));
+        Some(self.pending.front().map_or(captured_at, |sample| sample.received_at.min(captured_at)))
+    }
+
     fn gate(&self) -> Option<&SampleGate> {
         Some(&self.gate)
     }

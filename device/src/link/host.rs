@@ -8,6 +8,7 @@ mod frames;
 mod inbox;
 mod light;
 mod reported;
+mod shift;
 mod types;
 
 use super::compact::Compactor;
@@ -26,6 +27,7 @@ use crate::transport::{Lane, SendError, Transport, TransportError};
 use inbox::{Inbox, ECHOES_KEPT};
 use light::FieldCount;
 use reported::ReportedField;
+use shift::Shifting;
 pub use types::{
     DropReason, EchoSample, Epoch, LinkCounters, LinkError, LinkSettings, LinkState, SendOutcome, Verb,
 };
@@ -69,6 +71,9 @@ pub struct HostLink {
     reported: Option<ReportedField>,
     /// The caller wants to send tracks, if the device follows them.
     wants_tracks: bool,
+    /// The caller wants to shift slots, if the device lets it.
+    wants_shifts: bool,
+    shifting: Shifting,
     /// TRACKS sent in this session.
     tracks_sent: u32,
     /// While the host keeps the projector dark because of a limit: the end of this rest, and its reason.
@@ -120,6 +125,8 @@ impl HostLink {
             field,
             reported,
             wants_tracks: false,
+            wants_shifts: false,
+            shifting: Shifting::IDLE,
             tracks_sent: 0,
             rest: None,
             ordered: None,
@@ -137,6 +144,7 @@ impl HostLink {
         self.decoders = [Decoder::new(), Decoder::new()];
         self.state = LinkState::Greeting;
         self.slots = None;
+        self.shifting = Shifting::IDLE;
         self.verb = None;
         self.requested_at = NEVER;
         self.echo_sent_at = NEVER;
@@ -266,6 +274,7 @@ impl HostLink {
             }
         }
         self.count_reported(now, transport);
+        lost(self.follow_shift(now, transport))?;
         self.advance(transport)?;
         // Runs after the input was read: where a medium stamps with the poll's `now`, no answer may be older than its
         // question.
@@ -470,7 +479,8 @@ impl HostLink {
             limits: s.limits,
             tracks: self.greatest_shift().is_some(),
             timing: self.measures_timing(),
-            epoch: self.slots.map_or(DeviceTicks(0), |c| c.epoch()),
+            shifts: self.shifts_slots(),
+            epoch: self.slots.map_or(DeviceTicks(0), |c| c.epoch_of(u64::MAX)),
         }
     }
 
@@ -508,6 +518,11 @@ impl HostLink {
         self.tracks_sent = number;
         self.counters.tracks_sent += 1;
         Ok(())
+    }
+
+    /// True if planes may be sent otherwise than raw.
+    pub fn compacts(&self) -> bool {
+        self.compactor.is_some()
     }
 
     /// Frames that the device has room for.

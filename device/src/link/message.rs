@@ -8,6 +8,7 @@
 mod types;
 
 use super::limits::LightLimits;
+use super::slots::SlotShift;
 use super::tracks::Tracks;
 use crate::packet::{u16_at, u32_at, u64_at, Header, MessageType, MAX_CONTROL_BYTES};
 use crate::planes::{PlaneSchedule, PlaneSpec, Raster, MAX_PLANES};
@@ -71,6 +72,7 @@ pub enum HostMessage {
     Sync(u32),
     Echo(Echo),
     Tracks(Tracks),
+    Shift(SlotShift),
     Stop,
     Black,
     Freeze,
@@ -145,12 +147,18 @@ const CODES_REPEAT: u8 = 1;
 const FOLLOWS: u8 = 2;
 /// Flag of CONFIG: STATUS reports how early frames are whole.
 const TIMES: u8 = 8;
+/// Flag of CONFIG: the host sends SHIFT. Only with [`TIMES`].
+const SHIFTS: u8 = 16;
 /// Flag of CONFIG: the planes share the full light of a frame among them.
 const FILLS: u8 = 4;
 /// Feature of a device in HELLO: it follows TRACKS.
 const FEATURE_TRACKS: u8 = 1;
 /// The same: it measures how early frames are whole.
 const FEATURE_TIMING: u8 = 2;
+/// The same: its slots can be shifted.
+const FEATURE_SHIFT: u8 = 4;
+/// Length of a SHIFT's payload.
+const SHIFT_BYTES: usize = 16;
 /// Length of a STATUS without the parts that CONFIG may ask for, and of each of them, in the order in which they follow.
 const STATUS_BYTES: usize = 96;
 const TRACKS_BYTES: usize = 24;
@@ -182,7 +190,8 @@ impl Config {
         for (spec, &code) in specs.iter_mut().zip(&p[CONFIG_BYTES..]) {
             *spec = PlaneSpec::from_led_code(code).ok_or(field("led codes"))?;
         }
-        if p[19] & !(CODES_REPEAT | FOLLOWS | FILLS | TIMES) != 0 {
+        let is_unknown = p[19] & !(CODES_REPEAT | FOLLOWS | FILLS | TIMES | SHIFTS) != 0;
+        if is_unknown || p[19] & (SHIFTS | TIMES) == SHIFTS {
             return Err(field("flags"));
         }
         let watchdog_us = u32_at(p, 12);
@@ -212,6 +221,7 @@ impl Config {
             limits,
             tracks: p[19] & FOLLOWS != 0,
             timing: p[19] & TIMES != 0,
+            shifts: p[19] & SHIFTS != 0,
         })
     }
 
@@ -223,6 +233,7 @@ impl Config {
         w.u8(flag(self.schedule.has_repeats(), CODES_REPEAT)
             | flag(self.tracks, FOLLOWS)
             | flag(self.timing, TIMES)
+            | flag(self.shifts, SHIFTS)
             | flag(self.schedule.fills(), FILLS));
         w.u16(self.limits.mean_permille).u16(0).u64(self.epoch.0);
         w.u32(self.limits.window_ms).u32(self.limits.full_white_ms);
@@ -252,11 +263,12 @@ impl TrackCounts {
 
 impl FrameTiming {
     fn parse(p: &[u8]) -> Self {
-        Self { frame: u32_at(p, 0), slack_ns: u32_at(p, 4) as i32, transfer_ns: u32_at(p, 8) }
+        let (slack_ns, transfer_ns) = (u32_at(p, 4) as i32, u32_at(p, 8));
+        Self { frame: u32_at(p, 0), slack_ns, transfer_ns, epoch: u32_at(p, 12) }
     }
 
     fn write(&self, w: &mut Writer<'_>) {
-        w.u32(self.frame).u32(self.slack_ns as u32).u32(self.transfer_ns).u32(0);
+        w.u32(self.frame).u32(self.slack_ns as u32).u32(self.transfer_ns).u32(self.epoch);
     }
 }
 
@@ -298,6 +310,10 @@ impl HostMessage {
             }
             MessageType::Echo => Self::Echo(echo(p)?),
             MessageType::Tracks => Self::Tracks(Tracks::parse(p)?),
+            MessageType::Shift => {
+                expect_len(kind, p, SHIFT_BYTES)?;
+                Self::Shift(SlotShift { slot: u64_at(p, 0), epoch: DeviceTicks(u64_at(p, 8)) })
+            }
             MessageType::Stop | MessageType::Black | MessageType::Freeze | MessageType::Safe => {
                 expect_len(kind, p, 0)?;
                 match kind {
@@ -345,6 +361,10 @@ impl HostMessage {
                 w.len = tracks.write(w.out);
                 MessageType::Tracks
             }
+            Self::Shift(shift) => {
+                w.u64(shift.slot).u64(shift.epoch.0);
+                MessageType::Shift
+            }
             Self::Stop => MessageType::Stop,
             Self::Black => MessageType::Black,
             Self::Freeze => MessageType::Freeze,
@@ -370,6 +390,7 @@ impl DeviceMessage {
                     frame_buffers: p[13],
                     greatest_shift: (p[14] & FEATURE_TRACKS != 0).then_some(p[15]),
                     measures_timing: p[14] & FEATURE_TIMING != 0,
+                    shifts_slots: p[14] & FEATURE_SHIFT != 0,
                     tick_hz: u32_at(p, 16),
                     min_plane_ns: u32_at(p, 20),
                     serial: u64_at(p, 24),
@@ -443,7 +464,8 @@ impl DeviceMessage {
                 w.u8(h.max_planes).u8(h.frame_buffers);
                 let follows = h.greatest_shift.map_or(0, |_| FEATURE_TRACKS);
                 let measures = if h.measures_timing { FEATURE_TIMING } else { 0 };
-                w.u8(follows | measures).u8(h.greatest_shift.unwrap_or(0));
+                let shifts = if h.shifts_slots { FEATURE_SHIFT } else { 0 };
+                w.u8(follows | measures | shifts).u8(h.greatest_shift.unwrap_or(0));
                 w.u32(h.tick_hz).u32(h.min_plane_ns).u64(h.serial).u64(h.now.0);
                 MessageType::Hello
             }

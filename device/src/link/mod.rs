@@ -46,5 +46,5 @@ pub use message::{
 };
 #[cfg(feature = "std")]
 pub use session::SessionNumbers;
-pub use slots::SlotClock;
+pub use slots::{SlotClock, SlotShift, SHIFT_PARTS};
 pub use tracks::{move_plane, Area, Move, Moves, Region, Tracks, MAX_REGIONS, MAX_SHIFT, MAX_TRACK_US};

@@ -3,13 +3,27 @@
 use crate::time::{DeviceTicks, FrameRate};
 
 /// The slots of a configured device. Slot `k` begins at `epoch + floor(k * tick_hz * den / num)`: never more than a tick from
-/// the exact rational instant, with no accumulated drift.
+/// the exact rational instant, with no accumulated drift. From one slot on, another epoch may hold.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct SlotClock {
     epoch: DeviceTicks,
+    /// The first slot for which another epoch holds, and that epoch.
+    shifted: Option<SlotShift>,
     tick_hz: u32,
     rate: FrameRate,
 }
+
+/// A slot, from which on all slots begin as if slot 0 had begun at `epoch`.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct SlotShift {
+    /// The first of these slots.
+    pub slot: u64,
+    /// Start of slot 0 as these slots count it.
+    pub epoch: DeviceTicks,
+}
+
+/// Slots in light begin earlier or later by at most this part of a slot with each shift.
+pub const SHIFT_PARTS: u64 = 64;
 
 impl SlotClock {
     /// Slots of `rate` on a clock of `tick_hz` ticks a second, slot 0 at `epoch`. `None` when `tick_hz` is 0 or a slot would
@@ -18,7 +32,31 @@ impl SlotClock {
         if (tick_hz as u64) * (rate.den() as u64) < rate.num() as u64 {
             return None;
         }
-        Some(Self { epoch, tick_hz, rate })
+        Some(Self { epoch, shifted: None, tick_hz, rate })
+    }
+
+    /// The same slots, but from slot `shift.slot` on as if slot 0 had begun at `shift.epoch`. What held for the slot before
+    /// it holds for all before it.
+    pub const fn with_shift(&self, shift: SlotShift) -> Self {
+        Self { epoch: self.epoch_of(shift.slot.saturating_sub(1)), shifted: Some(shift), ..*self }
+    }
+
+    /// Start of slot 0 as slot `slot` counts it.
+    pub const fn epoch_of(&self, slot: u64) -> DeviceTicks {
+        match self.shifted {
+            Some(shift) if slot >= shift.slot => shift.epoch,
+            _ => self.epoch,
+        }
+    }
+
+    /// The last shift.
+    pub const fn shift(&self) -> Option<SlotShift> {
+        self.shifted
+    }
+
+    /// Length of a slot, ticks, rounded down.
+    pub const fn slot_ticks(&self) -> u64 {
+        self.tick_hz as u64 * self.rate.den() as u64 / self.rate.num() as u64
     }
 
     /// Start of slot `slot`; saturates at the end of the counter.
@@ -26,17 +64,29 @@ impl SlotClock {
         // At most 2^64 * 2^32 * 2^32: fits 128 bits exactly once; the division brings it back.
         let ticks = (slot as u128).saturating_mul(self.tick_hz as u128 * self.rate.den() as u128)
             / self.rate.num() as u128;
-        let at = ticks + self.epoch.0 as u128;
+        let at = ticks + self.epoch_of(slot).0 as u128;
         DeviceTicks(if at > u64::MAX as u128 { u64::MAX } else { at as u64 })
     }
 
     /// The slot that contains the instant `at`; `None` before slot 0.
     pub const fn slot_at(&self, at: DeviceTicks) -> Option<u64> {
-        if at.0 < self.epoch.0 {
+        match self.shifted {
+            Some(shift) if at.0 >= self.start(shift.slot).0 => self.slot_by(shift.epoch, at),
+            Some(shift) => match self.slot_by(self.epoch, at) {
+                // The slot before the first shifted one may last longer than the others.
+                Some(k) if k >= shift.slot => shift.slot.checked_sub(1),
+                k => k,
+            },
+            None => self.slot_by(self.epoch, at),
+        }
+    }
+
+    const fn slot_by(&self, epoch: DeviceTicks, at: DeviceTicks) -> Option<u64> {
+        if at.0 < epoch.0 {
             return None;
         }
         // The largest k with floor(k * hz * den / num) <= d, that is k * hz * den < (d + 1) * num.
-        let d = (at.0 - self.epoch.0) as u128;
+        let d = (at.0 - epoch.0) as u128;
         let k = ((d + 1) * self.rate.num() as u128 - 1) / (self.tick_hz as u128 * self.rate.den() as u128);
         Some(k as u64)
     }
@@ -51,7 +101,7 @@ impl SlotClock {
         DeviceTicks(if kept > slots { kept } else { slots })
     }
 
-    /// Start of slot 0.
+    /// Start of slot 0, as the slots before the last shift count it.
     pub const fn epoch(&self) -> DeviceTicks {
         self.epoch
     }
@@ -104,6 +154,31 @@ mod tests {
         assert_eq!(clock.dark_from(u64::MAX, u64::MAX).0, u64::MAX);
         let slow = SlotClock::new(DeviceTicks(0), 1000, FrameRate::new(1, 1).unwrap()).unwrap();
         assert_eq!(slow.dark_from(0, 20_000_000).0, 4000);
+    }
+
+    /// Slots are as long as before on both sides of a shift; the one before it is longer or shorter by as much.
+    #[test]
+    fn a_shift_changes_the_length_of_one_slot() {
+        let clock = SlotClock::new(DeviceTicks(5_000), 27_000_000, FrameRate::new(947, 1).unwrap()).unwrap();
+        for by in [-400i64, -1, 1, 400, 28_511] {
+            let later = |epoch: DeviceTicks| DeviceTicks(epoch.0.saturating_add_signed(by));
+            let once = clock.with_shift(SlotShift { slot: 50, epoch: later(clock.epoch_of(50)) });
+            let twice = once.with_shift(SlotShift { slot: 90, epoch: later(once.epoch_of(90)) });
+            for k in 0..49 {
+                assert_eq!(once.start(k), clock.start(k));
+            }
+            for k in 50..200 {
+                assert_eq!(once.start(k).0, clock.start(k).0.saturating_add_signed(by));
+                let shifts = if k < 90 { by } else { 2 * by };
+                assert_eq!(twice.start(k).0, clock.start(k).0.saturating_add_signed(shifts));
+            }
+            for (slots, from) in [(once, 0), (twice, 50)] {
+                for k in from..200u64 {
+                    assert_eq!(slots.slot_at(slots.start(k)), Some(k), "{by}");
+                    assert_eq!(slots.slot_at(DeviceTicks(slots.start(k + 1).0 - 1)), Some(k), "{by}");
+                }
+            }
+        }
     }
 
     #[test]

@@ -48,6 +48,8 @@ pub enum MessageType {
     Sync = 13,
     /// By how much regions of a frame are to be moved.
     Tracks = 14,
+    /// Host to device: from which slot on slots begin earlier or later.
+    Shift = 15,
 }
 
 impl MessageType {
@@ -68,6 +70,7 @@ impl MessageType {
             12 => Self::Safe,
             13 => Self::Sync,
             14 => Self::Tracks,
+            15 => Self::Shift,
             _ => return None,
         })
     }

@@ -44,6 +44,8 @@ pub struct FirmwareConfig {
     pub greatest_shift: Option<u8>,
     /// It measures how early frames are whole. Firmware 1.0 did not.
     pub measures_timing: bool,
+    /// Its slots can be shifted by SHIFT.
+    pub shifts_slots: bool,
     /// Lit slots of which the shifts are kept for [`super::ProjectorFirmware::next_moves`]; when full, the oldest are
     /// dropped and counted with the light events.
     pub moves_kept: usize,
@@ -97,6 +99,7 @@ impl FirmwareConfig {
             shown_kept: 0,
             greatest_shift: None,
             measures_timing: true,
+            shifts_slots: false,
             moves_kept: 0,
             changes_kept: 1024,
         }

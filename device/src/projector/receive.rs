@@ -322,6 +322,7 @@ impl Core {
                 self.echoes.push_back(Echo { device_received: self.ticks(), ..echo });
             }
             HostMessage::Tracks(tracks) => self.take_tracks(tracks),
+            HostMessage::Shift(shift) => self.take_shift(shift),
             HostMessage::Sync(frames_sent) => {
                 self.give_up_frame();
                 self.account(frames_sent);
@@ -391,7 +392,7 @@ impl Core {
         };
         let slack_ns = ns(now, begin).clamp(i32::MIN.into(), i32::MAX.into()) as i32;
         let transfer_ns = ns(frame.begun_at, now).clamp(0, u32::MAX.into()) as u32;
-        self.status.timing = Some(FrameTiming { frame: frame.frame, slack_ns, transfer_ns });
+        self.status.timing = Some(FrameTiming { frame: frame.frame, slack_ns, transfer_ns, epoch: 0 });
     }
 
     /// Queues a whole frame for its slot, or drops it as too late or too early.

@@ -1,7 +1,9 @@
 //! A session from HELLO over CONFIG to ARM, and what ends its light.
 
 use super::{Core, Mode, CHECKSUM_STORM};
-use crate::link::{faults, Config, ConfigRefusal, Fault, FaultCode, FlashLimiter, SlotClock, Status};
+use crate::link::{
+    faults, Config, ConfigRefusal, Fault, FaultCode, FlashLimiter, SlotClock, SlotShift, Status, SHIFT_PARTS,
+};
 
 impl Core {
     /// Goes dark and drops every frame in flight.
@@ -69,7 +71,8 @@ impl Core {
             SlotClock::new(config.epoch, self.setup.clock.tick_hz, config.rate).ok_or(ConfigRefusal::Rate)?;
         let plane_ns = 1_000_000_000 * u64::from(config.rate.den())
             / (u64::from(config.rate.num()) * config.schedule.len() as u64);
-        if plane_ns < u64::from(self.setup.min_plane_ns) {
+        let shortest_ns = if config.shifts { plane_ns - plane_ns.div_ceil(SHIFT_PARTS) } else { plane_ns };
+        if shortest_ns < u64::from(self.setup.min_plane_ns) || config.shifts && !self.setup.shifts_slots {
             return Err(ConfigRefusal::Rate);
         }
         self.disarm();
@@ -77,6 +80,37 @@ impl Core {
         self.guard.configure(config.rate, config.limits, self.setup.limits);
         self.flash = self.setup.flash_limit.map(|limit| FlashLimiter::backstop(config.rate, limit));
         Ok(())
+    }
+
+    /// SHIFT: slots that have not begun begin earlier or later. Those in light by a small part of a slot alone.
+    pub(super) fn take_shift(&mut self, shift: SlotShift) {
+        let (next, is_lit) = (self.slot_to_come(), self.lit_now);
+        let Some((_, slots)) = self.config.as_mut().filter(|(config, _)| config.shifts) else {
+            return self.count_ignored();
+        };
+        let held = slots.epoch_of(next.saturating_sub(1));
+        let by = i128::from(shift.epoch.0) - i128::from(held.0);
+        let (slot, part) = (i128::from(slots.slot_ticks()), i128::from(slots.slot_ticks() / SHIFT_PARTS));
+        let most = if is_lit { part } else { slot };
+        if !(-part..=most).contains(&by) {
+            return self.count_ignored();
+        }
+        // What was to come after another shift that has not begun is forgotten.
+        let now = SlotShift { slot: next, epoch: held };
+        *slots = slots.with_shift(now).with_shift(SlotShift { slot: shift.slot.max(next), ..shift });
+        self.status_due = true;
+    }
+
+    /// The first slot that has not begun.
+    fn slot_to_come(&self) -> u64 {
+        let slots = self.config.as_ref().map(|(_, slots)| slots);
+        slots.and_then(|slots| slots.slot_at(self.ticks())).map_or(0, |k| k + 1)
+    }
+
+    /// Low 32 bits of the tick at which slot 0 begins as the present slot counts it; 0 without shifts.
+    pub(super) fn present_epoch(&self) -> u32 {
+        let shifted = self.config.as_ref().filter(|(config, _)| config.shifts);
+        shifted.map_or(0, |(_, slots)| slots.epoch_of(self.slot_to_come().saturating_sub(1)).0 as u32)
     }
 
     /// ARM: light from the next slot on, unless a fault is not acknowledged.

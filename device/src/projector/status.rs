@@ -1,7 +1,7 @@
 //! What the device tells of itself: HELLO, its state, and the counters of STATUS.
 
 use super::{Core, Mode};
-use crate::link::{Decoder, DecoderCounters, DeviceHello, DeviceState, Status};
+use crate::link::{Decoder, DecoderCounters, DeviceHello, DeviceState, FrameTiming, Status};
 use crate::time::DeviceTicks;
 
 /// Counts of both lanes' decoders since power-on.
@@ -29,6 +29,7 @@ impl Core {
             frame_buffers: self.setup.frame_buffers,
             greatest_shift: self.setup.greatest_shift,
             measures_timing: self.setup.measures_timing,
+            shifts_slots: self.setup.shifts_slots,
             tick_hz: self.setup.clock.tick_hz,
             min_plane_ns: self.setup.min_plane_ns,
             serial: self.setup.serial,
@@ -68,7 +69,10 @@ impl Core {
                 .wrapping_add(all.foreign.wrapping_sub(before.foreign)),
             bytes_skipped: all.bytes_skipped.wrapping_sub(before.bytes_skipped),
             tracks: self.track_counts(),
-            timing: self.times().then(|| self.status.timing.unwrap_or_default()),
+            timing: self.times().then(|| FrameTiming {
+                epoch: self.present_epoch(),
+                ..self.status.timing.unwrap_or_default()
+            }),
             ..self.status
         }
     }

@@ -8,6 +8,7 @@ mod limits;
 mod panel;
 mod protocol;
 mod safety;
+mod shift;
 mod timing;
 
 use super::*;
@@ -504,7 +505,7 @@ fn packets_of_the_document() -> Vec<Vec<u8>> {
 #[test]
 fn the_documents_example_makes_light() {
     let packets = packets_of_the_document();
-    let [hello, config, arm, plane, commit, stop, _tracks] = &packets[..] else {
+    let [hello, config, arm, plane, commit, stop, _tracks, _shift] = &packets[..] else {
         panic!("{} packets", packets.len())
     };
     let mut mock = ProjectorFirmware::new(FirmwareConfig::new(Raster::new(16, 1).unwrap()));

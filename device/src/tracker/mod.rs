@@ -90,6 +90,11 @@ pub trait Tracker: Send {
         false
     }
 
+    /// When something will arrive, for a tracker that knows it: one in this process.
+    fn due_at(&self) -> Option<HostTime> {
+        None
+    }
+
     /// The gate through which its samples pass, which has counted them; `None` for a tracker without one.
     fn gate(&self) -> Option<&SampleGate> {
         None
@@ -115,6 +120,10 @@ impl<T: Tracker + ?Sized> Tracker for Box<T> {
 
     fn wait(&self, timeout: Duration) -> bool {
         (**self).wait(timeout)
+    }
+
+    fn due_at(&self) -> Option<HostTime> {
+        (**self).due_at()
     }
 
     fn gate(&self) -> Option<&SampleGate> {

@@ -471,6 +471,10 @@ impl Tracker for Replay {
         format!("{}; {}", self.status, self.gate.counters())
     }
 
+    fn due_at(&self) -> Option<HostTime> {
+        self.samples.get(self.next).map(|sample| sample.received_at)
+    }
+
     fn gate(&self) -> Option<&SampleGate> {
         Some(&self.gate)
     }

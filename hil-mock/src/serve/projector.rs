@@ -118,6 +118,7 @@ pub(super) fn run_beside(
         greatest_shift: arguments.greatest_shift,
         events_kept: 0,
         shown_kept,
+        shifts_slots: true,
         ..MockConfig::new(arguments.raster)
     });
     let log = arguments.light_log.as_deref().map(LightLog::create).transpose()?;

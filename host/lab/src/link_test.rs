@@ -156,6 +156,7 @@ impl Far {
             frame_buffers: mock.buffer_frames.min(64) as u8,
             events_kept: 0,
             greatest_shift: Some(GREATEST_SHIFT),
+            shifts_slots: true,
             ..MockConfig::new(raster)
         };
         let frame_buffers = usize::from(setup.frame_buffers);

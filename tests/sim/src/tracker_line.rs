@@ -316,6 +316,8 @@ impl Opener for PortOpener {
 /// The open port.
 struct TrackerPort(Arc<Mutex<Net>>, (u64, u64));
 
+impl Stream for TrackerPort {}
+
 impl Read for TrackerPort {
     fn read(&mut self, into: &mut [u8]) -> io::Result<usize> {
         lock(&self.0).on_line(|line, _, _| line.read(self.1, into)).unwrap_or(Ok(0))

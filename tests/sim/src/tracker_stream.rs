@@ -409,6 +409,8 @@ impl Opener for ServerOpener {
 /// The host's socket.
 struct TrackerSocket(Arc<Mutex<Net>>, u64);
 
+impl Stream for TrackerSocket {}
+
 impl Read for TrackerSocket {
     fn read(&mut self, into: &mut [u8]) -> io::Result<usize> {
         lock(&self.0).on_stream(|stream, now, _| stream.read(self.1, into, now)).unwrap_or(Ok(0))

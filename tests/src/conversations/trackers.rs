@@ -14,7 +14,7 @@ use dpm_device::tracker::serial::wire::{SerialMessage, VERSION};
 use dpm_device::tracker::udp::{Arrival, Datagrams};
 use dpm_device::tracker::vrpn::client::{VrpnClient, VrpnConfig};
 use dpm_device::tracker::vrpn::wire as vrpn;
-use dpm_device::tracker::{BodyKey, Tracker, TrackerCounters, TrackerSample};
+use dpm_device::tracker::{BodyKey, Stream, Tracker, TrackerCounters, TrackerSample};
 use hil_mock::motion::{Motion, MotionSpec};
 use hil_mock::natnet_server::{NatNetServer, NatNetServerConfig, Streaming, UnicastTo};
 use hil_mock::serial_server::SerialPoseDevice;
@@ -86,6 +86,8 @@ impl Memory {
         self.0.lock().expect("no panic").is_closed = true;
     }
 }
+
+impl Stream for Memory {}
 
 impl Read for Memory {
     fn read(&mut self, into: &mut [u8]) -> io::Result<usize> {

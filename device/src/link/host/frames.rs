@@ -62,6 +62,7 @@ impl HostLink {
         planes: &[u8],
         transport: &mut dyn Transport,
     ) -> Result<(), DropReason> {
+        let target_at = self.aim(target_at);
         let schedule = self.settings.schedule;
         let expected = self.settings.raster.plane_bytes() * schedule.len();
         assert!(planes.len() == expected, "frame of {} bytes, configured {expected}", planes.len());

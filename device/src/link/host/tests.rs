@@ -78,6 +78,7 @@ fn hello() -> DeviceMessage {
         frame_buffers: 2,
         greatest_shift: None,
         measures_timing: false,
+        shifts_slots: false,
         tick_hz: 1_000_000,
         min_plane_ns: 1000,
         serial: 0,

@@ -45,6 +45,7 @@ fn golden_messages_of_the_host() {
             limits: LightLimits { mean_permille: 300, window_ms: 10_000, full_white_ms: 70_000 },
             tracks: false,
             timing: false,
+            shifts: false,
         }),
         MessageType::Config,
         "0004 0003 60ea0000 e9030000 50c30000 03 01 02 00 2c01 0000 0807060504030201 10270000 70110100 07 10 33",
@@ -62,6 +63,8 @@ fn golden_messages_of_the_host() {
         "feffff00 01000000 02010000 ffffffff 8877665544332211",
     );
     host(HostMessage::Sync(258), MessageType::Sync, "02010000");
+    let shift = SlotShift { slot: 258, epoch: DeviceTicks(0x0102_0304_0506_0708) };
+    host(HostMessage::Shift(shift), MessageType::Shift, "0201000000000000 0807060504030201");
     host(
         HostMessage::Echo(Echo {
             host_sent_ns: 0x1122_3344_5566_7788,
@@ -169,6 +172,7 @@ fn an_led_code_may_repeat_only_where_the_flag_says_so() {
         limits: LightLimits::OFF,
         tracks: false,
         timing: false,
+        shifts: false,
     };
     let mut out = [0; MAX_CONTROL_BYTES];
     let (kind, n) = HostMessage::Config(config).write(&mut out);
@@ -187,8 +191,12 @@ fn an_led_code_may_repeat_only_where_the_flag_says_so() {
     assert_eq!(again[..n], out[..n]);
     out[19] = 4;
     assert!(HostMessage::parse(kind, &out[..n]).is_err(), "a code twice without its flag");
-    out[19] = 17;
+    out[19] = 33;
     assert!(HostMessage::parse(kind, &out[..n]).is_err(), "a flag without a meaning");
+    out[19] = 17;
+    assert!(HostMessage::parse(kind, &out[..n]).is_err(), "shifts without the report that confirms them");
+    out[19] = 29;
+    assert!(HostMessage::parse(kind, &out[..n]).is_ok());
     assert!(PlaneSchedule::with_repeats(&[equal[0]; 4]).is_none());
     assert!(PlaneSchedule::equal24().has_repeats() && !PlaneSchedule::rgb24().has_repeats());
     assert_eq!(PlaneSchedule::with_repeats(PlaneSchedule::rgb24().planes()), Some(PlaneSchedule::rgb24()));
@@ -206,6 +214,7 @@ fn golden_messages_of_the_device() {
             frame_buffers: 4,
             greatest_shift: None,
             measures_timing: false,
+            shifts_slots: false,
             tick_hz: 1_000_000_000,
             min_plane_ns: 44_000,
             serial: 0x1122_3344_5566_7788,
@@ -249,7 +258,8 @@ fn golden_messages_of_the_device() {
          01000000 02000000 03000000 04000000 05000000 06000000 07000000 08000000 09000000 0a000000 0b000000
          0c000000 0d000000 0e000000",
     );
-    let timing = FrameTiming { frame: 0x0a0b_0c0d, slack_ns: -2, transfer_ns: 0x0102_0304 };
+    let timing =
+        FrameTiming { frame: 0x0a0b_0c0d, slack_ns: -2, transfer_ns: 0x0102_0304, epoch: 0x0506_0708 };
     let tracks = TrackCounts {
         taken: 1,
         refused: 2,
@@ -259,7 +269,7 @@ fn golden_messages_of_the_device() {
         greatest_age: 6,
     };
     let moved = "01000000 02000000 03000000 04000000 05000000 06000000";
-    let timed = "0d0c0b0a feffffff 04030201 00000000";
+    let timed = "0d0c0b0a feffffff 04030201 08070605";
     for (tracks, timing, more) in [
         (Some(tracks), None, moved.to_owned()),
         (None, Some(timing), timed.to_owned()),

@@ -92,6 +92,8 @@ pub struct DeviceHello {
     pub greatest_shift: Option<u8>,
     /// It measures how early frames are whole, and reports it if CONFIG asks.
     pub measures_timing: bool,
+    /// Its slots can be shifted by SHIFT, if CONFIG asks.
+    pub shifts_slots: bool,
     /// Nominal ticks a second of the device's clock.
     pub tick_hz: u32,
     /// Shortest time one plane can be shown, nanoseconds.
@@ -135,6 +137,8 @@ pub struct Config {
     pub tracks: bool,
     /// STATUS reports how early frames are whole. Only for a device that measures it.
     pub timing: bool,
+    /// The host shifts the slots by SHIFT. Only for a device whose slots can be shifted, and only with `timing`.
+    pub shifts: bool,
 }
 
 /// FRAME_COMMIT: the end of a frame and how it is composed.
@@ -268,6 +272,8 @@ pub struct FrameTiming {
     /// From the arrival of its first packet to the instant at which it was whole, nanoseconds. Limited to the range of
     /// the type.
     pub transfer_ns: u32,
+    /// Low 32 bits of the tick at which slot 0 begins as the present slot counts it, if CONFIG asked for shifts; else 0.
+    pub epoch: u32,
 }
 
 /// Counters of a device that follows TRACKS, in STATUS.

@@ -215,7 +215,7 @@ fn light_outside_of_regions_is_the_light_that_was_sent() {
 #[test]
 fn the_documents_tracks_move_the_documents_frame() {
     let packets = packets_of_the_document();
-    let [hello, config, arm, plane, commit, _stop, tracks] = &packets[..] else {
+    let [hello, config, arm, plane, commit, _stop, tracks, _shift] = &packets[..] else {
         panic!("{} packets", packets.len())
     };
     let mut asks = config[32..32 + 41].to_vec();

@@ -15,6 +15,8 @@ struct Wire {
 #[derive(Clone, Default)]
 struct Port(Arc<Mutex<Wire>>);
 
+impl Stream for Port {}
+
 impl Read for Port {
     fn read(&mut self, into: &mut [u8]) -> io::Result<usize> {
         match self.0.lock().unwrap().to_host.read(into)? {

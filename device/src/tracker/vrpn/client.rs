@@ -5,6 +5,7 @@ use super::wire::{self, system, type_name, Message, COOKIE, COOKIE_BYTES};
 use crate::clock_map::{ClockMap, ExchangeOutcome};
 use crate::stream::{OnThread, Opener};
 use crate::time::{DeviceTicks, HostClock, HostTime};
+use crate::tracker::udp::wait_for_any;
 use crate::tracker::{
     BodyIndex, BodyKey, SampleGate, Stream, Tracker, TrackerCounters, TrackerError, TrackerSample,
 };
@@ -583,6 +584,12 @@ impl Tracker for VrpnClient {
 
     fn name(&self) -> &str {
         "vrpn"
+    }
+
+    fn wait(&self, timeout: Duration) -> bool {
+        let State::Open { stream, .. } = &self.state else { return false };
+        let descriptor = stream.descriptor();
+        descriptor.is_some() && wait_for_any([descriptor, None], timeout).is_ok()
     }
 
     fn status(&self) -> String {

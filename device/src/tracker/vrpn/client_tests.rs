@@ -48,6 +48,8 @@ impl Opener for Network {
 /// One connection; the server forgets it when there is a newer one.
 struct Socket(Network, u32);
 
+impl Stream for Socket {}
+
 impl Read for Socket {
     fn read(&mut self, into: &mut [u8]) -> io::Result<usize> {
         let mut wire = self.0 .0.lock().unwrap();

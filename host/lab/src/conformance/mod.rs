@@ -14,6 +14,7 @@ mod packets;
 mod planes;
 mod safety;
 mod session;
+mod shift;
 mod shot;
 mod time;
 mod timing;
@@ -78,6 +79,7 @@ pub fn rules() -> impl Iterator<Item = &'static Rule> {
         packets::RULES,
         safety::RULES,
         timing::RULES,
+        shift::RULES,
         tracks::RULES,
         time::RULES,
     ]

@@ -57,6 +57,7 @@ impl Bench<'_> {
             limits: LightLimits::OFF,
             tracks: false,
             timing: false,
+            shifts: false,
         })
     }
 

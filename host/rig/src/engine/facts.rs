@@ -10,6 +10,7 @@ use crate::plan::lead::LeadEstimator;
 use crate::rig::Rig;
 use crate::telemetry::monitor::RunMonitor;
 use crate::telemetry::report::Recovery;
+use crate::tracks::SampleRhythm;
 use dpm_device::time::HostTime;
 use dpm_handoff::path::Lock;
 use std::sync::atomic::{AtomicBool, AtomicI64, AtomicU64, Ordering};
@@ -48,6 +49,13 @@ pub(crate) struct Facts {
     pub slots_a_frame: AtomicU64,
     /// Slots for which the light of a frame must last at least, because the next may come as late.
     pub light_slots: AtomicU64,
+    /// The tracker's newest exposure on the host's clock, and how long after one its sample can be read.
+    sample_captured_ns: AtomicI64,
+    sample_takes_ns: AtomicI64,
+    /// From one sample to the next, nanoseconds; 0 while that is not known.
+    sample_period_ns: AtomicI64,
+    /// The slots follow the tracker.
+    pub in_step: AtomicBool,
     /// Slots from one planned frame to the next, in thousandths, averaged over the last frames.
     pub stride_milli: AtomicU64,
     /// Frames wait for busy stages, and none has found a stage idle for long.
@@ -107,10 +115,31 @@ impl Facts {
             starved_milli: AtomicU64::new(0),
             pressure_milli: AtomicU64::new(0),
             starved_ns: AtomicI64::new(0),
+            sample_captured_ns: AtomicI64::new(0),
+            sample_takes_ns: AtomicI64::new(0),
+            sample_period_ns: AtomicI64::new(0),
+            in_step: AtomicBool::new(false),
             made_ns: AtomicI64::new(0),
             recoveries: Lock::new(Vec::new()),
             error: Lock::new(None),
         }
+    }
+
+    /// When the tracker's samples are ready; `None` while that is not known.
+    pub(crate) fn rhythm(&self) -> Option<SampleRhythm> {
+        let period_ns = self.sample_period_ns.load(Ordering::Relaxed);
+        let captured_at = HostTime(self.sample_captured_ns.load(Ordering::Relaxed));
+        let takes_ns = self.sample_takes_ns.load(Ordering::Relaxed);
+        (period_ns > 0).then_some(SampleRhythm { captured_at, takes_ns, period_ns })
+    }
+
+    /// Tells when samples are ready.
+    pub(crate) fn tell_rhythm(&self, rhythm: Option<SampleRhythm>) {
+        if let Some(rhythm) = rhythm {
+            self.sample_captured_ns.store(rhythm.captured_at.0, Ordering::Relaxed);
+            self.sample_takes_ns.store(rhythm.takes_ns, Ordering::Relaxed);
+        }
+        self.sample_period_ns.store(rhythm.map_or(0, |rhythm| rhythm.period_ns), Ordering::Relaxed);
     }
 
     /// Ends the run in the dark with this error; the first error counts. Not for the frame path.

@@ -138,6 +138,7 @@ impl LinkKeeper {
             }
         }
         if !steady {
+            self.keep_slots(link);
             self.keep_time(now, link);
         }
         // After a stop request, no order lights the projector again.
@@ -312,6 +313,17 @@ impl LinkKeeper {
                 }
             }
             _ => {}
+        }
+    }
+
+    /// Takes over slots that were shifted.
+    fn keep_slots(&mut self, link: &HostLink) {
+        let clock = link.slots().filter(|clock| self.is_timed && *clock != self.time.clock);
+        if let Some(clock) = clock {
+            self.time.clock = clock;
+            if let Some(times) = &mut self.times {
+                times.publish(self.time);
+            }
         }
     }
 

@@ -3,6 +3,7 @@
 use super::cadence::Cadence;
 use super::facts::{Facts, RECEIPT_NS};
 use super::follow::Follower;
+use super::genlock;
 use super::keeper::{is_dark, LinkKeeper};
 use super::pace::Pace;
 use super::pack::is_overtaken;
@@ -12,7 +13,7 @@ use super::slack::{SentFrame, SlackMeter};
 use crate::frame::job::{Fate, FrameNote};
 use crate::plan::lead::LeadEstimator;
 use crate::telemetry::projector::ProjectorReport;
-use crate::tracks::TrackSnapshot;
+use crate::tracks::{SampleRhythm, TrackSnapshot};
 use dpm_device::link::{DropReason, HostLink, LinkState, SendOutcome};
 use dpm_device::time::HostTime;
 use dpm_device::transport::{Lane, Transport};
@@ -39,6 +40,9 @@ const DARK_STEP_NS: i64 = 1_000_000;
 const DARK_LOOKS: u32 = 4;
 /// Number of checks of a projector outside this process: STOP is repeated for 300 ms, and its watchdog does the rest.
 const DARK_LOOKS_OUTSIDE: u32 = 300;
+
+/// A tracker that has been silent for this long is not followed, nanoseconds.
+const STALE_NS: i64 = 250_000_000;
 
 /// What happened to a frame that was offered.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -80,6 +84,9 @@ pub(crate) struct LinkStage<P> {
     /// How long the frame being offered waited for room in the device, and for stages that were busy with frames before
     /// it, nanoseconds; `None` if the lead does not learn from it.
     waits_ns: Option<[i64; 2]>,
+    /// Bytes of planes that were sent, and bytes that the processor read and wrote of them from the read-back on.
+    planes_bytes: u64,
+    touched_bytes: u64,
     /// When the frame before was packed, and when it left this stage.
     before: [HostTime; 2],
     ending: Option<Ending>,
@@ -114,6 +121,8 @@ impl<P: Pace> LinkStage<P> {
             ready_at: None,
             credit_until: HostTime(i64::MIN / 2),
             waits_ns: None,
+            planes_bytes: 0,
+            touched_bytes: 0,
             before: [HostTime(i64::MIN / 2); 2],
             ending: None,
             looks,
@@ -157,7 +166,7 @@ impl<P: Pace> LinkStage<P> {
 
     /// Polls the link and does what is due between frames.
     pub(crate) fn poll(&mut self, now: HostTime, transport: &mut dyn Transport) {
-        let Self { facts, link, keeper, follower, slack, seen, .. } = self;
+        let Self { facts, link, keeper, follower, slack, seen, slot_ns, .. } = self;
         let alive = now.ns_since(HostTime(facts.alive_at_ns.load(Ordering::Relaxed))) <= ALIVE_WITHIN_NS;
         let result = keeper.poll(now, link, transport, !P::FOLLOWS_CLOCK, alive, &facts.monitor);
         let now_seen = [link.counters().sessions, keeper.clock_steps()];
@@ -173,6 +182,9 @@ impl<P: Pace> LinkStage<P> {
         }
         if let Some(follower) = follower {
             follower.poll(now, keeper.time(), link, transport);
+        }
+        if P::FOLLOWS_CLOCK {
+            follow_tracker(now, facts, keeper.time(), *slot_ns, link, transport);
         }
         if let Some(need) = need {
             self.learn(need);
@@ -236,9 +248,11 @@ impl<P: Pace> LinkStage<P> {
             return Offer::Settled;
         }
         let plan = &note.plan;
+        let wire_before = self.link.counters().frame_bytes_sent;
         let outcome = self.link.send_frame(now, plan.id.0, plan.target_at, plan.dark_from, planes, transport);
         note.fate = Fate::Offered(outcome);
         if outcome == SendOutcome::Sent {
+            self.count_touches(note.touched_bytes, planes.len() as u64, wire_before);
             self.keeper.sent(plan, has_light(planes), now);
             if let Some(follower) = &mut self.follower {
                 follower.sent(plan);
@@ -270,6 +284,17 @@ impl<P: Pace> LinkStage<P> {
             let needed_ns = now.ns_since(note.latch_due_at) - waited_ns + self.slack.travel_ns();
             self.learn(FrameNeed { needed_ns, behind_ns });
         }
+    }
+
+    /// Counts what the processor has read and written of a frame of `planes` bytes: `before` it was offered, and to put it
+    /// on the wire, which had carried `wire_before` bytes.
+    fn count_touches(&mut self, before: u64, planes: u64, wire_before: u64) {
+        // A payload is read once, for its checksum and its copy together, and written once.
+        let wire = 2 * (self.link.counters().frame_bytes_sent - wire_before);
+        // To be compacted it is compared with the frame before.
+        let compacted = if self.link.compacts() { 2 * planes } else { 0 };
+        self.planes_bytes += planes;
+        self.touched_bytes += before + wire + compacted;
     }
 
     /// True if the frame was planned by a clock of the projector that has since started anew, or whose map was wrong by
@@ -368,7 +393,33 @@ impl<P: Pace> LinkStage<P> {
 
     /// What the link carried over the medium `name`.
     pub(crate) fn report(&self, name: &str) -> ProjectorReport {
-        ProjectorReport { slack: self.slack.report(), ..self.keeper.report(&self.link, name) }
+        let touches = (self.planes_bytes > 0).then(|| self.touched_bytes as f64 / self.planes_bytes as f64);
+        ProjectorReport { slack: self.slack.report(), touches, ..self.keeper.report(&self.link, name) }
+    }
+}
+
+/// Shifts the slots so that they follow the tracker, where the projector lets it and the rates allow it.
+fn follow_tracker(
+    now: HostTime,
+    facts: &Facts,
+    time: &LinkTime,
+    slot_ns: i64,
+    link: &mut HostLink,
+    medium: &mut dyn Transport,
+) {
+    let is_fresh = |rhythm: &SampleRhythm| now.ns_since(rhythm.captured_at) < STALE_NS;
+    let rhythm = facts.rhythm().filter(|rhythm| is_fresh(rhythm) && genlock::keeps_step(rhythm, slot_ns));
+    facts.in_step.store(rhythm.is_some() && link.shifts_slots(), Ordering::Relaxed);
+    let Some(rhythm) = rhythm.filter(|_| link.may_shift() && !facts.gpu_is_slow.load(Ordering::Relaxed))
+    else {
+        return;
+    };
+    let lead_ns = facts.lead_ns.load(Ordering::Relaxed) + facts.travel_ns.load(Ordering::Relaxed);
+    let is_first = !link.has_sent_frames();
+    let shift = genlock::shift_ns(&rhythm, time, lead_ns, slot_ns, is_first, now);
+    if let Some((slot, by_ns)) = shift.and_then(|(slot, by)| Some((slot.checked_sub(time.first)?, by))) {
+        // A medium without room is asked again at the next poll.
+        let _ = link.shift_slots(now, slot, by_ns, medium);
     }
 }
 

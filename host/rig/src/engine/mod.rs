@@ -5,6 +5,7 @@
 //! - [`plan`]: which slot the next frame is for, and when its poses are read;
 //! - `cadence`: how many slots a frame gets;
 //! - [`pack`]: how long to wait for the GPU, and which frame to leave out;
+//! - `genlock`: by how much slots are shifted, to keep step with the tracker;
 //! - [`follow`]: what a projector that can move parts of a frame is told of the bodies meanwhile;
 //! - [`link`]: when a frame is sent, the operator's orders, the projector's clock, and how the light ends;
 //! - [`supervision`]: which thread has fallen silent, and what is restarted.
@@ -18,6 +19,7 @@ pub(crate) mod connect;
 pub(crate) mod error;
 pub(crate) mod facts;
 pub(crate) mod follow;
+mod genlock;
 pub(crate) mod keeper;
 pub(crate) mod link;
 pub(crate) mod options;

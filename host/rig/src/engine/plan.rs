@@ -1,6 +1,7 @@
 //! Decides which slot the next frame is for, when its poses are read, and when all frames of the run are planned.
 
 use super::facts::{CrewFacts, Facts};
+use super::genlock::{self, Awaited};
 use super::pace::{modelled_ns, Pace};
 use crate::frame::job::{Fate, FrameNote};
 use crate::frame::FrameTimeline;
@@ -33,6 +34,8 @@ pub(crate) struct Latch {
     pub at: HostTime,
     /// The same, but not before the slot was chosen. Reading the poses later than this is lateness of this thread.
     pub due_at: HostTime,
+    /// The sample that it waits for a little, if it is late.
+    pub awaited: Option<Awaited>,
     /// The lead: how long before the slot `at` is, nanoseconds.
     lead_ns: i64,
 }
@@ -117,12 +120,19 @@ impl<P: Pace> PlanStage<P> {
         if self.is_complete() {
             return None;
         }
-        let at = time.host_of_slot(self.next_slot).plus_ns(-leads.lead_ns);
+        let mut at = time.host_of_slot(self.next_slot).plus_ns(-leads.lead_ns);
+        let mut awaited = None;
+        if let Some(rhythm) = self.facts.rhythm().filter(|_| self.facts.in_step.load(Ordering::Relaxed)) {
+            // Most frames would still meet the slot.
+            let late_ns = (leads.lead_ns - leads.needed_ns) * 3 / 4;
+            (at, awaited) = genlock::latch_at(&rhythm, at, late_ns.max(0));
+        }
         Some(Latch {
             id: self.next_frame(),
             slot: self.next_slot,
             at,
             due_at: at.max(now),
+            awaited,
             lead_ns: leads.lead_ns,
         })
     }

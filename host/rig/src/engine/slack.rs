@@ -133,7 +133,7 @@ mod tests {
     }
 
     fn timing(frame: u32, slack_ns: i64) -> FrameTiming {
-        FrameTiming { frame, slack_ns: slack_ns as i32, transfer_ns: 7 }
+        FrameTiming { frame, slack_ns: slack_ns as i32, transfer_ns: 7, epoch: 0 }
     }
 
     #[test]

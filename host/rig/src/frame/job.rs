@@ -46,6 +46,8 @@ pub(crate) struct FrameNote {
     pub cost: Option<FrameCost>,
     /// Hash of the code values, to be compared with the light.
     pub code_hash: u64,
+    /// Bytes that the processor read and wrote to make its planes of what was read back.
+    pub touched_bytes: u64,
     /// Mirrors that are dark in all its planes for the eyes of tracked people.
     pub cut_mirrors: u32,
     /// What became of it.
@@ -63,6 +65,7 @@ impl FrameNote {
             timeline: FrameTimeline::default(),
             cost: None,
             code_hash: 0,
+            touched_bytes: 0,
             cut_mirrors: 0,
             fate: Fate::UnderWay,
         }
@@ -91,10 +94,20 @@ impl FrameNote {
 pub(crate) struct FrameMemory {
     /// The GPU's part; `None` when frames are prepared instead of rendered.
     pub gpu: Option<FrameSlot>,
-    /// Bit planes.
+    /// Bit planes that the processor has packed or changed.
     pub planes: BitPlaneFrame,
+    /// The planes are sent from where the GPU has put them.
+    pub sends_from_gpu: bool,
     /// The picture of a pattern that the planes hold; `None` for every other content.
     pub picture: Option<u64>,
+}
+
+impl FrameMemory {
+    /// The planes to be sent.
+    pub(crate) fn outgoing(&self) -> &[u8] {
+        let from_gpu = self.gpu.as_ref().filter(|_| self.sends_from_gpu).and_then(FrameSlot::planes);
+        from_gpu.unwrap_or(self.planes.bytes())
+    }
 }
 
 /// A frame and its memory.

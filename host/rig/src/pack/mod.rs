@@ -27,10 +27,24 @@ impl Packer {
     pub(crate) fn pack(&mut self, job: &mut FrameJob, verify: bool) {
         let FrameJob { note, memory } = job;
         let watch = Stopwatch::start();
+        let bytes = memory.planes.bytes().len() as u64;
+        memory.sends_from_gpu = false;
+        // What was written, unless something else is said below.
+        note.touched_bytes = bytes;
         match (&memory.gpu, &mut self.pictures) {
             (Some(slot), _) => match slot.planes() {
-                Some(planes) => pack::gpu::take(planes, &mut memory.planes),
-                None => pack::pack(self.kernel, slot.codes(), &mut memory.planes),
+                // What the GPU has packed is changed where eyes are spared, and packed otherwise where rows have odd ends.
+                Some(planes) if self.eyes.is_none() && planes.len() == memory.planes.bytes().len() => {
+                    (memory.sends_from_gpu, note.touched_bytes) = (true, 0);
+                }
+                Some(planes) => {
+                    pack::gpu::take(planes, &mut memory.planes);
+                    note.touched_bytes += bytes;
+                }
+                None => {
+                    pack::pack(self.kernel, slot.codes(), &mut memory.planes);
+                    note.touched_bytes += size_of_val(slot.codes()) as u64;
+                }
             },
             (None, Some(Pictures::Marked(prepared))) => {
                 prepared.pack(self.kernel, note.plan.id.0, &mut memory.planes);

@@ -149,7 +149,7 @@ impl Line {
         may_stall(&shared.facts, StallIn::Link, note.plan.id.0);
         let watch = Stopwatch::start();
         let mut now = clock.now();
-        let (planes, medium) = (memory.planes.bytes(), self.medium.as_mut());
+        let (planes, medium) = (memory.outgoing(), self.medium.as_mut());
         while let Offer::Again(at) = self.stage.offer(now, note, planes, is_newest, medium) {
             now = clock.wait_until(at);
             shared.link_pulse.beat(now, self.stage.expected_ns(STEP_NS));

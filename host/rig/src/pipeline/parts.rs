@@ -259,7 +259,7 @@ impl CrewParts {
 fn frame_memory(rig: &Rig, renderer: Option<&mut Renderer>) -> Result<FrameMemory, PipelineError> {
     let gpu = renderer.map(|renderer| renderer.create_slot(false)).transpose().map_err(RenderError::from)?;
     let planes = BitPlaneFrame::new(rig.camera.raster, rig.schedule);
-    Ok(FrameMemory { gpu, planes, picture: None })
+    Ok(FrameMemory { gpu, planes, sends_from_gpu: false, picture: None })
 }
 
 /// The mock projector that the rig file describes in `mock`, dark, with a recorder that reports its light to
@@ -280,6 +280,7 @@ pub(super) fn mock_projector(
     setup.frame_buffers = mock.buffer_frames.min(64) as u8;
     setup.clock = DeviceClock { skew_ppb: (mock.clock_ppm * 1000.0) as i32, ..DeviceClock::IDEAL };
     setup.flash_limit = projector::flash_limit(config);
+    setup.shifts_slots = true;
     (setup.greatest_shift, setup.moves_kept) = (Some(GREATEST_SHIFT), MOVES_KEPT);
     let emulated = EmulatedProjector::new(setup, &mock.faults, config.render.seed, start)
         .map_err(|e| RigError::Unsupported(format!("projector.backend.faults: {e}")))?;
@@ -305,6 +306,7 @@ pub(super) fn bring_up(
     if rig.wants_tracks() {
         link.want_tracks();
     }
+    link.want_shifts();
     let acknowledged = if rig.config.safety.acknowledge_faults { u32::MAX } else { ENDED_WITH_THE_LAST_RUN };
     let time = connect(&mut link, medium, acknowledged, monitor, now, &|| monitor.stop_requested())?;
     Ok((link, time))

@@ -13,6 +13,7 @@ use crate::light::collector::Collector;
 use crate::light::recorder::LightRecorder;
 use crate::pack::source::PatternSource;
 use crate::picture_stream::PictureStreams;
+use crate::plan::beat::{BeatReport, RatePair};
 use crate::rig::Rig;
 use crate::telemetry::monitor::RunMonitor;
 use crate::telemetry::projector::ProjectorReport;
@@ -161,6 +162,10 @@ impl Ran {
         collector.fill(&mut report);
         report.light_s = facts.monitor.light_times_s();
         report.tracker = facts.monitor.sample_counts();
+        report.beat = facts.rhythm().map(|rhythm| {
+            let pair = RatePair { tracker_hz: 1e9 / rhythm.period_ns as f64, slots_hz: rig.rate().hz() };
+            BeatReport::new(pair, facts.in_step.load(Ordering::Relaxed))
+        });
         report.warnings.extend(report.tracker.as_ref().and_then(TrackerReport::warning));
         report.stopped = facts.monitor.stop_requested();
         report.recoveries = facts.recoveries();

@@ -14,13 +14,14 @@ use dpm_render::{Output, Overlapping, RendererSettings, Tracing};
 /// Spare time in the first guess of the lead, as a divisor of the time of an undisturbed frame: a quarter.
 const GUESS_SPARE: i64 = 4;
 
-/// The modelled time from latch to sent in the rig file, nanoseconds.
+/// The modelled time from latch to sent in the rig file, but for rendering, nanoseconds.
 fn modelled_ns(rig: &Rig) -> i64 {
-    i64::from(rig.config.real_time.stage_costs_us.total()) * 1000
+    let costs = &rig.config.real_time.stage_costs_us;
+    (i64::from(costs.total()) - i64::from(costs.render)) * 1000
 }
 
 /// Estimates how early frames are latched. The first guess comes from the rig file and from `frame_ns`, the time of
-/// an undisturbed frame.
+/// an undisturbed frame; 0 if nothing is rendered.
 pub(super) fn lead_estimator(rig: &Rig, link: &HostLink, frame_ns: i64) -> LeadEstimator {
     let slot_ns = rig.rate().slot_len_ns(0);
     // Sending earlier is useless: the device has no free buffer, and its credit message takes part of a slot to
@@ -28,7 +29,7 @@ pub(super) fn lead_estimator(rig: &Rig, link: &HostLink, frame_ns: i64) -> LeadE
     let held = link.device().map_or(1, |hello| i64::from(hello.frame_buffers));
     let longest_wait_ns = held * slot_ns - slot_ns / 2;
     let rendered_ns = frame_ns + frame_ns / GUESS_SPARE;
-    LeadEstimator::new(slot_ns, modelled_ns(rig).max(rendered_ns), longest_wait_ns)
+    LeadEstimator::new(slot_ns, modelled_ns(rig) + rendered_ns, longest_wait_ns)
 }
 
 /// Keeps the GPU's time inside the slot by reducing samples. The unit is thousandths of a sample per pixel; the range

@@ -16,7 +16,7 @@ use crate::frame::Stage;
 use crate::pack::Packer;
 use crate::plan::link_time::LinkTime;
 use crate::rig::Rig;
-use crate::tracks::{TrackSnapshot, TrackingStage};
+use crate::tracks::{SampleRhythm, TrackSnapshot, TrackingStage};
 use dpm_common::clock::{Clock, MonotonicClock, Stopwatch};
 use dpm_common::realtime::os::thread_id;
 use dpm_common::realtime::wait_policy;
@@ -54,10 +54,14 @@ pub(super) const STEP_NS: i64 = 20_000_000;
 pub(super) const POLL_WITHIN_NS: i64 = 200_000_000;
 /// A frame whose memory came this long after its latch is planned anew, nanoseconds.
 const REPLAN_NS: i64 = 100_000;
+/// Time between two looks for a sample that is late, nanoseconds.
+const AWAIT_STEP_NS: i64 = 30_000;
 /// Longest wait for a tracker, which must also be polled to keep its connection and its clock.
 const WAIT_FOR_TRACKER: Duration = Duration::from_millis(2);
-/// Time between two polls of a tracker that cannot be waited for.
+/// Shortest time between two polls of a tracker that cannot be waited for ...
 const POLL_REST: Duration = Duration::from_micros(200);
+/// ... which begin this long before its next sample should be ready, nanoseconds.
+const POLL_BEFORE_NS: i64 = 500_000;
 
 /// What all threads of a run share, whichever crew works.
 pub(super) struct Shared {
@@ -131,18 +135,32 @@ pub(super) fn tracking_thread(
         steps = steps.saturating_add(1);
         enter_frame_path(steps >= WARM_UP_STEPS);
         read_tracker(facts, &mut stage, &mut latest, now);
+        let rhythm = stage.is_published(clock.now());
+        facts.tell_rhythm(rhythm);
         if let Some(to_link) = &mut to_link {
             stage.publish_lively(now, to_link);
         }
         // A tracker that can be waited for is read as soon as something arrives, and costs nothing while nothing does.
-        if !stage.wait(WAIT_FOR_TRACKER) {
-            std::thread::sleep(POLL_REST);
+        let due_at = stage.due_at();
+        if let Some(due_at) = due_at {
+            clock.wait_until(due_at.min(now.plus_ns(WAIT_FOR_TRACKER.as_nanos() as i64)));
+        } else if !stage.wait(WAIT_FOR_TRACKER) {
+            std::thread::sleep(rest_of(rhythm, now));
         }
     }
     enter_frame_path(false);
     stage.add_counts(clock.now(), facts.monitor.samples(), true);
     pulse.end();
     stage.never_seen(&facts.rig)
+}
+
+/// How long a tracker that cannot be waited for may rest at `now`: until shortly before the next sample, if it is known
+/// when that comes.
+fn rest_of(rhythm: Option<SampleRhythm>, now: HostTime) -> Duration {
+    let Some(rhythm) = rhythm else { return POLL_REST };
+    let since_ns = now.ns_since(rhythm.ready_at()).rem_euclid(rhythm.period_ns.max(1));
+    let until_ns = rhythm.period_ns - since_ns - POLL_BEFORE_NS;
+    Duration::from_nanos(until_ns.max(0) as u64).clamp(POLL_REST, WAIT_FOR_TRACKER)
 }
 
 /// Reads what the tracker has reported by `now`. The failure of a tracker shows in the age of its tracks: the light
@@ -272,8 +290,8 @@ impl<'a> PlanDesk<'a> {
         crew.planning.store(id, Ordering::Relaxed);
         may_stall(&shared.facts, StallIn::Plan, id);
         let time = *self.inbox.time.latest().0;
-        let Some(latch) = self.stage.choose_slot(&time, shared.clock.now()) else { return Some(()) };
-        let now = self.wait_for(&latch);
+        let Some(mut latch) = self.stage.choose_slot(&time, shared.clock.now()) else { return Some(()) };
+        let now = self.wait_for(&mut latch);
         // Memory is taken now and not before the wait, so that as little of it circulates as the stages need. After a
         // wait for memory another slot may be the first that can be met.
         if self.hottest.is_empty() && !self.are_back(1, MissCause::Buffers) {
@@ -303,11 +321,18 @@ impl<'a> PlanDesk<'a> {
         self.to_pack.push(job).ok()
     }
 
-    /// Waits until the poses should be read; returns the time.
-    fn wait_for(&self, latch: &Latch) -> HostTime {
+    /// Waits until the poses should be read; returns the time. What it waits longer for a sample is no lateness.
+    fn wait_for(&mut self, latch: &mut Latch) -> HostTime {
         let (clock, pulse) = (self.shared.clock, &self.crew.pulses[PLAN]);
         pulse.beat(latch.at.max(clock.now()), WAIT_NS + STEP_NS);
-        let now = clock.wait_until(latch.at);
+        let mut now = clock.wait_until(latch.at);
+        if let Some(awaited) = latch.awaited {
+            let woken_at = now;
+            while self.inbox.latest.latest().0.captured_at < awaited.captured_at && now < awaited.until {
+                now = clock.wait_until(awaited.until.min(now.plus_ns(AWAIT_STEP_NS)));
+            }
+            latch.due_at = latch.due_at.plus_ns(now.ns_since(woken_at));
+        }
         pulse.beat(now, STEP_NS);
         now
     }

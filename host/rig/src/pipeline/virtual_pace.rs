@@ -286,7 +286,7 @@ impl World {
         self.follow(now);
         self.live(now);
         let watch = Stopwatch::start();
-        let planes = memory.planes.bytes();
+        let planes = memory.outgoing();
         while let Offer::Again(at) = self.link.offer(now, note, planes, true, &mut self.cable) {
             now = at;
             self.live(now);

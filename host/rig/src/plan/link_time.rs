@@ -75,7 +75,9 @@ impl LinkTime {
         if since <= 0 {
             return self.first;
         }
-        let mut slot = self.first.saturating_add(self.clock.rate().slot_at_ns(since));
+        // A shift may have let slots begin up to one later.
+        let about = self.clock.rate().slot_at_ns(since).saturating_sub(1);
+        let mut slot = self.first.saturating_add(about);
         while self.host_of_slot(slot) < at {
             slot += 1;
         }

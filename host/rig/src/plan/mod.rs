@@ -1,6 +1,7 @@
 //! Decisions before a frame is drawn: how early it begins, how far poses are predicted, and how many rays it may
 //! cost.
 
+pub mod beat;
 pub mod budget;
 pub mod dark;
 pub mod eyes;

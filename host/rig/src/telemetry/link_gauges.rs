@@ -127,6 +127,7 @@ impl LinkGauges {
             clock_bound_ns,
             travel_ms: travel_ns.map(|ns| ns as f64 / 1e6),
             slack: None,
+            touches: None,
             celsius: Some(self.milli_celsius.0.load(Ordering::Relaxed))
                 .filter(|c| *c != NONE)
                 .map(|c| c as f64 / 1e3),
@@ -184,6 +185,7 @@ mod tests {
                 clock_bound_ns: Some(-13),
                 travel_ms: Some(14.0),
                 slack: None,
+                touches: None,
                 celsius: Some(41.5),
             }
         );

@@ -31,6 +31,9 @@ pub struct ProjectorReport {
     pub travel_ms: Option<f64>,
     /// How early frames were whole in the device; null for one that does not measure it.
     pub slack: Option<SlackReport>,
+    /// How often the processor read or wrote each byte of the planes that were sent, from what was read back of the GPU to
+    /// what the medium takes; null if none was sent.
+    pub touches: Option<f64>,
     /// The device's hottest sensor, degrees Celsius; null for a device that tells none.
     pub celsius: Option<f64>,
 }

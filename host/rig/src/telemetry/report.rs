@@ -4,6 +4,7 @@ use super::projector::ProjectorReport;
 use super::signed::SignedHistogram;
 use crate::failure::{Failure, FailureKind};
 use crate::frame::slots::MissCause;
+use crate::plan::beat::BeatReport;
 use crate::plan::dark::DarkCause;
 use crate::tracks::gauges::TrackerReport;
 use hdrhistogram::Histogram;
@@ -224,6 +225,8 @@ pub struct Report {
     pub frames_too_old: u64,
     /// What became of the tracker's samples; null for a rig without a tracker that counts them.
     pub tracker: Option<TrackerReport>,
+    /// How the slots and the tracker went together; null while the tracker's rhythm is not known, and at virtual pace.
+    pub beat: Option<BeatReport>,
     /// Average number of slots from one planned frame to the next, at the end: 1 if the renderer keeps up.
     pub slots_per_frame: f64,
     /// The longest time for which prediction may extend a body's track, at the end, milliseconds.
@@ -343,6 +346,7 @@ impl Default for Report {
             frames_withheld: 0,
             frames_unrecorded: 0,
             tracker: None,
+            beat: None,
             frames_late: 0,
             frames_repeated: 0,
             frames_too_old: 0,

@@ -111,6 +111,9 @@ impl Report {
             let lost = lost.into_iter().filter(|(_, n)| *n > 0).map(|(what, n)| format!(", {n} {what}"));
             table.row("samples", format!("{} used{}", t.used, lost.collect::<String>()));
         }
+        if let Some(beat) = &self.beat {
+            table.row("beat", beat.told(self.frame_rate_hz));
+        }
         for body in self.dark_by_body.iter().filter(|b| b.total() > 0) {
             let causes = DarkCause::ALL.iter().filter(|c| body.of(**c) > 0);
             let causes: Vec<String> =

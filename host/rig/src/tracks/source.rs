@@ -92,6 +92,10 @@ impl Tracker for InWorld {
         self.tracker.wait(timeout)
     }
 
+    fn due_at(&self) -> Option<HostTime> {
+        self.tracker.due_at()
+    }
+
     fn gate(&self) -> Option<&SampleGate> {
         self.tracker.gate()
     }

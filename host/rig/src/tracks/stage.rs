@@ -1,6 +1,7 @@
 //! The first stage of a frame: puts newly arrived samples into the tracks of all bodies.
 
 use super::keys::KeyWatch;
+use super::phase::{SamplePhase, SampleRhythm};
 use super::seen::{SeenBodies, Unseen};
 use super::tracker_frame::TrackerFrame;
 use crate::config::{PredictionConfig, MAX_TRACKED};
@@ -19,6 +20,8 @@ use std::time::Duration;
 pub struct TrackSnapshot {
     /// Everything that arrived up to this instant is included.
     pub through: HostTime,
+    /// The newest exposure of any body.
+    pub captured_at: HostTime,
     /// Per body: its track, and when the newest sample arrived.
     pub tracks: Vec<Option<(TrackState, HostTime)>>,
     /// Per body: it was reported at some time of the run, maybe before the stages were restarted.
@@ -34,6 +37,7 @@ impl TrackSnapshot {
         let bodies = bodies.min(MAX_TRACKED);
         Self {
             through: HostTime(i64::MIN),
+            captured_at: HostTime(i64::MIN),
             tracks: vec![None; bodies],
             ever_seen: vec![false; bodies],
             latency_ns: 0,
@@ -59,6 +63,9 @@ pub struct TrackingStage {
     seen: Arc<SeenBodies>,
     /// From the tracker's coordinates to the world's; `None` if they are the same.
     frame: Option<TrackerFrame>,
+    phase: SamplePhase,
+    /// Capture of the newest sample, and whether it came with the last step.
+    captured: (HostTime, bool),
     /// The longest latency of the last samples; it decays by 1/1024 per sample.
     latency_ns: i64,
     /// Time of the first step; `None` before it.
@@ -112,6 +119,8 @@ impl TrackingStage {
             bodies,
             seen: Arc::new(SeenBodies::new(bodies)),
             frame: TrackerFrame::of(&rig.config.tracker, rig.latency_ns),
+            phase: SamplePhase::new(),
+            captured: (HostTime(i64::MIN), false),
             latency_ns: 0,
             began_at: None,
             looked: false,
@@ -136,7 +145,9 @@ impl TrackingStage {
     /// The tracker is gone; the tracks that are known stay published.
     pub fn step(&mut self, now: HostTime, latest: &mut Publisher<TrackSnapshot>) -> Result<(), TrackerError> {
         self.began_at.get_or_insert(now);
-        let Self { tracker, bank, lively, received_at, contradictory, latency_ns, frame, .. } = self;
+        let Self { tracker, bank, lively, received_at, contradictory, latency_ns, frame, captured, .. } =
+            self;
+        captured.1 = false;
         let result = tracker.poll(now, &mut |sample| {
             let in_world;
             let sample = match frame {
@@ -156,8 +167,12 @@ impl TrackingStage {
                     }
                     let latency = sample.received_at.ns_since(sample.captured_at);
                     *latency_ns = latency.max(*latency_ns - *latency_ns / 1024);
+                    if sample.captured_at > captured.0 {
+                        *captured = (sample.captured_at, true);
+                    }
                 } else if let Some(count) = contradictory.get_mut(usize::from(sample.body.0)) {
-                    *count += 1;
+                    // The first samples of a body have nothing to contradict.
+                    *count += u64::from(bank.state(sample.body).is_some());
                 }
             }
         });
@@ -173,10 +188,11 @@ impl TrackingStage {
     }
 
     fn publish(&self, bank: &PoseFilterBank, now: HostTime, latest: &mut Publisher<TrackSnapshot>) {
-        let (received_at, latency_ns) = (&self.received_at, self.latency_ns);
+        let (received_at, latency_ns, captured_at) = (&self.received_at, self.latency_ns, self.captured.0);
         latest.publish_with(|snapshot| {
             snapshot.through = now;
             snapshot.latency_ns = latency_ns;
+            snapshot.captured_at = captured_at;
             for (i, (track, at)) in snapshot.tracks.iter_mut().zip(received_at).enumerate() {
                 *track = bank.state(BodyIndex(i as u16)).map(|s| (s, *at));
                 if track.is_some() {
@@ -187,6 +203,19 @@ impl TrackingStage {
                 *ever = self.seen.has(i);
             }
         });
+    }
+
+    /// What the last step has published can be read at `now`. Returns when samples are ready, if that is known.
+    pub(crate) fn is_published(&mut self, now: HostTime) -> Option<SampleRhythm> {
+        if let (captured_at, true) = self.captured {
+            self.phase.observe(captured_at, now);
+        }
+        self.phase.rhythm()
+    }
+
+    /// See [`Tracker::due_at`].
+    pub(crate) fn due_at(&self) -> Option<HostTime> {
+        self.tracker.due_at()
     }
 
     /// See [`Tracker::wait`].
@@ -276,7 +305,7 @@ mod tests {
     use dpm_device::planes::Raster;
     use dpm_device::pose::Pose;
     use dpm_device::rng::Draws;
-    use dpm_device::tracker::TrackerSample;
+    use dpm_device::tracker::{SampleGate, TrackerSample};
     use dpm_handoff::latest::latest;
 
     /// Reports the bodies below a number at every poll.
@@ -371,6 +400,66 @@ mod tests {
                 assert!(text.contains(&names[1]), "{text}");
             }
         }
+    }
+
+    /// Reports two bodies at rest, half a metre apart, and exchanges them in one sample of fifty.
+    struct Exchanges {
+        gate: SampleGate,
+    }
+
+    impl Tracker for Exchanges {
+        fn poll(
+            &mut self,
+            now: HostTime,
+            sink: &mut dyn FnMut(&TrackerSample),
+        ) -> Result<usize, TrackerError> {
+            let sequence = (now.0 / 2_000_000) as u32;
+            let other = u16::from(sequence.is_multiple_of(50));
+            for body in 0..2u16 {
+                let at = 0.5 * f64::from(body ^ other);
+                let sample = TrackerSample {
+                    body: BodyIndex(body),
+                    pose: Pose { position_m: [at, 0.0, 1.0], ..Pose::IDENTITY },
+                    tracked: true,
+                    mean_error_m: 0.0,
+                    sequence,
+                    captured_at: now,
+                    received_at: now,
+                };
+                if let Some(sample) = self.gate.admit(&sample) {
+                    sink(&sample);
+                }
+            }
+            Ok(2)
+        }
+
+        fn name(&self) -> &str {
+            "exchanging"
+        }
+
+        fn gate(&self) -> Option<&SampleGate> {
+            Some(&self.gate)
+        }
+    }
+
+    /// Exchanged bodies are counted for both of them, and reported by name.
+    #[test]
+    fn samples_of_exchanged_bodies_are_counted() {
+        let config = RigConfig::demo(&Overrides::default()).unwrap_or_else(|e| panic!("{e}"));
+        let rig = Rig::build(&config, Raster::new(16, 16)).unwrap_or_else(|e| panic!("{e}"));
+        let mut stage = TrackingStage::new(&rig, Box::new(Exchanges { gate: SampleGate::new(2) }));
+        let (mut publisher, _reader) = latest(TrackSnapshot::empty(2));
+        let gauges = TrackerGauges::default();
+        gauges.begin(2);
+        for step in 1..1_000i64 {
+            let now = HostTime(2_000_000 * step);
+            stage.step(now, &mut publisher).expect("it speaks");
+            stage.add_counts(now, &gauges, step == 999);
+        }
+        let told = gauges.report(["bunny", "venus"].into_iter()).expect("there are samples");
+        assert_eq!((told.samples, told.contradictory), (1_998, 38), "{told:?}");
+        let by_body: Vec<u64> = told.bodies.iter().map(|body| body.contradictory).collect();
+        assert_eq!(by_body, [19, 19]);
     }
 
     /// Swings to and fro by 0.1 m, twice a second for 16 m/s^2, or once in two seconds for 1 m/s^2.

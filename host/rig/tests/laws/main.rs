@@ -2,3 +2,4 @@
 
 mod frame_path_allocates_nothing;
 mod real_pace;
+mod tracker_losses;

@@ -11,6 +11,7 @@ use dpm_device::transport::Transport;
 use dpm_rig::config::RigConfig;
 use dpm_rig::pipeline::connect;
 use dpm_rig::pipeline::projector::{self, Surroundings};
+use dpm_rig::plan::beat::RatePair;
 use dpm_rig::presence;
 use dpm_rig::rig::plausible::Exchanges;
 use dpm_rig::rig::Rig;
@@ -136,6 +137,28 @@ pub(super) fn tracker(config: &RigConfig, rig: Option<&Rig>) -> (Finding, Option
     let heard = bodies.into_iter().zip(seen).zip(last);
     let heard = heard.map(|((body, count), last)| HeardBody { name: body.name, count, last });
     (finding, Some(heard.collect()))
+}
+
+/// Whether the slots can follow the tracker: its rate in the rig file beside that of frames. If it was `heard` at another
+/// rate, that one counts. `None` if neither is known.
+pub(super) fn beat(config: &RigConfig, heard: Option<&Heard>) -> Option<Finding> {
+    let most = heard.and_then(|heard| heard.iter().map(|body| body.count).max()).filter(|count| *count > 0);
+    let counted_hz = most.map(|most| f64::from(most) / (1e-9 * LISTEN_NS as f64));
+    let meant_hz = config.tracker.rate_hz().map(f64::from);
+    // While it was listened to, it also had to connect: a count says roughly what the rate is.
+    let is_meant = |meant: &f64| counted_hz.is_none_or(|counted| (counted / meant - 1.0).abs() < 0.1);
+    let tracker_hz = meant_hz.filter(is_meant).or(counted_hz.map(f64::round))?;
+    let pair = RatePair { tracker_hz, slots_hz: config.projector.frame_rate.hz() };
+    Some(match pair.told() {
+        None => Finding::new("beat", State::Ok, "slots and samples of the tracker go together", ""),
+        Some(told) => {
+            let [below, above] = pair.nearest_slots_hz();
+            let remedy = format!(
+                "projector.frame_rate = \"{below:.0}\" or \"{above:.0}\", or another rate of the tracker"
+            );
+            Finding::new("beat", State::Info, told, remedy)
+        }
+    })
 }
 
 /// Whether the projector answers, and whether it can show the rig's frames. `loads`: the code of a library that the rig

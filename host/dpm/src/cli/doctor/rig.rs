@@ -42,7 +42,9 @@ pub(super) fn findings(
         Ok(rig) => all.push(scene(rig)),
     }
     let (tracker, heard) = devices::tracker(config, rig.as_ref().ok());
-    all.extend([tracker, observer(config, heard.as_ref())]);
+    all.push(tracker);
+    all.extend(devices::beat(config, heard.as_ref()));
+    all.push(observer(config, heard.as_ref()));
     all.extend(rig.as_ref().ok().and_then(|rig| reach(rig, heard.as_ref())));
     all.extend(pictures(config));
     all.push(calibration(config));

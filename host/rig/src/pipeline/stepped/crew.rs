@@ -40,6 +40,7 @@ impl CrewParts {
         let memory = || FrameMemory {
             gpu: None,
             planes: BitPlaneFrame::new(rig.camera.raster, rig.schedule),
+            sends_from_gpu: false,
             picture: None,
         };
         Self {
@@ -293,6 +294,7 @@ impl Crew {
             Takes::Ns(ns) => {
                 let read_at = now.plus_ns(ns);
                 crate::pipeline::threads::read_tracker(facts, &mut self.tracking, &mut self.publisher, now);
+                facts.tell_rhythm(self.tracking.is_published(read_at));
                 if let Some(to_link) = &mut self.to_link {
                     self.tracking.publish_lively(now, to_link);
                 }

@@ -330,6 +330,7 @@ impl<M: Machine> SteppedRun<M> {
         if self.rig.wants_tracks() {
             link.want_tracks();
         }
+        link.want_shifts();
         let acknowledged =
             if self.rig.config.safety.acknowledge_faults { u32::MAX } else { ENDED_WITH_THE_LAST_RUN };
         let connecting = Connecting::begin(&mut link, acknowledged, now);
@@ -503,3 +504,6 @@ impl Running {
 pub(super) fn is_lit(dark: &Option<DarkCause>) -> bool {
     dark.is_none()
 }
+
+#[cfg(test)]
+mod tests;
