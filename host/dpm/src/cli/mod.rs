@@ -236,6 +236,8 @@ fn features() -> String {
         ("lab", cfg!(feature = "lab")),
         ("manual", cfg!(feature = "manual")),
         ("page", cfg!(feature = "page")),
+        ("plots", cfg!(feature = "plots")),
+        ("terminal", cfg!(feature = "terminal")),
         ("exr", cfg!(feature = "exr")),
         ("wayland", cfg!(feature = "wayland")),
         ("x11", cfg!(feature = "x11")),
