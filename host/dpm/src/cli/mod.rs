@@ -4,7 +4,6 @@
 mod bench;
 #[cfg(feature = "calibrate")]
 mod calibrate;
-#[cfg(feature = "manual")]
 mod completion;
 #[cfg(feature = "display")]
 mod display;
@@ -49,6 +48,7 @@ mod rig_args;
 #[cfg(feature = "page")]
 mod rigs;
 pub mod run;
+#[cfg(feature = "lab")]
 mod scene;
 #[cfg(feature = "page")]
 mod session;
@@ -151,6 +151,7 @@ enum Command {
     #[cfg(feature = "lab")]
     Snapshot(snapshot::SnapshotArgs),
     /// Write the room of a rig for other programs
+    #[cfg(feature = "lab")]
     Scene(scene::SceneArgs),
     /// Measure rays, samples and milliseconds per pass of every method on this device
     #[cfg(feature = "lab")]
@@ -181,7 +182,6 @@ enum Command {
 /// [`dpm_common::commit::get`].
 pub fn main(commit: &'static str) -> ExitCode {
     dpm_common::commit::set(commit);
-    #[cfg(feature = "manual")]
     completion::answer();
     let command = coloured(command());
     let parsed = command.try_get_matches().and_then(|m| Cli::from_arg_matches(&m));
@@ -291,6 +291,7 @@ fn dispatch(command: &Command) -> Result<(), Failure> {
         Command::Report(args) => report::execute(args),
         #[cfg(feature = "lab")]
         Command::Snapshot(args) => snapshot::execute(args),
+        #[cfg(feature = "lab")]
         Command::Scene(args) => scene::execute(args),
         #[cfg(feature = "lab")]
         Command::Bench(args) => bench::execute(args),
