@@ -27,7 +27,7 @@ statically by default, so that a bare machine with gcc builds the program. Whoev
 can, in either of two ways:
 
 * Link the system's libusb dynamically: install its development files (`libusb-1.0-0-dev` on Debian) and `pkg-config`, then
-  `cargo build --release -p dpm --no-default-features --features exr,wayland,x11`. `ldd target/release/dpm` then shows `libusb-1.0.so.0`.
+  `cargo build --release -p dpm --no-default-features --features satellites,terminal,exr,wayland,x11`. `ldd target/release/dpm` then shows `libusb-1.0.so.0`.
   Binaries that are passed on without their source should be built so.
 * Relink the static one: the source of this program is complete, `Cargo.lock` fixes every version, and
   `cargo build --release` compiles libusb from the source in the package `libusb1-sys` (folder `libusb/`), which may be changed

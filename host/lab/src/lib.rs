@@ -26,7 +26,6 @@ mod metrics;
 pub mod offline;
 pub mod paint;
 pub mod plan_savings;
-pub mod profile;
 pub mod reference;
 pub mod report;
 pub mod room;

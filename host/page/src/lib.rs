@@ -14,7 +14,6 @@ mod events;
 mod guard;
 mod hex;
 pub mod metrics;
-pub mod notes;
 mod orders;
 mod parameters;
 mod pictures;

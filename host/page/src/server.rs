@@ -3,7 +3,6 @@
 use crate::calibration::Guide;
 use crate::connections::{Connection, Connections};
 use crate::guard::Guard;
-use crate::notes::Notes;
 use crate::pictures::Pictures;
 use crate::rigs::Rigs;
 use crate::routes;
@@ -14,6 +13,7 @@ use crate::token::Token;
 use dpm_common::realtime::os::give_way;
 use dpm_rig::control::orders::Orders;
 use dpm_rig::telemetry::monitor::RunMonitor;
+use dpm_rig::telemetry::notes::Notes;
 use hyper::rt::{Sleep, Timer};
 use hyper::server::conn::http1;
 use hyper::service::service_fn;

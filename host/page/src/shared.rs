@@ -1,10 +1,10 @@
 //! The run that a page shows, and how many may follow it.
 
 use crate::connections::VIEWERS;
-use crate::notes::Notes;
 use crate::pictures::Pictures;
 use dpm_rig::control::orders::Orders;
 use dpm_rig::telemetry::monitor::RunMonitor;
+use dpm_rig::telemetry::notes::Notes;
 use std::sync::atomic::{AtomicUsize, Ordering};
 use std::sync::Arc;
 use std::time::Instant;

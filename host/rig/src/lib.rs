@@ -53,6 +53,7 @@ mod render;
 pub mod rig;
 pub mod run_rig;
 pub mod standing;
+pub mod still;
 pub mod telemetry;
 pub mod trackers;
 pub mod tracks;

@@ -4,7 +4,7 @@
 use super::dialogue::Dialogue;
 use super::lines::Lines;
 use super::poses::Poses;
-use super::results::Results;
+use crate::results::Results;
 use dpm_calibration::body::{tip_in_body, wander, Session, Surface, Touch};
 use dpm_calibration::file::{BodySection, Pose};
 use dpm_calibration::trajectory::{Stamped, Trajectory};

@@ -4,7 +4,7 @@ use super::aim::Aim;
 use super::body::{carried, index_of, triangles_of};
 use super::dialogue::Dialogue;
 use super::poses::{held, still, Poses};
-use super::results::Results;
+use crate::results::Results;
 use dpm_calibration::body::Surface;
 use dpm_calibration::check::{spread, Checked, Fault, Offset, Reading, Summary, SurfacePoint};
 use dpm_calibration::file::{CalibrationFile, CheckSection};

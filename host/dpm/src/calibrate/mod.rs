@@ -16,7 +16,6 @@ pub mod parts;
 pub mod poses;
 pub mod projector;
 pub mod recorder;
-pub mod results;
 pub mod sensor;
 pub mod showing;
 pub mod shown;

@@ -3,12 +3,10 @@
 use super::body::{carried, index_of, triangles_of};
 use super::outline::{Outlines, MOST_POINTS};
 use super::poses::Poses;
-use super::results::Results;
-use dpm_calibration::file::{BodySection, Pose, Provenance};
+use crate::results::Moved;
 use dpm_calibration::nudge::{Nudges, Order, TURN_DEG};
 use dpm_calibration::outline::Outline;
 use dpm_calibration::trajectory::Stamped;
-use dpm_rig::config::RigConfig;
 use dpm_rig::failure::{Failure, FailureKind};
 use dpm_rig::rig::Rig;
 use dpm_scene::geometry::projector::ProjectorCamera;
@@ -19,15 +17,6 @@ use std::time::Duration;
 
 /// Time between two pictures.
 const EVERY: Duration = Duration::from_millis(33);
-
-/// What is moved.
-#[derive(Clone, Debug, PartialEq, Eq)]
-pub enum Moved {
-    /// The mesh in the tracked body of this name.
-    Body(String),
-    /// The projector in the world.
-    Projector,
-}
 
 struct Shown {
     name: String,
@@ -204,40 +193,6 @@ fn told_of(nudges: &Nudges) -> String {
     let [x, y, z] = moved.to_array().map(|v| 1e3 * v);
     let [a, b, c] = turned.to_array().map(f64::to_degrees);
     format!("moved by ({x:.2}, {y:.2}, {z:.2}) mm, turned by ({a:.2}, {b:.2}, {c:.2}) degrees")
-}
-
-/// Refuses a projector that was not calibrated: its lens would be missing in the calibration file.
-///
-/// # Errors
-/// It was not (exit code 2).
-pub fn check_known(results: &Results, moved: &Moved) -> Result<(), Failure> {
-    if *moved == Moved::Projector && results.file.projector.is_none() {
-        let told = "the calibration file has no projector yet: run `dpm calibrate projector` first";
-        return Err(Failure::new(FailureKind::BadInput, told));
-    }
-    Ok(())
-}
-
-/// Puts a motion into the results.
-pub fn keep(results: &mut Results, config: &RigConfig, moved: &Moved, motion: &DAffine3) {
-    let place = Pose::new(motion);
-    match moved {
-        Moved::Body(name) => {
-            let old = results.file.bodies.get(name);
-            let data = old.map_or(String::new(), |b| b.provenance.data.clone());
-            let provenance = results.provenance(config, name, data, Provenance::BY_EYE);
-            // That of the measurement before does not hold for another place, and an eye gives none.
-            let section = BodySection { mesh_to_body: place, residual_m: None, provenance };
-            results.file.bodies.insert(name.clone(), section);
-        }
-        Moved::Projector => {
-            let data = results.file.projector.as_ref().map_or(String::new(), |p| p.provenance.data.clone());
-            let provenance = results.provenance(config, "", data, Provenance::BY_EYE);
-            if let Some(section) = &mut results.file.projector {
-                (section.world_from_projector, section.provenance) = (place, provenance);
-            }
-        }
-    }
 }
 
 #[cfg(test)]

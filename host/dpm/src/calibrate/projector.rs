@@ -4,7 +4,7 @@ use super::aim::Aim;
 use super::dialogue::Dialogue;
 use super::lines::Lines;
 use super::poses::{held, Poses};
-use super::results::Results;
+use crate::results::Results;
 use dpm_calibration::file::ProjectorSection;
 use dpm_calibration::projector::{Options, Session, Sight, Solved, Volume};
 use dpm_device::planes::Raster;

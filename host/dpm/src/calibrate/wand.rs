@@ -2,7 +2,7 @@
 
 use super::dialogue::Dialogue;
 use super::poses::Poses;
-use super::results::Results;
+use crate::results::Results;
 use dpm_calibration::file::WandSection;
 use dpm_calibration::pivot::{trace, Pivot};
 use dpm_common::clock::MonotonicClock;

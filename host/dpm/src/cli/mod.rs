@@ -1,43 +1,66 @@
-//! The command line of `dpm`: one file per command, without logic of its own.
+//! The command line of `dpm`: a file for each command, and what runs share. What stands beside the controller is a feature.
 
+#[cfg(feature = "lab")]
 mod bench;
+#[cfg(feature = "calibrate")]
 mod calibrate;
 mod completion;
+#[cfg(feature = "display")]
 mod display;
+#[cfg(feature = "dlpc900")]
 mod dlpc900;
 mod doctor;
+#[cfg(feature = "lab")]
 mod error;
+#[cfg(feature = "lab")]
 mod error_experiments;
+#[cfg(feature = "lab")]
 mod error_files;
 mod guard;
+#[cfg(feature = "page")]
 mod guide;
 mod keys;
+#[cfg(feature = "lab")]
 mod link_test;
+#[cfg(feature = "page")]
 mod live_page;
+#[cfg(not(feature = "page"))]
+#[path = "no_page.rs"]
+mod live_page;
+#[cfg(feature = "manual")]
 mod manual;
 mod order;
 mod os;
 mod osc;
 mod own_runs;
+#[cfg(feature = "page")]
 mod page;
 mod pattern;
+#[cfg(feature = "lab")]
 mod plan;
 mod profile;
+#[cfg(feature = "lab")]
 mod progress;
 mod record;
+#[cfg(feature = "lab")]
 mod report;
 mod rig_args;
+#[cfg(feature = "page")]
 mod rigs;
 pub mod run;
+#[cfg(feature = "lab")]
 mod scene;
+#[cfg(feature = "page")]
 mod session;
 mod set;
+#[cfg(feature = "lab")]
 mod snapshot;
+#[cfg(feature = "lab")]
 mod stability;
 mod tell;
 mod watch;
 
-use clap::{ColorChoice, CommandFactory, FromArgMatches, Parser, Subcommand};
+use clap::{CommandFactory, FromArgMatches, Parser, Subcommand};
 use dpm_rig::failure::Failure;
 use dpm_rig::order::Order;
 use std::any::TypeId;
@@ -65,6 +88,7 @@ enum Command {
     /// Run a rig file
     Run(run::RunArgs),
     /// Measure how much of this rig's pictures the link to the projector can carry, and at which frame rate
+    #[cfg(feature = "lab")]
     LinkTest(link_test::LinkTestArgs),
     /// Make the projectors of all running rigs dark, or of one; the rigs continue to run
     ///
@@ -98,15 +122,18 @@ enum Command {
     ///
     /// The link holds the key of the rig's page behind the sign #, which no browser sends. Give it to nobody. The page
     /// keeps the key until it is left.
+    #[cfg(feature = "page")]
     Page(page::PageArgs),
     /// Show several running rigs on one page: state, rates, what is dark and why; without orders
     ///
     /// Asks the live pages of the rigs, once a second while somebody looks. A rig on another machine comes through a
     /// tunnel: ssh -N -L 8948:127.0.0.1:8948 rig2
+    #[cfg(feature = "page")]
     Rigs(rigs::RigsArgs),
     /// Show a pattern on a rig's projector, for aiming, focusing and calibrating, or write it as PNG files
     Pattern(pattern::PatternArgs),
     /// Measure what a rig needs to know: wand, projector, bodies, latency, light
+    #[cfg(feature = "calibrate")]
     Calibrate(calibrate::CalibrateArgs),
     /// Record the samples of a rig's tracker into a file that `tracker.kind = "replay"` plays
     Record(record::RecordArgs),
@@ -115,28 +142,39 @@ enum Command {
     /// Show what this machine can do, and how to fix what is missing
     Doctor(doctor::DoctorArgs),
     /// Run stiff and extreme cases: measured error against bound, with the oracle of each
+    #[cfg(feature = "lab")]
     Stability(stability::StabilityArgs),
     /// Write what a run or a measurement left in a folder as one HTML file, and its tables as CSV
+    #[cfg(feature = "lab")]
     Report(report::ReportArgs),
     /// Write pictures of everything that one frame was made from: rates, errors, samples, history, motion, light
+    #[cfg(feature = "lab")]
     Snapshot(snapshot::SnapshotArgs),
     /// Write the room of a rig for other programs
+    #[cfg(feature = "lab")]
     Scene(scene::SceneArgs),
     /// Measure rays, samples and milliseconds per pass of every method on this device
+    #[cfg(feature = "lab")]
     Bench(bench::BenchArgs),
     /// Measure error against cost of every method: perceived error, bias, noise and flicker at equal rays
+    #[cfg(feature = "lab")]
     Error(error::ErrorArgs),
     /// Show what a rig needs from the renderer, and what is left out, why and how; with --measure also the savings
+    #[cfg(feature = "lab")]
     Plan(plan::PlanArgs),
     /// Control a DLPC900 projector (LightCrafter 6500 / 9000): status, patterns, rest
+    #[cfg(feature = "dlpc900")]
     Dlpc900(dlpc900::Dlpc900Args),
     /// List the displays that can serve as projectors, and what to write in a rig file for each mode
+    #[cfg(feature = "display")]
     Display(display::DisplayArgs),
     /// Print the completions of a shell: bash, zsh, fish and others
     ///
     /// For bash: dpm completions bash > ~/.local/share/bash-completion/completions/dpm
+    #[cfg(feature = "manual")]
     Completions(manual::CompletionsArgs),
     /// Write a man page for the program and one for each command
+    #[cfg(feature = "manual")]
     Man(manual::ManArgs),
 }
 
@@ -145,9 +183,7 @@ enum Command {
 pub fn main(commit: &'static str) -> ExitCode {
     dpm_common::commit::set(commit);
     completion::answer();
-    // https://no-color.org: set and not empty.
-    let plain = std::env::var_os("NO_COLOR").is_some_and(|v| !v.is_empty());
-    let command = command().color(if plain { ColorChoice::Never } else { ColorChoice::Auto });
+    let command = coloured(command());
     let parsed = command.try_get_matches().and_then(|m| Cli::from_arg_matches(&m));
     let cli = match parsed {
         Ok(cli) => cli,
@@ -157,6 +193,7 @@ pub fn main(commit: &'static str) -> ExitCode {
             return ExitCode::from(u8::try_from(e.exit_code()).unwrap_or(2));
         }
     };
+    #[cfg(feature = "display")]
     if let Some(command) = display::guardian_command() {
         dpm_display::transport::set_guardian(command);
     }
@@ -175,15 +212,38 @@ pub fn main(commit: &'static str) -> ExitCode {
     ExitCode::from(code)
 }
 
+/// Help and errors in colours, unless the user wants none.
+#[cfg(feature = "terminal")]
+fn coloured(command: clap::Command) -> clap::Command {
+    use clap::ColorChoice;
+    // https://no-color.org: set and not empty.
+    let plain = std::env::var_os("NO_COLOR").is_some_and(|v| !v.is_empty());
+    command.color(if plain { ColorChoice::Never } else { ColorChoice::Auto })
+}
+
+#[cfg(not(feature = "terminal"))]
+fn coloured(command: clap::Command) -> clap::Command {
+    command
+}
+
 /// What this program was built with: what it always has, and the features of Cargo that were asked for.
 fn features() -> String {
     let chosen = [
+        ("alp", cfg!(feature = "alp")),
+        ("calibrate", cfg!(feature = "calibrate")),
+        ("display", cfg!(feature = "display")),
+        ("dlpc900", cfg!(feature = "dlpc900")),
+        ("lab", cfg!(feature = "lab")),
+        ("manual", cfg!(feature = "manual")),
+        ("page", cfg!(feature = "page")),
+        ("plots", cfg!(feature = "plots")),
+        ("terminal", cfg!(feature = "terminal")),
         ("exr", cfg!(feature = "exr")),
         ("wayland", cfg!(feature = "wayland")),
         ("x11", cfg!(feature = "x11")),
         ("vendored-libusb", cfg!(feature = "vendored-libusb")),
     ];
-    let always = ["usb", "serial", "net", "alp", "display"];
+    let always = ["usb", "serial", "net"];
     let chosen = chosen.into_iter().filter(|(_, is_there)| *is_there).map(|(name, _)| name);
     always.into_iter().chain(chosen).collect::<Vec<_>>().join(", ")
 }
@@ -208,29 +268,44 @@ fn dispatch(command: &Command) -> Result<(), Failure> {
     match command {
         Command::Demo(args) => run::execute_demo(args),
         Command::Run(args) => run::execute(args),
+        #[cfg(feature = "lab")]
         Command::LinkTest(args) => link_test::execute(args),
         Command::Black(args) => order::execute(args, Order::Black),
         Command::Freeze(args) => order::execute(args, Order::Freeze),
         Command::Safe(args) => order::execute(args, Order::Safe),
         Command::Arm(args) => order::execute(args, Order::Arm),
         Command::Set(args) => set::execute(args),
+        #[cfg(feature = "page")]
         Command::Page(args) => page::execute(args),
+        #[cfg(feature = "page")]
         Command::Rigs(args) => rigs::execute(args),
         Command::Pattern(args) => pattern::execute(args),
+        #[cfg(feature = "calibrate")]
         Command::Calibrate(args) => calibrate::execute(args),
         Command::Record(args) => record::execute(args),
         Command::Profile(args) => profile::execute(args),
         Command::Doctor(args) => doctor::execute(args),
+        #[cfg(feature = "lab")]
         Command::Stability(args) => stability::execute(args),
+        #[cfg(feature = "lab")]
         Command::Report(args) => report::execute(args),
+        #[cfg(feature = "lab")]
         Command::Snapshot(args) => snapshot::execute(args),
+        #[cfg(feature = "lab")]
         Command::Scene(args) => scene::execute(args),
+        #[cfg(feature = "lab")]
         Command::Bench(args) => bench::execute(args),
+        #[cfg(feature = "lab")]
         Command::Error(args) => error::execute(args),
+        #[cfg(feature = "lab")]
         Command::Plan(args) => plan::execute(args),
+        #[cfg(feature = "dlpc900")]
         Command::Dlpc900(args) => dlpc900::execute(args),
+        #[cfg(feature = "display")]
         Command::Display(args) => display::execute(args),
+        #[cfg(feature = "manual")]
         Command::Completions(args) => manual::completions(args),
+        #[cfg(feature = "manual")]
         Command::Man(args) => manual::man(args),
     }
 }

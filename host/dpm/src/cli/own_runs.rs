@@ -1,11 +1,13 @@
 //! Which projector has a run of its own.
 
-use crate::dlpc900;
 use crate::own_run::OwnRun;
 use dpm_rig::config::RigConfig;
 use dpm_rig::failure::{Failure, FailureKind};
 
-const ALL: [&OwnRun; 1] = [&dlpc900::OWN_RUN];
+const ALL: &[&OwnRun] = &[
+    #[cfg(feature = "dlpc900")]
+    &crate::dlpc900::OWN_RUN,
+];
 
 /// The run of its own that the projector of `config` has; `None` for one that is fed frame by frame.
 ///
@@ -16,7 +18,7 @@ pub(super) fn of(config: &RigConfig) -> Result<Option<&'static OwnRun>, Failure>
     if !backend.kind().is_loaded() {
         return Ok(None);
     }
-    let known = ALL.into_iter().find(|own| own.kind == backend.word());
+    let known = ALL.iter().copied().find(|own| own.kind == backend.word());
     let absent = || {
         let told = format!("this program was built without runs on a {}", backend.kind().name);
         Failure::new(FailureKind::BadInput, told)

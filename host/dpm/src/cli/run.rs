@@ -4,6 +4,7 @@ use super::own_runs;
 use super::rig_args::RigArgs;
 use super::watch::{check_file, check_out, print, run_and_report, watch, write_text};
 use crate::keep_parameters;
+#[cfg(feature = "lab")]
 use dpm_lab::film::{film, FilmRequest};
 use dpm_rig::config::DEFAULT_PAGE;
 use dpm_rig::failure::Failure;
@@ -32,9 +33,11 @@ pub(crate) struct DemoArgs {
     flags: RigArgs,
     #[command(flatten)]
     page: PageArgs,
+    #[cfg(feature = "lab")]
     /// Also make a film of the room and of what the observer sees: a .gif, or an animated .png. Four instants of it lie beside it
     #[arg(long, value_name = "FILE")]
     film: Option<PathBuf>,
+    #[cfg(feature = "lab")]
     /// Length of the film
     #[arg(long, value_name = "S", default_value_t = 8.0, requires = "film")]
     film_seconds: f64,
@@ -75,12 +78,15 @@ pub(crate) fn execute(args: &RunArgs) -> Result<(), Failure> {
 /// Bad flags, scene or device.
 pub(crate) fn execute_demo(args: &DemoArgs) -> Result<(), Failure> {
     let flags = args.page.with(&args.flags);
-    let Some(path) = &args.film else { return start(None, &flags, args.json) };
-    flags.refuse("dpm demo --film", &["--frames", "--seconds"])?;
-    check_file(path, "--film")?;
-    let request = FilmRequest::new(path, args.film_seconds)?;
-    let rig = request.rig(&flags.rig(None)?)?;
-    run_and_report(rig, args.json, move |rig, monitor| film(rig, &request, monitor))
+    #[cfg(feature = "lab")]
+    if let Some(path) = &args.film {
+        flags.refuse("dpm demo --film", &["--frames", "--seconds"])?;
+        check_file(path, "--film")?;
+        let request = FilmRequest::new(path, args.film_seconds)?;
+        let rig = request.rig(&flags.rig(None)?)?;
+        return run_and_report(rig, args.json, move |rig, monitor| film(rig, &request, monitor));
+    }
+    start(None, &flags, args.json)
 }
 
 fn start(path: Option<&Path>, flags: &RigArgs, json: bool) -> Result<(), Failure> {

@@ -6,7 +6,7 @@
 //! that.
 
 use super::os;
-use crate::calibrate::results::TRIAL;
+use crate::results::TRIAL;
 use dpm_calibration::file;
 use dpm_common::unix::send_signal;
 use dpm_page::calibration::Session;

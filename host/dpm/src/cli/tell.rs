@@ -2,13 +2,16 @@
 //! stream or the terminal is stopped, that thread waits and the run continues.
 
 use crossbeam::channel::{bounded, Receiver, RecvTimeoutError, Sender};
-use dpm_page::notes::Notes;
 use dpm_rig::failure::{Failure, FailureKind};
 use dpm_rig::telemetry::light_state::LightState;
 use dpm_rig::telemetry::monitor::{ProjectorHealth, RunCounts};
+use dpm_rig::telemetry::notes::Notes;
+#[cfg(feature = "terminal")]
 use indicatif::{ProgressBar, ProgressDrawTarget, ProgressStyle};
 use std::collections::VecDeque;
-use std::io::{IsTerminal, Write};
+#[cfg(feature = "terminal")]
+use std::io::IsTerminal;
+use std::io::Write;
 use std::sync::Arc;
 use std::thread::JoinHandle;
 use std::time::{Duration, Instant};
@@ -173,8 +176,30 @@ fn told(light: LightState, counts: &RunCounts, total: u64, rate: f64) -> String 
 }
 
 enum Shown {
+    #[cfg(feature = "terminal")]
     Bar(ProgressBar),
-    Lines { next: Duration, every: Option<Duration> },
+    Lines {
+        next: Duration,
+        every: Option<Duration>,
+    },
+}
+
+/// The bar of a run on a terminal.
+#[cfg(feature = "terminal")]
+fn bar(total: u64, seconds: f64) -> Option<ProgressBar> {
+    if !std::io::stderr().is_terminal() {
+        return None;
+    }
+    let timed = total == 0 && seconds > 0.0;
+    let bar = match total {
+        0 if timed => ProgressBar::new((seconds * 1e3) as u64),
+        0 => ProgressBar::no_length(),
+        _ => ProgressBar::new(total),
+    };
+    bar.set_draw_target(ProgressDrawTarget::stderr());
+    let template = if total == 0 && !timed { "{wide_msg}" } else { "{bar:20} {wide_msg}" };
+    bar.set_style(ProgressStyle::with_template(template).expect("the template is a constant"));
+    Some(bar)
 }
 
 struct Progress {
@@ -192,20 +217,11 @@ struct Progress {
 impl Progress {
     /// For `total` frames, or else `seconds` of time; 0 means without an end.
     fn new(total: u64, seconds: f64, every: Option<Duration>) -> Self {
-        let timed = total == 0 && seconds > 0.0;
-        let shown = if std::io::stderr().is_terminal() {
-            let bar = match total {
-                0 if timed => ProgressBar::new((seconds * 1e3) as u64),
-                0 => ProgressBar::no_length(),
-                _ => ProgressBar::new(total),
-            };
-            bar.set_draw_target(ProgressDrawTarget::stderr());
-            let template = if total == 0 && !timed { "{wide_msg}" } else { "{bar:20} {wide_msg}" };
-            bar.set_style(ProgressStyle::with_template(template).expect("the template is a constant"));
-            Shown::Bar(bar)
-        } else {
-            Shown::Lines { next: every.unwrap_or_default(), every }
-        };
+        let lines = Shown::Lines { next: every.unwrap_or_default(), every };
+        #[cfg(feature = "terminal")]
+        let shown = bar(total, seconds).map_or(lines, Shown::Bar);
+        #[cfg(not(feature = "terminal"))]
+        let shown = lines;
         let rate = Rate { seen: VecDeque::new() };
         Self { started: Instant::now(), total, seconds, began: None, rate, shown }
     }
@@ -223,6 +239,7 @@ impl Progress {
 
     fn note(&self, text: &str) {
         match &self.shown {
+            #[cfg(feature = "terminal")]
             Shown::Bar(bar) => bar.println(text),
             Shown::Lines { .. } => {
                 let _ = writeln!(std::io::stderr(), "{}", serde_json::json!({ "note": text }));
@@ -233,8 +250,10 @@ impl Progress {
     fn tick(&mut self, light: LightState, counts: RunCounts) {
         let elapsed = self.started.elapsed();
         let rate = self.rate.at(elapsed, counts.frames_lit);
+        #[cfg(feature = "terminal")]
         let done = self.position(&counts);
         match &mut self.shown {
+            #[cfg(feature = "terminal")]
             Shown::Bar(bar) => {
                 bar.set_position(done);
                 bar.set_message(told(light, &counts, self.total, rate));
@@ -268,6 +287,7 @@ impl Progress {
 
     fn finish(mut self, light: LightState, counts: RunCounts) {
         self.tick(light, counts);
+        #[cfg(feature = "terminal")]
         if let Shown::Bar(bar) = self.shown {
             bar.finish_and_clear();
         }

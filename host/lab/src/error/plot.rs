@@ -3,8 +3,8 @@
 use super::figure3::{Figure3Group, Figure3Row};
 use super::plan::looks;
 use super::runs::{ErrorRow, GroupResult};
-use crate::profile::plots::{color, key, Stroke, SIZE};
 use crate::stamp::Stamp;
+use dpm_profile::plots::{color, key, Stroke, SIZE};
 use plotters::coord::combinators::{LogCoord, WithKeyPoints};
 use plotters::prelude::*;
 

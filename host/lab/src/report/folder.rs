@@ -1,7 +1,7 @@
 //! A folder into what this program has left there: results, texts, plots, pictures and flights, each within a limit.
 
-use super::html::is_plain_svg;
 use dpm_device::regular_file;
+use dpm_profile::svg::is_plain_svg;
 use dpm_rig::failure::{Failure, FailureKind};
 use serde_json::{Map, Value};
 use std::path::{Path, PathBuf};

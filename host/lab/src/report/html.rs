@@ -16,7 +16,7 @@ pub(crate) enum Part {
     List(Vec<String>),
     /// A table.
     Table(Table),
-    /// A plot as SVG, which [`is_plain_svg`] has accepted.
+    /// A plot as SVG, which [`dpm_profile::svg::is_plain_svg`] has accepted.
     Plot(String),
     /// A PNG picture with its name.
     Picture(String, Vec<u8>),
@@ -136,27 +136,11 @@ fn escaped(text: &str) -> String {
     text.replace('&', "&amp;").replace('<', "&lt;").replace('>', "&gt;").replace('"', "&quot;")
 }
 
-/// Elements that our plots consist of.
-const PLAIN: [&str; 10] =
-    ["svg", "g", "rect", "line", "polyline", "polygon", "path", "circle", "ellipse", "text"];
-
-/// True for an SVG of plain shapes and text only, which loads nothing, runs nothing and ends where it should.
-pub(crate) fn is_plain_svg(text: &str) -> bool {
-    let text = text.trim();
-    let plain = |tag: &str| {
-        let name = tag.trim_start_matches('/').split([' ', '\n', '\r', '\t', '>', '/']).next().unwrap_or("");
-        let within = tag.split('>').next().unwrap_or("").to_ascii_lowercase();
-        let loads = ["href", "url(", "style", "src"].iter().any(|word| within.contains(word));
-        let runs = within.split_whitespace().any(|attribute| attribute.starts_with("on"));
-        PLAIN.contains(&name) && tag.contains('>') && !loads && !runs
-    };
-    text.starts_with("<svg") && text.ends_with("</svg>") && text.split('<').skip(1).all(plain)
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
     use crate::report::table::Cell;
+    use dpm_profile::svg::is_plain_svg;
 
     #[test]
     fn nothing_in_a_text_becomes_a_part_of_the_page() {

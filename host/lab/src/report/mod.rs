@@ -8,14 +8,12 @@ mod table;
 
 pub use table::{Cell, Table};
 
-use crate::profile::civil;
 use against_model::against_model;
 use dpm_common::files::write_atomically;
+use dpm_profile::civil;
 use dpm_rig::failure::Failure;
 use dpm_rig::run_rig::cannot_write;
 use folder::{Folder, Found};
-#[cfg(test)]
-pub(crate) use html::is_plain_svg;
 use html::{page, Part};
 use markdown::blocks;
 use serde::Serialize;

@@ -5,10 +5,14 @@
 //! A kind is a file here, or in another crate that calls [`add`], with a [`ProjectorKind`]. A suite over all rows is in
 //! `tests/tests/laws/projector_kinds.rs`.
 
+#[cfg(feature = "alp")]
 mod alp;
+#[cfg(feature = "alp")]
 pub mod alp_library;
 mod compaction;
+#[cfg(feature = "display")]
 pub mod display;
+#[cfg(feature = "dlpc900")]
 pub mod dlpc900;
 mod keys;
 mod kind;
@@ -16,6 +20,7 @@ mod light;
 mod mock;
 mod serial;
 mod usb;
+#[cfg(feature = "display")]
 mod window;
 
 pub use compaction::Compaction;
@@ -34,9 +39,13 @@ static KINDS: Registry<ProjectorKind> = Registry::new(&[
     &mock::KIND,
     &usb::KIND,
     &serial::KIND,
+    #[cfg(feature = "alp")]
     &alp::KIND,
+    #[cfg(feature = "dlpc900")]
     &dlpc900::KIND,
+    #[cfg(feature = "display")]
     &display::KIND,
+    #[cfg(feature = "display")]
     &window::KIND,
 ]);
 

@@ -10,6 +10,7 @@ pub(crate) mod link_gauges;
 pub mod live;
 pub mod miss_log;
 pub mod monitor;
+pub mod notes;
 mod ordered;
 pub mod profile;
 pub mod projector;

@@ -120,7 +120,7 @@ impl SamplePhase {
     pub(crate) fn rhythm(&self) -> Option<SampleRhythm> {
         let [_, meant_at] = self.newest?;
         let is_steady = self.error_ns < UNSTEADY_NS.min(UNSTEADY_SHARE * self.period_ns);
-        (self.known == FEW && is_steady).then(|| SampleRhythm {
+        (self.known == FEW && is_steady).then_some(SampleRhythm {
             captured_at: meant_at,
             takes_ns: self.takes_ns as i64,
             period_ns: self.period_ns as i64,

@@ -2,9 +2,9 @@
 
 use super::{at_a_rate_that_is_carried, numbers, seconds, tip_and_sigma, Common, SensorArgs};
 use crate::calibrate::light::{self, FlatSource, Ways};
-use crate::calibrate::results::Results;
 use crate::calibrate::sensor;
 use crate::cli::watch::print;
+use crate::results::Results;
 use dpm_calibration::projector::Known;
 use dpm_calibration::sensor::Brightness;
 use dpm_rig::config::RigConfig;

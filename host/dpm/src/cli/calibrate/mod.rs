@@ -2,6 +2,7 @@
 
 mod check;
 mod light;
+#[cfg(feature = "page")]
 mod page;
 mod projector;
 
@@ -10,8 +11,8 @@ use super::watch::{print, watch_quietly};
 use crate::calibrate::dialogue::Dialogue;
 use crate::calibrate::pace::{slower, Paced};
 use crate::calibrate::recorder::Port;
-use crate::calibrate::results::Results;
 use crate::calibrate::{body, sensor, wand};
+use crate::results::Results;
 use check::{check, nudge, CheckArgs, NudgeArgs};
 use dpm_calibration::projector::{Known, LensTerms};
 use dpm_calibration::rehearsal::{rehearse_with, Bias};
@@ -23,6 +24,7 @@ use dpm_rig::telemetry::report::to_json;
 use dpm_scene::camera_files::{export, Form};
 use glam::DVec3;
 use light::{LatencyArgs, LightArgs};
+#[cfg(feature = "page")]
 use page::GuideArgs;
 use projector::ProjectorArgs;
 use std::path::{Path, PathBuf};
@@ -52,6 +54,7 @@ enum What {
     /// Find the latency alone, with a light sensor and the projector of the calibration file
     Latency(LatencyArgs),
     /// Serve a page in a browser that shows the steps for this rig, does them one by one, and asks what to keep
+    #[cfg(feature = "page")]
     Page(GuideArgs),
     /// Write lens and pose of the rig's projector as a file of OpenCV (.xml, .yml or .json)
     Export(ExportArgs),
@@ -331,6 +334,7 @@ pub(super) fn execute(args: &CalibrateArgs) -> Result<(), Failure> {
         What::Nudge(args) => nudge(args),
         What::Light(args) => args.execute(),
         What::Latency(args) => args.execute(),
+        #[cfg(feature = "page")]
         What::Page(args) => args.execute(),
         What::Export(args) => write_opencv(args),
         What::Rehearse(args) => rehearse(args),

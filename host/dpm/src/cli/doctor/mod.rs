@@ -2,21 +2,22 @@
 //! rig can run here.
 
 mod devices;
+#[cfg(feature = "display")]
+mod displays;
 mod rig;
 
-use super::display::{self, Seen};
 use super::os;
 use super::rig_args::RigArgs;
 use super::watch::print;
 use dpm_common::realtime::awake::CoresAwake;
 use dpm_common::realtime::{self, Refusal};
-use dpm_display::kms::Connector;
 use dpm_render::gpu::{DeviceSummary, GpuOptions};
 use dpm_rig::failure::{Failure, FailureKind};
+#[cfg(feature = "alp")]
 use dpm_rig::projectors::alp_library;
 use dpm_rig::telemetry::report::to_json;
 use std::fs;
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 
 /// Flags of `dpm doctor`.
 #[derive(clap::Args, Clone, Debug)]
@@ -104,7 +105,9 @@ pub(super) fn execute(args: &DoctorArgs) -> Result<(), Failure> {
     findings.extend(system.clock());
     findings.extend(system.usb());
     findings.push(system.serial_ports());
-    findings.extend(displays(&display::look()));
+    #[cfg(feature = "display")]
+    findings.extend(displays::findings());
+    #[cfg(feature = "alp")]
     findings.push(alp_libraries(&system.root));
     let with = |keys: &[&str]| args.flags.with_keys(args.rig.as_deref(), keys);
     let of_rig = config.as_ref().map(|config| rig::findings(config, args.load_libraries, &with));
@@ -206,47 +209,9 @@ fn simd() -> Finding {
     Finding::new("bit-plane packing", state, kernel.name(), remedy)
 }
 
-/// The displays that `projector.backend.kind = "display"` could drive.
-fn displays(all: &[Seen]) -> Vec<Finding> {
-    const UNTRIED: &str = "a display as projector has not been tried on real hardware yet (docs/DISPLAY.md)";
-    let mut findings = Vec::new();
-    for Seen { path, is_in_use, connectors } in all {
-        let name = format!("displays of {}", path.display());
-        let connectors = match connectors {
-            Ok(connectors) => connectors,
-            Err(e) => {
-                findings.push(Finding::new(&name, State::Info, "cannot be used", e.to_string()));
-                continue;
-            }
-        };
-        let answer = |c: &&Connector| c.is_connected;
-        let told: Vec<String> = connectors
-            .iter()
-            .filter(answer)
-            .map(|c| {
-                let mode = c.modes.first().map_or_else(|| "no mode".into(), ToString::to_string);
-                format!("{} ({mode})", c.name)
-            })
-            .collect();
-        let found = if told.is_empty() { "none answers".into() } else { told.join(", ") };
-        let remedy = if *is_in_use {
-            "another program drives them: a rig needs a bare console (Ctrl+Alt+F3), or a lease of one of them from the desktop \
-             (docs/DISPLAY.md)"
-        } else if told.is_empty() {
-            "plug one in and switch it on; `dpm display` lists connectors"
-        } else {
-            UNTRIED
-        };
-        findings.push(Finding::new(&name, State::Info, found, remedy));
-    }
-    if findings.is_empty() {
-        findings.push(Finding::new("displays", State::Info, "no graphics card that can set modes", ""));
-    }
-    findings
-}
-
 /// The ALP libraries below `root`.
-fn alp_libraries(root: &Path) -> Finding {
+#[cfg(feature = "alp")]
+fn alp_libraries(root: &std::path::Path) -> Finding {
     let found = alp_library::installed(root);
     if found.is_empty() {
         let remedy = "needed only for a ViALUX ALP: install the vendor's ALP for Linux";
@@ -498,7 +463,7 @@ mod tests {
             let root = std::env::temp_dir().join(format!("dpm-doctor-{}-{name}", std::process::id()));
             for (path, text) in files {
                 let path = root.join(path);
-                fs::create_dir_all(path.parent().unwrap_or(Path::new("/"))).unwrap();
+                fs::create_dir_all(path.parent().unwrap_or(std::path::Path::new("/"))).unwrap();
                 fs::write(path, text).unwrap();
             }
             (Self(root.clone()), System { root })

@@ -5,6 +5,7 @@ use super::super::os;
 use super::devices;
 use super::{Finding, State};
 use dpm_calibration::file;
+#[cfg(feature = "lab")]
 use dpm_lab::temporal_light::{mend, TemporalLight, NO_MEND};
 use dpm_rig::calibration_steps::age::{aged, days_since, OLD_DAYS};
 use dpm_rig::calibration_steps::is_simulated;
@@ -176,6 +177,7 @@ fn observer(config: &RigConfig, heard: Option<&devices::Heard>) -> Finding {
 }
 
 /// What a person notices of the course of the projector's light, and the keys that mend it.
+#[cfg(feature = "lab")]
 fn light_for_eyes(config: &RigConfig, with: &dyn Fn(&[&str]) -> Option<RigConfig>) -> Option<Finding> {
     let light = TemporalLight::of(&config.projector)?;
     let found = light.told();
@@ -185,6 +187,12 @@ fn light_for_eyes(config: &RigConfig, with: &dyn Fn(&[&str]) -> Option<RigConfig
     }
     let remedy = mend(&light, with).map_or(NO_MEND.to_owned(), |mend| mend.told());
     Some(Finding::new(name, State::Warning, found, remedy))
+}
+
+/// The laboratory judges that; without it nothing is said.
+#[cfg(not(feature = "lab"))]
+fn light_for_eyes(_: &RigConfig, _: &dyn Fn(&[&str]) -> Option<RigConfig>) -> Option<Finding> {
+    None
 }
 
 /// The bodies that show what another program makes. Without it they are black, and all else works.

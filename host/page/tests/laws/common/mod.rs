@@ -3,7 +3,6 @@
 
 use dpm_device::planes::Raster;
 use dpm_page::calibration::{Act, Guide, Session};
-use dpm_page::notes::Notes;
 use dpm_page::proof::{sign_request, Key};
 use dpm_page::token::Token;
 use dpm_page::{Page, Settings};
@@ -14,6 +13,7 @@ use dpm_rig::pipeline::{run_prepared, RunOptions, RunOutcome};
 use dpm_rig::rig::Rig;
 use dpm_rig::standing::{Identity, OrderFile};
 use dpm_rig::telemetry::monitor::RunMonitor;
+use dpm_rig::telemetry::notes::Notes;
 use std::io::{Read, Write};
 use std::net::{SocketAddr, TcpStream};
 use std::path::PathBuf;

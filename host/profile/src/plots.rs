@@ -191,7 +191,7 @@ fn draw(
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::profile::fixture::frame;
+    use crate::fixture::frame;
     use dpm_device::time::FrameRate;
 
     /// The points of every polyline of a drawing.

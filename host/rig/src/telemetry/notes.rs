@@ -1,7 +1,8 @@
 //! The last notes to the operator, for those who look later.
 
+use dpm_handoff::path::Lock;
 use std::collections::VecDeque;
-use std::sync::{Mutex, PoisonError};
+use std::sync::PoisonError;
 use std::time::{SystemTime, UNIX_EPOCH};
 
 /// Notes kept.
@@ -22,7 +23,7 @@ pub struct Note {
 
 /// The last notes.
 #[derive(Debug, Default)]
-pub struct Notes(Mutex<(u64, VecDeque<Note>)>);
+pub struct Notes(Lock<(u64, VecDeque<Note>)>);
 
 impl Notes {
     /// Adds a note.

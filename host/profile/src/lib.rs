@@ -1,12 +1,20 @@
 //! `dpm profile`: a rig at its true rate into distributions, logs, trace and plots.
 
 pub mod compare;
+#[cfg(feature = "plots")]
 mod histogram;
+#[cfg(feature = "plots")]
 pub mod plots;
+#[cfg(feature = "plots")]
+pub mod svg;
+#[cfg(feature = "plots")]
 mod v2log;
 
+#[cfg(feature = "plots")]
 use self::histogram::latency_histogram;
+#[cfg(feature = "plots")]
 use self::plots::percentiles;
+#[cfg(feature = "plots")]
 use self::v2log::write_v2_log;
 use dpm_common::files::write_atomically;
 use dpm_rig::config::RigConfig;
@@ -15,7 +23,9 @@ use dpm_rig::pipeline::{self, RunOptions, RunOutcome};
 use dpm_rig::presence;
 use dpm_rig::rig::Rig;
 use dpm_rig::run_rig::{cannot_write, check_output_folder, open_gpu, traced_raster};
-use dpm_rig::telemetry::interval::{Interval, IntervalKind};
+use dpm_rig::telemetry::interval::Interval;
+#[cfg(feature = "plots")]
+use dpm_rig::telemetry::interval::IntervalKind;
 use dpm_rig::telemetry::monitor::RunMonitor;
 use dpm_rig::telemetry::profile::ProfileReport;
 use dpm_rig::telemetry::report::{to_json, Report, MODELLED};
@@ -24,6 +34,7 @@ use serde::Serialize;
 use std::io::{Error, Write};
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
+#[cfg(feature = "plots")]
 use std::time::{Duration, SystemTime, UNIX_EPOCH};
 
 /// What a profiling run found: the report of any run, and the distributions.
@@ -98,35 +109,54 @@ fn summary(outcome: &RunOutcome, rig: &Rig, prepared: bool) -> Profile {
     }
 }
 
+/// Writes bytes somewhere.
+type Fill<'a> = &'a mut dyn FnMut(&mut dyn Write) -> Result<(), Error>;
+
 fn save(profile: &mut Profile, outcome: &RunOutcome, dir: &Path) -> Result<(), Failure> {
     std::fs::create_dir_all(dir).map_err(|e| cannot_write(dir, &e))?;
-    let length = Duration::from_secs_f64(profile.report.wall_s.max(0.0));
+    #[cfg(feature = "plots")]
     let made = made(&profile.report, SystemTime::now());
-    let mut put = |name: &str, write: &mut dyn FnMut(&mut dyn Write) -> Result<(), Error>| {
+    #[cfg(feature = "plots")]
+    let length = Duration::from_secs_f64(profile.report.wall_s.max(0.0));
+    let mut put = |name: &str, write: Fill<'_>| {
         let path: PathBuf = dir.join(name);
         write_atomically(&path, |mut out| write(&mut out)).map_err(|e| cannot_write(&path, &e))?;
         profile.report.files.push(path);
         Ok::<(), Failure>(())
     };
-    put("profile.hlog", &mut |mut out| write_v2_log(&mut out, &outcome.profiler, length))?;
     put("trace.json", &mut |out| write_trace(out, &outcome.traced, &outcome.standstills))?;
+    #[cfg(feature = "plots")]
+    save_plots(outcome, dir, length, &made, &mut put)?;
+    let text = to_json(&profile.profile);
+    put("profile.json", &mut |out| out.write_all(text.as_bytes()))
+}
+
+/// The log of HdrHistogram and the plots.
+#[cfg(feature = "plots")]
+fn save_plots(
+    outcome: &RunOutcome,
+    dir: &Path,
+    length: Duration,
+    made: &str,
+    put: &mut dyn FnMut(&str, Fill<'_>) -> Result<(), Failure>,
+) -> Result<(), Failure> {
+    put("profile.hlog", &mut |mut out| write_v2_log(&mut out, &outcome.profiler, length))?;
     for (name, kind) in [
         ("work.svg", IntervalKind::Work),
         ("waits.svg", IntervalKind::Wait),
         ("latency.svg", IntervalKind::Total),
     ] {
         let svg =
-            percentiles(&outcome.profiler, kind, &made).map_err(|e| cannot_write(&dir.join(name), &e))?;
+            percentiles(&outcome.profiler, kind, made).map_err(|e| cannot_write(&dir.join(name), &e))?;
         put(name, &mut |out| out.write_all(svg.as_bytes()))?;
     }
     let path = dir.join("histogram.svg");
-    let svg = latency_histogram(&outcome.profiler, &made).map_err(|e| cannot_write(&path, &e))?;
-    put("histogram.svg", &mut |out| out.write_all(svg.as_bytes()))?;
-    let text = to_json(&profile.profile);
-    put("profile.json", &mut |out| out.write_all(text.as_bytes()))
+    let svg = latency_histogram(&outcome.profiler, made).map_err(|e| cannot_write(&path, &e))?;
+    put("histogram.svg", &mut |out| out.write_all(svg.as_bytes()))
 }
 
 /// What ran, when and with which program, for the titles of plots.
+#[cfg(feature = "plots")]
 fn made(report: &Report, now: SystemTime) -> String {
     let seconds = now.duration_since(UNIX_EPOCH).map_or(0, |d| d.as_secs());
     let (year, month, day) = civil(seconds / 86_400);
@@ -144,7 +174,7 @@ fn made(report: &Report, now: SystemTime) -> String {
 }
 
 /// Days since 1970-01-01 as a date of the Gregorian calendar, UTC.
-pub(crate) fn civil(days: u64) -> (u64, u64, u64) {
+pub fn civil(days: u64) -> (u64, u64, u64) {
     // Counted from 0000-03-01, so that a leap day is the last of its year, in cycles of 400 years of 146,097 days [Hinnant].
     let z = days + 719_468;
     let (era, of_era) = (z / 146_097, z % 146_097);

@@ -1,11 +1,12 @@
 //! The calibration file of a rig: where it lies, what is in it already, and how new parts get into it.
 
-use dpm_calibration::file::{self, CalibrationFile, Provenance};
+use dpm_calibration::file::{self, BodySection, CalibrationFile, Pose, Provenance};
 use dpm_rig::calibration_steps::calibration_file;
 use dpm_rig::config::RigConfig;
 use dpm_rig::failure::{Failure, FailureKind};
 use dpm_rig::rig::Rig;
 use dpm_rig::standing::{utc, Identity};
+use glam::DAffine3;
 use std::path::{Path, PathBuf};
 use std::time::SystemTime;
 
@@ -98,6 +99,49 @@ impl Results {
             data,
             commit: dpm_common::commit::get().to_owned(),
             method: method.to_owned(),
+        }
+    }
+}
+
+/// What is moved.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub enum Moved {
+    /// The mesh in the tracked body of this name.
+    Body(String),
+    /// The projector in the world.
+    Projector,
+}
+
+/// Refuses a projector that was not calibrated: its lens would be missing in the calibration file.
+///
+/// # Errors
+/// It was not (exit code 2).
+pub fn check_known(results: &Results, moved: &Moved) -> Result<(), Failure> {
+    if *moved == Moved::Projector && results.file.projector.is_none() {
+        let told = "the calibration file has no projector yet: run `dpm calibrate projector` first";
+        return Err(Failure::new(FailureKind::BadInput, told));
+    }
+    Ok(())
+}
+
+/// Puts a motion into the results.
+pub fn keep(results: &mut Results, config: &RigConfig, moved: &Moved, motion: &DAffine3) {
+    let place = Pose::new(motion);
+    match moved {
+        Moved::Body(name) => {
+            let old = results.file.bodies.get(name);
+            let data = old.map_or(String::new(), |b| b.provenance.data.clone());
+            let provenance = results.provenance(config, name, data, Provenance::BY_EYE);
+            // That of the measurement before does not hold for another place, and an eye gives none.
+            let section = BodySection { mesh_to_body: place, residual_m: None, provenance };
+            results.file.bodies.insert(name.clone(), section);
+        }
+        Moved::Projector => {
+            let data = results.file.projector.as_ref().map_or(String::new(), |p| p.provenance.data.clone());
+            let provenance = results.provenance(config, "", data, Provenance::BY_EYE);
+            if let Some(section) = &mut results.file.projector {
+                (section.world_from_projector, section.provenance) = (place, provenance);
+            }
         }
     }
 }

@@ -39,7 +39,7 @@ pub(super) fn write_v2_log(
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::profile::fixture::frame;
+    use crate::fixture::frame;
     use dpm_device::time::FrameRate;
     use hdrhistogram::serialization::interval_log::{IntervalLogIterator, LogEntry};
     use hdrhistogram::serialization::Deserializer;

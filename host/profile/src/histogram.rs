@@ -105,8 +105,8 @@ fn draw(
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::profile::fixture::frame;
-    use crate::report::is_plain_svg;
+    use crate::fixture::frame;
+    use crate::svg::is_plain_svg;
     use dpm_device::time::FrameRate;
 
     /// Every frame is in one bin of its curve, and the slot has its line.
