@@ -63,12 +63,15 @@ struct Point<P> {
     exact: [bool; 3],
 }
 
+/// A sample, and when it was taken, nanoseconds; `None` before the first ones of a track.
+type Taken<C> = Option<(i64, <C as Chart>::Point)>;
+
 /// The motion of one body in the last seconds, and which part of it the body is repeating.
 #[derive(Clone, Debug)]
 pub(crate) struct Recall<C: Chart> {
     /// The last [`SAMPLES`] up to `end`, oldest first; `None` only before the first samples of a track. They move to the
     /// front when the end is reached, and not with every sample.
-    samples: Box<[Option<(i64, C::Point)>; 2 * SAMPLES]>,
+    samples: Box<[Taken<C>; 2 * SAMPLES]>,
     end: usize,
     /// A ring: point `i` lies at `i` modulo [`POINTS`].
     points: Box<[Option<Point<C::Point>>]>,

@@ -150,7 +150,7 @@ fn shoot(
         let due_ns = begun_ns + window.length_ns + (f64::from(pictures.len() as u32) * every_ns) as i64;
         if (pictures.len() as u32) < wanted && at_ns >= due_ns && !window.slots.is_empty() {
             let share = pictures.len() as f64 / f64::from(wanted);
-            pictures.push(studio.picture(share, window.seen(), &seen).map_err(&failed)?);
+            pictures.push(studio.picture(share, window.seen(), &seen).map_err(failed)?);
         }
     }
     if pictures.is_empty() {

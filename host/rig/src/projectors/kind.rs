@@ -28,6 +28,9 @@ pub enum SlotClock {
     Blanks,
 }
 
+/// Reads the keys of a kind from a table of the rig file, whose name comes last.
+type ReadKeys = fn(&BTreeMap<String, Entry>, &mut Reader, &str) -> Arc<dyn ProjectorKeys>;
+
 /// A kind of projectors: a row of the table.
 pub struct ProjectorKind {
     /// Its word and its keys in the rig file.
@@ -42,7 +45,7 @@ pub struct ProjectorKind {
     pub is_video: bool,
     /// The page of the manual about it, with a heading: `docs/ALP.md#...`.
     pub page: &'static str,
-    read: fn(&BTreeMap<String, Entry>, &mut Reader, &str) -> Arc<dyn ProjectorKeys>,
+    read: ReadKeys,
 }
 
 impl ProjectorKind {

@@ -70,7 +70,7 @@ impl Shape {
     }
 
     /// Distance from the body's origin to the box.
-    fn from_origin(&self) -> f64 {
+    fn distance_from_origin(&self) -> f64 {
         DVec3::ZERO.clamp(self.low, self.high).length()
     }
 }
@@ -169,7 +169,7 @@ fn of_shape(shape: &Shape) -> Vec<Doubt> {
         };
         all.push(Doubt { about: about.clone(), told, remedy });
     }
-    let far = shape.from_origin();
+    let far = shape.distance_from_origin();
     if far > FAR.0 * size && far > FAR.1 {
         all.push(Doubt {
             about,

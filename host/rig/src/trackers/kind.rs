@@ -25,6 +25,9 @@ pub enum PoseOrigin {
 /// A name in `tests/corpus` and a function that asserts what holds for any bytes.
 pub type Decoder = (&'static str, fn(&[u8]));
 
+/// Reads the keys of a kind from a table of the rig file, whose name comes last.
+type ReadKeys = fn(&BTreeMap<String, Entry>, &mut Reader, &str) -> Arc<dyn TrackerKeys>;
+
 /// A kind of trackers: a row of the table.
 pub struct TrackerKind {
     /// Its word and its keys in the rig file.
@@ -37,7 +40,7 @@ pub struct TrackerKind {
     pub decoders: &'static [Decoder],
     /// Starts a server of this kind on this machine.
     pub mock: fn(&MockScene) -> io::Result<MockServer>,
-    read: fn(&BTreeMap<String, Entry>, &mut Reader, &str) -> Arc<dyn TrackerKeys>,
+    read: ReadKeys,
 }
 
 impl TrackerKind {

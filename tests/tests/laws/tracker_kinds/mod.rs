@@ -147,10 +147,12 @@ fn bears_any_bytes(kind: &TrackerKind) {
         let mut runner =
             TestRunner::new(Config { cases: 400, failure_persistence: None, ..Config::default() });
         let bytes = proptest::collection::vec(proptest::num::u8::ANY, 0..300);
-        runner.run(&bytes, |bytes| {
-            let _: () = decode(&bytes);
-            Ok(())
-        }).unwrap();
+        runner
+            .run(&bytes, |bytes| {
+                let _: () = decode(&bytes);
+                Ok(())
+            })
+            .unwrap();
     }
 }
 
