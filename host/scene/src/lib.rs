@@ -32,6 +32,7 @@ mod limits;
 mod linear_picture;
 mod live_pictures;
 mod load;
+pub mod lobes;
 pub mod mesh;
 mod mesh_file;
 mod part_motion;
@@ -166,16 +167,18 @@ impl TextureRef {
     }
 }
 
-/// The target material: glTF 2.0 metallic-roughness with emissive strength, ior and transmission. The model is defined
-/// in `docs/RENDERING.md`, "Materials".
+/// The target material: glTF 2.0 metallic-roughness with the extensions of [`lobes`]. The model is defined in
+/// `docs/RENDERING.md`, "Materials".
 #[derive(Clone, Debug)]
 pub struct Material {
     /// Name in the file, for messages.
     pub name: String,
     /// Linear base colour, 0..1.
     pub base_color: Vec3,
-    /// MASK: below this alpha the surface is invisible. `None`: opaque.
+    /// MASK: below this alpha the surface is invisible. `None`: opaque, or [`Self::alpha_blend`].
     pub alpha_cutoff: Option<f32>,
+    /// BLEND: alpha is the share of the surface that is there. The rest of the light goes straight through.
+    pub alpha_blend: bool,
     /// Alpha factor of the base colour.
     pub alpha: f32,
     /// 0..1.
@@ -207,6 +210,8 @@ pub struct Material {
     pub emissive_texture: Option<TextureRef>,
     /// Linear; red is transmission.
     pub transmission_texture: Option<TextureRef>,
+    /// Lobes that few materials have.
+    pub lobes: lobes::Lobes,
 }
 
 impl Material {
@@ -220,6 +225,12 @@ impl Material {
             self.transmission_texture,
         ]
         .into_iter()
+        .chain(self.lobes.textures())
+    }
+
+    /// Light passes through the surface, so that its back is shaded, too.
+    pub fn shines_through(&self) -> bool {
+        self.transmission > 0.0 || self.lobes.diffuse_transmission.factor > 0.0
     }
 }
 
@@ -273,6 +284,7 @@ impl Default for Material {
             name: "default".into(),
             base_color: Vec3::ONE,
             alpha_cutoff: None,
+            alpha_blend: false,
             alpha: 1.0,
             metallic: 1.0,
             roughness: 1.0,
@@ -288,6 +300,7 @@ impl Default for Material {
             normal_texture: None,
             emissive_texture: None,
             transmission_texture: None,
+            lobes: lobes::Lobes::default(),
         }
     }
 }

@@ -22,6 +22,7 @@ mod gpu_samplers;
 pub mod gpu_shot;
 mod gpu_tracer;
 mod gpu_traversal;
+mod lobes;
 #[cfg(test)]
 mod numerics_table;
 mod planes;
@@ -163,6 +164,7 @@ pub fn cases() -> Vec<Case> {
     let all = [
         tracer::CASES,
         scattering::CASES,
+        lobes::CASES,
         predictor::CASES,
         clocks::CASES,
         calibration::CASES,
