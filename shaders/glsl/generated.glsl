@@ -15,6 +15,7 @@
 #define MATERIAL_DOUBLE_SIDED 1u
 #define MATERIAL_THIN 2u
 #define MATERIAL_TRANSMISSIVE 4u
+#define MATERIAL_BLEND 8u
 #define LIGHT_TRIANGLE 0u
 #define LIGHT_POINT 1u
 #define LIGHT_SPOT 2u
@@ -182,6 +183,24 @@ layout(constant_id = 31) const uint WALK_STACK = 24u;
 layout(constant_id = 32) const bool MANY_SAMPLES = true;
 // On GPUs: workgroups of the pass `trace` that keep the whole device busy to the end. A list that has too few samples for so many is cut into shorter ranges, because a lane that takes three samples one after the other while others idle makes the pass longer.
 layout(constant_id = 33) const uint TRACE_GROUPS = 1024u;
+// A material of the scene has a clear coat.
+layout(constant_id = 34) const bool HAS_CLEARCOAT = true;
+// A dielectric of the scene reflects in a colour of its own, or less than its index says.
+layout(constant_id = 35) const bool HAS_SPECULAR_COLOR = true;
+// A material of the scene is rougher along one direction.
+layout(constant_id = 36) const bool HAS_ANISOTROPY = true;
+// A material of the scene has fibres.
+layout(constant_id = 37) const bool HAS_SHEEN = true;
+// A solid of the scene absorbs light.
+layout(constant_id = 38) const bool HAS_ABSORPTION = true;
+// A material of the scene is partly there.
+layout(constant_id = 39) const bool HAS_ALPHA_BLEND = true;
+// A material of the scene has a thin film.
+layout(constant_id = 40) const bool HAS_IRIDESCENCE = true;
+// Light shines through a material of the scene in every direction.
+layout(constant_id = 41) const bool HAS_DIFFUSE_TRANSMISSION = true;
+// A solid of the scene refracts colours differently.
+layout(constant_id = 42) const bool HAS_DISPERSION = true;
 
 struct Frame {
     vec3 projector_position;
@@ -376,7 +395,38 @@ struct Material {
     TextureUse normal_texture;
     TextureUse emissive_texture;
     TextureUse transmission_texture;
-    uvec2 reserved;
+    float coat;
+    float coat_roughness;
+    float coat_normal_scale;
+    uint coat_table;
+    uint white_table;
+    uint sheen_table;
+    float specular;
+    vec3 specular_color;
+    float anisotropy;
+    vec2 anisotropy_direction;
+    vec3 sheen_color;
+    float sheen_roughness;
+    float film;
+    float film_ior;
+    vec2 film_thickness;
+    vec3 absorption;
+    float shine;
+    vec3 shine_color;
+    float dispersion;
+    TextureUse coat_texture;
+    TextureUse coat_roughness_texture;
+    TextureUse coat_normal_texture;
+    TextureUse specular_texture;
+    TextureUse specular_color_texture;
+    TextureUse anisotropy_texture;
+    TextureUse sheen_color_texture;
+    TextureUse sheen_roughness_texture;
+    TextureUse film_texture;
+    TextureUse film_thickness_texture;
+    TextureUse shine_texture;
+    TextureUse shine_color_texture;
+    uint reserved;
 };
 
 struct TextureInfo {

@@ -142,6 +142,7 @@ LightSample sample_light(vec3 p, vec3 n, float u_pick, vec2 u) {
         if (HAS_TEXTURES && material_at(ref.material).emissive_texture.texture != NO_TEXTURE)
             emitted *= sample_texture(material_at(ref.material).emissive_texture, interpolate_uv(ref, b)).rgb;
         if (HAS_ALPHA_MASK && !alpha_present(carrier, lights[index].triangle, b)) return r;
+        if (HAS_CLEARCOAT || HAS_SHEEN) emitted *= emission_through_layers(ref.material, HAS_TEXTURES ? interpolate_uv(ref, b) : vec2(0.0), cosine);
         r.pdf = select * d2 / (cosine * area);
         r.radiance = emitted / r.pdf;
         r.to_light = q + normal * surface_offset(q, carrier) - p;

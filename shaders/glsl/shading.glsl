@@ -21,7 +21,32 @@ struct Point {
     float offset;   // Distance from the surface at which a new ray starts.
     uint body;
     uint row;       // The first of its triangle's rows.
+    // Lobes that few materials have. Without them these are constants, and compiled away.
+    uint material;
+    float coverage;       // Share of the surface that is there.
+    float coat;           // Strength of the clear coat.
+    float coat_alpha;
+    vec3 coat_normal;     // On the side of v.
+    float across;         // Roughness of GGX across the tangent, where it is `alpha` along it; 0: the same everywhere.
+    vec3 tangent;         // Unit, across n.
+    float specular;       // Strength and colour of the dielectric reflection; 1 and white: as the index says.
+    vec3 specular_color;
+    vec3 sheen;
+    float sheen_alpha;
+    float film;           // Strength of the thin film.
+    float film_nm;
+    float shine;          // Share of the diffuse light that leaves on the other side, and its colour.
+    vec3 shine_color;
+    vec3 absorption;      // Of the solid behind the outside, per metre.
+    float dispersion;
 };
+
+float max3(vec3 v) { return max(v.x, max(v.y, v.z)); }
+
+// A sheen is no narrower.
+const float LEAST_SHEEN_ALPHA = 1e-3;
+// A surface that is rougher along one direction is no smoother than this across it.
+const float LEAST_BRUSHED_ALPHA = 1e-3;
 
 uint wrap_texel(int x, uint size, uint mode) {
     int n = int(size);
@@ -54,6 +79,11 @@ vec2 interpolate_uv(TriangleRef ref, vec2 b) {
     return vertex_at(ref.vertices.x).uv * (1.0 - b.x - b.y) + vertex_at(ref.vertices.y).uv * b.x + vertex_at(ref.vertices.z).uv * b.y;
 }
 
+#ifdef CHANCE_OF_COVERAGE
+// Defined by the shader that includes this file: whether a ray meets a triangle whose alpha is the share of it that is there.
+bool is_covered(float alpha, uint instance, uint triangle);
+#endif
+
 bool alpha_present(uint instance, uint triangle, vec2 barycentric) {
     TriangleRef ref = triangle_ref_at(instance_at(instance).triangle_offset + triangle);
     float cutoff = material_at(ref.material).alpha_cutoff;
@@ -61,6 +91,9 @@ bool alpha_present(uint instance, uint triangle, vec2 barycentric) {
     float a = material_at(ref.material).alpha;
     if (HAS_TEXTURES && material_at(ref.material).base_color_texture.texture != NO_TEXTURE)
         a *= sample_texture(material_at(ref.material).base_color_texture, interpolate_uv(ref, barycentric)).a;
+#ifdef CHANCE_OF_COVERAGE
+    if (HAS_ALPHA_BLEND && (material_at(ref.material).flags & MATERIAL_BLEND) != 0u) return is_covered(a, instance, triangle);
+#endif
     return a >= cutoff;
 }
 
@@ -126,6 +159,130 @@ bool leaves_body(uint body, uint row, vec3 normal, vec3 direction) {
 #endif
 }
 
+float factor_of(TextureUse use, vec2 uv, uint channel) {
+    return HAS_TEXTURES && use.texture != NO_TEXTURE ? sample_texture(use, uv)[channel] : 1.0;
+}
+
+vec3 color_of(TextureUse use, vec2 uv) {
+    return HAS_TEXTURES && use.texture != NO_TEXTURE ? sample_texture(use, uv).rgb : vec3(1.0);
+}
+
+// The nearest direction to `n` for which `v` is just above the surface; `other` where there is none.
+vec3 bend_toward(vec3 n, vec3 v, vec3 other) {
+    float nv = dot(n, v);
+    if (nv >= 1e-3) return n;
+    vec3 across = n - nv * v;
+    float l2 = dot(across, across);
+    return l2 > 1e-12 ? across * (sqrt(1.0 - 1e-6) * inversesqrt(l2)) + 1e-3 * v : other;
+}
+
+float coat_alpha_of(uint m, vec2 uv) {
+    float roughness = material_at(m).coat_roughness * factor_of(material_at(m).coat_roughness_texture, uv, 1u);
+    return max(roughness * roughness, 1e-4);
+}
+
+float sheen_alpha_of(uint m, vec2 uv) {
+    float roughness = material_at(m).sheen_roughness * factor_of(material_at(m).sheen_roughness_texture, uv, 3u);
+    return max(roughness * roughness, LEAST_SHEEN_ALPHA);
+}
+
+// A mirror reflects by Fresnel's law, which is row 0 of the table.
+float mirror_row(float alpha) { return alpha < 1e-3 ? 0.0 : alpha; }
+
+// What coat and sheen let through of the light that a surface emits at a cosine to its geometric normal.
+float emission_through_layers(uint m, vec2 uv, float mu) {
+    float through = 1.0;
+    if (HAS_CLEARCOAT && material_at(m).coat > 0.0) {
+        float coat = material_at(m).coat * factor_of(material_at(m).coat_texture, uv, 0u);
+        through -= coat * directional_albedo(material_at(m).coat_table, mirror_row(coat_alpha_of(m, uv)), mu);
+    }
+    if (HAS_SHEEN && max3(material_at(m).sheen_color) > 0.0) {
+        float sheen = max3(material_at(m).sheen_color * color_of(material_at(m).sheen_color_texture, uv));
+        through *= 1.0 - sheen * directional_albedo(material_at(m).sheen_table + 1u, sheen_alpha_of(m, uv), mu);
+    }
+    return through;
+}
+
+// The interpolated tangent of a hit, across `n`, and the sign of the bitangent in w; 0: there is none.
+vec4 tangent_at(TriangleRef ref, vec2 b, uint instance, vec3 n) {
+    vec4 t4 = vertex_at(ref.vertices.x).tangent * (1.0 - b.x - b.y) + vertex_at(ref.vertices.y).tangent * b.x + vertex_at(ref.vertices.z).tangent * b.y;
+    vec3 t = transform_vector(instance_at(instance).world_from_object, t4.xyz);
+    t -= n * dot(n, t);
+    return dot(t, t) > 1e-12 ? vec4(normalize(t), t4.w < 0.0 ? -1.0 : 1.0) : vec4(0.0);
+}
+
+// The lobes that few materials have. `smooth_normal` is interpolated, on the outside.
+void add_lobes(inout Point s, TriangleRef ref, vec2 b, vec2 uv, vec3 smooth_normal) {
+    uint m = ref.material;
+    s.material = m;
+    s.coverage = 1.0;
+    if (HAS_ALPHA_BLEND && (s.flags & MATERIAL_BLEND) != 0u)
+        s.coverage = clamp(material_at(m).alpha * factor_of(material_at(m).base_color_texture, uv, 3u), 0.0, 1.0);
+    s.coat = HAS_CLEARCOAT ? material_at(m).coat : 0.0;
+    s.coat_alpha = 1.0;
+    s.coat_normal = s.n;
+    if (HAS_CLEARCOAT && s.coat > 0.0) {
+        s.coat *= factor_of(material_at(m).coat_texture, uv, 0u);
+        s.coat_alpha = coat_alpha_of(m, uv);
+        vec3 n = smooth_normal;
+        if (HAS_TEXTURES && material_at(m).coat_normal_texture.texture != NO_TEXTURE) {
+            vec4 t = tangent_at(ref, b, s.body, n);
+            vec3 c = sample_texture(material_at(m).coat_normal_texture, uv).xyz * 2.0 - 1.0;
+            c.xy *= material_at(m).coat_normal_scale;
+            vec3 mapped = t.xyz * c.x + cross(n, t.xyz) * t.w * c.y + n * c.z;
+            if (t.w != 0.0 && dot(mapped, mapped) > 1e-12) n = normalize(mapped);
+        }
+        s.coat_normal = bend_toward(s.front ? n : -n, s.v, s.g);
+    }
+    s.across = 0.0;
+    s.tangent = s.n;
+    if (HAS_ANISOTROPY && material_at(m).anisotropy > 0.0) {
+        float strength = material_at(m).anisotropy;
+        vec2 along = material_at(m).anisotropy_direction;
+        if (HAS_TEXTURES && material_at(m).anisotropy_texture.texture != NO_TEXTURE) {
+            vec3 c = sample_texture(material_at(m).anisotropy_texture, uv).xyz;
+            vec2 d = c.xy * 2.0 - 1.0;
+            d = dot(d, d) > 1e-12 ? normalize(d) : vec2(1.0, 0.0);
+            along = vec2(along.x * d.x - along.y * d.y, along.x * d.y + along.y * d.x);
+            strength *= c.z;
+        }
+        float along_alpha = mix(s.alpha, 1.0, strength * strength);
+        vec4 t = tangent_at(ref, b, s.body, smooth_normal);
+        vec3 tangent = t.xyz * along.x + cross(smooth_normal, t.xyz) * t.w * along.y;
+        tangent -= s.n * dot(s.n, tangent);
+        if (along_alpha >= LEAST_BRUSHED_ALPHA && strength > 0.0 && dot(tangent, tangent) > 1e-12) {
+            s.tangent = normalize(tangent);
+            s.across = max(s.alpha, LEAST_BRUSHED_ALPHA);
+            s.alpha = max(along_alpha, LEAST_BRUSHED_ALPHA);
+        }
+    }
+    s.specular = HAS_SPECULAR_COLOR ? material_at(m).specular * factor_of(material_at(m).specular_texture, uv, 3u) : 1.0;
+    s.specular_color = HAS_SPECULAR_COLOR ? material_at(m).specular_color * color_of(material_at(m).specular_color_texture, uv) : vec3(1.0);
+    s.sheen = vec3(0.0);
+    s.sheen_alpha = 1.0;
+    if (HAS_SHEEN && max3(material_at(m).sheen_color) > 0.0) {
+        s.sheen = material_at(m).sheen_color * color_of(material_at(m).sheen_color_texture, uv);
+        s.sheen_alpha = sheen_alpha_of(m, uv);
+    }
+    s.film = HAS_IRIDESCENCE ? material_at(m).film : 0.0;
+    s.film_nm = 0.0;
+    if (HAS_IRIDESCENCE && s.film > 0.0) {
+        s.film *= factor_of(material_at(m).film_texture, uv, 0u);
+        vec2 range = material_at(m).film_thickness;
+        s.film_nm = mix(range.x, range.y, factor_of(material_at(m).film_thickness_texture, uv, 1u));
+    }
+    s.shine = HAS_DIFFUSE_TRANSMISSION ? material_at(m).shine : 0.0;
+    s.shine_color = vec3(0.0);
+    if (HAS_DIFFUSE_TRANSMISSION && s.shine > 0.0) {
+        s.shine *= factor_of(material_at(m).shine_texture, uv, 3u);
+        s.shine_color = material_at(m).shine_color * color_of(material_at(m).shine_color_texture, uv);
+    }
+    s.absorption = HAS_ABSORPTION ? material_at(m).absorption : vec3(0.0);
+    s.dispersion = HAS_DISPERSION && (s.flags & MATERIAL_THIN) == 0u && s.transmission > 0.0 ? material_at(m).dispersion : 0.0;
+    if (HAS_EMISSIVE && (HAS_CLEARCOAT || HAS_SHEEN) && max3(s.emitted) > 0.0)
+        s.emitted *= emission_through_layers(m, uv, abs(dot(s.g, s.v)));
+}
+
 Point shading_point(Hit hit, vec3 v) {
     Point s;
     uint instance = instance_of(hit.id), triangle = triangle_of(hit.id);
@@ -145,6 +302,7 @@ Point shading_point(Hit hit, vec3 v) {
     vec3 n = vertex_at(ref.vertices.x).normal * (1.0 - b.x - b.y) + vertex_at(ref.vertices.y).normal * b.x + vertex_at(ref.vertices.z).normal * b.y;
     n = dot(n, n) > 1e-12 ? transform_normal(instance_at(instance).world_from_object, n) : s.g;
     vec2 uv = HAS_TEXTURES ? interpolate_uv(ref, b) : vec2(0.0);
+    vec3 smooth_normal = n;
     if (HAS_NORMAL_MAPS && material_at(m).normal_texture.texture != NO_TEXTURE) {
         vec4 t4 = vertex_at(ref.vertices.x).tangent * (1.0 - b.x - b.y) + vertex_at(ref.vertices.y).tangent * b.x + vertex_at(ref.vertices.z).tangent * b.y;
         vec3 t = transform_vector(instance_at(instance).world_from_object, t4.xyz);
@@ -188,5 +346,6 @@ Point shading_point(Hit hit, vec3 v) {
             s.transmission *= sample_texture(material_at(m).transmission_texture, uv).r;
     }
     s.alpha = max(roughness * roughness, 1e-4);
+    add_lobes(s, ref, b, uv, smooth_normal);
     return s;
 }

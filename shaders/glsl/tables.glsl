@@ -125,19 +125,47 @@ TriangleRef triangle_ref_at(uint i) {
 layout(set = 0, binding = B_MATERIALS, rgba32ui) uniform readonly uimageBuffer materials_image;
 Material material_at(uint i) {
     uint at = i;
-    uvec4 r0 = imageLoad(materials_image, int(at) * 13 + 0);
-    uvec4 r1 = imageLoad(materials_image, int(at) * 13 + 1);
-    uvec4 r2 = imageLoad(materials_image, int(at) * 13 + 2);
-    uvec4 r3 = imageLoad(materials_image, int(at) * 13 + 3);
-    uvec4 r4 = imageLoad(materials_image, int(at) * 13 + 4);
-    uvec4 r5 = imageLoad(materials_image, int(at) * 13 + 5);
-    uvec4 r6 = imageLoad(materials_image, int(at) * 13 + 6);
-    uvec4 r7 = imageLoad(materials_image, int(at) * 13 + 7);
-    uvec4 r8 = imageLoad(materials_image, int(at) * 13 + 8);
-    uvec4 r9 = imageLoad(materials_image, int(at) * 13 + 9);
-    uvec4 r10 = imageLoad(materials_image, int(at) * 13 + 10);
-    uvec4 r11 = imageLoad(materials_image, int(at) * 13 + 11);
-    uvec4 r12 = imageLoad(materials_image, int(at) * 13 + 12);
+    uvec4 r0 = imageLoad(materials_image, int(at) * 41 + 0);
+    uvec4 r1 = imageLoad(materials_image, int(at) * 41 + 1);
+    uvec4 r2 = imageLoad(materials_image, int(at) * 41 + 2);
+    uvec4 r3 = imageLoad(materials_image, int(at) * 41 + 3);
+    uvec4 r4 = imageLoad(materials_image, int(at) * 41 + 4);
+    uvec4 r5 = imageLoad(materials_image, int(at) * 41 + 5);
+    uvec4 r6 = imageLoad(materials_image, int(at) * 41 + 6);
+    uvec4 r7 = imageLoad(materials_image, int(at) * 41 + 7);
+    uvec4 r8 = imageLoad(materials_image, int(at) * 41 + 8);
+    uvec4 r9 = imageLoad(materials_image, int(at) * 41 + 9);
+    uvec4 r10 = imageLoad(materials_image, int(at) * 41 + 10);
+    uvec4 r11 = imageLoad(materials_image, int(at) * 41 + 11);
+    uvec4 r12 = imageLoad(materials_image, int(at) * 41 + 12);
+    uvec4 r13 = imageLoad(materials_image, int(at) * 41 + 13);
+    uvec4 r14 = imageLoad(materials_image, int(at) * 41 + 14);
+    uvec4 r15 = imageLoad(materials_image, int(at) * 41 + 15);
+    uvec4 r16 = imageLoad(materials_image, int(at) * 41 + 16);
+    uvec4 r17 = imageLoad(materials_image, int(at) * 41 + 17);
+    uvec4 r18 = imageLoad(materials_image, int(at) * 41 + 18);
+    uvec4 r19 = imageLoad(materials_image, int(at) * 41 + 19);
+    uvec4 r20 = imageLoad(materials_image, int(at) * 41 + 20);
+    uvec4 r21 = imageLoad(materials_image, int(at) * 41 + 21);
+    uvec4 r22 = imageLoad(materials_image, int(at) * 41 + 22);
+    uvec4 r23 = imageLoad(materials_image, int(at) * 41 + 23);
+    uvec4 r24 = imageLoad(materials_image, int(at) * 41 + 24);
+    uvec4 r25 = imageLoad(materials_image, int(at) * 41 + 25);
+    uvec4 r26 = imageLoad(materials_image, int(at) * 41 + 26);
+    uvec4 r27 = imageLoad(materials_image, int(at) * 41 + 27);
+    uvec4 r28 = imageLoad(materials_image, int(at) * 41 + 28);
+    uvec4 r29 = imageLoad(materials_image, int(at) * 41 + 29);
+    uvec4 r30 = imageLoad(materials_image, int(at) * 41 + 30);
+    uvec4 r31 = imageLoad(materials_image, int(at) * 41 + 31);
+    uvec4 r32 = imageLoad(materials_image, int(at) * 41 + 32);
+    uvec4 r33 = imageLoad(materials_image, int(at) * 41 + 33);
+    uvec4 r34 = imageLoad(materials_image, int(at) * 41 + 34);
+    uvec4 r35 = imageLoad(materials_image, int(at) * 41 + 35);
+    uvec4 r36 = imageLoad(materials_image, int(at) * 41 + 36);
+    uvec4 r37 = imageLoad(materials_image, int(at) * 41 + 37);
+    uvec4 r38 = imageLoad(materials_image, int(at) * 41 + 38);
+    uvec4 r39 = imageLoad(materials_image, int(at) * 41 + 39);
+    uvec4 r40 = imageLoad(materials_image, int(at) * 41 + 40);
     return Material(vec3(uintBitsToFloat(r0.x), uintBitsToFloat(r0.y), uintBitsToFloat(r0.z)),
         uintBitsToFloat(r0.w),
         vec3(uintBitsToFloat(r1.x), uintBitsToFloat(r1.y), uintBitsToFloat(r1.z)),
@@ -164,7 +192,62 @@ Material material_at(uint i) {
         TextureUse(r10.w,
         vec3(uintBitsToFloat(r11.x), uintBitsToFloat(r11.y), uintBitsToFloat(r11.z)),
         vec3(uintBitsToFloat(r11.w), uintBitsToFloat(r12.x), uintBitsToFloat(r12.y))),
-        uvec2(r12.z, r12.w));
+        uintBitsToFloat(r12.z),
+        uintBitsToFloat(r12.w),
+        uintBitsToFloat(r13.x),
+        r13.y,
+        r13.z,
+        r13.w,
+        uintBitsToFloat(r14.x),
+        vec3(uintBitsToFloat(r14.y), uintBitsToFloat(r14.z), uintBitsToFloat(r14.w)),
+        uintBitsToFloat(r15.x),
+        vec2(uintBitsToFloat(r15.y), uintBitsToFloat(r15.z)),
+        vec3(uintBitsToFloat(r15.w), uintBitsToFloat(r16.x), uintBitsToFloat(r16.y)),
+        uintBitsToFloat(r16.z),
+        uintBitsToFloat(r16.w),
+        uintBitsToFloat(r17.x),
+        vec2(uintBitsToFloat(r17.y), uintBitsToFloat(r17.z)),
+        vec3(uintBitsToFloat(r17.w), uintBitsToFloat(r18.x), uintBitsToFloat(r18.y)),
+        uintBitsToFloat(r18.z),
+        vec3(uintBitsToFloat(r18.w), uintBitsToFloat(r19.x), uintBitsToFloat(r19.y)),
+        uintBitsToFloat(r19.z),
+        TextureUse(r19.w,
+        vec3(uintBitsToFloat(r20.x), uintBitsToFloat(r20.y), uintBitsToFloat(r20.z)),
+        vec3(uintBitsToFloat(r20.w), uintBitsToFloat(r21.x), uintBitsToFloat(r21.y))),
+        TextureUse(r21.z,
+        vec3(uintBitsToFloat(r21.w), uintBitsToFloat(r22.x), uintBitsToFloat(r22.y)),
+        vec3(uintBitsToFloat(r22.z), uintBitsToFloat(r22.w), uintBitsToFloat(r23.x))),
+        TextureUse(r23.y,
+        vec3(uintBitsToFloat(r23.z), uintBitsToFloat(r23.w), uintBitsToFloat(r24.x)),
+        vec3(uintBitsToFloat(r24.y), uintBitsToFloat(r24.z), uintBitsToFloat(r24.w))),
+        TextureUse(r25.x,
+        vec3(uintBitsToFloat(r25.y), uintBitsToFloat(r25.z), uintBitsToFloat(r25.w)),
+        vec3(uintBitsToFloat(r26.x), uintBitsToFloat(r26.y), uintBitsToFloat(r26.z))),
+        TextureUse(r26.w,
+        vec3(uintBitsToFloat(r27.x), uintBitsToFloat(r27.y), uintBitsToFloat(r27.z)),
+        vec3(uintBitsToFloat(r27.w), uintBitsToFloat(r28.x), uintBitsToFloat(r28.y))),
+        TextureUse(r28.z,
+        vec3(uintBitsToFloat(r28.w), uintBitsToFloat(r29.x), uintBitsToFloat(r29.y)),
+        vec3(uintBitsToFloat(r29.z), uintBitsToFloat(r29.w), uintBitsToFloat(r30.x))),
+        TextureUse(r30.y,
+        vec3(uintBitsToFloat(r30.z), uintBitsToFloat(r30.w), uintBitsToFloat(r31.x)),
+        vec3(uintBitsToFloat(r31.y), uintBitsToFloat(r31.z), uintBitsToFloat(r31.w))),
+        TextureUse(r32.x,
+        vec3(uintBitsToFloat(r32.y), uintBitsToFloat(r32.z), uintBitsToFloat(r32.w)),
+        vec3(uintBitsToFloat(r33.x), uintBitsToFloat(r33.y), uintBitsToFloat(r33.z))),
+        TextureUse(r33.w,
+        vec3(uintBitsToFloat(r34.x), uintBitsToFloat(r34.y), uintBitsToFloat(r34.z)),
+        vec3(uintBitsToFloat(r34.w), uintBitsToFloat(r35.x), uintBitsToFloat(r35.y))),
+        TextureUse(r35.z,
+        vec3(uintBitsToFloat(r35.w), uintBitsToFloat(r36.x), uintBitsToFloat(r36.y)),
+        vec3(uintBitsToFloat(r36.z), uintBitsToFloat(r36.w), uintBitsToFloat(r37.x))),
+        TextureUse(r37.y,
+        vec3(uintBitsToFloat(r37.z), uintBitsToFloat(r37.w), uintBitsToFloat(r38.x)),
+        vec3(uintBitsToFloat(r38.y), uintBitsToFloat(r38.z), uintBitsToFloat(r38.w))),
+        TextureUse(r39.x,
+        vec3(uintBitsToFloat(r39.y), uintBitsToFloat(r39.z), uintBitsToFloat(r39.w)),
+        vec3(uintBitsToFloat(r40.x), uintBitsToFloat(r40.y), uintBitsToFloat(r40.z))),
+        r40.w);
 }
 #else
 layout(set = 0, binding = B_MATERIALS, scalar) readonly buffer material_block { Material material_table[]; };
@@ -186,6 +269,37 @@ Material material_at(uint i) {
         material_table[at].normal_texture,
         material_table[at].emissive_texture,
         material_table[at].transmission_texture,
+        material_table[at].coat,
+        material_table[at].coat_roughness,
+        material_table[at].coat_normal_scale,
+        material_table[at].coat_table,
+        material_table[at].white_table,
+        material_table[at].sheen_table,
+        material_table[at].specular,
+        material_table[at].specular_color,
+        material_table[at].anisotropy,
+        material_table[at].anisotropy_direction,
+        material_table[at].sheen_color,
+        material_table[at].sheen_roughness,
+        material_table[at].film,
+        material_table[at].film_ior,
+        material_table[at].film_thickness,
+        material_table[at].absorption,
+        material_table[at].shine,
+        material_table[at].shine_color,
+        material_table[at].dispersion,
+        material_table[at].coat_texture,
+        material_table[at].coat_roughness_texture,
+        material_table[at].coat_normal_texture,
+        material_table[at].specular_texture,
+        material_table[at].specular_color_texture,
+        material_table[at].anisotropy_texture,
+        material_table[at].sheen_color_texture,
+        material_table[at].sheen_roughness_texture,
+        material_table[at].film_texture,
+        material_table[at].film_thickness_texture,
+        material_table[at].shine_texture,
+        material_table[at].shine_color_texture,
         material_table[at].reserved);
 }
 #endif

@@ -123,7 +123,7 @@ void trace_slots(uint base) {
         } else {
             // The code that shades is large, and stands once for all vertices.
             Point s = shading_point(hit, begins ? toward_eye(hit) : -normalize(branches.next.direction));
-            if (begins) path = begin_path(s);
+            if (begins) path = begin_path(s, sampler_of(slot), hit.id);
             else ended = !arrive(path, branches, hit, s);
             ended = ended || !branch(path, sampler_of(slot), rays, branches) || !follow(path, branches, hit);
         }

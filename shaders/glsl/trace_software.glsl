@@ -21,7 +21,7 @@ void main() {
     Path path;
     bool begins = true;
     do {
-        if (begins) path = begin_path(first);
+        if (begins) path = begin_path(first, rng, met.id);
         Branches branches;
         Hit hit;
         begins = !branch(path, rng, rays, branches) || !follow(path, branches, hit)

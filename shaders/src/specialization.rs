@@ -120,4 +120,22 @@ specialization_constants! {
     /// On GPUs: workgroups of the pass `trace` that keep the whole device busy to the end. A list that has too few samples for so many is cut into
     /// shorter ranges, because a lane that takes three samples one after the other while others idle makes the pass longer.
     TRACE_GROUPS: uint = 1024;
+    /// A material of the scene has a clear coat.
+    HAS_CLEARCOAT: bool = true;
+    /// A dielectric of the scene reflects in a colour of its own, or less than its index says.
+    HAS_SPECULAR_COLOR: bool = true;
+    /// A material of the scene is rougher along one direction.
+    HAS_ANISOTROPY: bool = true;
+    /// A material of the scene has fibres.
+    HAS_SHEEN: bool = true;
+    /// A solid of the scene absorbs light.
+    HAS_ABSORPTION: bool = true;
+    /// A material of the scene is partly there.
+    HAS_ALPHA_BLEND: bool = true;
+    /// A material of the scene has a thin film.
+    HAS_IRIDESCENCE: bool = true;
+    /// Light shines through a material of the scene in every direction.
+    HAS_DIFFUSE_TRANSMISSION: bool = true;
+    /// A solid of the scene refracts colours differently.
+    HAS_DISPERSION: bool = true;
 }

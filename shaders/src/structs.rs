@@ -411,8 +411,70 @@ gpu_structs! {
         emissive_texture: TextureUse,
         /// Transmission.
         transmission_texture: TextureUse,
+        /// Strength of the clear coat, 0..1.
+        coat: f32,
+        /// Perceptual roughness of the coat.
+        coat_roughness: f32,
+        /// Strength of the coat's own normal map.
+        coat_normal_scale: f32,
+        /// Which albedo table has the coat's.
+        coat_table: u32,
+        /// Which albedo table has what facets reflect that reflect everything.
+        white_table: u32,
+        /// Which albedo table has the sheen's as it was fitted. The next has what is left of it.
+        sheen_table: u32,
+        /// Strength of a dielectric's reflection, 0..1.
+        specular: f32,
+        /// Its colour at normal incidence.
+        specular_color: [f32; 3],
+        /// 0..1.
+        anisotropy: f32,
+        /// Cosine and sine of the angle from the tangent toward the bitangent.
+        anisotropy_direction: [f32; 2],
+        /// Colour of the sheen.
+        sheen_color: [f32; 3],
+        /// Perceptual roughness of the sheen.
+        sheen_roughness: f32,
+        /// Strength of the thin film, 0..1.
+        film: f32,
+        /// Its index of refraction.
+        film_ior: f32,
+        /// Its thickness where the texture is 0 and 1, nanometres.
+        film_thickness: [f32; 2],
+        /// What the solid absorbs, per metre.
+        absorption: [f32; 3],
+        /// Share of the diffuse light that leaves on the other side.
+        shine: f32,
+        /// Its colour.
+        shine_color: [f32; 3],
+        /// 20 over Abbe's number.
+        dispersion: f32,
+        /// Strength of the coat.
+        coat_texture: TextureUse,
+        /// Its roughness.
+        coat_roughness_texture: TextureUse,
+        /// Its normals.
+        coat_normal_texture: TextureUse,
+        /// Strength of the dielectric reflection.
+        specular_texture: TextureUse,
+        /// Its colour.
+        specular_color_texture: TextureUse,
+        /// Direction and strength of anisotropy.
+        anisotropy_texture: TextureUse,
+        /// Colour of the sheen.
+        sheen_color_texture: TextureUse,
+        /// Its roughness.
+        sheen_roughness_texture: TextureUse,
+        /// Strength of the film.
+        film_texture: TextureUse,
+        /// Its thickness.
+        film_thickness_texture: TextureUse,
+        /// Share of the light that shines through.
+        shine_texture: TextureUse,
+        /// Its colour.
+        shine_color_texture: TextureUse,
         /// 0.
-        reserved: [u32; 2],
+        reserved: u32,
     }
 
     /// Where a texture's texels are.
@@ -509,6 +571,7 @@ pub const CONSTANTS: &[(&str, u32)] = &[
     ("MATERIAL_DOUBLE_SIDED", MATERIAL_DOUBLE_SIDED),
     ("MATERIAL_THIN", MATERIAL_THIN),
     ("MATERIAL_TRANSMISSIVE", MATERIAL_TRANSMISSIVE),
+    ("MATERIAL_BLEND", MATERIAL_BLEND),
     ("LIGHT_TRIANGLE", LIGHT_TRIANGLE),
     ("LIGHT_POINT", LIGHT_POINT),
     ("LIGHT_SPOT", LIGHT_SPOT),
@@ -579,8 +642,10 @@ pub const HORIZON_STEPS: u32 = 15;
 pub const MATERIAL_DOUBLE_SIDED: u32 = 1;
 /// Transmission goes straight.
 pub const MATERIAL_THIN: u32 = 2;
-/// Transmission can be above zero.
+/// Light can pass, straight or in every direction.
 pub const MATERIAL_TRANSMISSIVE: u32 = 4;
+/// Alpha is the share of the surface that is there.
+pub const MATERIAL_BLEND: u32 = 8;
 /// Emissive triangle.
 pub const LIGHT_TRIANGLE: u32 = 0;
 /// Point light.

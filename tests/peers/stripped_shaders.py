@@ -18,7 +18,9 @@ GLSL = pathlib.Path(__file__).resolve().parents[2] / "shaders/glsl"
 # Values for a rig that needs nothing. The environment is constant (1), because something must light the scene.
 LEAN = {"HAS_TEXTURES": "false", "HAS_NORMAL_MAPS": "false", "HAS_ALPHA_MASK": "false", "HAS_TRANSMISSION": "false", "HAS_SPECULAR": "false",
         "HAS_EMISSIVE": "false", "HAS_PUNCTUAL": "false", "ENVIRONMENT_KIND": "1", "HAS_CLAMP": "false", "HAS_DIFFUSE": "true", "SAMPLER": "0",
-        "HAS_GUIDES": "true", "HAS_DEMODULATION": "false", "HAS_FILTER": "false"}
+        "HAS_GUIDES": "true", "HAS_DEMODULATION": "false", "HAS_FILTER": "false", "HAS_CLEARCOAT": "false",
+        "HAS_SPECULAR_COLOR": "false", "HAS_ANISOTROPY": "false", "HAS_SHEEN": "false", "HAS_ABSORPTION": "false", "HAS_ALPHA_BLEND": "false",
+        "HAS_IRIDESCENCE": "false", "HAS_DIFFUSE_TRANSMISSION": "false", "HAS_DISPERSION": "false"}
 SHADERS = [("trace", ["-DTEXEL_TABLES"]), ("trace", []), ("primary", ["-DTEXEL_TABLES"]), ("primary", []),
            ("reproject_point", []), ("accumulate_samples", []), ("spatial_regression", []), ("compensate", [])]
 CONSTANT = re.compile(r"layout\(constant_id = (\d+)\) const (\w+) (\w+) = \w+;")

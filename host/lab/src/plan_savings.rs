@@ -7,6 +7,7 @@ use dpm_render::gpu::Gpu;
 use dpm_render::method::{Method, SamplerKind, HISTORY_CAP};
 use dpm_render::{FrameSlot, Keep, RenderError, Renderer, RendererSettings};
 use dpm_rig::rig::Rig;
+use dpm_scene::lobes::*;
 use dpm_scene::{Environment, Material, Scene};
 use glam::Vec3;
 use serde::Serialize;
@@ -67,6 +68,15 @@ pub(super) fn keeping(feature: &str, method: &Method) -> Option<Keep> {
         "transmission" => &mut keep.needs.transmission,
         "specular" => &mut keep.needs.specular,
         "diffuse" => &mut keep.needs.diffuse,
+        "alpha blend" => &mut keep.needs.alpha_blend,
+        "clear coat" => &mut keep.needs.clearcoat,
+        "specular colour" => &mut keep.needs.specular_color,
+        "anisotropy" => &mut keep.needs.anisotropy,
+        "sheen" => &mut keep.needs.sheen,
+        "absorption" => &mut keep.needs.absorption,
+        "thin film" => &mut keep.needs.iridescence,
+        "diffuse transmission" => &mut keep.needs.diffuse_transmission,
+        "dispersion" => &mut keep.needs.dispersion,
         "emissive" => &mut keep.needs.emissive,
         "punctual lights" => &mut keep.needs.punctual,
         "firefly clamp" => &mut keep.needs.clamp,
@@ -121,9 +131,21 @@ pub(super) fn changed(feature: &str, scene: &Scene) -> Option<Scene> {
         "textures" => every(&|m| {
             (m.base_color_texture, m.metallic_roughness_texture, m.normal_texture) = (None, None, None);
             (m.emissive_texture, m.transmission_texture) = (None, None);
+            m.lobes.textures_mut().into_iter().for_each(|t| *t = None);
         }),
         "normal maps" => every(&|m| m.normal_texture = None),
-        "alpha mask" => every(&|m| m.alpha_cutoff = None),
+        "alpha mask" => every(&|m| (m.alpha_cutoff, m.alpha_blend) = (None, false)),
+        "alpha blend" => every(&|m| m.alpha_blend = false),
+        "clear coat" => every(&|m| m.lobes.coat = Coat::default()),
+        "specular colour" => every(&|m| m.lobes.specular = Specular::default()),
+        "anisotropy" => every(&|m| m.lobes.anisotropy = Anisotropy::default()),
+        "sheen" => every(&|m| m.lobes.sheen = Sheen::default()),
+        "absorption" => every(&|m| m.lobes.absorption = Vec3::ZERO),
+        "thin film" => every(&|m| m.lobes.film = Film::default()),
+        "diffuse transmission" => {
+            every(&|m| m.lobes.diffuse_transmission = DiffuseTransmission::default());
+        }
+        "dispersion" => every(&|m| m.lobes.dispersion = 0.0),
         "transmission" => every(&|m| (m.transmission, m.transmission_texture) = (0.0, None)),
         "specular" => {
             every(&|m| (m.ior, m.metallic, m.metallic_roughness_texture) = (1.0, 0.0, None));
@@ -261,11 +283,11 @@ mod tests {
             features.iter().filter_map(|f| Some(format!("{:?}", keeping(f, &history)?))).collect();
         kept.sort();
         kept.dedup();
-        assert_eq!(kept.len(), 12, "each puts back another part: {kept:#?}");
-        assert_eq!(with(&history), 12, "the switches of SceneNeeds but the environment's, and those of Keep");
-        assert_eq!(with(&Method { dpm: true, ..history.clone() }), 13, "what the last frame told");
-        assert_eq!(with(&Method::full(1)), 11, "without a history there are no rates");
-        assert_eq!(with(&Method { rate_map: true, ..history }), 11, "rates that are read are no spare code");
+        assert_eq!(kept.len(), 21, "each puts back another part: {kept:#?}");
+        assert_eq!(with(&history), 21, "the switches of SceneNeeds but the environment's, and those of Keep");
+        assert_eq!(with(&Method { dpm: true, ..history.clone() }), 22, "what the last frame told");
+        assert_eq!(with(&Method::full(1)), 20, "without a history there are no rates");
+        assert_eq!(with(&Method { rate_map: true, ..history }), 20, "rates that are read are no spare code");
     }
 
     #[test]
@@ -344,7 +366,7 @@ mod tests {
             let changes: Vec<_> = features.iter().filter_map(|f| Some((*f, changed(f, scene)?))).collect();
             assert_eq!(
                 changes.len(),
-                12 - 2,
+                21 - 2,
                 "all parts of scenes but the clamp, which is a setting, and the tree"
             );
             for (feature, other) in changes {

@@ -15,6 +15,7 @@ use dpm_rig::rig::Rig;
 use dpm_rig::run_rig::{open_gpu, traced_raster};
 use dpm_scene::bvh::{BodyBvh, Refit};
 use dpm_scene::{Body, Deformed, Environment, Material, Scene, TextureRef};
+use glam::Vec3;
 use serde::Serialize;
 
 /// One part that not every rig needs.
@@ -104,9 +105,10 @@ pub(crate) fn scene_entries(scene: &Scene, needs: &SceneNeeds, clamp: f64) -> Ve
         part(
             "alpha mask",
             needs.alpha_mask,
-            material(scene, |m| m.alpha_cutoff.is_some()),
+            material(scene, |m| m.alpha_cutoff.is_some() || m.alpha_blend),
             "no material is cut out",
         ),
+        part("alpha blend", needs.alpha_blend, material(scene, |m| m.alpha_blend), "all is there or not"),
         part(
             "transmission",
             needs.transmission,
@@ -124,6 +126,54 @@ pub(crate) fn scene_entries(scene: &Scene, needs: &SceneNeeds, clamp: f64) -> Ve
             needs.diffuse,
             material(scene, |m| m.metallic < 1.0 || m.metallic_roughness_texture.is_some()),
             "every material is metal",
+        ),
+        part(
+            "clear coat",
+            needs.clearcoat,
+            material(scene, |m| m.lobes.coat.factor > 0.0),
+            "no material has KHR_materials_clearcoat",
+        ),
+        part(
+            "specular colour",
+            needs.specular_color,
+            material(scene, |m| !m.lobes.specular.is_plain()),
+            "no material has KHR_materials_specular",
+        ),
+        part(
+            "anisotropy",
+            needs.anisotropy,
+            material(scene, |m| m.lobes.anisotropy.strength > 0.0),
+            "no material has KHR_materials_anisotropy",
+        ),
+        part(
+            "sheen",
+            needs.sheen,
+            material(scene, |m| m.lobes.sheen.color != Vec3::ZERO),
+            "no material has KHR_materials_sheen",
+        ),
+        part(
+            "absorption",
+            needs.absorption,
+            material(scene, |m| m.lobes.absorption != Vec3::ZERO),
+            "no solid absorbs (KHR_materials_volume)",
+        ),
+        part(
+            "thin film",
+            needs.iridescence,
+            material(scene, |m| m.lobes.film.factor > 0.0),
+            "no material has KHR_materials_iridescence",
+        ),
+        part(
+            "diffuse transmission",
+            needs.diffuse_transmission,
+            material(scene, |m| m.lobes.diffuse_transmission.factor > 0.0),
+            "no material has KHR_materials_diffuse_transmission",
+        ),
+        part(
+            "dispersion",
+            needs.dispersion,
+            material(scene, |m| m.lobes.dispersion > 0.0),
+            "no solid has KHR_materials_dispersion",
         ),
         part(
             "emissive",

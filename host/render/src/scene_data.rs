@@ -11,6 +11,7 @@ use bytemuck::Zeroable;
 use dpm_scene::albedo_table::{tabulated, AlbedoTable, ALBEDO_NODES};
 use dpm_scene::bvh::BodyBvh;
 use dpm_scene::horizon::{horizons, Horizon, CLOSED};
+use dpm_scene::lobes::{Coat, Lobes, LEAST_COVERAGE, THICKEST_FILM_NM};
 use dpm_scene::mesh::MAX_COORDINATE_M;
 use dpm_scene::{picture_at, LinearTexel, Scene, TextureRef, ToLinear, TriangleMesh, Wrap};
 use dpm_shaders::structs::{
@@ -279,17 +280,39 @@ impl SceneData {
         let iors: Vec<f32> = scene.materials.iter().map(ior_of).collect();
         let (tables, table_of) = tabulated(&iors);
         self.albedo.extend(tables.iter().flat_map(|&ior| albedo_cells(&AlbedoTable::new(ior))));
-        for (((m, used), &ior), table) in scene.materials.iter().zip(used).zip(&iors).zip(table_of) {
-            let transmissive = m.transmission > 0.0;
+        let lobes = || scene.materials.iter().zip(&used).filter(|(_, used)| **used).map(|(m, _)| &m.lobes);
+        let mut made = tables.len() as u32;
+        let mut extra = |wanted: bool, make: &dyn Fn() -> Vec<AlbedoTable>| {
+            let tables = if wanted { make() } else { vec![] };
+            self.albedo.extend(tables.iter().flat_map(albedo_cells));
+            made += tables.len() as u32;
+            made - tables.len() as u32
+        };
+        let coat_table = extra(lobes().any(|l| l.coat.factor > 0.0), &|| vec![AlbedoTable::new(Coat::IOR)]);
+        let facets = |l: &Lobes| !l.specular.is_plain() || l.film.factor > 0.0;
+        let white_table = extra(lobes().any(facets), &|| vec![AlbedoTable::white()]);
+        let sheen_table =
+            extra(lobes().any(|l| l.sheen.color != Vec3::ZERO), &|| AlbedoTable::sheen().to_vec());
+        for (((m, &used), &ior), table) in scene.materials.iter().zip(&used).zip(&iors).zip(table_of) {
+            let (transmissive, lobes) = (m.transmission > 0.0, &m.lobes);
             let metal_everywhere = m.metallic >= 1.0 && m.metallic_roughness_texture.is_none();
             if used {
                 let needs = &mut self.needs;
                 needs.textures |= m.textures().any(|t| t.is_some());
                 needs.normal_maps |= m.normal_texture.is_some();
-                needs.alpha_mask |= m.alpha_cutoff.is_some();
+                needs.alpha_mask |= m.alpha_cutoff.is_some() || m.alpha_blend;
                 needs.transmission |= transmissive;
                 needs.specular |= m.metallic > 0.0 || ior != 1.0;
                 needs.diffuse |= !metal_everywhere;
+                needs.clearcoat |= lobes.coat.factor > 0.0;
+                needs.specular_color |= !lobes.specular.is_plain() && !metal_everywhere && ior != 1.0;
+                needs.anisotropy |= lobes.anisotropy.strength > 0.0;
+                needs.sheen |= lobes.sheen.color != Vec3::ZERO;
+                needs.absorption |= lobes.absorption != Vec3::ZERO;
+                needs.alpha_blend |= m.alpha_blend;
+                needs.iridescence |= lobes.film.factor > 0.0;
+                needs.diffuse_transmission |= lobes.diffuse_transmission.factor > 0.0 && !metal_everywhere;
+                needs.dispersion |= lobes.dispersion > 0.0 && transmissive && !m.thin_walled;
             }
             let mut flags = 0;
             if m.double_sided {
@@ -298,14 +321,18 @@ impl SceneData {
             if m.thin_walled || ior < STRAIGHT_BELOW_IOR {
                 flags |= gpu::MATERIAL_THIN;
             }
-            if transmissive {
+            if m.shines_through() {
                 flags |= gpu::MATERIAL_TRANSMISSIVE;
             }
+            if m.alpha_blend {
+                flags |= gpu::MATERIAL_BLEND;
+            }
+            let Lobes { coat, specular, anisotropy, sheen, film, diffuse_transmission, .. } = *lobes;
             self.materials.push(Material {
                 base_color: m.base_color.into(),
                 alpha: m.alpha,
                 emissive: bounded(m.emissive).into(),
-                alpha_cutoff: m.alpha_cutoff.unwrap_or(-1.0),
+                alpha_cutoff: m.alpha_cutoff.unwrap_or(if m.alpha_blend { LEAST_COVERAGE } else { -1.0 }),
                 metallic: m.metallic,
                 roughness: m.roughness,
                 ior,
@@ -318,7 +345,38 @@ impl SceneData {
                 normal_texture: texture_use(m.normal_texture),
                 emissive_texture: texture_use(m.emissive_texture),
                 transmission_texture: texture_use(m.transmission_texture),
-                reserved: [0; 2],
+                coat: coat.factor,
+                coat_roughness: coat.roughness,
+                coat_normal_scale: coat.normal_scale,
+                coat_table,
+                white_table,
+                sheen_table,
+                specular: specular.factor,
+                specular_color: specular.color.into(),
+                anisotropy: anisotropy.strength,
+                anisotropy_direction: anisotropy.direction().into(),
+                sheen_color: sheen.color.into(),
+                sheen_roughness: sheen.roughness,
+                film: film.factor,
+                film_ior: film.ior,
+                film_thickness: film.thickness_nm.map(|nm| nm.min(THICKEST_FILM_NM)),
+                absorption: if m.thin_walled { [0.0; 3] } else { lobes.absorption.into() },
+                shine: diffuse_transmission.factor,
+                shine_color: diffuse_transmission.color.into(),
+                dispersion: if m.thin_walled { 0.0 } else { lobes.dispersion },
+                coat_texture: texture_use(coat.texture),
+                coat_roughness_texture: texture_use(coat.roughness_texture),
+                coat_normal_texture: texture_use(coat.normal_texture),
+                specular_texture: texture_use(specular.texture),
+                specular_color_texture: texture_use(specular.color_texture),
+                anisotropy_texture: texture_use(anisotropy.texture),
+                sheen_color_texture: texture_use(sheen.color_texture),
+                sheen_roughness_texture: texture_use(sheen.roughness_texture),
+                film_texture: texture_use(film.texture),
+                film_thickness_texture: texture_use(film.thickness_texture),
+                shine_texture: texture_use(diffuse_transmission.texture),
+                shine_color_texture: texture_use(diffuse_transmission.color_texture),
+                reserved: 0,
             });
         }
     }

@@ -53,6 +53,24 @@ scene_needs! {
     body_tree => HAS_BODY_TREE,
     /// The luminance of indirect contributions is limited.
     clamp => HAS_CLAMP,
+    /// A material has a clear coat.
+    clearcoat => HAS_CLEARCOAT,
+    /// A dielectric reflects in a colour of its own, or less than its index says.
+    specular_color => HAS_SPECULAR_COLOR,
+    /// A material is rougher along one direction.
+    anisotropy => HAS_ANISOTROPY,
+    /// A material has fibres.
+    sheen => HAS_SHEEN,
+    /// A solid absorbs light.
+    absorption => HAS_ABSORPTION,
+    /// A material is partly there.
+    alpha_blend => HAS_ALPHA_BLEND,
+    /// A material has a thin film.
+    iridescence => HAS_IRIDESCENCE,
+    /// Light shines through a material in every direction.
+    diffuse_transmission => HAS_DIFFUSE_TRANSMISSION,
+    /// A solid refracts colours differently.
+    dispersion => HAS_DISPERSION,
 }
 
 #[cfg(test)]

@@ -32,18 +32,36 @@ pub struct AlbedoTable {
 impl AlbedoTable {
     /// Integrates the table, which takes a few hundredths of a second. An `ior` below 1 or not finite counts as 1.
     pub fn new(ior: f32) -> Self {
-        let n = ALBEDO_NODES;
         let ior = if ior.is_finite() { ior.max(1.0) } else { 1.0 };
-        let mut directional = vec![0.0; n * n];
-        if ior > 1.0 {
-            let rule = Quadrature::new(20, 10);
-            for j in 0..n {
-                for i in 0..n {
-                    let (mu, alpha) = (node(i), node(j));
-                    directional[j * n + i] = by_quadrature(f64::from(ior), mu, alpha, &rule) as f32;
-                }
-            }
-        }
+        let rule = Quadrature::new(20, 10);
+        Self::of(ior, |mu, alpha| match ior {
+            1.0 => 0.0,
+            _ => by_quadrature(f64::from(ior), mu, alpha, &rule),
+        })
+    }
+
+    /// The table of facets that reflect everything: what a rough surface loses is the rest. Its index is infinite.
+    pub fn white() -> Self {
+        let rule = Quadrature::new(20, 10);
+        Self::of(f32::INFINITY, |mu, alpha| by_quadrature(f64::INFINITY, mu, alpha, &rule))
+    }
+
+    /// The tables of a white sheen, whose alpha is the sheen's. The first is the model's albedo as it was fitted: at grazing
+    /// angles it is above 1, up to 6 where the sheen is narrow. The second is what is left of it after the value was
+    /// divided by the larger albedo of both directions where that is above 1.
+    pub fn sheen() -> [Self; 2] {
+        let rule = (gauss_legendre(48), gauss_legendre(64));
+        let fitted = Self::of(0.0, |mu, alpha| sheen_albedo(mu, alpha, &rule, &|_| 1.0));
+        let limited = Self::of(0.0, |mu, alpha| {
+            let own = fitted.directional(mu, alpha).max(1.0);
+            sheen_albedo(mu, alpha, &rule, &|cos| own.max(fitted.directional(cos, alpha)))
+        });
+        [fitted, limited]
+    }
+
+    fn of(ior: f32, albedo: impl Fn(f64, f64) -> f64) -> Self {
+        let n = ALBEDO_NODES;
+        let directional: Vec<f32> = (0..n * n).map(|k| albedo(node(k % n), node(k / n)) as f32).collect();
         let average = directional.chunks_exact(n).map(|row| row_average(row) as f32).collect();
         Self { ior, directional, average }
     }
@@ -151,8 +169,8 @@ pub fn directional_albedo(ior: f64, mu: f64, alpha: f64) -> f64 {
 /// Unpolarised reflectance of a smooth dielectric interface from Fresnel's two amplitudes, by the cosines on both
 /// sides. `ior` >= 1, `cos` 0..1.
 fn fresnel(ior: f64, cos: f64) -> f64 {
-    if ior == 1.0 {
-        return 0.0;
+    if ior == 1.0 || ior.is_infinite() {
+        return if ior == 1.0 { 0.0 } else { 1.0 };
     }
     let inside = (1.0 - (1.0 - cos * cos) / (ior * ior)).sqrt();
     let across = (cos - ior * inside) / (cos + ior * inside);
@@ -238,6 +256,49 @@ fn by_quadrature(ior: f64, mu: f64, alpha: f64, rule: &Quadrature) -> f64 {
         }
     }
     sum
+}
+
+/// Width below which no sheen is narrower.
+pub const LEAST_SHEEN_ALPHA: f64 = 1e-3;
+
+/// Directional albedo of a white sheen, `integral D V (n.l) dl`, with D and V of \[Estevez17\] as KHR_materials_sheen has
+/// them. `rule`: nodes of the azimuth, and of the square root of the cosine of `l`.
+///
+/// `divided`: by what the value is divided for the cosine of `l`.
+fn sheen_albedo(
+    mu: f64,
+    alpha: f64,
+    rule: &(Vec<(f64, f64)>, Vec<(f64, f64)>),
+    divided: &dyn Fn(f64) -> f64,
+) -> f64 {
+    // No surface is seen at a smaller cosine.
+    let (mu, alpha) = (mu.max(1e-3), alpha.max(LEAST_SHEEN_ALPHA));
+    let v = DVec3::new((1.0 - mu * mu).max(0.0).sqrt(), 0.0, mu);
+    let lambda_v = sheen_lambda(mu, alpha);
+    let mut sum = 0.0;
+    for &(root, weight) in &rule.1 {
+        let cos = root * root;
+        let sin = (1.0 - cos * cos).sqrt();
+        // (n.l) of the integrand and of V cancel.
+        let visible = 1.0 / (divided(cos) * (1.0 + lambda_v + sheen_lambda(cos, alpha)) * 4.0 * mu);
+        for &(part, share) in &rule.0 {
+            let (sin_phi, cos_phi) = (PI * part).sin_cos();
+            let h = (v + DVec3::new(sin * cos_phi, sin * sin_phi, cos)).normalize();
+            let fibres = (2.0 + 1.0 / alpha) * (1.0 - h.z * h.z).max(0.0).powf(0.5 / alpha) / (2.0 * PI);
+            sum += weight * 2.0 * root * share * 2.0 * PI * fibres * visible;
+        }
+    }
+    sum
+}
+
+/// The fitted shadowing of \[Estevez17\].
+fn sheen_lambda(cos: f64, alpha: f64) -> f64 {
+    let t = (1.0 - alpha) * (1.0 - alpha);
+    let mix = |a: f64, b: f64| a + (b - a) * t;
+    let [a, b, c] = [mix(21.5473, 25.3245), mix(3.82987, 3.32435), mix(0.19823, 0.16801)];
+    let [d, e] = [mix(-1.97760, -1.27393), mix(-4.32054, -4.85967)];
+    let fit = |x: f64| a / (1.0 + b * x.powf(c)) + d * x + e;
+    if cos < 0.5 { fit(cos) } else { 2.0 * fit(0.5) - fit(1.0 - cos) }.exp()
 }
 
 /// Where a continuous function changes sign between `a` and `b`, by bisection; `None` if its ends have the same sign.
@@ -333,6 +394,41 @@ mod tests {
         }
         // Hemispherical reflectance of a smooth dielectric of index 1.5: 0.0918 [Duntley42].
         assert!((t.average(0.0) - 0.0918).abs() < 3e-4, "{}", t.average(0.0));
+    }
+
+    #[test]
+    fn facets_that_reflect_everything_lose_what_single_scattering_loses() {
+        let t = AlbedoTable::white();
+        assert!((t.directional(1.0, 0.0) - 1.0).abs() < 1e-7 && (t.average(0.0) - 1.0).abs() < 1e-6);
+        for (alpha, expected) in [(0.25, 0.882 / 0.9), (1.0, 0.55)] {
+            let average = t.average(alpha);
+            assert!(average < 1.0 && average > expected - 0.2, "{alpha}: {average}");
+        }
+        // No coat reflects more than that.
+        let coat = AlbedoTable::new(2.4);
+        assert!(t.directional.iter().zip(&coat.directional).all(|(all, some)| *all >= some - 1e-4));
+    }
+
+    #[test]
+    fn sheen_converges_and_reflects_no_more_than_it_gets() {
+        let (used, fine) =
+            ((gauss_legendre(48), gauss_legendre(64)), (gauss_legendre(160), gauss_legendre(200)));
+        let [fitted, limited] = AlbedoTable::sheen();
+        assert!(limited.directional.iter().chain(&limited.average).all(|e| (0.0..=1.0).contains(e)));
+        for j in (0..ALBEDO_NODES).step_by(3) {
+            for i in (0..ALBEDO_NODES).step_by(3) {
+                let (mu, alpha) = (node(i), node(j));
+                let [a, b] = [&used, &fine].map(|rule| sheen_albedo(mu, alpha, rule, &|_| 1.0));
+                assert!((a - b).abs() < 2e-3 * b.max(1.0), "mu {mu} alpha {alpha}: {a} {b}");
+            }
+        }
+        // Where the model sends out no more than it gets, it is as it was fitted.
+        for mu in [0.2, 0.5, 1.0] {
+            for alpha in [0.1, 0.5, 1.0] {
+                let [a, b] = [&fitted, &limited].map(|t| t.directional(mu, alpha));
+                assert!((a - b).abs() < 2e-3, "mu {mu} alpha {alpha}: {a} {b}");
+            }
+        }
     }
 
     #[test]

@@ -32,6 +32,7 @@ mod limits;
 mod linear_picture;
 mod live_pictures;
 mod load;
+pub mod lobes;
 pub mod mesh;
 mod mesh_file;
 pub mod names;
@@ -168,16 +169,18 @@ impl TextureRef {
     }
 }
 
-/// The target material: glTF 2.0 metallic-roughness with emissive strength, ior and transmission. The model is defined
-/// in `docs/RENDERING.md`, "Materials".
+/// The target material: glTF 2.0 metallic-roughness with the extensions of [`lobes`]. The model is defined in
+/// `docs/RENDERING.md`, "Materials".
 #[derive(Clone, Debug)]
 pub struct Material {
     /// Name in the file, for messages.
     pub name: String,
     /// Linear base colour, 0..1.
     pub base_color: Vec3,
-    /// MASK: below this alpha the surface is invisible. `None`: opaque.
+    /// MASK: below this alpha the surface is invisible. `None`: opaque, or [`Self::alpha_blend`].
     pub alpha_cutoff: Option<f32>,
+    /// BLEND: alpha is the share of the surface that is there. The rest of the light goes straight through.
+    pub alpha_blend: bool,
     /// Alpha factor of the base colour.
     pub alpha: f32,
     /// 0..1.
@@ -209,6 +212,8 @@ pub struct Material {
     pub emissive_texture: Option<TextureRef>,
     /// Linear; red is transmission.
     pub transmission_texture: Option<TextureRef>,
+    /// Lobes that few materials have.
+    pub lobes: lobes::Lobes,
 }
 
 impl Material {
@@ -222,6 +227,12 @@ impl Material {
             self.transmission_texture,
         ]
         .into_iter()
+        .chain(self.lobes.textures())
+    }
+
+    /// Light passes through the surface, so that its back is shaded, too.
+    pub fn shines_through(&self) -> bool {
+        self.transmission > 0.0 || self.lobes.diffuse_transmission.factor > 0.0
     }
 }
 
@@ -275,6 +286,7 @@ impl Default for Material {
             name: "default".into(),
             base_color: Vec3::ONE,
             alpha_cutoff: None,
+            alpha_blend: false,
             alpha: 1.0,
             metallic: 1.0,
             roughness: 1.0,
@@ -290,6 +302,7 @@ impl Default for Material {
             normal_texture: None,
             emissive_texture: None,
             transmission_texture: None,
+            lobes: lobes::Lobes::default(),
         }
     }
 }

@@ -80,15 +80,7 @@ impl SceneFeatures {
             out.emissive_triangles += if emits { triangles } else { 0 };
             out.lamp_triangles += if emits && !m.unlit { triangles } else { 0 };
             out.normal_maps |= m.normal_texture.is_some();
-            out.textures |= [
-                m.base_color_texture,
-                m.metallic_roughness_texture,
-                m.normal_texture,
-                m.emissive_texture,
-                m.transmission_texture,
-            ]
-            .iter()
-            .any(Option::is_some);
+            out.textures |= m.textures().any(|t| t.is_some());
             // An opaque alpha of 1 without a texture never falls below the cut-off.
             out.masks |= m.alpha_cutoff.is_some_and(|c| m.base_color_texture.is_some() || m.alpha < c);
             out.transmission |= transmits;

@@ -9,6 +9,7 @@ use dpm_render::{Renderer, RendererSettings};
 use dpm_rig::config::{Overrides, RenderMethod, RigConfig};
 use dpm_rig::pipeline::renderer_settings;
 use dpm_rig::rig::Rig;
+use dpm_scene::lobes::*;
 use dpm_scene::shapes::*;
 use dpm_scene::{Material, PunctualKind, PunctualLight, Scene};
 use dpm_tests::compare::{assert_same_picture, bits};
@@ -68,6 +69,23 @@ fn scenes() -> Vec<(&'static str, Scene)> {
     out.push(("one texture", textured.clone()));
     textured.materials[0].alpha_cutoff = Some(0.5);
     out.push(("a mask without holes", textured));
+    // Each lobe alone: the code of the others must not touch it.
+    let plastic = Material { roughness: 0.4, ..diffuse(Vec3::splat(0.5)) }.tap(|m| m.ior = 1.5);
+    let glass = Material { transmission: 1.0, thin_walled: false, ..plastic.clone() };
+    let lobes: [(&str, &Material, fn(&mut Lobes)); 8] = [
+        ("a coat", &plastic, |l| l.coat = Coat { factor: 1.0, roughness: 0.3, ..Coat::default() }),
+        ("a colour of its own", &plastic, |l| l.specular.color = Vec3::new(2.0, 1.0, 0.0)),
+        ("brushed", &plastic, |l| l.anisotropy.strength = 0.6),
+        ("sheen", &plastic, |l| l.sheen = Sheen { color: Vec3::ONE, roughness: 0.5, ..Sheen::default() }),
+        ("a film", &plastic, |l| l.film.factor = 1.0),
+        ("light shines through", &plastic, |l| l.diffuse_transmission.factor = 0.5),
+        ("absorption", &glass, |l| l.absorption = Vec3::new(1.0, 2.0, 0.0)),
+        ("dispersion", &glass, |l| l.dispersion = 0.5),
+    ];
+    for (name, base, change) in lobes {
+        out.push((name, room(base.clone().tap(|m| change(&mut m.lobes)))));
+    }
+    out.push(("a veil", room(plastic.tap(|m| (m.alpha, m.alpha_blend) = (0.4, true)))));
     out
 }
 

@@ -12,10 +12,12 @@ use glam::{DVec3, Vec3};
 
 /// Cases that take several seconds each, and whose law another case holds as well. They are of the second tier, which runs
 /// all cases, with validation. `tests/mutations/run` reads this list.
-pub(crate) const SLOW: [&str; 12] = [
+pub(crate) const SLOW: [&str; 14] = [
     "gpu-constant-input",
     "gpu-energy-of-every-lobe",
     "gpu-lights-that-touch",
+    "gpu-lobes-against-reference",
+    "gpu-lobes-energy",
     "gpu-mean-in-motion",
     "gpu-mean-in-motion-metal",
     "gpu-no-light",

@@ -3,7 +3,7 @@
 //! `alpha` is the GGX width (perceptual roughness squared). Sources: \[Walter07\] (distribution, refraction), \[Heitz14\]
 //! (height-correlated shadowing), \[Heitz18\] and \[Dupuy23\] (sampling of visible normals by a spherical cap).
 
-use glam::DVec3;
+use glam::{DVec2, DVec3};
 use std::f64::consts::PI;
 
 /// Unpolarised reflectance of a dielectric interface. `eta`: index behind the surface over the index in front, above 0.
@@ -102,4 +102,29 @@ pub(crate) fn sample_visible_normal(v: DVec3, alpha: f64, u: [f64; 2]) -> Option
     let sin = (1.0 - z * z).max(0.0).sqrt();
     let h = DVec3::new(sin * phi.cos(), sin * phi.sin(), z) + v_std;
     DVec3::new(h.x * alpha, h.y * alpha, h.z.max(0.0)).try_normalize()
+}
+
+/// The same density where the surface is `alpha.x` rough along x and `alpha.y` along y.
+pub(crate) fn brushed_d(h: DVec3, alpha: DVec2) -> f64 {
+    if h.z <= 0.0 {
+        return 0.0;
+    }
+    let t = (h.x / alpha.x).powi(2) + (h.y / alpha.y).powi(2) + h.z * h.z;
+    1.0 / (PI * alpha.x * alpha.y * t * t)
+}
+
+/// The width of a brushed surface along the azimuth of a direction.
+pub(crate) fn width_along(w: DVec3, alpha: DVec2) -> f64 {
+    let across = w.truncate();
+    match across.try_normalize() {
+        Some(d) => (d * alpha).length(),
+        None => (0.5 * alpha.length_squared()).sqrt(),
+    }
+}
+
+/// As [`sample_visible_normal`], for a brushed surface.
+pub(crate) fn sample_brushed_normal(v: DVec3, alpha: DVec2, u: [f64; 2]) -> Option<DVec3> {
+    let stretched = DVec3::new(v.x * alpha.x, v.y * alpha.y, v.z);
+    let h = sample_visible_normal(stretched.normalize(), 1.0, u)?;
+    DVec3::new(h.x * alpha.x, h.y * alpha.y, h.z).try_normalize()
 }

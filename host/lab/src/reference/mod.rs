@@ -12,6 +12,7 @@ pub(crate) mod bsdf;
 pub mod bvh;
 mod image;
 mod light;
+pub(crate) mod lobes;
 pub(crate) mod microfacet;
 mod path;
 mod surface;
@@ -23,6 +24,7 @@ pub use surface::SurfacePoint;
 
 use bvh::{Bvh, Hit, Triangle};
 use dpm_scene::albedo_table::{tabulated, AlbedoTable};
+use dpm_scene::lobes::LEAST_COVERAGE;
 use dpm_scene::Scene;
 use glam::{DAffine3, DMat3, DVec3};
 use light::Lights;
@@ -41,6 +43,8 @@ pub(crate) struct Reference<'a> {
     tables: Vec<(f32, OnceLock<AlbedoTable>)>,
     table_of_material: Vec<usize>,
     lights: Lights,
+    /// Some material is only partly there.
+    blends: bool,
     /// Triangles left out because a vertex is not finite or the area is zero.
     pub dropped_triangles: usize,
 }
@@ -79,6 +83,7 @@ impl<'a> Reference<'a> {
             tables,
             table_of_material,
             lights,
+            blends: scene.materials.iter().any(|m| m.alpha_blend),
             dropped_triangles,
         }
     }
@@ -125,7 +130,27 @@ impl<'a> Reference<'a> {
             return false;
         }
         let material = &self.scene.materials[body.mesh.materials[triangle.index as usize] as usize];
-        material.alpha_cutoff.is_none_or(|cutoff| self.alpha(hit) >= f64::from(cutoff))
+        let least = if material.alpha_blend { Some(LEAST_COVERAGE) } else { material.alpha_cutoff };
+        least.is_none_or(|least| self.alpha(hit) >= f64::from(least))
+    }
+
+    /// Whether a ray of a path meets a hit: a surface that is only partly there decides by chance, of the ray (`key`) and the triangle.
+    fn is_met(&self, hit: &Hit, key: u64) -> bool {
+        let triangle = self.bvh.triangle(hit.triangle);
+        let mesh = &self.scene.bodies[triangle.body as usize].mesh;
+        if !self.scene.materials[mesh.materials[triangle.index as usize] as usize].alpha_blend {
+            return self.exists(hit, false);
+        }
+        Sampler::new(key, hit.triangle as u64).uniform() < self.alpha(hit)
+    }
+
+    /// The number that decides what a ray meets; 0 where nothing is left to chance.
+    fn ray_key(&self, sampler: &mut Sampler) -> u64 {
+        if self.blends {
+            sampler.next_u64()
+        } else {
+            0
+        }
     }
 }
 

@@ -6,6 +6,7 @@
 use super::bsdf::Bsdf;
 use super::bvh::Hit;
 use super::light::Sky;
+use super::lobes::left_by;
 use super::{offset, Reference, Sampler, SurfacePoint};
 use glam::DVec3;
 
@@ -19,6 +20,15 @@ fn balance(own: f64, other: f64) -> f64 {
         own / (own + other)
     } else {
         0.0
+    }
+}
+
+/// What a ray from a point goes through: the solid that begins there, or nothing.
+fn along(point: &SurfacePoint, direction: DVec3) -> DVec3 {
+    if point.geometric.dot(direction) < 0.0 {
+        point.look.lobes.absorption
+    } else {
+        DVec3::ZERO
     }
 }
 
@@ -37,6 +47,22 @@ impl Reference<'_> {
         let mut sum = DVec3::ZERO;
         // Density of the direction that led here; None at x1 and behind a delta lobe, where light sampling has no part.
         let mut pdf: Option<f64> = None;
+        if point.look.lobes.coverage < 1.0 && sampler.uniform() >= point.look.lobes.coverage {
+            // The sample looks through the first surface.
+            let (on, key) = (-toward_viewer, self.ray_key(sampler));
+            let origin = offset(point.position, point.geometric, on, point.scale);
+            match self.bvh.closest(origin, on, f64::INFINITY, |hit| self.is_met(hit, key)) {
+                Some(hit) => {
+                    let met = self.resolve(&hit);
+                    if met.geometric.dot(on) > 0.0 {
+                        let way = met.position.distance(point.position);
+                        throughput *= left_by(met.look.lobes.absorption, way);
+                    }
+                    point = met;
+                }
+                None => return self.lights.sky_radiance(on),
+            }
+        }
         for vertex in 1..=depth {
             let facing = point.geometric.dot(v);
             if point.look.emission != DVec3::ZERO && (facing > 0.0 || point.look.emits_behind) {
@@ -45,10 +71,23 @@ impl Reference<'_> {
                         self.lights.triangle_pdf(point.bvh_triangle) * point.distance * point.distance;
                     balance(pdf, by_light / facing.abs())
                 });
-                sum += throughput * point.look.emission * weight;
+                sum += throughput * point.look.emission * point.look.lobes.over_emission(facing) * weight;
             }
             if vertex == depth {
                 break;
+            }
+            if point.look.lobes.dispersion > 0.0 && !point.look.thin {
+                // The path goes on with one channel, chosen by the light that it carries.
+                let total = throughput.element_sum();
+                let mut u = sampler.uniform() * total;
+                let chosen = (0..3).find(|&c| {
+                    let here = u < throughput[c];
+                    u -= throughput[c];
+                    here
+                });
+                let channel = chosen.unwrap_or(0);
+                throughput = DVec3::AXES[channel] * total;
+                point.look.ior = point.look.lobes.index_of_channel(point.look.ior, channel);
             }
             let table = self.table(point.look.material);
             let Some(bsdf) = Bsdf::new(&point, table, v) else { break };
@@ -70,9 +109,21 @@ impl Reference<'_> {
             }
             pdf = next.pdf;
             let origin = offset(point.position, point.geometric, next.l, point.scale);
-            match self.trace(origin, next.l, f64::INFINITY, false) {
-                Some(hit) => point = hit,
+            let medium = along(&point, next.l);
+            let key = self.ray_key(sampler);
+            match self.bvh.closest(origin, next.l, f64::INFINITY, |hit| self.is_met(hit, key)) {
+                Some(hit) => {
+                    let met = self.resolve(&hit);
+                    // The back of a solid is met from within it, wherever the ray comes from.
+                    let of_solid = met.look.lobes.absorption;
+                    let behind = met.geometric.dot(next.l) > 0.0;
+                    let pick = |c: usize| if behind && of_solid[c] > 0.0 { of_solid[c] } else { medium[c] };
+                    let absorption = DVec3::new(pick(0), pick(1), pick(2));
+                    throughput *= left_by(absorption, met.position.distance(point.position));
+                    point = met;
+                }
                 None => {
+                    throughput *= left_by(medium, f64::INFINITY);
                     let weight = pdf.map_or(1.0, |pdf| balance(pdf, self.lights.sky_pdf(next.l)));
                     sum += throughput * self.lights.sky_radiance(next.l) * weight;
                     break;
@@ -81,6 +132,10 @@ impl Reference<'_> {
             v = -next.l;
         }
         sum
+    }
+
+    fn is_blocked(&self, origin: DVec3, direction: DVec3, t_max: f64, key: u64) -> bool {
+        self.bvh.any(origin, direction, t_max, |hit| self.is_met(hit, key))
     }
 
     /// Light sampled at a vertex, scattered toward the viewer.
@@ -95,28 +150,31 @@ impl Reference<'_> {
             let way = light.position - point.position;
             let (distance, l) = (way.length(), way.normalize_or_zero());
             let facing = -light.geometric.dot(l);
-            let emits =
-                (facing > 0.0 || light.look.emits_behind) && facing != 0.0 && self.exists(&hit, false);
+            let key = self.ray_key(sampler);
+            let emits = (facing > 0.0 || light.look.emits_behind) && facing != 0.0 && self.is_met(&hit, key);
             let value = if emits { bsdf.evaluate(l) } else { Default::default() };
             if value.f_cos != DVec3::ZERO && light.look.emission != DVec3::ZERO {
                 let by_light = s.pdf_area * distance * distance / facing.abs();
                 let (from, to) = (start(l), offset(light.position, light.geometric, -l, light.scale));
                 let between = to - from;
                 let length = between.length();
-                if length == 0.0 || !self.occluded(from, between / length, length * JUST_BEFORE, false) {
+                if length == 0.0 || !self.is_blocked(from, between / length, length * JUST_BEFORE, key) {
+                    let emission = light.look.emission * light.look.lobes.over_emission(facing);
                     // balance / by_light, without dividing by a density that may underflow
-                    sum += value.f_cos * light.look.emission / (by_light + value.pdf);
+                    sum +=
+                        value.f_cos * emission * left_by(along(point, l), distance) / (by_light + value.pdf);
                 }
             }
         }
 
+        let key = self.ray_key(sampler);
         self.lights.punctual(point.position, sampler.uniform(), |a| {
             let value = bsdf.evaluate(a.l);
             if value.f_cos != DVec3::ZERO
                 && a.irradiance != DVec3::ZERO
-                && !self.occluded(start(a.l), a.l, a.distance * JUST_BEFORE, false)
+                && !self.is_blocked(start(a.l), a.l, a.distance * JUST_BEFORE, key)
             {
-                sum += value.f_cos * a.irradiance;
+                sum += value.f_cos * a.irradiance * left_by(along(point, a.l), a.distance);
             }
         });
 
@@ -125,9 +183,10 @@ impl Reference<'_> {
                 let value = bsdf.evaluate(l);
                 if value.f_cos != DVec3::ZERO
                     && by_light > 0.0
-                    && !self.occluded(start(l), l, f64::INFINITY, false)
+                    && !self.is_blocked(start(l), l, f64::INFINITY, key)
                 {
-                    sum += value.f_cos * image.radiance(l) / (by_light + value.pdf);
+                    let left = left_by(along(point, l), f64::INFINITY);
+                    sum += value.f_cos * image.radiance(l) * left / (by_light + value.pdf);
                 }
             }
         }

@@ -2,7 +2,7 @@
 
 use super::{
     gpu_chain, gpu_disocclusion, gpu_filter, gpu_histories_in_motion, gpu_history, gpu_paper, gpu_samplers,
-    gpu_tracer, gpu_traversal, Case,
+    gpu_tracer, gpu_traversal, lobes, Case,
 };
 use dpm_render::gpu::{Gpu, GpuOptions};
 use std::sync::Arc;
@@ -48,6 +48,7 @@ impl GpuCase {
 pub fn cases(device: &Device) -> Vec<Case> {
     let all = [
         gpu_tracer::CASES,
+        lobes::GPU_CASES,
         gpu_traversal::CASES,
         gpu_history::CASES,
         gpu_filter::CASES,

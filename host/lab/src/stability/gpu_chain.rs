@@ -43,6 +43,14 @@ pub(crate) const CASES: &[GpuCase] = &[
 
 /// A scene of three bodies and lights, and their poses.
 fn by_chance(seed: u64) -> (Scene, Vec<DAffine3>) {
+    furnish(seed, &mut |_, _, _| ())
+}
+
+/// The same, with the materials of two bodies changed by `change`, which draws from a sampler of its own.
+pub(super) fn furnish(
+    seed: u64,
+    change: &mut dyn FnMut(&mut Scene, &mut Sampler, &mut Material),
+) -> (Scene, Vec<DAffine3>) {
     let mut s = Sampler::new(seed, 7);
     let mut u = || s.uniform() as f32;
     let mut scene = Scene::default();
@@ -51,7 +59,7 @@ fn by_chance(seed: u64) -> (Scene, Vec<DAffine3>) {
     let base_color_texture = if u() < 0.5 { use_texture(&mut scene, texture) } else { None };
     let ground = Material { base_color_texture, ..diffuse(Vec3::new(0.3 + 0.6 * u(), 0.3 + 0.6 * u(), 0.5)) };
     add(&mut scene, floor(1.2, 0.0), ground);
-    for k in 0..2 {
+    for k in 0..2u64 {
         let metallic = if u() < 0.3 { 1.0 } else { 0.0 };
         let transmission = if u() < 0.3 { u() } else { 0.0 };
         let look = Material {
@@ -77,11 +85,12 @@ fn by_chance(seed: u64) -> (Scene, Vec<DAffine3>) {
                 quad(Vec3::new(-a, -c, -b), Vec3::Z * 2.0 * b, Vec3::Y * 2.0 * c),
             ])
         };
+        let mut look = look;
+        change(&mut scene, &mut Sampler::new(seed, 100 + k), &mut look);
         add(&mut scene, shape, look);
         let turn =
             DQuat::from_euler(glam::EulerRot::XYZ, f64::from(u()), 6.0 * f64::from(u()), f64::from(u()));
-        let at =
-            DVec3::new(f64::from(k) * 0.9 - 0.45, 0.45 + 0.2 * f64::from(u()), 0.6 * f64::from(u()) - 0.3);
+        let at = DVec3::new(k as f64 * 0.9 - 0.45, 0.45 + 0.2 * f64::from(u()), 0.6 * f64::from(u()) - 0.3);
         poses.push(DAffine3::from_rotation_translation(turn, at));
     }
     let lamp = quad(Vec3::new(-0.4, 1.7, -0.4), Vec3::X * (0.3 + u()), Vec3::Z * (0.3 + u()));

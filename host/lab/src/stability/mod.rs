@@ -23,6 +23,7 @@ pub mod gpu_shot;
 mod gpu_tracer;
 mod gpu_traversal;
 mod interval;
+mod lobes;
 #[cfg(test)]
 mod numerics_table;
 mod planes;
@@ -192,6 +193,7 @@ pub fn cases() -> Vec<Case> {
     let all = [
         tracer::CASES,
         scattering::CASES,
+        lobes::CASES,
         predictor::CASES,
         clocks::CASES,
         calibration::CASES,

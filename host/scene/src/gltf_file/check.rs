@@ -13,14 +13,20 @@ use super::json::{shorten, Item};
 use super::ktx2_image;
 
 /// Extensions that this program understands, or may ignore without a wrong picture.
-const UNDERSTOOD: [&str; 18] = [
+const UNDERSTOOD: [&str; 24] = [
     compressed::DRACO,
     compressed::MESHOPT[0],
     compressed::MESHOPT[1],
     instancing::NAME,
     "KHR_lights_punctual",
+    "KHR_materials_anisotropy",
+    "KHR_materials_clearcoat",
+    "KHR_materials_diffuse_transmission",
+    "KHR_materials_dispersion",
     "KHR_materials_emissive_strength",
     "KHR_materials_ior",
+    "KHR_materials_iridescence",
+    "KHR_materials_sheen",
     "KHR_materials_specular",
     "KHR_materials_transmission",
     "KHR_materials_unlit",

@@ -3,6 +3,7 @@
 use super::super::{Limits, SceneError};
 use super::check::Counts;
 use super::json::{shorten, Item};
+use super::lobes::{check_lobes, LOBES};
 
 /// Radiance factors and intensities beyond this count as damage.
 const GREATEST_INTENSITY: f32 = 1.0e9;
@@ -58,7 +59,7 @@ pub(crate) fn check_look(
 }
 
 /// Checks a use of a texture.
-fn check_texture(owner: &Item, key: &str, counts: &Counts) -> Result<(), SceneError> {
+pub(super) fn check_texture(owner: &Item, key: &str, counts: &Counts) -> Result<(), SceneError> {
     let Some(info) = owner.object(key)? else { return Ok(()) };
     info.index("index", counts.textures, "texture")?.ok_or_else(|| info.error("has no 'index'"))?;
     small_whole(&info, "texCoord")?;
@@ -79,7 +80,7 @@ fn small_whole(item: &Item, key: &str) -> Result<(), SceneError> {
 }
 
 /// A number that must be in a range if present.
-fn ranged(item: &Item, key: &str, low: f32, high: f32) -> Result<(), SceneError> {
+pub(super) fn ranged(item: &Item, key: &str, low: f32, high: f32) -> Result<(), SceneError> {
     match item.number(key)? {
         Some(x) if !(low..=high).contains(&x) => {
             Err(item.error(format!("'{key}' is {x}; it must be from {low} to {high}")))
@@ -88,7 +89,7 @@ fn ranged(item: &Item, key: &str, low: f32, high: f32) -> Result<(), SceneError>
     }
 }
 
-fn ranged_list<const N: usize>(item: &Item, key: &str, high: f32) -> Result<(), SceneError> {
+pub(super) fn ranged_list<const N: usize>(item: &Item, key: &str, high: f32) -> Result<(), SceneError> {
     match item.numbers::<N>(key)? {
         Some(list) if list.iter().any(|x| !(0.0..=high).contains(x)) => {
             Err(item.error(format!("'{key}' is {list:?}; each must be from 0 to {high}")))
@@ -98,7 +99,7 @@ fn ranged_list<const N: usize>(item: &Item, key: &str, high: f32) -> Result<(), 
 }
 
 /// The reader clamps factors 0..1 that writers round to slightly above 1.
-const UNIT: f32 = 1.001;
+pub(super) const UNIT: f32 = 1.001;
 
 fn check_material(material: &Item, counts: &Counts, warnings: &mut Vec<String>) -> Result<(), SceneError> {
     if let Some(pbr) = material.object("pbrMetallicRoughness")? {
@@ -118,10 +119,7 @@ fn check_material(material: &Item, counts: &Counts, warnings: &mut Vec<String>) 
     ranged(material, "alphaCutoff", 0.0, f32::MAX)?;
     material.flag("doubleSided")?;
     match material.text("alphaMode")? {
-        None | Some("OPAQUE" | "MASK") => {}
-        Some("BLEND") => {
-            warnings.push(format!("{}: alphaMode BLEND is shown as MASK with cut-off 0.5", material.name))
-        }
+        None | Some("OPAQUE" | "MASK" | "BLEND") => {}
         Some(other) => {
             return Err(material
                 .error(format!("'alphaMode' is '{}'; it must be OPAQUE, MASK or BLEND", shorten(other))))
@@ -144,12 +142,11 @@ fn check_material(material: &Item, counts: &Counts, warnings: &mut Vec<String>) 
         ranged(&e, "attenuationDistance", 0.0, f32::MAX)?;
         ranged_list::<3>(&e, "attenuationColor", UNIT)?;
         check_texture(&e, "thicknessTexture", counts)?;
-        if e.get("attenuationColor").is_some() || e.get("attenuationDistance").is_some() {
-            warnings.push(format!("{}: absorption inside the volume is ignored", material.name));
-        }
     }
+    check_lobes(material, counts)?;
     if let Some(extensions) = material.object("extensions")? {
-        for name in extensions.keys().filter(|n| !REPRODUCED.contains(&n.as_str())) {
+        let known = |n: &&String| REPRODUCED.iter().chain(&LOBES).any(|known| known == n);
+        for name in extensions.keys().filter(|n| !known(n)) {
             warnings.push(format!("{}: {} is ignored", material.name, shorten(name)));
         }
     }

@@ -9,6 +9,7 @@ use super::super::{Limits, Material, SceneError, Texture, TextureRef, Wrap};
 use super::accessor::Data;
 use super::container::{fetch, Folder};
 use super::json::Item;
+use super::lobes::read_lobes;
 use super::picture::{self, Picture, Size};
 
 /// The result of [`read_look`].
@@ -63,7 +64,9 @@ fn unlit(material: Material) -> Material {
         emissive_texture: material.base_color_texture,
         base_color: Vec3::ZERO,
         // Its alpha cuts.
-        base_color_texture: material.base_color_texture.filter(|_| material.alpha_cutoff.is_some()),
+        base_color_texture: material
+            .base_color_texture
+            .filter(|_| material.alpha_cutoff.is_some() || material.alpha_blend),
         metallic: 0.0,
         roughness: 1.0,
         // Without a coat.
@@ -71,6 +74,7 @@ fn unlit(material: Material) -> Material {
         name: material.name,
         alpha: material.alpha,
         alpha_cutoff: material.alpha_cutoff,
+        alpha_blend: material.alpha_blend,
         double_sided: material.double_sided,
         unlit: true,
         ..Material::default()
@@ -94,9 +98,11 @@ struct Reader<'a> {
 
 /// The slot of the texture that tilts a surface.
 const NORMAL: &str = "normal";
+/// The slot of the texture that tilts a clear coat.
+pub(super) const COAT_NORMAL: &str = "clearcoat normal";
 
 /// A texture reference of a material before its image is decoded.
-struct Use {
+pub(super) struct Use {
     slot: &'static str,
     texture: usize,
     uv_set: u32,
@@ -116,9 +122,8 @@ impl Reader<'_> {
         let pbr = m.pbr_metallic_roughness();
         let [r, g, b, alpha] = pbr.base_color_factor().map(|x| x.clamp(0.0, 1.0));
         let alpha_cutoff = match m.alpha_mode() {
-            gltf::material::AlphaMode::Opaque => None,
+            gltf::material::AlphaMode::Opaque | gltf::material::AlphaMode::Blend => None,
             gltf::material::AlphaMode::Mask => Some(m.alpha_cutoff().unwrap_or(0.5)),
-            gltf::material::AlphaMode::Blend => Some(0.5),
         };
         let strength = m.emissive_strength().unwrap_or(1.0);
         // In the extension, 0 means "reflects everything"; it occurs in converted files and is not physical.
@@ -126,6 +131,8 @@ impl Reader<'_> {
         if m.ior() == Some(0.0) {
             warnings.push(format!("{}: ior 0 is read as 1.5", raw.name));
         }
+        let thin_walled = m.volume().is_none_or(|v| v.thickness_factor() <= 0.0);
+        let (lobes, lobe_uses) = read_lobes(raw, thin_walled)?;
         let mut out = Material {
             name: m.name().map_or_else(|| raw.name.clone(), str::to_owned),
             base_color: Vec3::new(r, g, b),
@@ -136,7 +143,8 @@ impl Reader<'_> {
             emissive: Vec3::from(m.emissive_factor()) * strength,
             ior,
             transmission: m.transmission().map_or(0.0, |t| t.transmission_factor().clamp(0.0, 1.0)),
-            thin_walled: m.volume().is_none_or(|v| v.thickness_factor() <= 0.0),
+            thin_walled,
+            lobes,
             double_sided: m.double_sided(),
             normal_scale: m.normal_texture().map_or(1.0, |n| n.scale()),
             ..Material::default()
@@ -144,17 +152,16 @@ impl Reader<'_> {
         let uses = [
             pbr.base_color_texture().map(|i| plain_use("base colour", &i, true)),
             pbr.metallic_roughness_texture().map(|i| plain_use("metallic-roughness", &i, false)),
-            match m.normal_texture() {
-                Some(n) => Some(normal_use(&n, raw)?),
-                None => None,
-            },
+            // The crate does not provide the transform of a normal texture.
+            raw_use(NORMAL, raw, "normalTexture", false)?,
             m.emissive_texture().map(|i| plain_use("emissive", &i, true)),
             m.transmission()
                 .and_then(|t| t.transmission_texture())
                 .map(|i| plain_use("transmission", &i, false)),
         ];
-        let uv_set = uses.iter().flatten().next().map_or(0, |u| u.uv_set);
-        for u in uses.iter().flatten().filter(|u| u.uv_set != uv_set) {
+        let all = || uses.iter().chain(&lobe_uses).flatten();
+        let uv_set = all().next().map_or(0, |u| u.uv_set);
+        for u in all().filter(|u| u.uv_set != uv_set) {
             warnings.push(format!(
                 "{}: the {} texture uses coordinate set {}, but set {uv_set} is read for the whole material: it will look wrong",
                 raw.name, u.slot, u.uv_set
@@ -173,6 +180,15 @@ impl Reader<'_> {
             out.emissive_texture,
             out.transmission_texture,
         ] = references;
+        for (place, u) in out.lobes.textures_mut().into_iter().zip(&lobe_uses) {
+            if let Some(u) = u {
+                *place = self.reference(u, warnings)?;
+            }
+        }
+        // Exporters write BLEND for much that is opaque everywhere.
+        let opaque = |t: TextureRef| self.textures[t.texture as usize].texels.iter().all(|t| t[3] == 255);
+        out.alpha_blend = m.alpha_mode() == gltf::material::AlphaMode::Blend
+            && !(alpha >= 1.0 && out.base_color_texture.is_none_or(opaque));
         if m.unlit() {
             out = unlit(out);
         }
@@ -183,7 +199,7 @@ impl Reader<'_> {
     fn reference(&mut self, u: &Use, warnings: &mut Vec<String>) -> Result<Option<TextureRef>, SceneError> {
         let image = self.image(u, warnings)?;
         let Some(Some(picture)) = self.images.get(&image) else { return Ok(None) };
-        let heights = u.slot == NORMAL && picture.red_green_only;
+        let heights = [NORMAL, COAT_NORMAL].contains(&u.slot) && picture.red_green_only;
         let sampler = self.document.textures().nth(u.texture).and_then(|t| t.sampler().index());
         let key = (image, sampler, u.srgb, heights);
         let texture = match self.known.get(&key) {
@@ -312,26 +328,22 @@ fn plain_use(slot: &'static str, info: &gltf::texture::Info, srgb: bool) -> Use 
     }
 }
 
-/// The crate does not provide the transform of a normal texture, so it is read from the JSON.
-fn normal_use(normal: &gltf::material::NormalTexture, material: &Item) -> Result<Use, SceneError> {
-    let transform = match material.object("normalTexture")? {
-        Some(info) => info.extension("KHR_texture_transform")?,
-        None => None,
-    };
-    let mut out = Use {
-        slot: NORMAL,
-        texture: normal.texture().index(),
-        uv_set: normal.tex_coord(),
-        offset: [0.0; 2],
-        rotation: 0.0,
-        scale: [1.0; 2],
-        srgb: false,
-    };
-    if let Some(t) = transform {
+/// The use of a texture that is at `key`, from the JSON.
+pub(super) fn raw_use(
+    slot: &'static str,
+    owner: &Item,
+    key: &str,
+    srgb: bool,
+) -> Result<Option<Use>, SceneError> {
+    let Some(info) = owner.object(key)? else { return Ok(None) };
+    let texture = info.whole("index")?.ok_or_else(|| info.error("has no 'index'"))? as usize;
+    let uv_set = info.whole("texCoord")?.unwrap_or(0) as u32;
+    let mut out = Use { slot, texture, uv_set, offset: [0.0; 2], rotation: 0.0, scale: [1.0; 2], srgb };
+    if let Some(t) = info.extension("KHR_texture_transform")? {
         out.offset = t.numbers("offset")?.unwrap_or(out.offset);
         out.scale = t.numbers("scale")?.unwrap_or(out.scale);
         out.rotation = t.number("rotation")?.unwrap_or(0.0);
         out.uv_set = t.whole("texCoord")?.map_or(out.uv_set, |s| s as u32);
     }
-    Ok(out)
+    Ok(Some(out))
 }

@@ -13,6 +13,7 @@ mod flatten;
 mod instancing;
 mod json;
 mod ktx2_image;
+mod lobes;
 mod look;
 mod picture;
 mod primitive;
@@ -23,6 +24,7 @@ use std::path::Path;
 use serde_json::Value;
 
 use super::limits::Cancel;
+use super::lobes::MOST_ABSORPTION;
 use super::{Environment, Limits, LoadOptions, Scene, SceneError, Texture};
 use container::Folder;
 use json::Item;
@@ -108,6 +110,12 @@ pub(super) fn read(
     let claims = flatten::choose_bodies(&document, &hidden, options, &mut warnings)?;
     let mut look = look::read_look(&document, &root, &data, folder.as_ref(), limits, cancel, &mut warnings)?;
     let world = flatten::world_from_file(options);
+    // Light goes the further through a solid the larger the file's unit makes it.
+    let unit_m = options.scale.unwrap_or(1.0);
+    for lobes in look.materials.iter_mut().map(|m| &mut m.lobes) {
+        let per_metre = lobes.absorption.as_dvec3() / unit_m;
+        lobes.absorption = per_metre.min(glam::DVec3::splat(f64::from(MOST_ABSORPTION))).as_vec3();
+    }
     let source = flatten::Source {
         document: &document,
         data: &data,
