@@ -32,6 +32,22 @@ fn assert_refused(cases: Vec<(&str, Vec<u8>, &[&str])>) {
     }
 }
 
+/// Every listed file is refused, or read without what is damaged, with words that hold all those that are listed.
+fn assert_told(cases: Vec<(&str, Vec<u8>, &[&str])>) {
+    for (name, bytes, words) in cases {
+        let start = core_seconds();
+        let message = match dpm_scene::load_bytes(&bytes, &LoadOptions::default()) {
+            Ok(scene) => scene.warnings.join("\n"),
+            Err(e @ SceneError::Internal(_)) => panic!("{name} made the loader panic: {e}"),
+            Err(e) => e.to_string(),
+        };
+        assert!(core_seconds() - start < 5.0, "{name} took {:.1} core-seconds", core_seconds() - start);
+        for word in words {
+            assert!(message.contains(word), "{name}: '{message}' does not say '{word}'");
+        }
+    }
+}
+
 fn set(pointer: &str, value: Value) -> Vec<u8> {
     tetrahedra().set(pointer, value).bytes()
 }
@@ -55,12 +71,12 @@ fn containers_that_lie() {
     two_documents.extend(b"JSON{}  ");
     let length = two_documents.len() as u32;
     two_documents[8..12].copy_from_slice(&length.to_le_bytes());
-    assert_refused(vec![
+    assert_told(vec![
         ("empty file", vec![], &["empty"]),
         ("only the magic", b"glTF".to_vec(), &["GLB header", "cut off"]),
         ("version 1 container", patched(4, 1), &["GLB header", "version 1", "re-export"]),
         ("length beyond the file", patched(8, u32::MAX), &["promises 4294967295"]),
-        ("length below the file", patched(8, 12), &["promises 12"]),
+        ("length below the file", patched(8, 12), &["no JSON chunk"]),
         ("truncated in the middle", good[..good.len() / 2].to_vec(), &["cut off"]),
         ("chunk beyond the file", patched(12, u32::MAX - 3), &["GLB chunk 0", "left"]),
         (
@@ -277,7 +293,7 @@ fn trees_that_are_none() {
         "{message}"
     );
     assert!(dpm_scene::load_bytes(&chain(255), &LoadOptions::default()).is_ok());
-    assert_refused(vec![
+    assert_told(vec![
         ("depth 100,000", chain(100_000), &["deeper than 256"]),
         ("node is its own child", set("/nodes/0/children", json!([0])), &["cycle"]),
         (
@@ -324,7 +340,7 @@ fn trees_that_are_none() {
         (
             "movable body scaled to nothing",
             set("/nodes/0/scale", json!([0, 0, 0])),
-            &["body 'left'", "scale of zero"],
+            &["node 0 'left'", "scaled to nothing"],
         ),
         ("mesh 3", set("/nodes/0/mesh", json!(3)), &["node 0 'left'", "mesh 3"]),
     ]);
@@ -414,7 +430,7 @@ fn images_that_lie() {
     let good = png(4, 4, &[[9, 9, 9, 255]; 16]);
     assert!(dpm_scene::load_bytes(&with_image(&good).bytes(), &LoadOptions::default()).is_ok());
     let uri = |uri: &str| with_image(&good).set("/images/0", json!({"uri": uri})).bytes();
-    assert_refused(vec![
+    assert_told(vec![
         (
             "65,535 x 65,535 texels",
             with_image(&png_claiming(65_535, 65_535)).bytes(),
@@ -427,8 +443,8 @@ fn images_that_lie() {
         ),
         ("size beyond the data", with_image(&png_claiming(4000, 4000)).bytes(), &["image 0", "decoded"]),
         ("image cut off", with_image(&good[..good.len() / 2]).bytes(), &["image 0", "decoded"]),
-        ("noise", with_image(&[7; 64]).bytes(), &["image 0", "PNG, JPEG or KTX2"]),
-        ("WebP", with_image(b"RIFF\x10\0\0\0WEBPVP8 ....").bytes(), &["image 0", "WebP", "PNG or JPEG"]),
+        ("noise", with_image(&[7; 64]).bytes(), &["image 0", "PNG, JPEG, KTX2"]),
+        ("WebP", with_image(b"RIFF\x10\0\0\0WEBPVP8 ....").bytes(), &["image 0", "decoded"]),
         (
             "view of another world",
             with_image(&good).set("/images/0", json!({"bufferView": 99})).bytes(),
