@@ -189,12 +189,15 @@ vec3 film_change(Point s, float eta, float c) {
     return s.film * (film_reflectance(f0, material_at(s.material).film_ior, s.film_nm, outside) - fresnel_schlick(f0, outside));
 }
 
-// The most that the film changes of the light that facets of a width reflect toward a cosine: that of the mean surface, or of facets that are turned
-// toward the light.
+// What the film changes of the light that facets of a width reflect toward a cosine, in its strongest channel: the mean of four facets that light
+// from there sees.
 float film_change_of(Point s, float alpha, float mu) {
-    float most = -1.0;
-    for (int i = 0; i < 2; i++) most = max(most, max3(film_change(s, s.ior, i == 0 ? mu : min(sqrt(mu * mu + 0.25 * alpha * alpha), 1.0))));
-    return most;
+    vec3 v = vec3(sqrt(max(1.0 - mu * mu, 0.0)), 0.0, mu), sum = vec3(0.0);
+    for (int i = 0; i < 4; i++) {
+        vec3 h = sample_visible_normal(v, max(alpha, 1e-4), vec2(i < 2 ? 0.125 : 0.375, (i & 1) == 0 ? 0.25 : 0.75));
+        sum += film_change(s, s.ior, clamp(dot(v, h), 0.0, 1.0));
+    }
+    return 0.25 * max3(sum);
 }
 
 // Reflectance of a facet at the cosine `c`: of metal and dielectric together, and in `kept` what the dielectric does not let pass of its share.

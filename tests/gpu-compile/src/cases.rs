@@ -3,6 +3,7 @@
 use dpm_render::albedo_map::AlbedoMap;
 use dpm_render::drive::Response;
 use dpm_render::pack::Halftone;
+use dpm_render::scene_data::SceneNeeds;
 use dpm_render::{Keep, Output, RendererPlan, RendererSettings};
 use dpm_rig::config::{Overrides, RenderMethod, RigConfig};
 use dpm_rig::pipeline::renderer_settings;
@@ -31,8 +32,29 @@ fn bunny_venus() -> Scene {
     scene
 }
 
-/// Every part of the shaders, with tables for all that may have one: a sky from a picture, a lens, a response, a flat field, a map of albedo
-/// and halftones.
+/// Name of the case that has every lobe of glTF's extensions at once, which no scene has. The page shows it apart.
+pub const EVERY_LOBE: &str = "every lobe";
+/// Name of the case that has the commonest of them alone.
+pub const COAT: &str = "demo with a clear coat";
+
+/// Code of the tracer for every kind of material but the lobes of glTF's extensions.
+fn all_but_lobes() -> SceneNeeds {
+    SceneNeeds {
+        clearcoat: false,
+        specular_color: false,
+        anisotropy: false,
+        sheen: false,
+        absorption: false,
+        alpha_blend: false,
+        iridescence: false,
+        diffuse_transmission: false,
+        dispersion: false,
+        ..SceneNeeds::default().everything()
+    }
+}
+
+/// Everything that a rig may add to a scene, with tables for all that may have one: a lens, a response, a flat field, a map of albedo and
+/// halftones.
 fn with_everything(settings: RendererSettings, camera: ProjectorCamera) -> Result<RendererSettings, String> {
     let lens = Lens::opencv(&[-0.1, 0.01, 1e-3, 1e-3, 1e-3]).map_err(|e| e.to_string())?;
     let mut drive = settings.drive.clone();
@@ -42,44 +64,49 @@ fn with_everything(settings: RendererSettings, camera: ProjectorCamera) -> Resul
     Ok(RendererSettings {
         drive,
         lens: Some(ProjectorCamera { lens, ..camera }),
-        leave_nothing_out: true,
         clamp_indirect: Some(10.0),
         halftone: Some(Halftone { parts: 8, depth: 1, white: false }),
         ..settings
     })
 }
 
-/// All cases: the demo, bunny-venus and everything by method `dpm`, and two of them by the paper's, whose passes are others.
+/// All cases: the demo, bunny-venus and everything by method `dpm`, and two of them by the paper's, whose passes are others; then the demo with
+/// a clear coat, and everything with every lobe.
 ///
 /// # Errors
 /// The rig of the demo cannot be built.
 pub fn all() -> Result<Vec<Case>, String> {
     let config = RigConfig::demo(&Overrides::default()).map_err(|e| e.to_string())?;
     let rig = Rig::build(&config, None).map_err(|e| e.to_string())?;
-    let mut everything = rig.scene.clone();
-    everything.environment = image_sky(1.0);
-    let scenes = [("demo", &rig.scene), ("bunny-venus", &bunny_venus()), ("everything", &everything)];
-    let mut cases = Vec::new();
-    for (scene_name, scene) in scenes {
-        for method in [RenderMethod::Dpm, RenderMethod::Paper] {
-            // The passes of the paper's method are the same in every scene, apart from what `everything` adds.
-            if method == RenderMethod::Paper && scene_name == "bunny-venus" {
-                continue;
-            }
-            let mut render = rig.config.render.clone();
-            render.method = method;
-            let mut settings = RendererSettings {
-                method: render.to_method(),
-                output: Output::Planes(rig.schedule),
-                ..renderer_settings(&rig)
-            };
-            if scene_name == "everything" {
-                settings = with_everything(settings, rig.camera)?;
-            }
-            let plan = RendererPlan::new(scene, settings, Keep::default()).map_err(|e| e.to_string())?;
-            let by = if method == RenderMethod::Paper { ", paper" } else { "" };
-            cases.push(Case { name: format!("{scene_name}{by}"), plan });
+    let mut full = rig.scene.clone();
+    full.environment = image_sky(1.0);
+    let (demo, bunny_venus) = (&rig.scene, &bunny_venus());
+    let none = SceneNeeds::default();
+    let coat = SceneNeeds { clearcoat: true, ..none };
+    // The passes of the paper's method are the same in every scene, apart from what `everything` adds.
+    let cases = [
+        ("demo", demo, none, RenderMethod::Dpm),
+        ("demo, paper", demo, none, RenderMethod::Paper),
+        ("bunny-venus", bunny_venus, none, RenderMethod::Dpm),
+        ("everything", &full, all_but_lobes(), RenderMethod::Dpm),
+        ("everything, paper", &full, all_but_lobes(), RenderMethod::Paper),
+        (COAT, demo, coat, RenderMethod::Dpm),
+        (EVERY_LOBE, &full, none.everything(), RenderMethod::Dpm),
+    ];
+    let case = |(name, scene, needs, method): (&str, &Scene, SceneNeeds, RenderMethod)| {
+        let mut render = rig.config.render.clone();
+        render.method = method;
+        let mut settings = RendererSettings {
+            method: render.to_method(),
+            output: Output::Planes(rig.schedule),
+            ..renderer_settings(&rig)
+        };
+        if std::ptr::eq(scene, &full) {
+            settings = with_everything(settings, rig.camera)?;
         }
-    }
-    Ok(cases)
+        let keep = Keep { needs, ..Keep::default() };
+        let plan = RendererPlan::new(scene, settings, keep).map_err(|e| e.to_string())?;
+        Ok(Case { name: name.to_owned(), plan })
+    };
+    cases.into_iter().map(case).collect()
 }

@@ -1,11 +1,10 @@
 //! What compilers made of the passes, as rows: measured, written, read.
 
-use crate::cases::Case;
+use crate::cases::{Case, COAT, EVERY_LOBE};
 use crate::targets::Target;
 use dpm_render::gpu::{Executable, Gpu, GpuOptions};
 use dpm_render::Program;
 use serde::{Deserialize, Serialize};
-use std::fmt::Write as _;
 
 /// What one compiler made of one pass.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
@@ -193,6 +192,20 @@ pub fn everything_said(cases: &[Case]) -> Result<Vec<String>, String> {
     Ok(lines)
 }
 
+/// A line of the page: the worst of these rows.
+fn line(pass: &str, target: &str, rows: &[&Row]) -> String {
+    let most = |of: fn(&Row) -> u32| rows.iter().map(|r| of(r)).max().unwrap_or(0);
+    let waves = rows.iter().filter_map(|r| r.waves).min().map_or("-".to_owned(), |w| w.to_string());
+    format!(
+        "| {pass} | {target} | {} | {} | {} | {waves} | {} | {:.1} |\n",
+        most(|r| r.registers),
+        most(|r| r.spills),
+        most(|r| r.scratch),
+        most(|r| r.instructions),
+        f64::from(most(|r| r.code_bytes)) / 1024.0
+    )
+}
+
 /// The line of a target whose driver has no ray query.
 fn lacking(target: &str) -> String {
     match Target::named(target) {
@@ -204,39 +217,39 @@ fn lacking(target: &str) -> String {
 }
 
 impl Table {
-    /// One line for each pass and driver: the worst of all cases.
+    /// One line for each pass and driver: the worst of all cases without lobes of glTF's extensions. Then the tracer's passes of the cases that
+    /// have such.
     pub fn markdown(&self) -> String {
         let mut text = String::from(
             "| pass | target | registers | spills | scratch, bytes | waves of 32 | instructions | code, KiB |\n\
              |---|---|---:|---:|---:|---:|---:|---:|\n",
         );
+        let plain: Vec<&Row> =
+            self.passes.iter().filter(|r| ![COAT, EVERY_LOBE].contains(&r.case.as_str())).collect();
         let mut seen = Vec::new();
         let mut target = None;
-        for row in &self.passes {
+        for row in &plain {
             if let Some(last) = target.replace(&row.target).filter(|last| **last != row.target) {
                 text.push_str(&lacking(last));
             }
             let key = (&row.pass, &row.target);
-            if seen.contains(&key) {
-                continue;
+            if !seen.contains(&key) {
+                seen.push(key);
+                let same: Vec<&Row> = plain.iter().copied().filter(|r| (&r.pass, &r.target) == key).collect();
+                text.push_str(&line(&row.pass, &row.target, &same));
             }
-            seen.push(key);
-            let same = || self.passes.iter().filter(|r| (&r.pass, &r.target) == key);
-            let most = |of: fn(&Row) -> u32| same().map(of).max().unwrap_or(0);
-            let waves = same().filter_map(|r| r.waves).min().map_or("-".to_owned(), |w| w.to_string());
-            let _ = writeln!(
-                text,
-                "| {} | {} | {} | {} | {} | {waves} | {} | {:.1} |",
-                row.pass,
-                row.target,
-                most(|r| r.registers),
-                most(|r| r.spills),
-                most(|r| r.scratch),
-                most(|r| r.instructions),
-                f64::from(most(|r| r.code_bytes)) / 1024.0
-            );
         }
         text.push_str(&target.map_or(String::new(), |last| lacking(last)));
+        text.push_str(
+            "\n| pass of a scene with lobes | target | registers | spills | scratch, bytes | waves of 32 | instructions | code, KiB |\n\
+             |---|---|---:|---:|---:|---:|---:|---:|\n",
+        );
+        for case in [COAT, EVERY_LOBE] {
+            let tracers = |r: &&Row| r.case == case && r.pass.starts_with("trace");
+            for row in self.passes.iter().filter(tracers) {
+                text.push_str(&line(&format!("{}, {case}", row.pass), &row.target, &[row]));
+            }
+        }
         text
     }
 

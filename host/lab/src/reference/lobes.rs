@@ -1,7 +1,7 @@
 //! Thin films, sheen, and what layers let through, in f64: the parts of a material that `docs/RENDERING.md`, "Lobes of
 //! materials", adds to metal, dielectric and transmission.
 
-use super::microfacet::{fresnel_dielectric, fresnel_schlick};
+use super::microfacet::{fresnel_dielectric, fresnel_schlick, sample_visible_normal};
 use dpm_scene::albedo_table::{AlbedoTable, LEAST_SHEEN_ALPHA};
 use dpm_scene::lobes::Coat;
 use glam::{DMat3, DVec2, DVec3};
@@ -163,11 +163,16 @@ pub(super) fn film_change(f0: DVec3, cos: f64, lobes: &LobesHere) -> DVec3 {
     (with - fresnel_schlick(f0, cos)) * lobes.film
 }
 
-/// The most that the film changes of the light that facets of a width reflect toward a cosine: that of the mean surface, or of
-/// facets that are turned toward the light.
+/// What the film changes of the light that facets of a width reflect toward a cosine, in its strongest channel: the mean of four
+/// facets that light from there sees.
 pub(super) fn film_change_of(f0: DVec3, cos: f64, width: f64, lobes: &LobesHere) -> f64 {
-    let turned = (cos * cos + 0.25 * width * width).sqrt().min(1.0);
-    film_change(f0, cos, lobes).max_element().max(film_change(f0, turned, lobes).max_element())
+    let v = DVec3::new((1.0 - cos * cos).max(0.0).sqrt(), 0.0, cos);
+    let seen = [[0.125, 0.25], [0.125, 0.75], [0.375, 0.25], [0.375, 0.75]];
+    let of = |u| {
+        let h = sample_visible_normal(v, width.max(1e-4), u).unwrap_or(DVec3::Z);
+        film_change(f0, v.dot(h).clamp(0.0, 1.0), lobes)
+    };
+    (seen.map(of).into_iter().sum::<DVec3>() / 4.0).max_element()
 }
 
 /// \[Belcour17\] with the constants of KHR_materials_iridescence.

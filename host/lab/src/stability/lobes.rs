@@ -173,7 +173,9 @@ pub(crate) fn looks() -> Vec<Material> {
             for base in [metal(roughness), glass(roughness, false), glass(roughness, true)] {
                 all.push(with(base, |l| l.film = film(nm, 1.33)));
             }
-            all.push(with(plastic(roughness), |l| l.film = film(nm, 1.8)));
+            for ior in [1.8, 2.5] {
+                all.push(with(plastic(roughness), |l| l.film = film(nm, ior)));
+            }
         }
         let specular = Specular { factor: 0.7, color: Vec3::new(4.0, 1.0, 0.0), ..Specular::default() };
         all.push(with(plastic(roughness), |l| l.specular = specular));
