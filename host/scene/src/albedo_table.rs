@@ -50,7 +50,7 @@ impl AlbedoTable {
     /// angles it is above 1, up to 6 where the sheen is narrow. The second is what is left of it after the value was
     /// divided by the larger albedo of both directions where that is above 1.
     pub fn sheen() -> [Self; 2] {
-        let rule = (gauss_legendre(48), gauss_legendre(64));
+        let rule = Quadrature::new(48, 64);
         let fitted = Self::of(0.0, |mu, alpha| sheen_albedo(mu, alpha, &rule, &|_| 1.0));
         let limited = Self::of(0.0, |mu, alpha| {
             let own = fitted.directional(mu, alpha).max(1.0);
@@ -265,23 +265,18 @@ pub const LEAST_SHEEN_ALPHA: f64 = 1e-3;
 /// them. `rule`: nodes of the azimuth, and of the square root of the cosine of `l`.
 ///
 /// `divided`: by what the value is divided for the cosine of `l`.
-fn sheen_albedo(
-    mu: f64,
-    alpha: f64,
-    rule: &(Vec<(f64, f64)>, Vec<(f64, f64)>),
-    divided: &dyn Fn(f64) -> f64,
-) -> f64 {
+fn sheen_albedo(mu: f64, alpha: f64, rule: &Quadrature, divided: &dyn Fn(f64) -> f64) -> f64 {
     // No surface is seen at a smaller cosine.
     let (mu, alpha) = (mu.max(1e-3), alpha.max(LEAST_SHEEN_ALPHA));
     let v = DVec3::new((1.0 - mu * mu).max(0.0).sqrt(), 0.0, mu);
     let lambda_v = sheen_lambda(mu, alpha);
     let mut sum = 0.0;
-    for &(root, weight) in &rule.1 {
+    for &(root, weight) in &rule.tilt {
         let cos = root * root;
         let sin = (1.0 - cos * cos).sqrt();
         // (n.l) of the integrand and of V cancel.
         let visible = 1.0 / (divided(cos) * (1.0 + lambda_v + sheen_lambda(cos, alpha)) * 4.0 * mu);
-        for &(part, share) in &rule.0 {
+        for &(part, share) in &rule.azimuth {
             let (sin_phi, cos_phi) = (PI * part).sin_cos();
             let h = (v + DVec3::new(sin * cos_phi, sin * sin_phi, cos)).normalize();
             let fibres = (2.0 + 1.0 / alpha) * (1.0 - h.z * h.z).max(0.0).powf(0.5 / alpha) / (2.0 * PI);
@@ -411,8 +406,7 @@ mod tests {
 
     #[test]
     fn sheen_converges_and_reflects_no_more_than_it_gets() {
-        let (used, fine) =
-            ((gauss_legendre(48), gauss_legendre(64)), (gauss_legendre(160), gauss_legendre(200)));
+        let (used, fine) = (Quadrature::new(48, 64), Quadrature::new(160, 200));
         let [fitted, limited] = AlbedoTable::sheen();
         assert!(limited.directional.iter().chain(&limited.average).all(|e| (0.0..=1.0).contains(e)));
         for j in (0..ALBEDO_NODES).step_by(3) {

@@ -16,6 +16,9 @@ use dpm_tests::compare::{assert_same_picture, bits};
 use dpm_tests::gpu::with_gpu;
 use glam::{DVec3, Vec3};
 
+/// Gives a material a lobe.
+type Change = fn(&mut Lobes);
+
 /// One scene per thing that can be left out.
 fn scenes() -> Vec<(&'static str, Scene)> {
     let room = |material: Material| {
@@ -72,7 +75,7 @@ fn scenes() -> Vec<(&'static str, Scene)> {
     // Each lobe alone: the code of the others must not touch it.
     let plastic = Material { roughness: 0.4, ..diffuse(Vec3::splat(0.5)) }.tap(|m| m.ior = 1.5);
     let glass = Material { transmission: 1.0, thin_walled: false, ..plastic.clone() };
-    let lobes: [(&str, &Material, fn(&mut Lobes)); 8] = [
+    let lobes: [(&str, &Material, Change); 8] = [
         ("a coat", &plastic, |l| l.coat = Coat { factor: 1.0, roughness: 0.3, ..Coat::default() }),
         ("a colour of its own", &plastic, |l| l.specular.color = Vec3::new(2.0, 1.0, 0.0)),
         ("brushed", &plastic, |l| l.anisotropy.strength = 0.6),

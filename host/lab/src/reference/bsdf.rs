@@ -225,7 +225,7 @@ impl<'t> Bsdf<'t> {
     }
 
     /// The share of light that enters and leaves the base by two directions, of which `l` is the other.
-    fn into_base(&self, l: DVec3) -> f64 {
+    fn base_entry(&self, l: DVec3) -> f64 {
         let (a, b) = (1.0 - self.coat, 1.0 - self.dielectric_albedo(l));
         let at = |width: f64| {
             let mut e = self.table.average(width);
@@ -311,7 +311,7 @@ impl<'t> Bsdf<'t> {
         }
         if l.z < 0.0 && above < 0.0 && !self.inside {
             let (m, t, lobes) = (self.look.metallic, self.look.transmission, &self.look.lobes);
-            let kept = self.into_base(l) * self.through_spread(l, world) * -l.z / PI;
+            let kept = self.base_entry(l) * self.through_spread(l, world) * -l.z / PI;
             value.f_cos += lobes.shine_color * ((1.0 - m) * (1.0 - t) * lobes.shine * kept);
             value.pdf += self.choose.shine * -l.z / PI;
         }
@@ -335,7 +335,7 @@ impl<'t> Bsdf<'t> {
     fn add_diffuse(&self, value: &mut BsdfValue, l: DVec3, world: DVec3) {
         let (m, t, lobes) = (self.look.metallic, self.look.transmission, &self.look.lobes);
         if !self.inside && m < 1.0 && t < 1.0 {
-            let kept = self.into_base(l) * self.through_spread(l, world) * (1.0 - lobes.shine);
+            let kept = self.base_entry(l) * self.through_spread(l, world) * (1.0 - lobes.shine);
             value.f_cos += self.look.base * ((1.0 - m) * (1.0 - t) * kept * l.z / PI);
             value.pdf += self.choose.diffuse * l.z / PI;
         }

@@ -173,10 +173,9 @@ pub(crate) fn looks() -> Vec<Material> {
             for base in [metal(roughness), glass(roughness, false), glass(roughness, true)] {
                 all.push(with(base, |l| l.film = film(nm, 1.33)));
             }
-            for ior in [1.8, 2.5] {
-                all.push(with(plastic(roughness), |l| l.film = film(nm, ior)));
-            }
+            all.push(with(plastic(roughness), |l| l.film = film(nm, 1.8)));
         }
+        all.push(with(plastic(roughness), |l| l.film = film(80.0, 2.5)));
         let specular = Specular { factor: 0.7, color: Vec3::new(4.0, 1.0, 0.0), ..Specular::default() };
         all.push(with(plastic(roughness), |l| l.specular = specular));
         all.push(with(glass(roughness, false), |l| l.specular = specular));
@@ -362,7 +361,7 @@ fn thick_film(_: u64) -> f64 {
     for f0 in [0.04, 0.3, 0.9] {
         for ior in [1.2, 1.5, 2.0] {
             for cos in [1.0, 0.7, 0.3] {
-                let inside = (1.0 - (1.0 - cos * cos) / (ior * ior) as f64).sqrt();
+                let inside = f64::sqrt(1.0 - (1.0 - cos * cos) / (ior * ior));
                 let square = |a: f64, b: f64| ((a - b) / (a + b)).powi(2);
                 let root = f64::sqrt(f0);
                 let base = (1.0 + root) / (1.0 - root);
