@@ -3,6 +3,7 @@
 
 mod accessor;
 mod animation;
+mod bake;
 mod check;
 mod check_look;
 mod clip;
