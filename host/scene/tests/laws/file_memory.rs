@@ -85,8 +85,8 @@ fn bombs() -> Vec<(&'static str, Vec<u8>)> {
     };
     vec![
         ("PNG of 8192 x 4096", png(8192, 4096, false)),
-        ("deep PNG of 8192 x 4096", png(8192, 4096, true)),
-        ("PNG of 3000 x 2000", png(3000, 2000, true)),
+        ("deep PNG of 4096 x 3000", png(4096, 3000, true)),
+        ("PNG of 1500 x 1000", png(1500, 1000, true)),
         ("Radiance of 8192 x 4096", radiance(8192, 4096)),
         ("Radiance of 4096 x 2048", radiance(4096, 2048)),
         ("PFM", text("PF\n8192 4096\n-1\n".into())),
@@ -110,7 +110,7 @@ fn bombs() -> Vec<(&'static str, Vec<u8>)> {
             text(format!("{{\"asset\":{{\"version\":\"2.0\"}},\"extras\":[{}0]}}", "0,".repeat(1_500_000))),
         ),
         ("YAML of rows", text(format!("%YAML:1.0\nK: [{}0]\n", "0,".repeat(400_000)))),
-        ("glTF with a picture of 8192 x 8192", with_image(&png(8192, 8192, false)).bytes()),
+        ("glTF with a picture of 8192 x 4096", with_image(&png(8192, 4096, false)).bytes()),
     ]
 }
 
