@@ -145,6 +145,9 @@ pub struct TriangleMesh {
     pub materials: Vec<u32>,
     /// For each vertex its number in the file's primitive; only while a mesh that deforms is read, else empty.
     pub(crate) sources: Vec<u32>,
+    /// For each vertex the coordinates that take the place of [`Self::uvs`] once there are tangents; only while a file is read, else
+    /// empty.
+    pub(crate) later_uvs: Vec<Vec2>,
 }
 
 /// A use of a texture: its index, and the transform of KHR_texture_transform that is applied to the coordinates.
@@ -233,6 +236,19 @@ impl Material {
     /// Light passes through the surface, so that its back is shaded, too.
     pub fn shines_through(&self) -> bool {
         self.transmission > 0.0 || self.lobes.diffuse_transmission.factor > 0.0
+    }
+
+    /// The same to change, in the same order.
+    pub(crate) fn textures_mut(&mut self) -> impl Iterator<Item = &mut Option<TextureRef>> {
+        [
+            &mut self.base_color_texture,
+            &mut self.metallic_roughness_texture,
+            &mut self.normal_texture,
+            &mut self.emissive_texture,
+            &mut self.transmission_texture,
+        ]
+        .into_iter()
+        .chain(self.lobes.textures_mut())
     }
 }
 
