@@ -233,6 +233,12 @@ kinds! {
     X15,
     /// The clock of a VRPN server is set while it runs.
     X16,
+    /// The interlock opens, chatters, or hangs.
+    X17,
+    /// Somebody sends OSC, who may or may not.
+    X18,
+    /// One call to the disk fails, the first to the sixth from now.
+    X19,
 }
 
 const FILES: &str = "scenes are read only when the program starts, before any light";
@@ -260,6 +266,11 @@ impl Kind {
     /// It strikes only where the projector follows tracks.
     pub fn needs_tracks(self) -> bool {
         self == Self::X8
+    }
+
+    /// It strikes only where a guard stands alone that has to answer it.
+    pub fn needs_guard(self) -> bool {
+        matches!(self, Self::X17 | Self::X18 | Self::X19)
     }
 
     /// It strikes only where the projector hangs on a serial line.

@@ -315,7 +315,7 @@ impl Episodes {
             .filter(|kind| setup.follows || !kind.needs_tracks())
             .filter(|kind| setup.serial.is_some() || !kind.needs_line())
             .filter(|kind| tracker == TrackerKind::Vrpn || !kind.needs_connection())
-            .filter(|kind| setup.alone.is_none_or(|guard| guard.kinds().contains(kind)))
+            .filter(|kind| setup.alone.map_or(!kind.needs_guard(), |guard| guard.kinds().contains(kind)))
             .collect::<Vec<_>>();
         let wanted = |kind: &Kind| first.contains(kind) && kind.strikes(tracker);
         let mut first: Vec<Kind> = kinds.iter().copied().filter(wanted).collect();

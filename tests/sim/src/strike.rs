@@ -5,7 +5,8 @@ use crate::dice::Dice;
 use crate::kinds::Kind;
 use crate::machine::{GpuTrap, OpenTrap, Trap};
 use crate::net::{NetFaults, ServerKind};
-use crate::world::{projector_of, server_kind, Action, Undo, World, MS, S};
+use crate::process::SimContact;
+use crate::world::{projector_of, server_kind, Action, Undo, World, MS, OSC_TOKEN, S};
 use dpm_device::link::Packet;
 use dpm_device::link::{faults, HostLink, SessionNumbers};
 use dpm_device::planes::Raster;
@@ -87,6 +88,23 @@ impl World {
             K::X9 | K::X10 | K::X11 => self.strike_line(kind, &mut dice),
             K::T18 => self.strike_tracker_line(&mut dice),
             K::X12 | K::X13 | K::X14 | K::X15 | K::X16 => self.strike_connection(kind, &mut dice),
+            K::X17 => self.strike_interlock(&mut dice),
+            K::X18 => {
+                let word = dice.one_of(&["arm", "arm", "freeze", "black", "safe"]);
+                let token = dice.one_of(&[None, None, Some(OSC_TOKEN), Some("curtainx"), Some("c")]);
+                self.hear_osc(word, token, dice.happens(0.6));
+                self.lasts(kind, MS, Undo::Nothing);
+            }
+            K::X19 => {
+                lock(&self.disk).fails_in = Some(dice.between(0, 5) as u32);
+                self.give(dice.one_of(&[Order::Safe, Order::Black, Order::Freeze]));
+                if dice.happens(0.3) {
+                    self.plan(self.t + dice.between(1, 60) * MS, Action::Kill);
+                }
+                let until = dice.decades(50, 500) * MS;
+                self.laws.slow_disk_until(self.t + until);
+                self.lasts(kind, until, Undo::Disk);
+            }
             K::G3 | K::G9 => self.lasts(kind, MS, Undo::Nothing),
         }
     }
@@ -426,6 +444,20 @@ impl World {
         self.lasts(kind, 320 * MS, Undo::Traps);
     }
 
+    /// The interlock opens for a moment or for long, chatters, or its thread hangs.
+    fn strike_interlock(&mut self, dice: &mut Dice) {
+        let state = if dice.happens(0.25) { SimContact::HANGS } else { SimContact::OPEN };
+        let rounds = if dice.happens(0.2) { dice.between(2, 5) } else { 1 };
+        let mut at = self.t;
+        for _ in 0..rounds {
+            self.plan(at, Action::Contact(state));
+            at += dice.decades(3, 2_500) / rounds * MS + MS;
+            self.plan(at, Action::Contact(0));
+            at += dice.between(5, 80) * MS;
+        }
+        self.lasts(Kind::X17, at - self.t, Undo::Nothing);
+    }
+
     fn strike_host(&mut self, kind: Kind, dice: &mut Dice) {
         use Kind as K;
         let lasts_ns = dice.decades(20, 1_500) * MS;
@@ -539,7 +571,7 @@ impl World {
             }
             Undo::Disk => {
                 let mut disk = lock(&self.disk);
-                (disk.refuses, disk.is_full, disk.late_ns) = (false, false, 0);
+                (disk.refuses, disk.is_full, disk.late_ns, disk.fails_in) = (false, false, 0, None);
             }
             Undo::Load => lock(&self.beneath).load_milli = 1000,
             Undo::Traps => {
