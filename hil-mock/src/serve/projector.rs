@@ -87,9 +87,8 @@ impl ProjectorArguments {
             text => u64::from_str_radix(text.map_err(told)?.trim(), 16).ok(),
         };
         let mut random = SessionNumbers::from_system();
-        let serial = FirmwareConfig::serial_number(kept, || {
-            u64::from(random.draw()) << 32 | u64::from(random.draw())
-        });
+        let serial =
+            FirmwareConfig::serial_number(kept, || u64::from(random.draw()) << 32 | u64::from(random.draw()));
         if kept != Some(serial) {
             std::fs::write(flash, format!("{serial:016x}\n")).map_err(told)?;
         }

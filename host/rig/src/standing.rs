@@ -451,7 +451,8 @@ impl OrderFile {
             if let Some(others) = &self.others {
                 others.hide(&name);
             }
-            if name == self.identity.order_name(device) && folder.read(&name, BYTES as u64).is_ok_and(is_whole)
+            if name == self.identity.order_name(device)
+                && folder.read(&name, BYTES as u64).is_ok_and(is_whole)
             {
                 folder.rename(&name, &(self.identity.stem() + RESERVE))?;
             } else {
@@ -596,7 +597,11 @@ pub(crate) fn standing_in_folder(folder: &dyn StateFolder, identity: &Identity) 
     strongest(Some(folder), None, identity)
 }
 
-fn strongest(folder: Option<&dyn StateFolder>, others: Option<&Others>, identity: &Identity) -> Option<Stands> {
+fn strongest(
+    folder: Option<&dyn StateFolder>,
+    others: Option<&Others>,
+    identity: &Identity,
+) -> Option<Stands> {
     match holding(folder, others.filter(|_| !identity.is_mock()), identity, None) {
         Ok(all) => {
             let stands = all.into_iter().map(|held| held.told.stands);

@@ -35,7 +35,7 @@ pub enum Guard {
 }
 
 /// The share of lives in which a guard stands alone.
-const ALONE: f64 = 1.0 / 3.0;
+const ALONE: f64 = 0.6;
 /// A guard that is switched off acts after this time.
 const LATE_NS: i64 = 10_000_000_000;
 /// The longest by which the link is served late, nanoseconds; where slots are short, two fifths of one.
@@ -57,7 +57,8 @@ impl Guard {
 
     /// As given on the command line.
     pub fn word(self) -> &'static str {
-        ["watchdog", "dark-from", "age", "orders", "session", "clock", "interlock", "by-hand", "limits"][self as usize]
+        ["watchdog", "dark-from", "age", "orders", "session", "clock", "interlock", "by-hand", "limits"]
+            [self as usize]
     }
 
     /// The guard that stands alone in the life of `seed`, if any.

@@ -80,7 +80,8 @@ impl Limit {
     fn new(rig: &Rig) -> Self {
         let planes = rig.schedule.planes().iter();
         let planes: Vec<_> = planes.map(|p| (p.channel as usize, f64::from(1u32 << p.bit))).collect();
-        let of = |channel| planes.iter().filter(|(of, _)| *of == channel).map(|(_, weight)| weight).sum::<f64>();
+        let of =
+            |channel| planes.iter().filter(|(of, _)| *of == channel).map(|(_, weight)| weight).sum::<f64>();
         let limits = &rig.config.safety.limits;
         Self {
             full: rig.camera.raster.pixel_count() as f64 * (0..4).map(of).fold(0.0, f64::max),
@@ -496,7 +497,12 @@ impl Laws {
         let is_calm = calm_for > 2 * S && t - self.good_at < S && t - self.disturbed_at > 3 * S;
         // The run may end when a hang is found.
         let is_whole = t > self.hidden_until + S;
-        is_calm && is_whole && self.is_quick && self.limit.is_none() && t - crew_ready > 3 * S && t - self.started_at > 4 * S
+        is_calm
+            && is_whole
+            && self.is_quick
+            && self.limit.is_none()
+            && t - crew_ready > 3 * S
+            && t - self.started_at > 4 * S
     }
 
     pub(crate) fn remember(&mut self, beneath: &Arc<Mutex<Beneath>>) {
@@ -558,15 +564,23 @@ impl Laws {
             if at - since > allowed(since, self) + silence_ns {
                 self.fail(at, format!("{what} {} ms after the interlock opened", (at - since) / MS));
             }
-        } else if let Some(since) = self.awaits_reset.filter(|since| at - since > S) {
+        } else if let Some(since) =
+            self.awaits_reset.filter(|since| at - since > allowed(*since, self) + SILENCE_NS)
+        {
             self.fail(
                 at,
-                format!("{what}, and nobody gave ARM since the interlock opened {} ms ago", (at - since) / MS),
+                format!(
+                    "{what}, and nobody gave ARM since the interlock opened {} ms ago",
+                    (at - since) / MS
+                ),
             );
         }
         if let Some(since) = self.awaits_arm {
             if at - since > self.usual_watchdog_ns() + self.slot_ns {
-                self.fail(at, format!("{what}, and nobody gave ARM since the start {} ms ago", (at - since) / MS));
+                self.fail(
+                    at,
+                    format!("{what}, and nobody gave ARM since the start {} ms ago", (at - since) / MS),
+                );
             }
         }
         if let Some(since) = self.stopped_at.filter(|_| orders_count) {
@@ -813,7 +827,10 @@ impl Laws {
             self.ordered_at = t;
         }
         if t - self.ordered_at > ORDER_TOLD_NS && !matches!(word, LightState::DarkByOrder(_)) {
-            self.fail(t, format!("it has been dark by order for {} ms, and is called {word:?}", ORDER_TOLD_NS / MS));
+            self.fail(
+                t,
+                format!("it has been dark by order for {} ms, and is called {word:?}", ORDER_TOLD_NS / MS),
+            );
         }
         let [lit_at, dark_at] = self.mirrors;
         let since = t - self.word.1.max(if word.is_lit() { lit_at } else { dark_at });

@@ -24,8 +24,8 @@ dpm-sim: a simulated world around the rig, with every fault in every state
                   a fifth VRPN
   --kinds LIST    kinds of faults, as T18,X9; every episode begins with one of them in lives that they can strike;
                   default: all in turn
-  --alone WHO     which guard of the light stands alone: watchdog, dark-from, age, orders, session, clock; none; or
-                  some: default, one of them in a third of the seeds (none of --tracks all, --serial all and --kinds)
+  --alone WHO     which guard of the light stands alone: watchdog, dark-from, age, orders, session, clock, interlock,
+                  by-hand, limits; none; or some: default, one of them in three of five seeds (none of --tracks all, --serial all and --kinds)
   --until EVENT   stop the (single) seed at this event and print what happened
   --without LIST  numbers of faults that do not strike, as a shrunk seed names them
   --minutes M     end after so many minutes of real time

@@ -451,7 +451,9 @@ impl World {
         let mut at = self.t;
         for _ in 0..rounds {
             self.plan(at, Action::Contact(state));
-            at += dice.decades(3, 2_500) / rounds * MS + MS;
+            // A thread that hangs for less than the silence that counts is not noticed, and need not be.
+            let shortest = if state == SimContact::HANGS { 300 } else { 3 };
+            at += dice.decades(shortest, 2_500) / rounds * MS + MS;
             self.plan(at, Action::Contact(0));
             at += dice.between(5, 80) * MS;
         }

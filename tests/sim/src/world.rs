@@ -603,7 +603,10 @@ impl World {
         if self.active.iter().flatten().any(|active| !active.kind.is_of_tracker()) {
             self.laws.struck_elsewhere(self.t);
         }
-        self.laws.flashes(self.t, self.projector.status().faults & (faults::FLASH_LIMIT | faults::LIGHT_LIMIT) != 0);
+        self.laws.flashes(
+            self.t,
+            self.projector.status().faults & (faults::FLASH_LIMIT | faults::LIGHT_LIMIT) != 0,
+        );
         if self.far.is_some() {
             return self.reply_on_the_line();
         }
@@ -833,7 +836,9 @@ impl World {
         self.met.contacts += u64::from(state != 0 && kept);
         self.laws.contact(self.t, state, *reset == Restart::ByHand && kept);
         self.fold(8, state.into());
-        self.tell(|| ["the interlock closes", "the interlock opens", "the interlock hangs"][usize::from(state)].into());
+        self.tell(|| {
+            ["the interlock closes", "the interlock opens", "the interlock hangs"][usize::from(state)].into()
+        });
     }
 
     /// A datagram of OSC arrives at the rig's door. Who may say what is the rig's own to judge, and judged here once more.
@@ -857,7 +862,8 @@ impl World {
         let may = |order: &Order| is_listed && (order.is_dark() || token == Some(OSC_TOKEN));
         let wanted: Vec<Order> = named.into_iter().filter(may).collect();
         if orders != wanted {
-            let told = format!("OSC says {word} (listed {is_listed}, token {token:?}), and {orders:?} is obeyed");
+            let told =
+                format!("OSC says {word} (listed {is_listed}, token {token:?}), and {orders:?} is obeyed");
             self.laws.fail(self.t, told);
         }
         self.met.datagrams += u64::from(self.process.is_some());

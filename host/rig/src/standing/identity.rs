@@ -119,9 +119,7 @@ impl Identity {
         let stem = name.strip_suffix(ENDING).unwrap_or(name);
         // Which serial number was told is for the content to say.
         let stem = stem.split(AND_SERIAL).next().unwrap_or(stem);
-        let key_after = |family: &str| {
-            Some(stem.strip_prefix(&plain(family))?.strip_prefix('-')?.to_owned())
-        };
+        let key_after = |family: &str| Some(stem.strip_prefix(&plain(family))?.strip_prefix('-')?.to_owned());
         let others = || kinds().into_iter().filter(|kind| kind.is_video && self.is_video);
         let Some(key) = key_after(&self.family).or_else(|| others().find_map(|kind| key_after(kind.name)))
         else {

@@ -124,7 +124,11 @@ fn every_name_of_a_port_is_one_projector() {
     machine.link("serial/by-id/usb-FTDI_AB12-if00", "../../ttyUSB0");
     for (link, path) in [("projector", "pts/5"), ("serial/by-id/usb-FTDI_AB12-if00", "ttyUSB0")] {
         let [one, other] = [link, path].map(|path| machine.projector(path));
-        assert_eq!((one.order_name(None), one.lock_name()), (other.order_name(None), other.lock_name()), "{path}");
+        assert_eq!(
+            (one.order_name(None), one.lock_name()),
+            (other.order_name(None), other.lock_name()),
+            "{path}"
+        );
         assert!(one.is_one_device());
         machine.safe_at(link);
         assert!(machine.holds(path), "SAFE by {link} does not hold {path}");
@@ -391,7 +395,8 @@ fn an_order_of_one_user_holds_for_all_users() {
         OrderFile::open_beside(Some(folder.into()), others, machine.projector(path))
     };
     let [own, other] = ["own", "other"].map(|name| machine.at(name));
-    let (file, error, _) = OrderFile::open_beside(Some(own.clone()), Some(theirs), machine.projector("ttyUSB0"));
+    let (file, error, _) =
+        OrderFile::open_beside(Some(own.clone()), Some(theirs), machine.projector("ttyUSB0"));
     assert!(error.is_none(), "{error:?}");
     file.hear(Some(7));
     file.keep(Order::Safe, By::Key).unwrap();
