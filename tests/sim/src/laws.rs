@@ -117,6 +117,11 @@ impl Limit {
     }
 }
 
+/// An order of greater strength replaces another one.
+fn strength(order: Order) -> usize {
+    [Order::Freeze, Order::Black, Order::Safe].iter().position(|one| *one == order).unwrap_or(0)
+}
+
 /// See the module's documentation. All instants are true time.
 pub struct Laws {
     /// The first broken law.
@@ -426,7 +431,6 @@ impl Laws {
             (self.standing, self.hot_since) = (None, None);
             return;
         }
-        let strength = |o: Order| [Order::Freeze, Order::Black, Order::Safe].iter().position(|x| *x == o);
         if self.standing.is_some_and(|s| strength(s.order) > strength(order)) {
             return;
         }
@@ -434,6 +438,7 @@ impl Laws {
             self.thawed_at = t;
         }
         let since = self.standing.filter(|s| s.order == order).map_or(t, |s| s.since);
+        self.ordered_at = self.ordered_at.max(since);
         self.standing = Some(Standing { order, since, ticket, kept: false, is_orphan: false });
     }
 
@@ -826,7 +831,10 @@ impl Laws {
         if !is_ordered || word.is_lit() || t < self.hidden_until + S {
             self.ordered_at = t;
         }
-        if t - self.ordered_at > ORDER_TOLD_NS && !matches!(word, LightState::DarkByOrder(_)) {
+        // Of several orders the strongest counts, also after a restart.
+        let ordered = self.standing.map_or(0, |standing| strength(standing.order));
+        let is_named = matches!(word, LightState::DarkByOrder(order) if strength(order) >= ordered);
+        if t - self.ordered_at > ORDER_TOLD_NS && !is_named {
             self.fail(
                 t,
                 format!("it has been dark by order for {} ms, and is called {word:?}", ORDER_TOLD_NS / MS),
