@@ -331,7 +331,7 @@ impl Laws {
     pub fn flashes(&mut self, t: i64, has_flashed: bool) {
         // The limit counts what was within a second, and soon after the fault all frames are drawn and sent as usual.
         if has_flashed && !self.has_flashed && t - self.elsewhere_at > 1_200 * MS {
-            self.fail(t, "the projector latched its flash limit before the host acted".into());
+            self.fail(t, "the projector latched a limit of its own before the host acted".into());
         }
         self.has_flashed = has_flashed;
     }
