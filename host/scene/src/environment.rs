@@ -13,7 +13,7 @@ use glam::{DVec3, Vec3};
 use image::{ImageFormat, ImageReader};
 
 use super::gltf_file::read_file;
-use super::limits::Limits;
+use super::limits::{largest_piece, Limits};
 use super::load::contained;
 use super::primaries::Primaries;
 use super::srgb::to_linear;
@@ -174,9 +174,9 @@ pub fn decode_environment(bytes: &[u8], rotation_rad: f32, scale: f32) -> Result
         [b'#', b'?', ..] => read_rgbe(bytes)?,
         [0x76, 0x2f, 0x31, 0x01, ..] => read_exr(bytes)?,
         _ => match image::guess_format(bytes) {
-            Ok(ImageFormat::Tiff) => read_tiff(bytes)?.into(),
+            Ok(ImageFormat::Tiff) => read_tiff(bytes)?,
             Ok(format @ (ImageFormat::Png | ImageFormat::Jpeg | ImageFormat::WebP | ImageFormat::Bmp)) => {
-                read_srgb(bytes, format)?.into()
+                read_srgb(bytes, format)?
             }
             _ => return Err(SceneError::unsupported("this image format", FORMATS)),
         },
@@ -246,6 +246,46 @@ fn clamp(read: &mut Read, scale: f32) -> Result<(), SceneError> {
         }
     }
     Ok(())
+}
+
+/// Refuses a picture of `texels` that needs more memory in one piece than its file's length allows.
+pub(crate) fn check_piece(texels: usize, texel_bytes: u64, file_bytes: usize) -> Result<(), SceneError> {
+    SceneError::check_limit(
+        "the bytes of a picture in so short a file",
+        texels as u64 * texel_bytes,
+        largest_piece(file_bytes as u64),
+        "save it with fewer texels, or less compressed",
+    )
+}
+
+/// All texels of a picture, or the means of squares of them, if all take more memory than the length of the file allows.
+pub(crate) fn collect(
+    [width, height]: [u32; 2],
+    file_bytes: usize,
+    at: impl Fn(u32, u32) -> Vec3,
+) -> (Pixels, Option<String>) {
+    let most = largest_piece(file_bytes as u64) / size_of::<Vec3>() as u64;
+    let sides = |step: u32| (width.div_ceil(step), height.div_ceil(step));
+    let texels = |(w, h): (u32, u32)| u64::from(w) * u64::from(h);
+    let step = (1..).find(|step| texels(sides(*step)) <= most).unwrap_or(1);
+    let (w, h) = sides(step);
+    let mut out = Vec::with_capacity(w as usize * h as usize);
+    for y in 0..h {
+        for x in 0..w {
+            let (across, down) =
+                ((x * step..width.min((x + 1) * step)), (y * step..height.min((y + 1) * step)));
+            let count = across.len() * down.len();
+            let sum: DVec3 = down
+                .flat_map(|y| across.clone().map(move |x| (x, y)))
+                .map(|(x, y)| at(x, y).as_dvec3())
+                .sum();
+            out.push((sum / count as f64).as_vec3());
+        }
+    }
+    let told = format!(
+        "it is read with {w} x {h} of its {width} x {height} texels, as many as so short a file may take"
+    );
+    ((w, h, out), (step > 1).then_some(told))
 }
 
 pub(crate) type Pixels = (u32, u32, Vec<Vec3>);
@@ -396,44 +436,39 @@ fn read_rgbe(bytes: &[u8]) -> Result<Read, SceneError> {
         _ => return Err(wrong()),
     };
     let (width, height) = if by_rows { (inner, outer) } else { (outer, inner) };
-    check_size(width, height)?;
+    let count = check_size(width, height)?;
+    check_piece(count, 4, bytes.len())?;
     // No encoding of a scan line is shorter than one texel.
     if (rest.len() as u64) < 4 * u64::from(outer) / 2 {
         return Err(SceneError::broken("image", "has fewer bytes than its size needs: it is cut off"));
     }
-    let mut texels = vec![];
-    let mut row = vec![[0u8; 4]; inner as usize];
-    for y in 0..outer {
-        if read_rgbe_row(&mut rest, &mut row).is_none() {
+    let mut stored = vec![[0u8; 4]; count];
+    for (y, row) in stored.chunks_exact_mut(inner as usize).enumerate() {
+        if read_rgbe_row(&mut rest, row).is_none() {
             // Light that is missing at the end is told; a picture that is mostly missing is none.
-            if y <= outer / 2 {
+            if y <= outer as usize / 2 {
                 return Err(SceneError::broken(format!("row {y}"), "is cut off or damaged"));
             }
             warnings.push(format!(
                 "it is cut off or damaged from scan line {y} of {outer} on: the rest is black"
             ));
-            texels.resize(inner as usize * outer as usize, Vec3::ZERO);
+            row.fill([0; 4]);
             break;
         }
-        texels.extend(row.iter().map(|&[r, g, b, e]| {
-            let unit = if e == 0 { 0.0 } else { (f64::from(e) - 136.0).exp2() };
-            let scaled = |x: u8, gain: f32| (f64::from(x) * unit / f64::from(gain)) as f32;
-            Vec3::new(scaled(r, gain.x), scaled(g, gain.y), scaled(b, gain.z))
-        }));
     }
     // Up is +Y and right is +X: the upper left texel comes first here.
-    if !(by_rows && !outer_rises && inner_rises) {
-        let stored = texels;
-        let at = |x: u32, y: u32| {
-            let (x_rises, y_rises) =
-                if by_rows { (inner_rises, outer_rises) } else { (outer_rises, inner_rises) };
-            let x = if x_rises { x } else { width - 1 - x };
-            let y = if y_rises { height - 1 - y } else { y };
-            let (outer_at, inner_at) = if by_rows { (y, x) } else { (x, y) };
-            stored[outer_at as usize * inner as usize + inner_at as usize]
-        };
-        texels = (0..height).flat_map(|y| (0..width).map(move |x| (x, y))).map(|(x, y)| at(x, y)).collect();
-    }
+    let (x_rises, y_rises) = if by_rows { (inner_rises, outer_rises) } else { (outer_rises, inner_rises) };
+    let at = |x: u32, y: u32| {
+        let x = if x_rises { x } else { width - 1 - x };
+        let y = if y_rises { height - 1 - y } else { y };
+        let (outer_at, inner_at) = if by_rows { (y, x) } else { (x, y) };
+        let [r, g, b, e] = stored[outer_at as usize * inner as usize + inner_at as usize];
+        let unit = if e == 0 { 0.0 } else { (f64::from(e) - 136.0).exp2() };
+        let scaled = |x: u8, gain: f32| (f64::from(x) * unit / f64::from(gain)) as f32;
+        Vec3::new(scaled(r, gain.x), scaled(g, gain.y), scaled(b, gain.z))
+    };
+    let ((width, height, texels), told) = collect([width, height], bytes.len(), at);
+    warnings.extend(told);
     if is_xyz {
         let white = primaries.map_or(Primaries::XYZ.white, |p| p.white);
         primaries = Some(Primaries { white, ..Primaries::XYZ });
@@ -508,34 +543,63 @@ fn decode_bounded(
 ) -> Result<image::DynamicImage, SceneError> {
     let reader = || ImageReader::with_format(std::io::Cursor::new(bytes), format);
     let failed = |e: image::ImageError| SceneError::broken("image", format!("cannot be decoded: {e}"));
-    let (width, height) = reader().into_dimensions().map_err(failed)?;
+    let decoder = reader().into_decoder().map_err(failed)?;
+    let (width, height) = image::ImageDecoder::dimensions(&decoder);
     let texels = check_size(width, height)?;
+    check_piece(1, image::ImageDecoder::total_bytes(&decoder), bytes.len())?;
     let mut bounded = reader();
     let mut memory = image::Limits::default();
     memory.max_image_width = Some(width);
     memory.max_image_height = Some(height);
-    memory.max_alloc = Some(texels as u64 * texel_bytes + (16 << 20));
+    memory.max_alloc =
+        Some((texels as u64 * texel_bytes + (16 << 20)).min(2 * largest_piece(bytes.len() as u64)));
     bounded.limits(memory);
     bounded.decode().map_err(failed)
 }
 
-fn read_srgb(bytes: &[u8], format: ImageFormat) -> Result<Pixels, SceneError> {
-    let rgb = decode_bounded(bytes, format, 8)?.into_rgb16();
-    let linear = |x: u16| to_linear(f32::from(x) / 65535.0);
-    let texels = rgb.as_raw().chunks_exact(3);
-    let texels = texels.map(|c| Vec3::new(linear(c[0]), linear(c[1]), linear(c[2]))).collect();
-    Ok((rgb.width(), rgb.height(), texels))
+fn read_srgb(bytes: &[u8], format: ImageFormat) -> Result<Read, SceneError> {
+    use image::DynamicImage::{ImageLuma8, ImageRgb8, ImageRgba8};
+    let picture = decode_bounded(bytes, format, 8)?;
+    let sides = [picture.width(), picture.height()];
+    let of_eight: Vec<f32> = (0..=255u8).map(|code| to_linear(f32::from(code) / 255.0)).collect();
+    let of = |code: u8| of_eight[usize::from(code)];
+    Ok(match &picture {
+        ImageLuma8(grey) => {
+            collected(collect(sides, bytes.len(), |x, y| Vec3::splat(of(grey.get_pixel(x, y).0[0]))))
+        }
+        ImageRgb8(rgb) => {
+            collected(collect(sides, bytes.len(), |x, y| Vec3::from(rgb.get_pixel(x, y).0.map(of))))
+        }
+        ImageRgba8(rgba) => {
+            let at = |x, y| {
+                let [r, g, b, _] = rgba.get_pixel(x, y).0;
+                Vec3::from([r, g, b].map(of))
+            };
+            collected(collect(sides, bytes.len(), at))
+        }
+        _ => {
+            check_piece(sides[0] as usize * sides[1] as usize, 6, bytes.len())?;
+            let rgb = picture.into_rgb16();
+            let linear = |x: u16| to_linear(f32::from(x) / 65535.0);
+            collected(collect(sides, bytes.len(), |x, y| Vec3::from(rgb.get_pixel(x, y).0.map(linear))))
+        }
+    })
+}
+
+fn collected(((width, height, texels), told): (Pixels, Option<String>)) -> Read {
+    Read { width, height, texels, warnings: told.into_iter().collect(), ..Read::default() }
 }
 
 /// TIFF of whole numbers is a picture for a display, and one of floats is light.
-fn read_tiff(bytes: &[u8]) -> Result<Pixels, SceneError> {
+fn read_tiff(bytes: &[u8]) -> Result<Read, SceneError> {
     use image::DynamicImage::{ImageRgb32F, ImageRgba32F};
     let picture = decode_bounded(bytes, ImageFormat::Tiff, 32)?;
+    let sides = [picture.width(), picture.height()];
+    check_piece(sides[0] as usize * sides[1] as usize, 12, bytes.len())?;
     let is_linear = matches!(picture, ImageRgb32F(_) | ImageRgba32F(_));
     let rgb = picture.into_rgb32f();
     let of = |x: f32| if is_linear { x } else { to_linear(x) };
-    let texels = rgb.as_raw().chunks_exact(3).map(|c| Vec3::new(of(c[0]), of(c[1]), of(c[2]))).collect();
-    Ok((rgb.width(), rgb.height(), texels))
+    Ok(collected(collect(sides, bytes.len(), |x, y| Vec3::from(rgb.get_pixel(x, y).0.map(of)))))
 }
 
 #[cfg(test)]

@@ -144,6 +144,9 @@ pub struct TriangleMesh {
     pub materials: Vec<u32>,
     /// For each vertex its number in the file's primitive; only while a mesh that deforms is read, else empty.
     pub(crate) sources: Vec<u32>,
+    /// For each vertex the coordinates that take the place of [`Self::uvs`] once there are tangents; only while a file is read, else
+    /// empty.
+    pub(crate) later_uvs: Vec<Vec2>,
 }
 
 /// A use of a texture: its index, and the transform of KHR_texture_transform that is applied to the coordinates.
@@ -220,6 +223,18 @@ impl Material {
             self.normal_texture,
             self.emissive_texture,
             self.transmission_texture,
+        ]
+        .into_iter()
+    }
+
+    /// The same to change, in the same order.
+    pub(crate) fn textures_mut(&mut self) -> impl Iterator<Item = &mut Option<TextureRef>> {
+        [
+            &mut self.base_color_texture,
+            &mut self.metallic_roughness_texture,
+            &mut self.normal_texture,
+            &mut self.emissive_texture,
+            &mut self.transmission_texture,
         ]
         .into_iter()
     }

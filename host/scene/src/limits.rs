@@ -18,7 +18,7 @@ pub struct Limits {
     pub json_values: u64,
     /// Nodes, meshes, materials, accessors and so on: entries in any one list at the top of the file.
     pub objects: u64,
-    /// Triangles after every instance of a mesh is expanded; for a short file fewer: a million, plus one for every two
+    /// Triangles after every instance of a mesh is expanded; for a short file fewer: a million, plus one for every three
     /// bytes.
     pub triangles: u64,
     /// Texels of all decoded textures together.
@@ -31,6 +31,8 @@ pub struct Limits {
     pub lights: u64,
     /// Time that loading may take.
     pub time: Duration,
+    /// Bytes that the file has with its buffers; set where it is read, and 0 before. Pictures of more texels need longer files.
+    pub file_bytes: u64,
 }
 
 impl Default for Limits {
@@ -46,15 +48,22 @@ impl Default for Limits {
             node_depth: 256,
             lights: 1024,
             time: Duration::from_secs(30),
+            file_bytes: 0,
         }
     }
+}
+
+/// Bytes that one piece of memory may have for a file of `bytes`: short files of great pictures are refused before anything is
+/// taken for them, and the longest that are honest have fewer than sixteen for each of theirs.
+pub(crate) const fn largest_piece(bytes: u64) -> u64 {
+    64_000_000 + 16 * bytes
 }
 
 impl Limits {
     /// The limits for a file of `bytes` bytes in all. Triangles cost time, and a short file may request any number of
     /// them by instances of a mesh: a million are free, and more need bytes in the file.
     pub(crate) fn of_file(&self, bytes: u64) -> Self {
-        Self { triangles: self.triangles.min(1_000_000 + bytes / 2), ..self.clone() }
+        Self { triangles: self.triangles.min(1_000_000 + bytes / 3), file_bytes: bytes, ..self.clone() }
     }
 }
 

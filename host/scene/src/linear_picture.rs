@@ -1,7 +1,8 @@
 //! Pictures whose values are light as measured, without the curve of sRGB: flat fields.
 
-use crate::environment::{check_size, read_pfm};
+use crate::environment::{check_piece, check_size, collect, read_pfm};
 use crate::SceneError;
+use glam::Vec3;
 use image::{ImageFormat, ImageReader, Limits};
 use std::io::Cursor;
 
@@ -52,12 +53,16 @@ fn read_png(bytes: &[u8]) -> Result<LinearPicture, SceneError> {
     let reader = || ImageReader::with_format(Cursor::new(bytes), ImageFormat::Png);
     let (width, height) = reader().into_dimensions().map_err(broken)?;
     let texels = check_size(width, height)?;
+    check_piece(texels, 8, bytes.len())?;
     let mut limits = Limits::default();
-    limits.max_alloc = Some(texels as u64 * 16 + (1 << 20));
+    limits.max_alloc = Some(texels as u64 * 8 + (1 << 20));
     let mut reader = reader();
     reader.limits(limits);
-    let picture = reader.decode().map_err(broken)?.into_rgb32f();
-    Ok(LinearPicture { width, height, texels: picture.pixels().map(|p| p.0).collect() })
+    let picture = reader.decode().map_err(broken)?;
+    let rgb = picture.into_rgb16();
+    let at = |x, y| Vec3::from(rgb.get_pixel(x, y).0.map(|code| f32::from(code) / 65_535.0));
+    let ((width, height, texels), _) = collect([width, height], bytes.len(), at);
+    Ok(LinearPicture { width, height, texels: texels.iter().map(|t| t.to_array()).collect() })
 }
 
 #[cfg(test)]

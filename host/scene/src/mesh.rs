@@ -109,6 +109,7 @@ impl TriangleMesh {
         compact(&mut self.tangents, &used);
         compact(&mut self.uvs, &used);
         compact(&mut self.sources, &used);
+        compact(&mut self.later_uvs, &used);
         for i in self.triangles.iter_mut().flatten() {
             *i = new_index[*i as usize];
         }
@@ -131,6 +132,9 @@ impl TriangleMesh {
         self.uvs = corners.iter().map(|&i| self.uvs[i as usize]).collect();
         if !self.sources.is_empty() {
             self.sources = corners.iter().map(|&i| self.sources[i as usize]).collect();
+        }
+        if !self.later_uvs.is_empty() {
+            self.later_uvs = corners.iter().map(|&i| self.later_uvs[i as usize]).collect();
         }
         self.tangents.clear();
         self.normals = normals;
@@ -249,6 +253,7 @@ impl TriangleMesh {
                         self.normals.push(self.normals[i as usize]);
                         self.uvs.push(self.uvs[i as usize]);
                         self.sources.extend(self.sources.get(i as usize).copied());
+                        self.later_uvs.extend(self.later_uvs.get(i as usize).copied());
                         side.push(w);
                     }
                     self.triangles[k][corner] = j;

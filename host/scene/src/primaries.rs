@@ -55,6 +55,17 @@ impl Primaries {
         Some(columns * DMat3::from_diagonal(shares)).filter(|m| m.determinant().abs() > 1e-9)
     }
 
+    /// What each of these colours adds to luminance; those of sRGB if they span no space of colours.
+    #[cfg(feature = "exr")]
+    pub(crate) fn luminance(&self) -> Vec3 {
+        let weights = self.to_xyz().unwrap_or(DMat3::from_diagonal(DVec3::ONE)).row(1).as_vec3();
+        if weights.min_element() > 1e-3 {
+            weights
+        } else {
+            Vec3::new(0.2126, 0.7152, 0.0722)
+        }
+    }
+
     /// Linear sRGB from the colours of these primaries, with white staying white; `None` if they span no space of colours.
     pub(crate) fn to_srgb(self) -> Option<DMat3> {
         let (from, to) = (self.to_xyz()?, Self::SRGB.to_xyz()?);

@@ -52,7 +52,7 @@ use std::path::Path;
 pub const MAX_FILE_BYTES: u64 = 1 << 20;
 
 /// The rig file that `dpm demo` runs.
-pub const DEMO_RIG: &str = include_str!("../../../../rigs/demo.toml");
+pub const DEMO_RIG: &str = include_str!("demo.toml");
 
 section! {
     /// A whole rig. Every value is in its range, and no two values contradict each other.

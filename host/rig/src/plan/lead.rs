@@ -9,6 +9,12 @@
 //! beyond the quantile that they do determine is continued as an exponential one, with a scale that the frames
 //! determine, widened by its own uncertainty, and no further than the share that so many frames can show.
 //!
+//! A tail is single frames. Where all frames of a row need more than the lead, the machine itself has become slower:
+//! another program streams through the caches, for example. Then only the frames from there on count, and what was
+//! known before comes back with the first row that needs no more than before. Else one slow fifth of a second would
+//! lengthen the lead until both spans are over. If it becomes slow again within a span, that is no accident any more,
+//! and the frames of both count together.
+//!
 //! Bins are a 64th of a slot wide up to four slots. From there on each is a 33rd wider than the one before: a
 //! renderer that needs many slots for a frame also needs a lead, and its frames are planned for slots that they can
 //! meet.
@@ -47,16 +53,72 @@ const BEYOND: f64 = 8.0;
 const TAIL_SHARE: f64 = 0.2;
 /// With fewer frames than this the first guess also counts.
 const FEW: u32 = 16;
+/// A row of frames that decides whether the machine has become slower or is as before lasts this long, nanoseconds ...
+const ROW_NS: i64 = 32_000_000;
+/// ... but has no more frames than this, and no fewer than [`FEWEST_IN_A_ROW`].
+const MOST_IN_A_ROW: usize = 32;
+const FEWEST_IN_A_ROW: usize = 8;
+
+/// Frames by the time that they needed, of this span and of the one before.
+#[derive(Clone, Debug)]
+struct Spans {
+    bins: [[u32; BINS]; 2],
+    /// Frames of both.
+    totals: [u32; 2],
+}
+
+impl Spans {
+    const EMPTY: Self = Self { bins: [[0; BINS]; 2], totals: [0; 2] };
+
+    /// A frame that lies in `bin`. Whole spans of `most` frames are forgotten: counts that are halved lose their single events
+    /// first, and these are the tail.
+    fn add(&mut self, bin: usize, most: i64) {
+        self.bins[0][bin] += 1;
+        self.totals[0] += 1;
+        if i64::from(self.totals[0]) >= most {
+            self.bins[1] = std::mem::replace(&mut self.bins[0], [0; BINS]);
+            self.totals[1] = std::mem::take(&mut self.totals[0]);
+        }
+    }
+
+    fn join(&mut self, other: &Self) {
+        for (mine, theirs) in self.bins.iter_mut().flatten().zip(other.bins.iter().flatten()) {
+            *mine += theirs;
+        }
+        self.totals = [0, 1].map(|k| self.totals[k] + other.totals[k]);
+    }
+}
+
+/// How the frames compare with those before.
+#[derive(Clone, Copy, Debug)]
+enum Pace {
+    Usual,
+    /// So many frames in a row needed more than what was the lead before them, nanoseconds.
+    Rises {
+        lead_ns: i64,
+        row: usize,
+    },
+    /// All of a row did. `row`: frames in a row that need no more than before again; `frames`: all since then.
+    Slower {
+        lead_ns: i64,
+        row: usize,
+        frames: u32,
+    },
+}
 
 /// Quantiles of the time that frames need.
 #[derive(Clone, Debug)]
 pub struct LeadEstimator {
-    /// Frames by time, of this span and of the one before.
-    bins: [[u32; BINS]; 2],
+    spans: Spans,
+    pace: Pace,
+    /// What was known before the machine became slower, and the bins of the frames that showed it.
+    before: Spans,
+    row: [usize; MOST_IN_A_ROW],
+    /// Frames in a row that decide, and frames since the machine was slower last.
+    row_len: usize,
+    since_slower: u32,
     /// Upper edges of the bins, nanoseconds.
     edges: [i64; BINS],
-    /// Frames of both.
-    totals: [u32; 2],
     slot_ns: i64,
     first_guess_ns: i64,
     longest_wait_ns: i64,
@@ -78,9 +140,13 @@ impl LeadEstimator {
             };
         }
         Self {
-            bins: [[0; BINS]; 2],
+            spans: Spans::EMPTY,
+            pace: Pace::Usual,
+            before: Spans::EMPTY,
+            row: [0; MOST_IN_A_ROW],
+            row_len: ((ROW_NS / slot_ns) as usize).clamp(FEWEST_IN_A_ROW, MOST_IN_A_ROW),
+            since_slower: u32::MAX,
             edges,
-            totals: [0; 2],
             slot_ns,
             first_guess_ns: first_guess_ns.max(0),
             longest_wait_ns: longest_wait_ns.max(0),
@@ -104,21 +170,56 @@ impl LeadEstimator {
             self.stalls_in_a_row = 0;
         }
         let bin = self.edges.partition_point(|&edge| edge <= needed_ns);
-        let Some(bin) = self.bins[0].get_mut(bin) else { return };
-        *bin += 1;
-        self.totals[0] += 1;
+        if bin >= BINS {
+            return;
+        }
         let frame_ns = self.typical_ns().max(self.slot_ns);
         let most = (SPAN_NS / frame_ns).clamp(FEWEST_IN_A_SPAN.into(), MOST_IN_A_SPAN.into());
-        if i64::from(self.totals[0]) >= most {
-            // Whole spans are forgotten. Counts that are halved lose their single events first, and these are the tail.
-            self.bins[1] = std::mem::replace(&mut self.bins[0], [0; BINS]);
-            self.totals[1] = std::mem::take(&mut self.totals[0]);
-        }
+        self.compare(needed_ns, bin, most);
+        self.spans.add(bin, most);
+    }
+
+    /// Compares a frame with those before it, and decides of which frames the lead is made.
+    fn compare(&mut self, needed_ns: i64, bin: usize, most: i64) {
+        self.since_slower = self.since_slower.saturating_add(1);
+        let row_len = self.row_len;
+        self.pace = match self.pace {
+            Pace::Usual if self.total() >= FEW && needed_ns > self.lead_ns() => {
+                self.before.clone_from(&self.spans);
+                self.row[0] = bin;
+                Pace::Rises { lead_ns: self.lead_ns(), row: 1 }
+            }
+            Pace::Rises { lead_ns, row } if needed_ns > lead_ns && row < row_len => {
+                self.row[row] = bin;
+                Pace::Rises { lead_ns, row: row + 1 }
+            }
+            Pace::Rises { lead_ns, .. } if needed_ns > lead_ns => {
+                self.spans = Spans::EMPTY;
+                self.row[..row_len].iter().for_each(|bin| self.spans.add(*bin, most));
+                Pace::Slower { lead_ns, row: 0, frames: 0 }
+            }
+            Pace::Usual | Pace::Rises { .. } => Pace::Usual,
+            // It is the rule now.
+            Pace::Slower { frames, .. } if i64::from(frames) >= most => Pace::Usual,
+            Pace::Slower { lead_ns, row, .. } if needed_ns <= lead_ns && row + 1 >= row_len => {
+                if i64::from(self.since_slower) >= most {
+                    self.spans.clone_from(&self.before);
+                } else {
+                    self.spans.join(&self.before);
+                }
+                self.since_slower = 0;
+                Pace::Usual
+            }
+            Pace::Slower { lead_ns, row, frames } => {
+                let row = if needed_ns <= lead_ns { row + 1 } else { 0 };
+                Pace::Slower { lead_ns, row, frames: frames + 1 }
+            }
+        };
     }
 
     /// Frames that are remembered.
     fn total(&self) -> u32 {
-        self.totals[0] + self.totals[1]
+        self.spans.totals[0] + self.spans.totals[1]
     }
 
     /// How long before its slot a frame is latched so that nearly all are whole in time.
@@ -173,7 +274,7 @@ impl LeadEstimator {
     fn quantile(&self, beyond: f64) -> i64 {
         let most = (f64::from(self.total()) * beyond).floor() as u32;
         let mut rest = self.total();
-        for (edge, (new, old)) in self.edges.iter().zip(self.bins[0].iter().zip(&self.bins[1])) {
+        for (edge, (new, old)) in self.edges.iter().zip(self.spans.bins[0].iter().zip(&self.spans.bins[1])) {
             let n = new + old;
             rest -= n;
             if n > 0 && rest <= most {
@@ -314,6 +415,46 @@ mod tests {
         assert!(e.lead_ns() >= 1_500_000, "{}", e.lead_ns());
         feed(&mut e, 15_000, 300_000);
         assert!(e.lead_ns() < 550_000, "{}", e.lead_ns());
+    }
+
+    /// Memory that is slow for a fifth of a second, and then as before: the lead follows it there and back.
+    #[test]
+    fn a_slow_moment_is_over_when_it_is_over() {
+        for slot in [SLOT, 4 * SLOT, 16 * SLOT] {
+            let mut e = LeadEstimator::new(slot, 2 * slot, 4 * slot);
+            (0..5_000).for_each(|i| e.measured(exponential(i)));
+            let before = e.lead_ns();
+            let frames = (200_000_000 / slot) as u64;
+            (0..frames).for_each(|i| e.measured(4 * exponential(i)));
+            assert!(e.lead_ns() > before + 800_000, "{} ns for needs of 1.6 ms", e.lead_ns());
+            // Half a second.
+            (0..frames * 5 / 2).for_each(|i| e.measured(exponential(i)));
+            assert!((e.lead_ns() - before).abs() < 60_000, "{before} ns, then {} ns", e.lead_ns());
+        }
+    }
+
+    /// What is slow again and again is no accident: the lead remembers it.
+    #[test]
+    fn slow_moments_that_return_count() {
+        let mut e = estimator();
+        (0..5_000).for_each(|i| e.measured(exponential(i)));
+        for _ in 0..3 {
+            (0..100).for_each(|i| e.measured(4 * exponential(i)));
+            (0..900).for_each(|i| e.measured(exponential(i)));
+        }
+        assert!(e.lead_ns() > 1_600_000, "{}", e.lead_ns());
+    }
+
+    /// A machine that stays slower is followed within a row, and its lead is that of the new frames alone.
+    #[test]
+    fn what_becomes_slower_and_stays_is_followed() {
+        let mut e = estimator();
+        (0..5_000).for_each(|i| e.measured(exponential(i)));
+        (0..20_000).for_each(|i| e.measured(1_000_000 + exponential(i)));
+        let slow = e.lead_ns();
+        let mut alone = estimator();
+        (0..20_000).for_each(|i| alone.measured(1_000_000 + exponential(i)));
+        assert!((slow - alone.lead_ns()).abs() < 60_000, "{slow} and {} ns", alone.lead_ns());
     }
 
     /// Found in use, R21: a renderer that needs many slots for a frame gets a lead that it can keep, from its first

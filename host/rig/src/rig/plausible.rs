@@ -184,6 +184,82 @@ fn of_shape(shape: &Shape) -> Vec<Doubt> {
     all
 }
 
+/// Rays at a body that find out which sides of it the projector sees, the instants at which they are cast, and the most triangles
+/// that they are held to.
+const RAYS: usize = 64;
+const RAY_INSTANTS: usize = 6;
+const RAY_TESTS: usize = 20_000_000;
+/// Share of rays that a body's fronts stop at least.
+const FRONTS: f64 = 0.03;
+
+/// A triangle in the space of its body, and whether its back is lit.
+struct Face {
+    corners: [DVec3; 3],
+    has_back: bool,
+}
+
+fn faces(rig: &Rig, tracked: usize) -> Vec<Face> {
+    let Some(body) = rig.bodies.get(tracked) else { return vec![] };
+    let meshes = rig.scene.bodies.iter().filter(|b| b.tracked == Some(tracked as u16) && b.projected);
+    let of_mesh = |mesh: &TriangleMesh| {
+        let at = |i: u32| body.mesh_to_body.transform_point3(mesh.positions[i as usize].as_dvec3());
+        let look = |m: &u32| rig.scene.materials.get(*m as usize);
+        let has_back = |m: &u32| look(m).is_none_or(|m| m.double_sided || m.transmission > 0.0);
+        let both = mesh.triangles.iter().zip(&mesh.materials);
+        both.map(|(t, m)| Face { corners: t.map(at), has_back: has_back(m) }).collect::<Vec<_>>()
+    };
+    meshes.filter(|b| b.is_whole()).flat_map(|b| of_mesh(&b.mesh)).collect()
+}
+
+/// Whether the first surface that rays from the projector to the body meet is a back that stays dark, for nearly all rays at all of the
+/// places: for open surfaces, whose volume says nothing.
+fn shows_only_backs(faces: &[Face], projector: DVec3, places: &[&DAffine3]) -> bool {
+    if faces.iter().all(|face| face.has_back) {
+        return false;
+    }
+    let rays = RAYS.min(RAY_TESTS / faces.len().max(1)).max(8);
+    let step = faces.len().div_ceil(rays).max(1);
+    let only_backs = |place: &DAffine3| {
+        let from = place.inverse().transform_point3(projector);
+        let mut fronts = 0;
+        let mut cast = 0;
+        for target in faces.iter().step_by(step) {
+            cast += 1;
+            let [a, b, c] = target.corners;
+            fronts += usize::from(stops_at_front(faces, from, (a + b + c) / 3.0 - from));
+            if fronts as f64 > FRONTS * rays as f64 {
+                return false;
+            }
+        }
+        fronts as f64 <= FRONTS * f64::from(cast)
+    };
+    let some = places.len().div_ceil(RAY_INSTANTS).max(1);
+    places.iter().step_by(some).all(|place| only_backs(place))
+}
+
+/// Whether the nearest face that a ray meets can be lit from its origin.
+fn stops_at_front(faces: &[Face], from: DVec3, towards: DVec3) -> bool {
+    let mut nearest = (f64::INFINITY, false);
+    for face in faces {
+        let [a, b, c] = face.corners;
+        let (ab, ac) = (b - a, c - a);
+        let normal = ab.cross(ac);
+        let facing = -towards.dot(normal);
+        if facing == 0.0 {
+            continue;
+        }
+        let away = from - a;
+        let t = away.dot(normal) / facing;
+        let across = away.cross(towards);
+        let (u, v) = (ac.dot(across) / facing, -ab.dot(across) / facing);
+        // Wide by rounding, so that a ray to a corner's neighbour is not lost in a seam.
+        if t > 0.0 && t < nearest.0 && u >= -1e-9 && v >= -1e-9 && u + v <= 1.0 + 1e-9 {
+            nearest = (t, face.has_back || facing > 0.0);
+        }
+    }
+    nearest.1
+}
+
 /// Bodies whose surfaces are closed, have one side, and show their backs.
 fn inside_out(rig: &Rig) -> Vec<Doubt> {
     // A room that does not move is seen from its inside.
@@ -246,6 +322,17 @@ pub fn of_places(rig: &Rig, places: &[Vec<DAffine3>]) -> Vec<Doubt> {
         });
         let Some((best, place)) = best else { continue };
         let about = format!("body \"{}\"", shape.name);
+        let is_turned = |b: &dpm_scene::Body| b.tracked == Some(tracked as u16) && turned(rig, &b.mesh);
+        if !rig.scene.bodies.iter().any(is_turned)
+            && shows_only_backs(&faces(rig, tracked), camera.position(), &of_body)
+        {
+            all.push(Doubt {
+                about: about.clone(),
+                told: "the projector sees only backs of its single-sided surface, which stay black".into(),
+                remedy: "flip its faces where it was made, make its material double-sided, or turn the body"
+                    .into(),
+            });
+        }
         let far = !DISTANCES_M.contains(&best.distance);
         let across = scale * best.size_px[0].max(best.size_px[1]);
         if best.is_near && !far && across >= LEAST_PX {
@@ -455,6 +542,41 @@ mod tests {
             let word = if size > 0.12 { "millimetres?" } else { "metres?" };
             assert!(of_shape(&large).iter().any(|d| d.told.contains(word)), "{i}: {size}");
         }
+    }
+
+    /// A shell that is open at one side, a sheet, and what hides its own inside.
+    #[test]
+    fn only_backs_are_told_of_open_surfaces() {
+        let sphere = |keep: &dyn Fn(DVec3) -> bool, flip: bool| {
+            let at = |i: usize, k: usize| {
+                let (a, b) =
+                    (std::f64::consts::PI * i as f64 / 12.0, std::f64::consts::TAU * k as f64 / 24.0);
+                0.2 * DVec3::new(a.sin() * b.cos(), a.cos(), -a.sin() * b.sin())
+            };
+            let quads = (0..12).flat_map(|i| (0..24).map(move |k| (i, k)));
+            let halves = quads.flat_map(|(i, k)| {
+                let [a, b, c, d] = [at(i, k), at(i + 1, k), at(i + 1, k + 1), at(i, k + 1)];
+                [[a, b, c], [a, c, d]]
+            });
+            let is_kept = |t: &[DVec3; 3]| keep((t[0] + t[1] + t[2]) / 3.0);
+            let faces = halves
+                .filter(is_kept)
+                .map(|[a, b, c]| Face { corners: if flip { [a, c, b] } else { [a, b, c] }, has_back: false });
+            faces.collect::<Vec<_>>()
+        };
+        let projector = DVec3::new(0.0, 0.0, 2.0);
+        let here = DAffine3::IDENTITY;
+        let around = DAffine3::from_rotation_y(std::f64::consts::PI);
+        let open_below = |p: DVec3| p.y > -0.15;
+        assert!(!shows_only_backs(&sphere(&open_below, false), projector, &[&here]));
+        assert!(shows_only_backs(&sphere(&open_below, true), projector, &[&here, &around]));
+        // A bowl whose inside is meant: its fronts are seen from one side alone.
+        let bowl = sphere(&|p| p.z < 0.0, true);
+        assert!(!shows_only_backs(&bowl, projector, &[&here]));
+        assert!(!shows_only_backs(&bowl, projector, &[&around, &here]), "in time");
+        assert!(shows_only_backs(&bowl, projector, &[&around]));
+        let two_sided: Vec<Face> = bowl.into_iter().map(|face| Face { has_back: true, ..face }).collect();
+        assert!(!shows_only_backs(&two_sided, projector, &[&around]));
     }
 
     #[test]

@@ -119,6 +119,51 @@ fn every_dialect_gives_the_same_projector() {
     }
 }
 
+/// Files in sixteen dialects, and the pixels by OpenCV itself: `tests/peers/calibrations.py` wrote both.
+#[test]
+fn dialects_project_as_opencv_does() {
+    let folder = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../tests/assets/dialects");
+    let text = |name: &str| std::fs::read_to_string(folder.join(name)).unwrap();
+    let pixels: Vec<Vec<f64>> = text("pixels.csv")
+        .lines()
+        .skip(1)
+        .map(|line| line.split(',').map(|number| number.parse().unwrap()).collect())
+        .collect();
+    assert!(pixels.len() > 50);
+    let (mut read_ones, mut refused) = (0, 0);
+    for line in text("dialects.tsv").lines().skip(1) {
+        let [file, unit, device, frame, right] = line.split('\t').collect::<Vec<_>>()[..] else {
+            panic!("{line}")
+        };
+        let unit = if unit == "metre" { LengthUnit::Metre } else { LengthUnit::Millimetre };
+        let device = Some(device).filter(|device| *device != "-");
+        let bytes = std::fs::read(folder.join(file)).unwrap();
+        let got = read(&bytes, &ReadOptions { device, ..options(unit) });
+        if let Some(advice) = right.strip_prefix("refused: ") {
+            let told = got.unwrap_err().to_string();
+            assert!(advice.split(", ").all(|word| told.contains(word)), "{file}: {told}");
+            refused += 1;
+            continue;
+        }
+        let got = got.unwrap_or_else(|e| panic!("{file}: {e}"));
+        let is_as_told = match (&got.frame, frame) {
+            (Frame::World, "world") | (Frame::Camera { .. }, "camera") => true,
+            (Frame::WorldOfCamera { .. }, told) => told == "world of camera",
+            _ => false,
+        };
+        assert!(is_as_told, "{file}: {:?}", got.frame);
+        let first = ["lens", "lens of four", "no lens"].iter().position(|l| *l == right).unwrap() * 2 + 3;
+        for row in &pixels {
+            let pixel = got.camera.project(DVec3::new(row[0], row[1], row[2])).unwrap();
+            // OpenCV's pixels have their centres at whole numbers.
+            let off = pixel - DVec2::new(row[first] + 0.5, row[first + 1] + 0.5);
+            assert!(off.length() < 0.01, "{file}: {pixel} {row:?}");
+        }
+        read_ones += 1;
+    }
+    assert_eq!((read_ones, refused), (15, 1));
+}
+
 #[test]
 fn several_devices_are_a_question_whose_answer_is_the_projector() {
     for (name, unit, lens, answer) in [

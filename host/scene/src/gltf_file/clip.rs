@@ -7,7 +7,7 @@ use image::{AnimationDecoder, ImageDecoder, ImageError};
 
 use super::super::{Limits, SceneError, Texture};
 use super::json::Item;
-use super::picture::{check_size, Size};
+use super::picture::{check_decoded, check_size, Size};
 
 /// Most pictures of a clip.
 const MOST_PICTURES: usize = 10_000;
@@ -43,6 +43,7 @@ pub(super) fn decode(
         let picture = picture.map_err(failed)?;
         let so_far = texels_so_far + texels.len() as u64;
         check_size(item, Size { width, height }, so_far, limits)?;
+        check_decoded(item, bytes, 4 * (so_far + u64::from(width) * u64::from(height)), limits)?;
         if ends_ns.len() == MOST_PICTURES {
             return Err(item.error(format!("has more than {MOST_PICTURES} pictures")));
         }
@@ -50,6 +51,8 @@ pub(super) fn decode(
         let lasts_ns = i64::from(numerator) * 1_000_000 / i64::from(denominator.max(1));
         end += lasts_ns.max(SHORTEST_NS);
         ends_ns.push(end);
+        // Doubling what is there would take twice the memory of the whole clip.
+        texels.reserve_exact(width as usize * height as usize);
         texels.extend(picture.into_buffer().as_raw().chunks_exact(4).map(|c| [c[0], c[1], c[2], c[3]]));
     }
     if ends_ns.is_empty() {

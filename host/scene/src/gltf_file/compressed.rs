@@ -7,7 +7,7 @@ use draco_gltf::meshopt::{self, MeshoptFilter, MeshoptMode};
 use draco_gltf::{ComponentType, DecodeLimits, DracoPrimitiveContract, DracoPrimitiveExtension, JsonValue};
 use serde_json::{json, Value};
 
-use super::super::limits::Cancel;
+use super::super::limits::{largest_piece, Cancel};
 use super::super::{Limits, SceneError};
 use super::accessor::range_of;
 use super::json::{shorten, shorten_to, Item};
@@ -40,7 +40,8 @@ pub(super) fn decompress(
     limits: &Limits,
     cancel: &Cancel,
 ) -> Result<(), SceneError> {
-    let mut room = Room { used: buffers.iter().map(|b| b.len() as u64).sum(), limit: limits.bytes };
+    let used = buffers.iter().map(|b| b.len() as u64).sum();
+    let mut room = Room { used, limit: limits.bytes.min(largest_piece(used)) };
     for (view, bytes) in meshopt_views(tree, buffers, limits, &mut room, cancel)? {
         let plain = &mut list_mut(tree, "bufferViews")[view];
         plain["buffer"] = json!(buffers.len());

@@ -138,7 +138,7 @@ pub(super) fn flatten(
     }
     gatherer.tell_of_deforming(warnings);
     let paint = std::mem::take(&mut gatherer.paint);
-    paint.warn(warnings);
+    paint.warn(source.look, warnings);
     Ok((gatherer.into_flat(warnings)?, paint))
 }
 
@@ -373,7 +373,7 @@ impl<'a> Gatherer<'a> {
         let Source { document, data, look, deformations, .. } = *self.source;
         let primitive = &document.as_json().meshes[mesh].primitives[number];
         let material = primitive.material.map_or(look.materials.len() - 1, |m| m.value());
-        let look = (material as u32, look.uv_sets[material]);
+        let look = (look, material as u32);
         let deformation = deformations.of((node, mesh, number), pose);
         let stop = (self.cancel, self.limits);
         read_primitive(primitive, data, look, &deformation, &mut self.paint, stop)

@@ -7,6 +7,7 @@ use glam::{Vec2, Vec3};
 use super::super::limits::Cancel;
 use super::super::{Limits, Material, SceneError, Texture, TextureRef, Wrap};
 use super::accessor::Data;
+use super::bake::NORMALS;
 use super::container::{fetch, Folder};
 use super::json::Item;
 use super::picture::{self, Picture, Size};
@@ -15,8 +16,8 @@ use super::picture::{self, Picture, Size};
 pub(super) struct Look {
     /// One for each material of the file, followed by glTF's default material.
     pub materials: Vec<Material>,
-    /// Set of texture coordinates that each material needs.
-    pub uv_sets: Vec<u32>,
+    /// For each material the sets of texture coordinates of its textures, in the order of [`Material::textures`]; 0 where there is none.
+    pub sets: Vec<Vec<u32>>,
     /// Decoded images.
     pub textures: Vec<Texture>,
 }
@@ -44,15 +45,15 @@ pub(crate) fn read_look(
         texels: 0,
     };
     let raw = root.list("materials", "material", limits.objects)?;
-    let (mut materials, mut uv_sets) = (vec![], vec![]);
+    let (mut materials, mut sets) = (vec![], vec![]);
     for (material, raw) in document.materials().zip(&raw) {
-        let (look, uv_set) = reader.material(&material, raw, warnings)?;
+        let (look, of_look) = reader.material(&material, raw, warnings)?;
         materials.push(look);
-        uv_sets.push(uv_set);
+        sets.push(of_look);
     }
     materials.push(Material::default());
-    uv_sets.push(0);
-    Ok(Look { materials, uv_sets, textures: reader.textures })
+    sets.push(vec![]);
+    Ok(Look { materials, sets, textures: reader.textures })
 }
 
 /// KHR_materials_unlit: the base colour is what the surface sends out, whatever falls on it. It reflects nothing, and nothing else
@@ -106,13 +107,36 @@ struct Use {
     srgb: bool,
 }
 
+impl Look {
+    /// The set of a material's coordinates, or that of its map of normals if its textures lie on several.
+    pub(super) fn set_of(&self, material: u32) -> u32 {
+        let normals = self.used_sets(material).find(|(slot, _)| *slot == NORMALS);
+        normals.or_else(|| self.used_sets(material).next()).map_or(0, |(_, set)| set)
+    }
+
+    /// The places in [`Material::textures`] that have one, with their sets.
+    fn used_sets(&self, material: u32) -> impl Iterator<Item = (usize, u32)> + '_ {
+        let sets = &self.sets[material as usize];
+        let textures = self.materials[material as usize].textures().enumerate();
+        textures
+            .filter(|(_, texture)| texture.is_some())
+            .map(|(slot, _)| (slot, sets.get(slot).copied().unwrap_or(0)))
+    }
+
+    /// Whether the textures of a material lie on several sets.
+    pub(super) fn has_several_sets(&self, material: u32) -> bool {
+        let first = self.used_sets(material).next();
+        self.used_sets(material).any(|used| Some(used.1) != first.map(|f| f.1))
+    }
+}
+
 impl Reader<'_> {
     fn material(
         &mut self,
         m: &gltf::Material,
         raw: &Item,
         warnings: &mut Vec<String>,
-    ) -> Result<(Material, u32), SceneError> {
+    ) -> Result<(Material, Vec<u32>), SceneError> {
         let pbr = m.pbr_metallic_roughness();
         let [r, g, b, alpha] = pbr.base_color_factor().map(|x| x.clamp(0.0, 1.0));
         let alpha_cutoff = match m.alpha_mode() {
@@ -153,13 +177,7 @@ impl Reader<'_> {
                 .and_then(|t| t.transmission_texture())
                 .map(|i| plain_use("transmission", &i, false)),
         ];
-        let uv_set = uses.iter().flatten().next().map_or(0, |u| u.uv_set);
-        for u in uses.iter().flatten().filter(|u| u.uv_set != uv_set) {
-            warnings.push(format!(
-                "{}: the {} texture uses coordinate set {}, but set {uv_set} is read for the whole material: it will look wrong",
-                raw.name, u.slot, u.uv_set
-            ));
-        }
+        let mut sets: Vec<u32> = uses.iter().map(|u| u.as_ref().map_or(0, |u| u.uv_set)).collect();
         let mut references = [None; 5];
         for (reference, u) in references.iter_mut().zip(&uses) {
             if let Some(u) = u {
@@ -175,8 +193,9 @@ impl Reader<'_> {
         ] = references;
         if m.unlit() {
             out = unlit(out);
+            sets[3] = sets[0];
         }
-        Ok((out, uv_set))
+        Ok((out, sets))
     }
 
     /// `None`: its image cannot be read. The shape of a body is worth more than its picture.

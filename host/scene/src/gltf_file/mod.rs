@@ -3,6 +3,7 @@
 
 mod accessor;
 mod animation;
+mod bake;
 mod check;
 mod check_look;
 mod clip;
@@ -85,7 +86,8 @@ pub(super) fn read(
     ktx2_image::make_plain(&mut tree, limits)?;
     let root = Item::new(&tree, "document".into())?;
     let all_bytes = bytes.len() + buffers.iter().map(Vec::len).sum::<usize>();
-    let limits = &limits.of_file(all_bytes as u64);
+    // Of a document that was made from another file, that file counts.
+    let limits = &limits.of_file(if limits.file_bytes > 0 { limits.file_bytes } else { all_bytes as u64 });
     let data = accessor::Data::new(&root, buffers, limits)?;
     let check::Checked { mut warnings, instances } = check::check(&root, &data, limits)?;
     warnings.extend(told);

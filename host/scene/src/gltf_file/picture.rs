@@ -5,6 +5,7 @@ use std::io::Cursor;
 
 use image::{ImageFormat, ImageReader};
 
+use super::super::limits::largest_piece;
 use super::super::{Limits, SceneError};
 use super::json::Item;
 use super::ktx2_image;
@@ -69,9 +70,12 @@ pub(super) fn decode(
     let format = format_of(item, bytes, name)?;
     let reader = || ImageReader::with_format(Cursor::new(bytes), format);
     let failed = |e: image::ImageError| item.error(format!("cannot be decoded: {e}"));
-    let (width, height) = reader().into_dimensions().map_err(failed)?;
+    let decoder = reader().into_decoder().map_err(failed)?;
+    let (width, height) = image::ImageDecoder::dimensions(&decoder);
     let size = Size { width, height };
     check_size(item, size, texels_so_far, limits)?;
+    let decoded = image::ImageDecoder::total_bytes(&decoder).max(4 * size.texels() as u64);
+    check_decoded(item, bytes, decoded, limits)?;
     let mut bounded = reader();
     let mut memory = image::Limits::default();
     memory.max_image_width = Some(width);
@@ -117,6 +121,21 @@ pub(super) fn check(item: &Item, bytes: &[u8], name: &str, limits: &Limits) -> R
     let sides = ImageReader::with_format(Cursor::new(bytes), format).into_dimensions();
     let (width, height) = sides.map_err(|e| item.error(format!("cannot be decoded: {e}")))?;
     check_size(item, Size { width, height }, 0, limits)
+}
+
+/// Refuses a picture that takes more bytes than the length of its file allows.
+pub(super) fn check_decoded(
+    item: &Item,
+    bytes: &[u8],
+    decoded: u64,
+    limits: &Limits,
+) -> Result<(), SceneError> {
+    SceneError::check_limit(
+        &format!("the bytes of {} in so short a file", item.name),
+        decoded,
+        largest_piece(limits.file_bytes.max(bytes.len() as u64)),
+        "use a smaller texture",
+    )
 }
 
 /// Refuses a picture without texels, or with more than the limits allow.

@@ -10,7 +10,9 @@ use super::super::limits::Cancel;
 use super::super::mesh::Dropped;
 use super::super::{Limits, SceneError, TriangleMesh};
 use super::accessor::{Accessor, Data};
+use super::bake::Vertices;
 use super::deform::Deformation;
+use super::look::Look;
 use super::vertex_paint::Paint;
 
 /// Reads a primitive's triangles with their material; decodes only vertices that a triangle uses. `None` if there is
@@ -18,7 +20,7 @@ use super::vertex_paint::Paint;
 pub(crate) fn read_primitive(
     primitive: &Primitive,
     data: &Data,
-    (material, uv_set): (u32, u32),
+    (look, material): (&Look, u32),
     deformation: &Deformation,
     paint: &mut Paint,
     stop: (&Cancel, &Limits),
@@ -30,26 +32,25 @@ pub(crate) fn read_primitive(
         None => faces(primitive, data)?,
     };
     let Some(faces) = all else { return Ok(None) };
-    let colours = attribute(Semantic::Colors(0));
-    let painted = match colours {
-        Some(a) => paint.faces(&faces, material, |i| Vec3::from(data.floats::<3>(a, i)))?,
-        None => None,
+    // A NaN texture coordinate would spoil whole pixels; zero spoils only the texture.
+    let uv = |set: u32, i: u64| {
+        let numbers = attribute(Semantic::TexCoords(set)).map(|a| data.floats::<2>(a, i));
+        Vec2::from(numbers.unwrap_or_default().map(|x| if x.is_finite() { x } else { 0.0 }))
     };
+    let colours = attribute(Semantic::Colors(0));
+    let colour = |i: u64| colours.map_or(Vec3::ONE, |a| Vec3::from(data.floats::<3>(a, i)));
+    let vertices = Vertices { uv: &uv, colour: colours.is_some().then_some(&colour) };
+    // The address of the primitive names it as long as the document is read.
+    let name = std::ptr::from_ref(primitive) as usize;
+    let painted = paint.faces(look, (name, &faces), material, &vertices)?;
+    let uv_set = look.set_of(material);
     let (used, triangles) = match painted {
         Some(_) => apart(&faces),
         None => shared(&faces),
     };
     let floats3 = |a: &Accessor| used.iter().map(|&i| Vec3::from(data.floats::<3>(a, i))).collect::<Vec<_>>();
-    let (material, painted_uvs) = painted.map_or((material, None), |(material, uvs)| (material, Some(uvs)));
-    let uvs = match (painted_uvs, attribute(Semantic::TexCoords(uv_set))) {
-        (Some(uvs), _) => uvs,
-        // A NaN texture coordinate would spoil whole pixels; zero spoils only the texture.
-        (None, Some(a)) => used
-            .iter()
-            .map(|&i| Vec2::from(data.floats::<2>(a, i).map(|x| if x.is_finite() { x } else { 0.0 })))
-            .collect(),
-        (None, None) => vec![Vec2::ZERO; used.len()],
-    };
+    let (material, painted_uvs) = painted.unwrap_or((material, vec![]));
+    let uvs = used.iter().map(|&i| uv(uv_set, i)).collect();
     let normals = attribute(Semantic::Normals).map(floats3);
     let has_normals = normals.is_some();
     let mut mesh = TriangleMesh {
@@ -61,6 +62,7 @@ pub(crate) fn read_primitive(
             None => vec![],
         },
         uvs,
+        later_uvs: painted_uvs,
         materials: vec![material; triangles.len()],
         triangles,
         sources: if deformation.is_bind_pose() { used.iter().map(|&i| i as u32).collect() } else { vec![] },
@@ -76,6 +78,9 @@ pub(crate) fn read_primitive(
         mesh.generate_tangents();
     } else {
         mesh.repair_tangents();
+    }
+    if !mesh.later_uvs.is_empty() {
+        mesh.uvs = std::mem::take(&mut mesh.later_uvs);
     }
     Ok(Some((mesh, dropped)))
 }

@@ -1,4 +1,4 @@
-//! Colours of vertices as a texture, so that surfaces have one kind of colour.
+//! Colours of vertices as a texture, so that surfaces have one kind of colour. Beside other textures `bake.rs` samples them.
 //!
 //! Each triangle gets 2 x 2 texels, and its corners lie in the centres of three of them. The fourth is what makes bilinear
 //! interpolation linear on the triangle (`b + c - a`), up to the 8 bits of a texel and to values outside 0..1.
@@ -9,6 +9,7 @@ use glam::{Vec2, Vec3};
 
 use super::super::srgb::{from_linear, to_linear};
 use super::super::{Limits, SceneError, Texture, TextureRef, Wrap};
+use super::bake::{Bake, Vertices};
 use super::look::Look;
 
 /// Triangles in a row of the texture.
@@ -25,12 +26,11 @@ pub(super) struct Paint {
     known: HashMap<[[u8; 3]; 3], u32>,
     /// Painted material by plain material; numbers go on after those of the file.
     materials: HashMap<u32, u32>,
-    /// Materials of the file that have a texture, which cannot be painted.
+    /// Materials of the file that have a texture, which is sampled anew.
     is_textured: Vec<bool>,
+    bake: Bake,
     /// Most triangles that fit into the limits.
     most: u64,
-    /// Primitives whose colours are left out.
-    ignored: usize,
 }
 
 impl Paint {
@@ -43,32 +43,35 @@ impl Paint {
         Self { is_textured, most, ..Self::default() }
     }
 
-    /// Paints faces whose vertices have linear colours. `None`: they stay as they are, since they are white or their material
-    /// has a texture.
+    /// Paints faces whose vertices have linear colours, and those whose material has textures on several sets of coordinates.
+    /// `None`: they stay as they are. `primitive` names what the vertices are of.
     ///
     /// # Errors
     /// More colours than a texture holds.
     pub(super) fn faces(
         &mut self,
-        faces: &[[u64; 3]],
+        look: &Look,
+        (primitive, faces): (usize, &[[u64; 3]]),
         material: u32,
-        colour: impl Fn(u64) -> Vec3,
+        vertices: &Vertices,
     ) -> Result<Option<Painted>, SceneError> {
-        let white = |i: &u64| colour(*i).min_element() > 0.999;
-        if faces.as_flattened().iter().all(white) {
-            return Ok(None);
+        let white = |colour: &dyn Fn(u64) -> Vec3| {
+            faces.as_flattened().iter().all(|i| colour(*i).min_element() > 0.999)
+        };
+        let colour = vertices.colour.filter(|colour| !white(colour));
+        let next = (self.is_textured.len() + self.materials.len() + self.bake.materials()) as u32;
+        let is_textured = self.is_textured[material as usize];
+        if is_textured && (colour.is_some() || look.has_several_sets(material)) {
+            let vertices = Vertices { uv: vertices.uv, colour };
+            return self.bake.faces(look, (material, next), (primitive, faces), &vertices).map(Some);
         }
-        if self.is_textured.get(material as usize).copied().unwrap_or(true) {
-            self.ignored += 1;
-            return Ok(None);
-        }
+        let Some(colour) = colour else { return Ok(None) };
         let mut uvs = Vec::with_capacity(3 * faces.len());
         for face in faces {
             let block = self.block(face.map(|i| colour(i).to_array().map(encoded)))?;
             let corner = Vec2::new((block % PER_ROW * 2) as f32, (block / PER_ROW * 2) as f32);
             uvs.extend([Vec2::new(0.5, 0.5), Vec2::new(1.5, 0.5), Vec2::new(0.5, 1.5)].map(|at| corner + at));
         }
-        let next = (self.is_textured.len() + self.materials.len()) as u32;
         Ok(Some((*self.materials.entry(material).or_insert(next), uvs)))
     }
 
@@ -90,40 +93,35 @@ impl Paint {
         Ok(block)
     }
 
-    /// Says what is left out.
-    pub(super) fn warn(&self, warnings: &mut Vec<String>) {
-        if self.ignored > 0 {
-            warnings.push(format!(
-                "colours of vertices are ignored on {} primitives, whose materials have textures",
-                self.ignored
-            ));
-        }
+    /// Says what is sampled anew.
+    pub(super) fn warn(&self, look: &Look, warnings: &mut Vec<String>) {
+        self.bake.warn(look, warnings);
     }
 
-    /// Adds the texture and the painted materials.
-    pub(super) fn add_to(self, look: &mut Look) {
-        if self.blocks.is_empty() {
-            return;
+    /// Adds the textures and the painted materials.
+    pub(super) fn add_to(mut self, look: &mut Look) {
+        let mut made = std::mem::take(&mut self.bake).into_materials(look);
+        if !self.blocks.is_empty() {
+            let (width, height) = self.sides();
+            let reference = TextureRef {
+                texture: look.textures.len() as u32,
+                offset: Vec2::ZERO,
+                rotation: 0.0,
+                scale: Vec2::new(1.0 / width as f32, 1.0 / height as f32),
+            };
+            look.textures.push(self.texture());
+            made.extend(self.materials.iter().map(|(plain, painted)| {
+                let mut material = look.materials[*plain as usize].clone();
+                if material.unlit {
+                    material.emissive_texture = Some(reference);
+                } else {
+                    material.base_color_texture = Some(reference);
+                }
+                (*painted, material)
+            }));
         }
-        let (width, height) = self.sides();
-        let made = TextureRef {
-            texture: look.textures.len() as u32,
-            offset: Vec2::ZERO,
-            rotation: 0.0,
-            scale: Vec2::new(1.0 / width as f32, 1.0 / height as f32),
-        };
-        look.textures.push(self.texture());
-        let mut pairs: Vec<(u32, u32)> = self.materials.into_iter().collect();
-        pairs.sort_unstable_by_key(|(_, painted)| *painted);
-        for (plain, _) in pairs {
-            let mut material = look.materials[plain as usize].clone();
-            if material.unlit {
-                material.emissive_texture = Some(made);
-            } else {
-                material.base_color_texture = Some(made);
-            }
-            look.materials.push(material);
-        }
+        made.sort_by_key(|(number, _)| *number);
+        look.materials.extend(made.into_iter().map(|(_, material)| material));
     }
 
     fn sides(&self) -> (u32, u32) {

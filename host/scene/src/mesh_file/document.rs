@@ -89,6 +89,26 @@ impl Document {
         (low[0] <= high[0]).then_some((low, high))
     }
 
+    /// Scanners write the same colours twice, as a texture and at vertices, and no format but glTF says that one multiplies the other:
+    /// the texture alone counts.
+    pub(super) fn drop_colours_beside_textures(&mut self) {
+        let is_textured = |material: usize| {
+            let texture =
+                self.materials.get(material).map(|m| &m["pbrMetallicRoughness"]["baseColorTexture"]);
+            texture.is_some_and(|texture| !texture.is_null())
+        };
+        let mut dropped = 0;
+        for part in self.objects.iter_mut().flat_map(|object| &mut object.parts) {
+            if !part.colours.is_empty() && part.material.is_some_and(is_textured) {
+                part.colours = vec![];
+                dropped += 1;
+            }
+        }
+        if dropped > 0 {
+            self.warnings.push("colours of vertices or faces are not used beside the texture".into());
+        }
+    }
+
     /// The document as the bytes of a `.glb`.
     pub(super) fn to_glb(&self) -> Vec<u8> {
         let mut binary = Binary::default();

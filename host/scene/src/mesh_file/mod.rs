@@ -104,6 +104,7 @@ pub(super) fn read(
         let parts = document.objects.drain(..).flat_map(|object| object.parts).collect();
         document.objects = vec![document::Object { name, parts }];
     }
+    document.drop_colours_beside_textures();
     let (axes, told) = units::axes(&document, format, options);
     if let Some(told) = far::centre(&mut document, axes.scale) {
         document.warnings.push(told);
@@ -111,7 +112,8 @@ pub(super) fn read(
     let warnings = std::mem::take(&mut document.warnings);
     let glb = document.to_glb();
     drop::<Document>(document);
-    let options = LoadOptions { scale: Some(axes.scale), up: Some(axes.up), ..options.clone() };
+    let options =
+        LoadOptions { scale: Some(axes.scale), up: Some(axes.up), limits: limits.clone(), ..options.clone() };
     let mut scene = gltf_file::read(&glb, beside, &options, cancel)?;
     scene.warnings.splice(0..0, warnings.into_iter().chain([told]));
     Ok(scene)

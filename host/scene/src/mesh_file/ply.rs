@@ -415,11 +415,6 @@ fn parts(
         all.push((of(0), faces.triangles));
     }
     document.materials.push(mtl::plain("PLY"));
-    let is_textured = all.iter().any(|(material, _)| *material != plain);
-    if is_textured && !part.colours.is_empty() {
-        part.colours = vec![];
-        document.warnings.push("colours of vertices or faces are not used beside the texture".into());
-    }
     // Each part has all vertices: the reader of glTF keeps those that its triangles name.
     let last = all.len() - 1;
     let mut out = Vec::with_capacity(all.len());

@@ -415,18 +415,101 @@ fn unlit_materials_send_out_their_base_colour() {
     assert!(m.emissive_texture.is_some() && m.base_color_texture.is_none(), "{m:?}");
 }
 
-#[test]
-fn colours_of_vertices_are_painted_unless_a_texture_is_there() {
-    let coloured = |glb: Glb| glb.set("/meshes/0/primitives/0/attributes/COLOR_0", json!(0));
-    let scene = load(&coloured(tetrahedra()));
-    let painted = |scene: &Scene| {
-        let used = scene.bodies[0].mesh.materials[0] as usize;
-        scene.materials[used].base_color_texture.map(|t| scene.textures[t.texture as usize].height)
+/// The texture of a material's slot at a place of a triangle, between its texels, as linear light.
+fn seen(scene: &Scene, slot: usize, triangle: usize, [a, b, c]: [f32; 3]) -> Vec3 {
+    let mesh = &scene.bodies[0].mesh;
+    let material = &scene.materials[mesh.materials[triangle] as usize];
+    let used = material.textures().nth(slot).flatten().unwrap();
+    let texture = &scene.textures[used.texture as usize];
+    let [p, q, r] = mesh.triangles[triangle].map(|i| mesh.uvs[i as usize]);
+    let size = Vec2::new(texture.width as f32, texture.height as f32);
+    let at = used.apply(p * a + q * b + r * c) * size - 0.5;
+    let texel = |x: f32, y: f32| {
+        let place = |t: f32, n: u32| t.rem_euclid(n as f32) as usize;
+        let [r, g, b, _] =
+            texture.texels[place(y, texture.height) * texture.width as usize + place(x, texture.width)];
+        Vec3::from([r, g, b].map(|code| dpm_scene::srgb::to_linear(f32::from(code) / 255.0)))
     };
-    assert_eq!((painted(&scene), scene.warnings.len()), (Some(2), 0), "{:?}", scene.warnings);
-    let textured = load(&coloured(with_image(&png(4, 4, &[[200, 100, 50, 255]; 16]))));
-    assert_eq!(painted(&textured), Some(4), "the texture of the file");
-    assert!(textured.warnings.iter().any(|w| w.contains("colours of vertices")), "{:?}", textured.warnings);
+    let (x, y) = (at.x.floor(), at.y.floor());
+    let row = |y: f32| texel(x, y).lerp(texel(x + 1.0, y), at.x - x);
+    row(y).lerp(row(y + 1.0), at.y - y)
+}
+
+/// The first triangle at (0, 0), (1, 0), (0, 1) of its coordinates, with a picture of smooth colours.
+fn smooth_picture() -> Glb {
+    let texel = |i: usize| [(8 * (i % 32)) as u8, (8 * (i / 32)) as u8, 90, 255];
+    with_image(&png(32, 32, &(0..1024).map(texel).collect::<Vec<_>>()))
+}
+
+#[test]
+fn colours_of_vertices_are_painted_and_multiply_a_texture() {
+    let coloured = |mut glb: Glb, colours: &[f32]| {
+        let colours = glb.push_numbers("VEC3", colours);
+        glb.set("/meshes/0/primitives/0/attributes/COLOR_0", json!(colours))
+    };
+    let plain = load(&smooth_picture());
+    // The first and the last have the same coordinates on the picture.
+    let colours = [[0.9, 0.1, 0.5], [0.2, 0.8, 0.5], [0.6, 0.7, 0.1], [0.9, 0.1, 0.5]];
+    let painted = load(&coloured(tetrahedra(), colours.as_flattened()));
+    let both = load(&coloured(smooth_picture(), colours.as_flattened()));
+    assert!(painted.warnings.is_empty(), "{:?}", painted.warnings);
+    assert!(both.warnings.iter().any(|w| w.contains("sampled anew")), "{:?}", both.warnings);
+    let triangles = both.bodies[0].mesh.triangles.len();
+    assert_eq!(triangles, plain.bodies[0].mesh.triangles.len());
+    for triangle in 0..triangles {
+        for weights in [[0.8, 0.1, 0.1], [0.3, 0.3, 0.4], [0.1, 0.6, 0.3], [0.2, 0.1, 0.7]] {
+            let mesh = &plain.bodies[0].mesh;
+            let colour = mesh.triangles[triangle].map(|i| match mesh.uvs[i as usize] {
+                Vec2 { x: 1.0, .. } => colours[1],
+                Vec2 { y: 1.0, .. } => colours[2],
+                _ => colours[0],
+            });
+            let colour: Vec3 = colour.iter().zip(weights).map(|(c, w)| w * Vec3::from_array(*c)).sum();
+            let at = |scene: &Scene| seen(scene, 0, triangle, weights);
+            let (want, got) = (colour * at(&plain), at(&both));
+            assert!((want - got).abs().max_element() < 0.02, "{triangle} {weights:?}: {got} for {want}");
+        }
+    }
+    // White changes nothing, and the same mesh twice takes no more room.
+    let white = load(&coloured(smooth_picture(), &[1.0; 12]));
+    assert_eq!((white.textures.len(), white.materials.len()), (plain.textures.len(), plain.materials.len()));
+}
+
+#[test]
+fn textures_on_a_second_set_of_coordinates_lie_where_the_file_says() {
+    let emission = |set: u32| {
+        json!([{"pbrMetallicRoughness": {"baseColorTexture": {"index": 0}}, "emissiveFactor": [1, 1, 1],
+                "emissiveTexture": {"index": 0, "texCoord": set}}])
+    };
+    // Coordinates of the second set: the first mirrored.
+    let mirrored = [1.0, 0.0, 0.0, 0.0, 1.0, 1.0, 1.0, 0.0];
+    let file = |set: u32| {
+        let mut glb = smooth_picture();
+        let second = glb.push_numbers("VEC2", &mirrored);
+        glb.set("/meshes/0/primitives/0/attributes/TEXCOORD_1", json!(second))
+            .set("/materials", emission(set))
+    };
+    let (same, other) = (load(&file(0)), load(&file(1)));
+    let anew = |scene: &Scene| scene.warnings.iter().any(|w| w.contains("sampled anew"));
+    assert!(anew(&other) && !anew(&same), "{:?} {:?}", same.warnings, other.warnings);
+    let wholly_second = {
+        let mut glb = smooth_picture();
+        let second = glb.push_numbers("VEC2", &mirrored);
+        load(
+            &glb.set("/meshes/0/primitives/0/attributes/TEXCOORD_0", json!(second))
+                .set("/materials", emission(0)),
+        )
+    };
+    for triangle in 0..other.bodies[0].mesh.triangles.len() {
+        for weights in [[0.8, 0.1, 0.1], [0.3, 0.3, 0.4], [0.1, 0.6, 0.3]] {
+            let pairs = [(0, &same), (3, &wholly_second)];
+            for (slot, reference) in pairs {
+                let (want, got) =
+                    (seen(reference, slot, triangle, weights), seen(&other, slot, triangle, weights));
+                assert!((want - got).abs().max_element() < 0.02, "{slot} {triangle}: {got} for {want}");
+            }
+        }
+    }
 }
 
 #[test]

@@ -6,6 +6,7 @@ mod common;
 mod compressed_gltf;
 mod deform;
 mod deforming;
+mod file_memory;
 mod gltf_scenes;
 mod ktx2_formats;
 mod ktx2_textures;

@@ -23,7 +23,7 @@ use serde_json::{json, Value};
 
 use super::super::{Limits, SceneError};
 use super::json::{shorten, Item};
-use super::picture::{check_size, Picture, Size};
+use super::picture::{check_decoded, check_size, Picture, Size};
 
 /// The extension, at textures.
 pub(super) const BASISU: &str = "KHR_texture_basisu";
@@ -90,6 +90,7 @@ pub(super) fn decode(
     check_shape(item, &header)?;
     let size = Size { width: header.pixel_width, height: header.pixel_height };
     check_size(item, size, texels_so_far, limits)?;
+    check_decoded(item, bytes, 4 * size.texels() as u64, limits)?;
     check_meaning(item, &file)?;
     let content = Content { item, file: &file, size };
     let mut stored = match (header.format, file.descriptor.model) {

@@ -122,6 +122,7 @@ impl Glb {
         let view = self.push_view(bytes);
         let components = match kind {
             "SCALAR" => 1,
+            "VEC2" => 2,
             "VEC3" => 3,
             "VEC4" => 4,
             "MAT4" => 16,

@@ -1,0 +1,162 @@
+//! No file makes the readers ask for more memory at once than 64 MB and sixteen times its bytes, however much it promises.
+
+use crate::common::{chance, with_image};
+use crate::ktx2_textures::greatest_in;
+use dpm_scene::camera_files::{self, LengthUnit, LensKind, ReadOptions};
+use dpm_scene::{
+    decode_environment, decode_picture_here, load_bytes_here, load_linear_picture, load_mesh_here,
+    LoadOptions, MeshFormat,
+};
+use flate2::write::{GzEncoder, ZlibEncoder};
+use flate2::Compression;
+use std::io::{Cursor, Write};
+use std::path::Path;
+
+/// Every reader of files, with the greatest piece of memory that it asked for.
+fn greatest(bytes: &[u8]) -> [(&'static str, usize); 8] {
+    let options = || LoadOptions::default();
+    let mesh = |format| drop(load_mesh_here(bytes, format, &options()));
+    let raster = dpm_device::planes::Raster::new(1024, 768).unwrap();
+    let calibration =
+        ReadOptions { raster, unit: LengthUnit::Metre, lens: LensKind::Auto, region: None, device: None };
+    let readers: [(&'static str, &dyn Fn()); 8] = [
+        ("glTF", &|| drop(load_bytes_here(bytes, &options()))),
+        ("OBJ", &|| mesh(MeshFormat::Obj)),
+        ("PLY", &|| mesh(MeshFormat::Ply)),
+        ("STL", &|| mesh(MeshFormat::Stl)),
+        ("environment", &|| drop(decode_environment(bytes, 0.0, 1.0))),
+        ("texture", &|| drop(decode_picture_here(bytes))),
+        ("flat field", &|| drop(load_linear_picture(bytes))),
+        ("calibration", &|| drop(camera_files::read(bytes, &calibration))),
+    ];
+    readers.map(|(name, read)| (name, greatest_in(read)))
+}
+
+fn check(what: &str, bytes: &[u8]) {
+    let allowed = 64_000_000 + 16 * bytes.len();
+    for (reader, asked) in greatest(bytes) {
+        assert!(asked <= allowed, "{what} of {} bytes, read as {reader}: {asked} bytes at once", bytes.len());
+    }
+}
+
+fn png(width: u32, height: u32, deep: bool) -> Vec<u8> {
+    let mut out = Cursor::new(vec![]);
+    let picture = if deep {
+        image::DynamicImage::new_rgba16(width, height)
+    } else {
+        image::DynamicImage::new_rgb8(width, height)
+    };
+    picture.write_to(&mut out, image::ImageFormat::Png).unwrap();
+    out.into_inner()
+}
+
+/// A Radiance picture of black runs.
+fn radiance(width: usize, height: usize) -> Vec<u8> {
+    let mut out = format!("#?RADIANCE\n\n-Y {height} +X {width}\n").into_bytes();
+    let runs: Vec<u8> =
+        (0..width.div_ceil(127)).flat_map(|i| [128 + (width - 127 * i).min(127) as u8, 0]).collect();
+    let row = [vec![2, 2, (width >> 8) as u8, width as u8], runs.repeat(4)].concat();
+    out.extend(row.repeat(height));
+    out
+}
+
+/// Files that promise much in few bytes.
+fn bombs() -> Vec<(&'static str, Vec<u8>)> {
+    let text = |text: String| text.into_bytes();
+    let zeros = vec![0u8; 32 << 20];
+    let mut gzip = GzEncoder::new(vec![], Compression::fast());
+    gzip.write_all(&zeros).unwrap();
+    let mut zlib = ZlibEncoder::new(vec![], Compression::fast());
+    zlib.write_all(&zeros).unwrap();
+    let ply = |form: &str, element: &str, count: u64, property: &str| {
+        format!("ply\nformat {form} 1.0\nelement {element} {count}\n{property}\nend_header\n").into_bytes()
+    };
+    let ply_lists = [
+        ply("binary_little_endian", "face", 4_000_000_000, "property list uint uint vertex_indices"),
+        u32::MAX.to_le_bytes().repeat(64),
+    ];
+    let stl = [vec![0; 80], u32::MAX.to_le_bytes().to_vec(), vec![0; 500]].concat();
+    let accessor = |count: u64| {
+        let document = format!(
+            "{{\"asset\":{{\"version\":\"2.0\"}},\"scenes\":[{{\"nodes\":[0]}}],\"nodes\":[{{\"mesh\":0}}],\"meshes\":[{{\"primitives\":\
+             [{{\"attributes\":{{\"POSITION\":0}}}}]}}],\"accessors\":[{{\"componentType\":5126,\"type\":\"VEC3\",\"count\":{count}}}]}}"
+        );
+        document.into_bytes()
+    };
+    vec![
+        ("PNG of 8192 x 4096", png(8192, 4096, false)),
+        ("deep PNG of 4096 x 3000", png(4096, 3000, true)),
+        ("PNG of 1500 x 1000", png(1500, 1000, true)),
+        ("Radiance of 8192 x 4096", radiance(8192, 4096)),
+        ("Radiance of 4096 x 2048", radiance(4096, 2048)),
+        ("PFM", text("PF\n8192 4096\n-1\n".into())),
+        ("gzip", gzip.finish().unwrap()),
+        ("zlib", zlib.finish().unwrap()),
+        ("PLY with vertices", ply("binary_little_endian", "vertex", 4_000_000_000, "property double x")),
+        ("PLY with faces", ply("ascii", "face", 4_000_000_000, "property list uchar int vertex_indices")),
+        ("PLY with lists", ply_lists.concat()),
+        ("PLY with properties", ply("ascii", "vertex", 1, &"property double x\n".repeat(40_000))),
+        ("STL", stl),
+        (
+            "OBJ with one long face",
+            text(format!("v 0 0 0\nv 1 0 0\nv 0 1 0\nf{}\n", " 1 2 3".repeat(400_000))),
+        ),
+        ("OBJ with objects", text("o a\nv 0 0 0\nv 1 0 0\nv 0 1 0\nf -1 -2 -3\n".repeat(60_000))),
+        ("OBJ with far indices", text("f 2000000000 1999999999 4000000000\n".repeat(1000))),
+        ("accessor", accessor(2_000_000_000)),
+        ("accessor within the limits", accessor(3_000_000)),
+        (
+            "JSON of numbers",
+            text(format!("{{\"asset\":{{\"version\":\"2.0\"}},\"extras\":[{}0]}}", "0,".repeat(1_500_000))),
+        ),
+        ("YAML of rows", text(format!("%YAML:1.0\nK: [{}0]\n", "0,".repeat(400_000)))),
+        ("glTF with a picture of 8192 x 4096", with_image(&png(8192, 4096, false)).bytes()),
+    ]
+}
+
+#[test]
+fn short_files_ask_for_little_memory_at_once() {
+    bombs().into_iter().for_each(|(what, bytes)| check(what, &bytes));
+}
+
+#[test]
+fn the_files_of_the_repository_ask_for_little_memory_at_once() {
+    let root = Path::new(env!("CARGO_MANIFEST_DIR")).join("../..");
+    let folders = ["mesh", "picture", "environment", "calibration", "gltf"]
+        .map(|name| root.join("tests/corpus").join(name));
+    let folders = folders
+        .into_iter()
+        .chain(["cases", "dialects", "exr", "opencv"].map(|name| root.join("tests/assets").join(name)));
+    let mut count = 0;
+    for entry in folders.flat_map(|folder| std::fs::read_dir(folder).unwrap()) {
+        let path = entry.unwrap().path();
+        if path.is_file() {
+            check(&path.display().to_string(), &std::fs::read(&path).unwrap());
+            count += 1;
+        }
+    }
+    assert!(count > 100, "{count} files");
+}
+
+/// The same files with bytes that are changed where sizes and counts stand.
+mod breadth {
+    use super::*;
+
+    #[test]
+    fn damaged_files_ask_for_little_memory_at_once() {
+        let folder = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../tests/assets/cases");
+        let mut chance = chance(0x53_53_53_53);
+        for entry in std::fs::read_dir(folder).unwrap() {
+            let path = entry.unwrap().path();
+            let whole = std::fs::read(&path).unwrap();
+            for _ in 0..60 {
+                let mut damaged = whole.clone();
+                for _ in 0..1 + chance() % 4 {
+                    let place = chance() as usize % whole.len().min(4096);
+                    damaged[place] = [0, 0x7f, 0xff, chance() as u8][chance() as usize % 4];
+                }
+                check(&path.display().to_string(), &damaged);
+            }
+        }
+    }
+}
