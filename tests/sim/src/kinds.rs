@@ -233,6 +233,10 @@ kinds! {
     X15,
     /// The clock of a VRPN server is set while it runs.
     X16,
+    /// A queue stands between the stages, which are slower the more frames are under way.
+    X17,
+    /// The cable carries only every second to sixth frame, for seconds.
+    X18,
 }
 
 const FILES: &str = "scenes are read only when the program starts, before any light";
@@ -267,6 +271,11 @@ impl Kind {
         matches!(self, Self::X9 | Self::X10 | Self::X11)
     }
 
+    /// It strikes only lives of their own, see [`crate::plan::Setup::strained`].
+    pub fn needs_strain(self) -> bool {
+        matches!(self, Self::X17 | Self::X18)
+    }
+
     /// Why nothing of this kind happens in the world although it strikes; `None` if something does. Such strikes are counted
     /// apart, and fill no cell.
     pub fn stands_in(self) -> Option<&'static str> {
@@ -291,6 +300,7 @@ impl Kind {
             K::F1 | K::F2 | K::F3 | K::F4 | K::F5 | K::F6 | K::F7 | K::F8 | K::F9 | K::F10 => {
                 (state != State::Dark).then_some(FILES)
             }
+            K::X17 | K::X18 => (state != State::Running).then_some("it strikes frames that are shown"),
             K::H7 | K::G1 | K::G2 => {
                 (state != State::Dark).then_some("it strikes only when the program starts")
             }

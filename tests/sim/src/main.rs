@@ -23,7 +23,7 @@ dpm-sim: a simulated world around the rig, with every fault in every state
   --tracker WHAT  natnet, serial, vrpn or all: what the trackers speak; default: all, a fifth of the seeds' serial and
                   a fifth VRPN
   --kinds LIST    kinds of faults, as T18,X9; every episode begins with one of them in lives that they can strike;
-                  default: all in turn
+                  default: all in turn. With X17 or X18, which strike an eighth of the seeds', all lives are for them
   --alone WHO     which guard of the light stands alone: watchdog, dark-from, age, orders, session, clock; none; or
                   some: default, one of them in a third of the seeds (none of --tracks all, --serial all and --kinds)
   --until EVENT   stop the (single) seed at this event and print what happened
@@ -252,6 +252,7 @@ fn run() -> Result<bool, String> {
             follows: wish.follows,
             serial: wish.serial,
             tracker: wish.tracker,
+            strained: wish.first.iter().any(|kind| kind.needs_strain()).then_some(true),
             alone: match wish.alone {
                 Alone::AsDrawn => Guard::drawn(seed),
                 Alone::Of(guard) => guard,

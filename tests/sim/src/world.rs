@@ -100,6 +100,8 @@ pub enum Undo {
     Disk,
     /// The machine is as quick as before.
     Load,
+    /// The caches hold all frames again.
+    Queue,
     /// What no stage has met by now, none will meet.
     Traps,
     /// The rig file is right again.
@@ -495,6 +497,8 @@ impl World {
             K::U7 => cable().spoiled,
             K::U10 => cable().stale,
             K::X8 => cable().late,
+            K::X18 => cable().crawled,
+            K::X17 => lock(&self.beneath).queued,
             K::U15 | K::H2 | K::X3 => met.kills,
             K::H6 | K::X4 => met.stops,
             K::X5 => met.orders,
@@ -534,6 +538,9 @@ impl World {
             if self.seen(active.kind) > seen_before {
                 self.table.takes_effect(active.kind, state);
             }
+        }
+        if active.kind.needs_strain() {
+            self.laws.spell_is_over(self.t, self.table.total());
         }
         // Another fault of the same kind may still last.
         self.undo(&active.undo);
