@@ -74,11 +74,11 @@ impl Guard {
             Self::Watchdog => &[K::U15, K::H2, K::X3, K::X4, K::X6],
             Self::DarkFrom => &[K::U15, K::X6, K::T2, K::G5, K::G6, K::H4, K::H5],
             Self::Age => &[K::G6, K::G7, K::H4, K::H8, K::H9, K::T2, K::X6],
-            Self::Orders => &[K::X3, K::H2, K::X5, K::H6, K::X4, K::U15, K::X18, K::X19],
+            Self::Orders => &[K::X3, K::H2, K::X5, K::H6, K::X4, K::U15, K::X20, K::X21],
             Self::Session => &[K::U15, K::X4, K::H2],
             Self::Clock => &[K::H4, K::H8, K::H9, K::X6, K::U1, K::U15, K::T2],
-            Self::Interlock => &[K::X17, K::X17, K::X17, K::U15, K::X4, K::X5, K::X19],
-            Self::Hand => &[K::U15, K::X4, K::H5, K::H7, K::X3, K::X5, K::X18, K::X19],
+            Self::Interlock => &[K::X19, K::X19, K::X19, K::U15, K::X4, K::X5, K::X21],
+            Self::Hand => &[K::U15, K::X4, K::H5, K::H7, K::X3, K::X5, K::X20, K::X21],
             Self::Limits => &[K::T2, K::T3, K::U15, K::X4, K::X5, K::G7],
         }
     }

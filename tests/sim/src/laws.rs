@@ -50,6 +50,30 @@ pub struct Broken {
     pub told: String,
 }
 
+/// A time in which frames come at a steady rate although something is wrong.
+#[derive(Clone, Copy, Debug)]
+pub struct Spell {
+    /// When it begins, and how far apart frames may be at least and in the mean, nanoseconds.
+    from: i64,
+    apart_ns: i64,
+    /// The share of frames that must be there.
+    share: f64,
+    /// The light never goes off.
+    is_steady: bool,
+    frames: u64,
+    dark_at: Option<i64>,
+    /// Faults that had struck when it was announced.
+    faults: u64,
+}
+
+impl Spell {
+    /// From `from` on one frame each `apart_ns` is lit, or at least the share `share` of them; `is_steady`: and the light never
+    /// goes off.
+    pub fn new(from: i64, apart_ns: i64, share: f64, is_steady: bool) -> Self {
+        Self { from, apart_ns, share, is_steady, frames: 0, dark_at: None, faults: 0 }
+    }
+}
+
 /// An order that keeps the projector dark, or its picture still.
 #[derive(Clone, Copy, Debug)]
 struct Standing {
@@ -195,6 +219,9 @@ pub struct Laws {
     /// When ARM was ordered after FREEZE. ARM reaches the light when the disk has forgotten the standing order.
     thawed_at: i64,
     slow_disk_until: i64,
+    /// Until then frames may come at fewer than all slots.
+    slow_until: i64,
+    spell: Option<Spell>,
     rested_until: i64,
     /// A hang has been found by then.
     hidden_until: i64,
@@ -270,6 +297,8 @@ impl Laws {
             clock_moved_at: -S,
             thawed_at: -S,
             slow_disk_until: 0,
+            slow_until: 0,
+            spell: None,
             rested_until: 0,
             hidden_until: 0,
             elsewhere_at: 0,
@@ -307,6 +336,43 @@ impl Laws {
     /// Until then the disk may still be busy with an order.
     pub fn slow_disk_until(&mut self, t: i64) {
         self.slow_disk_until = self.slow_disk_until.max(t);
+    }
+
+    /// Until then frames may come at fewer than all slots.
+    pub fn slow_until(&mut self, t: i64) {
+        self.slow_until = self.slow_until.max(t);
+    }
+
+    /// Frames may come at fewer than all slots at `t`.
+    pub fn is_slow(&self, t: i64) -> bool {
+        t <= self.slow_until
+    }
+
+    /// Something is wrong that frames bear. `faults`: those that have struck.
+    pub fn spell(&mut self, spell: Spell, faults: u64) {
+        self.spell = Some(Spell { faults, ..spell });
+    }
+
+    /// It ends. If other faults have struck meanwhile, or the tracker is silent, nothing is said of the frames.
+    pub fn spell_is_over(&mut self, t: i64, faults: u64) {
+        let Some(spell) = self.spell.take() else { return };
+        let due = ((t - spell.from) / spell.apart_ns) as f64;
+        if spell.faults != faults || self.standing.is_some() {
+            return;
+        }
+        if let Some(at) = spell.dark_at.filter(|_| spell.is_steady) {
+            self.fail(
+                at,
+                "a cable that carries every n-th frame does not carry it steadily: the light goes off".into(),
+            );
+        }
+        if (spell.frames as f64) < spell.share * due {
+            let (frames, s) = (spell.frames, (t - spell.from) as f64 * 1e-9);
+            self.fail(
+                t,
+                format!("{frames} good frames in {s:.2} s, in which frames have settled; {due} are possible"),
+            );
+        }
     }
 
     /// The program does not run for `ns`, so it finds everything that much later.
@@ -501,7 +567,7 @@ impl Laws {
     pub(crate) fn is_in_peace(&self, t: i64, calm_for: i64, crew_ready: i64) -> bool {
         let is_calm = calm_for > 2 * S && t - self.good_at < S && t - self.disturbed_at > 3 * S;
         // The run may end when a hang is found.
-        let is_whole = t > self.hidden_until + S;
+        let is_whole = t > self.hidden_until + S && t > self.slow_until;
         is_calm
             && is_whole
             && self.is_quick
@@ -531,6 +597,9 @@ impl Laws {
             }
             (true, false) => {
                 self.must_be_dark(at - 1, "light goes off only now");
+                if let Some(spell) = self.spell.as_mut().filter(|spell| at >= spell.from) {
+                    spell.dark_at.get_or_insert(at);
+                }
                 (self.is_lit, self.dark_since) = (false, at);
                 self.showing = None;
             }
@@ -665,6 +734,9 @@ impl Laws {
         if sent.captured_at.is_some() {
             self.good_at = at;
             self.good_frames += 1;
+            if let Some(spell) = self.spell.as_mut().filter(|spell| at >= spell.from) {
+                spell.frames += 1;
+            }
             self.wordless_since = at;
         }
         self.showing = Some(sent);
@@ -731,10 +803,10 @@ impl Laws {
         let predict_ns = self.predict_ns.unwrap_or(sent.predict_ns);
         // The clocks are known to a fraction of a millisecond only.
         let mut allowed = predict_ns + self.slot_ns + MS;
-        // The host knows how long frames took on a line, not how long the next one takes: the line may stall, or the last ones
+        // The host knows how long frames took on a line, or on a cable that has become slow, not how long the next one takes: the line may stall, or the last ones
         // were smaller. It does not trust the port's rate either, which many adapters ignore. `dark from` bounds the light: for
         // three slots after its own a frame may be lit, whatever its age. The clock is known to a few milliseconds only.
-        if self.is_line {
+        if self.is_line || at <= self.slow_until {
             allowed = allowed.max(sent.due_at + self.stride_ns + 3 * self.slot_ns + 4 * MS - captured_at);
         }
         self.worst_age_milli = self.worst_age_milli.max(age * 1000 / allowed);

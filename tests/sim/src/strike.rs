@@ -2,8 +2,9 @@
 
 use crate::cable::{lock, CableFaults};
 use crate::dice::Dice;
-use crate::kinds::Kind;
-use crate::machine::{GpuTrap, OpenTrap, Trap};
+use crate::kinds::{Kind, State};
+use crate::laws::Spell;
+use crate::machine::{GpuTrap, OpenTrap, Queue, Trap};
 use crate::net::{NetFaults, ServerKind};
 use crate::process::SimContact;
 use crate::world::{projector_of, server_kind, Action, Undo, World, MS, OSC_TOKEN, S};
@@ -86,16 +87,17 @@ impl World {
                 self.lasts(kind, dice.decades(2, 1_500) * MS, Undo::Cable);
             }
             K::X9 | K::X10 | K::X11 => self.strike_line(kind, &mut dice),
+            K::X17 | K::X18 => self.strike_flow(kind, &mut dice),
             K::T18 => self.strike_tracker_line(&mut dice),
             K::X12 | K::X13 | K::X14 | K::X15 | K::X16 => self.strike_connection(kind, &mut dice),
-            K::X17 => self.strike_interlock(&mut dice),
-            K::X18 => {
+            K::X19 => self.strike_interlock(&mut dice),
+            K::X20 => {
                 let word = dice.one_of(&["arm", "arm", "freeze", "black", "safe"]);
                 let token = dice.one_of(&[None, None, Some(OSC_TOKEN), Some("curtainx"), Some("c")]);
                 self.hear_osc(word, token, dice.happens(0.6));
                 self.lasts(kind, MS, Undo::Nothing);
             }
-            K::X19 => {
+            K::X21 => {
                 lock(&self.disk).fails_in = Some(dice.between(0, 5) as u32);
                 self.give(dice.one_of(&[Order::Safe, Order::Black, Order::Freeze]));
                 if dice.happens(0.3) {
@@ -275,6 +277,41 @@ impl World {
         }
         drop(cable);
         self.lasts(kind, lasts_ns, Undo::Cable);
+    }
+
+    /// Frames queue between the stages, or the cable is too slow for them.
+    fn strike_flow(&mut self, kind: Kind, dice: &mut Dice) {
+        let slot_ns = S / i64::from(self.setup.rate_hz);
+        let begins = self.is_alone() && self.laws.is_lit_well(self.t) && !self.laws.is_slow(self.t);
+        let (lasts_ns, spell) = if kind == Kind::X17 {
+            // The stages keep up again after so long.
+            let slow_ns = dice.between(50, 200) * MS + 4 * slot_ns;
+            let until = HostTime(self.host() + slow_ns);
+            let queue = Queue { until, slow_ns: slot_ns * 11 / 10, crowd_ns: slot_ns * 24 / 100 };
+            lock(&self.beneath).queue = Some(queue);
+            let settles_ns = slow_ns + S / 2 + 12 * slot_ns;
+            let lasts_ns = settles_ns + dice.between(1_000, 2_000) * MS;
+            (lasts_ns, Spell::new(self.t + settles_ns, slot_ns, 0.9, false))
+        } else {
+            let slots = dice.between(2, 6);
+            let frame_ns = slots * slot_ns - dice.between(20, 60) * slot_ns / 100;
+            let own_ns = self.setup.frame_bytes() * self.setup.ns_per_byte;
+            lock(&self.cable).faults.crawl_ps = (frame_ns - own_ns).max(1) * 1000 / self.setup.frame_bytes();
+            let settles_ns = 1_500 * MS + 12 * slots * slot_ns;
+            let lasts_ns = settles_ns + dice.between(2_000, 5_000) * MS;
+            // While it was slow, full speed was tried more and more seldom.
+            self.laws.slow_until(self.t + 3 * lasts_ns + 2 * S);
+            (lasts_ns, Spell::new(self.t + settles_ns, slots * slot_ns, 0.7, true))
+        };
+        if begins {
+            self.laws.spell(spell, self.table.total());
+        }
+        self.lasts(kind, lasts_ns, if kind == Kind::X17 { Undo::Queue } else { Undo::Cable });
+    }
+
+    /// Nothing else is wrong, and frames are shown.
+    fn is_alone(&self) -> bool {
+        self.is_quiet() && self.state() == State::Running && !self.laws.has_standing_order()
     }
 
     fn strike_projector(&mut self, kind: Kind, dice: &mut Dice) {
@@ -457,7 +494,7 @@ impl World {
             self.plan(at, Action::Contact(0));
             at += dice.between(5, 80) * MS;
         }
-        self.lasts(Kind::X17, at - self.t, Undo::Nothing);
+        self.lasts(Kind::X19, at - self.t, Undo::Nothing);
     }
 
     fn strike_host(&mut self, kind: Kind, dice: &mut Dice) {
@@ -575,6 +612,7 @@ impl World {
                 let mut disk = lock(&self.disk);
                 (disk.refuses, disk.is_full, disk.late_ns, disk.fails_in) = (false, false, 0, None);
             }
+            Undo::Queue => lock(&self.beneath).queue = None,
             Undo::Load => lock(&self.beneath).load_milli = 1000,
             Undo::Traps => {
                 let mut beneath = lock(&self.beneath);

@@ -110,6 +110,8 @@ pub enum Undo {
     Disk,
     /// The machine is as quick as before.
     Load,
+    /// The caches hold all frames again.
+    Queue,
     /// What no stage has met by now, none will meet.
     Traps,
     /// The rig file is right again.
@@ -516,6 +518,8 @@ impl World {
             K::U7 => cable().spoiled,
             K::U10 => cable().stale,
             K::X8 => cable().late,
+            K::X18 => cable().crawled,
+            K::X17 => lock(&self.beneath).queued,
             K::U15 | K::H2 | K::X3 => met.kills,
             K::H6 | K::X4 => met.stops,
             K::X5 => met.orders,
@@ -523,9 +527,9 @@ impl World {
             K::G4 | K::G5 | K::G6 | K::G7 | K::X7 => lock(&self.beneath).met[1],
             K::H4 | K::H5 | K::X1 | K::X2 => lock(&self.beneath).met[0],
             K::H8 | K::H9 => lock(&self.beneath).slowed,
-            K::H1 | K::X19 => lock(&self.disk).met,
-            K::X17 => met.contacts,
-            K::X18 => met.datagrams,
+            K::H1 | K::X21 => lock(&self.disk).met,
+            K::X19 => met.contacts,
+            K::X20 => met.datagrams,
             K::H7 => met.refused_files,
             K::H3 | K::X6 => met.stands,
             // The projector itself is struck, whoever looks.
@@ -557,6 +561,9 @@ impl World {
             if self.seen(active.kind) > seen_before {
                 self.table.takes_effect(active.kind, state);
             }
+        }
+        if active.kind.needs_strain() {
+            self.laws.spell_is_over(self.t, self.table.total());
         }
         // Another fault of the same kind may still last.
         self.undo(&active.undo);
