@@ -1,10 +1,11 @@
 //! Computes the true pose at any time: closed forms of the motions that the mock tracker reports and the mock projector
 //! lights.
 //!
-//! Every motion is periodic with a period of whole nanoseconds, and time is reduced to the period as an integer before
-//! any floating-point operation: a pose is as exact after 400 days as in the first second.
+//! Every motion of a rig file is periodic with a period of whole nanoseconds, and time is reduced to the period as an
+//! integer before any floating-point operation: a pose is as exact after 400 days as in the first second.
 
 use dpm_device::pose::Pose;
+use std::sync::Arc;
 
 pub use crate::motion_spec::{MotionKind, MotionSpec};
 
@@ -75,8 +76,10 @@ pub struct Motion {
 }
 
 /// One elementary motion with its period in whole nanoseconds.
-#[derive(Clone, Copy, Debug, PartialEq)]
+#[derive(Clone, Debug, PartialEq)]
 enum Part {
+    /// Through poses relative to the rest pose, so many nanoseconds apart; at rest before the first and after the last.
+    Path { poses: Arc<[Pose]>, step_ns: i64 },
     /// Two straight stretches of twice `half_stretch_ns`, joined by turns of `turn_ns`, with a rest of `rest_ns` in the
     /// middle of each turn.
     Line { direction: [f64; 3], speed: f64, half_stretch_ns: i64, turn_ns: i64, rest_ns: i64 },
@@ -114,6 +117,21 @@ impl Motion {
     /// A body at rest. Never panics: an invalid pose is returned as the error.
     pub fn still(rest: Pose) -> Result<Self, MotionError> {
         Self::new(&MotionSpec::Still {}, rest)
+    }
+
+    /// A body that goes through `poses`, relative to `rest` and `step_ns` > 0 apart, once: a recording. It moves on cubic
+    /// polynomials through four of them, and is at rest before the first and after the last, where its velocity is taken
+    /// for 0. Fewer than four poses are a body at rest.
+    ///
+    /// # Errors
+    /// A pose is not rigid.
+    pub fn through(rest: Pose, poses: &[Pose], step_ns: i64) -> Result<Self, MotionError> {
+        if let Some(pose) = [rest].iter().chain(poses).find(|pose| !pose.is_valid(1e-6)) {
+            return Err(MotionError::RestPose(*pose));
+        }
+        let is_path = poses.len() >= 4 && step_ns > 0;
+        let path = Part::Path { poses: poses.into(), step_ns };
+        Ok(Self { rest, parts: if is_path { vec![path] } else { Vec::new() } })
     }
 
     /// The pose that the motion is relative to.
@@ -231,6 +249,7 @@ impl Part {
     /// Applies this part to `pose` and `twist`, the state after the previous parts.
     fn apply(&self, t_ns: i64, pose: &mut Pose, twist: &mut Twist) {
         match *self {
+            Part::Path { ref poses, step_ns } => along(poses, step_ns, t_ns, pose, twist),
             Part::Line { direction, speed, half_stretch_ns, turn_ns, rest_ns } => {
                 let (s, v) = line_at(t_ns, speed, half_stretch_ns, turn_ns, rest_ns);
                 pose.position_m = add(pose.position_m, scale(direction, s));
@@ -259,6 +278,49 @@ impl Part {
             }
         }
     }
+}
+
+/// Applies the pose at `t_ns` of a path of four poses or more.
+fn along(poses: &[Pose], step_ns: i64, t_ns: i64, pose: &mut Pose, twist: &mut Twist) {
+    let end_ns = (poses.len() as i64 - 1) * step_ns;
+    let t_ns = t_ns.clamp(0, end_ns);
+    let first = (t_ns / step_ns - 1).clamp(0, poses.len() as i64 - 4);
+    let u = (t_ns - first * step_ns) as f64 / step_ns as f64;
+    let around: [&Pose; 4] = std::array::from_fn(|k| &poses[first as usize + k]);
+    // Lagrange's polynomials through 0, 1, 2 and 3, and their derivatives.
+    let weights = [
+        -(u - 1.0) * (u - 2.0) * (u - 3.0) / 6.0,
+        u * (u - 2.0) * (u - 3.0) / 2.0,
+        -u * (u - 1.0) * (u - 3.0) / 2.0,
+        u * (u - 1.0) * (u - 2.0) / 6.0,
+    ];
+    let slopes = [
+        -(3.0 * u * u - 12.0 * u + 11.0) / 6.0,
+        (3.0 * u * u - 10.0 * u + 6.0) / 2.0,
+        -(3.0 * u * u - 8.0 * u + 3.0) / 2.0,
+        (3.0 * u * u - 6.0 * u + 2.0) / 6.0,
+    ];
+    let (mut position, mut velocity, mut turn, mut rate) = ([0.0; 3], [0.0; 3], [0.0; 4], [0.0; 4]);
+    for ((at, weight), slope) in around.iter().zip(weights).zip(slopes) {
+        position = add(position, scale(at.position_m, weight));
+        velocity = add(velocity, scale(at.position_m, slope));
+        // The same hemisphere, so that quaternions can be added.
+        let dot = at.rotation_xyzw.iter().zip(around[0].rotation_xyzw).map(|(a, b)| a * b).sum::<f64>();
+        for (i, q) in at.rotation_xyzw.iter().enumerate() {
+            turn[i] += dot.signum() * weight * q;
+            rate[i] += dot.signum() * slope * q;
+        }
+    }
+    let per_s = if t_ns == 0 || t_ns == end_ns { 0.0 } else { 1e9 / step_ns as f64 };
+    let norm = turn.iter().map(|c| c * c).sum::<f64>().sqrt();
+    let turn = turn.map(|c| c / norm);
+    let [x, y, z, w] = turn;
+    // The angular velocity is twice the vector part of the quaternion's rate and its conjugate.
+    let [wx, wy, wz, _] = multiply(rate.map(|c| 2.0 * per_s * c / norm), [-x, -y, -z, w]);
+    pose.position_m = add(pose.position_m, position);
+    pose.rotation_xyzw = multiply(turn, pose.rotation_xyzw);
+    twist.linear_m_s = add(twist.linear_m_s, scale(velocity, per_s));
+    twist.angular_rad_s = add(twist.angular_rad_s, [wx, wy, wz]);
 }
 
 /// Sine and cosine of `2 pi t / period`, and the angular frequency in rad/s.

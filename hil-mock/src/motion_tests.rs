@@ -218,3 +218,35 @@ fn specs_are_read_with_defaults_and_unknown_keys_refused() {
         assert_eq!(serde_json::from_str::<MotionSpec>(&text).unwrap(), spec);
     }
 }
+
+/// A recording of a motion is that motion, as well as cubic polynomials can be it, and its velocity is that of its poses.
+#[test]
+fn a_recording_goes_through_its_poses() {
+    let sway =
+        MotionSpec::Sway { axis: [0.3, 1.0, -0.2], peak_rate_rad_s: 2.0, peak_acceleration_rad_s2: 20.0 };
+    let wave = MotionSpec::Sinusoid {
+        direction: [1.0, 0.5, -0.3],
+        peak_speed_m_s: 0.8,
+        peak_acceleration_m_s2: 5.0,
+    };
+    let parts = vec![sway, wave];
+    let truth = Motion::new(&MotionSpec::Together { parts }, Pose::IDENTITY).unwrap();
+    let step_ns = 5_000_000;
+    let poses: Vec<Pose> = (0..400).map(|k| truth.pose_at(k * step_ns)).collect();
+    let recording = Motion::through(Pose::IDENTITY, &poses, step_ns).unwrap();
+    let far = |a: &[f64], b: &[f64]| a.iter().zip(b).map(|(a, b)| (a - b).abs()).fold(0.0, f64::max);
+    for t in (10_000_000..1_900_000_000).step_by(7_654_321) {
+        let ((pose, twist), (right, speed)) = (recording.state_at(t), truth.state_at(t));
+        assert!(far(&pose.position_m, &right.position_m) < 1e-6, "{t}: {pose:?} {right:?}");
+        assert!(far(&pose.rotation_xyzw, &right.rotation_xyzw) < 1e-5, "{t}: {pose:?} {right:?}");
+        assert!(far(&twist.linear_m_s, &speed.linear_m_s) < 1e-3, "{t}: {twist:?} {speed:?}");
+        assert!(far(&twist.angular_rad_s, &speed.angular_rad_s) < 1e-2, "{t}: {twist:?} {speed:?}");
+    }
+    for (t, k) in [(-5, 0), (0, 0), (399 * step_ns, 399), (i64::MAX, 399)] {
+        let (pose, twist) = recording.state_at(t);
+        assert!(far(&pose.position_m, &poses[k].position_m) < 1e-12 && twist == Twist::default(), "{t}");
+    }
+    let broken = Pose { position_m: [f64::NAN; 3], ..Pose::IDENTITY };
+    assert!(Motion::through(Pose::IDENTITY, &[broken; 4], step_ns).is_err());
+    assert_eq!(Motion::through(Pose::IDENTITY, &poses[..3], step_ns).unwrap().pose_at(7), Pose::IDENTITY);
+}

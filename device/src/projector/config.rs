@@ -24,7 +24,7 @@ pub struct FirmwareConfig {
     pub settle_ns: u32,
     /// Codecs that it decodes, bits [`Codec::mask`]; raw always.
     pub codecs: u32,
-    /// Serial number.
+    /// Serial number; see [`FirmwareConfig::serial_number`].
     pub serial: u64,
     /// Firmware version that it reports.
     pub firmware: u16,
@@ -103,6 +103,19 @@ impl FirmwareConfig {
             moves_kept: 0,
             changes_kept: 1024,
         }
+    }
+}
+
+impl FirmwareConfig {
+    /// The serial number of a projector: the one that it has `kept`, or a new one from `draw`, which gives 64 random bits. The
+    /// caller keeps it for ever. By 0 and 1 no projector is known, and by all ones no memory that is erased.
+    pub fn serial_number(kept: Option<u64>, mut draw: impl FnMut() -> u64) -> u64 {
+        let names_one = |serial: &u64| (2..u64::MAX).contains(serial);
+        kept.filter(names_one).unwrap_or_else(|| loop {
+            if let Some(serial) = Some(draw()).filter(names_one) {
+                return serial;
+            }
+        })
     }
 }
 

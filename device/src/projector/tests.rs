@@ -234,6 +234,17 @@ fn no_light_without_hello_config_and_arm() {
 }
 
 #[test]
+fn a_serial_number_is_drawn_once_and_names_a_projector() {
+    let mut drawn = [0, 1, u64::MAX, 77, 78].into_iter();
+    let first = FirmwareConfig::serial_number(None, || drawn.next().unwrap());
+    assert_eq!(first, 77);
+    assert_eq!(FirmwareConfig::serial_number(Some(first), || unreachable!("it is kept")), 77);
+    for erased in [0, 1, u64::MAX] {
+        assert_eq!(FirmwareConfig::serial_number(Some(erased), || 9), 9);
+    }
+}
+
+#[test]
 fn silence_is_dark_at_the_watchdogs_tick_and_stays_dark() {
     let mut rig = clean(settings(), FirmwareConfig::new(raster()));
     rig.stream();

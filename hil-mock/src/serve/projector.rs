@@ -8,8 +8,9 @@ use std::sync::{Arc, Mutex, PoisonError};
 use std::time::Duration;
 
 use clap::{Args, ValueEnum};
-use dpm_device::link::{faults, MAX_SHIFT};
+use dpm_device::link::{faults, SessionNumbers, MAX_SHIFT};
 use dpm_device::planes::Raster;
+use dpm_device::projector::FirmwareConfig;
 use dpm_device::time::HostTime;
 use dpm_device::transport::LinkDevice;
 use hil_mock::monotonic;
@@ -35,9 +36,12 @@ pub(crate) struct ProjectorArguments {
     /// Offer to follow tracks, and move light by this many mirrors at most. Pictures and logs of the light show frames as they were sent
     #[arg(long, value_name = "MIRRORS", value_parser = clap::value_parser!(u8).range(1..=MAX_SHIFT as i64))]
     greatest_shift: Option<u8>,
-    /// Serial number
-    #[arg(long, default_value_t = 1)]
-    serial_number: u64,
+    /// Serial number; 1, which names no projector, without this and --flash
+    #[arg(long)]
+    serial_number: Option<u64>,
+    /// Draw the serial number at random at the first start, and keep it in this file, as a projector keeps it in its flash memory
+    #[arg(long, value_name = "FILE", conflicts_with = "serial_number")]
+    flash: Option<PathBuf>,
     /// Speed of the USB cable
     #[arg(long, value_enum, default_value_t = SpeedWord::Super)]
     speed: SpeedWord,
@@ -74,6 +78,23 @@ fn raster(text: &str) -> Result<Raster, String> {
 }
 
 impl ProjectorArguments {
+    /// The serial number, drawn and kept at the first start.
+    fn serial(&self) -> Result<u64, Box<dyn Error>> {
+        let Some(flash) = &self.flash else { return Ok(self.serial_number.unwrap_or(1)) };
+        let told = |e: std::io::Error| format!("{}: {e}", flash.display());
+        let kept = match std::fs::read_to_string(flash) {
+            Err(e) if e.kind() == std::io::ErrorKind::NotFound => None,
+            text => u64::from_str_radix(text.map_err(told)?.trim(), 16).ok(),
+        };
+        let mut random = SessionNumbers::from_system();
+        let serial =
+            FirmwareConfig::serial_number(kept, || u64::from(random.draw()) << 32 | u64::from(random.draw()));
+        if kept != Some(serial) {
+            std::fs::write(flash, format!("{serial:016x}\n")).map_err(told)?;
+        }
+        Ok(serial)
+    }
+
     /// The mirrors.
     pub(super) fn raster(&self) -> Raster {
         self.raster
@@ -114,7 +135,7 @@ pub(super) fn run_beside(
 ) -> Result<(), Box<dyn Error>> {
     let projector = MockProjector::new(MockConfig {
         frame_buffers: arguments.buffers,
-        serial: arguments.serial_number,
+        serial: arguments.serial()?,
         greatest_shift: arguments.greatest_shift,
         events_kept: 0,
         shown_kept,

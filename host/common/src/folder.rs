@@ -6,10 +6,10 @@
 //! that descriptor. Nobody can exchange the folder between the check and the use.
 
 use crate::unix::{open_at, remove_at, rename_at, user, user_name};
-use std::fs::{self, DirBuilder, File, Metadata};
+use std::fs::{self, DirBuilder, File, Metadata, Permissions};
 use std::io::{self, Read, Write};
 use std::os::fd::AsRawFd;
-use std::os::unix::fs::{DirBuilderExt, MetadataExt, OpenOptionsExt};
+use std::os::unix::fs::{DirBuilderExt, MetadataExt, OpenOptionsExt, PermissionsExt};
 use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicU32, Ordering};
 
@@ -75,6 +75,28 @@ impl Folder {
             }
             _ => FolderError::Io { path: path.into(), source },
         })?;
+        Self::checked(path, handle, whose)
+    }
+
+    /// Opens `path`, a folder of root's in which everybody may write and nobody may touch what is another's, as the
+    /// temporary folders are.
+    ///
+    /// # Errors
+    /// [`FolderError`]; `NotOurs` for any other folder.
+    pub fn open_of_all(path: &Path) -> Result<Self, FolderError> {
+        let io = |source| FolderError::Io { path: path.into(), source };
+        let flags = libc::O_DIRECTORY | libc::O_NOFOLLOW | libc::O_CLOEXEC;
+        let handle = File::options().read(true).custom_flags(flags).open(path).map_err(io)?;
+        let about = handle.metadata().map_err(io)?;
+        if about.uid() != 0 || about.mode() & 0o1777 != 0o1777 {
+            let reason = "is no folder of root's in which everybody may write their own files only".into();
+            return Err(FolderError::NotOurs { path: path.into(), reason });
+        }
+        Ok(Self { path: path.into(), handle, owner: user() })
+    }
+
+    fn checked(path: &Path, handle: File, whose: Owner) -> Result<Self, FolderError> {
+        let not_ours = |reason: String| FolderError::NotOurs { path: path.into(), reason };
         let about = handle.metadata().map_err(|source| FolderError::Io { path: path.into(), source })?;
         let me = user();
         let owner = about.uid();
@@ -155,6 +177,22 @@ impl Folder {
     pub fn read(&self, name: &str, most: u64) -> Result<Vec<u8>, FolderError> {
         let file = open_at(&self.handle, name, libc::O_RDONLY, 0).map_err(|e| self.refused(name, e))?;
         check_file(&file, &self.path.join(name), self.owner)?;
+        self.read_open(file, name, most)
+    }
+
+    /// The content of the regular file `name`, at most `most` bytes, whoever wrote it, and the user that it belongs to.
+    ///
+    /// # Errors
+    /// A link; no regular file; longer than `most`; those of the operating system.
+    pub fn read_of_any(&self, name: &str, most: u64) -> Result<(u32, Vec<u8>), FolderError> {
+        let file = open_at(&self.handle, name, libc::O_RDONLY, 0).map_err(|e| self.refused(name, e))?;
+        let about = file.metadata().map_err(self.named(name))?;
+        let owner = about.uid();
+        check_file(&file, &self.path.join(name), owner)?;
+        Ok((owner, self.read_open(file, name, most)?))
+    }
+
+    fn read_open(&self, file: File, name: &str, most: u64) -> Result<Vec<u8>, FolderError> {
         let mut bytes = Vec::new();
         file.take(most + 1).read_to_end(&mut bytes).map_err(self.named(name))?;
         if bytes.len() as u64 > most {
@@ -168,6 +206,23 @@ impl Folder {
     /// # Errors
     /// Those of the operating system; the old content is then unchanged.
     pub fn replace(&self, name: &str, bytes: &[u8]) -> Result<(), FolderError> {
+        self.replace_with(name, bytes, |_| Ok(()))
+    }
+
+    /// As [`Folder::replace`], and everybody may read it, whatever this process's mask of modes.
+    ///
+    /// # Errors
+    /// As [`Folder::replace`].
+    pub fn replace_for_all(&self, name: &str, bytes: &[u8]) -> Result<(), FolderError> {
+        self.replace_with(name, bytes, |file| file.set_permissions(Permissions::from_mode(0o644)))
+    }
+
+    fn replace_with(
+        &self,
+        name: &str,
+        bytes: &[u8],
+        prepare: impl Fn(&File) -> io::Result<()>,
+    ) -> Result<(), FolderError> {
         static NUMBER: AtomicU32 = AtomicU32::new(0);
         let number = NUMBER.fetch_add(1, Ordering::Relaxed);
         let temporary = format!(".new-{}-{number}", std::process::id());
@@ -176,6 +231,7 @@ impl Folder {
         let write = || -> io::Result<()> {
             let flags = libc::O_WRONLY | libc::O_CREAT | libc::O_EXCL;
             let mut file = open_at(&self.handle, &temporary, flags, 0o644)?;
+            prepare(&file)?;
             file.write_all(bytes)?;
             file.sync_all()?;
             rename_at(&self.handle, &temporary, name)?;

@@ -17,9 +17,9 @@ use std::thread::JoinHandle;
 use std::time::Duration;
 
 /// How often the contact is asked.
-const ASK_EVERY: Duration = Duration::from_millis(5);
+pub const ASK_EVERY: Duration = Duration::from_millis(5);
 /// A "yes" older than this does not count, because the asking thread has fallen silent.
-pub(crate) const SILENCE_NS: i64 = 100_000_000;
+pub const SILENCE_NS: i64 = 100_000_000;
 /// Earlier than any instant of the clock.
 const NEVER: i64 = i64::MIN / 2;
 
@@ -33,13 +33,48 @@ pub trait Contact: Send {
 /// What the asking thread shares with all others.
 #[derive(Debug)]
 struct Shared {
-    clock: MonotonicClock,
+    clock: Arc<dyn Clock>,
     /// When the contact was last found closed; [`NEVER`] since it was found open.
     closed_at: AtomicI64,
     /// It was found open since it was reset.
     has_opened: AtomicBool,
     keys: HeldKey,
     stop: AtomicBool,
+}
+
+impl Shared {
+    fn new(clock: Arc<dyn Clock>, release_ms: u32) -> Arc<Self> {
+        Arc::new(Self {
+            clock,
+            closed_at: AtomicI64::new(NEVER),
+            has_opened: AtomicBool::new(false),
+            keys: HeldKey {
+                at: AtomicI64::new(NEVER),
+                repeats: AtomicBool::new(false),
+                release_ns: i64::from(release_ms) * 1_000_000,
+            },
+            stop: AtomicBool::new(false),
+        })
+    }
+}
+
+/// The side that asks the contact.
+pub struct Asking {
+    shared: Arc<Shared>,
+    contact: Box<dyn Contact>,
+}
+
+impl Asking {
+    /// Asks once. The interlock opens by itself if this is not done for [`SILENCE_NS`].
+    pub fn ask(&mut self) {
+        let before = self.shared.clock.now().0;
+        // The time before asking counts: an answer that took long is already old.
+        let at = if self.contact.is_closed() { before } else { NEVER };
+        self.shared.closed_at.store(at, Ordering::SeqCst);
+        if at == NEVER {
+            self.shared.has_opened.store(true, Ordering::SeqCst);
+        }
+    }
 }
 
 /// A key of a terminal, which auto-repeats while it is held.
@@ -123,38 +158,28 @@ impl Interlock {
         Self::start(what.to_owned(), None, 0, |_| Box::new(contact))
     }
 
+    /// The same without a thread: whoever moves `clock` asks the contact every few milliseconds.
+    pub fn stepped(what: &str, clock: Arc<dyn Clock>, contact: impl Contact + 'static) -> (Self, Asking) {
+        let shared = Shared::new(clock, 0);
+        let asking = Asking { shared: shared.clone(), contact: Box::new(contact) };
+        (Self { shared, key: None, what: what.to_owned(), reset: Restart::ByItself, thread: None }, asking)
+    }
+
     fn start(
         what: String,
         key: Option<u8>,
         release_ms: u32,
         contact: impl FnOnce(&Arc<Shared>) -> Box<dyn Contact>,
     ) -> Result<Self, Failure> {
-        let shared = Arc::new(Shared {
-            clock: MonotonicClock::new(0),
-            closed_at: AtomicI64::new(NEVER),
-            has_opened: AtomicBool::new(false),
-            keys: HeldKey {
-                at: AtomicI64::new(NEVER),
-                repeats: AtomicBool::new(false),
-                release_ns: i64::from(release_ms) * 1_000_000,
-            },
-            stop: AtomicBool::new(false),
-        });
-        let mut contact = contact(&shared);
+        let shared = Shared::new(Arc::new(MonotonicClock::new(0)), release_ms);
+        let mut asking = Asking { contact: contact(&shared), shared: shared.clone() };
         let (asked, first) = crossbeam::channel::unbounded();
-        let asking = shared.clone();
         let thread = std::thread::Builder::new()
             .name("dpm-interlock".into())
             .spawn(move || {
                 // A panic of the contact ends the thread, and with it the light.
-                while !asking.stop.load(Ordering::Relaxed) {
-                    let before = asking.clock.now().0;
-                    // The time before asking counts: an answer that took long is already old.
-                    let at = if contact.is_closed() { before } else { NEVER };
-                    asking.closed_at.store(at, Ordering::SeqCst);
-                    if at == NEVER {
-                        asking.has_opened.store(true, Ordering::SeqCst);
-                    }
+                while !asking.shared.stop.load(Ordering::Relaxed) {
+                    asking.ask();
                     let _ = asked.send(());
                     std::thread::sleep(ASK_EVERY);
                 }

@@ -11,15 +11,18 @@
 
 mod edid;
 mod identity;
+mod others;
 mod port;
 
 pub use identity::Identity;
 
 use crate::config::Restart;
 use crate::order::Order;
+use crate::telemetry::monitor::RunMonitor;
 use dpm_common::folder::{Folder, FolderError, Owner};
 use dpm_common::unix::{user, user_name};
 use identity::Match;
+use others::Others;
 use port::Port;
 use std::fmt;
 use std::io;
@@ -36,6 +39,8 @@ const BYTES: usize = 4096;
 const ENDING: &str = ".order";
 /// File name extension of the file that becomes the next order.
 const RESERVE: &str = ".reserve";
+/// File name extension of what this user has lifted of another's order.
+const LIFTED: &str = ".lifted";
 /// Other projectors for which an order is lifted, at most; for the oldest it then holds again.
 const MOST_LIFTED: usize = 6;
 /// Characters of a name in a file, at most.
@@ -125,6 +130,12 @@ impl Content {
         u64::from_str_radix(self.serial.as_deref()?, 16).ok()
     }
 
+    /// Both are about one order.
+    fn is_about(&self, other: &Self) -> bool {
+        let told = |c: &Self| (c.order.clone(), c.at.clone(), c.by.clone(), c.process, c.serial.clone());
+        told(self) == told(other)
+    }
+
     /// Exactly [`BYTES`] bytes.
     fn to_bytes(&self) -> io::Result<Vec<u8>> {
         let mut bytes = serde_json::to_vec(self)?;
@@ -157,6 +168,16 @@ impl Stands {
             is_on_disk: false,
         };
         kept.or_else(|| (start == Restart::ByHand).then(by_hand))
+    }
+
+    /// The same for the run of `monitor`, which is then called never armed where nothing else is the reason.
+    pub fn begin(kept: Option<Self>, start: Restart, monitor: &RunMonitor) -> Option<Self> {
+        let is_kept = kept.is_some();
+        let stands = Self::at_start(kept, start);
+        if stands.is_some() && !is_kept {
+            monitor.await_first_arm();
+        }
+        stands
     }
 }
 
@@ -261,23 +282,39 @@ pub struct OrderFile {
     device: AtomicU64,
     folder: Option<Box<dyn StateFolder>>,
     path: PathBuf,
+    /// Orders of other users of this machine.
+    others: Option<Others>,
 }
 
 impl OrderFile {
     /// Opens the state folder `path`, creates it if it is missing, and reads what stands for `identity`. The second
     /// part of the result says why a folder cannot be used; the file then keeps nothing.
     pub fn open(path: Option<PathBuf>, identity: Identity) -> (Self, Option<FolderError>, Option<Stands>) {
+        Self::open_beside(path, None, identity)
+    }
+
+    /// The same on this machine: in the state folder of this user, and with the orders of others.
+    pub fn on_this_machine(identity: Identity) -> (Self, Option<FolderError>, Option<Stands>) {
+        Self::open_beside(state_folder(), Others::of_this_machine(), identity)
+    }
+
+    fn open_beside(
+        path: Option<PathBuf>,
+        others: Option<Others>,
+        identity: Identity,
+    ) -> (Self, Option<FolderError>, Option<Stands>) {
+        let others = others.filter(|_| !identity.is_mock());
         let Some(path) = path else {
             let source =
                 io::Error::new(io::ErrorKind::NotFound, "this user has no home directory; set DPM_STATE_DIR");
             let error = FolderError::Io { path: "(no state folder)".into(), source };
             return (Self::without_folder(identity, PathBuf::new()), Some(error), None);
         };
-        let stands = standing_in(&path, &identity);
+        let stands = standing_beside(&path, others.as_ref(), &identity);
         match Folder::make(&path, Owner::OwnOrAnyForRoot) {
             Ok(folder) => {
                 let (file, error) = Self::in_folder(Box::new(folder), identity);
-                (file, error, stands)
+                (Self { others, ..file }.shown(), error, stands)
             }
             Err(e) => (Self::without_folder(identity, path), Some(e), stands),
         }
@@ -293,7 +330,20 @@ impl OrderFile {
     }
 
     fn without_folder(identity: Identity, path: PathBuf) -> Self {
-        Self { identity, device: AtomicU64::new(0), folder: None, path }
+        Self { identity, device: AtomicU64::new(0), folder: None, path, others: None }
+    }
+
+    /// Shows the others what stands by this user's orders, should their copy be gone.
+    fn shown(self) -> Self {
+        if let (Some(others), Some(folder)) = (&self.others, &self.folder) {
+            let names = folder.names().unwrap_or_default().into_iter().filter(|name| name.ends_with(ENDING));
+            for name in names {
+                if let Ok(bytes) = folder.read(&name, BYTES as u64) {
+                    others.show(&name, &bytes);
+                }
+            }
+        }
+        self
     }
 
     /// The projector said HELLO with this serial number: orders are kept for it and lifted for it from now on.
@@ -308,18 +358,18 @@ impl OrderFile {
     /// The orders on the disk that name a projector by its serial number, whatever else they name.
     pub(crate) fn by_serial_number(&self) -> Vec<(u64, Order)> {
         let Some(folder) = &self.folder else { return Vec::new() };
-        let names = folder.names().unwrap_or_default().into_iter().filter(|name| name.ends_with(ENDING));
-        let read = |name: String| {
-            let bytes = folder.read(&name, BYTES as u64).map_err(|e| e.to_string());
-            let (stands, content) = stands_in(bytes, &name);
-            Some((content?.serial()?, stands.order))
+        let told = |order: Told| {
+            let Told { stands, content, .. } = order;
+            let content = content?;
+            let serial = content.serial()?;
+            (!content.lifted.contains(&by_serial(serial))).then_some((serial, stands.order))
         };
-        names.filter_map(read).collect()
+        all_told(Some(&**folder), self.others.as_ref()).into_iter().flatten().filter_map(told).collect()
     }
 
     /// The file in which orders for this projector are kept.
     pub(crate) fn path(&self) -> PathBuf {
-        self.path.join(self.identity.order_name())
+        self.path.join(self.identity.order_name(self.device()))
     }
 
     /// BLACK and FREEZE end with an orderly end of the run.
@@ -337,19 +387,42 @@ impl OrderFile {
             let source = io::Error::other("could not be used when the run began");
             return Err(FolderError::Io { path: self.path.clone(), source });
         };
-        let (identity, name) = (&self.identity, self.identity.order_name());
+        let (identity, device) = (&self.identity, self.device());
+        let (name, unnamed) = (identity.order_name(device), identity.order_name(None));
         let mut content = Content::new(order, &by.to_string(), identity.what(), identity.port().cloned());
-        content.serial = self.device().map(|serial| format!("{serial:016x}"));
+        content.serial = device.map(|serial| format!("{serial:016x}"));
+        if by == By::SerialNumber {
+            self.remember_who(&mut content);
+        }
         let bytes = content.to_bytes().map_err(|source| FolderError::Io { path: self.path(), source })?;
-        let reserve = identity.stem() + RESERVE;
+        let reserve_name = identity.stem() + RESERVE;
         folder
-            .overwrite(&reserve, &bytes)
-            .and_then(|()| folder.rename(&reserve, &name))
+            .overwrite(&reserve_name, &bytes)
+            .and_then(|()| folder.rename(&reserve_name, &name))
             // The reserve has become this file with an earlier order. A power failure that leaves a mixture leaves a
             // damaged file, which counts as SAFE.
             .or_else(|_| folder.overwrite(&name, &bytes))
-            .or_else(|_| folder.replace(&name, &bytes))?;
+            .or_else(|_| folder.replace(&name, &bytes))
+            // An order that was given before the projector said HELLO has the reserve, and the disk is full.
+            .or_else(|_| folder.overwrite(&unnamed, &bytes))?;
+        // The next order may be for a projector with another serial number at this port, in a file of its own.
+        let _ = reserve(&**folder, identity);
+        if let Some(others) = &self.others {
+            others.show(&name, &bytes);
+        }
         Ok(self.path())
+    }
+
+    /// An order that is given again, because its projector is here, keeps its time and who gave it.
+    fn remember_who(&self, again: &mut Content) {
+        let Some(folder) = &self.folder else { return };
+        let all = all_told(Some(&**folder), self.others.as_ref()).unwrap_or_default();
+        let mut same = all.into_iter().filter_map(|order| order.content);
+        if let Some(Content { at, by, .. }) =
+            same.find(|content| content.serial == again.serial && content.order == again.order)
+        {
+            (again.at, again.by) = (at, by);
+        }
     }
 
     /// Lifts every order that holds this projector; that is on the disk when this returns. An order that may be for
@@ -359,16 +432,26 @@ impl OrderFile {
     /// An error of the operating system; an order then still stands.
     pub(crate) fn forget(&self) -> Result<(), FolderError> {
         let Some(folder) = &self.folder else { return Ok(()) };
-        for Held { name, is_same, stands, content } in holding(&**folder, &self.identity, self.device())? {
-            let failed = |source| FolderError::Io { path: folder.path().join(&name), source };
-            if !is_same {
+        let device = self.device();
+        let held = holding(Some(&**folder), self.others.as_ref(), &self.identity, device)?;
+        for Held { told: Told { name, is_own, stands, content }, is_same } in held {
+            if !is_same || !is_own {
                 let mut content = content
                     .unwrap_or_else(|| Content::new(Order::Safe, &stands.told, "an unknown projector", None));
+                let serial = content.serial().filter(|serial| Some(*serial) == device);
                 content.version = VERSION;
+                content.lifted.extend(serial.map(by_serial));
                 content.lifted.push(self.identity.instance());
                 content.lifted.drain(..content.lifted.len().saturating_sub(MOST_LIFTED));
+                let name = if is_own { name } else { name + LIFTED };
+                let failed = |source| FolderError::Io { path: folder.path().join(&name), source };
                 folder.replace(&name, &content.to_bytes().map_err(failed)?)?;
-            } else if name == self.identity.order_name()
+                continue;
+            }
+            if let Some(others) = &self.others {
+                others.hide(&name);
+            }
+            if name == self.identity.order_name(device)
                 && folder.read(&name, BYTES as u64).is_ok_and(is_whole)
             {
                 folder.rename(&name, &(self.identity.stem() + RESERVE))?;
@@ -401,69 +484,127 @@ fn reserve(folder: &dyn StateFolder, identity: &Identity) -> Result<(), FolderEr
     folder.rename(&trial, &reserve)
 }
 
-/// A file that holds a projector.
-struct Held {
+/// An order on the disk.
+struct Told {
     name: String,
-    /// Its order was given to this projector, as far as can be told.
-    is_same: bool,
+    /// It lies in this user's folder, and not among the orders of others.
+    is_own: bool,
     stands: Stands,
     /// `None` for a damaged file.
     content: Option<Content>,
 }
 
-/// The files that hold the projector of `identity`. `device`: its serial number, if it has given one by now.
+/// An order that holds a projector.
+struct Held {
+    told: Told,
+    /// It was given to this projector, as far as can be told.
+    is_same: bool,
+}
+
+/// What lifts an order for the projector with this serial number, whatever its port.
+fn by_serial(serial: u64) -> String {
+    format!("serial {serial:016x}")
+}
+
+/// All orders on the disk: those in `folder`, and those of other users with what this user has lifted of them.
+fn all_told(folder: Option<&dyn StateFolder>, others: Option<&Others>) -> Result<Vec<Told>, FolderError> {
+    let mut all = Vec::new();
+    let own = folder.map_or(Ok(Vec::new()), |folder| folder.names())?;
+    let read = |name: &str| {
+        let folder = folder.ok_or_else(String::new)?;
+        folder.read(name, BYTES as u64).map_err(|e| e.to_string())
+    };
+    for name in own.into_iter().filter(|name| name.ends_with(ENDING)) {
+        let path = folder.map_or(name.clone(), |folder| folder.path().join(&name).display().to_string());
+        let (stands, content) = stands_in(read(&name), &path);
+        all.push(Told { name, is_own: true, stands, content });
+    }
+    for (name, bytes) in others.map(Others::orders).unwrap_or_default() {
+        let (stands, content) = stands_in(Ok(bytes), &name);
+        // Anybody may write there: what is damaged was not written by a rig.
+        let Some(mut content) = content else { continue };
+        let note = read(&(name.clone() + LIFTED));
+        if let Some(note) = stands_in(note, &name).1.filter(|note| note.is_about(&content)) {
+            content.lifted = note.lifted;
+        }
+        all.push(Told { name, is_own: false, stands, content: Some(content) });
+    }
+    Ok(all)
+}
+
+/// The orders that hold the projector of `identity`. `device`: its serial number, if it has given one by now.
 fn holding(
-    folder: &dyn StateFolder,
+    folder: Option<&dyn StateFolder>,
+    others: Option<&Others>,
     identity: &Identity,
     device: Option<u64>,
 ) -> Result<Vec<Held>, FolderError> {
     let mut all = Vec::new();
-    for name in folder.names()?.into_iter().filter(|name| name.ends_with(ENDING)) {
-        let path = folder.path().join(&name).display().to_string();
-        let bytes = folder.read(&name, BYTES as u64).map_err(|e| e.to_string());
-        let (mut stands, content) = stands_in(bytes, &path);
-        let (projector, port) =
-            content.as_ref().map_or(("", None), |c| (c.projector.as_str(), c.port.as_ref()));
-        let by_name = identity.is_meant_by(&name, projector, port);
+    for mut told in all_told(folder, others)? {
+        let content = told.content.as_ref();
+        let (projector, port) = content.map_or(("", None), |c| (c.projector.as_str(), c.port.as_ref()));
+        let by_name = identity.is_meant_by(Others::name_of(&told.name), projector, port);
         // A serial number proves that it is the same one. That it is another one, with a name that this one may have, is
         // for a person to say by ARM, which then lifts the order for this one alone.
-        let meant = match content.as_ref().and_then(Content::serial).zip(device) {
+        let meant = match content.and_then(Content::serial).zip(device) {
             Some((then, now)) if then == now => Match::Same,
             Some(_) if by_name == Match::Same => Match::Doubtful,
             _ => by_name,
         };
         let is_same = meant == Match::Same;
-        let is_lifted = content.as_ref().is_some_and(|c| c.lifted.contains(&identity.instance()));
+        let armed = match content.and_then(Content::serial).zip(device) {
+            Some((then, now)) if then == now => by_serial(now),
+            _ => identity.instance(),
+        };
+        let is_lifted = content.is_some_and(|c| c.lifted.contains(&armed));
         // Lifted for this port, and given again where its own projector says HELLO.
-        let waits_for_hello = device.is_none() && content.as_ref().is_some_and(|c| c.serial.is_some());
-        if meant == Match::Other || is_lifted && (!is_same || waits_for_hello) {
+        let waits_for_hello = device.is_none() && content.is_some_and(|c| c.serial.is_some());
+        if meant == Match::Other || is_lifted && (!is_same || waits_for_hello || !told.is_own) {
             continue;
         }
-        stands.is_on_disk = is_same;
+        // An order of another user stays in force for that user, whoever lifts it for themselves.
+        told.stands.is_on_disk = is_same && told.is_own;
         if content.is_some() && projector != identity.what() {
             let maybe = if is_same { "" } else { ", which may be this one" };
-            stands.told += &format!(", for {}{maybe}", clean(projector));
+            told.stands.told += &format!(", for {}{maybe}", clean(projector));
         }
-        all.push(Held { name, is_same, stands, content });
+        all.push(Held { told, is_same });
     }
     Ok(all)
+}
+
+/// What stands for `identity` on this machine: in the state folder of this user, and by orders of others.
+pub fn standing(identity: &Identity) -> Option<Stands> {
+    standing_beside(&state_folder()?, Others::of_this_machine().as_ref(), identity)
 }
 
 /// What stands for `identity` in the state folder `path`. A missing folder contains nothing. A folder that cannot be
 /// read or trusted counts as SAFE, and so does a file that is damaged or has an unknown version.
 pub fn standing_in(path: &Path, identity: &Identity) -> Option<Stands> {
+    standing_beside(path, None, identity)
+}
+
+fn standing_beside(path: &Path, others: Option<&Others>, identity: &Identity) -> Option<Stands> {
     match Folder::open(path, Owner::OwnOrAnyForRoot) {
-        Ok(folder) => standing_in_folder(&folder, identity),
-        Err(e) if e.is_missing() => None,
+        Ok(folder) => strongest(Some(&folder), others, identity),
+        Err(e) if e.is_missing() => strongest(None, others, identity),
         Err(e) => Some(unreadable(&e)),
     }
 }
 
 /// The same for a folder that is open.
 pub(crate) fn standing_in_folder(folder: &dyn StateFolder, identity: &Identity) -> Option<Stands> {
-    match holding(folder, identity, None) {
+    strongest(Some(folder), None, identity)
+}
+
+fn strongest(
+    folder: Option<&dyn StateFolder>,
+    others: Option<&Others>,
+    identity: &Identity,
+) -> Option<Stands> {
+    match holding(folder, others.filter(|_| !identity.is_mock()), identity, None) {
         Ok(all) => {
-            let stands = all.into_iter().map(|held| held.stands);
+            let stands = all.into_iter().map(|held| held.told.stands);
             stands.max_by_key(|stands| (stands.order.strength(), stands.is_on_disk))
         }
         Err(e) => Some(unreadable(&e)),

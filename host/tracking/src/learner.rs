@@ -89,7 +89,6 @@ struct Errors {
 pub(crate) struct Learner<C: Chart> {
     /// Of the settings, m/s^2 or rad/s^2.
     acceleration: f64,
-    learns: bool,
     recall_after_s: f64,
     now: Present<C>,
     base: C::Point,
@@ -112,7 +111,6 @@ impl<C: Chart> Learner<C> {
         };
         Self {
             acceleration,
-            learns: true,
             recall_after_s,
             now: Present {
                 bank: Imm::new(&config, z, r),
@@ -124,11 +122,6 @@ impl<C: Chart> Learner<C> {
             past: [None; KEPT],
             next: 0,
         }
-    }
-
-    /// The same, whose bank alone predicts, for the acceleration of the settings.
-    pub(crate) fn without_learning(self) -> Self {
-        Self { learns: false, ..self }
     }
 
     /// Steps by which the learned acceleration lies above that of the settings; each doubles it.
@@ -188,9 +181,6 @@ impl<C: Chart> Learner<C> {
     pub(crate) fn advance(&mut self, h: f64, recalled: Option<Recalled>) {
         let config = self.config();
         self.now.bank.advance(&config, h, recalled);
-        if !self.learns {
-            return;
-        }
         // What a noise of 1 makes of a step, of which each rung has its share.
         let unit = MotionModel { accelerates: true, swing_rad_s: 0.0, noise: 1.0 }.process_noise(h);
         let mut noise = JERK * (self.acceleration * f64::from(-(MIDDLE as i32)).exp2()).powi(2);
@@ -207,9 +197,6 @@ impl<C: Chart> Learner<C> {
     /// normalised innovation squared of the bank.
     pub(crate) fn update(&mut self, at_ns: i64, z: C::Point, r: f64) -> f64 {
         let nis = self.now.bank.update(z, r);
-        if !self.learns {
-            return nis;
-        }
         let measured = C::between(self.base, z);
         for rung in &mut self.now.rungs {
             let (covariance, [kp, kv, ka]) = rung.covariance.updated(r);

@@ -63,8 +63,6 @@ pub struct PoseFilterConfig {
     pub acceleration_m_s2: f64,
     /// The same for rotations, rad/s^2.
     pub angular_acceleration_rad_s2: f64,
-    /// Learn how sharply the body moves; otherwise the two values above are used permanently.
-    pub learns: bool,
     /// Mean time after which a body that moves as it did before is believed to repeat itself, seconds.
     pub recall_after_s: f64,
     /// Samples further than this many standard deviations from the prediction are set aside.
@@ -94,7 +92,6 @@ impl Default for PoseFilterConfig {
             measure_noise: true,
             acceleration_m_s2: 5.0,
             angular_acceleration_rad_s2: 20.0,
-            learns: true,
             recall_after_s: 0.03,
             gate_sigmas: 6.0,
             max_speed_m_s: 20.0,
@@ -449,9 +446,6 @@ impl PoseFilter {
         let (a, turn, late) = (c.acceleration_m_s2, c.angular_acceleration_rad_s2, c.recall_after_s);
         let mut position = Learner::new(a, late, level_p, first.position, rp);
         let mut rotation = Learner::new(turn, late, level_r, first.rotation, rr);
-        if !c.learns {
-            (position, rotation) = (position.without_learning(), rotation.without_learning());
-        }
         self.position_noise.break_track();
         self.rotation_noise.break_track();
         self.position_recall.break_track();

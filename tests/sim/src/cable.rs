@@ -22,6 +22,8 @@ pub struct CableFaults {
     pub stalled: bool,
     /// It is slower by this factor, in thousandths; 0: full speed.
     pub slow_milli: i64,
+    /// A byte of frames takes so many more picoseconds.
+    pub crawl_ps: i64,
     /// Share of packets to the device that are damaged.
     pub corrupt: f64,
     /// Share of packets to the device that are lost.
@@ -57,6 +59,8 @@ pub struct CableEffects {
     pub stalled: u64,
     /// Bytes took longer.
     pub slowed: u64,
+    /// Frames waited for one before them, of those that crawl.
+    pub crawled: u64,
     /// Transfers ended too early.
     pub short: u64,
     /// Replies were damaged.
@@ -289,6 +293,10 @@ impl Cable {
             self.met.slowed += 1;
         }
         let begin = self.now.max(if lane == Lane::Data { self.free_at } else { 0 });
+        if lane == Lane::Data && faults.crawl_ps > 0 {
+            ns += bytes.len() as i64 * faults.crawl_ps / 1000;
+            self.met.crawled += u64::from(begin > self.now);
+        }
         let mut at = begin + ns + self.travel_ns;
         if lane == Lane::Data {
             self.free_at = begin + ns;

@@ -18,6 +18,8 @@ pub struct Disk {
     pub is_full: bool,
     /// An order was refused because the disk is full.
     pub lost_order: bool,
+    /// The call after so many more fails, once.
+    pub fails_in: Option<u32>,
     /// How often the disk refused something, or was slow.
     pub met: u64,
     /// How much longer a write takes, nanoseconds.
@@ -25,6 +27,14 @@ pub struct Disk {
 }
 
 impl Disk {
+    /// A call: true if it is to fail.
+    fn refuses(&mut self) -> bool {
+        let is_due = self.fails_in == Some(0);
+        self.fails_in = self.fails_in.and_then(|n| n.checked_sub(1));
+        self.met += u64::from(is_due);
+        self.refuses || is_due
+    }
+
     /// The power fails while `name` is written: old or new content remains, never half of it; with `torn` a stray file
     /// of the writer remains too.
     pub fn tear(&mut self) {
@@ -64,9 +74,10 @@ impl StateFolder for SimFolder {
     fn replace(&self, name: &str, bytes: &[u8]) -> Result<(), FolderError> {
         let mut disk = lock(&self.0);
         disk.met += u64::from(disk.late_ns > 0);
-        if disk.refuses || disk.is_full {
+        let refuses = disk.refuses();
+        if refuses || disk.is_full {
             disk.met += 1;
-            disk.lost_order |= !disk.refuses && name.ends_with(".order");
+            disk.lost_order |= !refuses && name.ends_with(".order");
             return Err(refused(name));
         }
         disk.files.insert(name.into(), bytes.into());
@@ -75,7 +86,7 @@ impl StateFolder for SimFolder {
 
     fn overwrite(&self, name: &str, bytes: &[u8]) -> Result<(), FolderError> {
         let mut disk = lock(&self.0);
-        let (refuses, is_full) = (disk.refuses, disk.is_full);
+        let (refuses, is_full) = (disk.refuses(), disk.is_full);
         disk.met += u64::from(refuses || is_full || disk.late_ns > 0);
         let file = disk.files.get_mut(name).ok_or_else(|| missing(name))?;
         if refuses || is_full && bytes.len() > file.len() {
@@ -87,7 +98,7 @@ impl StateFolder for SimFolder {
 
     fn rename(&self, from: &str, to: &str) -> Result<(), FolderError> {
         let mut disk = lock(&self.0);
-        if disk.refuses {
+        if disk.refuses() {
             disk.met += 1;
             return Err(refused(from));
         }
@@ -98,7 +109,7 @@ impl StateFolder for SimFolder {
 
     fn remove(&self, name: &str) -> Result<(), FolderError> {
         let mut disk = lock(&self.0);
-        if disk.refuses {
+        if disk.refuses() {
             disk.met += 1;
             return Err(refused(name));
         }

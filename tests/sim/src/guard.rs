@@ -25,10 +25,17 @@ pub enum Guard {
     Session,
     /// The map of the projector's clock, which is no guard but what all instants go by. The link is served late.
     Clock,
+    /// The interlock, in half of the lives reset by hand. What it makes dark nothing else does.
+    Interlock,
+    /// A person's word for every start (`safety.start`), and what OSC may do. The projector loses its memory when the
+    /// program ends.
+    Hand,
+    /// The limit to the mean of the light.
+    Limits,
 }
 
 /// The share of lives in which a guard stands alone.
-const ALONE: f64 = 1.0 / 3.0;
+const ALONE: f64 = 0.6;
 /// A guard that is switched off acts after this time.
 const LATE_NS: i64 = 10_000_000_000;
 /// The longest by which the link is served late, nanoseconds; where slots are short, two fifths of one.
@@ -36,12 +43,22 @@ const LINK_LATE_NS: i64 = 5_000_000;
 
 impl Guard {
     /// All guards.
-    pub const ALL: [Self; 6] =
-        [Self::Watchdog, Self::DarkFrom, Self::Age, Self::Orders, Self::Session, Self::Clock];
+    pub const ALL: [Self; 9] = [
+        Self::Watchdog,
+        Self::DarkFrom,
+        Self::Age,
+        Self::Orders,
+        Self::Session,
+        Self::Clock,
+        Self::Interlock,
+        Self::Hand,
+        Self::Limits,
+    ];
 
     /// As given on the command line.
     pub fn word(self) -> &'static str {
-        ["watchdog", "dark-from", "age", "orders", "session", "clock"][self as usize]
+        ["watchdog", "dark-from", "age", "orders", "session", "clock", "interlock", "by-hand", "limits"]
+            [self as usize]
     }
 
     /// The guard that stands alone in the life of `seed`, if any.
@@ -57,24 +74,40 @@ impl Guard {
             Self::Watchdog => &[K::U15, K::H2, K::X3, K::X4, K::X6],
             Self::DarkFrom => &[K::U15, K::X6, K::T2, K::G5, K::G6, K::H4, K::H5],
             Self::Age => &[K::G6, K::G7, K::H4, K::H8, K::H9, K::T2, K::X6],
-            Self::Orders => &[K::X3, K::H2, K::X5, K::H6, K::X4, K::U15],
+            Self::Orders => &[K::X3, K::H2, K::X5, K::H6, K::X4, K::U15, K::X20, K::X21],
             Self::Session => &[K::U15, K::X4, K::H2],
             Self::Clock => &[K::H4, K::H8, K::H9, K::X6, K::U1, K::U15, K::T2],
+            Self::Interlock => &[K::X19, K::X19, K::X19, K::U15, K::X4, K::X5, K::X21],
+            Self::Hand => &[K::U15, K::X4, K::H5, K::H7, K::X3, K::X5, K::X20, K::X21],
+            Self::Limits => &[K::T2, K::T3, K::U15, K::X4, K::X5, K::G7],
         }
     }
 
     /// `dark from` is told this much later than the host means, nanoseconds.
     pub fn stretches_ns(self) -> i64 {
-        if matches!(self, Self::DarkFrom | Self::Clock) {
-            0
-        } else {
-            LATE_NS
+        match self {
+            Self::Watchdog | Self::Age | Self::Orders | Self::Session => LATE_NS,
+            _ => 0,
         }
     }
 
     /// `safety.watchdog_ms`, where it is not the usual one.
     pub fn watchdog_ms(self) -> Option<i64> {
         matches!(self, Self::DarkFrom | Self::Orders | Self::Session).then_some(LATE_NS / 1_000_000)
+    }
+
+    /// What the rig file says of `[safety]` besides.
+    pub fn keys(self) -> &'static str {
+        match self {
+            Self::Hand => "start = \"by hand\"\n",
+            Self::Limits => "limits = { mean_level = 0.25, mean_window_s = 0.6 }\n",
+            _ => "",
+        }
+    }
+
+    /// The projector has forgotten everything when the program has ended.
+    pub fn forgets(self) -> bool {
+        matches!(self, Self::Orders | Self::Hand)
     }
 
     /// How much later than usual the link is served where a slot takes `slot_ns`.

@@ -233,6 +233,16 @@ kinds! {
     X15,
     /// The clock of a VRPN server is set while it runs.
     X16,
+    /// A queue stands between the stages, which are slower the more frames are under way.
+    X17,
+    /// The cable carries only every second to sixth frame, for seconds.
+    X18,
+    /// The interlock opens, chatters, or hangs.
+    X19,
+    /// Somebody sends OSC, who may or may not.
+    X20,
+    /// One call to the disk fails, the first to the sixth from now.
+    X21,
 }
 
 const FILES: &str = "scenes are read only when the program starts, before any light";
@@ -262,9 +272,19 @@ impl Kind {
         self == Self::X8
     }
 
+    /// It strikes only where a guard stands alone that has to answer it.
+    pub fn needs_guard(self) -> bool {
+        matches!(self, Self::X19 | Self::X20 | Self::X21)
+    }
+
     /// It strikes only where the projector hangs on a serial line.
     pub fn needs_line(self) -> bool {
         matches!(self, Self::X9 | Self::X10 | Self::X11)
+    }
+
+    /// It strikes only lives of their own, see [`crate::plan::Setup::strained`].
+    pub fn needs_strain(self) -> bool {
+        matches!(self, Self::X17 | Self::X18)
     }
 
     /// Why nothing of this kind happens in the world although it strikes; `None` if something does. Such strikes are counted
@@ -291,6 +311,7 @@ impl Kind {
             K::F1 | K::F2 | K::F3 | K::F4 | K::F5 | K::F6 | K::F7 | K::F8 | K::F9 | K::F10 => {
                 (state != State::Dark).then_some(FILES)
             }
+            K::X17 | K::X18 => (state != State::Running).then_some("it strikes frames that are shown"),
             K::H7 | K::G1 | K::G2 => {
                 (state != State::Dark).then_some("it strikes only when the program starts")
             }

@@ -11,6 +11,7 @@ use crate::tracks::Moment;
 use dpm_device::light::{LightEvent, LightKind};
 use dpm_device::link::{frame_newer, DeviceState};
 use dpm_rig::control::orders::Ticket;
+use dpm_rig::interlock::SILENCE_NS;
 use dpm_rig::order::Order;
 use dpm_rig::pipeline::stepped::{SteppedEnd, StoredOrder};
 use dpm_rig::rig::Rig;
@@ -18,6 +19,7 @@ use dpm_rig::telemetry::light_state::LightState;
 use dpm_rig::telemetry::monitor::{ProjectorHealth, RunCounts};
 use hil_mock::motion::Motion;
 use hil_mock::projector::{DeviceClock, LightChange};
+use std::collections::VecDeque;
 use std::sync::{Arc, Mutex};
 
 const MS: i64 = 1_000_000;
@@ -32,6 +34,8 @@ const DARK_AT_LAST_NS: i64 = 300 * MS;
 pub(crate) const BEGINS_WITHIN_NS: i64 = 300 * MS;
 /// Light returns within this time after all causes are gone.
 const LIT_WITHIN_NS: i64 = S;
+/// A stage may stall for a second before the program can say that an order is the reason of darkness.
+const ORDER_TOLD_NS: i64 = 1_500 * MS;
 /// The map of a clock whose exchanges are stamped in time is no more wrong than this, besides their travel.
 const CLOCK_NS: i64 = 300_000;
 /// The body's greatest speed, metres a second.
@@ -46,6 +50,30 @@ pub struct Broken {
     pub told: String,
 }
 
+/// A time in which frames come at a steady rate although something is wrong.
+#[derive(Clone, Copy, Debug)]
+pub struct Spell {
+    /// When it begins, and how far apart frames may be at least and in the mean, nanoseconds.
+    from: i64,
+    apart_ns: i64,
+    /// The share of frames that must be there.
+    share: f64,
+    /// The light never goes off.
+    is_steady: bool,
+    frames: u64,
+    dark_at: Option<i64>,
+    /// Faults that had struck when it was announced.
+    faults: u64,
+}
+
+impl Spell {
+    /// From `from` on one frame each `apart_ns` is lit, or at least the share `share` of them; `is_steady`: and the light never
+    /// goes off.
+    pub fn new(from: i64, apart_ns: i64, share: f64, is_steady: bool) -> Self {
+        Self { from, apart_ns, share, is_steady, frames: 0, dark_at: None, faults: 0 }
+    }
+}
+
 /// An order that keeps the projector dark, or its picture still.
 #[derive(Clone, Copy, Debug)]
 struct Standing {
@@ -56,6 +84,66 @@ struct Standing {
     kept: bool,
     /// The process that it was given to has ended.
     is_orphan: bool,
+}
+
+/// The law of a limit to the mean of the light.
+struct Limit {
+    /// Channel and weight of each plane.
+    planes: Vec<(usize, f64)>,
+    plane_bytes: usize,
+    /// All mirrors, in every plane of the channel that has most.
+    full: f64,
+    level: f64,
+    window_ns: i64,
+    /// Instants of slots of the last window, and their light: nanoseconds of full white.
+    slots: VecDeque<(i64, f64)>,
+    sum: f64,
+}
+
+impl Limit {
+    fn new(rig: &Rig) -> Self {
+        let planes = rig.schedule.planes().iter();
+        let planes: Vec<_> = planes.map(|p| (p.channel as usize, f64::from(1u32 << p.bit))).collect();
+        let of =
+            |channel| planes.iter().filter(|(of, _)| *of == channel).map(|(_, weight)| weight).sum::<f64>();
+        let limits = &rig.config.safety.limits;
+        Self {
+            full: rig.camera.raster.pixel_count() as f64 * (0..4).map(of).fold(0.0, f64::max),
+            planes,
+            plane_bytes: rig.camera.raster.plane_bytes(),
+            level: limits.mean_level,
+            window_ns: (limits.mean_window_s * S as f64) as i64,
+            slots: VecDeque::new(),
+            sum: 0.0,
+        }
+    }
+
+    /// A slot with these planes.
+    fn see(&mut self, at: i64, planes: Option<&[u8]>, slot_ns: i64) -> Result<(), String> {
+        let mut drive = [0.0; 4];
+        let planes = planes.unwrap_or_default().chunks(self.plane_bytes);
+        for (plane, (channel, weight)) in planes.zip(&self.planes) {
+            drive[*channel] += weight * f64::from(plane.iter().map(|byte| byte.count_ones()).sum::<u32>());
+        }
+        let light = drive.into_iter().fold(0.0, f64::max) / self.full * slot_ns as f64;
+        self.slots.push_back((at, light));
+        self.sum += light;
+        while self.slots.front().is_some_and(|(then, _)| at - then >= self.window_ns) {
+            self.sum -= self.slots.pop_front().map_or(0.0, |(_, light)| light);
+        }
+        let mean = self.sum / self.window_ns as f64;
+        // The window is rounded up to whole slots.
+        let allowed = self.level + 2.0 * slot_ns as f64 / self.window_ns as f64;
+        if mean > allowed {
+            return Err(format!("the mean level of a window is {mean:.3}; {allowed:.3} are allowed"));
+        }
+        Ok(())
+    }
+}
+
+/// An order of greater strength replaces another one.
+fn strength(order: Order) -> usize {
+    [Order::Freeze, Order::Black, Order::Safe].iter().position(|one| *one == order).unwrap_or(0)
 }
 
 /// See the module's documentation. All instants are true time.
@@ -92,6 +180,8 @@ pub struct Laws {
     mirrors: [i64; 2],
     /// What the program calls the light: lit or not, and since when.
     word: (Option<bool>, i64),
+    /// Since when it is dark and an order is the reason, as the program should say.
+    ordered_at: i64,
     /// The planes that were looked at last have light.
     looked: (u64, bool),
     /// When a frame with light on the body was lit last.
@@ -101,6 +191,16 @@ pub struct Laws {
     ticks: [u64; 11],
     tick: usize,
     standing: Option<Standing>,
+    /// The interlock's contact is not closed since, and whether it only does not answer.
+    open: Option<(i64, bool)>,
+    /// Since then an interlock that is reset by hand waits for ARM.
+    awaits_reset: Option<i64>,
+    armed_at: i64,
+    /// Every start waits for ARM, and this one does since.
+    by_hand: bool,
+    awaits_arm: Option<i64>,
+    /// Where the mean of the light is limited.
+    limit: Option<Limit>,
     stopped_at: Option<i64>,
     died_at: Option<i64>,
     /// When the projector last heard of a program that had ended: a serial line finishes what it was given.
@@ -119,6 +219,9 @@ pub struct Laws {
     /// When ARM was ordered after FREEZE. ARM reaches the light when the disk has forgotten the standing order.
     thawed_at: i64,
     slow_disk_until: i64,
+    /// Until then frames may come at fewer than all slots.
+    slow_until: i64,
+    spell: Option<Spell>,
     rested_until: i64,
     /// A hang has been found by then.
     hidden_until: i64,
@@ -167,12 +270,19 @@ impl Laws {
             dark_since: 0,
             mirrors: [0; 2],
             word: (None, 0),
+            ordered_at: 0,
             looked: (u64::MAX, false),
             good_at: 0,
             good_frames: 0,
             ticks: [0; 11],
             tick: 0,
             standing: None,
+            open: None,
+            awaits_reset: None,
+            armed_at: -S,
+            by_hand: setup.alone == Some(Guard::Hand),
+            awaits_arm: None,
+            limit: (setup.alone == Some(Guard::Limits)).then(|| Limit::new(rig)),
             stopped_at: None,
             died_at: None,
             echoed_at: 0,
@@ -187,6 +297,8 @@ impl Laws {
             clock_moved_at: -S,
             thawed_at: -S,
             slow_disk_until: 0,
+            slow_until: 0,
+            spell: None,
             rested_until: 0,
             hidden_until: 0,
             elsewhere_at: 0,
@@ -226,6 +338,43 @@ impl Laws {
         self.slow_disk_until = self.slow_disk_until.max(t);
     }
 
+    /// Until then frames may come at fewer than all slots.
+    pub fn slow_until(&mut self, t: i64) {
+        self.slow_until = self.slow_until.max(t);
+    }
+
+    /// Frames may come at fewer than all slots at `t`.
+    pub fn is_slow(&self, t: i64) -> bool {
+        t <= self.slow_until
+    }
+
+    /// Something is wrong that frames bear. `faults`: those that have struck.
+    pub fn spell(&mut self, spell: Spell, faults: u64) {
+        self.spell = Some(Spell { faults, ..spell });
+    }
+
+    /// It ends. If other faults have struck meanwhile, or the tracker is silent, nothing is said of the frames.
+    pub fn spell_is_over(&mut self, t: i64, faults: u64) {
+        let Some(spell) = self.spell.take() else { return };
+        let due = ((t - spell.from) / spell.apart_ns) as f64;
+        if spell.faults != faults || self.standing.is_some() {
+            return;
+        }
+        if let Some(at) = spell.dark_at.filter(|_| spell.is_steady) {
+            self.fail(
+                at,
+                "a cable that carries every n-th frame does not carry it steadily: the light goes off".into(),
+            );
+        }
+        if (spell.frames as f64) < spell.share * due {
+            let (frames, s) = (spell.frames, (t - spell.from) as f64 * 1e-9);
+            self.fail(
+                t,
+                format!("{frames} good frames in {s:.2} s, in which frames have settled; {due} are possible"),
+            );
+        }
+    }
+
     /// The program does not run for `ns`, so it finds everything that much later.
     pub fn pauses(&mut self, t: i64, ns: i64) {
         if self.hidden_until > t {
@@ -248,7 +397,7 @@ impl Laws {
     pub fn flashes(&mut self, t: i64, has_flashed: bool) {
         // The limit counts what was within a second, and soon after the fault all frames are drawn and sent as usual.
         if has_flashed && !self.has_flashed && t - self.elsewhere_at > 1_200 * MS {
-            self.fail(t, "the projector latched its flash limit before the host acted".into());
+            self.fail(t, "the projector latched a limit of its own before the host acted".into());
         }
         self.has_flashed = has_flashed;
     }
@@ -307,6 +456,7 @@ impl Laws {
         (self.stopped_at, self.died_at, self.still) = (None, None, None);
         self.started_at = t;
         (self.crews, self.is_told) = (1, false);
+        self.awaits_arm = self.by_hand.then_some(t);
         self.starts_in_calm += u32::from(is_calm);
         self.process += 1;
         if self.starts_in_calm > 4 {
@@ -316,19 +466,37 @@ impl Laws {
 
     /// True while the person wants it dark, or still.
     pub fn has_standing_order(&self) -> bool {
-        self.standing.is_some()
+        self.standing.is_some() || self.awaits_arm.is_some()
+    }
+
+    /// The interlock's contact closes (0), opens (1) or does not answer (2). `by_hand`: the program that asks it needs ARM after
+    /// that.
+    pub fn contact(&mut self, t: i64, state: u8, by_hand: bool) {
+        if state != 0 {
+            self.open.get_or_insert((t, state == 2));
+            return;
+        }
+        let Some((since, hangs)) = self.open.take() else { return };
+        // It is asked every 5 ms, and counts as silent after a tenth of a second.
+        let found_ns = if hangs { SILENCE_NS + 30 * MS } else { 30 * MS };
+        if by_hand && t - since.max(self.started_at) > found_ns && t - self.armed_at > S {
+            self.awaits_reset.get_or_insert(since);
+        }
     }
 
     /// The person ordered something.
     pub fn ordered(&mut self, order: Order, ticket: Ticket, t: i64) {
         if order == Order::Arm {
+            (self.awaits_arm, self.armed_at) = (None, t);
+            if self.open.is_none() {
+                self.awaits_reset = None;
+            }
             if self.is_frozen() {
                 self.thawed_at = t;
             }
             (self.standing, self.hot_since) = (None, None);
             return;
         }
-        let strength = |o: Order| [Order::Freeze, Order::Black, Order::Safe].iter().position(|x| *x == o);
         if self.standing.is_some_and(|s| strength(s.order) > strength(order)) {
             return;
         }
@@ -336,6 +504,7 @@ impl Laws {
             self.thawed_at = t;
         }
         let since = self.standing.filter(|s| s.order == order).map_or(t, |s| s.since);
+        self.ordered_at = self.ordered_at.max(since);
         self.standing = Some(Standing { order, since, ticket, kept: false, is_orphan: false });
     }
 
@@ -343,6 +512,9 @@ impl Laws {
     pub fn order_at_exit(&mut self, process: &Process, t: i64) {
         if self.is_frozen() {
             self.thawed_at = t;
+        }
+        if !matches!(process.orders.kept(), Some(Order::Black | Order::Safe)) {
+            self.awaits_reset = None;
         }
         let Some(standing) = &mut self.standing else { return };
         standing.kept |= process.orders.outcome(standing.ticket) == Some(StoredOrder::Kept);
@@ -395,8 +567,13 @@ impl Laws {
     pub(crate) fn is_in_peace(&self, t: i64, calm_for: i64, crew_ready: i64) -> bool {
         let is_calm = calm_for > 2 * S && t - self.good_at < S && t - self.disturbed_at > 3 * S;
         // The run may end when a hang is found.
-        let is_whole = t > self.hidden_until + S;
-        is_calm && is_whole && self.is_quick && t - crew_ready > 3 * S && t - self.started_at > 4 * S
+        let is_whole = t > self.hidden_until + S && t > self.slow_until;
+        is_calm
+            && is_whole
+            && self.is_quick
+            && self.limit.is_none()
+            && t - crew_ready > 3 * S
+            && t - self.started_at > 4 * S
     }
 
     pub(crate) fn remember(&mut self, beneath: &Arc<Mutex<Beneath>>) {
@@ -420,6 +597,9 @@ impl Laws {
             }
             (true, false) => {
                 self.must_be_dark(at - 1, "light goes off only now");
+                if let Some(spell) = self.spell.as_mut().filter(|spell| at >= spell.from) {
+                    spell.dark_at.get_or_insert(at);
+                }
                 (self.is_lit, self.dark_since) = (false, at);
                 self.showing = None;
             }
@@ -450,6 +630,30 @@ impl Laws {
                 self.fail(
                     at,
                     format!("{what} {} ms after {}{how}", late / MS, s.order.word().to_uppercase()),
+                );
+            }
+        }
+        if let Some((since, hangs)) = self.open {
+            let silence_ns = if hangs { SILENCE_NS } else { 0 };
+            if at - since > allowed(since, self) + silence_ns {
+                self.fail(at, format!("{what} {} ms after the interlock opened", (at - since) / MS));
+            }
+        } else if let Some(since) =
+            self.awaits_reset.filter(|since| at - since > allowed(*since, self) + SILENCE_NS)
+        {
+            self.fail(
+                at,
+                format!(
+                    "{what}, and nobody gave ARM since the interlock opened {} ms ago",
+                    (at - since) / MS
+                ),
+            );
+        }
+        if let Some(since) = self.awaits_arm {
+            if at - since > self.usual_watchdog_ns() + self.slot_ns {
+                self.fail(
+                    at,
+                    format!("{what}, and nobody gave ARM since the start {} ms ago", (at - since) / MS),
                 );
             }
         }
@@ -488,6 +692,12 @@ impl Laws {
         clock: DeviceClock,
     ) {
         let at = event.first_photon_at.0;
+        if let Some(limit) = &mut self.limit {
+            let planes = planes.filter(|_| event.kind != LightKind::Blank);
+            if let Err(told) = limit.see(at, planes, self.slot_ns) {
+                self.fail(at, told);
+            }
+        }
         if event.kind == LightKind::Blank {
             return;
         }
@@ -524,6 +734,9 @@ impl Laws {
         if sent.captured_at.is_some() {
             self.good_at = at;
             self.good_frames += 1;
+            if let Some(spell) = self.spell.as_mut().filter(|spell| at >= spell.from) {
+                spell.frames += 1;
+            }
             self.wordless_since = at;
         }
         self.showing = Some(sent);
@@ -590,10 +803,10 @@ impl Laws {
         let predict_ns = self.predict_ns.unwrap_or(sent.predict_ns);
         // The clocks are known to a fraction of a millisecond only.
         let mut allowed = predict_ns + self.slot_ns + MS;
-        // The host knows how long frames took on a line, not how long the next one takes: the line may stall, or the last ones
+        // The host knows how long frames took on a line, or on a cable that has become slow, not how long the next one takes: the line may stall, or the last ones
         // were smaller. It does not trust the port's rate either, which many adapters ignore. `dark from` bounds the light: for
         // three slots after its own a frame may be lit, whatever its age. The clock is known to a few milliseconds only.
-        if self.is_line {
+        if self.is_line || at <= self.slow_until {
             allowed = allowed.max(sent.due_at + self.stride_ns + 3 * self.slot_ns + 4 * MS - captured_at);
         }
         self.worst_age_milli = self.worst_age_milli.max(age * 1000 / allowed);
@@ -682,7 +895,23 @@ impl Laws {
         if self.word.0 != says_lit {
             self.word = (says_lit, t);
         }
-        let Some(word) = word else { return };
+        let Some(word) = word else {
+            self.ordered_at = t;
+            return;
+        };
+        let is_ordered = self.standing.is_some() && self.stopped_at.is_none();
+        if !is_ordered || word.is_lit() || t < self.hidden_until + S {
+            self.ordered_at = t;
+        }
+        // Of several orders the strongest counts, also after a restart.
+        let ordered = self.standing.map_or(0, |standing| strength(standing.order));
+        let is_named = matches!(word, LightState::DarkByOrder(order) if strength(order) >= ordered);
+        if t - self.ordered_at > ORDER_TOLD_NS && !is_named {
+            self.fail(
+                t,
+                format!("it has been dark by order for {} ms, and is called {word:?}", ORDER_TOLD_NS / MS),
+            );
+        }
         let [lit_at, dark_at] = self.mirrors;
         let since = t - self.word.1.max(if word.is_lit() { lit_at } else { dark_at });
         if since > S {

@@ -55,6 +55,21 @@ pub enum Trap {
     Panics,
 }
 
+/// Memory that is too slow for every slot for a moment, and caches that do not hold several frames: stages are slower the more
+/// frames are under way, so that a queue keeps itself standing.
+#[derive(Clone, Copy, Debug)]
+pub struct Queue {
+    /// Until then packing and the link take longer by `slow_ns`. Host's clock.
+    pub until: HostTime,
+    /// See `until`.
+    pub slow_ns: i64,
+    /// Both take so much longer for each frame beyond the first, of three at most.
+    pub crowd_ns: i64,
+}
+
+/// As many frames under way are a queue.
+const QUEUE: i64 = 3;
+
 /// A fault that the next frame meets on the GPU.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum GpuTrap {
@@ -151,6 +166,12 @@ pub struct Beneath {
     pub met: [u64; 3],
     /// Steps that took longer because the machine was busy.
     pub slowed: u64,
+    /// What lets a queue stand.
+    pub queue: Option<Queue>,
+    /// The newest frames that planning and the link have worked on: those between them are under way.
+    newest: [u64; 2],
+    /// Steps that met a queue whose cause was over.
+    pub queued: u64,
     /// The GPU's time of a usual frame, nanoseconds.
     pub frame_ns: i64,
     /// Frames that were sent and not looked at yet.
@@ -174,6 +195,9 @@ impl Beneath {
             link_late_ns: 0,
             met: [0; 3],
             slowed: 0,
+            queue: None,
+            newest: [0; 2],
+            queued: 0,
             frame_ns,
             sent: VecDeque::new(),
             crew_ready_at: 0,
@@ -181,11 +205,29 @@ impl Beneath {
         }
     }
 
+    /// How much longer a step of `part` takes that works on `frame`, where a queue can stand.
+    fn crowded_ns(&mut self, part: Part, frame: u64, now: HostTime) -> i64 {
+        match part {
+            Part::Plan => self.newest[0] = frame,
+            Part::Link if frame > 0 => self.newest[1] = frame,
+            _ => {}
+        }
+        let (Some(queue), Part::Pack | Part::Link) = (self.queue, part) else { return 0 };
+        if frame == 0 {
+            return 0;
+        }
+        let under_way = self.newest[0].saturating_sub(self.newest[1]) as i64;
+        let is_slow = now < queue.until;
+        self.queued += u64::from(!is_slow && under_way >= QUEUE);
+        queue.crowd_ns * (under_way - 1).clamp(0, 3) + if is_slow { queue.slow_ns } else { 0 }
+    }
+
     /// A new process does not meet the traps of the old one.
     pub fn new_process(&mut self) {
         self.process += 1;
         self.traps.clear();
         self.gpu_traps.clear();
+        self.newest = [0; 2];
     }
 }
 
@@ -208,7 +250,7 @@ fn device() -> Arc<str> {
 }
 
 impl Machine for SimMachine {
-    fn takes(&mut self, part: Part, _: u64, _: HostTime) -> Takes {
+    fn takes(&mut self, part: Part, frame: u64, now: HostTime) -> Takes {
         let mut beneath = lock(&self.beneath);
         let quantiles = match part {
             Part::Tracking => TRACKING_US,
@@ -219,7 +261,8 @@ impl Machine for SimMachine {
         };
         let load_milli = beneath.load_milli;
         let late_ns = if part == Part::Link { beneath.link_late_ns } else { 0 };
-        let ns = drawn(&mut beneath.dice, quantiles) * load_milli / 1000 + late_ns;
+        let crowded_ns = beneath.crowded_ns(part, frame, now);
+        let ns = drawn(&mut beneath.dice, quantiles) * load_milli / 1000 + late_ns + crowded_ns;
         beneath.slowed += u64::from(load_milli != 1000);
         if !beneath.traps.is_empty() {
             if let Some(i) = beneath.traps.iter().position(|(of, _)| *of == part) {

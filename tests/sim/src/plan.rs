@@ -122,6 +122,8 @@ pub struct Setup {
     pub motion: BodyMotion,
     /// The guard of the light that stands alone.
     pub alone: Option<Guard>,
+    /// A machine on which a queue can keep itself standing, and a cable that can be too slow for every slot.
+    pub strained: bool,
 }
 
 /// The share of lives whose projector follows tracks.
@@ -133,6 +135,11 @@ const ON_A_LINE: f64 = 1.0 / 5.0;
 const LINE_RATES: [u32; 6] = [24, 24, 60, 60, 120, 240];
 /// The bits per second that adapters run at.
 const BAUDS: [u32; 6] = [115_200, 230_400, 460_800, 921_600, 3_000_000, 12_000_000];
+
+/// The share of the other lives that are strained, and the highest rate of such a life: with shorter slots two frames are under
+/// way at any time.
+const STRAINED: f64 = 1.0 / 8.0;
+const STRAINED_MOST_HZ: u32 = 1_000;
 
 /// Bytes of a frame of `planes` planes on a serial line, if none of them can be compacted.
 fn frame_bytes(raster: (u32, u32), planes: u32) -> u64 {
@@ -228,6 +235,7 @@ impl Setup {
         Self {
             follows,
             alone: None,
+            strained: false,
             serial,
             raster,
             motion,
@@ -242,6 +250,25 @@ impl Setup {
             ns_per_byte: dice.between(2, 40),
             travel_ns: dice.between(30, 250) * 1_000,
         }
+    }
+}
+
+impl Setup {
+    /// The same rig, strained if that is wanted or drawn, and if it can be: on a USB cable, without tracks, with a renderer that
+    /// keeps up, and with the reach of prediction that follows from the rig. Others are what they were before there were any.
+    pub fn strained(self, wanted: Option<bool>) -> Self {
+        let drawn = Dice::new(self.seed, 0x57a1).happens(STRAINED);
+        let can_be = !self.follows && self.serial.is_none() && self.rate_hz <= STRAINED_MOST_HZ;
+        if !(can_be && wanted.unwrap_or(drawn)) {
+            return self;
+        }
+        Self { strained: true, predict_ms: None, render_milli: self.render_milli.min(500), ..self }
+    }
+
+    /// Bytes of a frame on the cable, if no plane is compacted.
+    pub fn frame_bytes(&self) -> i64 {
+        let plane = (self.raster.0.div_ceil(8) * self.raster.1) as usize;
+        (self.planes as usize * packet_bytes(plane) + packet_bytes(COMMIT_BYTES)) as i64
     }
 }
 
@@ -314,8 +341,9 @@ impl Episodes {
         let kinds = all
             .filter(|kind| setup.follows || !kind.needs_tracks())
             .filter(|kind| setup.serial.is_some() || !kind.needs_line())
+            .filter(|kind| setup.strained || !kind.needs_strain())
             .filter(|kind| tracker == TrackerKind::Vrpn || !kind.needs_connection())
-            .filter(|kind| setup.alone.is_none_or(|guard| guard.kinds().contains(kind)))
+            .filter(|kind| setup.alone.map_or(!kind.needs_guard(), |guard| guard.kinds().contains(kind)))
             .collect::<Vec<_>>();
         let wanted = |kind: &Kind| first.contains(kind) && kind.strikes(tracker);
         let mut first: Vec<Kind> = kinds.iter().copied().filter(wanted).collect();

@@ -4,16 +4,20 @@ use crate::cable::{lock, Cable, HostEnd};
 use crate::disk::{Disk, SimFolder};
 use crate::machine::SimMachine;
 use crate::port::SimPorts;
+use dpm_common::clock::ManualClock;
 use dpm_device::time::HostTime;
 use dpm_device::transport::serial::{SerialSettings, SerialTransport};
 use dpm_device::transport::{Transport, TransportError};
+use dpm_rig::config::Restart;
 use dpm_rig::failure::{Failure, FailureKind};
+use dpm_rig::interlock::{Asking, Contact, Interlock, ASK_EVERY};
 use dpm_rig::pipeline::projector::frame_bytes;
 use dpm_rig::pipeline::stepped::{SteppedEnd, SteppedOrders, SteppedRun};
 use dpm_rig::projectors::Cable as RigCable;
 use dpm_rig::rig::Rig;
 use dpm_rig::standing::Identity;
 use dpm_rig::telemetry::monitor::{ProjectorHealth, RunMonitor};
+use std::sync::atomic::{AtomicU8, Ordering};
 use std::sync::{Arc, Mutex};
 
 /// How often the thread that writes orders down looks for new ones, nanoseconds.
@@ -23,6 +27,30 @@ const DISK_NS: i64 = 2_000_000;
 
 /// A program that was asked to stop ends after this time, whatever hangs, nanoseconds.
 const STOPPED_NS: i64 = 2_000_000_000;
+
+/// How often the interlock's contact is asked, nanoseconds.
+const ASK_NS: i64 = ASK_EVERY.as_nanos() as i64;
+
+/// The contact of the interlock: closed, open, or it does not answer.
+#[derive(Clone, Debug, Default)]
+pub struct SimContact(pub Arc<AtomicU8>);
+
+impl SimContact {
+    /// It is open.
+    pub const OPEN: u8 = 1;
+    /// It does not answer.
+    pub const HANGS: u8 = 2;
+
+    fn hangs(&self) -> bool {
+        self.0.load(Ordering::Relaxed) == Self::HANGS
+    }
+}
+
+impl Contact for SimContact {
+    fn is_closed(&mut self) -> bool {
+        self.0.load(Ordering::Relaxed) == 0
+    }
+}
 
 /// How a process ended.
 #[derive(Debug)]
@@ -55,6 +83,10 @@ pub struct Process {
     /// Its orders.
     pub orders: SteppedOrders,
     disk: Arc<Mutex<Disk>>,
+    /// What the interlock's thread has besides its light.
+    interlock: Option<(SimContact, Asking)>,
+    clock: Arc<ManualClock>,
+    asked_due: i64,
     orders_due: i64,
     run_due: i64,
     /// A stop was asked for.
@@ -73,12 +105,25 @@ impl Process {
         cable: &Arc<Mutex<Cable>>,
         disk: &Arc<Mutex<Disk>>,
         machine: SimMachine,
+        contact: Option<(&SimContact, Restart)>,
         now: i64,
     ) -> Result<Self, Exit> {
         let monitor = Arc::new(RunMonitor::default());
+        let clock = Arc::new(ManualClock::new(HostTime(now)));
+        let interlock = contact.map(|(contact, reset)| {
+            let (interlock, mut asking) = Interlock::stepped("a contact", clock.clone(), contact.clone());
+            asking.ask();
+            monitor.set_interlock(interlock.reset_by(reset));
+            (contact.clone(), asking)
+        });
         let identity = Identity::of(&rig.config.projector.backend);
-        let orders = SteppedOrders::begin(Box::new(SimFolder(disk.clone())), identity, monitor.clone())
-            .map_err(Exit::ForGood)?;
+        let orders = SteppedOrders::begin(
+            Box::new(SimFolder(disk.clone())),
+            identity,
+            monitor.clone(),
+            rig.config.safety.start,
+        )
+        .map_err(Exit::ForGood)?;
         let medium = medium(rig, cable).map_err(|e| Exit::Again(e.to_string()))?;
         let run = SteppedRun::begin(rig.clone(), monitor.clone(), medium, machine, HostTime(now));
         let disk = disk.clone();
@@ -87,6 +132,9 @@ impl Process {
             monitor,
             orders,
             disk,
+            asked_due: if interlock.is_some() { now + ASK_NS } else { i64::MAX },
+            clock,
+            interlock,
             orders_due: now,
             run_due: now,
             is_stopping: false,
@@ -96,11 +144,18 @@ impl Process {
 
     /// When it does something next, host's clock.
     pub fn due(&self) -> i64 {
-        self.run_due.min(self.orders_due).min(self.end_by)
+        self.run_due.min(self.orders_due).min(self.end_by).min(self.asked_due)
     }
 
     /// Does what is due at `now`.
     pub fn step(&mut self, now: i64) {
+        self.clock.advance_to(HostTime(now));
+        if self.asked_due <= now {
+            self.asked_due = now + ASK_NS;
+            if let Some((_, asking)) = self.interlock.as_mut().filter(|(contact, _)| !contact.hangs()) {
+                asking.ask();
+            }
+        }
         if self.orders_due <= now {
             let disk_ns = DISK_NS + lock(&self.disk).late_ns;
             let next = self.orders.step(HostTime(now), disk_ns);

@@ -2,10 +2,12 @@
 
 use crate::cable::{lock, CableFaults};
 use crate::dice::Dice;
-use crate::kinds::Kind;
-use crate::machine::{GpuTrap, OpenTrap, Trap};
+use crate::kinds::{Kind, State};
+use crate::laws::Spell;
+use crate::machine::{GpuTrap, OpenTrap, Queue, Trap};
 use crate::net::{NetFaults, ServerKind};
-use crate::world::{projector_of, server_kind, Action, Undo, World, MS, S};
+use crate::process::SimContact;
+use crate::world::{projector_of, server_kind, Action, Undo, World, MS, OSC_TOKEN, S};
 use dpm_device::link::Packet;
 use dpm_device::link::{faults, HostLink, SessionNumbers};
 use dpm_device::planes::Raster;
@@ -85,8 +87,26 @@ impl World {
                 self.lasts(kind, dice.decades(2, 1_500) * MS, Undo::Cable);
             }
             K::X9 | K::X10 | K::X11 => self.strike_line(kind, &mut dice),
+            K::X17 | K::X18 => self.strike_flow(kind, &mut dice),
             K::T18 => self.strike_tracker_line(&mut dice),
             K::X12 | K::X13 | K::X14 | K::X15 | K::X16 => self.strike_connection(kind, &mut dice),
+            K::X19 => self.strike_interlock(&mut dice),
+            K::X20 => {
+                let word = dice.one_of(&["arm", "arm", "freeze", "black", "safe"]);
+                let token = dice.one_of(&[None, None, Some(OSC_TOKEN), Some("curtainx"), Some("c")]);
+                self.hear_osc(word, token, dice.happens(0.6));
+                self.lasts(kind, MS, Undo::Nothing);
+            }
+            K::X21 => {
+                lock(&self.disk).fails_in = Some(dice.between(0, 5) as u32);
+                self.give(dice.one_of(&[Order::Safe, Order::Black, Order::Freeze]));
+                if dice.happens(0.3) {
+                    self.plan(self.t + dice.between(1, 60) * MS, Action::Kill);
+                }
+                let until = dice.decades(50, 500) * MS;
+                self.laws.slow_disk_until(self.t + until);
+                self.lasts(kind, until, Undo::Disk);
+            }
             K::G3 | K::G9 => self.lasts(kind, MS, Undo::Nothing),
         }
     }
@@ -259,6 +279,41 @@ impl World {
         self.lasts(kind, lasts_ns, Undo::Cable);
     }
 
+    /// Frames queue between the stages, or the cable is too slow for them.
+    fn strike_flow(&mut self, kind: Kind, dice: &mut Dice) {
+        let slot_ns = S / i64::from(self.setup.rate_hz);
+        let begins = self.is_alone() && self.laws.is_lit_well(self.t) && !self.laws.is_slow(self.t);
+        let (lasts_ns, spell) = if kind == Kind::X17 {
+            // The stages keep up again after so long.
+            let slow_ns = dice.between(50, 200) * MS + 4 * slot_ns;
+            let until = HostTime(self.host() + slow_ns);
+            let queue = Queue { until, slow_ns: slot_ns * 11 / 10, crowd_ns: slot_ns * 24 / 100 };
+            lock(&self.beneath).queue = Some(queue);
+            let settles_ns = slow_ns + S / 2 + 12 * slot_ns;
+            let lasts_ns = settles_ns + dice.between(1_000, 2_000) * MS;
+            (lasts_ns, Spell::new(self.t + settles_ns, slot_ns, 0.9, false))
+        } else {
+            let slots = dice.between(2, 6);
+            let frame_ns = slots * slot_ns - dice.between(20, 60) * slot_ns / 100;
+            let own_ns = self.setup.frame_bytes() * self.setup.ns_per_byte;
+            lock(&self.cable).faults.crawl_ps = (frame_ns - own_ns).max(1) * 1000 / self.setup.frame_bytes();
+            let settles_ns = 1_500 * MS + 12 * slots * slot_ns;
+            let lasts_ns = settles_ns + dice.between(2_000, 5_000) * MS;
+            // While it was slow, full speed was tried more and more seldom.
+            self.laws.slow_until(self.t + 3 * lasts_ns + 2 * S);
+            (lasts_ns, Spell::new(self.t + settles_ns, slots * slot_ns, 0.7, true))
+        };
+        if begins {
+            self.laws.spell(spell, self.table.total());
+        }
+        self.lasts(kind, lasts_ns, if kind == Kind::X17 { Undo::Queue } else { Undo::Cable });
+    }
+
+    /// Nothing else is wrong, and frames are shown.
+    fn is_alone(&self) -> bool {
+        self.is_quiet() && self.state() == State::Running && !self.laws.has_standing_order()
+    }
+
     fn strike_projector(&mut self, kind: Kind, dice: &mut Dice) {
         use Kind as K;
         let now = HostTime(self.t);
@@ -426,6 +481,22 @@ impl World {
         self.lasts(kind, 320 * MS, Undo::Traps);
     }
 
+    /// The interlock opens for a moment or for long, chatters, or its thread hangs.
+    fn strike_interlock(&mut self, dice: &mut Dice) {
+        let state = if dice.happens(0.25) { SimContact::HANGS } else { SimContact::OPEN };
+        let rounds = if dice.happens(0.2) { dice.between(2, 5) } else { 1 };
+        let mut at = self.t;
+        for _ in 0..rounds {
+            self.plan(at, Action::Contact(state));
+            // A thread that hangs for less than the silence that counts is not noticed, and need not be.
+            let shortest = if state == SimContact::HANGS { 300 } else { 3 };
+            at += dice.decades(shortest, 2_500) / rounds * MS + MS;
+            self.plan(at, Action::Contact(0));
+            at += dice.between(5, 80) * MS;
+        }
+        self.lasts(Kind::X19, at - self.t, Undo::Nothing);
+    }
+
     fn strike_host(&mut self, kind: Kind, dice: &mut Dice) {
         use Kind as K;
         let lasts_ns = dice.decades(20, 1_500) * MS;
@@ -539,8 +610,9 @@ impl World {
             }
             Undo::Disk => {
                 let mut disk = lock(&self.disk);
-                (disk.refuses, disk.is_full, disk.late_ns) = (false, false, 0);
+                (disk.refuses, disk.is_full, disk.late_ns, disk.fails_in) = (false, false, 0, None);
             }
+            Undo::Queue => lock(&self.beneath).queue = None,
             Undo::Load => lock(&self.beneath).load_milli = 1000,
             Undo::Traps => {
                 let mut beneath = lock(&self.beneath);

@@ -10,14 +10,16 @@ use crate::line::SerialLine;
 use crate::machine::{Beneath, SimMachine, Trap};
 use crate::net::{Net, ServerKind};
 use crate::plan::{Episode, Setup, TrackerSetup};
-use crate::process::{Exit, Process};
+use crate::process::{Exit, Process, SimContact};
 use crate::table::Table;
 use crate::tracks::TrackLaws;
 use dpm_device::link::{faults, Status};
 use dpm_device::planes::Raster;
 use dpm_device::time::HostTime;
 use dpm_device::transport::{Lane, LinkDevice};
-use dpm_rig::config::{Overrides, RigConfig};
+use dpm_rig::config::{Overrides, Restart, RigConfig};
+use dpm_rig::control::osc::decode::Heard;
+use dpm_rig::control::osc::Doorkeeper;
 use dpm_rig::order::Order;
 use dpm_rig::pipeline::stepped::Part;
 use dpm_rig::rig::Rig;
@@ -27,6 +29,7 @@ use hil_mock::projector::serial::SerialEnd;
 use hil_mock::projector::{DeviceClock, MockConfig, MockProjector, GREATEST_SHIFT};
 use std::cmp::Reverse;
 use std::collections::{BinaryHeap, VecDeque};
+use std::net::{IpAddr, Ipv4Addr};
 use std::path::Path;
 use std::sync::atomic::{AtomicI64, Ordering};
 use std::sync::{Arc, Mutex};
@@ -49,6 +52,11 @@ const PERSON_NS: i64 = 300 * MS;
 const DISTURB_NS: i64 = 7 * MS;
 /// ... and for how long after the program has fallen silent: as many damaged packets as the projector bears.
 const DISTURBS_NS: i64 = 2 * S;
+/// Who may send OSC, and with which token more than darkness; and somebody else.
+const OSC_DESK: IpAddr = IpAddr::V4(Ipv4Addr::new(10, 0, 0, 5));
+const OSC_STRANGER: IpAddr = IpAddr::V4(Ipv4Addr::new(10, 0, 0, 6));
+/// See [`OSC_DESK`].
+pub(crate) const OSC_TOKEN: &str = "curtain";
 /// Slots of which the shifts wait to be judged.
 const MOVES_KEPT: usize = 64;
 
@@ -73,6 +81,8 @@ pub enum Action {
     Episode,
     /// A neighbour disturbs the cable.
     Disturb,
+    /// The interlock's contact is in this state from now on.
+    Contact(u8),
     /// The faults of the episode strike although its state was not reached.
     Overdue(u32),
 }
@@ -100,6 +110,8 @@ pub enum Undo {
     Disk,
     /// The machine is as quick as before.
     Load,
+    /// The caches hold all frames again.
+    Queue,
     /// What no stage has met by now, none will meet.
     Traps,
     /// The rig file is right again.
@@ -135,6 +147,9 @@ struct Met {
     /// Times that the program's machine or the program itself stood still, or had its clock set.
     stands: u64,
     steps: u64,
+    /// Times that the interlock opened while the program ran, and datagrams of OSC that it heard.
+    contacts: u64,
+    datagrams: u64,
 }
 
 /// Everything.
@@ -152,6 +167,8 @@ pub struct World {
     pub(crate) net: Arc<Mutex<Net>>,
     pub(crate) beneath: Arc<Mutex<Beneath>>,
     pub(crate) disk: Arc<Mutex<Disk>>,
+    /// The interlock's contact, and who lets light return; `None` where there is no interlock.
+    pub(crate) contact: Option<(SimContact, Restart)>,
     clock: Arc<AtomicI64>,
     lag: Arc<AtomicI64>,
     pub(crate) projector: MockProjector,
@@ -214,6 +231,7 @@ fn rig_of(setup: &Setup, acknowledges: bool) -> Result<Rig, String> {
     let predict = setup.predict_ms.map_or(String::new(), |ms| format!("predict_ms = {ms}\n"));
     let watchdog = setup.alone.and_then(Guard::watchdog_ms);
     let watchdog = watchdog.map_or(String::new(), |ms| format!("watchdog_ms = {ms}\n"));
+    let keys = setup.alone.map_or("", Guard::keys);
     let backend = match setup.serial {
         Some(line) => format!("kind = \"serial\", port = \"/dev/simulated\", baud = {}", line.baud),
         None => "kind = \"usb\"".into(),
@@ -228,7 +246,7 @@ fn rig_of(setup: &Setup, acknowledges: bool) -> Result<Rig, String> {
     let text = format!(
         "[tracker]\n{tracker}\nrate_hz = {}\n\
          [projector]\nwidth = {}\nheight = {}\nplanes = {}\nframe_rate = {}\nbackend = {{ {backend} }}\n{tracks}\
-         [scene]\nfile = \"triangle.gltf\"\n[[scene.bodies]]\nname = \"a\"\n[safety]\nacknowledge_faults = {acknowledges}\n{predict}{watchdog}",
+         [scene]\nfile = \"triangle.gltf\"\n[[scene.bodies]]\nname = \"a\"\n[safety]\nacknowledge_faults = {acknowledges}\n{predict}{watchdog}{keys}",
         setup.tracker_hz, setup.raster.0, setup.raster.1, setup.planes, setup.rate_hz
     );
     let config = RigConfig::parse("simulated.toml", &text, Path::new(ASSETS), &Overrides::default())
@@ -281,6 +299,10 @@ impl World {
             net: Arc::new(Mutex::new(Net::new(seed, kind, setup.tracker)?)),
             beneath: Arc::new(Mutex::new(beneath)),
             disk: Arc::default(),
+            contact: (setup.alone == Some(Guard::Interlock)).then(|| {
+                let reset = if seed.is_multiple_of(2) { Restart::ByHand } else { Restart::ByItself };
+                (SimContact::default(), reset)
+            }),
             clock: Arc::default(),
             lag: Arc::default(),
             projector,
@@ -453,6 +475,7 @@ impl World {
                 Action::Again(kind, seed, round) => self.again(kind, seed, round),
                 Action::Episode => {}
                 Action::Disturb => self.disturb(),
+                Action::Contact(state) => self.set_contact(state),
                 Action::Overdue(episode) => self.overdue(episode),
             }
         }
@@ -495,6 +518,8 @@ impl World {
             K::U7 => cable().spoiled,
             K::U10 => cable().stale,
             K::X8 => cable().late,
+            K::X18 => cable().crawled,
+            K::X17 => lock(&self.beneath).queued,
             K::U15 | K::H2 | K::X3 => met.kills,
             K::H6 | K::X4 => met.stops,
             K::X5 => met.orders,
@@ -502,7 +527,9 @@ impl World {
             K::G4 | K::G5 | K::G6 | K::G7 | K::X7 => lock(&self.beneath).met[1],
             K::H4 | K::H5 | K::X1 | K::X2 => lock(&self.beneath).met[0],
             K::H8 | K::H9 => lock(&self.beneath).slowed,
-            K::H1 => lock(&self.disk).met,
+            K::H1 | K::X21 => lock(&self.disk).met,
+            K::X19 => met.contacts,
+            K::X20 => met.datagrams,
             K::H7 => met.refused_files,
             K::H3 | K::X6 => met.stands,
             // The projector itself is struck, whoever looks.
@@ -534,6 +561,9 @@ impl World {
             if self.seen(active.kind) > seen_before {
                 self.table.takes_effect(active.kind, state);
             }
+        }
+        if active.kind.needs_strain() {
+            self.laws.spell_is_over(self.t, self.table.total());
         }
         // Another fault of the same kind may still last.
         self.undo(&active.undo);
@@ -580,7 +610,10 @@ impl World {
         if self.active.iter().flatten().any(|active| !active.kind.is_of_tracker()) {
             self.laws.struck_elsewhere(self.t);
         }
-        self.laws.flashes(self.t, self.projector.status().faults & faults::FLASH_LIMIT != 0);
+        self.laws.flashes(
+            self.t,
+            self.projector.status().faults & (faults::FLASH_LIMIT | faults::LIGHT_LIMIT) != 0,
+        );
         if self.far.is_some() {
             return self.reply_on_the_line();
         }
@@ -718,9 +751,9 @@ impl World {
         self.restart_at = self.t + RESTART_NS;
     }
 
-    /// The program has ended. Where its orders stand alone, the projector keeps none of them.
+    /// The program has ended. Where its word stands alone, the projector keeps none of them.
     fn left_alone(&mut self) {
-        if self.setup.alone == Some(Guard::Orders) {
+        if self.setup.alone.is_some_and(Guard::forgets) {
             self.lose_memory();
         }
     }
@@ -760,10 +793,16 @@ impl World {
         };
         let host = self.host();
         let rig = if by_hand { self.rig_by_hand.clone() } else { self.rig.clone() };
-        match Process::start(&rig, &self.cable, &self.disk, machine, host) {
+        let contact = self.contact.as_ref().map(|(contact, reset)| (contact, *reset));
+        match Process::start(&rig, &self.cable, &self.disk, machine, contact, host) {
             Ok(process) => {
                 self.tell(|| "the program starts".into());
                 self.process = Some(process);
+                if self.laws.has_standing_order() && self.clearing_since.is_none() {
+                    // Whoever sees that it waits for a word comes and gives it.
+                    self.clearing_since = Some(self.t);
+                    self.plan(self.t + PERSON_NS, Action::ClearUp);
+                }
             }
             Err(exit) => {
                 self.tell(|| format!("the program does not start: {exit:?}"));
@@ -794,6 +833,48 @@ impl World {
         self.laws.ordered(order, ticket, self.t);
         self.fold(5, order as u64);
         self.tell(|| format!("a person orders {}", order.word()));
+    }
+
+    /// The interlock's contact closes, opens, or does not answer any more.
+    pub(crate) fn set_contact(&mut self, state: u8) {
+        let Some((contact, reset)) = &self.contact else { return };
+        contact.0.store(state, Ordering::Relaxed);
+        let kept = self.process.as_ref().is_some_and(|process| process.monitor.interlock().is_some());
+        self.met.contacts += u64::from(state != 0 && kept);
+        self.laws.contact(self.t, state, *reset == Restart::ByHand && kept);
+        self.fold(8, state.into());
+        self.tell(|| {
+            ["the interlock closes", "the interlock opens", "the interlock hangs"][usize::from(state)].into()
+        });
+    }
+
+    /// A datagram of OSC arrives at the rig's door. Who may say what is the rig's own to judge, and judged here once more.
+    pub(crate) fn hear_osc(&mut self, word: &str, token: Option<&str>, is_listed: bool) {
+        let text = |text: &str| {
+            let mut bytes = text.as_bytes().to_vec();
+            bytes.resize((text.len() / 4 + 1) * 4, 0);
+            bytes
+        };
+        let tags = if token.is_some() { ",s" } else { "," };
+        let parts = [Some(format!("/dpm/{word}")), Some(tags.into()), token.map(str::to_owned)];
+        let bytes: Vec<u8> = parts.into_iter().flatten().flat_map(|part| text(&part)).collect();
+        let door = Doorkeeper { from: vec![OSC_DESK], token: Some(OSC_TOKEN.into()) };
+        let heard = door.hear(&bytes, if is_listed { OSC_DESK } else { OSC_STRANGER });
+        let orders = heard.into_iter().filter_map(|one| match one {
+            Ok(Heard::Order(order)) => Some(order),
+            _ => None,
+        });
+        let orders: Vec<Order> = orders.collect();
+        let named = [Order::Black, Order::Freeze, Order::Safe].into_iter().find(|order| order.word() == word);
+        let may = |order: &Order| is_listed && (order.is_dark() || token == Some(OSC_TOKEN));
+        let wanted: Vec<Order> = named.into_iter().filter(may).collect();
+        if orders != wanted {
+            let told =
+                format!("OSC says {word} (listed {is_listed}, token {token:?}), and {orders:?} is obeyed");
+            self.laws.fail(self.t, told);
+        }
+        self.met.datagrams += u64::from(self.process.is_some());
+        orders.into_iter().for_each(|order| self.give(order));
     }
 
     pub(crate) fn ask_to_stop(&mut self) {

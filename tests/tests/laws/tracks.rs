@@ -3,6 +3,7 @@
 //! weighted with the light of its plane. It is in a file of its own so that nothing else runs at the same time.
 
 use dpm_device::projector::SlotMoves;
+use dpm_rig::config::TracksUse;
 use dpm_rig::light::planes::{PlaneMeter, PlanePoint};
 use dpm_rig::pipeline::{self, RunOptions, RunOutcome};
 use dpm_rig::rig::Rig;
@@ -27,8 +28,8 @@ struct Setting {
 
 /// Trackers and delays, with the greatest 99th percentile that turns may have, pixels.
 const SETTINGS: [(Setting, f64); 3] = [
-    (Setting { rate_hz: 500, latency_us: 2000, lead_us: 2200 }, 1.7),
-    (Setting { rate_hz: 500, latency_us: 2000, lead_us: 4500 }, 1.7),
+    (Setting { rate_hz: 500, latency_us: 2000, lead_us: 2200 }, 2.0),
+    (Setting { rate_hz: 500, latency_us: 2000, lead_us: 4500 }, 2.0),
     (Setting { rate_hz: 1000, latency_us: 500, lead_us: 2200 }, 1.0),
 ];
 
@@ -95,7 +96,12 @@ impl Light {
         for record in outcome.recent.iter().filter(|record| record.id.0 >= BEGUN) {
             let of_frame = |m: &&SlotMoves| m.frame == record.id.0 as u32 && m.slot == record.slot;
             // The light of the last frames ends with the run.
-            let Some(moves) = outcome.moves.iter().find(of_frame) else { continue };
+            let moves = outcome.moves.iter().find(of_frame);
+            if rig.config.projector.tracks == TracksUse::Off {
+                meter.measure(record, None, &mut |p: PlanePoint| self.lit.push((p.off_px, p.light)));
+                continue;
+            }
+            let Some(moves) = moves else { continue };
             meter.measure(record, Some(moves), &mut |p: PlanePoint| {
                 self.drawn.push((p.drawn_off_px, p.light));
                 self.lit.push((p.off_px, p.light));
@@ -216,6 +222,11 @@ fn moved_light(rig: &Rig, sent: &[[u8; 3]], moves: &SlotMoves) -> Vec<[u8; 3]> {
 /// Seconds of motion.
 mod breadth {
     use super::*;
+    use dpm_device::pose::Pose;
+    use dpm_device::rng::Sampler;
+    use glam::{DQuat, DVec3};
+    use hil_mock::motion::Motion;
+    use std::f64::consts::TAU;
 
     /// A run repeats, shifts included. "off" sends none, and changes nothing else.
     #[test]
@@ -252,6 +263,158 @@ mod breadth {
             assert!(lit[0] <= 1.02 * drawn[0], "p50 {} px as drawn, {} px as lit", drawn[0], lit[0]);
             assert!(quantile(&mut light.ages_ms, 0.99) <= 0.6);
         }
+    }
+
+    /// A hand by chance: sums of waves of all frequencies up to 6 Hz along and about all axes, that never repeat. `sharp`: m/s2
+    /// and, times four, rad/s2, of all together.
+    fn hand(seed: u64, sharp: f64) -> Vec<Pose> {
+        const WAVES: usize = 24;
+        let mut sampler = Sampler::new(seed, 0);
+        let mut unit = || (sampler.next_u64() >> 11) as f64 / (1u64 << 53) as f64;
+        let waves: Vec<(f64, f64, DVec3, DVec3)> = (0..WAVES)
+            .map(|_| {
+                let rate = TAU * 0.2 * 30.0f64.powf(unit());
+                let phase = TAU * unit();
+                let mut along = || DVec3::new(unit() - 0.5, unit() - 0.5, unit() - 0.5).normalize();
+                // No wave is wider than 8 cm or 0.2 rad.
+                let size = sharp * (2.0 / WAVES as f64).sqrt() / (rate * rate);
+                (rate, phase, along() * size.min(0.08), along() * (4.0 * size).min(0.2))
+            })
+            .collect();
+        let steps = (FRAMES as usize) * 3 / 2 + 500;
+        let at = |s: f64| {
+            let sum = |of: fn(&(f64, f64, DVec3, DVec3)) -> DVec3| -> DVec3 {
+                waves.iter().map(|wave| of(wave) * (wave.0 * s + wave.1).sin()).sum()
+            };
+            (sum(|wave| wave.2), DQuat::from_scaled_axis(sum(|wave| wave.3)))
+        };
+        (0..steps).map(|k| at(k as f64 * STEP_NS as f64 * 1e-9)).map(rigid).collect()
+    }
+
+    /// The time between two poses of a recording, nanoseconds.
+    const STEP_NS: i64 = 1_000_000;
+
+    fn rigid((position, rotation): (DVec3, DQuat)) -> Pose {
+        Pose { position_m: position.to_array(), rotation_xyzw: rotation.normalize().to_array() }
+    }
+
+    /// A recorded motion without its slow travel, which would leave the picture, from `from_s` on. A line of the file has
+    /// seconds, x y z in metres and a quaternion x y z w.
+    fn recording(path: &std::path::Path, from_s: f64) -> Vec<Pose> {
+        let text = std::fs::read_to_string(path).unwrap_or_else(|e| panic!("{}: {e}", path.display()));
+        let rows: Vec<[f64; 8]> = text
+            .lines()
+            .filter(|line| !line.starts_with('#'))
+            .map(|line| {
+                line.split_whitespace().map(|word| word.parse().expect("a number")).collect::<Vec<f64>>()
+            })
+            .map(|row| row.try_into().expect("eight numbers"))
+            .collect();
+        let smooth = |k: usize, sigma: usize, column: usize, turn: Option<&[f64; 8]>| {
+            let reach = (3 * sigma).min(k).min(rows.len() - 1 - k);
+            let of = |row: &[f64; 8]| {
+                let same = turn.is_none_or(|first| (4..8).map(|i| first[i] * row[i]).sum::<f64>() >= 0.0);
+                if same {
+                    row[column]
+                } else {
+                    -row[column]
+                }
+            };
+            let weighted = (k - reach..=k + reach).map(|j| {
+                let weight = (-0.5 * ((j as f64 - k as f64) / sigma as f64).powi(2)).exp();
+                (weight * of(&rows[j]), weight)
+            });
+            let (sum, weight) = weighted.fold((0.0, 0.0), |(s, w), (a, b)| (s + a, w + b));
+            sum / weight
+        };
+        let per_s = rows.len() as f64 / (rows[rows.len() - 1][0] - rows[0][0]);
+        let slow = (0.5 * per_s) as usize;
+        let rigid_rows: Vec<(f64, DVec3, DQuat)> = (0..rows.len())
+            .map(|k| {
+                let place = |i: usize| smooth(k, 2, i, None) - smooth(k, slow, i, None);
+                let turn = |i: usize| smooth(k, 2, i, Some(&rows[k]));
+                let rotation = DQuat::from_xyzw(turn(4), turn(5), turn(6), turn(7)).normalize();
+                (rows[k][0] - rows[0][0], DVec3::new(place(1), place(2), place(3)), rotation)
+            })
+            .collect();
+        let first = rigid_rows[0].2.inverse();
+        let steps = (FRAMES as usize) * 3 / 2 + 500;
+        (0..steps)
+            .map(|k| {
+                let t = from_s + k as f64 * STEP_NS as f64 * 1e-9;
+                let i = rigid_rows.partition_point(|row| row.0 <= t).clamp(2, rows.len() - 2) - 1;
+                let around = &rigid_rows[i - 1..i + 3];
+                let weight = |n: usize| -> f64 {
+                    (0..4)
+                        .filter(|&m| m != n)
+                        .map(|m| (t - around[m].0) / (around[n].0 - around[m].0))
+                        .product()
+                };
+                let position = (0..4).map(|n| around[n].1 * weight(n)).sum();
+                let turn = (0..4).fold(DQuat::from_xyzw(0.0, 0.0, 0.0, 0.0), |sum, n| {
+                    let q = around[n].2;
+                    sum + if q.dot(around[0].2) < 0.0 { -q } else { q } * weight(n)
+                });
+                (position, first * turn.normalize())
+            })
+            .map(rigid)
+            .collect()
+    }
+
+    /// The light of both bodies going through `poses`, with tracks or without.
+    fn light_along(poses: &[Pose], setting: Setting, tracks: &str) -> Light {
+        let mut rig = rig(STEADY, setting, tracks);
+        for body in &mut Arc::get_mut(&mut rig).expect("nobody else has it").bodies {
+            body.motion = Some(Motion::through(body.rest, poses, STEP_NS).expect("rigid poses"));
+        }
+        let mut light = Light::default();
+        light.add(&rig, &lit(&rig, FRAMES));
+        light
+    }
+
+    /// Whatever moves, light is never worse with tracks than without at its 99th percentile. `DPM_RECORDINGS` names a folder with
+    /// recordings, which are judged as well.
+    #[test]
+    fn tracks_never_lose_on_motion_of_people() {
+        let mut motions: Vec<(String, Vec<Pose>)> = [(1, 2.0), (2, 6.0), (3, 15.0), (4, 40.0)]
+            .map(|(k, a)| (format!("hand, {a} m/s2"), hand(k, a)))
+            .into();
+        if let Ok(folder) = std::env::var("DPM_RECORDINGS") {
+            let files = std::fs::read_dir(&folder).unwrap_or_else(|e| panic!("{folder}: {e}"));
+            let mut files: Vec<_> = files.map(|file| file.expect("a file").path()).collect();
+            files.sort();
+            for path in files {
+                let name = path.file_stem().unwrap_or_default().to_string_lossy().into_owned();
+                motions.push((name, recording(&path, 1.0)));
+            }
+        }
+        let mut lost = Vec::new();
+        for (what, poses) in motions {
+            for (setting, _) in SETTINGS {
+                let [on, off] = ["auto", "off"].map(|tracks| {
+                    let mut light = light_along(&poses, setting, tracks);
+                    let [_, [p50, p99]] = light.quantiles();
+                    (p50, p99, light.planes_moved)
+                });
+                let Setting { rate_hz, lead_us, .. } = setting;
+                println!(
+                    "| {what} | {rate_hz} Hz, {lead_us} us | {:.3} / {:.3} | {:.3} / {:.3} | {:.3} | {} |",
+                    off.0,
+                    off.1,
+                    on.0,
+                    on.1,
+                    on.1 / off.1,
+                    on.2
+                );
+                if on.1 > 1.01 * off.1 {
+                    lost.push(format!(
+                        "{what} at {rate_hz} Hz, {lead_us} us: {} px, without tracks {} px",
+                        on.1, off.1
+                    ));
+                }
+            }
+        }
+        assert!(lost.is_empty(), "{lost:#?}");
     }
 
     /// Motion without surprises is at most 15 % worse.

@@ -1,6 +1,6 @@
 //! `dpm error`: error against cost of every method, as tables and curves.
 
-use super::error_experiments::run;
+use super::error_experiments::{run, run_folder};
 use super::error_files::merge;
 use super::rig_args::RigArgs;
 use super::watch::print;
@@ -29,11 +29,11 @@ use std::sync::Arc;
 pub(crate) struct ErrorArgs {
     #[command(subcommand)]
     command: Option<ErrorCommand>,
-    /// The rig file
+    /// The rig file; or a folder of rig files, each of them a group whose bodies move as it says
     #[arg(value_name = "RIG.toml", required = true)]
-    rig: Option<PathBuf>,
+    pub(super) rig: Option<PathBuf>,
     #[command(flatten)]
-    flags: RigArgs,
+    pub(super) flags: RigArgs,
     /// Small raster, few frames, three budgets: takes minutes on two cores without a GPU
     #[arg(long)]
     quick: bool,
@@ -131,11 +131,22 @@ pub(super) fn execute(args: &ErrorArgs) -> Result<(), Failure> {
         None => {}
     }
     args.flags.refuse("dpm error", &["--frames", "--seconds", "--no-prediction"])?;
+    let rigs = args.rig.as_deref().filter(|rig| rig.is_dir());
     let budgets = match (&args.budgets[..], args.quick) {
+        ([], _) if rigs.is_some() => vec![FOLDER_BUDGET],
         ([], true) => vec![2.0, 6.0, 18.0],
         ([], false) => vec![0.25, 0.5, 1.0, 2.0, 4.0, 9.0, 18.0, 36.0, 64.0],
         (given, _) => given.to_vec(),
     };
+    if let Some(rigs) = rigs {
+        if args.preset.is_some() || args.sequences {
+            let told =
+                "a folder of rigs is measured without --preset and --sequences; name one rig file for these";
+            return Err(Failure::new(FailureKind::BadInput, told));
+        }
+        let settings: Vec<Setting> = budgets.iter().map(|&budget| Setting::plain(true, budget)).collect();
+        return run_folder(args, rigs, &settings);
+    }
     match args.preset {
         Some(Preset::Figure3) => run::<Figure3Group>(args, &Setting::of_figure3()),
         Some(Preset::Table) => run::<TableGroup>(args, &Setting::of_table()),
@@ -143,6 +154,27 @@ pub(super) fn execute(args: &ErrorArgs) -> Result<(), Failure> {
         None => run::<GroupResult>(args, &Setting::at_budgets(&budgets)),
     }
 }
+
+/// The rig files of a folder, by name.
+pub(super) fn rig_files(folder: &Path) -> Result<Vec<PathBuf>, Failure> {
+    let told =
+        |e: &dyn std::fmt::Display| Failure::new(FailureKind::BadInput, format!("{}: {e}", folder.display()));
+    let entries = std::fs::read_dir(folder).map_err(|e| told(&e))?;
+    let paths =
+        entries.map(|entry| entry.map(|e| e.path())).collect::<Result<Vec<_>, _>>().map_err(|e| told(&e))?;
+    let mut files: Vec<PathBuf> = paths
+        .into_iter()
+        .filter(|path| path.extension().is_some_and(|e| e == "toml") && path.is_file())
+        .collect();
+    files.sort();
+    if files.is_empty() {
+        return Err(told(&"no rig file (.toml) lies here; rigs/groups has some"));
+    }
+    Ok(files)
+}
+
+/// Samples of a pixel of `paper` where the eye looks with a folder of rigs.
+const FOLDER_BUDGET: f64 = 6.0;
 
 /// Samples of a pixel of `paper` where the eye looks with `--preset seen`: about what a GPU traces at 947 frames/s.
 const SEEN_BUDGET: f64 = 2.0;
@@ -184,6 +216,7 @@ fn planes(follow: f64, json: bool) -> Result<(), Failure> {
 /// Where groups and reports lie.
 pub(super) fn folder(args: &ErrorArgs) -> PathBuf {
     let own = match args.preset {
+        None if args.rig.as_deref().is_some_and(Path::is_dir) => "out/groups",
         Some(Preset::Figure3) => "out/figure3",
         Some(Preset::Table) => "out/table",
         Some(Preset::Seen) => "out/seen",
@@ -195,6 +228,11 @@ pub(super) fn folder(args: &ErrorArgs) -> PathBuf {
 /// The group names with their numbers. A rig file that cannot be run has no groups.
 pub(super) fn list(args: &ErrorArgs, names: impl Iterator<Item = String>) -> Result<(), Failure> {
     args.flags.rig_at_rest(args.rig.as_deref())?;
+    list_names(args, names)
+}
+
+/// The names with their numbers.
+pub(super) fn list_names(args: &ErrorArgs, names: impl Iterator<Item = String>) -> Result<(), Failure> {
     if args.json {
         let names: Vec<String> = names.collect();
         print(&(to_json(&serde_json::json!({ "groups": names })) + "\n"));
@@ -206,10 +244,10 @@ pub(super) fn list(args: &ErrorArgs, names: impl Iterator<Item = String>) -> Res
 }
 
 /// The groups that `--index` selects, or all.
-pub(super) fn chosen<T: Copy>(args: &ErrorArgs, all: &[T]) -> Result<Vec<T>, Failure> {
+pub(super) fn chosen<T: Clone>(args: &ErrorArgs, all: &[T]) -> Result<Vec<T>, Failure> {
     match args.index {
         None => Ok(all.to_vec()),
-        Some(i) if i < all.len() => Ok(vec![all[i]]),
+        Some(i) if i < all.len() => Ok(vec![all[i].clone()]),
         Some(i) => {
             let told = format!("--index {i}: there are groups 0 to {}; --list names them", all.len() - 1);
             Err(Failure::new(FailureKind::BadInput, told))

@@ -1,9 +1,10 @@
 //! The experiments of `dpm error`: what each measures of a setting, what that takes, and what it reports. One loop runs them all.
 
-use super::error::{chosen, folder, list, options, rig_of, stage, ErrorArgs};
-use super::error_files::{known, known_or, report, show};
+use super::error::{chosen, folder, list, list_names, options, rig_files, rig_of, stage, ErrorArgs};
+use super::error_files::{known, known_or, report, report_rigs, show};
 use super::progress::Progress;
 use dpm_lab::error::figure3::{self, Figure3Group, SPP};
+use dpm_lab::error::groups::RigGroup;
 use dpm_lab::error::plan::{contenders, Setting};
 use dpm_lab::error::plot::{self, curves, Cost};
 use dpm_lab::error::report::{csv, markdown};
@@ -19,6 +20,7 @@ use dpm_rig::failure::{Failure, FailureKind};
 use dpm_rig::pipeline::PipelineError;
 use serde::de::DeserializeOwned;
 use serde::Serialize;
+use std::path::Path;
 
 /// An experiment, by a measured group of it as it lies in a folder.
 pub(super) trait Experiment: Serialize + DeserializeOwned {
@@ -250,7 +252,46 @@ pub(super) fn run<T: Experiment>(args: &ErrorArgs, all: &[Setting]) -> Result<()
     if args.list {
         return list(args, all.iter().map(|s| s.name()));
     }
-    let (out, chosen) = (folder(args), chosen(args, all)?);
+    let groups = measure_all::<T>(args, &chosen(args, all)?)?;
+    if args.index.is_some() {
+        // One group of many is no report: those of the whole come from `merge`.
+        show(&groups, args.json);
+        return Ok(());
+    }
+    report(&folder(args), &groups, args.json)
+}
+
+/// Measures the settings of every rig file of a folder, each into a folder of its own, and reports all of them in one table.
+///
+/// # Errors
+/// As [`run`]; no rig file lies in the folder.
+pub(super) fn run_folder(args: &ErrorArgs, rigs: &Path, settings: &[Setting]) -> Result<(), Failure> {
+    let files = rig_files(rigs)?;
+    let name = |file: &Path| file.file_stem().unwrap_or_default().to_string_lossy().into_owned();
+    let of_rig = |file: &Path| {
+        let mut own = args.clone();
+        (own.rig, own.index) = (Some(file.to_owned()), None);
+        own.flags.out = Some(folder(args).join(name(file)));
+        own
+    };
+    if args.list {
+        // A file that cannot be run is found now.
+        files.iter().try_for_each(|file| of_rig(file).flags.rig_at_rest(Some(file)).map(|_| ()))?;
+        return list_names(args, files.iter().map(|file| name(file)));
+    }
+    let mut measured = Vec::new();
+    for file in chosen(args, &files)? {
+        for group in measure_all::<GroupResult>(&of_rig(&file), settings)? {
+            measured.push((name(&file), group));
+        }
+    }
+    let groups: Vec<RigGroup<'_>> = measured.iter().map(|(rig, result)| RigGroup { rig, result }).collect();
+    report_rigs(&folder(args), &groups, args.json, args.index.is_none())
+}
+
+/// Measures the settings that are not measured yet. All of them come back, in their order.
+fn measure_all<T: Experiment>(args: &ErrorArgs, chosen: &[Setting]) -> Result<Vec<T>, Failure> {
+    let out = folder(args);
     let (options, (gpu, rig)) = (options(args, &out), stage(args)?);
     let (extent, stamp) = (options.extent, Stamp::new(&rig, gpu.summary()));
     let methods = contenders(&rig.config.render, options.ablation).len();
@@ -268,7 +309,7 @@ pub(super) fn run<T: Experiment>(args: &ErrorArgs, all: &[Setting]) -> Result<()
     let totals: Vec<u64> = chosen.iter().enumerate().map(total).collect();
     let mut progress = Progress::new(&totals);
     let mut groups: Vec<T> = Vec::new();
-    for &setting in &chosen {
+    for &setting in chosen {
         let name = setting.name();
         let runs = || {
             let own = rig_of(args, &rig.config, Some(rig.camera.raster))?;
@@ -284,10 +325,5 @@ pub(super) fn run<T: Experiment>(args: &ErrorArgs, all: &[Setting]) -> Result<()
         progress.end_of_part(&name);
         groups.push(group);
     }
-    if args.index.is_some() {
-        // One group of many is no report: those of the whole come from `merge`.
-        show(&groups, args.json);
-        return Ok(());
-    }
-    report(&out, &groups, args.json)
+    Ok(groups)
 }

@@ -6,6 +6,7 @@ use super::watch::print;
 use dpm_common::files::write_atomically;
 use dpm_device::regular_file;
 use dpm_lab::error::figure3::Figure3Group;
+use dpm_lab::error::groups::{markdown, RigGroup};
 use dpm_lab::error::plan::Setting;
 use dpm_lab::error::runs::{GroupResult, Measured};
 use dpm_lab::error::seen::SeenGroup;
@@ -83,6 +84,24 @@ fn write_reports<T: Experiment>(out: &Path, groups: &[T]) -> Result<(), Failure>
 /// Prints one JSON object or the tables.
 pub(super) fn show<T: Experiment>(groups: &[T], json: bool) {
     print(&if json { to_json(&object(groups)) + "\n" } else { T::markdown(groups) });
+}
+
+/// Prints the table of the groups of several rigs or one JSON object; with `whole` both are also written into the folder.
+pub(super) fn report_rigs(
+    out: &Path,
+    groups: &[RigGroup<'_>],
+    json: bool,
+    whole: bool,
+) -> Result<(), Failure> {
+    let each = groups.iter().map(|g| serde_json::json!({ "rig": g.rig, "group": g.result }));
+    let object = to_json(&serde_json::json!({ "rigs": each.collect::<Vec<_>>() }));
+    let table = markdown(groups);
+    if whole {
+        write(&out.join("groups.json"), &object)?;
+        write(&out.join("groups.md"), &table)?;
+    }
+    print(&if json { object + "\n" } else { table });
+    Ok(())
 }
 
 fn object<T: Experiment>(groups: &[T]) -> Value {

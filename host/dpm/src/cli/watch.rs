@@ -26,7 +26,7 @@ use dpm_rig::interlock::Interlock;
 use dpm_rig::order::Order;
 use dpm_rig::pipeline::leave_behind;
 use dpm_rig::run_rig::{cannot_write, check_output_folder, stopped_before_light};
-use dpm_rig::standing::{state_folder, By, Identity, OrderFile, Stands};
+use dpm_rig::standing::{By, Identity, OrderFile, Stands};
 use dpm_rig::telemetry::monitor::{ProjectorHealth, RunMonitor};
 use dpm_rig::telemetry::report::{to_json, Report};
 use std::io::Write;
@@ -362,7 +362,7 @@ fn status_line(monitor: &RunMonitor) -> String {
 /// The projector is real and the state folder cannot be used, so an order could not be kept (exit code 2).
 fn stand_by(rig: &RigConfig, monitor: &Arc<RunMonitor>, teller: &Teller) -> Result<Orders, Failure> {
     let identity = Identity::of(&rig.projector.backend);
-    let (file, error, kept) = OrderFile::open(state_folder(), identity.clone());
+    let (file, error, kept) = OrderFile::on_this_machine(identity.clone());
     if let Some(e) = &error {
         let told = format!(
             "SAFE could not be kept over a restart: {e}; make room there, or name another state folder by DPM_STATE_DIR"
@@ -372,11 +372,7 @@ fn stand_by(rig: &RigConfig, monitor: &Arc<RunMonitor>, teller: &Teller) -> Resu
         }
         teller.note(&format!("warning: {told}"));
     }
-    let is_kept = kept.is_some();
-    let stands = Stands::at_start(kept, rig.safety.start);
-    if stands.is_some() && !is_kept {
-        monitor.await_first_arm();
-    }
+    let stands = Stands::begin(kept, rig.safety.start, monitor);
     if let Some(stands) = &stands {
         teller.note(&told_of(stands));
     }
@@ -461,8 +457,7 @@ pub(super) fn take_locks(rig: &RigConfig) -> Result<Locks, Failure> {
 /// # Errors
 /// The standing order, since when and by whom (exit code 3).
 pub(super) fn refuse_where_dark_stands(identity: &Identity) -> Result<(), Failure> {
-    let stands = state_folder().and_then(|folder| dpm_rig::standing::standing_in(&folder, identity));
-    match stands {
+    match dpm_rig::standing::standing(identity) {
         None => Ok(()),
         Some(stands) => {
             let word = if stands.order == Order::Safe { "SAFE" } else { "BLACK" };

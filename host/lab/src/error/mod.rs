@@ -3,6 +3,7 @@
 mod equal;
 pub mod export;
 pub mod figure3;
+pub mod groups;
 mod parts;
 pub mod plan;
 pub mod planes;

@@ -39,7 +39,14 @@ pub(super) struct Verdict {
     pub first_in_flip: String,
 }
 
-fn ratio(dpm: [f64; 2], dpm_runs: [f64; 2], other: [f64; 2], other_runs: [f64; 2], name: &str) -> Ratio {
+/// dpm by another method: errors as measured and with the reference's own taken off, and those of single runs.
+pub(super) fn ratio(
+    dpm: [f64; 2],
+    dpm_runs: [f64; 2],
+    other: [f64; 2],
+    other_runs: [f64; 2],
+    name: &str,
+) -> Ratio {
     let all: Vec<f64> = dpm_runs.iter().flat_map(|a| other_runs.map(|b| a / b)).collect();
     Ratio {
         raw: dpm[0] / other[0],

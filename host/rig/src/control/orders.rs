@@ -179,6 +179,11 @@ impl Desk {
                 self.monitor.arm_unless_darkened(given.signals);
             }
         }
+        if let Some(device) = given.device.filter(|_| given.order != Order::Arm) {
+            // In this run too: another projector may be armed at this port before this one is back.
+            let order = if given.order == Order::Safe { Order::Safe } else { Order::Black };
+            self.monitor.hold_device(device, order);
+        }
         // Orders that came meanwhile get their result when they are settled themselves.
         self.settled = given.number;
         self.outcome = Some(outcome);
@@ -532,7 +537,7 @@ mod tests {
         settled(&orders, ticket);
         let _ = rig.monitor.take_order();
         // An object in its place that no rename replaces and no unlink removes.
-        let path = rig.dir.join(rig.identity.order_name());
+        let path = rig.dir.join(rig.identity.order_name(None));
         std::fs::remove_file(&path).unwrap();
         std::fs::create_dir(&path).unwrap();
         std::fs::write(path.join("x"), b"").unwrap();

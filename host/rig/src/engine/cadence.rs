@@ -76,10 +76,10 @@ impl Cadence {
     }
 
     /// Slots after which the next frame is due for certain, 1 or more: its light must last so long. It is longer than the
-    /// cadence, so that a frame that is lost does not show as a blink.
+    /// cadence, so that a frame that is lost does not show as a blink; in a trial longer still, because what queues up in it
+    /// must be shed.
     pub(crate) fn light_slots(&self) -> u64 {
-        let slots = self.sufficed.unwrap_or(self.slots);
-        slots + slots / 2
+        self.sufficed.map_or(self.slots + self.slots / 2, |slots| 2 * slots)
     }
 
     /// Frames were held back for another reason than time: an order, a session that begins, a projector that is gone.

@@ -60,6 +60,8 @@ pub(crate) struct Facts {
     pub stride_milli: AtomicU64,
     /// Frames wait for busy stages, and none has found a stage idle for long.
     pub queue_stands: AtomicBool,
+    /// The frame that was sent last is on the medium, as far as the projector's reports tell.
+    pub is_on_the_way: AtomicBool,
     /// The GPU needs about a slot or more for a frame.
     pub gpu_is_slow: AtomicBool,
     /// The longest time for which prediction may extend a body's track, nanoseconds.
@@ -107,6 +109,7 @@ impl Facts {
             light_slots: AtomicU64::new(1),
             stride_milli: AtomicU64::new(1000),
             queue_stands: AtomicBool::new(false),
+            is_on_the_way: AtomicBool::new(false),
             gpu_is_slow: AtomicBool::new(false),
             predict_ns: AtomicI64::new(predict_ns),
             gpu_since_ns: AtomicI64::new(i64::MAX),

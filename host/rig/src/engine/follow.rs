@@ -35,6 +35,8 @@ const CLAMP: u8 = 8;
 const _: () = assert!(CLAMP as usize <= TILE);
 /// The least distance that moves anything, mirrors: below half a mirror no shift brings light nearer to its place.
 const LEAST_GATE: f64 = 0.5;
+/// Nor does a distance below so many standard deviations of it, which may be noise: light is never worse with tracks.
+const GATE_SIGMAS: f64 = 2.0;
 /// Points of a body at which the distance is taken.
 const POINTS: usize = 8;
 /// Sent frames that are remembered: more than a projector holds.
@@ -305,7 +307,8 @@ impl Scene<'_> {
         let ms = SPACING_NS as f64 * 1e-6;
         let centre = camera.to_projector_space(made[0].transform_point3(shape.points[0]));
         let depth = -centre.z;
-        // Both filters know the same samples, so their distance has less noise than two independent ones would have.
+        // Both poses rest on the same samples but for the newest, so their distance has less noise than two independent ones
+        // would have.
         let (before, now) = (drawn.sigma_m[body], late[0].position_sigma_m);
         let noise = (before * before + now * now).sqrt() * camera.fx / depth;
         let fixed = |v: DVec2| Some([fixed(v.x)?, fixed(v.y)?]);
@@ -314,7 +317,7 @@ impl Scene<'_> {
             Region {
                 area: self.area(drawn, body, shape, clamp)?,
                 clamp,
-                gate: (LEAST_GATE.max(noise) * 256.0).min(f64::from(u16::MAX)) as u16,
+                gate: (LEAST_GATE.max(GATE_SIGMAS * noise) * 256.0).min(f64::from(u16::MAX)) as u16,
                 offset: fixed(d0)?,
                 velocity: fixed((4.0 * d1 - 3.0 * d0 - d2) / (2.0 * ms))?,
                 half_acceleration: fixed((d0 - 2.0 * d1 + d2) / (2.0 * ms * ms))?,

@@ -70,6 +70,9 @@ pub(crate) struct LinkStage<P> {
     lead: LeadEstimator,
     slack: SlackMeter,
     queue: QueueWatch,
+    /// The same for the medium, and which of both have a standing queue.
+    medium_queue: QueueWatch,
+    stands: [bool; 2],
     standing: StandingWait,
     cadence: Cadence,
     /// Sessions of the link, and steps of the projector's clock, so far.
@@ -113,6 +116,8 @@ impl<P: Pace> LinkStage<P> {
             lead,
             slack: SlackMeter::new(),
             queue: QueueWatch::new(slot_ns),
+            medium_queue: QueueWatch::new(slot_ns),
+            stands: [false; 2],
             standing: StandingWait::new(slot_ns),
             cadence: Cadence::new(slot_ns),
             seen: [0; 2],
@@ -166,12 +171,13 @@ impl<P: Pace> LinkStage<P> {
 
     /// Polls the link and does what is due between frames.
     pub(crate) fn poll(&mut self, now: HostTime, transport: &mut dyn Transport) {
-        let Self { facts, link, keeper, follower, slack, seen, slot_ns, .. } = self;
+        let Self { facts, link, keeper, follower, slack, seen, slot_ns, medium_queue, stands, .. } = self;
         let alive = now.ns_since(HostTime(facts.alive_at_ns.load(Ordering::Relaxed))) <= ALIVE_WITHIN_NS;
         let result = keeper.poll(now, link, transport, !P::FOLLOWS_CLOCK, alive, &facts.monitor);
         let now_seen = [link.counters().sessions, keeper.clock_steps()];
         if std::mem::replace(seen, now_seen) != now_seen {
             slack.forget();
+            (*medium_queue, stands[1]) = (QueueWatch::new(*slot_ns), false);
         }
         let timing = link.status().and_then(|status| status.timing);
         let need = timing.and_then(|timing| slack.observe(timing, now));
@@ -187,8 +193,16 @@ impl<P: Pace> LinkStage<P> {
             follow_tracker(now, facts, keeper.time(), *slot_ns, link, transport);
         }
         if let Some(need) = need {
+            self.stands[1] = self.medium_queue.observe(self.slack.queued_ns(), now);
             self.learn(need);
         }
+        self.tell_queues(now);
+    }
+
+    /// Planning learns whether a queue stands.
+    fn tell_queues(&self, now: HostTime) {
+        self.facts.queue_stands.store(self.stands != [false; 2], Ordering::Relaxed);
+        self.facts.is_on_the_way.store(self.slack.is_on_the_way(now), Ordering::Relaxed);
     }
 
     /// The lead learns what a frame needed.
@@ -238,7 +252,8 @@ impl<P: Pace> LinkStage<P> {
         let behind_ns = packed_before.ns_since(stamps.rendered_at).max(0)
             + (sent_before.ns_since(stamps.packed_at) - queued_ns).max(0);
         self.waits_ns = Some([waited_ns, behind_ns]);
-        self.facts.queue_stands.store(self.queue.observe(idle_ns, now), Ordering::Relaxed);
+        self.stands[0] = self.queue.observe(idle_ns, now);
+        self.tell_queues(now);
         // Where the projector's clock is not well known, light may come later than it seems.
         let latest = self.lit_at(note, now).plus_ns(self.keeper.time().bound_ns);
         if is_too_old(note, latest, self.slot_ns) {
@@ -316,7 +331,12 @@ impl<P: Pace> LinkStage<P> {
     /// When a frame that is sent at `now` will be lit: in its slot, or in the first one that begins after it arrives.
     fn lit_at(&self, note: &FrameNote, now: HostTime) -> HostTime {
         let due_at = note.timeline.due_at;
-        let arrives_at = now.plus_ns(if P::FOLLOWS_CLOCK { self.travel_ns() } else { 0 });
+        let arrives_ns = match (P::FOLLOWS_CLOCK, self.link.measures_timing()) {
+            (false, _) => 0,
+            (true, true) => self.slack.arrives_ns(now),
+            (true, false) => self.travel_ns(),
+        };
+        let arrives_at = now.plus_ns(arrives_ns);
         if arrives_at <= due_at {
             return due_at;
         }

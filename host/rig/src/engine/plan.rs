@@ -20,6 +20,9 @@ use std::sync::Arc;
 /// How long trackers are read before the first frame, so that the filters know the motion, nanoseconds.
 pub(crate) const LISTEN_NS: i64 = 150_000_000;
 
+/// How often planning looks whether the medium is free, where a frame waits for that, nanoseconds.
+pub(crate) const ON_THE_WAY_STEP_NS: i64 = 200_000;
+
 /// No frame is planned for a slot that is further ahead than the lead and this time, nanoseconds.
 const FAR_NS: i64 = 1_000_000_000;
 
@@ -103,10 +106,15 @@ impl<P: Pace> PlanStage<P> {
         !self.crew.gpu.is_slow() || self.crew.gpu.in_flight() == 0
     }
 
-    /// True while no frame may be begun before all earlier ones are sent: a queue stands between the stages, and leaving
-    /// frames out ends it at once.
+    /// True while no frame may be begun before all earlier ones are sent and whole: a queue stands between the stages or on
+    /// the medium, and leaving frames out ends it at once.
     pub(crate) fn sheds(&self) -> bool {
         self.facts.queue_stands.load(Ordering::Relaxed)
+    }
+
+    /// True while a frame that was sent is on the medium.
+    pub(crate) fn is_on_the_way(&self) -> bool {
+        self.facts.is_on_the_way.load(Ordering::Relaxed)
     }
 
     /// Chooses the slot of the next frame at `now`. `None` if that slot lies beyond the end of the run.

@@ -132,6 +132,15 @@ fn a_projector_for_which_an_order_stands_is_never_armed_wherever_it_is_plugged_i
         assert_eq!(monitor.take_order(), None);
         monitor.meet_device(9);
         assert_eq!(monitor.take_order(), Some(Order::Black), "another one, for which one stands too");
+        // An order of this run holds it when it is back.
+        monitor.hold_device(11, Order::Black);
+        monitor.hold_device(11, Order::Safe);
+        monitor.meet_device(11);
+        assert_eq!(monitor.take_order(), Some(Order::Safe));
+        // More than are remembered are all held.
+        monitor.hold_devices((100..200).map(|device| (device, Order::Black)).collect());
+        monitor.meet_device(12);
+        assert_eq!(monitor.take_order(), Some(Order::Black));
     }
 }
 

@@ -3,7 +3,6 @@
 
 use super::{Contact, Shared};
 use crate::config::InterlockConfig;
-use dpm_common::clock::Clock;
 use dpm_device::tty::{ControlLine, ControlSignal};
 use std::fs::OpenOptions;
 use std::io::Read;

@@ -144,7 +144,7 @@ impl CrewParts {
         let Heritage { scene, budget, first, budget_milli } = heritage.clone();
         let renderer = || scene.as_ref().map(Renderer::from_prepared).transpose();
         let parts = Self::drawn_by(renderer, rig, origin, options, clock)?;
-        Ok(Self { budget, first, budget_milli, ..parts }.with_tracks(rig))
+        Ok(Self { budget, first, budget_milli, ..parts })
     }
 
     /// What a crew that takes over on the same device needs of this one.
@@ -224,16 +224,7 @@ impl CrewParts {
                 self.budget_milli = budget.rays();
             }
         }
-        Ok(self.with_tracks(rig))
-    }
-
-    /// With the filters that tracks between frames need, if the rig sends any.
-    fn with_tracks(self, rig: &Rig) -> Self {
-        if rig.wants_tracks() {
-            Self { tracking: self.tracking.with_lively(rig), ..self }
-        } else {
-            self
-        }
+        Ok(self)
     }
 
     /// The same, in a run that has seen the bodies of `seen` before.

@@ -8,7 +8,7 @@ use crate::engine::facts::Facts;
 use crate::engine::options::StallIn;
 use crate::engine::pace::Real;
 use crate::engine::pack::PackStage;
-use crate::engine::plan::{Latch, PlanStage};
+use crate::engine::plan::{Latch, PlanStage, ON_THE_WAY_STEP_NS};
 use crate::engine::pulse::Pulse;
 use crate::frame::job::FrameJob;
 use crate::frame::slots::MissCause;
@@ -138,7 +138,7 @@ pub(super) fn tracking_thread(
         let rhythm = stage.is_published(clock.now());
         facts.tell_rhythm(rhythm);
         if let Some(to_link) = &mut to_link {
-            stage.publish_lively(now, to_link);
+            stage.publish(now, to_link);
         }
         // A tracker that can be waited for is read as soon as something arrives, and costs nothing while nothing does.
         let due_at = stage.due_at();
@@ -282,6 +282,12 @@ impl<'a> PlanDesk<'a> {
             return Some(());
         }
         if self.stage.sheds() && !self.are_back(self.circulating, MissCause::Queue) {
+            return Some(());
+        }
+        if self.stage.sheds() && self.stage.is_on_the_way() {
+            self.held_up_by = Some(MissCause::Queue);
+            let clock = self.shared.clock;
+            clock.wait_until(clock.now().plus_ns(ON_THE_WAY_STEP_NS));
             return Some(());
         }
         let (shared, crew) = (self.shared, self.crew);

@@ -137,14 +137,14 @@ impl LateTracks {
         let tracker = open_for(rig, Arc::new(|| HostTime(0)), HostTime(0))?;
         let empty = || latest(TrackSnapshot::empty(rig.tracked_count()));
         let ((frames, _), (publisher, reader)) = (empty(), empty());
-        let tracking = TrackingStage::new(rig, tracker).with_lively(rig);
+        let tracking = TrackingStage::new(rig, tracker);
         Ok(Some(Self { tracking, frames, publisher, reader: Some(reader) }))
     }
 
     /// Reads what has arrived by `now`. The failure of a tracker shows in the frames.
     fn read(&mut self, now: HostTime) {
         let _ = self.tracking.step(now, &mut self.frames);
-        self.tracking.publish_lively(now, &mut self.publisher);
+        self.tracking.publish(now, &mut self.publisher);
     }
 }
 

@@ -9,6 +9,8 @@ use std::fmt;
 const MAX_STEM: usize = 160;
 /// How the name of a display begins that has told its serial number.
 const EDID: &str = "edid-";
+/// What comes between the name of a projector and the serial number that it gave in HELLO; no part of a name has it.
+const AND_SERIAL: char = '+';
 /// The family of all serial ports.
 const SERIAL: &str = "projector on";
 
@@ -90,9 +92,11 @@ impl Identity {
         ports.is_some_and(|(then, now)| then.is_certainly_not(now, &self.system))
     }
 
-    /// Name of the file of its standing order.
-    pub(crate) fn order_name(&self) -> String {
-        self.stem() + ENDING
+    /// Name of the file of its standing order. A projector that has told its serial number in HELLO has one of its own,
+    /// which no order for another projector at the same port replaces.
+    pub(crate) fn order_name(&self, device: Option<u64>) -> String {
+        let serial = device.map_or(String::new(), |serial| format!("{AND_SERIAL}{serial:016x}"));
+        self.stem() + &serial + ENDING
     }
 
     pub(super) fn stem(&self) -> String {
@@ -112,10 +116,10 @@ impl Identity {
     /// Whether an order in the file `name` holds this projector. `projector` and `port`: those that the file names.
     /// Where nothing proves that they are another projector, it does.
     pub(super) fn is_meant_by(&self, name: &str, projector: &str, port: Option<&Port>) -> Match {
-        let key_after = |family: &str| {
-            let stem = name.strip_suffix(ENDING)?;
-            Some(stem.strip_prefix(&plain(family))?.strip_prefix('-')?.to_owned())
-        };
+        let stem = name.strip_suffix(ENDING).unwrap_or(name);
+        // Which serial number was told is for the content to say.
+        let stem = stem.split(AND_SERIAL).next().unwrap_or(stem);
+        let key_after = |family: &str| Some(stem.strip_prefix(&plain(family))?.strip_prefix('-')?.to_owned());
         let others = || kinds().into_iter().filter(|kind| kind.is_video && self.is_video);
         let Some(key) = key_after(&self.family).or_else(|| others().find_map(|kind| key_after(kind.name)))
         else {
@@ -123,7 +127,7 @@ impl Identity {
         };
         // Versions before 2 named a port by its path alone.
         let is_worded_alike = self.family == SERIAL && port.is_none() && projector == self.what;
-        if name == self.order_name() || is_worded_alike {
+        if stem == self.stem() || is_worded_alike {
             return Match::Same;
         }
         let is_edid = |key: &str| key.starts_with(EDID);

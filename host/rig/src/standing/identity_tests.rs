@@ -124,7 +124,11 @@ fn every_name_of_a_port_is_one_projector() {
     machine.link("serial/by-id/usb-FTDI_AB12-if00", "../../ttyUSB0");
     for (link, path) in [("projector", "pts/5"), ("serial/by-id/usb-FTDI_AB12-if00", "ttyUSB0")] {
         let [one, other] = [link, path].map(|path| machine.projector(path));
-        assert_eq!((one.order_name(), one.lock_name()), (other.order_name(), other.lock_name()), "{path}");
+        assert_eq!(
+            (one.order_name(None), one.lock_name()),
+            (other.order_name(None), other.lock_name()),
+            "{path}"
+        );
         assert!(one.is_one_device());
         machine.safe_at(link);
         assert!(machine.holds(path), "SAFE by {link} does not hold {path}");
@@ -331,4 +335,90 @@ fn an_order_goes_with_the_serial_number_of_the_projector() {
     second.hear(Some(one));
     second.forget().unwrap();
     assert!(second.by_serial_number().is_empty() && !machine.holds("ttyUSB0"));
+}
+
+/// Found in use again: the order for a projector was lost when another one was made dark at the same port.
+#[test]
+fn orders_for_two_projectors_at_one_port_stand_side_by_side() {
+    let machine = Machine::new("two");
+    machine.plugged(0, 10, "1-1", Some("A"));
+    let (one, other) = (0x51, 0x52);
+    let start = |device| {
+        let file = machine.file("ttyUSB0");
+        let is_held = machine.holds("ttyUSB0");
+        let held = file.by_serial_number().into_iter().any(|(of, _)| Some(of) == device);
+        file.hear(device);
+        (file, is_held || held)
+    };
+    let (file, _) = start(Some(one));
+    file.keep(Order::Safe, By::Socket { uid: 0 }).unwrap();
+    // The other one: a person arms it, and makes it dark later.
+    let (file, is_dark) = start(Some(other));
+    assert!(is_dark, "before HELLO nothing says that it is another one");
+    file.forget().unwrap();
+    assert!(!start(Some(other)).1);
+    file.keep(Order::Black, By::Key).unwrap();
+    file.keep(Order::Black, By::Key).unwrap();
+    file.forget().unwrap();
+    file.keep(Order::Black, By::Key).unwrap();
+    // The first one is back, and is given its order again, which says who gave it first.
+    let (file, is_dark) = start(Some(one));
+    assert!(is_dark && file.by_serial_number().contains(&(one, Order::Safe)));
+    file.keep(Order::Safe, By::SerialNumber).unwrap();
+    let told = standing_in_folder(&machine.disk, &machine.projector("ttyUSB0")).unwrap();
+    assert!(told.order == Order::Safe && told.told.contains("user root over the control socket"), "{told:?}");
+    // Each is lifted by its own ARM.
+    file.forget().unwrap();
+    assert!(!start(Some(one)).1 && start(Some(other)).1);
+    start(Some(other)).0.forget().unwrap();
+    assert!(!start(Some(one)).1 && !start(Some(other)).1 && !machine.holds("ttyUSB0"));
+}
+
+/// Orders of one user hold the projector for every other user, and root too; each lifts them for themselves.
+#[test]
+fn an_order_of_one_user_holds_for_all_users() {
+    let machine = Machine::new("users");
+    machine.plugged(0, 10, "1-1", Some("A"));
+    machine.plugged(1, 11, "1-2", Some("B"));
+    let shared = machine.at("shared");
+    fs::create_dir(&shared).unwrap();
+    let me = dpm_common::unix::user();
+    assert!(Others::in_folder(&shared, me).is_none(), "a folder in which anybody may touch anything");
+    fs::set_permissions(&shared, std::os::unix::fs::PermissionsExt::from_mode(0o1777)).unwrap();
+    let Some(theirs) = Others::in_folder(&shared, me) else {
+        assert_ne!(me, 0, "the folder must be root's");
+        return;
+    };
+    // Two users with a state folder each; the files of both belong to the one who runs this.
+    let seen = |path: &str, folder: &Path| {
+        let others = Others::in_folder(&shared, me + 1);
+        OrderFile::open_beside(Some(folder.into()), others, machine.projector(path))
+    };
+    let [own, other] = ["own", "other"].map(|name| machine.at(name));
+    let (file, error, _) =
+        OrderFile::open_beside(Some(own.clone()), Some(theirs), machine.projector("ttyUSB0"));
+    assert!(error.is_none(), "{error:?}");
+    file.hear(Some(7));
+    file.keep(Order::Safe, By::Key).unwrap();
+    let (second, _, stands) = seen("ttyUSB0", &other);
+    let stands = stands.expect("it holds for the other user");
+    assert!(stands.order == Order::Safe && stands.told.contains("ordered by a key"), "{stands:?}");
+    assert!(seen("ttyUSB1", &other).2.is_none(), "it is for another adapter");
+    assert_eq!(seen("ttyUSB1", &other).0.by_serial_number(), [(7, Order::Safe)]);
+    // What is damaged, or of another's name, holds nothing.
+    fs::write(shared.join(format!("dpm-order-{me}-projector-on-x.order")), "{").unwrap();
+    fs::copy(
+        shared.join(format!("dpm-order-{me}-{}", machine.projector("ttyUSB0").order_name(Some(7)))),
+        shared.join(format!("dpm-order-{}-projector-on-x.order", me + 9)),
+    )
+    .unwrap();
+    second.hear(Some(7));
+    second.forget().unwrap();
+    assert!(seen("ttyUSB0", &other).2.is_none() && seen("ttyUSB1", &other).0.by_serial_number().is_empty());
+    assert!(standing_in(&own, &machine.projector("ttyUSB0")).is_some(), "for its own user it stands");
+    // Given anew, it holds again; lifted by its own user, it holds for nobody.
+    file.keep(Order::Black, By::Key).unwrap();
+    assert!(seen("ttyUSB0", &other).2.is_some());
+    file.forget().unwrap();
+    assert!(seen("ttyUSB0", &other).2.is_none());
 }

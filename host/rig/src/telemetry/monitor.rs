@@ -152,6 +152,9 @@ impl fmt::Display for ProjectorHealth {
     }
 }
 
+/// Projectors that may be held by their serial numbers at once.
+const MOST_HELD: usize = 32;
+
 /// Shared between a run and its observers. Accesses to numbers and flags are relaxed: the numbers are for display,
 /// and the stop flag guards no data.
 #[derive(Debug, Default)]
@@ -166,10 +169,11 @@ pub struct RunMonitor {
     found_safe: AtomicBool,
     /// The serial number that the projector gave in HELLO; 0 before.
     device: AtomicU64,
-    /// Orders that stand for projectors by their serial numbers.
-    held: OnceLock<Vec<(u64, Order)>>,
-    /// The serial number of the projector that a person has armed since: its order is lifted.
-    armed_device: AtomicU64,
+    /// Orders that stand for projectors by their serial numbers: the number, 0 for none, and the order as a code. Written by
+    /// the thread that keeps orders, read by the link's.
+    held: [(AtomicU64, AtomicU8); MOST_HELD],
+    /// More orders stood than there is room for: every projector with a serial number is held.
+    held_all: AtomicBool,
     /// The order that was found for the projector's serial number, as a code.
     found_held: AtomicU8,
     projector: AtomicU64,
@@ -340,24 +344,40 @@ impl RunMonitor {
         self.found_safe.swap(false, Ordering::Relaxed)
     }
 
-    /// Orders that stand for projectors with these serial numbers, wherever they are plugged in. A second list is dropped. Set
-    /// it before the run begins.
+    /// Orders that stand for projectors with these serial numbers, wherever they are plugged in.
     pub(crate) fn hold_devices(&self, held: Vec<(u64, Order)>) {
-        let _ = self.held.set(held);
+        held.into_iter().for_each(|(device, order)| self.hold_device(device, order));
+    }
+
+    /// An order stands for the projector with this serial number, until [`RunMonitor::lift_held`].
+    pub(crate) fn hold_device(&self, device: u64, order: Order) {
+        let of = |device| self.held.iter().find(|(of, _)| of.load(Ordering::Relaxed) == device);
+        match of(device).or_else(|| of(0)) {
+            Some((of, code)) => {
+                let before = Order::from_code(code.load(Ordering::Relaxed)).map_or(0, Order::strength);
+                if of.load(Ordering::Relaxed) != device || before < order.strength() {
+                    code.store(order as u8, Ordering::Relaxed);
+                }
+                // The order is there before its number is.
+                of.store(device, Ordering::Release);
+            }
+            None => self.held_all.store(true, Ordering::Relaxed),
+        }
     }
 
     /// The projector has said HELLO with this serial number. An order that stands for it is given, before anything arms it.
     /// 0, and 1, which is that of mocks and of firmware that has drawn none, name no projector.
     pub(crate) fn meet_device(&self, serial: u64) {
         let serial = if serial > 1 { serial } else { 0 };
-        let is_known = self.device.swap(serial, Ordering::Relaxed) == serial;
-        if is_known || self.armed_device.load(Ordering::Relaxed) == serial {
+        if self.device.swap(serial, Ordering::Relaxed) == serial || serial == 0 {
             return;
         }
-        let held = self.held.get().into_iter().flatten().filter(|(device, _)| *device == serial);
-        if let Some((_, order)) = held.max_by_key(|(_, order)| order.strength()) {
-            self.found_held.store(*order as u8, Ordering::Relaxed);
-            self.give_order(*order);
+        let held = self.held.iter().find(|(device, _)| device.load(Ordering::Acquire) == serial);
+        let order = held.and_then(|(_, code)| Order::from_code(code.load(Ordering::Relaxed)));
+        let all = self.held_all.load(Ordering::Relaxed).then_some(Order::Black);
+        if let Some(order) = order.or(all) {
+            self.found_held.store(order as u8, Ordering::Relaxed);
+            self.give_order(order);
         }
     }
 
@@ -373,7 +393,9 @@ impl RunMonitor {
 
     /// A person has armed the projector with this serial number.
     pub(crate) fn lift_held(&self, device: u64) {
-        self.armed_device.store(device, Ordering::Relaxed);
+        for (of, _) in self.held.iter().filter(|(of, _)| of.load(Ordering::Relaxed) == device) {
+            of.store(0, Ordering::Relaxed);
+        }
     }
 
     /// Sets the projector's state.

@@ -4,13 +4,13 @@ use super::keys::KeyWatch;
 use super::phase::{SamplePhase, SampleRhythm};
 use super::seen::{SeenBodies, Unseen};
 use super::tracker_frame::TrackerFrame;
-use crate::config::{PredictionConfig, MAX_TRACKED};
+use crate::config::MAX_TRACKED;
 use crate::rig::Rig;
 use crate::tracks::gauges::{AddedCounts, TrackerGauges};
 use dpm_device::time::HostTime;
 use dpm_device::tracker::{BodyIndex, Tracker, TrackerError};
 use dpm_handoff::latest::Publisher;
-use dpm_tracking::{PoseFilterBank, PoseFilterConfig, TrackState};
+use dpm_tracking::{PoseFilterBank, TrackState};
 use glam::DVec3;
 use std::sync::Arc;
 use std::time::Duration;
@@ -49,8 +49,6 @@ impl TrackSnapshot {
 pub struct TrackingStage {
     tracker: Box<dyn Tracker>,
     bank: PoseFilterBank,
-    /// Filters of the same bodies that follow faster; `None` if nobody asks for them.
-    lively: Option<PoseFilterBank>,
     received_at: Vec<HostTime>,
     /// Samples by body that the filters did not accept.
     contradictory: Vec<u64>,
@@ -83,24 +81,12 @@ const ADD_EVERY_NS: i64 = 50_000_000;
 /// that must be reconnected within half a second.
 const SEEN_WITHIN_NS: i64 = 1_000_000_000;
 
-/// How much more acceleration the filters expect whose tracks correct the light between frames: a correction that comes at
-/// once is worth more noise, which [`crate::engine::follow`] keeps out by its gate.
-const LIVELIER: f64 = 1.5;
-
-/// Filters for the bodies of `rig` that expect `livelier` times the acceleration of the rig file, and learn it if they may.
-fn bank(rig: &Rig, livelier: f64, learns: bool) -> PoseFilterBank {
+/// Filters for the bodies of `rig`.
+fn bank(rig: &Rig) -> PoseFilterBank {
     // Each frame decides how long a body is shown without samples, see [`crate::plan::frame::FramePlan::fill`]. The filter
     // only needs to know how long a track is worth keeping.
     let longest_ms = rig.config.safety.predict_ms.unwrap_or(MAX_PREDICT_MS);
-    let prediction = &rig.config.prediction;
-    let expected = PredictionConfig {
-        acceleration: livelier * prediction.acceleration,
-        angular_acceleration: livelier * prediction.angular_acceleration,
-        ..prediction.clone()
-    };
-    let bodies = rig.tracked_count();
-    let filter = PoseFilterConfig { learns, ..expected.to_filter(longest_ms) };
-    PoseFilterBank::new(&vec![filter; bodies])
+    PoseFilterBank::new(&vec![rig.config.prediction.to_filter(longest_ms); rig.tracked_count()])
 }
 
 impl TrackingStage {
@@ -109,8 +95,7 @@ impl TrackingStage {
         let bodies = rig.tracked_count();
         Self {
             tracker,
-            bank: bank(rig, 1.0, true),
-            lively: None,
+            bank: bank(rig),
             received_at: vec![HostTime(0); bodies],
             contradictory: vec![0; bodies],
             keys: vec![KeyWatch::default(); bodies],
@@ -132,21 +117,13 @@ impl TrackingStage {
         Self { seen, ..self }
     }
 
-    /// The same with filters that follow faster, for [`TrackingStage::publish_lively`].
-    pub(crate) fn with_lively(self, rig: &Rig) -> Self {
-        // Two filters that had learned differently would draw a frame at one place and correct it to another; and after
-        // steady motion neither would expect the turn that tracks are for.
-        Self { bank: bank(rig, 1.0, false), lively: Some(bank(rig, LIVELIER, false)), ..self }
-    }
-
     /// Reads what has arrived by `now` and publishes the tracks.
     ///
     /// # Errors
     /// The tracker is gone; the tracks that are known stay published.
     pub fn step(&mut self, now: HostTime, latest: &mut Publisher<TrackSnapshot>) -> Result<(), TrackerError> {
         self.began_at.get_or_insert(now);
-        let Self { tracker, bank, lively, received_at, contradictory, latency_ns, frame, captured, .. } =
-            self;
+        let Self { tracker, bank, received_at, contradictory, latency_ns, frame, captured, .. } = self;
         captured.1 = false;
         let result = tracker.poll(now, &mut |sample| {
             let in_world;
@@ -157,9 +134,6 @@ impl TrackingStage {
                     &in_world
                 }
             };
-            if let Some(lively) = lively {
-                lively.update(sample);
-            }
             if let Some(verdict) = bank.update(sample) {
                 if verdict.is_accepted() {
                     if let Some(at) = received_at.get_mut(usize::from(sample.body.0)) {
@@ -176,25 +150,19 @@ impl TrackingStage {
                 }
             }
         });
-        self.publish(&self.bank, now, latest);
+        self.publish(now, latest);
         result.map(|_| ())
     }
 
-    /// Publishes the tracks of the filters that follow faster as they are at `now`, if there are such filters.
-    pub(crate) fn publish_lively(&self, now: HostTime, latest: &mut Publisher<TrackSnapshot>) {
-        if let Some(bank) = &self.lively {
-            self.publish(bank, now, latest);
-        }
-    }
-
-    fn publish(&self, bank: &PoseFilterBank, now: HostTime, latest: &mut Publisher<TrackSnapshot>) {
+    /// Publishes the tracks as they were at `now`, after the last step.
+    pub(crate) fn publish(&self, now: HostTime, latest: &mut Publisher<TrackSnapshot>) {
         let (received_at, latency_ns, captured_at) = (&self.received_at, self.latency_ns, self.captured.0);
         latest.publish_with(|snapshot| {
             snapshot.through = now;
             snapshot.latency_ns = latency_ns;
             snapshot.captured_at = captured_at;
             for (i, (track, at)) in snapshot.tracks.iter_mut().zip(received_at).enumerate() {
-                *track = bank.state(BodyIndex(i as u16)).map(|s| (s, *at));
+                *track = self.bank.state(BodyIndex(i as u16)).map(|s| (s, *at));
                 if track.is_some() {
                     self.seen.mark(i);
                 }

@@ -152,8 +152,8 @@ mod breadth {
             for _ in 0..60 {
                 let mut damaged = whole.clone();
                 for _ in 0..1 + chance() % 4 {
-                    let place = chance() as usize % whole.len().min(4096);
-                    damaged[place] = [0, 0x7f, 0xff, chance() as u8][chance() as usize % 4];
+                    let place = chance() % whole.len().min(4096);
+                    damaged[place] = [0, 0x7f, 0xff, chance() as u8][chance() % 4];
                 }
                 check(&path.display().to_string(), &damaged);
             }

@@ -19,6 +19,7 @@ fn order(seed: u64, rate_hz: Option<u32>, seconds: i64) -> Order {
         follows: None,
         serial: None,
         tracker: Some(TrackerKind::NatNet),
+        strained: Some(false),
         alone: None,
         first: Vec::new(),
         without: BTreeSet::new(),
@@ -98,6 +99,25 @@ fn every_guard_of_the_light_keeps_the_laws_alone() {
         }
         let all = guard.kinds();
         assert!(all.iter().all(|kind| struck.contains(&kind)), "{guard:?}: {struck:?} of {all:?}");
+    }
+}
+
+/// A queue that keeps itself standing is shed, and a cable that is too slow for every slot carries every n-th frame steadily.
+#[test]
+fn frames_bear_a_standing_queue_and_a_slow_cable() {
+    for kind in [Kind::X17, Kind::X18] {
+        for (seed, rate_hz) in [(1, 60), (2, 240), (3, 947)] {
+            let strained = Order {
+                strained: Some(true),
+                follows: Some(false),
+                serial: Some(false),
+                first: vec![kind],
+                ..order(seed, Some(rate_hz), 40)
+            };
+            let lived = lived(&strained);
+            assert_eq!(lived.broken, None, "{kind:?}, seed {seed}");
+            assert!(lived.table.of(kind) > 0, "{kind:?}, seed {seed}: nothing of it was seen");
+        }
     }
 }
 

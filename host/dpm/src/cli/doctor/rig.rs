@@ -13,7 +13,7 @@ use dpm_rig::config::{BodyConfig, LiveSource, PictureSource, RigConfig};
 use dpm_rig::picture_stream::look_at;
 use dpm_rig::presence;
 use dpm_rig::rig::{affine, plausible, Rig, RigError};
-use dpm_rig::standing::{standing_in, state_folder, Identity};
+use dpm_rig::standing::{standing, Identity};
 use std::net::{SocketAddr, TcpListener};
 use std::path::Path;
 use std::time::SystemTime;
@@ -272,7 +272,7 @@ fn calibration(config: &RigConfig) -> Finding {
 /// An order that outlived the run in which it was given.
 fn standing_order(config: &RigConfig) -> Option<Finding> {
     let identity = Identity::of(&config.projector.backend);
-    let stands = standing_in(&state_folder()?, &identity)?;
+    let stands = standing(&identity)?;
     let found =
         format!("the projector stays dark: {} stands {}", stands.order.word().to_uppercase(), stands.told);
     Some(Finding::new("standing order", State::Warning, found, "run the rig and say `dpm arm`"))

@@ -202,6 +202,61 @@ fn r1_a_link_of_the_port_is_the_same_projector() {
     bench.comes_up_dark_until_armed("SAFE stands since");
 }
 
+/// Found in use again: BLACK for another projector at the same port replaced SAFE for the first one.
+#[test]
+fn orders_for_two_projectors_at_one_port_stand_side_by_side() {
+    let bench = Bench::new("two-projectors");
+    let plug = |serial| {
+        bench.far.unplug();
+        bench.far.exchange(MockConfig { serial, ..MockConfig::new(raster()) });
+        bench.far.plug_in();
+    };
+    let dark_after = |run: &mut Running, word: &str| {
+        run.wait_for_line(LONG, |line| line.contains(word));
+        let begin = Instant::now();
+        while begin.elapsed() < Duration::from_millis(500) {
+            let s = bench.far.status();
+            assert!(!s.lit && s.state != DeviceState::Armed, "{s:?}");
+            std::thread::sleep(Duration::from_millis(1));
+        }
+    };
+    plug(0xa1);
+    let run = bench.start();
+    bench.far.until(LONG, "light of the first one", &mut |s| s.lit);
+    bench.order("safe", &run, 0);
+    run.signal("KILL");
+    run.finish();
+    // The other one, which a person arms and makes dark.
+    plug(0xb2);
+    let mut run = bench.start();
+    dark_after(&mut run, "SAFE stands since");
+    bench.order("arm", &run, 0);
+    bench.far.until(LONG, "light of the other one", &mut |s| s.lit);
+    bench.order("black", &run, 0);
+    run.signal("KILL");
+    run.finish();
+    // The first one is back, without power meanwhile.
+    plug(0xa1);
+    let mut run = bench.start();
+    dark_after(&mut run, "SAFE stands since");
+    bench.order("arm", &run, 0);
+    bench.far.until(LONG, "light of the first one", &mut |s| s.lit);
+    // Within one run, too: nobody has armed the other one.
+    plug(0xb2);
+    dark_after(&mut run, "stands for the one with this serial number");
+    bench.order("arm", &run, 0);
+    bench.far.until(LONG, "light of the other one", &mut |s| s.lit);
+    bench.order("black", &run, 0);
+    plug(0xa1);
+    bench.far.until(LONG, "a session with the first one", &mut |s| s.state == DeviceState::Configured);
+    bench.order("arm", &run, 0);
+    bench.far.until(LONG, "light of the first one", &mut |s| s.lit);
+    plug(0xb2);
+    dark_after(&mut run, "stands for the one with this serial number");
+    run.signal("TERM");
+    assert_eq!(run.finish().0.code(), Some(0));
+}
+
 #[test]
 fn a_start_by_hand_is_dark_until_somebody_arms() {
     let bench = Bench::new("by-hand");

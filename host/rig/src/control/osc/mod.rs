@@ -62,8 +62,7 @@ impl OscSocket {
         let stop = Arc::new(AtomicBool::new(false));
         let mut ear = Ear {
             socket,
-            from,
-            token,
+            door: Doorkeeper { from, token },
             monitor,
             orders,
             waiting: Vec::with_capacity(WAITING),
@@ -114,10 +113,18 @@ struct Refusals {
     told_at: Option<Instant>,
 }
 
+/// Who may say what.
+#[derive(Debug, Default)]
+pub struct Doorkeeper {
+    /// Addresses that are heard; empty: those of this machine.
+    pub from: Vec<IpAddr>,
+    /// Whoever gives it may do more than make dark; without one nobody may.
+    pub token: Option<String>,
+}
+
 struct Ear {
     socket: UdpSocket,
-    from: Vec<IpAddr>,
-    token: Option<String>,
+    door: Doorkeeper,
     monitor: Arc<RunMonitor>,
     orders: Arc<Orders>,
     waiting: Vec<Waiting>,
@@ -152,48 +159,27 @@ impl Ear {
 
     fn hear(&mut self, bytes: &[u8], from: SocketAddr) {
         let ip = from.ip().to_canonical();
-        let may_send = if self.from.is_empty() { ip.is_loopback() } else { self.from.contains(&ip) };
-        if !may_send {
-            return self.refused.add(format!("{ip} is not in osc.from"));
-        }
-        let mut all = Vec::new();
-        let end = decode(bytes, &mut |one| all.push(one));
-        for heard in all.into_iter().chain(end.err().map(Err)) {
-            let done = match heard.map(|said| (self.permits(&said), said.heard)) {
-                Ok((permitted, Heard::Order(order))) if permitted.is_ok() || order.is_dark() => {
+        for heard in self.door.hear(bytes, ip) {
+            let done = match heard {
+                Ok(Heard::Order(order)) => {
                     self.order(order, from);
-                    continue;
+                    Ok(())
                 }
-                Ok((_, Heard::Nothing)) => continue,
-                Ok((Err(why), _)) => Err(why.into()),
-                Ok((Ok(()), Heard::Order(_))) => continue,
-                Ok((Ok(()), Heard::Set { name, numbers })) => {
+                Ok(Heard::Nothing) => Ok(()),
+                Ok(Heard::Set { name, numbers }) => {
                     let command = Command::Set { name, numbers };
-                    parameters::give(&self.monitor, &command, &format!("osc {ip}")).map_err(|e| e.to_string())
+                    let given = parameters::give(&self.monitor, &command, &format!("osc {ip}"));
+                    given.map(|_| ()).map_err(|e| format!("{ip}: {e}"))
                 }
-                Err(wrong) => Err(wrong.to_string()),
+                Err(why) => Err(why),
             };
             if let Err(why) = done {
-                self.refused.add(format!("{ip}: {why}"));
+                self.refused.add(why);
             }
         }
     }
 
-    /// Whether the sender of a message may do more than make dark.
-    fn permits(&self, said: &Said) -> Result<(), &'static str> {
-        match (&self.token, &said.token) {
-            (None, _) => Err("OSC only makes dark, because the rig file has no osc.token"),
-            (Some(_), None) => Err("without the token of the rig file (osc.token) OSC only makes dark"),
-            (Some(right), Some(told)) if is_same(right, told) => Ok(()),
-            (Some(_), Some(_)) => Err("the token is not that of the rig file (osc.token)"),
-        }
-    }
-
     fn order(&mut self, order: Order, from: SocketAddr) {
-        // The decoder knows no ARM; this holds it whatever becomes of the decoder.
-        if order == Order::Arm {
-            return;
-        }
         let ticket = self.orders.give(order, By::Osc { from: from.ip() });
         if self.waiting.len() < WAITING {
             self.waiting.push(Waiting { order, ticket, since: Instant::now(), from });
@@ -209,6 +195,42 @@ impl Ear {
             monitor.note(format!("osc {}: {}: {}", w.from.ip(), w.order.word(), answer.text));
             false
         });
+    }
+}
+
+impl Doorkeeper {
+    /// What is to be done after a datagram from `ip`, and why the rest of it is refused.
+    pub fn hear(&self, bytes: &[u8], ip: IpAddr) -> Vec<Result<Heard, String>> {
+        let may_send = if self.from.is_empty() { ip.is_loopback() } else { self.from.contains(&ip) };
+        if !may_send {
+            return vec![Err(format!("{ip} is not in osc.from"))];
+        }
+        let mut all = Vec::new();
+        let end = decode(bytes, &mut |one| all.push(one));
+        let judged = all.into_iter().chain(end.err().map(Err)).map(|heard| {
+            let said = heard.map_err(|wrong| format!("{ip}: {wrong}"))?;
+            match (self.permits(&said), said.heard) {
+                // The decoder knows no ARM; this holds it whatever becomes of the decoder.
+                (_, Heard::Order(Order::Arm)) => Err(format!("{ip}: OSC never arms")),
+                (permitted, Heard::Order(order)) if permitted.is_ok() || order.is_dark() => {
+                    Ok(Heard::Order(order))
+                }
+                (_, Heard::Nothing) => Ok(Heard::Nothing),
+                (Ok(()), heard) => Ok(heard),
+                (Err(why), _) => Err(format!("{ip}: {why}")),
+            }
+        });
+        judged.collect()
+    }
+
+    /// Whether the sender of a message may do more than make dark.
+    fn permits(&self, said: &Said) -> Result<(), &'static str> {
+        match (&self.token, &said.token) {
+            (None, _) => Err("OSC only makes dark, because the rig file has no osc.token"),
+            (Some(_), None) => Err("without the token of the rig file (osc.token) OSC only makes dark"),
+            (Some(right), Some(told)) if is_same(right, told) => Ok(()),
+            (Some(_), Some(_)) => Err("the token is not that of the rig file (osc.token)"),
+        }
     }
 }
 

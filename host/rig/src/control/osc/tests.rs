@@ -138,8 +138,7 @@ fn a_sender_that_is_not_listed_is_not_heard() {
     let bench = Bench::new("127.0.0.1", None);
     let mut ear = Ear {
         socket: UdpSocket::bind("127.0.0.1:0").unwrap(),
-        from: vec!["192.0.2.7".parse().unwrap()],
-        token: None,
+        door: Doorkeeper { from: vec!["192.0.2.7".parse().unwrap()], token: None },
         monitor: bench.monitor.clone(),
         orders: {
             let identity = Identity::of(&backend("mock").unwrap());
@@ -162,7 +161,7 @@ fn a_sender_that_is_not_listed_is_not_heard() {
         assert_eq!(bench.monitor.take_order().is_some(), is_heard, "{from}");
     }
     assert_eq!(ear.refused.count, 3);
-    ear.from.clear();
+    ear.door.from.clear();
     for (from, is_heard) in [("127.0.0.9:9", true), ("[::1]:9", true), ("192.0.2.7:9", false)] {
         ear.hear(black, from.parse().unwrap());
         assert_eq!(bench.monitor.take_order().is_some(), is_heard, "{from}");

@@ -6,7 +6,7 @@ use crate::engine::error::PipelineError;
 use crate::engine::facts::{CrewFacts, Facts};
 use crate::engine::pace::Real;
 use crate::engine::pack::PackStage;
-use crate::engine::plan::{Latch, PlanStage};
+use crate::engine::plan::{Latch, PlanStage, ON_THE_WAY_STEP_NS};
 use crate::engine::pulse::{Pulse, Silence};
 use crate::engine::supervision::Trouble;
 use crate::frame::job::{FrameJob, FrameMemory, FrameNote};
@@ -44,7 +44,7 @@ impl CrewParts {
             picture: None,
         };
         Self {
-            tracking: tracking(rig, tracker),
+            tracking: TrackingStage::new(rig, tracker),
             renderer: None,
             packer: Packer { kernel: Kernel::best(), pictures: None, eyes: EyeMask::of_rig(rig) },
             budget: None,
@@ -52,16 +52,6 @@ impl CrewParts {
             first: WarmUp { wall_ns: frame_ns, gpu_ns: None },
             budget_milli: u64::MAX,
         }
-    }
-}
-
-/// Tracking, with the filters that tracks between frames need if the rig sends any.
-fn tracking(rig: &Rig, tracker: Box<dyn Tracker>) -> TrackingStage {
-    let stage = TrackingStage::new(rig, tracker);
-    if rig.wants_tracks() {
-        stage.with_lively(rig)
-    } else {
-        stage
     }
 }
 
@@ -296,7 +286,7 @@ impl Crew {
                 crate::pipeline::threads::read_tracker(facts, &mut self.tracking, &mut self.publisher, now);
                 facts.tell_rhythm(self.tracking.is_published(read_at));
                 if let Some(to_link) = &mut self.to_link {
-                    self.tracking.publish_lively(now, to_link);
+                    self.tracking.publish(now, to_link);
                 }
                 let next = machine.next_sample_at(now).min(now.plus_ns(POLL_AT_LEAST_NS));
                 self.tracking_at = next.max(read_at.plus_ns(POLL_REST_NS));
@@ -353,6 +343,10 @@ impl Crew {
         if self.plan.sheds() && self.free.len() < self.in_flight {
             self.held_up_by = Some(MissCause::Queue);
             return later;
+        }
+        if self.plan.sheds() && self.plan.is_on_the_way() {
+            self.held_up_by = Some(MissCause::Queue);
+            return Planning::Free { at: now.plus_ns(ON_THE_WAY_STEP_NS) };
         }
         let time = *self.times.latest().0;
         let Some(latch) = self.plan.choose_slot(&time, now) else { return later };

@@ -1,5 +1,6 @@
 //! Orders that are written down without a thread: whoever steps them says how long the disk takes.
 
+use crate::config::Restart;
 use crate::control::orders::{Desk, Given, Kept, Ticket};
 use crate::order::Order;
 use crate::standing::{standing_in_folder, By, Identity, OrderFile, Stands, StateFolder};
@@ -27,7 +28,8 @@ pub struct SteppedOrders {
 }
 
 impl SteppedOrders {
-    /// Reads what stands for `identity` in `folder`, and gives it to the run that is about to begin.
+    /// Reads what stands for `identity` in `folder`, and gives it, or what `start` demands, to the run that is about to
+    /// begin.
     ///
     /// # Errors
     /// The folder cannot be used: the process ends with exit code 2 before it makes any light.
@@ -35,8 +37,9 @@ impl SteppedOrders {
         folder: Box<dyn StateFolder>,
         identity: Identity,
         monitor: Arc<RunMonitor>,
+        start: Restart,
     ) -> Result<Self, String> {
-        let stands: Option<Stands> = standing_in_folder(folder.as_ref(), &identity);
+        let stands = Stands::begin(standing_in_folder(folder.as_ref(), &identity), start, &monitor);
         let (file, error) = OrderFile::in_folder(folder, identity);
         if let Some(e) = error {
             return Err(e.to_string());

@@ -4,8 +4,11 @@ use super::*;
 use crate::config::{Overrides, RigConfig};
 use crate::mock::{DeviceClock, EmulatedProjector, MockConfig};
 use crate::tracks::open_for;
+use dpm_device::link::Packet;
 use dpm_device::planes::Raster;
 use dpm_device::transport::inproc::Direct;
+use dpm_device::transport::{Lane, LinkDevice, SendError, TransportError};
+use std::collections::VecDeque;
 
 const MS: i64 = 1_000_000;
 /// What pack and link take of a frame that is alone in the caches, nanoseconds.
@@ -19,6 +22,59 @@ enum Strikes {
     Thread(Part),
     /// Another program streams through memory: all stages are four times slower.
     Memory,
+    /// A cable that carries a frame in seven tenths of a slot, and holds two more, moves nothing for 60 ms.
+    Cable,
+}
+
+/// Such a cable. Replies pass it at once.
+struct Cable {
+    inner: Direct<EmulatedProjector>,
+    frame_ns: i64,
+    stops_at: HostTime,
+    /// What it holds, by when it will have been carried.
+    holds: VecDeque<(HostTime, Vec<u8>)>,
+}
+
+/// For so long it moves nothing.
+const STOPPED_NS: i64 = 60 * MS;
+/// Frames that find room.
+const ROOM: usize = 3;
+
+impl Transport for Cable {
+    fn send(&mut self, now: HostTime, lane: Lane, packets: &[Packet<'_>]) -> Result<(), SendError> {
+        if lane == Lane::Control {
+            return self.inner.send(now, lane, packets);
+        }
+        if !self.has_room(lane) {
+            return Err(SendError::Busy);
+        }
+        let begins_at = self.holds.back().map_or(now, |(at, _)| now.max(*at));
+        let ends_at = begins_at.plus_ns(self.frame_ns);
+        let is_stopped = begins_at < self.stops_at.plus_ns(STOPPED_NS) && ends_at > self.stops_at;
+        let ends_at = if is_stopped { ends_at.plus_ns(STOPPED_NS) } else { ends_at };
+        self.holds.push_back((ends_at, packets.iter().flat_map(Packet::to_vec).collect()));
+        Ok(())
+    }
+
+    fn has_room(&mut self, lane: Lane) -> bool {
+        lane == Lane::Control || self.holds.len() < ROOM
+    }
+
+    fn receive(
+        &mut self,
+        now: HostTime,
+        sink: &mut dyn FnMut(Lane, HostTime, &[u8]),
+    ) -> Result<(), TransportError> {
+        while self.holds.front().is_some_and(|(at, _)| *at <= now) {
+            let Some((at, bytes)) = self.holds.pop_front() else { break };
+            self.inner.device_mut().receive(at, Lane::Data, &bytes);
+        }
+        self.inner.receive(now, sink)
+    }
+
+    fn name(&self) -> &str {
+        "cable"
+    }
 }
 
 const STRIKES_AT: HostTime = HostTime(1_000 * MS);
@@ -30,6 +86,7 @@ struct Sent {
     sent_at: HostTime,
     due_at: HostTime,
     captured_at: Option<HostTime>,
+    planned_at: HostTime,
 }
 
 /// A machine whose stages are slower the more frames are under way, as where the frames do not fit the caches: with four
@@ -42,6 +99,9 @@ struct Cached {
     newest: [u64; 2],
     /// One in so many steps takes longer.
     steps: i64,
+    /// When the newest frames were planned, by number.
+    planned: [HostTime; 64],
+    alone_ns: i64,
     sent: Vec<Sent>,
     /// The collector takes so long for a pass.
     collector_ns: i64,
@@ -51,10 +111,10 @@ impl Cached {
     fn stage_ns(&mut self, now: HostTime) -> i64 {
         self.steps += 1;
         let under_way = self.newest[0].saturating_sub(self.newest[1]) as i64;
-        let crowd = ALONE_NS * (under_way - 1).clamp(0, 3) * 9 / 10;
+        let crowd = self.alone_ns * (under_way - 1).clamp(0, 3) * 9 / 10;
         let hiccup = if self.steps % 97 == 0 { 250_000 } else { self.steps * 7919 % 40_000 };
         let slow = self.strikes == Strikes::Memory && (0..STRUCK_NS).contains(&now.ns_since(STRIKES_AT));
-        (ALONE_NS + crowd + hiccup) * if slow { 4 } else { 1 }
+        (self.alone_ns + crowd + hiccup) * if slow { 4 } else { 1 }
     }
 }
 
@@ -70,6 +130,7 @@ impl Machine for Cached {
             Part::Tracking => 10_000,
             Part::Plan => {
                 self.newest[0] = frame;
+                self.planned[frame as usize % 64] = now;
                 20_000
             }
             Part::Pack => self.stage_ns(now),
@@ -102,12 +163,25 @@ impl Machine for Cached {
 
     fn sent(&mut self, frame: &SentFrame<'_>) {
         let (sent_at, due_at, captured_at) = (frame.sent_at, frame.due_at, frame.captured_at);
-        self.sent.push(Sent { sent_at, due_at, captured_at });
+        let planned_at = self.planned[frame.frame as usize % 64];
+        self.sent.push(Sent { sent_at, due_at, captured_at, planned_at });
     }
 }
 
 /// What was sent in a run of `ms` milliseconds with these keys.
 fn run(keys: &[&str], strikes: Strikes, collector_ns: i64, shifts_slots: bool, ms: i64) -> Vec<Sent> {
+    run_of(keys, strikes, collector_ns, shifts_slots, ms, ALONE_NS)
+}
+
+/// The same where pack and link each take `alone_ns`.
+fn run_of(
+    keys: &[&str],
+    strikes: Strikes,
+    collector_ns: i64,
+    shifts_slots: bool,
+    ms: i64,
+    alone_ns: i64,
+) -> Vec<Sent> {
     let flags = keys.iter().map(|key| (*key).to_owned()).chain(["real_time.pace=\"real\"".to_owned()]);
     let overrides = Overrides { variables: vec![], flags: flags.collect() };
     let config = RigConfig::demo(&overrides).unwrap_or_else(|e| panic!("{e}"));
@@ -118,13 +192,22 @@ fn run(keys: &[&str], strikes: Strikes, collector_ns: i64, shifts_slots: bool, m
     setup.clock = DeviceClock { skew_ppb: 60_000, ..DeviceClock::IDEAL };
     let mut now = HostTime(5 * MS);
     let projector = EmulatedProjector::new(setup, "", 1, now).expect("no faults");
-    let medium = Box::new(Direct::new(projector));
+    let inner = Direct::new(projector);
+    let medium: Box<dyn Transport> = match strikes {
+        Strikes::Cable => {
+            let frame_ns = rig.rate().slot_len_ns(0) * 7 / 10;
+            Box::new(Cable { inner, frame_ns, stops_at: STRIKES_AT, holds: VecDeque::new() })
+        }
+        _ => Box::new(inner),
+    };
     let machine = Cached {
         rig: rig.clone(),
         strikes,
         has_struck: false,
         newest: [0; 2],
         steps: 0,
+        planned: [now; 64],
+        alone_ns,
         sent: Vec::new(),
         collector_ns,
     };
@@ -134,6 +217,8 @@ fn run(keys: &[&str], strikes: Strikes, collector_ns: i64, shifts_slots: bool, m
         now = run.step(now).min(HostTime(ms * MS));
     }
     assert!(run.is_running(), "it goes on");
+    let slack = run.carried().expect("the link is up").slack;
+    println!("{keys:?}, {strikes:?}: {slack:?}");
     std::mem::take(&mut run.machine().sent)
 }
 
@@ -193,6 +278,33 @@ fn the_good_state_returns_after_memory_was_slow() {
     returns_after(Strikes::Memory);
 }
 
+/// A cable that stood still has frames before each other in it, and carries them as fast as they come. Such a queue is shed as
+/// one between the stages is: half a second later frames travel alone again.
+#[test]
+fn a_queue_on_the_cable_is_shed() {
+    for rate in [60, 240, 947] {
+        let key = format!("projector.frame_rate=\"{rate}\"");
+        let slot_ns = 1_000 * MS / rate;
+        let sent = run(&[&key], Strikes::Cable, 100_000, false, 3_000);
+        let from = STRIKES_AT.plus_ns(STOPPED_NS + 500 * MS + 8 * slot_ns);
+        let to = HostTime(2_900 * MS);
+        let after = sent.iter().filter(|s| s.due_at >= from && s.due_at < to);
+        // As long before its slot as the cable needs for a frame that travels alone.
+        let early = after.clone().filter(|s| s.due_at.ns_since(s.sent_at) >= slot_ns * 7 / 10).count();
+        let ages: Vec<i64> = after.map(|s| s.due_at.ns_since(s.planned_at)).collect();
+        let slots = (to.ns_since(from) / slot_ns) as usize;
+        assert!(early * 100 >= slots * 97, "{rate}: {early} of {slots} frames in time");
+        let mean = ages.iter().sum::<i64>() / ages.len() as i64;
+        assert!(mean < slot_ns + 1_600_000, "{rate}: latched {mean} ns before their slots");
+        // Frames that wait for each other leave no two slots apart.
+        let during = sent.iter().filter(|s| s.due_at >= STRIKES_AT && s.due_at < from);
+        assert!(
+            during.count() < (from.ns_since(STRIKES_AT) / slot_ns) as usize,
+            "{rate}: nothing was left out"
+        );
+    }
+}
+
 /// Passes of a collector that gets no core take a second each: it reads nothing while frames go on.
 #[test]
 fn a_starved_collector_changes_nothing_about_the_light() {
@@ -208,6 +320,27 @@ fn a_starved_collector_changes_nothing_about_the_light() {
         usual.len(),
         starved.len()
     );
+}
+
+/// The lead needs no thousand frames: after three seconds at 240 frames/s, or at 60, most frames are latched no earlier than
+/// half as long again as their work takes, and nearly all are in time.
+#[test]
+fn the_lead_of_few_frames_is_no_longer_than_they_need() {
+    for rate in [240, 60] {
+        let rate = format!("projector.frame_rate=\"{rate}\"");
+        let sent = run_of(&[&rate], Strikes::Nothing, 100_000, false, 6_000, 700_000);
+        let settled = sent.iter().filter(|s| s.due_at > HostTime(3_000 * MS));
+        let median = |of: fn(&Sent) -> i64| {
+            let mut all: Vec<i64> = settled.clone().map(of).collect();
+            all.sort_unstable();
+            all[all.len() / 2]
+        };
+        let work = median(|s| s.sent_at.ns_since(s.planned_at));
+        let lead = median(|s| s.due_at.ns_since(s.planned_at));
+        assert!(work > 1_400_000 && 2 * lead <= 3 * work, "{rate}: {lead} ns for {work} ns of work");
+        let late = settled.clone().filter(|s| s.sent_at > s.due_at).count();
+        assert!(late * 100 <= settled.count(), "{rate}: {late} late");
+    }
 }
 
 /// Where one rate divides the other, each frame shows a sample that has just become ready, though the clocks of tracker and

@@ -90,7 +90,9 @@ pub(super) fn read_layers(
         let position = header.own_attributes.layer_position;
         let divides = |[x, y]: &Sampling| {
             let fits = |side: usize, at: i32, step: u32| {
-                (1..=COARSEST).contains(&step) && side % step as usize == 0 && at.rem_euclid(step as i32) == 0
+                (1..=COARSEST).contains(&step)
+                    && side.is_multiple_of(step as usize)
+                    && at.rem_euclid(step as i32) == 0
             };
             fits(width, position.x(), *x) && fits(height, position.y(), *y)
         };
@@ -151,7 +153,7 @@ fn decompressed(
     let width = header.layer_size.width();
     let size_of = |y: usize| -> usize {
         let of = |(channel, [across, down]): (&exr::meta::attribute::ChannelDescription, &Sampling)| {
-            let is_there = y % *down as usize == 0;
+            let is_there = y.is_multiple_of(*down as usize);
             usize::from(is_there) * (width / *across as usize) * channel.sample_type.bytes_per_sample()
         };
         header.channels.list.iter().zip(sampling).map(of).sum()
@@ -206,7 +208,7 @@ fn by_channel(
     let mut channels = vec![];
     for (channel, [across, down]) in header.channels.list.iter().zip(sampling) {
         let columns = header.layer_size.width() / *across as usize;
-        let own_rows = (first..first + rows).filter(|y| y % *down as usize == 0).count();
+        let own_rows = (first..first + rows).filter(|y| y.is_multiple_of(*down as usize)).count();
         let size = columns * own_rows * channel.sample_type.bytes_per_sample();
         let taken = match channel.sample_type {
             SampleType::F16 => b44_length(rest, columns.div_ceil(4) * own_rows.div_ceil(4)),
@@ -238,7 +240,7 @@ fn by_channel(
     let mut out = Vec::with_capacity(channels.iter().map(|(plain, ..)| plain.len()).sum());
     for y in first..first + rows {
         for ((plain, row, down), at) in channels.iter().zip(&mut places) {
-            if y % down == 0 {
+            if y.is_multiple_of(*down) {
                 out.extend_from_slice(&plain[*at..*at + row]);
                 *at += row;
             }
@@ -274,7 +276,7 @@ impl Coarse {
     fn take_row(&mut self, y: usize, kind: SampleType, bytes: &mut &[u8]) {
         let [columns, _] = Self::sides(self.sampling, self.size);
         let down = self.sampling[1] as usize;
-        if y % down != 0 {
+        if !y.is_multiple_of(down) {
             return;
         }
         let row = &mut self.samples[y / down * columns..][..columns];
