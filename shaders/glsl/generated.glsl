@@ -20,6 +20,9 @@
 #define LIGHT_POINT 1u
 #define LIGHT_SPOT 2u
 #define LIGHT_DIRECTIONAL 3u
+#define LIGHT_BODY 4u
+#define SKY_NODES 33u
+#define SKY_LOBES 7u
 #define FRAME_CAMERA_IS_EYE 1u
 #define FRAME_RATE_MAP 2u
 #define FRAME_CHECKERBOARD 4u
@@ -248,6 +251,8 @@ struct Frame {
     uint mover_count;
     uint group_count;
     uint body_nodes;
+    uint lamp_count;
+    float mean_light;
 };
 
 struct Mover {

@@ -29,20 +29,24 @@ vec3 environment_radiance(vec3 d) {
     return environment_texels[y * frame.environment_width + x].rgb;
 }
 
-// Pdf over solid angle with which sample_environment finds the direction `d`, without the choice of the environment among the lights.
-float environment_pdf(vec3 d, vec3 n) {
-    if (ENVIRONMENT_KIND == ENVIRONMENT_NONE) return 0.0;
-    if (ENVIRONMENT_KIND == ENVIRONMENT_CONSTANT) return max(dot(n, d), 0.0) / PI;
+// Pdf over solid angle of the directions of a texel.
+float texel_pdf(uint x, uint y) {
     uint w = frame.environment_width, h = frame.environment_height;
-    vec2 uv = environment_position(d);
-    uint x = min(uint(uv.x * float(w)), w - 1u);
-    uint y = min(uint(uv.y * float(h)), h - 1u);
     float row = environment_texels[w * h + y].x - (y > 0u ? environment_texels[w * h + y - 1u].x : 0.0);
     float column = environment_texels[y * w + x].w - (x > 0u ? environment_texels[y * w + x - 1u].w : 0.0);
     // Texels are constant and rows are sampled uniformly in the cosine of the polar angle.
     float c0 = cos(PI * float(y) / float(h)), c1 = cos(PI * float(y + 1u) / float(h));
     float solid_angle = 2.0 * PI / float(w) * max(c0 - c1, 1e-12);
     return row * column / solid_angle;
+}
+
+// Pdf over solid angle with which sample_environment finds the direction `d`, without the choice of the environment among the lights.
+float environment_pdf(vec3 d, vec3 n) {
+    if (ENVIRONMENT_KIND == ENVIRONMENT_NONE) return 0.0;
+    if (ENVIRONMENT_KIND == ENVIRONMENT_CONSTANT) return max(dot(n, d), 0.0) / PI;
+    uint w = frame.environment_width, h = frame.environment_height;
+    vec2 uv = environment_position(d);
+    return texel_pdf(min(uint(uv.x * float(w)), w - 1u), min(uint(uv.y * float(h)), h - 1u));
 }
 
 LightSample sample_environment(vec3 n, vec2 u) {
@@ -85,7 +89,8 @@ LightSample sample_environment(vec3 n, vec2 u) {
         float sine = sqrt(max(1.0 - cosine * cosine, 0.0));
         float azimuth = ((float(x) + in_column) / float(w) - 0.5) * 2.0 * PI - frame.environment_rotation;
         r.to_light = vec3(sine * sin(azimuth), cosine, -sine * cos(azimuth));
-        r.pdf = environment_pdf(r.to_light, n);
+        // By the texel that was chosen. At its edge the direction is rounded into the next one, whose pdf may be a ten thousandth.
+        r.pdf = texel_pdf(x, y);
         r.radiance = environment_texels[y * w + x].rgb;
         r.valid = r.pdf > 1e-12;
     }

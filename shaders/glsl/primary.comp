@@ -8,22 +8,12 @@
 #define ALPHA_TEST
 #include "bvh.glsl"
 #include "shading.glsl"
+#include "bsdf.glsl"
+#include "relight.glsl"
 
 layout(local_size_x = 8, local_size_y = 8) in;
 
 layout(set = 0, binding = B_TILES, scalar) readonly buffer Tiles { uint tiles[]; };
-
-// Reflectance of the look for uniform white light, approximately. It varies with the texture but not with the light. Light from below the surface
-// itself is lost, whatever the direction of the shading normal: that share of a cosine lobe is (1 - cos) / 2 of the angle between the normals.
-vec3 demodulation(Hit hit, vec3 toward) {
-    Point s = shading_point(hit, toward);
-    float nv = dot(s.n, s.v);
-    float e = HAS_SPECULAR ? directional_albedo(s.table, s.alpha, nv) : 0.0;
-    float m = pow(clamp(1.0 - nv, 0.0, 1.0), 5.0);
-    vec3 metal = s.base + (1.0 - s.base) * m;
-    float above = 0.5 + 0.5 * dot(s.n, s.g);
-    return clamp(mix(e + (1.0 - e) * above * s.base, metal, s.metallic), 0.02, 1.0);
-}
 
 // Method dpm: in every fourth frame a block of 8 x 8 pixels traces all its rays, and takes nothing from the last frame.
 bool asks_anew(uvec2 pixel) {

@@ -285,8 +285,10 @@ uvec2 lit_beside(uvec2 pixel) {
 //
 // A pixel beside a body's edge keeps the history of a point that is in it, although its own ray misses the body. The next frame may bring the pixel
 // back onto the body. The body that is lit beside it would have shown this pixel in the last frame as far away as it did that one.
-bool carry(uvec2 pixel, uint at, bool lit, out History h, out vec3 shift) {
+// `variance` is that of a sample by the histories around without the point's own.
+bool carry(uvec2 pixel, uint at, bool lit, out History h, out vec3 shift, out float variance) {
     shift = vec3(0.0);
+    variance = 0.0;
     uvec2 of = lit ? pixel : lit_beside(pixel);
     if (!lit && of == pixel) return false;
     Place place = place_of(of, of.y * frame.width + of.x);
@@ -295,6 +297,7 @@ bool carry(uvec2 pixel, uint at, bool lit, out History h, out vec3 shift) {
     h = begin_history(place, at);
     if (a.nearest != NO_HIT) {
         History known = former_at(a.nearest);
+        variance = a.count > 1u ? max(a.variance - known.variance, 0.0) / float(a.count - 1u) : 0.0;
         known.frame = frame.frame;
         if (lit) shift = carry_point(h, known, a, place, pixel, at);
         else h = known;
@@ -311,10 +314,11 @@ void main() {
     bool lit = is_lit(surface_at(at));
     History h;
     vec3 shift;
-    bool keeps = carry(pixel, at, lit, h, shift);
+    float variance;
+    bool keeps = carry(pixel, at, lit, h, shift, variance);
     if (lit) {
         set_shift(at, pack_shift(shift));
-        importance = importance_of(h);
+        importance = importance_of(h, variance, luminance(albedo_of(tint_at(at))) * frame.mean_light);
         demand = importance | ((h.flags & HISTORY_EXACT) != 0u ? DEMAND_EXACT : 0u) | (h.used == 0u ? DEMAND_NEW : 0u);
     }
     set_demand(at, demand);

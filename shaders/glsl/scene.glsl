@@ -140,7 +140,7 @@ bool pixel_beside(ivec2 q, out uint index) {
     return nearest == q;
 }
 
-// Reflectance of the surface. Method dpm divides radiance by it before it is stored and filtered.
+// What method dpm divides radiance by before it is kept and filtered: see relight.glsl. Under an even sky it is the reflectance.
 vec3 albedo_of(Tint t) { return vec3(unpackHalf2x16(t.albedo_rg), unpackHalf2x16(t.albedo_b_and_angle).x); }
 
 // Angle at the eye between the gaze point and the surface point, degrees.

@@ -28,6 +28,8 @@ const float LEAST_CORRECTION = 0.5, MOST_CORRECTION = 2.0;
 const float LIKE_NORMAL = 0.6, DEPTH = 3.0;
 // Expected squares of the slopes relative to the light: 2 % a pixel over the raster, and a third over the normal's whole range.
 const float RASTER_SLOPES = 4e-4, NORMAL_SLOPES = 0.1;
+// Squared error of what light is divided by, relative to how it varies around: 5 %.
+const float STEEP = 0.0025;
 // What is left of an unknown is never taken as smaller, so that one can divide by it.
 const float LEAST_PIVOT = 1e-12;
 
@@ -36,7 +38,9 @@ struct Sums {
     float used;     // Number of neighbours.
     float power;    // Weighted squares of their luminance, relative to the pixel's own.
     float expected; // Weighted variances that chance explains.
-    float single;   // Sum of the variances of one sample.
+    float single;   // Sum of the variances of one sample, each relative to the square of what its light is divided by.
+    float plain;    // Sum of the same as they are.
+    vec2 divisor;   // Sums of what their light is divided by, and of its squares.
 };
 
 float sequence_variance(float held) {
@@ -106,7 +110,7 @@ Sums gather(uvec2 pixel, uint at, vec3 own, float tolerated, out Equations a) {
     vec3 along = cross(normal, across);
     float farthest = DEPTH * abs(surface_at(at).distance) * frame.pixel_size;
     a = Equations(vec4(0.0), 0.0, vec4(0.0), vec3(0.0), vec2(0.0), 0.0, vec3(0.0), vec3(0.0), vec3(0.0), vec3(0.0), vec3(0.0));
-    Sums s = Sums(0.0, 0.0, 0.0, 0.0);
+    Sums s = Sums(0.0, 0.0, 0.0, 0.0, 0.0, vec2(0.0));
     [[dont_unroll]] for (int row = -2; row <= 2; row++) {
         WRITTEN_OUT for (int column = -2; column <= 2; column++) {
             ivec2 d = ivec2(column, row);
@@ -144,6 +148,8 @@ Sums gather(uvec2 pixel, uint at, vec3 own, float tolerated, out Equations a) {
             s.used += like ? 1.0 : 0.0;
             s.expected += w * noise;
             s.single += like ? noise * weight : 0.0;
+            s.divisor += like ? vec2(light, light * light) : vec2(0.0);
+            s.plain += like ? noise * weight * light * light : 0.0;
         }
     }
     return s;
@@ -210,12 +216,16 @@ vec3 regressed(uvec2 pixel, uint at, vec3 own) {
     // The structure that the fit misses, around or at this very pixel, against the noise that the eye's mean leaves [Lee80].
     float structure = max(max(s.power - explained, 0.0) / total * s.used / max(s.used - 4.0, 1.0) - s.expected / total, 0.0);
     // A single pixel hardly knows the variance of its samples, so that of the neighbourhood is taken. It does know their number.
-    float held = weight_of(filtered_at(at));
-    float noise = s.single / s.used / max(held, 1e-6);
+    // Beside a highlight it is larger relative to the light than on it, and on a highlight larger as it is: the smaller counts.
+    vec2 held_and_divisor = unpackHalf2x16(filtered_at(at).weight_and_albedo);
+    float held = held_and_divisor.x;
+    float noise = min(s.single, s.plain / (held_and_divisor.y * held_and_divisor.y)) / s.used / max(held, 1e-6);
     float apart = luminance(step_);
     // In the periphery the eye sees flicker better than blur.
     float beyond = periphery(angle_of(tint_at(at)));
     structure = max(structure, apart * apart - mix(3.0, 16.0, beyond) * noise);
+    // What histories are divided by errs the more the steeper it is.
+    structure = max(structure, STEEP * max(s.divisor.y * s.used / (s.divisor.x * s.divisor.x) - 1.0, 0.0));
     // The eye's mean removes what changes from frame to frame. Of a young point that is little, because all its frames share the same samples.
     float changing = min(SEEN_FRAMES * samples_a_frame(), OWN_CHANGING * float(history_noise_at(at).body_and_used & HISTORY_USED));
     noise *= mix(1.0, 5.0, beyond) * held / (held + changing);

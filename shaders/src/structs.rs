@@ -156,6 +156,10 @@ gpu_structs! {
         group_count: u32,
         /// Nodes of the tree over the bodies, for each octant of directions.
         body_nodes: u32,
+        /// Lamps in the light table after its lights: what the light of histories is divided by.
+        lamp_count: u32,
+        /// About the mean radiance of what shines on a surface, as luminance: what the light of histories is divided by is relative to it.
+        mean_light: f32,
     }
 
     /// A body that moves while the planes of a frame last. Motions are those of the whole exposure.
@@ -209,7 +213,7 @@ gpu_structs! {
 
     /// What the light of a pixel is filtered by (method dpm).
     struct Tint {
-        /// Reflectance by which radiance is divided before it is filtered: red and green as halves.
+        /// What radiance is divided by before it is kept and filtered (`relight.glsl`): red and green as halves.
         albedo_rg: u32,
         /// Blue, and the angle at the eye between the gaze point and this point in degrees, as halves.
         albedo_b_and_angle: u32,
@@ -576,6 +580,9 @@ pub const CONSTANTS: &[(&str, u32)] = &[
     ("LIGHT_POINT", LIGHT_POINT),
     ("LIGHT_SPOT", LIGHT_SPOT),
     ("LIGHT_DIRECTIONAL", LIGHT_DIRECTIONAL),
+    ("LIGHT_BODY", LIGHT_BODY),
+    ("SKY_NODES", SKY_NODES),
+    ("SKY_LOBES", SKY_LOBES),
     ("FRAME_CAMERA_IS_EYE", FRAME_CAMERA_IS_EYE),
     ("FRAME_RATE_MAP", FRAME_RATE_MAP),
     ("FRAME_CHECKERBOARD", FRAME_CHECKERBOARD),
@@ -654,6 +661,13 @@ pub const LIGHT_POINT: u32 = 1;
 pub const LIGHT_SPOT: u32 = 2;
 /// Directional light.
 pub const LIGHT_DIRECTIONAL: u32 = 3;
+/// All emissive triangles of a body together, as a lamp: `position` is their centre, `direction` the sum of their areas along their normals,
+/// `range` the area that shines in all directions alike, `intensity` their radiance.
+pub const LIGHT_BODY: u32 = 4;
+/// Nodes along a side of the octahedral map of a filtered sky. The outermost lie on its border, so that maps need no wrapping.
+pub const SKY_NODES: u32 = 33;
+/// Widths of lobes for which the sky is filtered: perceptual roughness from 1/4 to 1 in steps of 1/8. The cosine lobe comes after them.
+pub const SKY_LOBES: u32 = 7;
 /// Ordinary camera: radiance goes back along the primary ray, everything hit is lit (tests).
 pub const FRAME_CAMERA_IS_EYE: u32 = 1;
 /// Rates are decided per tile (\[paper\] section 2.2 and 2.3).

@@ -521,6 +521,8 @@ impl Renderer {
             clamp_indirect: self.settings.clamp_indirect.unwrap_or(f32::MAX),
             ambient: self.settings.drive.ambient,
             light_count: self.data.lights.len() as u32,
+            lamp_count: self.data.lamps.len() as u32,
+            mean_light: self.data.mean_light,
             flags: method.flags()
                 | if self.settings.camera_is_eye { gpu_structs::FRAME_CAMERA_IS_EYE } else { 0 }
                 | if steady { gpu_structs::FRAME_STEADY } else { 0 },

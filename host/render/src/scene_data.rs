@@ -1,6 +1,7 @@
 //! A scene into the flat arrays that the shaders read: BVHs, vertices, materials, texels, lights and the environment.
 
 mod lights;
+mod relight;
 
 use super::body_tree::FEWEST_BODIES;
 use super::deforming_body::DeformingBody;
@@ -129,8 +130,14 @@ pub struct SceneData {
     pub texels: Vec<LinearTexel>,
     /// Emissive triangles and punctual lights with their alias table.
     pub lights: Vec<Light>,
+    /// The strongest of them, all triangles of a body as one: what histories are relit by.
+    pub lamps: Vec<Light>,
+    /// About the mean radiance of what shines on a surface, as luminance; 1 where nothing does.
+    pub mean_light: f32,
     /// Texels of the map with the conditional cdf, then the marginal cdf.
     pub environment: Vec<[f32; 4]>,
+    /// The map filtered by the lobes of materials: what histories are relit by. Empty if the environment is constant.
+    pub filtered_sky: Vec<[f32; 4]>,
     /// Width and height of the map; 0 if the environment is constant.
     pub environment_size: [u32; 2],
     /// Constant radiance.
@@ -239,6 +246,7 @@ impl SceneData {
         let light_power: f32 = powers.iter().sum();
         data.add_environment(scene, radius, light_power);
         data.make_alias_table(&powers);
+        data.add_lamps(radius, &powers);
         Ok(data)
     }
 

@@ -88,8 +88,12 @@ impl SceneGpu {
             materials: rows("materials", cast_slice(&data.materials), false)?,
             textures: Buffer::from_slice(gpu, "texture table", &data.textures)?,
             texels: Buffer::from_slice(gpu, "textures", &data.texels)?,
-            lights: Buffer::from_slice(gpu, "lights", &data.lights)?,
-            environment: Buffer::from_slice(gpu, "environment map", &data.environment)?,
+            lights: Buffer::from_slice(gpu, "lights", &[&data.lights[..], &data.lamps].concat())?,
+            environment: Buffer::from_slice(
+                gpu,
+                "environment map",
+                &[&data.environment[..], &data.filtered_sky].concat(),
+            )?,
             albedo: rows("albedo tables", cast_slice(&data.albedo), false)?,
         })
     }

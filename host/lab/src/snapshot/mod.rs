@@ -58,7 +58,7 @@ pub enum SnapshotImage {
     Motion,
     /// Variance of one sample's luminance.
     Variance,
-    /// Reflectance by which radiance is divided before it is filtered.
+    /// What radiance is divided by before it is kept and filtered: under an even sky the reflectance.
     Albedo,
     /// Normals, world, x y z from -1..1 to 0..1.
     Normal,

@@ -1,5 +1,6 @@
 //! The lights of a scene and its environment, with the tables by which samples find them.
 
+use super::relight::relit_sky;
 use super::{bounded, luminance, SceneData};
 use bytemuck::Zeroable;
 use dpm_scene::{Environment, PunctualKind, Scene};
@@ -55,11 +56,14 @@ impl SceneData {
                 self.environment_rotation = *rotation_rad;
                 self.environment_constant = Vec3::ONE;
                 let mean = self.tabulate_environment(*width as usize, *height as usize, texels);
+                let sky = relit_sky([*width as usize, *height as usize], texels, *rotation_rad);
+                (self.filtered_sky, self.lamps) = (sky.filtered, sky.suns);
                 self.needs.environment_kind =
                     if mean > 0.0 { gpu::ENVIRONMENT_MAP } else { gpu::ENVIRONMENT_NONE };
                 mean
             }
         };
+        self.mean_light = mean;
         if self.needs.environment_kind == gpu::ENVIRONMENT_NONE {
             return;
         }
