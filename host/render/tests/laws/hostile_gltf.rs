@@ -131,8 +131,8 @@ fn documents_that_are_not_gltf() {
 fn extensions_that_cannot_be_done() {
     let required = |name: &str| set("/extensionsRequired", json!([name]));
     assert_refused(vec![
-        ("clearcoat", required("KHR_materials_clearcoat"), &["clearcoat", "extensionsUsed"]),
-        ("unknown", required("ACME_dragons"), &["ACME_dragons", "without it"]),
+        ("a texture format", required("MSFT_texture_dds"), &["MSFT_texture_dds", "re-export with PNG"]),
+        ("unknown", required("ACME_dragons"), &["ACME_dragons", "without it", "extensionsUsed"]),
         (
             "not a list",
             set("/extensionsRequired", json!("KHR_materials_ior")),
