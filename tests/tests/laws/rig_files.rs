@@ -6,9 +6,13 @@ use std::path::Path;
 #[test]
 fn every_rig_file_is_accepted_as_it_stands_and_simulated() {
     let folder = Path::new(concat!(env!("CARGO_MANIFEST_DIR"), "/../rigs"));
-    let entries = std::fs::read_dir(folder).unwrap_or_else(|e| panic!("{}: {e}", folder.display()));
-    let files: Vec<_> = entries.map(|entry| entry.unwrap().path()).collect();
-    assert!(files.len() >= 3, "{files:?}");
+    let files_of = |folder: &Path| -> Vec<_> {
+        let entries = std::fs::read_dir(folder).unwrap_or_else(|e| panic!("{}: {e}", folder.display()));
+        let paths = entries.map(|entry| entry.unwrap().path());
+        paths.filter(|path| path.extension().is_some_and(|e| e == "toml")).collect()
+    };
+    let files = [files_of(folder), files_of(&folder.join("groups"))].concat();
+    assert!(files.len() >= 20, "{files:?}");
     for file in files {
         for simulate in [false, true] {
             let purpose = Purpose { simulate, ..Purpose::default() };

@@ -15,13 +15,13 @@ const UNKNOWNS: usize = 5;
 pub struct FilterPixel {
     /// What the projector's ray met.
     pub surface: Surface,
-    /// Light without albedo.
+    /// Light without what it is divided by.
     pub light: DVec3,
     /// Samples of the history.
     pub weight: f64,
-    /// Variance of the luminance of one sample, with albedo.
+    /// Variance of the luminance of one sample, undivided.
     pub variance: f64,
-    /// Luminance of the albedo.
+    /// Luminance of what light is divided by.
     pub albedo: f64,
     /// Surface point, body space, metres.
     pub position: DVec3,
@@ -110,7 +110,9 @@ impl FilterPicture {
         let along = own.normal.cross(across);
         let mut matrix = [[0.0; UNKNOWNS]; UNKNOWNS];
         let mut right = [DVec3::ZERO; UNKNOWNS];
-        let [mut power, mut expected, mut single, mut total] = [0.0; 4];
+        let [mut power, mut expected, mut total] = [0.0; 3];
+        // Variances of one sample, relative to the squares of what light is divided by, and as they are; sums of what it is divided by.
+        let [mut relative, mut plain, mut divisors, mut squares] = [0.0; 4];
         let around = self.alike(at);
         let used = around.len() as f64;
         if used < 4.0 {
@@ -128,7 +130,10 @@ impl FilterPicture {
             }
             power += w * luminance(apart).powi(2);
             expected += w * noise;
-            single += of_sample;
+            relative += of_sample;
+            plain += of_sample * p.albedo * p.albedo;
+            divisors += p.albedo;
+            squares += p.albedo * p.albedo;
             total += w;
         }
         for (i, slopes) in [4e-4, 4e-4, 0.1, 0.1].into_iter().enumerate() {
@@ -138,11 +143,15 @@ impl FilterPicture {
         let explained: f64 = fit.iter().zip(right).map(|(x, b)| luminance(*x) * luminance(b)).sum();
         let step = fit[UNKNOWNS - 1];
         let missed = (power - explained).max(0.0) / total * used / (used - 4.0).max(1.0);
+        let single = f64::min(relative, plain / (own.albedo * own.albedo));
         let of_mean = single / used / own.weight.max(1e-6);
+        // How uneven the divisor is around, relative to its mean.
+        let steep = (squares * used / (divisors * divisors) - 1.0).max(0.0);
         let beyond = own.periphery;
         let structure = (missed - expected / total)
             .max(0.0)
-            .max(luminance(step).powi(2) - mix(3.0, 16.0, beyond) * of_mean);
+            .max(luminance(step).powi(2) - mix(3.0, 16.0, beyond) * of_mean)
+            .max(0.0025 * steep);
         let changing = (20.0 * self.samples_a_frame).min(0.3 * f64::from(own.body_and_used & HISTORY_USED));
         let noise = of_mean * mix(1.0, 5.0, beyond) * own.weight / (own.weight + changing);
         (own.light + step * (noise / (structure + noise).max(1e-12))).max(DVec3::ZERO)
