@@ -435,7 +435,10 @@ impl OrderFile {
         let device = self.device();
         let held = holding(Some(&**folder), self.others.as_ref(), &self.identity, device)?;
         for Held { told: Told { name, is_own, stands, content }, is_same } in held {
-            if !is_same || !is_own {
+            // Before HELLO nobody has said whether the projector is the one whose serial number the order names: it is lifted
+            // for this port, and given again where that one says HELLO.
+            let is_named = device.is_none() && content.as_ref().is_some_and(|c| c.serial.is_some());
+            if !is_same || !is_own || is_named {
                 let mut content = content
                     .unwrap_or_else(|| Content::new(Order::Safe, &stands.told, "an unknown projector", None));
                 let serial = content.serial().filter(|serial| Some(*serial) == device);

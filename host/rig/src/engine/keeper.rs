@@ -130,12 +130,13 @@ impl LinkKeeper {
         if link.counters().sessions != self.session {
             self.session = link.counters().sessions;
             (self.is_timed, self.map) = (false, None);
-            if let Some(hello) = link.device() {
-                monitor.meet_device(hello.serial);
-            }
             if let Some(reports) = &mut self.reports {
                 reports.new_session();
             }
+        }
+        // A session begins some polls before its projector says HELLO, and nothing is armed before that.
+        if let Some(hello) = link.device() {
+            monitor.meet_device(hello.serial);
         }
         if !steady {
             self.keep_slots(link);

@@ -367,6 +367,9 @@ fn orders_for_two_projectors_at_one_port_stand_side_by_side() {
     file.keep(Order::Safe, By::SerialNumber).unwrap();
     let told = standing_in_folder(&machine.disk, &machine.projector("ttyUSB0")).unwrap();
     assert!(told.order == Order::Safe && told.told.contains("user root over the control socket"), "{told:?}");
+    // ARM before HELLO lifts them for the port alone.
+    start(None).0.forget().unwrap();
+    assert!(!machine.holds("ttyUSB0") && start(Some(one)).1 && start(Some(other)).1);
     // Each is lifted by its own ARM.
     file.forget().unwrap();
     assert!(!start(Some(one)).1 && start(Some(other)).1);
