@@ -166,10 +166,27 @@ pub(crate) fn camera(rig: &Rig, bodies: Bounds, eye: DVec3, raster: Raster) -> O
     let side = if right.dot(eye - ball.centre) > 0.0 { -right } else { right };
     let (aside, above) = (ASIDE_DEG.to_radians(), ABOVE_DEG.to_radians());
     let back = (axis * aside.cos() + side * aside.sin()) * above.cos() + DVec3::Y * above.sin();
-    let scale = (projector - ball.centre).length().max(ball.radius);
-    let around = |centre: DVec3, radius: f64| Bounds::of_ball(Ball { centre, radius }).corners();
-    let shown = [bodies.corners(), around(projector, 0.06 * scale), around(eye, 0.06 * scale)].concat();
+    let scale = reach_of(rig, ball);
+    let head = Bounds::of_ball(Ball { centre: eye, radius: 0.06 * scale });
+    let shown = [bodies.corners(), case_corners(rig, ball), head.corners()].concat();
     fitted(raster, FOV_DEG, back, ball.centre.lerp(projector, 0.4), &shown)
+}
+
+/// How far the projector stands from the bodies, or what fills a room where it stands among them.
+fn reach_of(rig: &Rig, bodies: Ball) -> f64 {
+    (rig.camera.position() - bodies.centre).length().max(bodies.radius)
+}
+
+/// Half of the sides of the projector's case, metres, in a room of this reach.
+fn case_of(reach: f64) -> DVec3 {
+    DVec3::new(0.055, 0.035, 0.075) * reach
+}
+
+/// The corners of the projector's case, whose front is at the lens.
+fn case_corners(rig: &Rig, bodies: Ball) -> [DVec3; 8] {
+    let half = case_of(reach_of(rig, bodies));
+    let case = Bounds { lower: DVec3::Z * half.z - half, upper: DVec3::Z * half.z + half };
+    case.corners().map(|corner| rig.camera.world_from_projector.transform_point3(corner))
 }
 
 /// A thing of the room that a ray meets: how far, its normal, and what colour it has.
@@ -197,8 +214,8 @@ pub(crate) struct Room {
 
 impl Room {
     pub(crate) fn new(rig: &Rig, bodies: Ball, eye: DVec3) -> Self {
-        let reach = (rig.camera.position() - bodies.centre).length().max(bodies.radius);
-        let case = DVec3::new(0.055, 0.035, 0.075) * reach;
+        let reach = reach_of(rig, bodies);
+        let case = case_of(reach);
         // Ten lines or so across the bodies, at a distance that a ruler has.
         let wanted = bodies.radius * 0.35;
         let decade = 10f64.powf(wanted.log10().floor());
@@ -306,7 +323,8 @@ mod tests {
         let bodies = Bounds::around(&rig, (0..4).map(|i| i * 100_000_000)).unwrap();
         for eye in [DVec3::new(0.25, 0.35, 1.0), DVec3::new(-1.0, 1.5, 0.2), DVec3::new(0.0, 0.1, 3.0)] {
             let camera = camera(&rig, bodies, eye, raster).unwrap();
-            for shown in [bodies.ball().centre, rig.camera.position(), eye] {
+            let case = case_corners(&rig, bodies.ball());
+            for shown in [bodies.ball().centre, rig.camera.position(), eye].into_iter().chain(case) {
                 let at = camera.project(shown).unwrap();
                 assert!(
                     at.x > 0.0 && at.y > 0.0 && at.x < 400.0 && at.y < 300.0,
