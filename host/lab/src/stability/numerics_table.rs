@@ -1,4 +1,4 @@
-//! The declarations of the cases into the tables of `docs/NUMERICS.md` and `docs/lab/NUMERICS.md`, and the pages held to them.
+//! The declarations of the cases into the tables of `docs/lab/CASES.md` and `docs/lab/NUMERICS.md`, and the pages held to them.
 
 use super::{cases, gpu, Case};
 use std::collections::BTreeMap;
@@ -77,8 +77,8 @@ fn assert_up_to_date(name: &str, head: &str, rows: impl Fn(&str) -> String) {
 #[test]
 fn the_page_declares_every_case_as_the_code_does() {
     let all = all_cases();
-    assert_up_to_date("NUMERICS.md", DECLARED, |_| declared(&all));
-    assert!(std::fs::read_to_string(page("NUMERICS.md")).unwrap().contains(RENEW));
+    assert_up_to_date("lab/CASES.md", DECLARED, |_| declared(&all));
+    assert!(std::fs::read_to_string(page("lab/CASES.md")).unwrap().contains(RENEW));
 }
 
 #[test]
@@ -93,7 +93,7 @@ fn no_page_names_a_case_that_is_gone() {
     let all = all_cases();
     let groups: Vec<String> =
         all.iter().filter_map(|c| Some(c.name.split_once('-')?.0.to_owned() + "-")).collect();
-    for name in ["NUMERICS.md", "lab/NUMERICS.md"] {
+    for name in ["NUMERICS.md", "lab/CASES.md", "lab/NUMERICS.md"] {
         let text = std::fs::read_to_string(page(name)).unwrap();
         let words = text.split('`').skip(1).step_by(2).filter(|w| groups.iter().any(|g| w.starts_with(g)));
         let gone: Vec<&str> = words
