@@ -360,31 +360,40 @@ impl RigConfig {
         out
     }
 
-    /// The manual `docs/CONFIG.md`.
+    /// The manual `docs/CONFIG.md`: each table once, in the order in which their first keys are declared.
     pub fn manual() -> String {
-        let mut out = String::from(MANUAL_HEAD);
-        let mut section = String::new();
+        let cell = |text: &str| text.replace('|', "\\|");
+        let mut tables: Vec<(String, String)> = Vec::new();
         for key in Self::key_docs() {
             let (table, name) = key.key.rsplit_once('.').unwrap_or(("", &key.key));
-            if table != section {
-                if section == "scene.bodies[]" {
-                    out += &motions();
-                }
-                section = table.to_string();
-                out += &format!(
-                    "\n## {}\n\n| key | type | default | allowed | what it does |\n|---|---|---|---|---|\n",
-                    heading(table)
-                );
-            }
-            let cell = |text: &str| text.replace('|', "\\|");
             let allowed = [key.range.as_str(), key.unit].join(" ");
-            out += &format!(
+            let row = format!(
                 "| `{name}` | {} | `{}` | {} | {} |\n",
                 cell(&key.kind),
                 cell(&key.default),
                 cell(allowed.trim()),
                 cell(&key.doc)
             );
+            match tables.iter().position(|(other, _)| other == table) {
+                Some(at) => tables[at].1 += &row,
+                None => tables.push((table.to_string(), row)),
+            }
+        }
+        let mut out = String::from(MANUAL_HEAD);
+        for (table, rows) in &tables {
+            let alike = |(other, its): &&(String, String)| its == rows && is_variant(other, table);
+            let variants: Vec<&str> = tables.iter().filter(alike).map(|(other, _)| other.as_str()).collect();
+            // Kinds with the same keys in a table share its section.
+            if variants.first() != Some(&table.as_str()) {
+                continue;
+            }
+            out += &format!(
+                "\n## {}\n\n| key | type | default | allowed | what it does |\n|---|---|---|---|---|\n{rows}",
+                heading(&variants)
+            );
+            if table == "scene.bodies[]" {
+                out += &motions();
+            }
         }
         out
     }
@@ -422,13 +431,30 @@ fn motions() -> String {
     out
 }
 
-/// Formats `projector.backend(usb)` as `[projector.backend]` with `kind = "usb"`, a table within it likewise, and
-/// `scene.bodies[]` as `[[scene.bodies]]`.
-fn heading(table: &str) -> String {
-    let of_kind = table.split_once('(').and_then(|(before, rest)| Some((before, rest.split_once(')')?)));
-    match (of_kind, table.strip_suffix("[]")) {
-        (Some((table, (kind, within))), _) => format!("`[{table}{within}]` with `kind = \"{kind}\"`"),
-        (_, Some(list)) => format!("`[[{list}]]`"),
-        _ => format!("`[{table}]`"),
-    }
+/// `tracker(vrpn).transform` as the table, its kind, and what lies within it.
+fn of_kind(table: &str) -> Option<(&str, &str, &str)> {
+    let (before, rest) = table.split_once('(')?;
+    let (kind, within) = rest.split_once(')')?;
+    Some((before, kind, within))
+}
+
+/// Whether two names stand for one table, of whatever kinds.
+fn is_variant(one: &str, other: &str) -> bool {
+    let table = |name| of_kind(name).map(|(before, _, within)| (before, within));
+    one == other || table(one).is_some_and(|one| table(other) == Some(one))
+}
+
+/// Formats `projector.backend(usb)` as `[projector.backend]` with `kind = "usb"`, a table within it likewise, several
+/// kinds one after the other, and `scene.bodies[]` as `[[scene.bodies]]`.
+fn heading(variants: &[&str]) -> String {
+    let kinds: Vec<_> = variants.iter().filter_map(|table| of_kind(table)).collect();
+    let Some((table, kind, within)) = kinds.first() else {
+        let table = variants.first().copied().unwrap_or_default();
+        return match table.strip_suffix("[]") {
+            Some(list) => format!("`[[{list}]]`"),
+            None => format!("`[{table}]`"),
+        };
+    };
+    let others: String = kinds.iter().skip(1).map(|(_, kind, _)| format!(", `\"{kind}\"`")).collect();
+    format!("`[{table}{within}]` with `kind = \"{kind}\"`{others}")
 }
