@@ -37,20 +37,19 @@ section! {
         /// light of "7 6 5 4 3 2 1 0" is over soonest: its centre comes 0.12 ms earlier at 947 frames/s, and so needs
         /// less prediction. Has no effect on planes of equal weights.
         plane_order: BitOrder = BitOrder::default(), "", Any;
-        /// The instant for which each bit plane shows the bodies. "own": the planes of each bit (each plane, if all give equal
-        /// light) are shown where the bodies are while these planes are lit, so that a moving picture is not smeared.
-        /// "frame": all planes show the bodies at the centre of the frame's light, which saves two passes where bodies move.
+        /// The instant for which each bit plane shows the bodies. "own": the planes of each bit (each plane, if all
+        /// give equal light) are shown where the bodies are while these planes are lit, so that a moving picture is not
+        /// smeared. "frame": all at the centre of the frame's light, which saves two passes.
         plane_poses: PlanePoses = PlanePoses::Own, "", Any;
         /// How far the planes of each bit go on the way from the centre of the frame's light to their own instant with
-        /// `plane_poses = "own"`: 1 shows each where the bodies are while it is lit, 0 shows all where they are at the centre.
-        /// An eye that follows a body sees its picture sharpest with 1; one that rests sees a picture that passes with less
-        /// noise if the number is smaller. Change it to 1 if all who watch follow the bodies. The share is that at 947
-        /// frames/s or more. In longer frames the same time is left of the way and not the same share. Planes of equal weights,
-        /// and those that show a whole code value, always go to their own instant.
+        /// `plane_poses = "own"`: 1 shows each where the bodies are while it is lit, 0 shows all where they are at the
+        /// centre. 1 is sharpest for an eye that follows a body; less is less noisy for one that rests. In frames
+        /// longer than a 947th of a second the same time is left of the way, not the same share. Planes of equal
+        /// weights, and those that show a whole code value, always go to their own instant.
         plane_follow: f64 = FOLLOW_SHARE, "", Within(0.0, 1.0);
-        /// Whether the projector is told between frames where the bodies are by now, so that it moves their light while the
-        /// planes are lit. "auto": if it offers that (the link's TRACKS), and not on a serial line. "off": never. Change it to
-        /// "auto" if bodies turn sharply and the projector can; it has not been tried on real hardware.
+        /// Whether the projector gets the places of the bodies between frames, so that it moves their light while the
+        /// planes are lit. "auto": if it offers that (the link's TRACKS), and not on a serial line. Change it to "auto"
+        /// if bodies turn sharply and the projector can; it has not been tried on real hardware.
         tracks: TracksUse = TracksUse::Off, "", Any;
         /// Position of the projector's lens in the world. Measure it, or give `calibration` instead.
         position: [f64; 3] = [0.0, 0.35, 1.1], "m", Within(-1e6, 1e6);
@@ -61,9 +60,8 @@ section! {
         /// Full angle of view across the raster's width. Change it to match the lens.
         horizontal_fov_deg: f64 = 30.0, "deg", Within(0.1, 170.0);
         /// A calibration file that replaces `position`, `look_at`, `up` and `horizontal_fov_deg`: OpenCV FileStorage
-        /// XML, YAML or JSON (also as mapamok, ProCamCalib, procam-calibration, scan3d-capture, slstudio, kalibr and ROS
-        /// name the entries, also in gzip), or MPCDI with profile sl. If the file names a raster, it must have this one's shape; the view is scaled. Use it for every
-        /// real rig.
+        /// XML, YAML or JSON in any dialect of docs/CALIBRATION.md, or MPCDI with profile sl. If the file names a
+        /// raster, it must have this one's shape; the view is scaled. Use it for every real rig.
         calibration: Option<PathBuf> = None, "", NotEmpty;
         /// Unit of the lengths in the calibration file; its numbers do not show it. Required with `calibration`.
         calibration_unit: Option<CalibrationUnit> = None, "", Any;
@@ -88,8 +86,8 @@ section! {
         /// How much light a code value gives. Binary planes of calibrated LEDs are linear; a display's are not.
         response: ResponseConfig = ResponseConfig::default(), "", Any;
         /// A picture of a white field, as measured on a surface at an even distance (linear PNG with 8 or 16 bits, or
-        /// PFM; its size need not be the raster's). Pixels that are darker than the brightest one are driven harder,
-        /// so that an even picture is even; `max_intensity` is that of the brightest.
+        /// PFM, of any size). Pixels that are darker than the brightest one are driven harder; `max_intensity` is that
+        /// of the brightest.
         flat_field: Option<PathBuf> = None, "", NotEmpty;
         /// Time by which light falls later than the projector reports. Set it if a check shows that light trails the
         /// motion whatever the tracker.

@@ -16,10 +16,9 @@ section! {
         /// Position of the eye if it is not tracked, and until the tracker has seen it.
         position: [f64; 3] = [0.25, 0.35, 1.0], "m", Within(-1e6, 1e6);
         /// The rigid body that carries the eye, for example glasses, by the name under which the tracker reports it. It
-        /// needs neither a node of the scene nor a mesh, and is no entry of `scene.bodies`. A table says more than the name:
-        /// `{ name = "glasses", id = 7 }` for a tracker that has numbers and no names, and
-        /// `{ name = "glasses", motion = { kind = "sway", peak_rate_rad_s = 1, peak_acceleration_rad_s2 = 4 } }` for the mock,
-        /// with which it stands at `position` without a motion.
+        /// is no entry of `scene.bodies`. A table has more: `{ name = "glasses", id = 7 }` for a tracker that has
+        /// numbers and no names, and `{ name = "glasses", motion = { kind = "sway", peak_rate_rad_s = 1,
+        /// peak_acceleration_rad_s2 = 4 } }` for the mock, with which it stands at `position` without a motion.
         tracked: Option<Wearable> = None, "", Any;
         /// The same by one of `scene.bodies[].name`, whose mesh is then never lit; `tracked` needs no mesh.
         body: Option<String> = None, "", NotEmpty;
@@ -182,21 +181,19 @@ section! {
         /// axes are seldom those of the glTF node. `dpm calibrate body` measures it. The mock tracker reports the mesh
         /// itself and ignores it.
         mesh_to_body: PoseConfig = PoseConfig::default(), "", Any;
-        /// A picture that its mesh shows in the place of its file's colours: PNG, JPEG or KTX2; or an
-        /// animated PNG, whose pictures follow each other over and over. It lies over the texture coordinates that the
-        /// textures of its mesh use, and repeats. What else its materials say stays: roughness, metal,
-        /// bumps. An unlit material shows the picture as it is. Large pictures cost memory, not time.
-        /// `pipe:` with the path of a named pipe, or `pipewire:` with the name or number of a node, shows what another
-        /// program makes while the rig runs (docs/SCENES.md).
+        /// A picture that its mesh shows in the place of its file's colours: PNG, JPEG or KTX2, or an animated PNG,
+        /// which plays over and over. It lies over the texture coordinates that the textures of its mesh use, and
+        /// repeats. `pipe:` with the path of a named pipe, or `pipewire:` with the name or number of a node, shows what
+        /// another program makes while the rig runs (docs/SCENES.md).
         texture: Option<PictureSource> = None, "", Any;
         /// Columns and rows that pictures of another program have on the body. Others are fitted to it.
         texture_size: [u32; 2] = [512, 512], "texels", Within(1, 4096);
         /// Albedo of its real surface, if it differs from `scene.surface_albedo`: one number, or one for each channel. With
         /// `albedo_map` it is a factor for the picture, 1 if left out.
         albedo: Option<PerChannel> = None, "", Each(0.01, 1.0);
-        /// A picture of the albedo of its real surface, for example of what is printed on it: PNG with 8 or 16 bits, or PFM.
-        /// It lies over the texture coordinates that the textures of its mesh use, as these do, and repeats. Values below
-        /// 0.01 count as 0.01. All pictures of a rig together may have 8 million pixels (8388608).
+        /// A picture of the albedo of its real surface, for example of what is printed on it: PNG with 8 or 16 bits, or
+        /// PFM, over the texture coordinates of its mesh. Values below 0.01 count as 0.01. All pictures of a rig
+        /// together may have 8 million pixels (8388608).
         albedo_map: Option<PathBuf> = None, "", NotEmpty;
         /// What the numbers of a PNG in `albedo_map` mean; those of a PFM are linear.
         albedo_map_encoding: AlbedoEncoding = AlbedoEncoding::Srgb, "", Any;

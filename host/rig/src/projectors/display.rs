@@ -34,9 +34,9 @@ section! {
         encoding: DisplayEncoding = DisplayEncoding::Rgb8, "", Any;
         /// The graphics card's device file; the first with such a connector if left out.
         card: Option<PathBuf> = None, "", NotEmpty;
-        /// Whether a desktop is asked to lend the connector. "auto" takes the card where no other program drives it, and
-        /// else asks the desktop that the environment names: by WAYLAND_DISPLAY, or else by DISPLAY. "off" asks none. "x11"
-        /// and "wayland" ask at once. docs/DISPLAY.md says what a desktop lends.
+        /// Whether a desktop is asked to lend the connector (docs/DISPLAY.md). "auto" takes the card where no other
+        /// program drives it, and else asks the desktop of WAYLAND_DISPLAY, or else of DISPLAY. "off" asks none. "x11"
+        /// and "wayland" ask at once.
         lease: DisplayLease = DisplayLease::Auto, "", Any;
         /// How long before its vertical blank a frame is chosen and written. Half a frame and at most 8000 if left out.
         /// Raise it if the report counts repeated frames although frames were there in time; each microsecond is one
