@@ -366,14 +366,13 @@ impl RigConfig {
         let mut tables: Vec<(String, String)> = Vec::new();
         for key in Self::key_docs() {
             let (table, name) = key.key.rsplit_once('.').unwrap_or(("", &key.key));
+            let kind = key.kind.strip_prefix("a ").or(key.kind.strip_prefix("an ")).unwrap_or(&key.kind);
             let allowed = [key.range.as_str(), key.unit].join(" ");
-            let row = format!(
-                "| `{name}` | {} | `{}` | {} | {} |\n",
-                cell(&key.kind),
-                cell(&key.default),
-                cell(allowed.trim()),
-                cell(&key.doc)
-            );
+            let value = match allowed.trim() {
+                "" => cell(kind),
+                allowed => cell(&format!("{kind}, {allowed}")),
+            };
+            let row = format!("| `{name}` | `{}` | {value} | {} |\n", cell(&key.default), cell(&key.doc));
             match tables.iter().position(|(other, _)| other == table) {
                 Some(at) => tables[at].1 += &row,
                 None => tables.push((table.to_string(), row)),
@@ -388,7 +387,7 @@ impl RigConfig {
                 continue;
             }
             out += &format!(
-                "\n## {}\n\n| key | type | default | allowed | what it does |\n|---|---|---|---|---|\n{rows}",
+                "\n## {}\n\n| key | default | value | what it does |\n|---|---|---|---|\n{rows}",
                 heading(&variants)
             );
             if table == "scene.bodies[]" {
