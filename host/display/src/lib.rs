@@ -4,9 +4,9 @@
 //! A display is the firmware of [`dpm_device::projector`] with the vertical blanks as its clock: one slot of the link is one
 //! blank. [`mode`] says what a mode is, [`set_up`] chooses connector, mode and properties or says why not, [`encoding`] puts
 //! planes into pixels, [`pacer`] follows the blanks, [`panel`] is the state machine, and [`transport`] its thread at the end
-//! of an in-process cable. [`scan_out`] is what a panel asks of what shows its pictures, [`kms`] what is asked of the kernel
-//! besides, [`card`] the kernel, [`lease`] asks a desktop for a part of a card, [`fake`] the one of tests, [`dlpc900`] a controller that the display feeds, and [`window`] a
-//! window for a desk without a projector.
+//! of an in-process cable. [`scan_out`] is the trait that a panel draws through, [`kms`] the other calls of the kernel,
+//! [`card`] the real kernel, [`fake`] the kernel of tests. [`lease`] asks a desktop for a part of a card, [`dlpc900`] is a
+//! controller that the display feeds, and [`window`] a window for a desk without a projector.
 //!
 //! **Nothing of this has run on real hardware yet.**
 

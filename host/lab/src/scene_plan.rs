@@ -25,7 +25,7 @@ pub struct PlanEntry {
     pub feature: &'static str,
     /// Something in the rig calls for it.
     pub needed: bool,
-    /// It is left out of what runs. Never true of what is needed; false for what is not needed but kept.
+    /// It is left out of what runs. True only for parts that are not needed and were removed.
     pub left_out: bool,
     /// The rig file switched it off; the method would have it.
     pub switched_off: bool,

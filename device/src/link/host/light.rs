@@ -181,10 +181,10 @@ mod tests {
         }
     }
 
-    /// A device that has no frame of its own for a slot shows the one before, and its limiter counts the slot: so does the
-    /// host's, and strikes first, however many slots its frames are held for, whenever the device was armed, and however dim
-    /// the light: what is an eighth of full falls by less than a tenth where a darkness is shared out over two averages. Nor
-    /// does it matter who makes it dark.
+    /// When a slot has no new frame, the device repeats the last one, and its flash limiter counts the slot. The host's
+    /// limiter counts the same slots and must trigger first, for any hold time, arming time, brightness and cause of the
+    /// dark. Dim light is the hard case: an eighth of full falls by less than a tenth where a dark slot is shared by two
+    /// averages.
     #[test]
     fn the_host_counts_flashes_as_often_as_the_device_and_strikes_first() {
         for (rate, limit) in [(60, 3), (240, 3), (947, 3), (2000, 1)] {

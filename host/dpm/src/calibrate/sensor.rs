@@ -523,7 +523,7 @@ mod tests {
         assert_eq!(rests.carried_too_few(&other, 0.5, 120.0), None);
     }
 
-    /// Who goes on at a lower rate is told how long a place takes now, and has time for half as many again as are needed.
+    /// At a lower rate the operator sees the new time per place, and the recording allows half as many places again.
     #[test]
     fn a_lower_rate_asks_for_longer_rests_and_leaves_time_for_them() {
         let code = InverseCode::new(dpm_device::planes::Raster::new(128, 96).unwrap());

@@ -1,8 +1,8 @@
 //! Measured groups into what can be said of dpm beside the other methods: at equal rays and at equal time, group by group, the worst group
 //! beside the best.
 //!
-//! Every ratio is told as measured first, then with the reference's own error taken off both sides, then what it would be with either run
-//! of either method: two runs are no statistics, but a claim that one of the four breaks is none.
+//! Every ratio stands as measured first, then with the reference's own error taken off both sides, then as it would be with either run
+//! of either method. Two runs do not give statistics, but a claim that fails in one of the four pairings is rejected.
 
 use super::report::{best_other, dpm_of, least_flicker};
 use super::runs::{is_other, EqualTime, ErrorRow, GroupResult};

@@ -128,7 +128,7 @@ pub struct CaseResult {
     pub seed: u64,
     /// How long it took.
     pub wall_s: f64,
-    /// Why there is no error value: a panic, a number that is none, or what is missing.
+    /// Why there is no error value: the case panicked, returned NaN, or lacked something that it needs.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub note: Option<String>,
 }

@@ -93,7 +93,7 @@ mod tests {
             let shortage = left(kb(failed), 0, threads).expect_err("refused");
             assert!(shortage.needed > shortage.limit && shortage.limit == kb(failed));
         }
-        // What is in use already is not there for Vulkan, and what is left over is there for buffers.
+        // Address space in use is not available to Vulkan; the remainder is available for buffers.
         let whole = left(kb(4_000_000), 0, 2).unwrap();
         assert_eq!(left(kb(4_000_000), 1000, 2), Ok(whole - 1000));
         assert!(left(kb(4_000_000), kb(4_000_000), 2).is_err());

@@ -43,9 +43,9 @@ section! {
         plane_poses: PlanePoses = PlanePoses::Own, "", Any;
         /// How far the planes of each bit go on the way from the centre of the frame's light to their own instant with
         /// `plane_poses = "own"`: 1 shows each where the bodies are while it is lit, 0 shows all where they are at the
-        /// centre. 1 is sharpest for an eye that follows a body; less is less noisy for one that rests. In frames
-        /// longer than a 947th of a second the same time is left of the way, not the same share. Planes of equal
-        /// weights, and those that show a whole code value, always go to their own instant.
+        /// centre. 1 is sharpest for an eye that follows a body; less is less noisy for one that rests. At 947 frames/s
+        /// and above the value is a fraction of the way; at lower rates the planes stop the same time short of it.
+        /// Planes of equal weights, and those that show a whole code value, always go to their own instant.
         plane_follow: f64 = FOLLOW_SHARE, "", Within(0.0, 1.0);
         /// Whether the projector gets the places of the bodies between frames, so that it moves their light while the
         /// planes are lit. "auto": if it offers that (the link's TRACKS), and not on a serial line. Change it to "auto"

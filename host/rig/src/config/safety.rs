@@ -18,10 +18,11 @@ section! {
         /// it is 50 ms or three frames, whichever is longer.
         watchdog_ms: Option<u32> = None, "ms", Within(1, 10_000);
         /// Prediction extends a body's track for at most this long, from the tracker's newest sample to the middle of
-        /// the light; then its light goes off. A frame that would be lit later than that plus one slot is not sent, and
-        /// one that is late on its way or shown again goes dark at that age, but not within three slots of its own. If
-        /// left out: the tracker's latency, two of its samples, the time from latch to light and two slots, at least 20
-        /// ms. A value in the file is binding: a rig whose frames take longer stays dark and reports it.
+        /// the light; then its light goes off. A frame that would be lit later than that plus one slot is not sent. A
+        /// frame that arrives late or is repeated goes dark when its poses reach this age, but never sooner than three
+        /// slots after its own. If left out: the tracker's latency, two of its samples, the time from latch to light
+        /// and two slots, at least 20 ms. A value in the file is binding: a rig whose frames take longer stays dark and
+        /// reports it.
         predict_ms: Option<u32> = None, "ms", Within(0, 1_000);
         /// Permitted general flashes of the whole picture per second; beyond this the projector rests in the dark for
         /// two seconds. WCAG 2.3.1 allows 3; 0 is off.
