@@ -10,9 +10,8 @@ use std::path::PathBuf;
 section! {
     /// What `dpm calibrate` measured.
     pub struct CalibrationConfig {
-        /// The file that `dpm calibrate` writes. Each part that it has takes the place of keys of this file: the
-        /// projector's lens and pose of `projector.position`, `look_at`, `up`, `horizontal_fov_deg` and `calibration`;
-        /// bodies of `scene.bodies[].mesh_to_body`; the latency of `tracker.latency_us`; light of
+        /// The file that `dpm calibrate` writes. Its parts take the place of `projector.position`, `look_at`, `up`,
+        /// `horizontal_fov_deg` and `calibration`; of `scene.bodies[].mesh_to_body`; of `tracker.latency_us`; of
         /// `projector.response` and `projector.flat_field`, and of the channels' shares of `projector.max_intensity`.
         file: Option<PathBuf> = None, "", NotEmpty;
     }

@@ -23,9 +23,8 @@ section! {
         /// Frames per second, as a whole number or as a fraction in a string, for example "60000/1001". Change it to
         /// the rate at which the projector is driven.
         frame_rate: FrameRate = FrameRate::new(947, 1).expect("not zero"), "frames/s", Within(Rate(1, 1), Rate(100_000, 1));
-        /// Bit planes in a frame. 24 planes are eight bits of red, green and blue. 8 planes are eight bits of one
-        /// white channel, which shows the green of the picture; this gives a monochrome rig three times the frame
-        /// rate.
+        /// Bit planes in a frame: 24 are eight bits of red, green and blue; 8 are eight bits of one white channel,
+        /// which shows the green of the picture at three times the frame rate.
         planes: u32 = 24, "", OneOf(&[8, 24]);
         /// How much light the planes of a channel give: "binary" halves it from plane to plane, so that their bits are the
         /// code value; "equal" gives every plane the same, and shows grey as a halftone of mirrors and planes. Change it
@@ -75,9 +74,8 @@ section! {
         calibration_device: Option<String> = None, "", NotEmpty;
         /// Pose in the world of the camera that made the calibration file.
         calibration_camera: Option<CalibrationCameraConfig> = None, "", Any;
-        /// Columns and rows of the raster that the calibration file refers to; the projector's own if left out. The
-        /// file's view is kept if `width` and `height` differ, for example to trace fewer pixels (`--raster` then
-        /// sets this key).
+        /// Columns and rows of the raster that the calibration file refers to; the projector's own if left out. Its
+        /// view is kept if `width` and `height` differ (`--raster` sets this key).
         calibration_raster: Option<[u32; 2]> = None, "px", Within(1, Raster::MAX_SIDE);
         /// Radiant intensity of one pixel at full drive, in scene units: one number, or one for each channel. The
         /// scene's radiance 1 needs `pi * d^2 / albedo` at distance d. Raise it if the report says that light is

@@ -201,8 +201,8 @@ section! {
         affinity: Vec<u32> = Vec::new(), "", Any;
         /// Keep all memory resident, so that no page fault delays a frame.
         lock_memory: bool = false, "", Any;
-        /// Keep idle cores from deep sleep while the rig runs, for all programs of this machine: a stage that waits then
-        /// starts within microseconds. It costs power. If the right is refused, the run warns once.
+        /// Keep idle cores from deep sleep while the rig runs, for all programs of this machine, so that a stage that
+        /// waits starts within microseconds. It costs power. If the right is refused, the run warns once.
         keep_awake: bool = true, "", Any;
         /// How stages wait for each other.
         wait: Wait = Wait::Auto, "", Any;
@@ -240,8 +240,8 @@ section! {
     pub struct RunConfig {
         /// Frames to light; 0 runs until stopped.
         frames: u64 = 0, "frames", Any;
-        /// Duration in seconds, counted from the first frame; 0 is no limit. At real pace these are seconds of the
-        /// wall clock, however many frames that makes; at virtual pace they are seconds of the rig's own clock.
+        /// Duration in seconds from the first frame, of the wall clock at real pace, of the rig's own clock at virtual
+        /// pace; 0 is no limit.
         seconds: f64 = 0.0, "s", Within(0.0, 1e9);
     }
 }

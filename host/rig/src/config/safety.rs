@@ -31,9 +31,8 @@ section! {
         /// Otherwise the run refuses to start and names them. Set it once, on the command line, when the cause is
         /// gone.
         acknowledge_faults: bool = false, "", Any;
-        /// Whether a run makes light as soon as it can, or stays dark until somebody gives ARM. "by hand" holds for
-        /// every start of the program, also that after a failure. The packaged service starts by hand
-        /// (docs/ORDERS.md).
+        /// Whether a run makes light as soon as it can, or stays dark until somebody gives ARM, at every start of the
+        /// program. The packaged service starts by hand (docs/ORDERS.md).
         start: Restart = Restart::ByItself, "", Any;
         /// How much light is permitted; docs/SAFETY.md says what that does for people and what it does not.
         limits: LimitsConfig = LimitsConfig::default(), "", Any;

@@ -72,15 +72,13 @@ section! {
     pub struct SceneConfig {
         /// A glTF 2.0 file (`.glb` or `.gltf`), or an OBJ, PLY or STL file; replaces `builtin`.
         file: Option<PathBuf> = None, "", NotEmpty;
-        /// Length that a unit of `file` stands for. If left out, it is 1 for glTF. OBJ, PLY and STL name no unit: there it
-        /// is guessed from the size, and the program says what it took.
+        /// Length that a unit of `file` stands for. If left out, it is 1 for glTF, and guessed from the size for OBJ,
+        /// PLY and STL, with a note.
         scale: Option<f64> = None, "m", Within(1e-9, 1e6);
-        /// The axis of `file` that points up. If left out, it is `y` for glTF, OBJ and PLY, and `z` for STL; the program
-        /// says so for formats that name none.
+        /// The axis of `file` that points up. If left out, it is `y` for glTF, OBJ and PLY, and `z` for STL.
         up: Option<FileAxis> = None, "", Any;
-        /// Which animation of a glTF file plays, over and over: `first`, `none`, or its name. It moves nodes; each that has
-        /// surfaces is a body of its own, at most 128. It deforms skins, shapes and sizes, at most 32 meshes. Its time is
-        /// that of the light.
+        /// Which animation of a glTF file plays, over and over: `first`, `none`, or its name (docs/SCENES.md). Its time
+        /// is that of the light.
         animation: String = "first".into(), "", NotEmpty;
         /// How fast it plays; 1 is the file's own time.
         animation_speed: f64 = 1.0, "", Within(0.001, 1000.0);
@@ -197,9 +195,9 @@ section! {
         albedo_map: Option<PathBuf> = None, "", NotEmpty;
         /// What the numbers of a PNG in `albedo_map` mean; those of a PFM are linear.
         albedo_map_encoding: AlbedoEncoding = AlbedoEncoding::Srgb, "", Any;
-        /// How it moves if the tracker is the mock, for example `{ kind = "translate", speed_m_s = 1.0 }`; the kinds
-        /// are listed below. If left out, the first body moves back and forth at 1 m/s, the second rotates in place,
-        /// and the others stand still.
+        /// How it moves if the tracker is the mock, for example `{ kind = "translate", speed_m_s = 1.0 }` (below). If
+        /// left out, the first body moves back and forth at 1 m/s, the second rotates in place, and the others stand
+        /// still.
         motion: MotionValue = MotionValue::default(), "", Any;
     }
 }

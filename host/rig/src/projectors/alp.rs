@@ -21,8 +21,8 @@ section! {
         /// How long the planes of a frame are lit. With "equal" write `projector.weights` = "equal", so that grey is
         /// made of equal planes, or dim the light source from plane to plane.
         weights: AlpWeights = AlpWeights::Equal, "", Any;
-        /// Slots for which a frame is lit if the host is late with the next one. The device shows it so often by itself, and no longer:
-        /// it is also the longest time of light after the host has died.
+        /// Slots for which a frame is lit if the host is late with the next one. It is also the longest time of light
+        /// after the host has died.
         slots_per_sequence: u32 = 1, "slots", Within(1, 3);
         /// Frames that may wait in the device's memory; fewer, if it holds fewer.
         frames_in_flight: u32 = 4, "frames", Within(1, 60);

@@ -26,9 +26,9 @@ section! {
     pub struct DisplayConfig {
         /// The connector, as `dpm display` lists them, for example "HDMI-A-1"; the only one with a display if left out.
         connector: Option<String> = None, "", NotEmpty;
-        /// The mode: a size and a rate that the display offers, or a timing of one's own, as in "138.51 1920 1968 2000
-        /// 2080 1080 1083 1088 1111 +hsync -vsync" (MHz, row, frame, pulses). `projector.width`, `height` and
-        /// `frame_rate` must be exactly the mode's; `dpm display` prints what to write.
+        /// A size and a rate that the display offers, or a timing of one's own, as in "138.51 1920 1968 2000 2080 1080
+        /// 1083 1088 1111 +hsync -vsync" (MHz, row, frame, pulses). `projector.width`, `height` and `frame_rate` must
+        /// be exactly the mode's; `dpm display` prints what to write.
         mode: String = "1920x1080@60".into(), "", NotEmpty;
         /// What the bits of a pixel mean.
         encoding: DisplayEncoding = DisplayEncoding::Rgb8, "", Any;

@@ -21,8 +21,8 @@ section! {
         /// full link. Together they must fit into the kernel's `usbfs_memory_mb`.
         transfers_in_flight: u32 = 2, "frames", Within(1, 64);
         /// How planes are compacted. "auto" chooses for each plane the smallest of raw, RLE, XOR with the previous
-        /// frame + RLE, and LZ4, and does not send planes that have not changed. A list permits only those codecs.
-        /// "raw" saves the host's time on a link that can carry every frame (`dpm link-test` shows whether it can).
+        /// frame + RLE, and LZ4, and does not send unchanged planes. A list permits only those codecs. "raw" saves the
+        /// host's time on a link that can carry every frame (`dpm link-test`).
         compaction: Compaction = Compaction::Auto, "", Any;
     }
 }
