@@ -375,7 +375,7 @@ mod tests {
     }
 
     #[test]
-    #[ignore = "it prints figures of docs/RENDERING.md"]
+    #[ignore = "it prints figures of docs/lab/H100.md"]
     fn shares_of_the_demo() {
         for body in crate::builtin().bodies.iter().filter(|body| body.tracked.is_some()) {
             let triangles = corners(&body.mesh);
