@@ -1,6 +1,7 @@
-//! The rig's events for one viewer, as server-sent events: the state four times a second, figures when there are new
+//! The rig's events for one viewer, as server-sent events: the state and the places of the room five times a second, figures when there are new
 //! ones, notes, and pictures. What a slow viewer has no room for is never made.
 
+use crate::room;
 use crate::shared::Viewer;
 use crate::site::Site;
 use crate::state::State;
@@ -79,6 +80,9 @@ impl Events {
             if is_new || self.ticks == 0 {
                 self.event(&mut text, "figures", &state.to_json().figures);
                 self.figures = state.figures;
+            }
+            if let Some(places) = room::places(&shared) {
+                self.event(&mut text, "room", &places);
             }
             let mark = shared.monitor.parameters().mark();
             if mark != self.parameters || self.ticks == 0 {

@@ -21,6 +21,7 @@ pub mod probe;
 pub mod proof;
 mod query;
 pub mod rigs;
+mod room;
 mod routes;
 mod server;
 mod shared;

@@ -33,10 +33,11 @@ const CALIBRATION: &str = include_str!("calibration.html");
 const RIGS: &str = include_str!("rigs/rigs.html");
 /// What stands for that number in a page, and for what pages share.
 const NONCE: &str = "{{nonce}}";
-const SHARED: [(&str, &str); 3] = [
+const SHARED: [(&str, &str); 4] = [
     ("{{style}}", include_str!("shared.css")),
     ("{{script}}", include_str!("shared.js")),
     ("{{key}}", include_str!("key.js")),
+    ("{{room}}", include_str!("room.js")),
 ];
 /// Longest page of a flight, bytes.
 const MAX_FLIGHT_BYTES: u64 = 1 << 20;
@@ -223,6 +224,20 @@ async fn of_run(
         }
         "/api/state" => json(StatusCode::OK, &fresh(shared).await.to_json()),
         "/api/parameters" => json(StatusCode::OK, &shared.monitor.parameters().shown()),
+        "/api/room" => match shared.monitor.live().rig() {
+            Some(rig) => {
+                // A scan of a million triangles takes a moment, and an order must not wait for it.
+                let (shared, rig) = (shared.clone(), rig.clone());
+                let made = tokio::task::spawn_blocking(move || {
+                    shared.room.get_or_init(|| crate::room::shapes(&rig)).clone()
+                });
+                match made.await {
+                    Ok(shapes) => json(StatusCode::OK, &shapes),
+                    Err(_) => plain(StatusCode::SERVICE_UNAVAILABLE, "the program ends"),
+                }
+            }
+            None => plain(StatusCode::SERVICE_UNAVAILABLE, "the run has not begun"),
+        },
         "/api/events" => match shared.viewer() {
             Some(viewer) => {
                 connection.now_does(Doing::Views);
@@ -240,7 +255,7 @@ async fn of_run(
         },
         _ if path.starts_with("/api/flights/") => flight(path, shared).await,
         _ => {
-            let known = "there is /, /calibration, /metrics, /api/state, /api/parameters, /api/calibration and /api/events";
+            let known = "there is /, /calibration, /metrics, /api/state, /api/room, /api/parameters, /api/calibration and /api/events";
             plain(StatusCode::NOT_FOUND, known)
         }
     }

@@ -6,7 +6,7 @@ use dpm_rig::control::orders::Orders;
 use dpm_rig::telemetry::monitor::RunMonitor;
 use dpm_rig::telemetry::notes::Notes;
 use std::sync::atomic::{AtomicUsize, Ordering};
-use std::sync::Arc;
+use std::sync::{Arc, OnceLock};
 use std::time::Instant;
 
 /// A run as every request about it may use it.
@@ -16,6 +16,8 @@ pub(crate) struct Shared {
     pub(crate) notes: Arc<Notes>,
     pub(crate) pictures: Pictures,
     pub(crate) began: Instant,
+    /// The shapes of [`crate::room`], once somebody has asked for them.
+    pub(crate) room: OnceLock<serde_json::Value>,
     viewers: AtomicUsize,
 }
 
@@ -26,7 +28,7 @@ impl Shared {
         notes: Arc<Notes>,
         pictures: Pictures,
     ) -> Self {
-        Self { monitor, orders, notes, pictures, began: Instant::now(), viewers: AtomicUsize::new(0) }
+        Self { monitor, orders, notes, pictures, began: Instant::now(), room: OnceLock::new(), viewers: AtomicUsize::new(0) }
     }
 
     /// A place among the viewers; `None` if all are taken.

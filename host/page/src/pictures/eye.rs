@@ -1,7 +1,7 @@
 //! What falls on the bodies, and what the observer sees of it, as small pictures of linear light.
 
 use super::depth::{small, DepthBuffer};
-use super::mesh::CoarseMesh;
+use super::mesh::{CoarseMesh, CELLS};
 use dpm_device::planes::Raster;
 use dpm_device::projector::light_of_planes;
 use dpm_rig::rig::Rig;
@@ -45,7 +45,7 @@ impl Eye {
         Self {
             rig: rig.clone(),
             raster: small(rig.camera.raster),
-            meshes: meshes.map(|(i, b)| (i, CoarseMesh::of(&b.mesh))).collect(),
+            meshes: meshes.map(|(i, b)| (i, CoarseMesh::of(&b.mesh, CELLS))).collect(),
             codes: Vec::new(),
             poses: Vec::new(),
             from_eye: DepthBuffer::default(),

@@ -1,15 +1,15 @@
-//! A body's mesh with few triangles, for small pictures.
+//! A body's mesh with few triangles, for small pictures and for the room.
 
 use dpm_scene::TriangleMesh;
 use glam::{DVec3, Vec2, Vec3};
 use std::collections::HashMap;
 
-/// Cells along the longest side of a mesh: about half a pixel of the picture where the body fills it.
-const CELLS: f32 = 96.0;
+/// Cells along the longest side of a mesh in a picture: about half a pixel where the body fills it.
+pub(super) const CELLS: f32 = 96.0;
 
 /// Positions and normals in the body's space, metres, and triangles.
 #[derive(Clone, Debug, Default)]
-pub(super) struct CoarseMesh {
+pub(crate) struct CoarseMesh {
     pub positions: Vec<Vec3>,
     pub normals: Vec<Vec3>,
     pub triangles: Vec<[u32; 3]>,
@@ -21,8 +21,8 @@ pub(super) struct CoarseMesh {
 }
 
 impl CoarseMesh {
-    /// Merges the vertices of `mesh` that share a cell of a grid.
-    pub(super) fn of(mesh: &TriangleMesh) -> Self {
+    /// Merges the vertices of `mesh` that share a cell of a grid, of which there are `cells` along its longest side.
+    pub(crate) fn of(mesh: &TriangleMesh, cells: f32) -> Self {
         let (mut lower, mut upper) = (Vec3::INFINITY, Vec3::NEG_INFINITY);
         for p in &mesh.positions {
             lower = lower.min(*p);
@@ -31,8 +31,8 @@ impl CoarseMesh {
         if !lower.is_finite() {
             return Self::default();
         }
-        let side = ((upper - lower).max_element() / CELLS).max(f32::MIN_POSITIVE);
-        let mut cells: HashMap<[i32; 3], u32> = HashMap::new();
+        let side = ((upper - lower).max_element() / cells).max(f32::MIN_POSITIVE);
+        let mut known: HashMap<[i32; 3], u32> = HashMap::new();
         let mut sums: Vec<(Vec3, Vec3, f32)> = Vec::new();
         let cell_of: Vec<u32> = mesh
             .positions
@@ -40,7 +40,7 @@ impl CoarseMesh {
             .zip(&mesh.normals)
             .map(|(p, n)| {
                 let at = ((*p - lower) / side).floor();
-                let cell = *cells.entry([at.x as i32, at.y as i32, at.z as i32]).or_insert_with(|| {
+                let cell = *known.entry([at.x as i32, at.y as i32, at.z as i32]).or_insert_with(|| {
                     sums.push((Vec3::ZERO, Vec3::ZERO, 0.0));
                     sums.len() as u32 - 1
                 });
@@ -109,7 +109,7 @@ mod tests {
     #[test]
     fn a_fine_mesh_becomes_coarse_and_stays_where_it_was() {
         let fine = sphere(400);
-        let coarse = CoarseMesh::of(&fine);
+        let coarse = CoarseMesh::of(&fine, CELLS);
         // A surface of six squares of cells holds at most a few vertices a cell.
         assert!(coarse.triangles.len() < 8 * 6 * (CELLS * CELLS) as usize / 4, "{}", coarse.triangles.len());
         assert!(coarse.triangles.len() < fine.triangles.len() / 2);
@@ -137,9 +137,9 @@ mod tests {
     #[test]
     fn a_coarse_mesh_is_kept_and_an_empty_one_is_no_fault() {
         let few = sphere(4);
-        let mesh = CoarseMesh::of(&few);
+        let mesh = CoarseMesh::of(&few, CELLS);
         assert!((mesh.radius_m - 3f64.sqrt()).abs() < 1e-3 && mesh.centre.length() < 1e-6);
-        let empty = CoarseMesh::of(&TriangleMesh::default());
+        let empty = CoarseMesh::of(&TriangleMesh::default(), CELLS);
         assert!(empty.triangles.is_empty() && empty.radius_m == 0.0);
     }
 }

@@ -6,7 +6,7 @@
 
 mod depth;
 mod eye;
-mod mesh;
+pub(crate) mod mesh;
 
 use dpm_common::realtime::os::{give_way, thread_cpu_ns};
 use dpm_rig::pictures::to_srgb;

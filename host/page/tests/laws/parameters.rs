@@ -1,6 +1,6 @@
 //! Parameters over HTTP: from a request to the frame that uses the change, and who may not change them.
 
-use crate::common::{ask, Running};
+use crate::common::{ask, Running, Viewer};
 
 impl Running {
     fn change(&self, path: &str) -> (u16, String) {
@@ -48,6 +48,32 @@ fn a_change_is_answered_when_a_frame_uses_it_and_is_taken_back() {
     rig.order("black");
     assert_eq!(rig.change("/api/parameters/set?name=exposure&value=3").0, 200);
     assert_eq!(rig.monitor.projector().word(), "BLACK");
+}
+
+#[test]
+fn the_room_has_every_body_and_the_projector_moves_in_it_by_hand() {
+    let rig = Running::start("room");
+    let answer = rig.ask("GET", "/api/room", &[]);
+    assert_eq!(answer.status, 200, "{}", answer.body);
+    let shapes: serde_json::Value = serde_json::from_str(&answer.body).unwrap();
+    let mut viewer = Viewer::new(&rig);
+    let numbers = |of: &serde_json::Value| -> Vec<f64> {
+        of.as_array().unwrap().iter().map(|n| n.as_f64().unwrap()).collect()
+    };
+    let before = viewer.next("room", |_| true);
+    assert_eq!(before["bodies"].as_array().unwrap().len(), shapes["bodies"].as_array().unwrap().len());
+    assert!(before["bodies"].as_array().unwrap().iter().all(|pose| numbers(pose).len() == 12));
+    // Tracked bodies go where the tracker says.
+    let bunny = shapes["bodies"].as_array().unwrap().iter().position(|b| b["tracked"] == "bunny").unwrap();
+    viewer.next("room", |now| numbers(&now["bodies"][bunny])[9..] != numbers(&before["bodies"][bunny])[9..]);
+    // Ten millimetres along the projector's own x.
+    let from = numbers(&before["projector"]);
+    assert_eq!(rig.change("/api/parameters/set?name=projector&value=10,0,0,0,0,0").0, 200);
+    let moved = viewer.next("room", |now| numbers(&now["projector"]) != from);
+    let to = numbers(&moved["projector"]);
+    for k in 0..3 {
+        assert!((to[9 + k] - from[9 + k] - 0.01 * from[k]).abs() < 2e-4, "{from:?} {to:?}");
+    }
 }
 
 #[test]

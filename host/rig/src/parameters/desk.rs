@@ -200,6 +200,13 @@ impl ParameterDesk {
         })
     }
 
+    /// Where the projector stands by the newest values; `None` if this run has none.
+    pub fn projector(&self) -> Option<DAffine3> {
+        let place = self.state();
+        let s = place.as_ref()?;
+        Some(Applied::new(s.version, &s.values, &s.rig, &s.middles).camera.world_from_projector)
+    }
+
     /// The newest version, and whether it is in use, can be taken back and is saved: for those who look whether
     /// anything has changed.
     pub fn mark(&self) -> Option<[u64; 3]> {

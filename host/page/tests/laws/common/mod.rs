@@ -14,7 +14,7 @@ use dpm_rig::rig::Rig;
 use dpm_rig::standing::{Identity, OrderFile};
 use dpm_rig::telemetry::monitor::RunMonitor;
 use dpm_rig::telemetry::notes::Notes;
-use std::io::{Read, Write};
+use std::io::{BufRead, BufReader, Read, Write};
 use std::net::{SocketAddr, TcpStream};
 use std::path::PathBuf;
 use std::sync::Arc;
@@ -193,4 +193,39 @@ pub(crate) fn send(address: SocketAddr, bytes: &[u8]) -> std::io::Result<Answer>
     let (head, body) = text.split_once("\r\n\r\n").unwrap_or((&text, ""));
     let status = head.split(' ').nth(1).and_then(|s| s.parse().ok()).unwrap_or(0);
     Ok(Answer { status, head: head.to_owned(), body: body.to_owned() })
+}
+
+/// One who follows the events of a rig.
+pub(crate) struct Viewer<'a> {
+    pub(crate) rig: &'a Running,
+    lines: BufReader<TcpStream>,
+}
+
+impl<'a> Viewer<'a> {
+    pub(crate) fn new(rig: &'a Running) -> Self {
+        let mut stream = TcpStream::connect(rig.address).unwrap();
+        stream.set_read_timeout(Some(PATIENCE)).unwrap();
+        let request = format!("GET /api/events HTTP/1.1\r\nHost: {}\r\n\r\n", rig.address);
+        stream.write_all(request.as_bytes()).unwrap();
+        Self { rig, lines: BufReader::new(stream) }
+    }
+
+    /// The data of the next event of this name for which `is` holds.
+    pub(crate) fn next(&mut self, name: &str, is: impl Fn(&serde_json::Value) -> bool) -> serde_json::Value {
+        let begin = Instant::now();
+        let mut event = String::new();
+        loop {
+            assert!(begin.elapsed() < PATIENCE, "no such {name}: {:?}", self.rig.monitor.counts());
+            let mut line = String::new();
+            self.lines.read_line(&mut line).unwrap();
+            if let Some(name) = line.trim_end().strip_prefix("event: ") {
+                event = name.to_owned();
+            } else if let Some(data) = line.strip_prefix("data: ").filter(|_| event == name) {
+                let data = serde_json::from_str(data.trim_end()).unwrap();
+                if is(&data) {
+                    return data;
+                }
+            }
+        }
+    }
 }

@@ -1,44 +1,10 @@
 //! The rig's events: state, figures, notes and pictures for those who look, and nothing for nobody.
 
-use crate::common::{Running, PATIENCE};
+use crate::common::{Running, Viewer, PATIENCE};
 use base64::prelude::{Engine, BASE64_STANDARD};
-use std::io::{BufRead, BufReader, Write};
-use std::net::TcpStream;
 use std::time::Instant;
 
-struct Viewer<'a> {
-    rig: &'a Running,
-    lines: BufReader<TcpStream>,
-}
-
-impl<'a> Viewer<'a> {
-    fn new(rig: &'a Running) -> Self {
-        let mut stream = TcpStream::connect(rig.address).unwrap();
-        stream.set_read_timeout(Some(PATIENCE)).unwrap();
-        let request = format!("GET /api/events HTTP/1.1\r\nHost: {}\r\n\r\n", rig.address);
-        stream.write_all(request.as_bytes()).unwrap();
-        Self { rig, lines: BufReader::new(stream) }
-    }
-
-    /// The data of the next event of this name for which `is` holds.
-    fn next(&mut self, name: &str, is: impl Fn(&serde_json::Value) -> bool) -> serde_json::Value {
-        let begin = Instant::now();
-        let mut event = String::new();
-        loop {
-            assert!(begin.elapsed() < PATIENCE, "no such {name}: {:?}", self.rig.monitor.counts());
-            let mut line = String::new();
-            self.lines.read_line(&mut line).unwrap();
-            if let Some(name) = line.trim_end().strip_prefix("event: ") {
-                event = name.to_owned();
-            } else if let Some(data) = line.strip_prefix("data: ").filter(|_| event == name) {
-                let data = serde_json::from_str(data.trim_end()).unwrap();
-                if is(&data) {
-                    return data;
-                }
-            }
-        }
-    }
-
+impl Viewer<'_> {
     /// The mean of the newest picture of the light, 0 to 255.
     fn brightness(&mut self, is: impl Fn(f64) -> bool) -> f64 {
         let mean = |pictures: &serde_json::Value| {
