@@ -1,8 +1,7 @@
 //! The rig's events: state, figures, notes and pictures for those who look, and nothing for nobody.
 
-use crate::common::{Running, Viewer, PATIENCE};
+use crate::common::{Running, Viewer};
 use base64::prelude::{Engine, BASE64_STANDARD};
-use std::time::Instant;
 
 impl Viewer<'_> {
     /// The mean of the newest picture of the light, 0 to 255.
