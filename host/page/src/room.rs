@@ -46,7 +46,8 @@ pub(crate) fn places(shared: &Shared) -> Option<Value> {
     let live = shared.monitor.live();
     let rig = live.rig()?;
     // Before the first frame the bodies stand where the rig file puts them.
-    let tracked = live.drawn(None).map(|drawn| drawn.poses).filter(|poses| poses.len() == rig.tracked_count());
+    let tracked =
+        live.drawn(None).map(|drawn| drawn.poses).filter(|poses| poses.len() == rig.tracked_count());
     let tracked = tracked.unwrap_or_else(|| rig.bodies.iter().map(|body| affine(&body.rest)).collect());
     let t_ns = live.snapshot().map_or(0, |figures| figures.frame.due_at.0);
     let mut poses = Vec::new();
@@ -95,12 +96,14 @@ mod tests {
                 .collect();
             assert!(!points.is_empty() && numbers("triangles").iter().all(|i| (*i as usize) < points.len()));
             let bounds = |points: &[Vec3]| {
-                points
-                    .iter()
-                    .fold((Vec3::INFINITY, Vec3::NEG_INFINITY), |(l, u), p| (l.min(*p), u.max(*p)))
+                points.iter().fold((Vec3::INFINITY, Vec3::NEG_INFINITY), |(l, u), p| (l.min(*p), u.max(*p)))
             };
             let ((low, high), (least, most)) = (bounds(&points), bounds(&of.mesh.positions));
-            assert!((low - least).min_element() > -1e-3 && (most - high).min_element() > -1e-3, "{}", of.name);
+            assert!(
+                (low - least).min_element() > -1e-3 && (most - high).min_element() > -1e-3,
+                "{}",
+                of.name
+            );
             // A merged vertex lies within its cell, so the shape keeps nearly all of its size.
             assert!((high - low).max_element() > 0.85 * (most - least).max_element(), "{}", of.name);
         }

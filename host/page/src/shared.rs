@@ -28,7 +28,15 @@ impl Shared {
         notes: Arc<Notes>,
         pictures: Pictures,
     ) -> Self {
-        Self { monitor, orders, notes, pictures, began: Instant::now(), room: OnceLock::new(), viewers: AtomicUsize::new(0) }
+        Self {
+            monitor,
+            orders,
+            notes,
+            pictures,
+            began: Instant::now(),
+            room: OnceLock::new(),
+            viewers: AtomicUsize::new(0),
+        }
     }
 
     /// A place among the viewers; `None` if all are taken.
