@@ -191,7 +191,7 @@ impl LinkKeeper {
             Verb::Safe => Some(Order::Safe),
             Verb::Stop => None,
         });
-        gauge.tell(&LightReport { standing, ..seen });
+        gauge.tell(&LightReport { standing, ..seen }, now);
     }
 
     /// How often the map of the projector's clock was found wrong. What was learned by it is wrong then, too.

@@ -2,17 +2,15 @@
 
 use crate::plan::dark::DarkCause;
 use crate::plan::frame::FramePlan;
-use crate::telemetry::light_gauge::{LightGauge, LightReport};
+use crate::telemetry::light_gauge::{LightGauge, LightReport, HELD_NS, NEVER};
 use dpm_device::link::{DeviceState, Status};
 use dpm_device::time::{DeviceTicks, HostTime};
 
-/// For so long after it was last seen, light counts as present, nanoseconds. With the time that a report takes, and a
-/// look at the state, the word is never wrong for a second.
-const HELD_NS: i64 = 900_000_000;
-/// Frames whose content is remembered. A projector holds 64 at most, the one on its mirrors, and its base.
+/// Sent frames whose content is remembered. A projector holds 64 at most, and its base. The one on its mirrors has a
+/// place of its own: FREEZE holds it however many follow.
 const REMEMBERED: usize = 128;
-/// An instant before every other.
-const NEVER: HostTime = HostTime(i64::MIN / 2);
+/// The place of the frame on the mirrors, behind them.
+const SHOWN: usize = REMEMBERED;
 
 /// What a frame that was sent shows.
 #[derive(Clone, Copy, Debug)]
@@ -28,7 +26,7 @@ struct Content {
 /// Reads the reports of the projector, one session after the other. Its memory is taken at the start.
 #[derive(Debug)]
 pub(crate) struct ReportedLight {
-    sent: [Option<Content>; REMEMBERED],
+    sent: [Option<Content>; SHOWN + 1],
     next: usize,
     /// Per remembered frame and tracked body: why it is dark.
     dark: Vec<Option<DarkCause>>,
@@ -48,9 +46,9 @@ impl ReportedLight {
     /// For a rig with `bodies` tracked bodies.
     pub(crate) fn new(bodies: usize) -> Self {
         Self {
-            sent: [None; REMEMBERED],
+            sent: [None; SHOWN + 1],
             next: 0,
-            dark: vec![None; REMEMBERED * bodies],
+            dark: vec![None; (SHOWN + 1) * bodies],
             body_lit_at: vec![NEVER; bodies],
             last: None,
             mirrors_lit_at: NEVER,
@@ -86,12 +84,11 @@ impl ReportedLight {
             self.last = Some((status.now, status.frames_lit));
             self.read(status, lit_before, now, gauge);
         }
-        let lately = |at: HostTime| now.ns_since(at) < HELD_NS;
         LightReport {
-            mirrors_lit: lately(self.mirrors_lit_at),
-            frames_lit: lately(self.frame_lit_at),
-            frames_sent: lately(self.sent_at),
-            head_lost: lately(self.head_lost_at),
+            mirrors_lit_at: self.mirrors_lit_at,
+            frame_lit_at: self.frame_lit_at,
+            sent_at: self.sent_at,
+            head_lost_at: self.head_lost_at,
             was_armed: self.was_armed,
             is_over: false,
             standing: None,
@@ -114,17 +111,25 @@ impl ReportedLight {
         if !is_lit || status.frames_lit == 0 {
             return;
         }
-        let place = self.sent.iter().position(|sent| sent.is_some_and(|s| s.frame == status.last_lit_frame));
+        let bodies = self.body_lit_at.len();
+        let is_it = |sent: &Option<Content>| sent.is_some_and(|s| s.frame == status.last_lit_frame);
+        if !is_it(&self.sent[SHOWN]) {
+            let place = self.sent.iter().position(is_it);
+            self.sent[SHOWN] = place.and_then(|place| self.sent[place]);
+            if let Some(place) = place {
+                self.dark.copy_within(place * bodies..(place + 1) * bodies, SHOWN * bodies);
+            }
+        }
+        let shown = self.sent[SHOWN];
         // A frame that is not known was sent by nobody here: what is on the mirrors counts as light.
-        if place.and_then(|place| self.sent[place]).is_none_or(|content| content.has_light) {
+        if shown.is_none_or(|content| content.has_light) {
             self.mirrors_lit_at = now;
         }
-        let Some(place) = place else { return };
-        if self.sent[place].is_some_and(|content| content.head_lost) {
+        let Some(content) = shown else { return };
+        if content.head_lost {
             self.head_lost_at = now;
         }
-        let bodies = self.body_lit_at.len();
-        let dark = &self.dark[place * bodies..(place + 1) * bodies];
+        let dark = &self.dark[SHOWN * bodies..];
         for (body, (lit_at, dark)) in self.body_lit_at.iter_mut().zip(dark).enumerate() {
             if dark.is_none() {
                 *lit_at = now;
@@ -146,6 +151,8 @@ mod tests {
     use crate::config::{Overrides, RigConfig};
     use crate::plan::frame::FrameId;
     use crate::rig::Rig;
+    use crate::telemetry::light_state::Evidence;
+    use crate::telemetry::monitor::ProjectorHealth;
     use dpm_device::planes::Raster;
     use DarkCause::Silent;
 
@@ -178,8 +185,15 @@ mod tests {
             self.light.sent(&self.plan, has_light, HostTime(ms * MS));
         }
 
+        /// What is known after the newest report was read at `ms`.
+        fn read(&mut self, ms: i64) -> Evidence {
+            let seen = self.light.observe(Some(&self.status), HostTime(ms * MS), &self.gauge);
+            self.gauge.tell(&seen, HostTime(ms * MS));
+            self.gauge.evidence(ProjectorHealth::Up)
+        }
+
         /// Frame `frame` is on the mirrors at `ms`.
-        fn lit(&mut self, frame: u32, ms: i64) -> LightReport {
+        fn lit(&mut self, frame: u32, ms: i64) -> Evidence {
             let frames_lit = self.status.frames_lit + u32::from(self.status.last_lit_frame != frame);
             self.status = Status {
                 lit: true,
@@ -188,12 +202,12 @@ mod tests {
                 now: DeviceTicks(ms as u64),
                 ..self.status
             };
-            self.light.observe(Some(&self.status), HostTime(ms * MS), &self.gauge)
+            self.read(ms)
         }
 
-        fn dark(&mut self, state: DeviceState, ms: i64) -> LightReport {
+        fn dark(&mut self, state: DeviceState, ms: i64) -> Evidence {
             self.status = Status { lit: false, state, now: DeviceTicks(ms as u64), ..self.status };
-            self.light.observe(Some(&self.status), HostTime(ms * MS), &self.gauge)
+            self.read(ms)
         }
     }
 
@@ -229,11 +243,27 @@ mod tests {
         bench.sent(2, true, [None, None], 20);
         assert!(bench.lit(2, 30).mirrors_lit);
         // The same report is no news, however often it is read.
-        let status = bench.status;
-        let mut seen = |ms: i64| bench.light.observe(Some(&status), HostTime(ms * MS), &bench.gauge);
-        assert!(seen(929).mirrors_lit && !seen(930).mirrors_lit);
+        assert!(bench.read(929).mirrors_lit && !bench.read(930).mirrors_lit);
         // A frame that nobody here has sent counts as light.
         assert!(bench.lit(99, 3_000).mirrors_lit);
+    }
+
+    /// FREEZE holds what is on the mirrors, while frames go on to be sent that the projector refuses.
+    #[test]
+    fn a_black_picture_that_is_held_is_no_light_however_many_frames_follow() {
+        for has_light in [false, true] {
+            let mut bench = bench();
+            let dark = [None, (!has_light).then_some(Silent)];
+            bench.sent(1, has_light, dark, 0);
+            bench.lit(1, 10);
+            bench.status.state = DeviceState::Frozen;
+            for frame in 2..2_000 {
+                let ms = frame as i64 * 10;
+                bench.sent(frame, true, [None, None], ms);
+                assert_eq!(bench.lit(1, ms).mirrors_lit, has_light, "{ms} ms");
+            }
+            assert_eq!(bench.gauge.body(1), dark[1]);
+        }
     }
 
     #[test]

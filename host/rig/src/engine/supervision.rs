@@ -276,9 +276,11 @@ impl Supervision {
         None
     }
 
-    /// What the link's thread told of the light holds while it goes on, whether it hangs or gets no core.
+    /// What the link's thread told of the light holds while it goes on, whether it hangs or gets no core. The light
+    /// itself grows old in any case: what was seen last may have been seen long before the thread fell silent.
     fn watch_light(&mut self, now: HostTime) {
         let gauge = self.facts.monitor.light_gauge();
+        gauge.pass(now);
         let tellings = gauge.tellings();
         if tellings != self.link_told.0 || self.link_told.1 > now {
             self.link_told = (tellings, now);

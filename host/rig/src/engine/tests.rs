@@ -19,7 +19,9 @@ use crate::pipeline::projector;
 use crate::plan::lead::LeadEstimator;
 use crate::plan::link_time::LinkTime;
 use crate::rig::Rig;
-use crate::telemetry::monitor::RunMonitor;
+use crate::telemetry::light_gauge::{LightReport, NEVER};
+use crate::telemetry::light_state::LightState;
+use crate::telemetry::monitor::{ProjectorHealth, RunMonitor};
 use crate::tracks::TrackSnapshot;
 use dpm_device::link::{DeviceState, HostLink, LinkState, Packet, SendOutcome};
 use dpm_device::planes::Raster;
@@ -500,6 +502,41 @@ fn a_link_that_goes_on_within_two_seconds_costs_no_run() {
     let ended = watch(1_100, 5_000).expect("it does not go on again");
     assert!((3_020..=3_030).contains(&ended), "{ended} ms");
     assert!(matches!(bench.facts.take_error(), Some(PipelineError::Hung { stage: "link" })));
+}
+
+/// Light that was seen before the link's thread hung does not count for longer because nobody says that it is over: a
+/// black picture was on the mirrors, FREEZE held it, and then the thread hung.
+#[test]
+fn light_grows_old_while_the_thread_of_the_link_hangs() {
+    let bench = bench(&[], RunOptions::default());
+    let mut mind = supervision(&bench.facts);
+    let (link, collector) = (Pulse::new("link"), Pulse::new("collector"));
+    let monitor = &bench.facts.monitor;
+    monitor.set_projector(ProjectorHealth::Frozen);
+    let told = |ms: i64| {
+        let at = HostTime(1_000 * MS);
+        let seen = LightReport {
+            mirrors_lit_at: at,
+            frame_lit_at: at,
+            sent_at: at,
+            head_lost_at: NEVER,
+            was_armed: true,
+            is_over: false,
+            standing: Some(Order::Freeze),
+        };
+        monitor.light_gauge().tell(&seen, HostTime(ms * MS));
+    };
+    told(1_000);
+    // The last that it says is that there was light 0.8 s ago.
+    told(1_800);
+    let mut word = |ms: i64| {
+        mind.watch(&link, &collector, HostTime(ms * MS), 2 * MS);
+        monitor.light()
+    };
+    assert_eq!(word(1_801), LightState::Lit { is_held: true });
+    for ms in [1_950, 2_600, 2_800] {
+        assert_eq!(word(ms), LightState::DarkByOrder(Order::Freeze), "{ms} ms");
+    }
 }
 
 /// The light of frames that the old crew had still sent is no light after it.

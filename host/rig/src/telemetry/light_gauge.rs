@@ -5,32 +5,35 @@ use super::monitor::ProjectorHealth;
 use crate::order::Order;
 use crate::plan::dark::DarkCause;
 use dpm_device::link::faults;
+use dpm_device::time::HostTime;
 use dpm_render::scene_data::MAX_BODIES;
-use std::sync::atomic::{AtomicU64, AtomicU8, Ordering};
+use std::sync::atomic::{AtomicI64, AtomicU64, AtomicU8, Ordering};
+
+/// For so long after it was last seen, light counts as present, nanoseconds. With the time that a report takes, and a
+/// look at the state, the word is never wrong for a second.
+pub(crate) const HELD_NS: i64 = 900_000_000;
+/// An instant before every other.
+pub(crate) const NEVER: HostTime = HostTime(i64::MIN / 2);
 
 /// Bits of the first word of [`LightGauge`].
 mod bit {
-    pub(super) const MIRRORS_LIT: u64 = 1;
-    pub(super) const FRAMES_LIT: u64 = 1 << 1;
-    pub(super) const FRAMES_SENT: u64 = 1 << 2;
-    pub(super) const WAS_ARMED: u64 = 1 << 3;
-    pub(super) const IS_OVER: u64 = 1 << 4;
-    pub(super) const HEAD_LOST: u64 = 1 << 5;
+    pub(super) const WAS_ARMED: u64 = 1;
+    pub(super) const IS_OVER: u64 = 1 << 1;
     /// Above them: the order that stands, 0 for none.
     pub(super) const STANDING_SHIFT: u32 = 8;
 }
 
 /// What the link's thread sees of the light at one moment.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) struct LightReport {
-    /// Mirrors were lit within the last second, and no darkness was reported since.
-    pub mirrors_lit: bool,
-    /// A frame was lit for the first time within the last second.
-    pub frames_lit: bool,
-    /// A frame was sent within the last second.
-    pub frames_sent: bool,
-    /// A frame that is dark for a lost head was lit within the last second.
-    pub head_lost: bool,
+    /// When mirrors were last seen lit; [`NEVER`] if darkness was reported since.
+    pub mirrors_lit_at: HostTime,
+    /// When a frame was last lit for the first time.
+    pub frame_lit_at: HostTime,
+    /// When a frame was last sent.
+    pub sent_at: HostTime,
+    /// When a frame was last lit that is dark for a lost head.
+    pub head_lost_at: HostTime,
     /// The projector was armed in this run.
     pub was_armed: bool,
     /// The run has ended its light.
@@ -44,6 +47,10 @@ pub(crate) struct LightReport {
 #[derive(Debug)]
 pub(crate) struct LightGauge {
     seen: AtomicU64,
+    /// The four instants of [`LightReport`]. They pass also where the link's thread says nothing any more.
+    at_ns: [AtomicI64; 4],
+    /// The host's clock, when the link's thread or the supervisor last looked.
+    now_ns: AtomicI64,
     /// Per tracked body: why it has had no light for a second, as its place in `DarkCause::ALL` and 1; 0 if it has.
     bodies: [AtomicU8; MAX_BODIES],
     /// Set by the supervisor.
@@ -61,6 +68,8 @@ impl Default for LightGauge {
     fn default() -> Self {
         Self {
             seen: AtomicU64::new(0),
+            at_ns: [const { AtomicI64::new(NEVER.0) }; 4],
+            now_ns: AtomicI64::new(0),
             bodies: [const { AtomicU8::new(0) }; MAX_BODIES],
             restarts: AtomicU8::new(0),
             link_silent: AtomicU8::new(0),
@@ -72,28 +81,34 @@ impl Default for LightGauge {
 }
 
 impl LightGauge {
-    /// The link's thread tells what it sees.
-    pub(crate) fn tell(&self, seen: &LightReport) {
+    /// The link's thread tells at `now` what it sees.
+    pub(crate) fn tell(&self, seen: &LightReport, now: HostTime) {
+        let instants = [seen.mirrors_lit_at, seen.frame_lit_at, seen.sent_at, seen.head_lost_at];
+        self.at_ns.iter().zip(instants).for_each(|(to, at)| to.store(at.0, Ordering::Relaxed));
+        self.pass(now);
         let set = |is: bool, bit: u64| if is { bit } else { 0 };
-        let bits = set(seen.mirrors_lit, bit::MIRRORS_LIT)
-            | set(seen.frames_lit, bit::FRAMES_LIT)
-            | set(seen.frames_sent, bit::FRAMES_SENT)
-            | set(seen.head_lost, bit::HEAD_LOST)
-            | set(seen.was_armed, bit::WAS_ARMED)
+        let bits = set(seen.was_armed, bit::WAS_ARMED)
             | set(seen.is_over, bit::IS_OVER)
             | seen.standing.map_or(0, |order| order as u64) << bit::STANDING_SHIFT;
         self.seen.store(bits, Ordering::Relaxed);
         self.tellings.fetch_add(1, Ordering::Relaxed);
     }
 
+    /// It is `now`, whoever looks: what was seen of the light grows old.
+    pub(crate) fn pass(&self, now: HostTime) {
+        self.now_ns.store(now.0, Ordering::Relaxed);
+    }
+
     /// What a projector without frames of this program shows.
     pub(crate) fn tell_shown(&self, health: ProjectorHealth, is_lit: bool) {
         let was_armed = is_lit || self.seen.load(Ordering::Relaxed) & bit::WAS_ARMED != 0;
-        self.tell(&LightReport {
-            mirrors_lit: is_lit,
-            frames_lit: is_lit,
-            frames_sent: is_lit,
-            head_lost: false,
+        // It needs no frames to stay lit.
+        let at = if is_lit { HostTime(i64::MAX) } else { NEVER };
+        let seen = LightReport {
+            mirrors_lit_at: at,
+            frame_lit_at: at,
+            sent_at: at,
+            head_lost_at: NEVER,
             was_armed,
             is_over: health == ProjectorHealth::Stopped,
             standing: match health {
@@ -102,7 +117,8 @@ impl LightGauge {
                 ProjectorHealth::Faulted(faults::HOST_SAFE) => Some(Order::Safe),
                 _ => None,
             },
-        });
+        };
+        self.tell(&seen, HostTime(0));
     }
 
     /// Why body `body` has had no light for a second; `None` if it has.
@@ -152,16 +168,19 @@ impl LightGauge {
     pub(crate) fn evidence(&self, projector: ProjectorHealth) -> Evidence {
         let bits = self.seen.load(Ordering::Relaxed);
         let is = |bit: u64| bits & bit != 0;
+        let now = self.now_ns.load(Ordering::Relaxed);
+        let [mirrors_lit, frames_lit, frames_sent, head_lost] =
+            self.at_ns.each_ref().map(|at| now.saturating_sub(at.load(Ordering::Relaxed)) < HELD_NS);
         let flag = |flag: &AtomicU8| flag.load(Ordering::Relaxed) != 0;
         Evidence {
             projector,
             standing: Order::from_code((bits >> bit::STANDING_SHIFT) as u8),
             awaits_first_arm: flag(&self.awaits_first_arm),
             was_armed: is(bit::WAS_ARMED),
-            mirrors_lit: is(bit::MIRRORS_LIT),
-            frames_lit: is(bit::FRAMES_LIT),
-            frames_sent: is(bit::FRAMES_SENT),
-            head_lost: is(bit::HEAD_LOST),
+            mirrors_lit,
+            frames_lit,
+            frames_sent,
+            head_lost,
             some_body_dark: self.bodies.iter().any(flag),
             restarts: flag(&self.restarts),
             link_silent: flag(&self.link_silent),
@@ -183,23 +202,33 @@ mod tests {
     fn what_is_told_comes_out_as_evidence() {
         let gauge = LightGauge::default();
         assert_eq!(gauge.evidence(ProjectorHealth::Connecting), Evidence::default());
+        let now = HostTime(5_000_000_000);
         for k in 0..6 {
             let is = |n: u32| n == k;
+            // What is not so was so until just now.
+            let at = |n: u32| if is(n) { now } else { HostTime(now.0 - HELD_NS) };
             let seen = LightReport {
-                mirrors_lit: is(0),
-                frames_lit: is(1),
-                frames_sent: is(2),
+                mirrors_lit_at: at(0),
+                frame_lit_at: at(1),
+                sent_at: at(2),
                 was_armed: is(3),
                 is_over: is(4),
-                head_lost: is(5),
+                head_lost_at: at(5),
                 standing: [None, Some(Order::Black), Some(Order::Freeze), Some(Order::Safe), None, None]
                     [k as usize],
             };
-            gauge.tell(&seen);
-            let e = gauge.evidence(ProjectorHealth::Up);
-            let told = [e.mirrors_lit, e.frames_lit, e.frames_sent, e.was_armed, e.is_over, e.head_lost];
-            assert_eq!(told, [0, 1, 2, 3, 4, 5].map(is));
-            assert_eq!(e.standing, seen.standing);
+            gauge.tell(&seen, now);
+            let told = || {
+                let e = gauge.evidence(ProjectorHealth::Up);
+                assert_eq!(e.standing, seen.standing);
+                [e.mirrors_lit, e.frames_lit, e.frames_sent, e.was_armed, e.is_over, e.head_lost]
+            };
+            assert_eq!(told(), [0, 1, 2, 3, 4, 5].map(is));
+            // Nobody says anything any more, and light passes all the same.
+            gauge.pass(HostTime(now.0 + HELD_NS - 1));
+            assert_eq!(told(), [0, 1, 2, 3, 4, 5].map(is));
+            gauge.pass(HostTime(now.0 + HELD_NS));
+            assert_eq!(told(), [6, 6, 6, 3, 4, 6].map(is));
         }
         assert_eq!(gauge.tellings(), 6);
         for (body, cause) in DarkCause::ALL.into_iter().enumerate() {
@@ -209,6 +238,10 @@ mod tests {
             assert!(gauge.evidence(ProjectorHealth::Up).some_body_dark);
             gauge.tell_body(body, None);
         }
+        gauge.tell_shown(ProjectorHealth::Frozen, true);
+        assert!(gauge.evidence(ProjectorHealth::Frozen).mirrors_lit, "what needs no frames stays");
+        gauge.tell_shown(ProjectorHealth::Black, false);
+        assert!(!gauge.evidence(ProjectorHealth::Black).mirrors_lit);
         gauge.spent(LightState::PartlyLit { is_held: false }, 1_500_000_000);
         assert_eq!(gauge.times_s(), [0.0, 1.5, 0.0, 0.0, 0.0, 0.0]);
     }
