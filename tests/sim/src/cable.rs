@@ -2,7 +2,7 @@
 //! projector hangs on a serial line, the bytes are on [`crate::line`] instead.
 
 use crate::dice::Dice;
-use crate::guard::stretched;
+use crate::guard::{darkens, stretched};
 use crate::line::{Echo, SerialLine};
 use dpm_device::link::Packet;
 use dpm_device::time::HostTime;
@@ -71,6 +71,8 @@ pub struct CableEffects {
     pub spoiled: u64,
     /// Packets of the control lane were late.
     pub late: u64,
+    /// Orders to go dark were lost.
+    pub orders: u64,
     /// Bytes travelled on a serial line that has a fault.
     pub on_line: u64,
 }
@@ -125,6 +127,8 @@ pub struct Cable {
     pub met: CableEffects,
     /// Light of frames ends so many ticks later than the host says.
     pub stretch: u64,
+    /// So many of the next orders to go dark are lost.
+    pub loses_orders: u32,
     /// The most transfers that ever waited in either direction.
     pub longest: usize,
 }
@@ -151,6 +155,7 @@ impl Cable {
             dice: Dice::new(seed, 0xcab1e),
             spare: Vec::new(),
             stretch: 0,
+            loses_orders: 0,
             met: CableEffects::default(),
             longest: 0,
         }
@@ -257,8 +262,15 @@ impl Cable {
         let faults = self.faults;
         let is_bad = faults.corrupt > 0.0 || faults.loss > 0.0 || faults.twice > 0.0;
         self.disturbed |= is_bad || faults.short > 0.0;
+        let mut is_lost = false;
         for packet in packets {
             let from = bytes.len();
+            if self.loses_orders > 0 && darkens(packet) {
+                self.loses_orders -= 1;
+                self.met.orders += 1;
+                is_lost = true;
+                continue;
+            }
             let told = (self.stretch > 0).then(|| stretched(packet, self.stretch)).flatten();
             bytes.extend(told.unwrap_or_else(|| packet.to_vec()));
             if !is_bad {
@@ -279,6 +291,9 @@ impl Cable {
                 let at = from + self.dice.bits() as usize % (end - from);
                 bytes[at] ^= 1 << (self.dice.bits() % 8);
             }
+        }
+        if bytes.is_empty() && is_lost {
+            return self.recycle(bytes);
         }
         let mut cut = false;
         if self.dice.happens(faults.short) && !bytes.is_empty() {

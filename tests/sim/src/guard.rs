@@ -5,7 +5,7 @@
 
 use crate::dice::Dice;
 use crate::kinds::Kind;
-use dpm_device::link::{Header, HostMessage, Packet, HEADER_BYTES, MAX_CONTROL_BYTES};
+use dpm_device::link::{Header, HostMessage, MessageType, Packet, HEADER_BYTES, MAX_CONTROL_BYTES};
 use dpm_device::time::DeviceTicks;
 
 /// A guard of the light.
@@ -32,6 +32,10 @@ pub enum Guard {
     Hand,
     /// The limit to the mean of the light.
     Limits,
+    /// What is done until the projector confirms an order to go dark. The cable loses such orders, and carries the rest.
+    Unconfirmed,
+    /// What the projector latches, until somebody acknowledges it. A neighbour sends it an ARM that acknowledges nothing.
+    Latch,
 }
 
 /// The share of lives in which a guard stands alone.
@@ -43,7 +47,7 @@ const LINK_LATE_NS: i64 = 5_000_000;
 
 impl Guard {
     /// All guards.
-    pub const ALL: [Self; 9] = [
+    pub const ALL: [Self; 11] = [
         Self::Watchdog,
         Self::DarkFrom,
         Self::Age,
@@ -53,12 +57,25 @@ impl Guard {
         Self::Interlock,
         Self::Hand,
         Self::Limits,
+        Self::Unconfirmed,
+        Self::Latch,
     ];
 
     /// As given on the command line.
     pub fn word(self) -> &'static str {
-        ["watchdog", "dark-from", "age", "orders", "session", "clock", "interlock", "by-hand", "limits"]
-            [self as usize]
+        [
+            "watchdog",
+            "dark-from",
+            "age",
+            "orders",
+            "session",
+            "clock",
+            "interlock",
+            "by-hand",
+            "limits",
+            "unconfirmed",
+            "latch",
+        ][self as usize]
     }
 
     /// The guard that stands alone in the life of `seed`, if any.
@@ -76,10 +93,12 @@ impl Guard {
             Self::Age => &[K::G6, K::G7, K::H4, K::H8, K::H9, K::T2, K::X6],
             Self::Orders => &[K::X3, K::H2, K::X5, K::H6, K::X4, K::U15, K::X20, K::X21],
             Self::Session => &[K::U15, K::X4, K::H2],
-            Self::Clock => &[K::H4, K::H8, K::H9, K::X6, K::U1, K::U15, K::T2],
+            Self::Clock => &[K::H4, K::H8, K::H9, K::X6, K::U1, K::U8, K::U8, K::U15, K::T2],
             Self::Interlock => &[K::X19, K::X19, K::X19, K::U15, K::X4, K::X5, K::X21],
             Self::Hand => &[K::U15, K::X4, K::H5, K::H7, K::X3, K::X5, K::X20, K::X21],
-            Self::Limits => &[K::T2, K::T3, K::U15, K::X4, K::X5, K::G7],
+            Self::Limits => &[K::X24, K::X24, K::T2, K::T3, K::U15, K::X4, K::X5, K::G7],
+            Self::Unconfirmed => &[K::X22, K::X22, K::X22, K::U15, K::X4, K::X5, K::T2],
+            Self::Latch => &[K::X23, K::X23, K::X3, K::U12, K::X4],
         }
     }
 
@@ -96,12 +115,16 @@ impl Guard {
         matches!(self, Self::DarkFrom | Self::Orders | Self::Session).then_some(LATE_NS / 1_000_000)
     }
 
-    /// What the rig file says of `[safety]` besides.
-    pub fn keys(self) -> &'static str {
+    /// What the rig file says of `[safety]` besides, for pictures of so many `planes`.
+    pub fn keys(self, planes: u32) -> String {
         match self {
-            Self::Hand => "start = \"by hand\"\n",
-            Self::Limits => "limits = { mean_level = 0.25, mean_window_s = 0.6 }\n",
-            _ => "",
+            Self::Hand => "start = \"by hand\"\n".into(),
+            Self::Limits => {
+                // Three quarters of the mean level of the pictures: the light rests again and again.
+                let level = if planes > 8 { 0.05 } else { 0.02 };
+                format!("limits = {{ mean_level = {level}, mean_window_s = 0.6 }}\n")
+            }
+            _ => String::new(),
         }
     }
 
@@ -137,6 +160,38 @@ pub fn first_packet(bytes: &[u8]) -> Option<&[u8]> {
     let header = Header::decode(bytes.first_chunk::<HEADER_BYTES>()?).ok()?;
     let whole = dpm_device::link::packet_bytes(header.payload_bytes as usize);
     bytes.get(..whole).filter(|_| header.payload_bytes > 0)
+}
+
+/// The session of the first packet of `bytes`.
+pub fn session(bytes: &[u8]) -> Option<u32> {
+    Header::decode(bytes.first_chunk::<HEADER_BYTES>()?).ok().map(|header| header.session)
+}
+
+/// `packet` is an order to go dark.
+pub fn darkens(packet: &Packet<'_>) -> bool {
+    let kind = Header::decode(packet.header()).map(|header| header.kind);
+    matches!(kind, Ok(MessageType::Black | MessageType::Safe | MessageType::Stop))
+}
+
+/// An ARM in `session` that acknowledges nothing.
+pub fn bare_arm(session: u32) -> Vec<u8> {
+    let mut payload = [0; MAX_CONTROL_BYTES];
+    let (kind, n) = HostMessage::Arm(0).write(&mut payload);
+    Packet::new(Header::control(kind, session, 0), &payload[..n]).to_vec()
+}
+
+/// Word of another host that its session goes on.
+pub fn word_of_another_host(session: u32) -> Vec<u8> {
+    let mut payload = [0; MAX_CONTROL_BYTES];
+    let (kind, n) = HostMessage::Sync(0).write(&mut payload);
+    Packet::new(Header::control(kind, !session, 0), &payload[..n]).to_vec()
+}
+
+/// `packet`, whole, as another host would send it.
+pub fn of_another_host(packet: &[u8]) -> Option<Vec<u8>> {
+    let header = Header::decode(packet.first_chunk::<HEADER_BYTES>()?).ok()?;
+    let payload = packet.get(HEADER_BYTES..HEADER_BYTES + header.payload_bytes as usize)?;
+    Some(Packet::new(Header { session: !header.session, ..header }, payload).to_vec())
 }
 
 /// Damages the payload of `packet`.

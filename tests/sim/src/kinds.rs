@@ -243,6 +243,12 @@ kinds! {
     X20,
     /// One call to the disk fails, the first to the sixth from now.
     X21,
+    /// The cable loses orders to go dark, the first few or all for a while, and nothing else.
+    X22,
+    /// The projector latches a fault, and then an ARM arrives that acknowledges nothing.
+    X23,
+    /// An order to go dark while the light rests.
+    X24,
 }
 
 const FILES: &str = "scenes are read only when the program starts, before any light";
@@ -274,7 +280,7 @@ impl Kind {
 
     /// It strikes only where a guard stands alone that has to answer it.
     pub fn needs_guard(self) -> bool {
-        matches!(self, Self::X19 | Self::X20 | Self::X21)
+        matches!(self, Self::X19 | Self::X20 | Self::X21 | Self::X22 | Self::X23 | Self::X24)
     }
 
     /// It strikes only where the projector hangs on a serial line.
@@ -312,6 +318,7 @@ impl Kind {
                 (state != State::Dark).then_some(FILES)
             }
             K::X17 | K::X18 => (state != State::Running).then_some("it strikes frames that are shown"),
+            K::X24 => (state != State::Running).then_some("light rests only where there was some"),
             K::H7 | K::G1 | K::G2 => {
                 (state != State::Dark).then_some("it strikes only when the program starts")
             }

@@ -38,6 +38,8 @@ const LIT_WITHIN_NS: i64 = S;
 const ORDER_TOLD_NS: i64 = 1_500 * MS;
 /// The map of a clock whose exchanges are stamped in time is no more wrong than this, besides their travel.
 const CLOCK_NS: i64 = 300_000;
+/// Who plans by a clock that the projector no longer has is wrong by more than this.
+const FORMER_NS: i64 = 20 * MS;
 /// The body's greatest speed, metres a second.
 const SPEED: f64 = 0.3;
 
@@ -132,8 +134,8 @@ impl Limit {
             self.sum -= self.slots.pop_front().map_or(0.0, |(_, light)| light);
         }
         let mean = self.sum / self.window_ns as f64;
-        // The window is rounded up to whole slots.
-        let allowed = self.level + 2.0 * slot_ns as f64 / self.window_ns as f64;
+        // The window is rounded up to whole slots, and the level of a picture to what the limit counts in.
+        let allowed = self.level * (1.0 + 2.0 * slot_ns as f64 / self.window_ns as f64) + 1e-3;
         if mean > allowed {
             return Err(format!("the mean level of a window is {mean:.3}; {allowed:.3} are allowed"));
         }
@@ -196,6 +198,8 @@ pub struct Laws {
     /// Since then an interlock that is reset by hand waits for ARM.
     awaits_reset: Option<i64>,
     armed_at: i64,
+    /// The projector reports since then that it is armed.
+    armed_since: Option<i64>,
     /// Every start waits for ARM, and this one does since.
     by_hand: bool,
     awaits_arm: Option<i64>,
@@ -280,6 +284,7 @@ impl Laws {
             open: None,
             awaits_reset: None,
             armed_at: -S,
+            armed_since: None,
             by_hand: setup.alone == Some(Guard::Hand),
             awaits_arm: None,
             limit: (setup.alone == Some(Guard::Limits)).then(|| Limit::new(rig)),
@@ -542,7 +547,8 @@ impl Laws {
         }
     }
 
-    fn is_frozen(&self) -> bool {
+    /// The person wants the picture held.
+    pub(crate) fn is_frozen(&self) -> bool {
         self.standing.is_some_and(|s| s.order == Order::Freeze && !s.is_orphan)
     }
 
@@ -607,6 +613,62 @@ impl Laws {
         }
         if change.state == DeviceState::Faulted {
             self.rested_until = self.rested_until.max(at);
+        }
+    }
+
+    /// Whether the projector is armed, as it reports, while the program runs. Light may be far off, but who armed it did so
+    /// against somebody's word.
+    pub fn armed(&mut self, t: i64, is_armed: bool) {
+        if !is_armed {
+            self.armed_since = None;
+            return;
+        }
+        let since = *self.armed_since.get_or_insert(t);
+        // What was on its way when the word was given arrives, and what was lost is repeated.
+        if t - since < DARK_AT_LAST_NS || self.alone == Some(Guard::Session) {
+            return;
+        }
+        let standing = self.standing.filter(|s| s.order != Order::Freeze);
+        let open = self.open.map(|(since, hangs)| since + if hangs { SILENCE_NS } else { 0 });
+        let against = [
+            (standing.map(|s| s.since), standing.map_or("", |s| s.order.word())),
+            (self.stopped_at, "a stop"),
+            (self.awaits_arm, "a start by hand"),
+            (self.hot_since, "a fault that waits for a person"),
+            (open, "an open interlock"),
+        ];
+        if let Some((given, word)) =
+            against.into_iter().find_map(|(given, word)| Some((given.filter(|given| *given < since)?, word)))
+        {
+            let ms = (since - given) / MS;
+            self.fail(t, format!("the projector was armed {ms} ms after {word}, and nobody gave ARM"));
+        }
+    }
+
+    /// What stands when a program begins: nothing weaker than what the one before had kept.
+    pub fn begins_with(&mut self, kept: Option<Order>, t: i64) {
+        let has_kept = self.standing.filter(|s| s.kept && s.order == Order::Safe);
+        if has_kept.is_some() && kept != Some(Order::Safe) {
+            self.fail(t, format!("SAFE was kept, and the program begins with {kept:?}"));
+        }
+    }
+
+    /// Frames that were sent just now to a projector that is armed: their slots are slots of its clock, which it may have
+    /// had anew since they were planned.
+    pub fn judge_sent(&mut self, t: i64, beneath: &Arc<Mutex<Beneath>>, clock: DeviceClock, lag: i64) {
+        if t - self.clock_moved_at > 4 * S {
+            let off = |sent: &Sent| clock.instant_of(sent.target_at).0 - lag - sent.due_at;
+            let wrong =
+                lock(beneath).sent.iter().find(|sent| off(sent).abs() > FORMER_NS).map(|s| (s.frame, off(s)));
+            if let Some((frame, off)) = wrong {
+                self.fail(
+                    t,
+                    format!(
+                        "frame {frame} is sent for a slot that is {} ms off by the projector's clock",
+                        off / MS
+                    ),
+                );
+            }
         }
     }
 

@@ -2,6 +2,7 @@
 
 use crate::cable::{lock, CableFaults};
 use crate::dice::Dice;
+use crate::guard::Guard;
 use crate::kinds::{Kind, State};
 use crate::laws::Spell;
 use crate::machine::{GpuTrap, OpenTrap, Queue, Trap};
@@ -16,6 +17,7 @@ use dpm_device::transport::{Lane, LinkDevice, SendError, Transport, TransportErr
 use dpm_rig::order::Order;
 use dpm_rig::pipeline::projector::link_settings;
 use dpm_rig::pipeline::stepped::Part;
+use dpm_rig::telemetry::monitor::ProjectorHealth;
 
 /// A transport that keeps what is sent: the words of a second host.
 #[derive(Default)]
@@ -106,6 +108,12 @@ impl World {
                 let until = dice.decades(50, 500) * MS;
                 self.laws.slow_disk_until(self.t + until);
                 self.lasts(kind, until, Undo::Disk);
+            }
+            K::X22 => self.lose_orders(&mut dice),
+            K::X23 => self.strike_latch(&mut dice),
+            K::X24 => {
+                self.again(kind, dice.bits(), 35);
+                self.lasts(kind, 700 * MS, Undo::Nothing);
             }
             K::G3 | K::G9 => self.lasts(kind, MS, Undo::Nothing),
         }
@@ -424,6 +432,11 @@ impl World {
                 if dice.happens(0.3) {
                     lock(&self.disk).tear();
                 }
+                // A weaker order follows, which must not take its place.
+                if matches!(self.setup.alone, Some(Guard::Orders | Guard::Hand)) && dice.happens(0.4) {
+                    let weaker = dice.one_of(&[Order::Black, Order::Freeze]);
+                    self.plan(self.t + after_ns / 2, Action::Give(weaker));
+                }
                 self.plan(self.t + after_ns, Action::Kill);
             }
             K::H3 if dice.happens(0.3) => {
@@ -542,10 +555,53 @@ impl World {
         }
     }
 
+    /// The cable loses orders to go dark, and a person gives one.
+    fn lose_orders(&mut self, dice: &mut Dice) {
+        // A held picture ends by such an order alone: there only as many are lost as are repeated in time.
+        let are_few = dice.happens(0.5) || self.laws.is_frozen();
+        lock(&self.cable).loses_orders = if are_few { dice.between(1, 3) as u32 } else { u32::MAX };
+        match dice.one_of(&[Some(Order::Black), Some(Order::Black), Some(Order::Safe), None]) {
+            Some(order) => self.give(order),
+            None => self.ask_to_stop(),
+        }
+        self.lasts(Kind::X22, dice.between(60, 900) * MS, Undo::Orders);
+    }
+
+    /// The projector latches a fault whose cause is gone at once, or SAFE. Then words arrive that acknowledge nothing.
+    fn strike_latch(&mut self, dice: &mut Dice) {
+        if dice.happens(0.5) {
+            self.give(Order::Safe);
+        } else {
+            let bits = dice.one_of(&[faults::OVER_TEMPERATURE, faults::LAMP, faults::EMERGENCY_STOP]);
+            for bits in [bits, 0] {
+                self.projector.set_faults(HostTime(self.t), bits);
+            }
+            self.see_light();
+            self.laws.hot(self.t);
+        }
+        for round in 1..=dice.between(1, 4) {
+            self.plan(self.t + round * dice.between(3, 60) * MS, Action::BareArm);
+        }
+        self.lasts(Kind::X23, 300 * MS, Undo::Nothing);
+    }
+
+    /// A person gives an order to go dark as soon as the light rests.
+    fn order_at_rest(&mut self, seed: u64, rounds: u32) {
+        let health = self.process.as_ref().map(|process| process.health());
+        if matches!(health, Some(ProjectorHealth::Resting(_))) {
+            self.rests_met();
+            return self.give([Order::Black, Order::Safe][seed as usize % 2]);
+        }
+        self.plan(self.t + 20 * MS, Action::Again(Kind::X24, seed, rounds - 1));
+    }
+
     /// Another step of a fault that has several.
     pub(crate) fn again(&mut self, kind: Kind, seed: u64, rounds: u32) {
         if rounds == 0 {
             return;
+        }
+        if kind == Kind::X24 {
+            return self.order_at_rest(seed, rounds);
         }
         // The second host greets the projector, under a session of its own.
         let settings = link_settings(&self.rig.config, self.rig.camera.raster);
@@ -612,6 +668,7 @@ impl World {
                 let mut disk = lock(&self.disk);
                 (disk.refuses, disk.is_full, disk.late_ns, disk.fails_in) = (false, false, 0, None);
             }
+            Undo::Orders => lock(&self.cable).loses_orders = 0,
             Undo::Queue => lock(&self.beneath).queue = None,
             Undo::Load => lock(&self.beneath).load_milli = 1000,
             Undo::Traps => {

@@ -3,7 +3,7 @@
 use crate::cable::{lock, Cable};
 use crate::dice::Dice;
 use crate::disk::Disk;
-use crate::guard::{damage, first_packet, Guard};
+use crate::guard::{bare_arm, damage, first_packet, of_another_host, session, word_of_another_host, Guard};
 use crate::kinds::{Kind, State};
 use crate::laws::{Laws, BEGINS_WITHIN_NS};
 use crate::line::SerialLine;
@@ -13,7 +13,7 @@ use crate::plan::{Episode, Setup, TrackerSetup};
 use crate::process::{Exit, Process, SimContact};
 use crate::table::Table;
 use crate::tracks::TrackLaws;
-use dpm_device::link::{faults, Status};
+use dpm_device::link::{faults, DeviceState, Status};
 use dpm_device::planes::Raster;
 use dpm_device::time::HostTime;
 use dpm_device::transport::{Lane, LinkDevice};
@@ -81,6 +81,8 @@ pub enum Action {
     Episode,
     /// A neighbour disturbs the cable.
     Disturb,
+    /// Somebody sends an ARM that acknowledges nothing.
+    BareArm,
     /// The interlock's contact is in this state from now on.
     Contact(u8),
     /// The faults of the episode strike although its state was not reached.
@@ -108,6 +110,8 @@ pub enum Undo {
     Heat,
     /// The disk is as it should be.
     Disk,
+    /// Orders get through.
+    Orders,
     /// The machine is as quick as before.
     Load,
     /// The caches hold all frames again.
@@ -150,6 +154,9 @@ struct Met {
     /// Times that the interlock opened while the program ran, and datagrams of OSC that it heard.
     contacts: u64,
     datagrams: u64,
+    /// Words that acknowledged nothing of what the projector had latched, and orders while the light rested.
+    bare_arms: u64,
+    rests: u64,
 }
 
 /// Everything.
@@ -218,8 +225,9 @@ pub struct World {
     pub is_loud: bool,
     met: Met,
     striking: Option<Struck>,
-    /// A packet that a neighbour has overheard.
+    /// A packet that a neighbour has overheard, and its session.
     overheard: Vec<u8>,
+    session: u32,
     neighbour: Dice,
 }
 
@@ -231,7 +239,7 @@ fn rig_of(setup: &Setup, acknowledges: bool) -> Result<Rig, String> {
     let predict = setup.predict_ms.map_or(String::new(), |ms| format!("predict_ms = {ms}\n"));
     let watchdog = setup.alone.and_then(Guard::watchdog_ms);
     let watchdog = watchdog.map_or(String::new(), |ms| format!("watchdog_ms = {ms}\n"));
-    let keys = setup.alone.map_or("", Guard::keys);
+    let keys = setup.alone.map_or(String::new(), |guard| guard.keys(setup.planes));
     let backend = match setup.serial {
         Some(line) => format!("kind = \"serial\", port = \"/dev/simulated\", baud = {}", line.baud),
         None => "kind = \"usb\"".into(),
@@ -338,6 +346,7 @@ impl World {
             met: Met::default(),
             striking: None,
             overheard: Vec::new(),
+            session: 0,
             neighbour: Dice::new(seed, 0xa10e8),
             setup,
         };
@@ -446,6 +455,7 @@ impl World {
         self.move_projector();
         self.move_process();
         self.compare_word();
+        self.judge_armed();
         if self.restart_at <= self.t {
             self.start();
         }
@@ -475,6 +485,7 @@ impl World {
                 Action::Again(kind, seed, round) => self.again(kind, seed, round),
                 Action::Episode => {}
                 Action::Disturb => self.disturb(),
+                Action::BareArm => self.bare_arm(),
                 Action::Contact(state) => self.set_contact(state),
                 Action::Overdue(episode) => self.overdue(episode),
             }
@@ -530,6 +541,9 @@ impl World {
             K::H1 | K::X21 => lock(&self.disk).met,
             K::X19 => met.contacts,
             K::X20 => met.datagrams,
+            K::X22 => cable().orders,
+            K::X23 => met.bare_arms,
+            K::X24 => met.rests,
             K::H7 => met.refused_files,
             K::H3 | K::X6 => met.stands,
             // The projector itself is struck, whoever looks.
@@ -595,6 +609,9 @@ impl World {
                     self.laws.heard_of_the_dead(self.t);
                 }
                 self.hear(&transfer.bytes, transfer.cut);
+                if self.setup.alone == Some(Guard::Latch) {
+                    self.session = session(&transfer.bytes).unwrap_or(self.session);
+                }
             } else if self.setup.alone == Some(Guard::Watchdog) {
                 self.laws.heard_of_the_silent(self.t);
                 self.overheard = first_packet(&transfer.bytes).unwrap_or_default().to_vec();
@@ -632,10 +649,39 @@ impl World {
             return;
         }
         let mut bytes = self.overheard.clone();
-        damage(&mut bytes, &mut self.neighbour);
-        self.projector.receive(HostTime(self.t), Lane::Data, &bytes);
-        self.projector.end_of_transfer(HostTime(self.t), Lane::Data);
+        let mut lane = Lane::Data;
+        match self.neighbour.between(0, 3) {
+            0 => bytes = of_another_host(&bytes).unwrap_or_default(),
+            1 => {
+                bytes = word_of_another_host(session(&bytes).unwrap_or_default());
+                lane = Lane::Control;
+            }
+            _ => damage(&mut bytes, &mut self.neighbour),
+        }
+        self.projector.receive(HostTime(self.t), lane, &bytes);
+        self.projector.end_of_transfer(HostTime(self.t), lane);
         self.see_light();
+    }
+
+    /// Somebody sends an ARM that acknowledges nothing to a projector that has latched something.
+    fn bare_arm(&mut self) {
+        if self.projector.status().faults == 0 || !lock(&self.cable).plugged {
+            return;
+        }
+        self.met.bare_arms += 1;
+        self.projector.receive(HostTime(self.t), Lane::Control, &bare_arm(self.session));
+        self.see_light();
+        if self.projector.status().faults == 0 {
+            self.laws.fail(
+                self.t,
+                "the projector is armed, and nobody has acknowledged what it had latched".into(),
+            );
+        }
+    }
+
+    /// An order was given while the light rested.
+    pub(crate) fn rests_met(&mut self) {
+        self.met.rests += 1;
     }
 
     /// The laws of tracks read what is about to reach the projector on the control lane.
@@ -691,6 +737,21 @@ impl World {
             }
         }
         self.tracks = Some(tracks);
+    }
+
+    /// What the projector reports of being armed, and what it was sent.
+    fn judge_armed(&mut self) {
+        let is_armed = self.projector.status().state == DeviceState::Armed;
+        let runs = self.process.is_some() && self.t >= self.frozen_until;
+        self.laws.armed(self.t, is_armed && runs);
+        if self.setup.alone == Some(Guard::Clock) {
+            if is_armed {
+                let lag = self.lag.load(Ordering::Relaxed);
+                self.laws.judge_sent(self.t, &self.beneath, self.projector.clock(), lag);
+            }
+            // Others were sent to whom they cannot reach.
+            self.laws.remember(&self.beneath);
+        }
     }
 
     /// The word for the light is compared with the light.
@@ -797,6 +858,7 @@ impl World {
         match Process::start(&rig, &self.cable, &self.disk, machine, contact, host) {
             Ok(process) => {
                 self.tell(|| "the program starts".into());
+                self.laws.begins_with(process.orders.kept(), self.t);
                 self.process = Some(process);
                 if self.laws.has_standing_order() && self.clearing_since.is_none() {
                     // Whoever sees that it waits for a word comes and gives it.
