@@ -418,6 +418,18 @@ fn ordered_dark(
     }
 }
 
+/// A projector that has latched these faults. Where they would pass by themselves, an order that stands is what keeps it
+/// dark.
+fn faulted(latched: u32, standing: Option<Verb>) -> ProjectorHealth {
+    let passes = latched != 0 && latched & !faults::PASSING == 0;
+    match standing.filter(|_| passes) {
+        // FREEZE has no picture left to hold.
+        Some(Verb::Black | Verb::Freeze) => ProjectorHealth::Black,
+        Some(Verb::Safe) => ProjectorHealth::Faulted(latched | faults::HOST_SAFE),
+        Some(Verb::Stop) | None => ProjectorHealth::Faulted(latched),
+    }
+}
+
 fn health(link: &HostLink, standing: Option<Verb>) -> ProjectorHealth {
     use DeviceState as D;
     let state = link.status().map_or(D::Idle, |s| s.state);
@@ -429,7 +441,7 @@ fn health(link: &HostLink, standing: Option<Verb>) -> ProjectorHealth {
     }
     match (link.state(), standing) {
         (LinkState::Lost | LinkState::Closed, _) => ProjectorHealth::Lost,
-        (LinkState::Faulted, _) => ProjectorHealth::Faulted(link.status().map_or(0, |s| s.faults)),
+        (LinkState::Faulted, _) => faulted(link.status().map_or(0, |s| s.faults), standing),
         // Black only once the projector reports it.
         (_, Some(Verb::Black)) if !matches!(state, D::Armed | D::Frozen) => ProjectorHealth::Black,
         (_, Some(Verb::Freeze)) if state != D::Armed => ProjectorHealth::Frozen,
@@ -438,5 +450,30 @@ fn health(link: &HostLink, standing: Option<Verb>) -> ProjectorHealth {
         (_, Some(Verb::Stop)) if is_dark(link) => ProjectorHealth::Stopped,
         (LinkState::Streaming, _) => ProjectorHealth::Up,
         _ => ProjectorHealth::Connecting,
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// Nothing says that light comes back by itself where somebody has ordered the dark.
+    #[test]
+    fn what_would_pass_by_itself_does_not_while_an_order_stands() {
+        let all = [None, Some(Verb::Freeze), Some(Verb::Black), Some(Verb::Safe)];
+        for latched in [faults::WATCHDOG, faults::CHECKSUM_STORM, faults::PASSING] {
+            for standing in all {
+                let told = faulted(latched, standing).to_string();
+                assert_eq!(told.contains("by itself"), standing.is_none(), "{standing:?}: {told}");
+                assert!(standing.is_none() || told.contains("`dpm arm`"), "{standing:?}: {told}");
+            }
+            // What waits for a person is named, whatever else stands.
+            for standing in all {
+                let hot = latched | faults::OVER_TEMPERATURE;
+                assert_eq!(faulted(hot, standing), ProjectorHealth::Faulted(hot));
+            }
+        }
+        assert_eq!(faulted(faults::HOST_SAFE, Some(Verb::Safe)), ProjectorHealth::Faulted(faults::HOST_SAFE));
+        assert_eq!(faulted(0, Some(Verb::Black)), ProjectorHealth::Faulted(0));
     }
 }
