@@ -19,6 +19,7 @@ use dpm_rig::pipeline::projector::{self, Surroundings};
 use dpm_rig::pipeline::{connect, renderer_settings, PipelineError, ENDED_WITH_THE_LAST_RUN};
 use dpm_rig::projectors::{Cable, Compaction};
 use dpm_rig::rig::Rig;
+use dpm_rig::standing::{standing_for_device, Stands};
 use dpm_rig::telemetry::monitor::RunMonitor;
 use hil_mock::projector::{serve_cable, EmulatedProjector, MockConfig, GREATEST_SHIFT};
 use std::sync::Arc;
@@ -28,6 +29,8 @@ use std::time::Duration;
 const REST: Duration = Duration::from_micros(50);
 /// A projector that does not go dark within this long is left to its watchdog.
 const DARK_WITHIN_NS: i64 = 300_000_000;
+/// A projector that says no HELLO within this long is told of by the test itself.
+const HELLO_WITHIN_NS: i64 = 2_000_000_000;
 
 /// What `dpm link-test` tells.
 #[derive(Clone, Debug, serde::Serialize)]
@@ -179,6 +182,54 @@ impl Far {
             Self::Inside(host) => host,
         }
     }
+
+    /// Fails if an order stands for this projector, whatever port it was at when the order was given.
+    fn refuse_held(
+        &mut self,
+        settings: LinkSettings,
+        clock: MonotonicClock,
+        stop: &dyn Fn() -> bool,
+    ) -> Result<(), Failure> {
+        match self {
+            Self::Outside(transport) => {
+                let mut now = || {
+                    std::thread::sleep(Duration::from_micros(200));
+                    clock.now()
+                };
+                refuse_held(settings, transport.as_mut(), &mut now, stop, &standing_for_device)
+            }
+            Self::Inside(_) => Ok(()),
+        }
+    }
+}
+
+/// Hears who is at the other end, without arming it. Fails if by `stands` an order stands for who says HELLO with that
+/// serial number. Who says nothing is left to the test itself.
+fn refuse_held(
+    settings: LinkSettings,
+    transport: &mut dyn Transport,
+    now: &mut dyn FnMut() -> HostTime,
+    stop: &dyn Fn() -> bool,
+    stands: &dyn Fn(u64) -> Option<Stands>,
+) -> Result<(), Failure> {
+    let mut link = HostLink::new(settings);
+    link.connect();
+    let begin = now();
+    let serial = loop {
+        let at = now();
+        let is_over = link.poll(at, transport).is_err() || at.ns_since(begin) > HELLO_WITHIN_NS || stop();
+        match link.device() {
+            Some(hello) => break hello.serial,
+            None if is_over => return Ok(()),
+            None => {}
+        }
+    };
+    let Some(Stands { order, told, .. }) = stands(serial) else { return Ok(()) };
+    let (name, word) = (transport.name(), order.word().to_uppercase());
+    let told = format!(
+        "{name}: {word} stands {told} for the projector with this serial number; run its rig and say `dpm arm`"
+    );
+    Err(Failure::new(FailureKind::Device, told))
 }
 
 /// Judges the projector of `config` by docs/PROTOCOL.md, less of it when `stop` says so. It is dark afterwards.
@@ -193,6 +244,7 @@ pub fn judge_projector(
     let clock = MonotonicClock::new(0);
     let raster = config.projector.raster();
     let mut far = Far::open(config, raster, clock)?;
+    far.refuse_held(projector::link_settings(config, raster), clock, stop)?;
     let (kind, bytes_per_s) = match config.projector.backend.cable() {
         Cable::Usb => (MediumKind::Usb, None),
         Cable::Serial { bytes_per_s } => (MediumKind::Serial, Some(bytes_per_s)),
@@ -216,6 +268,7 @@ pub fn link_test(
     let clock = MonotonicClock::new(0);
     let mut far = Far::open(&rig.config, rig.camera.raster, clock)?;
     let settings = projector::link_settings(&rig.config, rig.camera.raster);
+    far.refuse_held(settings.clone(), clock, stop)?;
     let mut ways = vec![("raw".to_owned(), Codec::Raw.mask())];
     let backend = &rig.config.projector.backend;
     let allowed = backend.compaction().filter(|_| !backend.is_mock());
@@ -362,6 +415,11 @@ impl LinkTestReport {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use dpm_device::link::DeviceState;
+    use dpm_device::transport::inproc::Direct;
+    use dpm_rig::config::Overrides;
+    use dpm_rig::order::Order;
+    use hil_mock::projector::MockProjector;
 
     fn measured(frames_per_s: f64, link_busy: u64, no_credit: u64) -> LinkMeasurement {
         LinkMeasurement {
@@ -386,6 +444,33 @@ mod tests {
         // Nothing refused and yet too slow: the time went into compacting.
         let busy = judge("auto".into(), 947.0, &measured(666.6, 0, 0), None);
         assert_eq!((busy.limited_by, busy.allows_hz), ("host", 666.0));
+    }
+
+    /// Who was made dark at another port is not lit by a test either, and is not armed to be asked who it is.
+    #[test]
+    fn a_projector_for_which_an_order_stands_is_refused_by_its_serial_number() {
+        let config = RigConfig::demo(&Overrides::default()).unwrap_or_else(|e| panic!("{e}"));
+        let raster = Raster::new(16, 16).expect("a raster");
+        let mock = MockConfig { serial: 7, ..MockConfig::new(raster) };
+        let mut direct = Direct::new(MockProjector::new(mock));
+        let mut asked = |held: u64| {
+            let stands = |serial: u64| {
+                let told = "since yesterday".to_owned();
+                (serial == held).then(|| Stands { order: Order::Black, told, is_on_disk: true })
+            };
+            let mut at = 0;
+            let mut now = || {
+                at += 200_000;
+                HostTime(at)
+            };
+            let settings = projector::link_settings(&config, raster);
+            let answer = refuse_held(settings, &mut direct, &mut now, &|| false, &stands);
+            assert!(!direct.device_mut().status().state.eq(&DeviceState::Armed), "nobody arms it");
+            answer
+        };
+        let told = asked(7).expect_err("BLACK stands").to_string();
+        assert!(told.contains("BLACK stands since yesterday") && told.contains("`dpm arm`"), "{told}");
+        assert!(asked(8).is_ok());
     }
 
     #[test]

@@ -358,13 +358,8 @@ impl OrderFile {
     /// The orders on the disk that name a projector by its serial number, whatever else they name.
     pub(crate) fn by_serial_number(&self) -> Vec<(u64, Order)> {
         let Some(folder) = &self.folder else { return Vec::new() };
-        let told = |order: Told| {
-            let Told { stands, content, .. } = order;
-            let content = content?;
-            let serial = content.serial()?;
-            (!content.lifted.contains(&by_serial(serial))).then_some((serial, stands.order))
-        };
-        all_told(Some(&**folder), self.others.as_ref()).into_iter().flatten().filter_map(told).collect()
+        let named = |order: Told| Some((order.device()?, order.stands.order));
+        all_told(Some(&**folder), self.others.as_ref()).into_iter().flatten().filter_map(named).collect()
     }
 
     /// The file in which orders for this projector are kept.
@@ -497,6 +492,14 @@ struct Told {
     content: Option<Content>,
 }
 
+impl Told {
+    /// The serial number for which it stands.
+    fn device(&self) -> Option<u64> {
+        let content = self.content.as_ref()?;
+        content.serial().filter(|serial| !content.lifted.contains(&by_serial(*serial)))
+    }
+}
+
 /// An order that holds a projector.
 struct Held {
     told: Told,
@@ -579,6 +582,20 @@ fn holding(
 /// What stands for `identity` on this machine: in the state folder of this user, and by orders of others.
 pub fn standing(identity: &Identity) -> Option<Stands> {
     standing_beside(&state_folder()?, Others::of_this_machine().as_ref(), identity)
+}
+
+/// What stands on this machine for the projector that says HELLO with this serial number, whatever port its order names:
+/// for who lights a projector without a run. 0 and 1 name no projector.
+pub fn standing_for_device(serial: u64) -> Option<Stands> {
+    let folder = Folder::open(&state_folder()?, Owner::OwnOrAnyForRoot).ok();
+    let folder = folder.as_ref().map(|folder| folder as &dyn StateFolder);
+    of_device(folder, Others::of_this_machine().as_ref(), serial)
+}
+
+fn of_device(folder: Option<&dyn StateFolder>, others: Option<&Others>, serial: u64) -> Option<Stands> {
+    let all = all_told(folder, others).into_iter().flatten();
+    let its = all.filter(|told| serial > 1 && told.device() == Some(serial)).map(|told| told.stands);
+    its.max_by_key(|stands| stands.order.strength())
 }
 
 /// What stands for `identity` in the state folder `path`. A missing folder contains nothing. A folder that cannot be

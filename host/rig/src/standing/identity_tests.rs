@@ -326,6 +326,8 @@ fn an_order_goes_with_the_serial_number_of_the_projector() {
     let second = machine.file("ttyUSB1");
     assert!(!machine.holds("ttyUSB1"));
     assert_eq!(second.by_serial_number(), [(one, Order::Safe)]);
+    let stands = |serial| of_device(Some(&machine.disk), None, serial).map(|stands| stands.order);
+    assert_eq!([one, other, 0, 1].map(stands), [Some(Order::Safe), None, None, None]);
     // Another projector at the first port: who arms it lifts the order for this port, and not for the projector.
     first.hear(Some(other));
     first.forget().unwrap();
@@ -335,6 +337,7 @@ fn an_order_goes_with_the_serial_number_of_the_projector() {
     second.hear(Some(one));
     second.forget().unwrap();
     assert!(second.by_serial_number().is_empty() && !machine.holds("ttyUSB0"));
+    assert_eq!(stands(one), None);
 }
 
 /// Found in use again: the order for a projector was lost when another one was made dark at the same port.
