@@ -118,9 +118,12 @@ impl Board {
         0
     }
 
-    /// Yours: 64 bits that no other projector has, drawn when the board is first switched on, and kept.
+    /// Yours: 64 bits that no other projector has, drawn when the board is first switched on, and kept
+    /// (`FirmwareConfig::serial_number`). The emulated board keeps nothing while it is off and has nothing to draw from.
+    /// It says 1, which names no projector, until that is done: with another number that every copy of this file has, an
+    /// order for one board would hold all of them, and who arms one would lift the order for another.
     pub fn serial(&mut self) -> u64 {
-        0x6172_6d2d_716d_7501
+        1
     }
 
     /// Yours: loads `mirrors` (rows of whole bytes, bit 7 is the leftmost) and lights the LED of `spec` at 2^bit / 255.
