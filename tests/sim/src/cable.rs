@@ -2,7 +2,7 @@
 //! projector hangs on a serial line, the bytes are on [`crate::line`] instead.
 
 use crate::dice::Dice;
-use crate::guard::{darkens, stretched};
+use crate::guard::{darkens, freezes, stretched};
 use crate::line::{Echo, SerialLine};
 use dpm_device::link::Packet;
 use dpm_device::time::HostTime;
@@ -265,6 +265,10 @@ impl Cable {
         let mut is_lost = false;
         for packet in packets {
             let from = bytes.len();
+            if self.loses_orders > 0 && freezes(packet) {
+                // Nothing but such an order ends a held picture: from now on they are repeated in time.
+                self.loses_orders = self.loses_orders.min(2);
+            }
             if self.loses_orders > 0 && darkens(packet) {
                 self.loses_orders -= 1;
                 self.met.orders += 1;

@@ -96,8 +96,8 @@ impl Guard {
             Self::Clock => &[K::H4, K::H8, K::H9, K::X6, K::U1, K::U8, K::U8, K::U15, K::T2],
             Self::Interlock => &[K::X19, K::X19, K::X19, K::U15, K::X4, K::X5, K::X21],
             Self::Hand => &[K::U15, K::X4, K::H5, K::H7, K::X3, K::X5, K::X20, K::X21],
-            Self::Limits => &[K::X24, K::X24, K::T2, K::T3, K::U15, K::X4, K::X5, K::G7],
-            Self::Unconfirmed => &[K::X22, K::X22, K::X22, K::U15, K::X4, K::X5, K::T2],
+            Self::Limits => &[K::X24, K::X24, K::X24, K::T2, K::U15, K::X4, K::X5, K::G7],
+            Self::Unconfirmed => &[K::X22, K::X22, K::X22, K::U15, K::X4, K::T2],
             Self::Latch => &[K::X23, K::X23, K::X3, K::U12, K::X4],
         }
     }
@@ -169,8 +169,16 @@ pub fn session(bytes: &[u8]) -> Option<u32> {
 
 /// `packet` is an order to go dark.
 pub fn darkens(packet: &Packet<'_>) -> bool {
-    let kind = Header::decode(packet.header()).map(|header| header.kind);
-    matches!(kind, Ok(MessageType::Black | MessageType::Safe | MessageType::Stop))
+    matches!(kind(packet), Some(MessageType::Black | MessageType::Safe | MessageType::Stop))
+}
+
+/// `packet` is FREEZE.
+pub fn freezes(packet: &Packet<'_>) -> bool {
+    kind(packet) == Some(MessageType::Freeze)
+}
+
+fn kind(packet: &Packet<'_>) -> Option<MessageType> {
+    Header::decode(packet.header()).ok().map(|header| header.kind)
 }
 
 /// An ARM in `session` that acknowledges nothing.

@@ -318,7 +318,8 @@ impl Kind {
                 (state != State::Dark).then_some(FILES)
             }
             K::X17 | K::X18 => (state != State::Running).then_some("it strikes frames that are shown"),
-            K::X24 => (state != State::Running).then_some("light rests only where there was some"),
+            K::X24 => matches!(state, State::Dark | State::FrozenOrBlack | State::ShuttingDown)
+                .then_some("light rests only where there was some"),
             K::H7 | K::G1 | K::G2 => {
                 (state != State::Dark).then_some("it strikes only when the program starts")
             }

@@ -112,8 +112,8 @@ impl World {
             K::X22 => self.lose_orders(&mut dice),
             K::X23 => self.strike_latch(&mut dice),
             K::X24 => {
-                self.again(kind, dice.bits(), 35);
-                self.lasts(kind, 700 * MS, Undo::Nothing);
+                self.again(kind, dice.bits(), 75);
+                self.lasts(kind, 1_500 * MS, Undo::Nothing);
             }
             K::G3 | K::G9 => self.lasts(kind, MS, Undo::Nothing),
         }

@@ -649,17 +649,13 @@ impl World {
             return;
         }
         let mut bytes = self.overheard.clone();
-        let mut lane = Lane::Data;
         match self.neighbour.between(0, 3) {
             0 => bytes = of_another_host(&bytes).unwrap_or_default(),
-            1 => {
-                bytes = word_of_another_host(session(&bytes).unwrap_or_default());
-                lane = Lane::Control;
-            }
+            1 => bytes = word_of_another_host(session(&bytes).unwrap_or_default()),
             _ => damage(&mut bytes, &mut self.neighbour),
         }
-        self.projector.receive(HostTime(self.t), lane, &bytes);
-        self.projector.end_of_transfer(HostTime(self.t), lane);
+        self.projector.receive(HostTime(self.t), Lane::Data, &bytes);
+        self.projector.end_of_transfer(HostTime(self.t), Lane::Data);
         self.see_light();
     }
 
