@@ -112,8 +112,9 @@ impl World {
             K::X22 => self.lose_orders(&mut dice),
             K::X23 => self.strike_latch(&mut dice),
             K::X24 => {
-                self.again(kind, dice.bits(), 75);
-                self.lasts(kind, 1_500 * MS, Undo::Nothing);
+                // The rest ends while the order stands: two seconds after it began at the latest.
+                self.again(kind, dice.bits(), 60);
+                self.lasts(kind, 3_500 * MS, Undo::Nothing);
             }
             K::G3 | K::G9 => self.lasts(kind, MS, Undo::Nothing),
         }
