@@ -624,8 +624,10 @@ impl Laws {
             return;
         }
         let since = *self.armed_since.get_or_insert(t);
-        // What was on its way when the word was given arrives, and what was lost is repeated.
-        if t - since < DARK_AT_LAST_NS || self.alone == Some(Guard::Session) {
+        // What was on its way when the word was given arrives, and what was lost is repeated. Where all words are lost, or none
+        // is judged, this says nothing.
+        let is_judged = !matches!(self.alone, Some(Guard::Session | Guard::Unconfirmed));
+        if t - since < DARK_AT_LAST_NS || !is_judged {
             return;
         }
         let standing = self.standing.filter(|s| s.order != Order::Freeze);
