@@ -27,8 +27,13 @@ vec3 filtered_sky(vec3 d, uint lobe) {
     return mix(upper, mix(environment_texels[at].rgb, environment_texels[at + 1u].rgb, beyond.x), beyond.y);
 }
 
-// The lobe that is nearest to one of this width.
-uint nearest_lobe(float alpha) { return uint(clamp(8.0 * sqrt(alpha) - 1.5, 0.0, float(SKY_LOBES - 1u))); }
+// The same over a lobe of GGX of this width, between the two that are nearest.
+vec3 sky_over(vec3 d, float alpha) {
+    if (ENVIRONMENT_KIND != ENVIRONMENT_MAP) return filtered_sky(d, 0u);
+    float x = clamp(8.0 * sqrt(alpha) - 2.0, 0.0, float(SKY_LOBES - 1u));
+    uint lower = min(uint(x), SKY_LOBES - 2u);
+    return mix(filtered_sky(d, lower), filtered_sky(d, lower + 1u), x - float(lower));
+}
 
 // Where a lobe's light comes from on average: the rougher the surface, the nearer to its normal [Lagarde14].
 vec3 lobe_direction(vec3 n, vec3 v, float alpha) {
@@ -75,45 +80,67 @@ Seen lamp_from(vec3 p, uint index) {
     return Seen(to, lamp.intensity * falloff, 0.0);
 }
 
-// Of a lamp's light, what a surface sends toward the eye by the model of docs/RENDERING.md. `diffuse` is its reflectance below the coat, and `average`
-// the coat's E_avg.
-vec3 reflected(Point s, vec3 diffuse, float average, Seen lamp) {
-    float nl = dot(s.n, lamp.to), nv = dot(s.n, s.v), radius = min(lamp.radius, 1.0);
-    // A disk sets little by little: a parabola between its edges on the horizon.
-    float risen = nl + radius;
-    if (risen <= 0.0) return vec3(0.0);
-    if (nl < radius) nl = risen * risen / (4.0 * radius);
-    vec3 value = diffuse * (nl / PI);
-    if (HAS_SPECULAR) {
-        value *= (1.0 - directional_albedo(s.table, s.alpha, nl)) / max(1.0 - average, 1e-4);
-        // A wide lamp makes the lobe wider: half vectors move by half of its radius.
-        float alpha = min(sqrt(s.alpha * s.alpha + 0.25 * radius * radius), 1.0);
-        vec3 h = normalize(s.v + lamp.to);
-        float away = 1.0 - clamp(dot(s.v, h), 0.0, 1.0), index = (s.ior - 1.0) / (s.ior + 1.0);
-        vec3 f0 = mix(vec3(index * index), s.base, s.metallic);
-        vec3 f = f0 + (1.0 - f0) * (away * away * away * away * away);
-        value += f * (ggx_d(alpha, s.n, h) / ((1.0 + smith_lambda(alpha, nv) + smith_lambda(alpha, nl)) * 4.0 * nv));
+// Of a lamp's light, what a surface sends toward the eye by the model of docs/RENDERING.md. A disk sets little by little behind the surface: of one that
+// has begun to, the part that is left shines from its own middle.
+vec3 reflected(Point s, Lobes q, Seen lamp) {
+    float radius = min(lamp.radius, 1.0), height = dot(s.g, lamp.to), share = 1.0;
+    vec3 l = lamp.to;
+    if (height < radius && (!HAS_DIFFUSE_TRANSMISSION || height > -radius)) {
+        float risen = height + radius;
+        if (risen <= 0.0) return vec3(0.0);
+        share = risen / (2.0 * radius);
+        l = normalize(l + s.g * (0.5 * risen - height));
     }
-    return value * lamp.irradiance;
+    // A wide lamp makes lobes wider: half vectors move by half of its radius.
+    float spread = 0.25 * radius * radius;
+    s.alpha = min(sqrt(s.alpha * s.alpha + spread), 1.0);
+    if (HAS_ANISOTROPY && s.across > 0.0) s.across = min(sqrt(s.across * s.across + spread), 1.0);
+    if (HAS_CLEARCOAT) s.coat_alpha = min(sqrt(s.coat_alpha * s.coat_alpha + spread), 1.0);
+    vec3 value;
+    float pdf;
+    evaluate(s, q, l, value, pdf);
+    return value * share * lamp.irradiance;
 }
+
+// Of the sky's light, what a lobe with this reflectance for even light sends toward the eye.
+vec3 sky_light(vec3 sky, vec3 reflectance) { return reflectance * max(sky, vec3(LEAST_LIGHT * frame.mean_light)); }
 
 // Light from below the surface itself is lost, whatever the direction of the shading normal: that share of a cosine lobe is (1 - cos) / 2 of the angle
 // between the normals.
 vec3 demodulation(Hit hit, vec3 toward) {
     Point s = shading_point(hit, toward);
+    Lobes q = lobes_of(s);
     float nv = dot(s.n, s.v);
-    float e = HAS_SPECULAR ? directional_albedo(s.table, s.alpha, nv) : 0.0;
-    float m = pow(clamp(1.0 - nv, 0.0, 1.0), 5.0);
-    vec3 diffuse = (1.0 - e) * (1.0 - s.metallic) * s.base;
-    vec3 specular = mix(vec3(e), s.base + (1.0 - s.base) * m, s.metallic);
-    float above = 0.5 + 0.5 * dot(s.n, s.g);
-    vec3 least = vec3(LEAST_LIGHT * frame.mean_light);
+    // What the layers leave of light on its way to the base and back.
+    float under = (1.0 - q.coat_v) * (1.0 - q.sheen_v), above = 0.5 + 0.5 * dot(s.n, s.g);
+    float below = q.dielectric * (1.0 - q.albedo_v) * under, matte = below * (1.0 - s.transmission);
     vec3 light = s.emitted;
-    if (HAS_DIFFUSE) light += diffuse * (above * max(filtered_sky(s.n, SKY_LOBES), least));
-    if (HAS_SPECULAR) light += specular * max(filtered_sky(lobe_direction(s.n, s.v, s.alpha), nearest_lobe(s.alpha)), least);
+    if (HAS_DIFFUSE || HAS_SHEEN) {
+        vec3 diffuse = HAS_DIFFUSE ? s.base * matte : vec3(0.0);
+        if (HAS_DIFFUSE_TRANSMISSION && q.shine > 0.0) {
+            light += sky_light(filtered_sky(-s.n, SKY_LOBES), s.shine_color * (matte * s.shine * above));
+            diffuse *= 1.0 - s.shine;
+        }
+        // The light of a sheen is as spread.
+        if (HAS_SHEEN && q.sheen_v > 0.0) diffuse += s.sheen * (q.sheen_v / max3(s.sheen) * (1.0 - q.coat_v));
+        light += sky_light(filtered_sky(s.n, SKY_LOBES), diffuse * above);
+    }
+    if (HAS_SPECULAR) {
+        vec3 specular = s.metallic * fresnel_schlick(s.base, nv) + q.dielectric * q.albedo_v;
+        if (HAS_OTHER_FACETS && (is_tinted(s) || has_film(s))) {
+            float kept;
+            specular = facet_reflectance(s, q.eta, nv, kept);
+        }
+        float alpha = is_brushed(s) ? sqrt(s.alpha * s.across) : s.alpha;
+        light += sky_light(sky_over(lobe_direction(s.n, s.v, alpha), alpha), specular * under);
+    }
+    if (HAS_CLEARCOAT && q.coat_v > 0.0)
+        light += sky_light(sky_over(lobe_direction(s.coat_normal, s.v, s.coat_alpha), s.coat_alpha), vec3(q.coat_v));
+    // What lies behind a solid is seen through two of its surfaces at the least. It is taken to lie straight ahead.
+    if (HAS_TRANSMISSION && s.transmission > 0.0) light += sky_light(sky_over(-s.v, s.alpha), s.base * (below * s.transmission));
     if (HAS_EMISSIVE || HAS_PUNCTUAL || ENVIRONMENT_KIND == ENVIRONMENT_MAP) {
-        float average = HAS_SPECULAR && HAS_DIFFUSE ? average_albedo(s.table, s.alpha) : 0.0;
-        for (uint i = 0u; i < frame.lamp_count; i++) light += reflected(s, diffuse, average, lamp_from(s.p, frame.light_count + i));
+        q.transmit = 0.0;
+        for (uint i = 0u; i < frame.lamp_count; i++) light += reflected(s, q, lamp_from(s.p, frame.light_count + i));
     }
     return clamp(light / frame.mean_light, vec3(LEAST_DIVISOR), vec3(MOST_DIVISOR));
 }

@@ -44,11 +44,12 @@ const float LEAST_NOISE = 1e-8;
 
 // How long a history serves.
 // Lag counts beyond this many times the power that chance explains, and beyond this share of the light.
-const float LAG_BEYOND_CHANCE = 2.0, LEAST_LAG = 0.007;
-// Weight of the power of noise against that of lag. The spatial filter removes some noise, but noise also costs flicker.
-const float NOISE_COUNTS = 1.2;
+const float LAG_BEYOND_CHANCE = 1.0, LEAST_LAG = 0.007;
+// Weight of the power of noise against that of lag. Points of a sequence average out sooner than frames that are independent, and the spatial filter
+// removes some of the noise, but noise also costs flicker.
+const float NOISE_COUNTS = 0.5;
 // Weight of the structure that the plane leaves over.
-const float STRUCTURE_COUNTS = 1.5;
+const float STRUCTURE_COUNTS = 5.0;
 // Structure never cuts a history to fewer frames than this.
 const float LEAST_CRISP_FRAMES = 0.3;
 // Structure does not count while the point moves by less than this. Pixels a frame.

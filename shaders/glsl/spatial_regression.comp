@@ -110,6 +110,8 @@ Sums gather(uvec2 pixel, uint at, vec3 own, float tolerated, out Equations a) {
     vec3 along = cross(normal, across);
     float farthest = DEPTH * abs(surface_at(at).distance) * frame.pixel_size;
     a = Equations(vec4(0.0), 0.0, vec4(0.0), vec3(0.0), vec2(0.0), 0.0, vec3(0.0), vec3(0.0), vec3(0.0), vec3(0.0), vec3(0.0));
+    // Neighbours are weighed by their numbers of samples alone. By their variances those whose samples missed the light would weigh most.
+    float divisor = unpackHalf2x16(filtered_at(at).weight_and_albedo).y, single = history_noise_at(at).variance / (divisor * divisor);
     Sums s = Sums(0.0, 0.0, 0.0, 0.0, 0.0, vec2(0.0));
     [[dont_unroll]] for (int row = -2; row <= 2; row++) {
         WRITTEN_OUT for (int column = -2; column <= 2; column++) {
@@ -128,7 +130,7 @@ Sums gather(uvec2 pixel, uint at, vec3 own, float tolerated, out Equations a) {
             vec2 weight_and_albedo = unpackHalf2x16(f.weight_and_albedo);
             float weight = weight_and_albedo.x, light = weight_and_albedo.y;
             float noise = like ? history.variance * sequence_variance(weight) / (weight * light * light) : 0.0;
-            float w = like ? 1.0 / (noise + tolerated) : 0.0;
+            float w = like ? 1.0 / (single * sequence_variance(weight) / weight + tolerated) : 0.0;
             vec3 m = like ? f.light - own : vec3(0.0);
             vec4 e = vec4(d, dot(n, across), dot(n, along));
             vec4 we = w * e;

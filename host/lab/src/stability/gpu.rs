@@ -1,8 +1,8 @@
 //! A Vulkan device into the stability cases that need one: the shaders that run in the rig, on whichever device is here.
 
 use super::{
-    gpu_chain, gpu_disocclusion, gpu_filter, gpu_histories_in_motion, gpu_history, gpu_paper, gpu_samplers,
-    gpu_tracer, gpu_traversal, lobes, Case,
+    gpu_chain, gpu_disocclusion, gpu_filter, gpu_histories_in_motion, gpu_history, gpu_paper, gpu_relight,
+    gpu_samplers, gpu_tracer, gpu_traversal, lobes, Case,
 };
 use dpm_render::gpu::{Gpu, GpuOptions};
 use std::sync::Arc;
@@ -52,6 +52,7 @@ pub fn cases(device: &Device) -> Vec<Case> {
         gpu_traversal::CASES,
         gpu_history::CASES,
         gpu_filter::CASES,
+        gpu_relight::CASES,
         gpu_paper::CASES,
         gpu_disocclusion::CASES,
         gpu_histories_in_motion::CASES,

@@ -18,6 +18,7 @@ mod gpu_filter;
 mod gpu_histories_in_motion;
 mod gpu_history;
 mod gpu_paper;
+mod gpu_relight;
 mod gpu_samplers;
 pub mod gpu_shot;
 mod gpu_tracer;

@@ -113,6 +113,8 @@ impl FilterPicture {
         let [mut power, mut expected, mut total] = [0.0; 3];
         // Variances of one sample, relative to the squares of what light is divided by, and as they are; sums of what it is divided by.
         let [mut relative, mut plain, mut divisors, mut squares] = [0.0; 4];
+        // Neighbours are weighed by how many samples they have, and by the variance of one sample of this pixel.
+        let one = own.variance / (own.albedo * own.albedo);
         let around = self.alike(at);
         let used = around.len() as f64;
         if used < 4.0 {
@@ -121,7 +123,7 @@ impl FilterPicture {
         for (place, p) in around {
             let of_sample = p.variance * self.sequence_variance(p.weight) / (p.albedo * p.albedo);
             let noise = of_sample / p.weight;
-            let w = 1.0 / (noise + tolerated);
+            let w = 1.0 / (one * self.sequence_variance(p.weight) / p.weight + tolerated);
             let row = [place.x, place.y, p.normal.dot(across), p.normal.dot(along), 1.0];
             let apart = p.light - own.light;
             for (i, a) in row.iter().enumerate() {
