@@ -172,6 +172,14 @@ mod breadth {
             let [a, b] = r.runs_raw;
             assert!((0.5 * (a * a + b * b) - r.perceived_rmse_raw.powi(2)).abs() < 1e-12, "{}", r.method);
             assert!(r.middle_half_ms[0] <= r.middle_half_ms[1]);
+            // By the costs of a card the time is met as well as rays follow samples, but where it has no more rays to give.
+            let known = is_other(&r.method) && r.method != "own";
+            assert_eq!(!r.on_cards.is_empty(), known, "{}", r.method);
+            for t in &r.on_cards {
+                println!("{} on {}: {:.1} samples, {:.2}", r.method, t.card, t.seen.spp, t.seen.time_to_dpm);
+                assert!(t.seen.spp >= 1.0 || r.method != "full", "{}: {}", r.method, t.seen.spp);
+                assert!((0.3..3.0).contains(&t.seen.time_to_dpm), "{}: {}", r.method, t.seen.time_to_dpm);
+            }
             let Some(t) = r.equal_time else { continue };
             println!(
                 "{}: {:.1} samples, {:.2} of the time, {:.5}",

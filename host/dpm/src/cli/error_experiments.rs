@@ -3,6 +3,7 @@
 use super::error::{chosen, folder, list, list_names, options, rig_files, rig_of, stage, ErrorArgs};
 use super::error_files::{known, known_or, report, report_rigs, show};
 use super::progress::Progress;
+use dpm_lab::error::costs::CardCosts;
 use dpm_lab::error::figure3::{self, Figure3Group, SPP};
 use dpm_lab::error::groups::RigGroup;
 use dpm_lab::error::plan::{contenders, Setting};
@@ -230,11 +231,12 @@ fn cost(what: &str, setting: Setting, extent: Extent, methods: usize) -> u64 {
 /// Races of a group at most: one at equal rays, the others for equal time.
 const MOST_RACES: u64 = 1 + RACES as u64;
 
-/// Each method twice, the races, and each of the others twice at equal time.
+/// Each method twice, the races, and each of the others twice at equal time, here and on every card.
 fn cost_of_methods(setting: Setting, extent: Extent, methods: usize) -> u64 {
     let of = |what: &str| cost(what, setting, extent, methods);
     let others = contenders(&RenderConfig::default(), false).iter().filter(|c| is_other(c.name)).count();
-    2 * methods as u64 * of("") + MOST_RACES * of("times") + 2 * others as u64 * of(AT_EQUAL_TIME)
+    let times = (others * (1 + CardCosts::all().len())) as u64;
+    2 * methods as u64 * of("") + MOST_RACES * of("times") + 2 * times * of(AT_EQUAL_TIME)
 }
 
 fn failure(error: ErrorRunError) -> Failure {

@@ -242,6 +242,7 @@ mod tests {
             middle_half_ms: [0.9, 1.1],
             runs_raw: [0.1; 2],
             equal_time: None,
+            on_cards: Vec::new(),
             single_rmse: 1.0,
             single_rel_mse: 1.0,
             perceived_rmse: 1.0,

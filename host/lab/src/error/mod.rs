@@ -1,5 +1,6 @@
 //! Error against rays and time of every method: runs, references, tables, plots.
 
+pub mod costs;
 mod equal;
 pub mod export;
 pub mod figure3;

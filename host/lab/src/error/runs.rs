@@ -6,6 +6,7 @@
 //!
 //! Equal rays are not equal time, so the other methods are drawn once more with as many samples as fill the time of a frame of dpm.
 
+use super::costs::CardCosts;
 use super::equal::{corrected, least_spp, nearest, off_equal, where_equal, with_samples, Trial};
 use super::parts::Part;
 use super::plan::{contenders, looks, paper_at, Contender, Setting, Window};
@@ -86,6 +87,15 @@ pub struct EqualTime {
     pub runs_raw: [f64; 2],
 }
 
+/// A method with as many samples as fill the time of a frame of dpm on a card that was measured before.
+#[derive(Clone, Debug, Serialize, Deserialize)]
+pub struct TimeOnCard {
+    /// The card.
+    pub card: String,
+    /// What the eye saw. Its time is computed from the costs of the card.
+    pub seen: EqualTime,
+}
+
 /// One method at one budget. Errors are in the scene's unit of radiance.
 #[derive(Clone, Debug, Serialize, Deserialize)]
 pub struct ErrorRow {
@@ -144,6 +154,9 @@ pub struct ErrorRow {
     /// With the time of dpm in place of the rays of `paper`; `None` of dpm itself and its parts.
     #[serde(default)]
     pub equal_time: Option<EqualTime>,
+    /// The same on each card of `host/lab/cards/` that has the costs of the method.
+    #[serde(default)]
+    pub on_cards: Vec<TimeOnCard>,
 }
 
 /// A measured group, as it is kept in its file.
@@ -323,6 +336,7 @@ impl ErrorRuns {
             (row.gpu_ms, row.wall_ms, row.middle_half_ms) = (time.gpu_ms, time.wall_ms, time.middle_half_ms);
         }
         self.at_equal_time(&theatre, &contenders, &times, &mut rows, &reference, each)?;
+        self.on_cards(theatre.probes().len() as f64, &contenders, &mut rows, &reference, each)?;
         let result = GroupResult {
             stamp: self.stamp.clone(),
             key,
@@ -382,25 +396,63 @@ impl ErrorRuns {
             }
         }
         for (&i, tried) in others.iter().zip(&trials) {
-            let (name, (spp, time_to_dpm)) = (contenders[i].name, nearest(tried));
-            let method = with_samples(&contenders[i].method, spp as f32);
-            // Only what the eye sees at the end is wanted.
-            let warm_up = if method.needs_history() { self.options.extent.warm_up } else { 0 };
-            let short = self.theatre(warm_up, EYE_FRAMES as u32)?;
-            let mut play = |seed: u32| {
-                each(&format!("{name}{AT_EQUAL_TIME}"));
-                let seen = short.play(&method, spp as f32, seed, &mut |_, _| ())?;
-                Ok::<_, RenderError>(eye_mean(&seen.frames, EYE_FRAMES))
-            };
-            let eyes = [play(seed)?, play(seed.wrapping_add(1_000_003))?];
-            let (raw, clean) = reference.perceived(&eyes, &|_| true);
-            rows[i].equal_time = Some(EqualTime {
-                spp,
-                time_to_dpm,
-                perceived_rmse_raw: raw,
-                perceived_rmse: clean,
-                runs_raw: reference.each_run(&eyes),
-            });
+            rows[i].equal_time = Some(self.seen_with(&contenders[i], nearest(tried), reference, each)?);
+        }
+        Ok(())
+    }
+
+    /// What the eye sees of a method with the samples of a trial.
+    fn seen_with(
+        &self,
+        contender: &Contender,
+        (spp, time_to_dpm): Trial,
+        reference: &Reference,
+        each: &mut dyn FnMut(&str),
+    ) -> Result<EqualTime, ErrorRunError> {
+        let (name, seed) = (contender.name, self.stamp.seed as u32);
+        let method = with_samples(&contender.method, spp as f32);
+        // Only what the eye sees at the end is wanted.
+        let warm_up = if method.needs_history() { self.options.extent.warm_up } else { 0 };
+        let short = self.theatre(warm_up, EYE_FRAMES as u32)?;
+        let mut play = |seed: u32| {
+            each(&format!("{name}{AT_EQUAL_TIME}"));
+            let seen = short.play(&method, spp as f32, seed, &mut |_, _| ())?;
+            Ok::<_, RenderError>(eye_mean(&seen.frames, EYE_FRAMES))
+        };
+        let eyes = [play(seed)?, play(seed.wrapping_add(1_000_003))?];
+        let (raw, clean) = reference.perceived(&eyes, &|_| true);
+        let runs_raw = reference.each_run(&eyes);
+        Ok(EqualTime { spp, time_to_dpm, perceived_rmse_raw: raw, perceived_rmse: clean, runs_raw })
+    }
+
+    /// Draws every method but dpm and its parts with as many samples as fill the time of a frame of dpm on each card whose costs
+    /// are known.
+    fn on_cards(
+        &self,
+        lit_pixels: f64,
+        contenders: &[Contender],
+        rows: &mut [ErrorRow],
+        reference: &Reference,
+        each: &mut dyn FnMut(&str),
+    ) -> Result<(), ErrorRunError> {
+        let Some(dpm) = rows.iter().find(|r| r.method == DPM).map(|r| r.rays) else { return Ok(()) };
+        for card in CardCosts::all() {
+            let Some(wanted) = card.of(DPM).map(|costs| costs.frame_ms(lit_pixels, dpm)) else { continue };
+            for (contender, row) in contenders.iter().zip(&mut *rows).filter(|(c, _)| is_other(c.name)) {
+                let Some(costs) = card.of(contender.name) else { continue };
+                let least = least_spp(&contender.method);
+                let most = (MOST_SAMPLES_MORE * row.spp as f32).clamp(least, MOST_SPP);
+                // A method whose samples go by the visual angle keeps its table's shape, and its rays grow with it.
+                let rays = |spp: f32| self.rays_at(&with_samples(&contender.method, spp), spp);
+                let (few, many) = (row.spp as f32, 2.0 * row.spp as f32);
+                let (at_few, at_many) = (rays(few)?, rays(many)?);
+                let slope = (at_many - at_few) / f64::from(many - few);
+                let base = at_few - slope * f64::from(few);
+                let spp = corrected(few, base, at_few, costs.rays_in(wanted, lit_pixels)).clamp(least, most);
+                let time = costs.frame_ms(lit_pixels, base + slope * f64::from(spp)) / wanted;
+                let seen = self.seen_with(contender, (f64::from(spp), time), reference, each)?;
+                row.on_cards.push(TimeOnCard { card: card.name().to_owned(), seen });
+            }
         }
         Ok(())
     }
@@ -517,6 +569,7 @@ impl ErrorRuns {
             flicker_periphery: flicker_periphery.filter(|_| share >= LEAST_PERIPHERY),
             ratio_to_paper: 1.0,
             equal_time: None,
+            on_cards: Vec::new(),
         };
         let [eye, _] = eyes;
         Ok((row, eye))

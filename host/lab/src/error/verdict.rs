@@ -109,11 +109,40 @@ pub(super) fn runs_text(runs: [f64; 2]) -> String {
 
 /// Every other method with as many samples as fill the time of dpm, as a Markdown table with what it says above. Nothing where no group
 /// was measured so.
-pub(super) fn equal_time_table<'a>(groups: impl Iterator<Item = (String, &'a GroupResult)>) -> String {
+pub(super) fn equal_time_table<'a>(
+    groups: impl Iterator<Item = (String, &'a GroupResult)> + Clone,
+) -> String {
+    let here = "At equal time every other method is drawn again with as many samples as fill the time of a frame of dpm on this device: \
+                races of all methods in turns say how many these are, and `time / dpm` how well that was met.";
+    let mut text = table_at(groups.clone(), here, &|r| r.equal_time);
+    let mut cards: Vec<&str> = Vec::new();
+    let known = groups.clone().flat_map(|(_, g)| &g.rows).flat_map(|r| &r.on_cards);
+    known.for_each(|t| {
+        if !cards.contains(&t.card.as_str()) {
+            cards.push(&t.card);
+        }
+    });
+    for card in cards {
+        let told = format!(
+            "The same by the costs that passes and rays had on a card that was measured, `dpm bench --report` of {card}: computed, and not \
+             timed here."
+        );
+        let on_card = |r: &ErrorRow| r.on_cards.iter().find(|t| t.card == card).map(|t| t.seen);
+        text += &format!("\n{}", table_at(groups.clone(), &told, &on_card));
+    }
+    text
+}
+
+/// Methods at equal times of one kind, with what these are above; nothing where none is known.
+fn table_at<'a>(
+    groups: impl Iterator<Item = (String, &'a GroupResult)>,
+    told: &str,
+    time: &dyn Fn(&ErrorRow) -> Option<EqualTime>,
+) -> String {
     let mut text = String::new();
     for (name, g) in groups {
         let Some(dpm) = dpm_of(g) else { continue };
-        for (r, t) in g.rows.iter().filter_map(|r| Some((r, r.equal_time?))) {
+        for (r, t) in g.rows.iter().filter_map(|r| Some((r, time(r)?))) {
             // Writing into a string cannot fail.
             let _ = writeln!(
                 text,
@@ -133,8 +162,7 @@ pub(super) fn equal_time_table<'a>(groups: impl Iterator<Item = (String, &'a Gro
         return text;
     }
     format!(
-        "At equal time every other method is drawn again with as many samples as fill the time of a frame of dpm on this device: races \
-         of all methods in turns say how many these are, and `time / dpm` how well that was met.\n\n\
+        "{told}\n\n\
          | group | method | samples at equal rays | in the time of dpm | time / dpm | perceived RMSE as measured | less the reference's own | \
          two runs | dpm / it, as measured |\n|---|---|---:|---:|---:|---:|---:|---|---:|\n{text}"
     )
