@@ -107,6 +107,7 @@ pub struct PlaneSchedule {
     len: u8,
     repeats: bool,
     fills: bool,
+    exceeds: bool,
 }
 
 /// How a code value is shared out over a frame whose planes do not weigh as its bits do: each channel shows several parts, one
@@ -117,6 +118,9 @@ pub struct Parts {
     pub count: u8,
     /// Bits of a part, 1 to 8. A part of one bit is a plane, and all planes give equal light then.
     pub depth: u8,
+    /// Planes below the parts, 0 to 7, each shown once, that weigh as the bits of a number do: the lowest plane counts 1, and a
+    /// part of one bit `2^low`. 0 unless parts have one bit.
+    pub low: u8,
     /// All planes are white, and show the green code value; else red, green and blue have as many parts each.
     pub white: bool,
 }
@@ -124,7 +128,7 @@ pub struct Parts {
 impl Parts {
     /// The greatest sum of the parts of a channel: what a mirror adds up to that is on in all its planes.
     pub const fn most(self) -> u32 {
-        self.count as u32 * ((1 << self.depth) - 1)
+        ((self.count as u32 * ((1 << self.depth) - 1)) << self.low) + (1 << self.low) - 1
     }
 }
 
@@ -142,7 +146,7 @@ impl PlaneSchedule {
         }
         let mut all = [PlaneSpec { channel: Channel::White, bit: 0 }; MAX_PLANES];
         all[..planes.len()].copy_from_slice(planes);
-        Some(Self { planes: all, len: planes.len() as u8, repeats: false, fills: false })
+        Some(Self { planes: all, len: planes.len() as u8, repeats: false, fills: false, exceeds: false })
     }
 
     /// Planes in the order given, of which several may have the same channel and bit: for codes that need planes of equal
@@ -157,12 +161,25 @@ impl PlaneSchedule {
     /// dimmed from plane to plane are of this kind. `None` as for [`PlaneSchedule::new`], or if the channels that are lit do not
     /// reach the same sum; white and coloured planes do not mix.
     pub fn filling(planes: &[PlaneSpec]) -> Option<Self> {
+        Self::even(planes).map(|schedule| Self { fills: true, ..schedule })
+    }
+
+    /// Planes in the order given, each with the light of its bit, of which more than full white comes together: the sum of a
+    /// lit channel is above 255, because a bit is shown several times. No plane is brighter than it is in another schedule.
+    /// `None` as for [`PlaneSchedule::filling`], or if the sum is 255 or less.
+    pub fn exceeding(planes: &[PlaneSpec]) -> Option<Self> {
+        let schedule = Self::even(planes)?;
+        (schedule.greatest_sum() > 255).then_some(Self { exceeds: true, ..schedule })
+    }
+
+    /// Planes whose lit channels all reach the same sum; white and coloured planes do not mix.
+    fn even(planes: &[PlaneSpec]) -> Option<Self> {
         let schedule = Self::repeating(planes)?;
         let sums = [Channel::Red, Channel::Green, Channel::Blue].map(|channel| schedule.sum_of(channel));
         let whites = planes.iter().filter(|p| p.channel == Channel::White).count();
         let is_one_kind = whites == 0 || whites == planes.len();
         let is_even = sums.iter().all(|&sum| sum == 0 || sum == schedule.greatest_sum());
-        (is_one_kind && is_even).then_some(Self { fills: true, ..schedule })
+        (is_one_kind && is_even).then_some(schedule)
     }
 
     /// This schedule as one whose planes share the full light; itself if that is not possible. See [`PlaneSchedule::filling`].
@@ -177,7 +194,7 @@ impl PlaneSchedule {
         let mut all = [PlaneSpec { channel: Channel::White, bit: 0 }; MAX_PLANES];
         all[..planes.len()].copy_from_slice(planes);
         let repeats = planes.iter().enumerate().any(|(i, p)| planes[..i].contains(p));
-        Some(Self { planes: all, len: planes.len() as u8, repeats, fills: false })
+        Some(Self { planes: all, len: planes.len() as u8, repeats, fills: false, exceeds: false })
     }
 
     /// Sum of `2^bit` over the planes that light `channel`.
@@ -226,42 +243,77 @@ impl PlaneSchedule {
         Self::with_repeats(&[PlaneSpec { channel: Channel::White, bit: 4 }; 8]).expect("128 of 255")
     }
 
+    /// The bits that each channel shows in turn where the highest one is split: three planes of bit 7 where others have one, and
+    /// none of bits 0 and 1. This order, and levels that begin with either of two of them in turn, leave least modulation at
+    /// the frame rate of all.
+    const SPLIT: [u8; 8] = [6, 2, 7, 5, 3, 7, 4, 7];
+
+    /// 24 planes whose highest bit is split, red, green and blue in turn: 508 of 255 if all are on. Levels go in steps of four.
+    pub fn split_rgb24() -> Self {
+        let channels = [Channel::Red, Channel::Green, Channel::Blue];
+        let planes: [PlaneSpec; 24] =
+            core::array::from_fn(|i| PlaneSpec { channel: channels[i % 3], bit: Self::SPLIT[i / 3] });
+        Self::exceeding(&planes).expect("508 in each channel")
+    }
+
+    /// 8 white planes whose highest bit is split.
+    pub fn split_mono8() -> Self {
+        Self::exceeding(&Self::SPLIT.map(|bit| PlaneSpec { channel: Channel::White, bit }))
+            .expect("508 of 255")
+    }
+
     /// How code values are shared out over the planes, if these do not weigh as the bits of a code value do: every channel
-    /// (one white, or red, green and blue alike) shows the same few bits several times, lowest first. A white channel has at
-    /// most 24 planes, a coloured one at most 8. `None` for other schedules.
+    /// (one white, or red, green and blue alike) shows the same few bits several times, lowest first, or each of some bits
+    /// once and the one above them several times, in any order. A white channel has at most 24 planes, a coloured one at
+    /// most 8. `None` for other schedules.
     pub fn parts(&self) -> Option<Parts> {
         let white = self.planes().iter().all(|p| p.channel == Channel::White);
         let of =
             |channel| if white { Some(self.numbers_of(Channel::White)?) } else { self.numbers_of(channel) };
         let [red, green, blue] = [Channel::Red, Channel::Green, Channel::Blue].map(of);
         let first = red?;
-        let planes = usize::from(first.0) * usize::from(first.1);
+        let [count, depth, low, _] = first;
+        let planes = usize::from(count) * usize::from(depth) + usize::from(low);
         let all = if white { planes } else { 3 * planes };
         let is_alike = green == red && blue == red && all == self.len();
         let fits = planes <= if white { 24 } else { 8 };
-        (is_alike && fits && first.0 > 1).then_some(Parts { count: first.0, depth: first.1, white })
+        (is_alike && fits && count > 1).then_some(Parts { count, depth, low, white })
     }
 
-    /// How often a channel shows how many bits, and the lowest of them; `None` if it does not show the same ones again and
-    /// again.
-    fn numbers_of(&self, channel: Channel) -> Option<(u8, u8, u8)> {
+    /// How often a channel shows how many bits, how many others it shows once below them, and the lowest of all; `None` if it
+    /// shows no bits again and again, or not all of those below.
+    fn numbers_of(&self, channel: Channel) -> Option<[u8; 4]> {
         let bits = || self.planes().iter().filter(|p| p.channel == channel).map(|p| p.bit);
+        let (lowest, highest) = (bits().min()?, bits().max()?);
+        let times = |bit: u8| bits().filter(|&b| b == bit).count() as u8;
+        if highest > lowest && times(highest) > 1 && (lowest..highest).all(|bit| times(bit) == 1) {
+            return Some([times(highest), 1, highest - lowest, lowest]);
+        }
         let lowest = bits().next()?;
         let depth = bits().zip(lowest..).take_while(|(bit, rising)| bit == rising).count();
         let is_again = |(i, bit): (usize, u8)| usize::from(bit - lowest) == i % depth;
         let count = bits().count();
         let is_even =
             count % depth == 0 && bits().all(|bit| bit >= lowest) && bits().enumerate().all(is_again);
-        is_even.then_some(((count / depth) as u8, depth as u8, lowest))
+        is_even.then_some([(count / depth) as u8, depth as u8, 0, lowest])
     }
 
-    /// The sum of `2^bit` over the planes of a channel that is full white: 255, unless the planes share the full light among
-    /// them.
+    /// The sum of `2^bit` over the planes of a channel that is as bright as this schedule makes it: 255, unless the planes share
+    /// the full light among them or exceed it.
     pub fn white_weight(&self) -> u32 {
-        if self.fills {
+        if self.fills || self.exceeds {
             self.greatest_sum()
         } else {
             255
+        }
+    }
+
+    /// The sum of `2^bit` that limits on light call full: the same light whether planes exceed it or not.
+    pub fn limit_weight(&self) -> u32 {
+        if self.exceeds {
+            255
+        } else {
+            self.white_weight()
         }
     }
 
@@ -272,9 +324,18 @@ impl PlaneSchedule {
         ((sum.min(white) * 255 + white / 2) / white) as u8
     }
 
-    /// Light of a channel when all planes are on, as a code value: 255 for binary planes of eight bits.
+    /// Light of a channel when all planes are on, in units of which 255 is full light: 255 for binary planes of eight bits, and
+    /// more only where planes exceed it.
     pub fn full_light(&self) -> u32 {
-        self.light_of(self.greatest_sum()).into()
+        match self.exceeds {
+            true => self.greatest_sum(),
+            false => self.light_of(self.greatest_sum()).into(),
+        }
+    }
+
+    /// The planes of a channel give more than full light together; see [`PlaneSchedule::exceeding`].
+    pub const fn exceeds(&self) -> bool {
+        self.exceeds
     }
 
     /// The planes share the full light of a frame among them; see [`PlaneSchedule::filling`].
@@ -335,7 +396,7 @@ mod tests {
     use super::*;
 
     fn parts(count: u8, depth: u8, white: bool) -> Parts {
-        Parts { count, depth, white }
+        Parts { count, depth, low: 0, white }
     }
 
     /// What a schedule was made of is found in it again, and schedules whose bits weigh as those of a code value have none.
@@ -380,6 +441,34 @@ mod tests {
             (ascending.parts(), ascending.has_repeats(), ascending.white_weight()),
             (None, false, 255)
         );
+    }
+
+    /// Nearly twice the light of binary planes, none of them brighter than the brightest of those.
+    #[test]
+    fn a_split_highest_bit_gives_more_light() {
+        for (schedule, white) in [(PlaneSchedule::split_rgb24(), false), (PlaneSchedule::split_mono8(), true)]
+        {
+            assert_eq!(schedule.parts(), Some(Parts { count: 3, depth: 1, low: 5, white }));
+            assert!(schedule.exceeds() && schedule.has_repeats() && !schedule.fills());
+            assert!(f64::from(schedule.full_light()) >= 1.9 * f64::from(PlaneSchedule::rgb24().full_light()));
+            assert_eq!(schedule.white_weight(), schedule.parts().unwrap().most() << 2);
+            assert_eq!([254, 508].map(|sum| schedule.light_of(sum)), [128, 255]);
+            assert!(schedule.limit_weight() == 255 && schedule.planes().iter().all(|p| p.bit <= 7));
+            assert_eq!(PlaneSchedule::with_repeats(schedule.planes()), None);
+        }
+        // No more than full light, uneven light, mixed light; a bit that is missing, and one twice, below those that repeat.
+        let white = |bits: &[u8]| -> Option<PlaneSchedule> {
+            let planes: std::vec::Vec<_> =
+                bits.iter().map(|&bit| PlaneSpec { channel: Channel::White, bit }).collect();
+            PlaneSchedule::exceeding(&planes)
+        };
+        assert_eq!(white(&[7, 6, 5, 4, 3, 2, 1, 0]), None);
+        assert!(white(&[7, 7]).is_some_and(|s| s.parts() == Some(parts(2, 1, true))));
+        assert_eq!([white(&[7, 5, 7]), white(&[7, 6, 6, 7])].map(|s| s.unwrap().parts()), [None, None]);
+        let plane = |channel, bit| PlaneSpec { channel, bit };
+        let uneven = [plane(Channel::Red, 7), plane(Channel::Red, 7), plane(Channel::Green, 7)];
+        let mixed = [plane(Channel::White, 7), plane(Channel::White, 7), plane(Channel::Green, 7)];
+        assert_eq!([&uneven, &mixed].map(|planes| PlaneSchedule::exceeding(planes)), [None, None]);
     }
 
     #[test]

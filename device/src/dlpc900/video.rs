@@ -352,7 +352,8 @@ mod tests {
         let of = |schedule: PlaneSchedule, bits, us| {
             VideoPatterns::of_rig(Dmd::Dlp6500, Receiver::Hdmi, rate, &schedule, bits, us).entries
         };
-        let parts = |count, depth, white| PlaneSchedule::of_parts(Parts { count, depth, white }).unwrap();
+        let parts =
+            |count, depth, white| PlaneSchedule::of_parts(Parts { count, depth, low: 0, white }).unwrap();
         let planes = of(PlaneSchedule::equal_rgb24(), VideoBits::PLANES, 620);
         let leds: Vec<u8> = planes[..4].iter().map(|e| e.leds).collect();
         assert_eq!(leds, [led::RED, led::GREEN, led::BLUE, led::RED]);

@@ -72,10 +72,15 @@ pub fn mean_luminance(raster: Raster, schedule: &PlaneSchedule, planes: &[u8]) -
     (light * u64::from(FULL_LUMINANCE) / full).min(u64::from(FULL_LUMINANCE)) as u32
 }
 
-/// True if light of these luminances, slot by slot, breaks a limit of `limit` flashes a second in some slot that it may begin in.
-pub fn breaks_limit(rate: FrameRate, limit: u8, light: impl Iterator<Item = u32> + Clone) -> bool {
-    (0..FlashLimiter::new(rate, limit).slots_per_window).any(|first| {
-        let mut limiter = FlashLimiter::new(rate, limit);
+/// True if light of planes of `schedule` with these luminances, slot by slot, breaks a limit of `limit` flashes a second in some slot that it may begin in.
+pub fn breaks_limit(
+    (rate, limit): (FrameRate, u8),
+    schedule: &PlaneSchedule,
+    light: impl Iterator<Item = u32> + Clone,
+) -> bool {
+    let limiter = FlashLimiter::new(rate, limit).of_planes(schedule);
+    (0..limiter.slots_per_window).any(|first| {
+        let mut limiter = limiter.clone();
         light.clone().zip(u64::from(first)..).any(|(luminance, slot)| limiter.observe(slot, luminance))
     })
 }
@@ -97,6 +102,8 @@ pub struct FlashLimiter {
     in_window: u32,
     sum: u64,
     window: u32,
+    /// A change that counts.
+    step: u32,
     /// Lowest or highest window mean since the last change, and the direction of that change.
     extreme: u32,
     rising: Option<bool>,
@@ -120,6 +127,7 @@ impl FlashLimiter {
             in_window: 0,
             sum: 0,
             window: 0,
+            step: STEP,
             extreme: 0,
             rising: None,
             changes: [0; 2 * HIGHEST_LIMIT as usize + 1],
@@ -132,6 +140,11 @@ impl FlashLimiter {
     pub fn backstop(rate: FrameRate, limit: u8) -> Self {
         let limiter = Self::new(rate, limit);
         Self { allowed: (limiter.allowed + 2).min(limiter.changes.len() - 1), ..limiter }
+    }
+
+    /// For planes of `schedule`: where they exceed full light, changes count from the same light on as with those that do not.
+    pub fn of_planes(self, schedule: &PlaneSchedule) -> Self {
+        Self { step: STEP * schedule.limit_weight() / schedule.white_weight(), ..self }
     }
 
     /// Observes the light of slot number `slot` (0 when dark). Returns `true` if this slot makes more flashes in the last
@@ -181,8 +194,8 @@ impl FlashLimiter {
 
     /// True when `mean` completes a change that opposes the one before.
     fn changed(&mut self, mean: u32) -> bool {
-        let up = mean >= self.extreme.saturating_add(STEP) && self.extreme < DARK_SIDE;
-        let down = self.extreme >= mean.saturating_add(STEP) && mean < DARK_SIDE;
+        let up = mean >= self.extreme.saturating_add(self.step) && self.extreme < DARK_SIDE;
+        let down = self.extreme >= mean.saturating_add(self.step) && mean < DARK_SIDE;
         match self.rising {
             // In the direction of the last change the extreme follows the mean.
             Some(true) if mean > self.extreme => self.extreme = mean,
@@ -273,6 +286,31 @@ mod tests {
         for first in 1..9 {
             assert_eq!(strikes(&|slot| *slot >= first), all, "from slot {first}");
             assert_eq!(strikes(&|slot| !(50..50 + first).contains(slot)), all, "{first} slots left out");
+        }
+    }
+
+    /// A flash of a tenth of full light counts, whatever more the planes can give; one of less light does not.
+    #[test]
+    fn planes_that_exceed_full_light_flash_by_the_same_light() {
+        let (raster, rate) = (Raster::new(8, 8).unwrap(), rate());
+        for schedule in [PlaneSchedule::rgb24(), PlaneSchedule::split_rgb24()] {
+            for (sum, strikes) in [(20, false), (24, false), (28, true), (128, true)] {
+                // Planes of these bits, each once, in all three channels.
+                let mut left = [sum; 3];
+                let planes: Vec<u8> = schedule
+                    .planes()
+                    .iter()
+                    .flat_map(|p| {
+                        let left = &mut left[p.channel as usize];
+                        let is_on = *left >> p.bit & 1 == 1;
+                        *left &= if is_on { !(1 << p.bit) } else { !0 };
+                        [if is_on { 0xff } else { 0 }; 8]
+                    })
+                    .collect();
+                let bright = mean_luminance(raster, &schedule, &planes);
+                let light = (0..1894).map(|slot| if slot / 80 % 2 == 0 { bright } else { 0 });
+                assert_eq!(breaks_limit((rate, 3), &schedule, light), strikes, "{sum}");
+            }
         }
     }
 

@@ -105,7 +105,8 @@ impl HostLink {
             Compactor::new(settings.raster, settings.schedule.len(), frame_ns, settings.codecs)
         });
         let field = FieldCount::new(&settings);
-        let reported = settings.flash_limit.map(|limit| ReportedField::new(settings.rate, limit));
+        let reported =
+            settings.flash_limit.map(|limit| ReportedField::new(settings.rate, limit, &settings.schedule));
         Self {
             settings,
             sessions,
@@ -399,6 +400,9 @@ impl HostLink {
         }
         if hello.raster != s.raster {
             return Err(LinkError::Raster { device: device(), theirs: hello.raster, ours: s.raster });
+        }
+        if s.schedule.exceeds() && !hello.exceeds {
+            return Err(LinkError::Exceeds { device: device() });
         }
         let planes = s.schedule.len();
         let plane_ns = 1_000_000_000 * u64::from(s.rate.den()) / (u64::from(s.rate.num()) * planes as u64);

@@ -76,7 +76,7 @@ impl LightLimits {
 
 /// Level of a frame, 0 to [`FULL_LUMINANCE`]: the greatest of the mean drives of red, green and blue over all mirrors;
 /// planes of [`Channel::White`] count for each. Every row is counted, so no pattern can hide between samples. Schedules
-/// with both white and coloured planes can reach twice the full level.
+/// with both white and coloured planes, or whose planes exceed full light, can reach twice the full level.
 ///
 /// # Panics
 /// When `planes` does not have the size that raster and schedule demand.
@@ -92,7 +92,7 @@ pub fn light_level(raster: Raster, schedule: &PlaneSchedule, planes: &[u8]) -> u
     }
     let white = drive[Channel::White as usize];
     let greatest = drive[..3].iter().map(|d| d + white).fold(0, u64::max);
-    let full = raster.pixel_count() as u64 * u64::from(schedule.white_weight());
+    let full = raster.pixel_count() as u64 * u64::from(schedule.limit_weight());
     // Rounded up, so that rounding never hides an excess.
     (greatest * u64::from(FULL_LUMINANCE)).div_ceil(full) as u32
 }

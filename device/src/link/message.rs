@@ -151,12 +151,16 @@ const TIMES: u8 = 8;
 const SHIFTS: u8 = 16;
 /// Flag of CONFIG: the planes share the full light of a frame among them.
 const FILLS: u8 = 4;
+/// Flag of CONFIG: the planes give more than full light together. Only with [`CODES_REPEAT`], and never with [`FILLS`].
+const EXCEEDS: u8 = 32;
 /// Feature of a device in HELLO: it follows TRACKS.
 const FEATURE_TRACKS: u8 = 1;
 /// The same: it measures how early frames are whole.
 const FEATURE_TIMING: u8 = 2;
 /// The same: its slots can be shifted.
 const FEATURE_SHIFT: u8 = 4;
+/// The same: its planes may give more than full light together.
+const FEATURE_EXCEEDS: u8 = 8;
 /// Length of a SHIFT's payload.
 const SHIFT_BYTES: usize = 16;
 /// Length of a STATUS without the parts that CONFIG may ask for, and of each of them, in the order in which they follow.
@@ -166,11 +170,15 @@ const TIMING_BYTES: usize = 16;
 
 /// The planes of a CONFIG with `flags`; `None` if codes stand there that the flags do not allow.
 fn schedule(planes: &[PlaneSpec], flags: u8) -> Option<PlaneSchedule> {
-    match (flags & FILLS != 0, flags & CODES_REPEAT != 0) {
-        (false, false) => PlaneSchedule::new(planes),
-        (false, true) => PlaneSchedule::with_repeats(planes),
-        (true, false) => PlaneSchedule::filling(planes).filter(|schedule| !schedule.has_repeats()),
-        (true, true) => PlaneSchedule::filling(planes),
+    const BOTH: u8 = CODES_REPEAT | FILLS;
+    const MORE: u8 = CODES_REPEAT | EXCEEDS;
+    match flags & (CODES_REPEAT | FILLS | EXCEEDS) {
+        0 => PlaneSchedule::new(planes),
+        CODES_REPEAT => PlaneSchedule::with_repeats(planes),
+        FILLS => PlaneSchedule::filling(planes).filter(|schedule| !schedule.has_repeats()),
+        BOTH => PlaneSchedule::filling(planes),
+        MORE => PlaneSchedule::exceeding(planes),
+        _ => None,
     }
 }
 
@@ -190,7 +198,7 @@ impl Config {
         for (spec, &code) in specs.iter_mut().zip(&p[CONFIG_BYTES..]) {
             *spec = PlaneSpec::from_led_code(code).ok_or(field("led codes"))?;
         }
-        let is_unknown = p[19] & !(CODES_REPEAT | FOLLOWS | FILLS | TIMES | SHIFTS) != 0;
+        let is_unknown = p[19] & !(CODES_REPEAT | FOLLOWS | FILLS | TIMES | SHIFTS | EXCEEDS) != 0;
         if is_unknown || p[19] & (SHIFTS | TIMES) == SHIFTS {
             return Err(field("flags"));
         }
@@ -234,7 +242,8 @@ impl Config {
             | flag(self.tracks, FOLLOWS)
             | flag(self.timing, TIMES)
             | flag(self.shifts, SHIFTS)
-            | flag(self.schedule.fills(), FILLS));
+            | flag(self.schedule.fills(), FILLS)
+            | flag(self.schedule.exceeds(), EXCEEDS));
         w.u16(self.limits.mean_permille).u16(0).u64(self.epoch.0);
         w.u32(self.limits.window_ms).u32(self.limits.full_white_ms);
         for plane in self.schedule.planes() {
@@ -391,6 +400,7 @@ impl DeviceMessage {
                     greatest_shift: (p[14] & FEATURE_TRACKS != 0).then_some(p[15]),
                     measures_timing: p[14] & FEATURE_TIMING != 0,
                     shifts_slots: p[14] & FEATURE_SHIFT != 0,
+                    exceeds: p[14] & FEATURE_EXCEEDS != 0,
                     tick_hz: u32_at(p, 16),
                     min_plane_ns: u32_at(p, 20),
                     serial: u64_at(p, 24),
@@ -465,7 +475,8 @@ impl DeviceMessage {
                 let follows = h.greatest_shift.map_or(0, |_| FEATURE_TRACKS);
                 let measures = if h.measures_timing { FEATURE_TIMING } else { 0 };
                 let shifts = if h.shifts_slots { FEATURE_SHIFT } else { 0 };
-                w.u8(follows | measures | shifts).u8(h.greatest_shift.unwrap_or(0));
+                let exceeds = if h.exceeds { FEATURE_EXCEEDS } else { 0 };
+                w.u8(follows | measures | shifts | exceeds).u8(h.greatest_shift.unwrap_or(0));
                 w.u32(h.tick_hz).u32(h.min_plane_ns).u64(h.serial).u64(h.now.0);
                 MessageType::Hello
             }

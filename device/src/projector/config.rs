@@ -46,6 +46,8 @@ pub struct FirmwareConfig {
     pub measures_timing: bool,
     /// Its slots can be shifted by SHIFT.
     pub shifts_slots: bool,
+    /// Its LEDs bear planes that give more than full light together ([`crate::planes::PlaneSchedule::exceeding`]).
+    pub exceeds: bool,
     /// Lit slots of which the shifts are kept for [`super::ProjectorFirmware::next_moves`]; when full, the oldest are
     /// dropped and counted with the light events.
     pub moves_kept: usize,
@@ -100,6 +102,7 @@ impl FirmwareConfig {
             greatest_shift: None,
             measures_timing: true,
             shifts_slots: false,
+            exceeds: false,
             moves_kept: 0,
             changes_kept: 1024,
         }

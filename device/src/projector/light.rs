@@ -231,7 +231,7 @@ mod tests {
     proptest! {
         #![proptest_config(ProptestConfig::with_cases(48))]
         #[test]
-        fn words_equal_single_bits(w in 1u32..150, h in 1u32..6, seed in any::<u64>(), kind in 0u8..7) {
+        fn words_equal_single_bits(w in 1u32..150, h in 1u32..6, seed in any::<u64>(), kind in 0u8..8) {
             let raster = Raster::new(w, h).unwrap();
             let mixed: Vec<PlaneSpec> =
                 [0x07, 0x37, 0x36, 0x10, 0x22].iter().map(|&c| PlaneSpec::from_led_code(c).unwrap()).collect();
@@ -240,8 +240,9 @@ mod tests {
                 1 => PlaneSchedule::rgb24(),
                 2 => PlaneSchedule::equal_rgb24(),
                 3 => PlaneSchedule::equal_rgb24().filled(),
-                4 => PlaneSchedule::of_parts(Parts { count: 3, depth: 8, white: true }).unwrap(),
-                5 => PlaneSchedule::of_parts(Parts { count: 2, depth: 4, white: false }).unwrap(),
+                4 => PlaneSchedule::of_parts(Parts { count: 3, depth: 8, low: 0, white: true }).unwrap(),
+                5 => PlaneSchedule::of_parts(Parts { count: 2, depth: 4, low: 0, white: false }).unwrap(),
+                6 => PlaneSchedule::split_rgb24(),
                 _ => PlaneSchedule::new(&mixed).unwrap(),
             };
             let mut state = seed | 1;

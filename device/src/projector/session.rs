@@ -64,6 +64,9 @@ impl Core {
         if config.raster != self.setup.raster {
             return Err(ConfigRefusal::Raster);
         }
+        if config.schedule.exceeds() && !self.setup.exceeds {
+            return Err(ConfigRefusal::Format);
+        }
         if config.schedule.len() > self.setup.max_planes as usize {
             return Err(ConfigRefusal::Planes);
         }
@@ -78,7 +81,10 @@ impl Core {
         self.disarm();
         self.config = Some((config, slots));
         self.guard.configure(config.rate, config.limits, self.setup.limits);
-        self.flash = self.setup.flash_limit.map(|limit| FlashLimiter::backstop(config.rate, limit));
+        self.flash = self
+            .setup
+            .flash_limit
+            .map(|limit| FlashLimiter::backstop(config.rate, limit).of_planes(&config.schedule));
         Ok(())
     }
 

@@ -30,6 +30,7 @@ impl Core {
             greatest_shift: self.setup.greatest_shift,
             measures_timing: self.setup.measures_timing,
             shifts_slots: self.setup.shifts_slots,
+            exceeds: self.setup.exceeds,
             tick_hz: self.setup.clock.tick_hz,
             min_plane_ns: self.setup.min_plane_ns,
             serial: self.setup.serial,

@@ -140,6 +140,7 @@ pub(super) fn run_beside(
         events_kept: 0,
         shown_kept,
         shifts_slots: true,
+        exceeds: true,
         ..MockConfig::new(arguments.raster)
     });
     let log = arguments.light_log.as_deref().map(LightLog::create).transpose()?;

@@ -160,6 +160,7 @@ impl Far {
             events_kept: 0,
             greatest_shift: Some(GREATEST_SHIFT),
             shifts_slots: true,
+            exceeds: true,
             ..MockConfig::new(raster)
         };
         let frame_buffers = usize::from(setup.frame_buffers);

@@ -65,7 +65,7 @@ fn with_everything(settings: RendererSettings, camera: ProjectorCamera) -> Resul
         drive,
         lens: Some(ProjectorCamera { lens, ..camera }),
         clamp_indirect: Some(10.0),
-        halftone: Some(Halftone { parts: 8, depth: 1, white: false }),
+        halftone: Some(Halftone { parts: 8, depth: 1, low: 0, white: false }),
         ..settings
     })
 }

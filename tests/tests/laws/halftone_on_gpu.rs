@@ -9,7 +9,6 @@ use dpm_render::gpu::{Buffer, Gpu};
 use dpm_render::pack::{halftone, halftone_of_bodies, Halftone};
 use dpm_render::Surface;
 use dpm_rig::light::recorder::LightFrame;
-use dpm_shaders::specialization as ids;
 use dpm_shaders::structs::{Frame, Instance, Mover, NO_HIT};
 use dpm_shaders::Reading;
 use dpm_tests::gpu::{run_shader, uploaded, with_gpu};
@@ -61,11 +60,7 @@ fn on_gpu(
     let tiles = uploaded(gpu, "tiles", bytemuck::cast_slice(&tiles));
     let noise = uploaded(gpu, "noise", blue_noise::MASK);
     let words = Buffer::from_slice(gpu, "codes", codes).unwrap();
-    let constants = [
-        (ids::HALFTONE_PARTS, how.parts),
-        (ids::HALFTONE_DEPTH, how.depth),
-        (ids::HALFTONE_WHITE, how.white.into()),
-    ];
+    let constants = how.constants();
     let surfaces: Vec<Surface> = shows.ids.iter().map(|&id| Surface { id, ..Surface::zeroed() }).collect();
     let instances: Vec<Instance> =
         shows.movers_of_instances.iter().map(|&mover| Instance { mover, ..Instance::zeroed() }).collect();
@@ -97,8 +92,8 @@ fn on_gpu(
 fn schedules() -> Vec<PlaneSchedule> {
     let parts =
         [(3, 8, true), (4, 6, true), (6, 4, true), (8, 3, true), (12, 2, true), (2, 4, false), (4, 2, false)];
-    let of_parts =
-        parts.map(|(count, depth, white)| PlaneSchedule::of_parts(Parts { count, depth, white }).unwrap());
+    let of_parts = parts
+        .map(|(count, depth, white)| PlaneSchedule::of_parts(Parts { count, depth, low: 0, white }).unwrap());
     let equal = [PlaneSchedule::equal_rgb24(), PlaneSchedule::equal_mono8(), PlaneSchedule::equal24()];
     [&equal[..], &of_parts].concat()
 }

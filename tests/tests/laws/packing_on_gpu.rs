@@ -33,8 +33,9 @@ fn planes_of_gpu_and_cpu_are_the_same_bytes() {
         PlaneSchedule::new(&odd).unwrap(),
         PlaneSchedule::equal_rgb24(),
         PlaneSchedule::equal24(),
-        PlaneSchedule::of_parts(Parts { count: 3, depth: 8, white: true }).unwrap(),
-        PlaneSchedule::of_parts(Parts { count: 2, depth: 4, white: false }).unwrap(),
+        PlaneSchedule::of_parts(Parts { count: 3, depth: 8, low: 0, white: true }).unwrap(),
+        PlaneSchedule::of_parts(Parts { count: 2, depth: 4, low: 0, white: false }).unwrap(),
+        PlaneSchedule::split_rgb24(),
     ];
     let sizes = [
         (1, 1),

@@ -62,7 +62,7 @@ impl FieldCount {
             raster,
             schedule,
             light: LightLimiter::ahead(rate, &settings.limits, OBEYED_WITHIN_MS),
-            flash: settings.flash_limit.map(|limit| FlashLimiter::new(rate, limit)),
+            flash: settings.flash_limit.map(|limit| FlashLimiter::new(rate, limit).of_planes(&schedule)),
             slot: None,
             held: Brightness::default(),
             over: 0,

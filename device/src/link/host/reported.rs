@@ -6,6 +6,7 @@
 
 use crate::link::flash::FlashLimiter;
 use crate::link::message::Status;
+use crate::planes::PlaneSchedule;
 use crate::time::FrameRate;
 
 /// Sent frames whose light may still be reported: more than a device holds.
@@ -24,14 +25,10 @@ pub(super) struct ReportedField {
 }
 
 impl ReportedField {
-    /// For slots of `rate` and a limit of flashes a second.
-    pub(super) fn new(rate: FrameRate, limit: u8) -> Self {
-        Self {
-            limiters: [FlashLimiter::new(rate, limit), FlashLimiter::new(rate, limit)],
-            sent: [(0, 0); REMEMBERED],
-            next: 0,
-            before: None,
-        }
+    /// For slots of `rate` with planes of `schedule`, and a limit of flashes a second.
+    pub(super) fn new(rate: FrameRate, limit: u8, schedule: &PlaneSchedule) -> Self {
+        let limiter = FlashLimiter::new(rate, limit).of_planes(schedule);
+        Self { limiters: [limiter.clone(), limiter], sent: [(0, 0); REMEMBERED], next: 0, before: None }
     }
 
     /// Counters begin at zero again.
@@ -91,7 +88,7 @@ mod tests {
             let mut strikes = 0;
             for seed in 0..40 {
                 let draws = Draws::new(seed);
-                let mut host = ReportedField::new(rate, limit);
+                let mut host = ReportedField::new(rate, limit, &PlaneSchedule::rgb24());
                 let mut device = FlashLimiter::backstop(rate, limit);
                 let mut status = Status::default();
                 let is_steady = seed % 4 == 0;
@@ -126,7 +123,7 @@ mod tests {
     #[test]
     fn what_is_dim_does_not_flash() {
         let rate = FrameRate::new(947, 1).unwrap();
-        let mut host = ReportedField::new(rate, 3);
+        let mut host = ReportedField::new(rate, 3, &PlaneSchedule::rgb24());
         host.sent(7, FULL_LUMINANCE / 20);
         let mut status = Status { last_lit_frame: 7, ..Status::default() };
         for slot in 0..4000u64 {

@@ -79,6 +79,7 @@ fn hello() -> DeviceMessage {
         greatest_shift: None,
         measures_timing: false,
         shifts_slots: false,
+        exceeds: false,
         tick_hz: 1_000_000,
         min_plane_ns: 1000,
         serial: 0,

@@ -102,6 +102,12 @@ pub enum LinkError {
         /// Planes the device takes.
         max_planes: u8,
     },
+    /// The device does not light planes that give more than full light together.
+    #[error("{device}: the device does not offer planes of more than full light together; write projector.weights = \"binary\"")]
+    Exceeds {
+        /// Name of the transport.
+        device: String,
+    },
     /// The device refused CONFIG for a reason that HELLO did not show.
     #[error("{device}: configuration refused: {reason:?}")]
     ConfigRefused {

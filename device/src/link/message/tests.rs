@@ -191,8 +191,19 @@ fn an_led_code_may_repeat_only_where_the_flag_says_so() {
     assert_eq!(again[..n], out[..n]);
     out[19] = 4;
     assert!(HostMessage::parse(kind, &out[..n]).is_err(), "a code twice without its flag");
+    // Planes that exceed full light: only by their own flag, beside the one for codes that repeat.
     out[19] = 33;
-    assert!(HostMessage::parse(kind, &out[..n]).is_err(), "a flag without a meaning");
+    let Ok(HostMessage::Config(more)) = HostMessage::parse(kind, &out[..n]) else { panic!() };
+    assert!(more.schedule.exceeds() && !more.schedule.fills() && more.schedule.full_light() == 256);
+    assert_eq!(HostMessage::Config(more).write(&mut again), (kind, n));
+    assert_eq!(again[..n], out[..n]);
+    for (flags, why) in [(32, "a code twice without its flag"), (37, "both meanings"), (65, "no meaning")] {
+        out[19] = flags;
+        assert!(HostMessage::parse(kind, &out[..n]).is_err(), "{why}");
+    }
+    (out[19], out[40]) = (33, 0x36);
+    assert!(HostMessage::parse(kind, &out[..n]).is_err(), "64 + 64 + 64 exceed nothing");
+    out[40] = 0x37;
     out[19] = 17;
     assert!(HostMessage::parse(kind, &out[..n]).is_err(), "shifts without the report that confirms them");
     out[19] = 29;
@@ -215,13 +226,14 @@ fn golden_messages_of_the_device() {
             greatest_shift: None,
             measures_timing: false,
             shifts_slots: false,
+            exceeds: true,
             tick_hz: 1_000_000_000,
             min_plane_ns: 44_000,
             serial: 0x1122_3344_5566_7788,
             now: DeviceTicks(9),
         }),
         MessageType::Hello,
-        "0100 0302 01000000 4001 f000 18 04 0000 00ca9a3b e0ab0000 8877665544332211 0900000000000000",
+        "0100 0302 01000000 4001 f000 18 04 08 00 00ca9a3b e0ab0000 8877665544332211 0900000000000000",
     );
     device(
         DeviceMessage::Status(Status {

@@ -94,6 +94,8 @@ pub struct DeviceHello {
     pub measures_timing: bool,
     /// Its slots can be shifted by SHIFT, if CONFIG asks.
     pub shifts_slots: bool,
+    /// It lights schedules whose planes give more than full light together ([`PlaneSchedule::exceeding`]).
+    pub exceeds: bool,
     /// Nominal ticks a second of the device's clock.
     pub tick_hz: u32,
     /// Shortest time one plane can be shown, nanoseconds.

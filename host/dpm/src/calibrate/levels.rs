@@ -10,7 +10,7 @@ use dpm_calibration::sensor::Block;
 use dpm_device::link::{breaks_limit, mean_luminance, FULL_LUMINANCE};
 use dpm_device::planes::{Channel, PlaneSchedule, Raster};
 use dpm_device::time::FrameRate;
-use dpm_render::pack::{pack, BitPlaneFrame, Kernel};
+use dpm_render::pack::{pack_codes, BitPlaneFrame, Kernel};
 use dpm_rig::pack::source::{Canvas, PatternSource};
 use std::collections::BTreeMap;
 
@@ -154,7 +154,7 @@ impl Levels {
             hold += 2 * slots(TILES_MARGIN_S);
         }
         if let Field::Full(Some(limit)) = field {
-            while flashes_too_often(&light, hold, rate, limit) {
+            while flashes_too_often(&light, schedule, hold, (rate, limit)) {
                 hold += hold / 10;
                 if hold > slots(LONGEST_HOLD_S).max(2 * HOLD_FRAMES) {
                     return Err(format!(
@@ -253,14 +253,14 @@ fn luminance(schedule: &PlaneSchedule, code: u32) -> u32 {
     // Every pixel is the same, so a small raster has the light of a large one.
     let Some(raster) = Raster::new(8, 1) else { return 0 };
     let mut planes = BitPlaneFrame::new(raster, *schedule);
-    pack(Kernel::Scalar, &[code; 8], &mut planes);
+    pack_codes(Kernel::Scalar, &[code; 8], &mut planes);
     mean_luminance(raster, schedule, planes.bytes())
 }
 
 /// True if levels of light, each for `hold` slots, over and over, break the limit.
-fn flashes_too_often(light: &[u32], hold: u64, rate: FrameRate, limit: u8) -> bool {
+fn flashes_too_often(light: &[u32], schedule: &PlaneSchedule, hold: u64, limit: (FrameRate, u8)) -> bool {
     let around = light.iter().chain(light).flat_map(|l| std::iter::repeat_n(*l, hold as usize));
-    breaks_limit(rate, limit, around)
+    breaks_limit(limit, schedule, around)
 }
 
 /// Frequency of the lamps, and the light without the projector.

@@ -314,6 +314,14 @@ fn config_format(b: &mut Bench<'_>) -> R {
         p[41] = p[40];
         refused(b, &p, &[4], "an LED code that stands twice")?;
     }
+    if b.hello.is_some_and(|hello| !hello.exceeds) {
+        let mut p = plain(b)?;
+        // Three planes of bit 7, which is more than full light.
+        p.truncate(40);
+        (p[16], p[19]) = (3, p[19] | 33);
+        p.extend([0x07; 3]);
+        refused(b, &p, &[2, 4], "planes that exceed full light, which it does not offer")?;
+    }
     Ok(())
 }
 

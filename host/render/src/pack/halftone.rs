@@ -22,6 +22,12 @@
 //! a matter of chance. Cells that begin at the same part lie evenly among the others, so that no part shifts the centre of
 //! what is seen. Where they begin is drawn within that, so that no speed makes an eye that rests see one part all the time.
 //!
+//! Where the highest bit of a code value is split into equal planes (`PlaneSchedule::split_rgb24`), each of these is a part of
+//! one bit, and the bits below are shown once, as they are. What a sum has of whole parts goes to the equal planes by the same
+//! order. Only two of the planes begin an order, and none at another one in the next frame: the planes of a level would
+//! follow one another at a fraction of the frame rate, which eyes see sooner. The shader does not do this yet, and no rig file
+//! asks for it.
+//!
 //! Everything is integer arithmetic, so `shaders/glsl/halftone.comp` gives the same words.
 
 use crate::blue_noise;
@@ -43,6 +49,8 @@ pub struct Halftone {
     pub parts: u32,
     /// Bits of a part. A channel has at most 8 in all its parts, or 24 if there is only white.
     pub depth: u32,
+    /// Bits below the parts, which are shown once; see [`Parts::low`].
+    pub low: u32,
     /// All planes are white. They show the green code value.
     pub white: bool,
 }
@@ -50,13 +58,13 @@ pub struct Halftone {
 impl Halftone {
     /// That of `schedule`; `None` if its planes weigh as the bits of a code value do.
     pub fn of(schedule: &PlaneSchedule) -> Option<Self> {
-        let Parts { count, depth, white } = schedule.parts()?;
-        Some(Self { parts: count.into(), depth: depth.into(), white })
+        let Parts { count, depth, low, white } = schedule.parts()?;
+        Some(Self { parts: count.into(), depth: depth.into(), low: low.into(), white })
     }
 
     /// What the parts of a channel add up to at full light.
     pub const fn most(self) -> u32 {
-        self.parts * ((1 << self.depth) - 1)
+        ((self.parts * ((1 << self.depth) - 1)) << self.low) + (1 << self.low) - 1
     }
 
     /// Each part holds a whole code value, so that its bits may be interpolated between pixels.
@@ -65,7 +73,7 @@ impl Halftone {
     }
 
     /// Specialization constants of the pass.
-    pub(crate) fn constants(self) -> [(u32, u32); 3] {
+    pub fn constants(self) -> [(u32, u32); 3] {
         [
             (ids::HALFTONE_PARTS, self.parts),
             (ids::HALFTONE_DEPTH, self.depth),
@@ -84,8 +92,9 @@ impl Halftone {
 
     /// What the parts of red, green and blue of the word `word` add up to.
     pub(super) fn sums(self, word: u32) -> [u32; 3] {
-        let sum =
-            |at: u32| (0..self.parts).map(|p| word >> (at + p * self.depth) & ((1 << self.depth) - 1)).sum();
+        let bits = |at: u32, count: u32| word >> at & ((1 << count) - 1);
+        let parts = |at: u32| (0..self.parts).map(|p| bits(at + p * self.depth, self.depth)).sum::<u32>();
+        let sum = |at: u32| (parts(at + self.low) << self.low) + bits(at, self.low);
         match self.white {
             true => [sum(0); 3],
             false => [0, 8, 16].map(sum),
@@ -106,7 +115,7 @@ fn noise([x, y]: [i32; 2], frame: u32, channel: usize) -> u32 {
 /// The part at which the order of parts begins at a place: the same in each cell. Of four neighbouring cells each begins in
 /// another quarter of the parts, of 16 each in another sixteenth, and so on up to the 256 cells of 64 x 64 places. Which of the
 /// four has which quarter is drawn, so that no pattern repeats along a line.
-fn phase([x, y]: [i32; 2], frame: u32, parts: u32) -> u32 {
+fn phase([x, y]: [i32; 2], frame: u32, how: Halftone) -> u32 {
     let [mut x, mut y] = [x, y].map(|c| c.rem_euclid(blue_noise::SIZE as i32) as u32 / CELL);
     let mut rank = 0;
     for level in 0..4 {
@@ -114,8 +123,11 @@ fn phase([x, y]: [i32; 2], frame: u32, parts: u32) -> u32 {
         (x, y) = (x >> 1, y >> 1);
         rank = rank << 2 | quarter ^ hash_u32(level << 16 | rank << 8 | y << 4 | x) & 3;
     }
+    if how.low > 0 {
+        return rank / 128;
+    }
     // Five has no divisor in common with any number of parts that there is.
-    (rank * parts / 256 + 5 * (frame % parts)) % parts
+    (rank * how.parts / 256 + 5 * (frame % how.parts)) % how.parts
 }
 
 /// `hash_u32` of `shaders/glsl/scene.glsl`.
@@ -131,12 +143,16 @@ fn order(parts: u32) -> impl Iterator<Item = u32> {
     (0..1u32 << bits).map(move |i| i.reverse_bits() >> (u32::BITS - bits)).filter(move |&p| p < parts)
 }
 
-/// The parts of a mirror, of `depth` bits each, that add up to `sum`: all the same number, or one more in some of `parts`, the first
-/// of the order that begins at part `phase`.
-fn spread(sum: u32, parts: u32, depth: u32, phase: u32) -> u32 {
+/// The bits of a mirror that add up to `sum`: those below the parts, and parts that are all the same number, or one more in some of
+/// them, the first of the order that begins at part `phase`.
+fn spread(sum: u32, how: Halftone, phase: u32) -> u32 {
+    let Halftone { parts, depth, low, .. } = how;
+    let (below, sum) = (sum & ((1 << low) - 1), sum >> low);
     let (each, more) = (sum / parts, sum % parts);
     let all = (0..parts).fold(0, |word, p| word | each << (p * depth));
-    order(parts).take(more as usize).fold(all, |word, p| word + (1 << ((p + phase) % parts * depth)))
+    let all =
+        order(parts).take(more as usize).fold(all, |word, p| word + (1 << ((p + phase) % parts * depth)));
+    all << low | below
 }
 
 /// Code values `0x00BBGGRR` of frame number `frame`, row after row, into words in which each plane of a channel has a
@@ -216,9 +232,8 @@ impl Block<'_> {
         for (i, x, y) in pixels() {
             let before = keys.iter().filter(|&&key| key > keys[i]).count() as u32;
             let sum = code(x, y) * self.halftone.most() / 255 + u32::from(keys[i] > 0 && before < extra);
-            let Halftone { parts, depth, .. } = self.halftone;
-            let phase = phase(place(x, y), self.frame, parts);
-            words[y * width + x] |= spread(sum, parts, depth, phase) << bits_at;
+            let phase = phase(place(x, y), self.frame, self.halftone);
+            words[y * width + x] |= spread(sum, self.halftone, phase) << bits_at;
         }
     }
 }
@@ -244,7 +259,7 @@ mod tests {
     }
 
     fn of_parts(count: u8, depth: u8, white: bool) -> PlaneSchedule {
-        PlaneSchedule::of_parts(Parts { count, depth, white }).unwrap()
+        PlaneSchedule::of_parts(Parts { count, depth, low: 0, white }).unwrap()
     }
 
     fn schedules() -> [PlaneSchedule; 10] {
@@ -319,7 +334,8 @@ mod tests {
             all.sort_unstable();
             assert_eq!(all, (0..parts).collect::<Vec<_>>());
             for phase in 0..parts {
-                let words: Vec<u32> = (0..=parts).map(|sum| spread(sum, parts, 1, phase)).collect();
+                let how = Halftone { parts, depth: 1, low: 0, white: true };
+                let words: Vec<u32> = (0..=parts).map(|sum| spread(sum, how, phase)).collect();
                 assert!(words.iter().zip(0..).all(|(word, sum)| word.count_ones() == sum), "{words:x?}");
                 assert!(words.windows(2).all(|w| w[0] & w[1] == w[0]), "{words:x?}");
             }

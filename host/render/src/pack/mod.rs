@@ -106,17 +106,32 @@ pub(crate) const fn source_bit(plane: PlaneSpec) -> u32 {
 /// in parts they are what [`halftone()`] makes of code values, in which each plane of a channel has a bit of its own.
 pub fn source_bits(schedule: &PlaneSchedule) -> [u8; MAX_PLANES] {
     let mut bits = [0; MAX_PLANES];
-    let mut before = [0u8; 4];
+    let Some(parts) = schedule.parts() else {
+        for (bit, &plane) in bits.iter_mut().zip(schedule.planes()) {
+            *bit = source_bit(plane) as u8;
+        }
+        return bits;
+    };
+    let lowest = lowest_bit(schedule);
+    // The planes of the parts come behind those below them, in the order in which they are shown.
+    let mut before = [parts.low; 4];
     for (bit, &plane) in bits.iter_mut().zip(schedule.planes()) {
-        let number = &mut before[plane.channel as usize];
-        *bit = match (schedule.parts(), plane.channel) {
-            (None, _) => source_bit(plane) as u8,
-            (Some(_), Channel::White) => *number,
-            (Some(_), channel) => 8 * channel as u8 + *number,
+        let number = match plane.bit - lowest {
+            below if below < parts.low => below,
+            _ => {
+                before[plane.channel as usize] += 1;
+                before[plane.channel as usize] - 1
+            }
         };
-        *number += 1;
+        let first = if plane.channel == Channel::White { 0 } else { 8 * plane.channel as u8 };
+        *bit = first + number;
     }
     bits
+}
+
+/// The lowest bit that a schedule's planes show.
+fn lowest_bit(schedule: &PlaneSchedule) -> u8 {
+    schedule.planes().iter().map(|plane| plane.bit).fold(7, u8::min)
 }
 
 /// What a schedule's planes show of a pixel's word: the light of a mirror, which is what the projector sends out for it.
@@ -148,8 +163,7 @@ impl Shown {
     /// above full light stays full.
     pub fn light(self, code: u32) -> u32 {
         if let Some((halftone, schedule)) = self.halftone {
-            // The lowest bit of a part weighs what the first plane does.
-            let lowest = schedule.planes()[0].bit;
+            let lowest = lowest_bit(&schedule);
             let [r, g, b] = halftone.sums(code).map(|sum| u32::from(schedule.light_of(sum << lowest)));
             return r | g << 8 | b << 16;
         }
@@ -186,6 +200,18 @@ pub fn pack(kernel: Kernel, codes: &[u32], frame: &mut BitPlaneFrame) {
         #[allow(unreachable_patterns)]
         _ => scalar::pack(codes, frame),
     }
+}
+
+/// Code values of a picture that rests, as its planes show them: as [`pack`], by way of [`halftone()`] where the planes do not weigh
+/// as the bits do. It allocates.
+///
+/// # Panics
+/// As [`pack`].
+pub fn pack_codes(kernel: Kernel, codes: &[u32], frame: &mut BitPlaneFrame) {
+    let Some(how) = Halftone::of(frame.schedule()) else { return pack(kernel, codes, frame) };
+    let mut words = vec![0; codes.len()];
+    halftone(how, frame.raster(), 0, codes, &mut words);
+    pack(kernel, &words, frame);
 }
 
 /// The planes of `frame` back into code values. Bits that no plane shows are 0; a white plane gives the green bit.

@@ -46,7 +46,11 @@ pub fn plane_groups(schedule: &PlaneSchedule, instants: &[f64]) -> Vec<PlaneGrou
     let mut groups = Vec::new();
     let mut from = 0;
     for i in 1..=planes.len() {
-        let is_same_bit = |i: usize| schedule.parts().is_none() && planes[i].bit == planes[i - 1].bit;
+        // Of parts every plane of a colour has an instant of its own, but where their highest bit is split.
+        let is_of_bits = schedule.parts().is_none_or(|parts| parts.low > 0);
+        let is_same_bit = |i: usize| {
+            is_of_bits && planes[i].bit == planes[i - 1].bit && planes[i].channel != planes[from].channel
+        };
         let is_together = |i: usize| {
             planes[i].channel == planes[from].channel && (instants[i] - instants[from]).abs() < LEAST_SHARE
         };
@@ -85,6 +89,8 @@ mod tests {
             (PlaneSchedule::mono8(), 8),
             (PlaneSchedule::equal_rgb24(), 24),
             (PlaneSchedule::equal_mono8(), 8),
+            (PlaneSchedule::split_rgb24(), 8),
+            (PlaneSchedule::split_mono8(), 8),
         ] {
             let n = schedule.len();
             let instants: Vec<f64> = (0..n).map(|i| (i as f64 + 0.5) / n as f64 - 0.25).collect();

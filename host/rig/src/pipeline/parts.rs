@@ -272,6 +272,7 @@ pub(super) fn mock_projector(
     setup.clock = DeviceClock { skew_ppb: (mock.clock_ppm * 1000.0) as i32, ..DeviceClock::IDEAL };
     setup.flash_limit = projector::flash_limit(config);
     setup.shifts_slots = true;
+    setup.exceeds = true;
     (setup.greatest_shift, setup.moves_kept) = (Some(GREATEST_SHIFT), MOVES_KEPT);
     let emulated = EmulatedProjector::new(setup, &mock.faults, config.render.seed, start)
         .map_err(|e| RigError::Unsupported(format!("projector.backend.faults: {e}")))?;

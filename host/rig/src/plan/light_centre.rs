@@ -315,7 +315,7 @@ mod tests {
         }
         for (count, depth, white) in [(1, 8, false), (3, 8, true), (4, 6, true), (2, 4, false), (12, 2, true)]
         {
-            let schedule = PlaneSchedule::of_parts(Parts { count, depth, white }).unwrap();
+            let schedule = PlaneSchedule::of_parts(Parts { count, depth, low: 0, white }).unwrap();
             let timing = PlaneTiming::Together { planes: depth };
             let pattern_ns = 24 / i64::from(depth) * 100_000;
             let lit_ns = pattern_ns * 24 / i64::from(depth);

@@ -82,7 +82,7 @@ impl DisplayEncoding {
             Self::Mono2x12 => (12, 2, true),
             Self::Mono1x24 => (24, 1, true),
         };
-        Parts { count, depth, white }
+        Parts { count, depth, low: 0, white }
     }
 
     /// How a DLPC900 cuts a pixel into patterns.
