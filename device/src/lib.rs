@@ -1,6 +1,6 @@
 //! The far side of the cable.
 //!
-//! Wire formats (bit-plane link, DLPC900, NatNet, VRPN, serial poses) as `no_std` code that firmware can reuse, and behind the
+//! Wire formats (bit-plane link, NatNet, VRPN, serial poses) as `no_std` code that firmware can reuse, and behind the
 //! features `usb`, `serial` and `net` the transports, projectors and trackers that speak them.
 //!
 //! Reading order: [`time`] and [`pose`] and [`planes`] are the vocabulary; [`tracker`] is where motion comes in.
@@ -54,11 +54,8 @@
 #[cfg(feature = "alloc")]
 extern crate alloc;
 
-#[cfg(feature = "alp")]
-pub mod alp;
 pub mod clock_map;
 pub mod cobs;
-pub mod dlpc900;
 pub mod light;
 #[cfg(feature = "serial")]
 mod line;
@@ -83,4 +80,4 @@ pub mod transport;
 #[cfg(feature = "serial")]
 pub mod tty;
 #[cfg(feature = "usb")]
-mod usb_help;
+pub mod usb_help;

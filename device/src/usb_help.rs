@@ -3,7 +3,7 @@
 use rusb::{Device, Error, UsbContext};
 
 /// The remedy for an error of libusb, for an operator who stands beside the device.
-pub(crate) const fn remedy(e: Error) -> &'static str {
+pub const fn remedy(e: Error) -> &'static str {
     match e {
         Error::Io => "the cable or a hub failed: plug the device straight into the machine, try another cable, and see `dmesg`",
         Error::Access => "this user may not open it: copy packaging/60-dpm.rules to /etc/udev/rules.d/ and plug it in again",
@@ -27,12 +27,12 @@ pub(crate) const fn remedy(e: Error) -> &'static str {
 }
 
 /// The path of the device file, in the form that `lsusb` and `fuser` use.
-pub(crate) fn node(bus: u8, address: u8) -> String {
+pub fn node(bus: u8, address: u8) -> String {
     format!("/dev/bus/usb/{bus:03}/{address:03}")
 }
 
 /// The device file of `device`.
-pub(crate) fn node_of<T: UsbContext>(device: &Device<T>) -> String {
+pub fn node_of<T: UsbContext>(device: &Device<T>) -> String {
     node(device.bus_number(), device.address())
 }
 

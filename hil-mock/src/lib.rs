@@ -1,51 +1,16 @@
-//! A software projector and a software tracker: the same mocks in-process, over USB/IP, pseudo-terminals and UDP.
+//! The mocks of [`dpm_mock`] for other programs, over USB/IP, pseudo-terminals, UDP and TCP, and mocks of devices that the
+//! controller itself needs not: a TI DLPC900 and a wand with a light sensor.
 //!
-//! Reading order: [`motion`] is the true motion, [`faults`] the one vocabulary of faults, [`tracker`] the samples that
-//! a tracker would report, [`projector`] the light that a projector makes from its packets. All randomness comes from
-//! [`dpm_device::rng`], keyed by a seed; time is always an argument.
-//!
-//! # Example: a tracker that goes blind for 10 ms
-//!
-//! ```
-//! use dpm_device::{pose::Pose, time::HostTime, tracker::Tracker};
-//! use hil_mock::motion::{Motion, MotionSpec};
-//! use hil_mock::tracker::{MockTracker, MockTrackerConfig};
-//!
-//! # fn main() -> Result<(), Box<dyn std::error::Error>> {
-//! let spin = MotionSpec::Rotate { axis: [0.0, 1.0, 0.0], rate_rad_s: 3.0, pivot_offset_m: [0.0; 3] };
-//! let body = Motion::new(&spin, Pose::IDENTITY)?;
-//! let config = MockTrackerConfig { faults: "dropout@20ms+10ms".parse()?, ..Default::default() };
-//! let mut tracker = MockTracker::new(config, vec![body.clone()])?;
-//!
-//! // Everything that arrives within the first 50 ms: 500 samples a second, each 2 ms after its capture.
-//! let mut captured = Vec::new();
-//! tracker.poll(HostTime(50_000_000), &mut |sample| {
-//!     let truth = body.pose_at(sample.captured_at.0);
-//!     assert_eq!(sample.pose.position_m, truth.position_m, "no noise was asked for");
-//!     captured.push(sample.captured_at.0 / 1_000_000);
-//! })?;
-//! assert!(captured.contains(&18) && captured.contains(&30));
-//! assert!(!captured.iter().any(|ms| (20..30).contains(ms)), "blind: {captured:?}");
-//! # Ok(())
-//! # }
-//! ```
+//! Reading order: [`usb_model`] is a USB device, [`usb_plug`] its cable, [`usbip`] the cable to another kernel.
+
+pub use dpm_mock::{
+    faults, hand, line_port, monotonic, motion, natnet_host, natnet_server, report_queue, serial_server,
+    tracker, vrpn_host, vrpn_server,
+};
 
 pub mod dlpc900;
-pub mod faults;
-pub mod hand;
-pub mod line_port;
-pub mod monotonic;
-pub mod motion;
-mod motion_spec;
-pub mod natnet_host;
-pub mod natnet_server;
 pub mod projector;
-pub mod report_queue;
 pub mod sensor_wand;
-pub mod serial_server;
-pub mod tracker;
 pub mod usb_model;
 pub mod usb_plug;
 pub mod usbip;
-pub mod vrpn_host;
-pub mod vrpn_server;

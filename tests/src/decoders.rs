@@ -4,8 +4,6 @@
 use crate::conversations::{link, sensor, trackers, usb};
 use dpm_device::clock_map::{ClockMap, ExchangeOutcome};
 use dpm_device::cobs::{encode, encoded_bytes, Deframer};
-use dpm_device::dlpc900::command::{CommandAssembler, ReplyAssembler, REPORT_BYTES};
-use dpm_device::dlpc900::image;
 use dpm_device::link::crc32c;
 use dpm_device::link::{
     move_plane, rle_encode, Assembly, Decoder, DeviceMessage, Header, HostMessage, MessageType, PacketSink,
@@ -14,6 +12,8 @@ use dpm_device::link::{
 use dpm_device::planes::Raster;
 use dpm_device::sensor::wire::{SensorMessage, MAX_FRAME, MAX_PACKET, MAX_SAMPLES};
 use dpm_device::time::{DeviceTicks, HostTime};
+use dpm_dlpc900::command::{CommandAssembler, ReplyAssembler, REPORT_BYTES};
+use dpm_dlpc900::image;
 use dpm_rig::config::{Overrides, RigConfig};
 use dpm_rig::control::osc::decode as osc;
 use dpm_rig::control::{server, status_file, Asked};

@@ -7,11 +7,6 @@ use std::os::unix::net::UnixStream;
 use std::sync::{Arc, Mutex};
 use std::time::{Duration, Instant};
 
-use dpm_device::dlpc900::driver::{Dlpc900, Dlpc900Error, PortError};
-use dpm_device::dlpc900::image::PlaneOrder;
-use dpm_device::dlpc900::lut::Dmd;
-use dpm_device::dlpc900::sequence::{LedSetup, Pattern, Repeat, SequenceBuilder};
-use dpm_device::dlpc900::usb::{list, UsbHid};
 use dpm_device::link::{
     faults, packet_bytes, Codec, Epoch, HostLink, LightLimits, LinkSettings, LinkState, SendOutcome,
     Underrun, COMMIT_BYTES,
@@ -20,6 +15,11 @@ use dpm_device::planes::{PlaneSchedule, Raster};
 use dpm_device::time::{DeviceTicks, FrameRate, HostTime};
 use dpm_device::transport::usb::{UsbSettings, UsbTransport, DATA_OUT};
 use dpm_device::transport::LinkDevice;
+use dpm_dlpc900::driver::{Dlpc900, Dlpc900Error, PortError};
+use dpm_dlpc900::image::PlaneOrder;
+use dpm_dlpc900::lut::Dmd;
+use dpm_dlpc900::sequence::{LedSetup, Pattern, Repeat, SequenceBuilder};
+use dpm_dlpc900::usb::{list, UsbHid};
 use hil_mock::dlpc900::{Dlpc900Model, Options};
 use hil_mock::projector::usb::UsbProjector;
 use hil_mock::projector::{MockConfig, MockProjector};

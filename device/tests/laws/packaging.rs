@@ -81,7 +81,8 @@ fn groups(user: &str) -> (BTreeSet<String>, BTreeSet<String>) {
 /// Found in use, O7: the rule gave devices to the user at the seat only, and the service has no seat.
 #[test]
 fn the_rules_name_every_usb_device_that_is_opened_and_the_service_may_open_them() {
-    use dpm_device::{dlpc900::usb as dlpc900, transport::usb as link};
+    use dpm_device::transport::usb as link;
+    use dpm_dlpc900::usb as dlpc900;
     let opened: BTreeSet<(String, String)> =
         [(link::VENDOR_ID, link::PRODUCT_ID), (dlpc900::VENDOR, dlpc900::PRODUCT)]
             .map(|(vendor, product)| (format!("{vendor:04x}"), format!("{product:04x}")))

@@ -2,10 +2,10 @@
 
 use std::collections::BTreeMap;
 
-use dpm_device::dlpc900::command::{flag, Command, Opcode};
-use dpm_device::dlpc900::driver::error_meaning;
-use dpm_device::dlpc900::lut::{led, DisplayMode, LutEntry};
 use dpm_device::time::HostTime;
+use dpm_dlpc900::command::{flag, Command, Opcode};
+use dpm_dlpc900::driver::error_meaning;
+use dpm_dlpc900::lut::{led, DisplayMode, LutEntry};
 
 use super::patterns::{Patterns, Refusal};
 use super::registers::{is_loose, setting};

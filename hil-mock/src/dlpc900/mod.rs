@@ -15,11 +15,11 @@ mod video;
 use std::collections::VecDeque;
 use std::fmt::Write as _;
 
-use dpm_device::dlpc900::command::{flag, CommandAssembler, Opcode, Reply, REPORT_BYTES};
-use dpm_device::dlpc900::image::PlaneOrder;
-use dpm_device::dlpc900::lut::{DisplayMode, Dmd, LutEntry};
-use dpm_device::dlpc900::sequence::Version;
 use dpm_device::time::HostTime;
+use dpm_dlpc900::command::{flag, CommandAssembler, Opcode, Reply, REPORT_BYTES};
+use dpm_dlpc900::image::PlaneOrder;
+use dpm_dlpc900::lut::{DisplayMode, Dmd, LutEntry};
+use dpm_dlpc900::sequence::Version;
 
 use crate::usb_model::{Progress, Setup, Speed, Then, UsbDeviceModel};
 use controller::Controller;

@@ -2,10 +2,8 @@
 
 use std::collections::BTreeMap;
 
-use dpm_device::dlpc900::image::{extract_plane, ImageDecoder, ImageHeader, PlaneOrder, HEADER_BYTES};
-use dpm_device::dlpc900::lut::{
-    check_entry, step_us, validate, DisplayMode, Dmd, Limits, LutEntry, MAX_IMAGES,
-};
+use dpm_dlpc900::image::{extract_plane, ImageDecoder, ImageHeader, PlaneOrder, HEADER_BYTES};
+use dpm_dlpc900::lut::{check_entry, step_us, validate, DisplayMode, Dmd, Limits, LutEntry, MAX_IMAGES};
 
 /// An error code of the controller and the reason.
 pub(super) type Refusal = (u8, String);

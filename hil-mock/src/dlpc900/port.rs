@@ -3,9 +3,9 @@
 use std::sync::{Arc, Mutex, PoisonError};
 use std::time::Duration;
 
-use dpm_device::dlpc900::command::REPORT_BYTES;
-use dpm_device::dlpc900::driver::{HidPort, PortError, SecondLine};
 use dpm_device::time::HostTime;
+use dpm_dlpc900::command::REPORT_BYTES;
+use dpm_dlpc900::driver::{HidPort, PortError, SecondLine};
 
 use super::Dlpc900Model;
 

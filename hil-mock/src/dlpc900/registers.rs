@@ -1,7 +1,7 @@
 //! Commands that only store and return a value: their sizes and reset values. \[DLPU018 table A-1\]
 
-use dpm_device::dlpc900::command::Opcode;
-use dpm_device::dlpc900::sequence::Version;
+use dpm_dlpc900::command::Opcode;
+use dpm_dlpc900::sequence::Version;
 
 /// Size and reset value of a plain setting; `None` when the opcode is not one.
 pub(super) fn setting(opcode: Opcode, firmware: Version) -> Option<Vec<u8>> {

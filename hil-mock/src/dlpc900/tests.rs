@@ -1,11 +1,11 @@
 //! Tests of the emulator with golden bytes, and of the driver against it.
 
 use super::*;
-use dpm_device::dlpc900::command::Command;
-use dpm_device::dlpc900::driver::{Dlpc900, Dlpc900Error, HidPort, PortError};
-use dpm_device::dlpc900::image::{encode, Compression};
-use dpm_device::dlpc900::sequence::{LedSetup, Pattern, PatternSequence, Repeat, SequenceBuilder};
-use dpm_device::dlpc900::video::{Receiver, VideoPatterns};
+use dpm_dlpc900::command::Command;
+use dpm_dlpc900::driver::{Dlpc900, Dlpc900Error, HidPort, PortError};
+use dpm_dlpc900::image::{encode, Compression};
+use dpm_dlpc900::sequence::{LedSetup, Pattern, PatternSequence, Repeat, SequenceBuilder};
+use dpm_dlpc900::video::{Receiver, VideoPatterns};
 use proptest::prelude::*;
 use std::sync::{Arc, Mutex};
 use std::time::Duration;

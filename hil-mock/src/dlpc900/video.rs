@@ -1,9 +1,9 @@
 //! The video input: patterns are cut out of the frame that has arrived while the next one arrives.
 
-use dpm_device::dlpc900::command::Opcode;
-use dpm_device::dlpc900::lut::{DisplayMode, LutEntry};
 use dpm_device::planes::Raster;
 use dpm_device::time::HostTime;
+use dpm_dlpc900::command::Opcode;
+use dpm_dlpc900::lut::{DisplayMode, LutEntry};
 
 use super::controller::{Controller, Sequencer};
 
@@ -121,11 +121,11 @@ impl Controller {
 mod tests {
     use super::super::{Dlpc900Fault, Dlpc900Model, VirtualHid};
     use super::*;
-    use dpm_device::dlpc900::driver::Dlpc900;
-    use dpm_device::dlpc900::lut::Dmd;
-    use dpm_device::dlpc900::video::{exposure_us, Receiver, VideoBits, VideoPatterns};
     use dpm_device::planes::PlaneSchedule;
     use dpm_device::time::FrameRate;
+    use dpm_dlpc900::driver::Dlpc900;
+    use dpm_dlpc900::lut::Dmd;
+    use dpm_dlpc900::video::{exposure_us, Receiver, VideoBits, VideoPatterns};
     use std::sync::{Arc, Mutex, MutexGuard};
 
     const SIZE: [u32; 2] = [1920, 1080];

@@ -3,9 +3,9 @@
 use super::usb::{offer, UsbArguments};
 use super::{complain, say};
 use clap::{Args, ValueEnum};
-use dpm_device::dlpc900::image::PlaneOrder;
-use dpm_device::dlpc900::lut::Dmd;
-use dpm_device::dlpc900::sequence::Version;
+use dpm_dlpc900::image::PlaneOrder;
+use dpm_dlpc900::lut::Dmd;
+use dpm_dlpc900::sequence::Version;
 use hil_mock::dlpc900::{Dlpc900Model, Options, Sequencer};
 use std::error::Error;
 use std::path::PathBuf;

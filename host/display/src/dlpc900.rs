@@ -9,9 +9,9 @@ use std::sync::{Arc, OnceLock};
 use std::thread::JoinHandle;
 use std::time::{Duration, Instant};
 
-use dpm_device::dlpc900::driver::{Dlpc900, Dlpc900Error, HidPort, StopAsked};
-use dpm_device::dlpc900::video::VideoPatterns;
 use dpm_device::transport::TransportError;
+use dpm_dlpc900::driver::{Dlpc900, Dlpc900Error, HidPort, StopAsked};
+use dpm_dlpc900::video::VideoPatterns;
 
 use crate::scan_out::{DisplayError, Flip, Picture, Pixels, ScanOut};
 use crate::transport::Opener;

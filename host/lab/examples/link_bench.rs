@@ -9,11 +9,11 @@ use dpm_device::time::{DeviceTicks, HostTime};
 use dpm_device::transport::inproc::Direct;
 use dpm_device::transport::{Lane, SendError, Transport, TransportError};
 use dpm_lab::link_test::Content;
+use dpm_mock::projector::{MockConfig, MockProjector};
 use dpm_render::gpu::{Gpu, GpuOptions};
 use dpm_rig::config::{Overrides, RigConfig};
 use dpm_rig::pipeline::projector;
 use dpm_rig::rig::Rig;
-use hil_mock::projector::{MockConfig, MockProjector};
 use std::time::{Duration, Instant};
 
 /// A device called directly behind a buffer that its frames are gathered in, as every real medium does; the device's own time is set apart.

@@ -11,8 +11,8 @@
 use dpm_device::pose::Pose;
 use dpm_device::time::{FrameRate, HostTime};
 use dpm_device::tracker::{BodyIndex, Tracker};
-use hil_mock::motion::{Motion, MotionSpec};
-use hil_mock::tracker::{MockTracker, MockTrackerConfig};
+use dpm_mock::motion::{Motion, MotionSpec};
+use dpm_mock::tracker::{MockTracker, MockTrackerConfig};
 
 const ACCELERATION: f64 = 5.0;
 const SPEED: f64 = 0.5;

@@ -9,6 +9,7 @@ use dpm_device::time::HostTime;
 use dpm_device::transport::inproc::{threaded, HostEnd};
 use dpm_device::transport::{LinkDevice, Transport};
 use dpm_handoff::wake::WaitPolicy;
+use dpm_mock::projector::{serve_cable, EmulatedProjector, MockConfig, GREATEST_SHIFT};
 use dpm_render::gpu::Gpu;
 use dpm_render::pack::{pack, BitPlaneFrame, Kernel};
 use dpm_render::{RenderError, Renderer};
@@ -21,7 +22,6 @@ use dpm_rig::projectors::{Cable, Compaction};
 use dpm_rig::rig::Rig;
 use dpm_rig::standing::{standing_for_device, Stands};
 use dpm_rig::telemetry::monitor::RunMonitor;
-use hil_mock::projector::{serve_cable, EmulatedProjector, MockConfig, GREATEST_SHIFT};
 use std::sync::Arc;
 use std::time::Duration;
 

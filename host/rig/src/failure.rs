@@ -84,17 +84,6 @@ impl<T> From<T> for Ended<T> {
     }
 }
 
-impl From<dpm_device::dlpc900::driver::Dlpc900Error> for Failure {
-    fn from(e: dpm_device::dlpc900::driver::Dlpc900Error) -> Self {
-        use dpm_device::dlpc900::driver::Dlpc900Error;
-        let kind = match e {
-            Dlpc900Error::Sequence(_) => FailureKind::BadInput,
-            _ => FailureKind::Device,
-        };
-        Self::new(kind, e)
-    }
-}
-
 impl From<dpm_device::tracker::record::RecordError> for Failure {
     fn from(e: dpm_device::tracker::record::RecordError) -> Self {
         use dpm_device::tracker::record::RecordError;

@@ -1,22 +1,22 @@
 //! The mock tracker and the mock projector, as the rig uses them. No other file of the rig names the crate
 //! `hil-mock`.
 
-use hil_mock::faults::FaultKind;
-use hil_mock::projector::FaultyProjector;
-use hil_mock::tracker::TRACKER_FAULTS;
+use dpm_mock::faults::FaultKind;
+use dpm_mock::projector::FaultyProjector;
+use dpm_mock::tracker::TRACKER_FAULTS;
 use std::net::{Ipv4Addr, SocketAddrV4};
 
-pub(crate) use hil_mock::faults::{FaultError, FaultPlan};
-pub(crate) use hil_mock::motion::{Motion, MotionError, MotionSpec};
-pub(crate) use hil_mock::natnet_host::{free_port, NatNetHost};
-pub(crate) use hil_mock::natnet_server::{NatNetServer, NatNetServerConfig};
-pub(crate) use hil_mock::projector::{
+pub(crate) use dpm_mock::faults::{FaultError, FaultPlan};
+pub(crate) use dpm_mock::motion::{Motion, MotionError, MotionSpec};
+pub(crate) use dpm_mock::natnet_host::{free_port, NatNetHost};
+pub(crate) use dpm_mock::natnet_server::{NatNetServer, NatNetServerConfig};
+pub(crate) use dpm_mock::projector::{
     serve_cable, DeviceClock, EmulatedProjector, MockConfig, MockProjector, Served, GREATEST_SHIFT,
 };
-pub(crate) use hil_mock::serial_server::{pseudo_terminal, SerialPoseDevice, SerialPoseHost};
-pub(crate) use hil_mock::tracker::{MockTracker, MockTrackerConfig, SampleSource};
-pub(crate) use hil_mock::vrpn_host::VrpnHost;
-pub(crate) use hil_mock::vrpn_server::{VrpnNames, VrpnReports};
+pub(crate) use dpm_mock::serial_server::{pseudo_terminal, SerialPoseDevice, SerialPoseHost};
+pub(crate) use dpm_mock::tracker::{MockTracker, MockTrackerConfig, SampleSource};
+pub(crate) use dpm_mock::vrpn_host::VrpnHost;
+pub(crate) use dpm_mock::vrpn_server::{VrpnNames, VrpnReports};
 
 /// Any free port of this machine, for a mock server.
 pub(crate) const ANY_PORT: SocketAddrV4 = SocketAddrV4::new(Ipv4Addr::LOCALHOST, 0);

@@ -7,9 +7,9 @@ use dpm_common::so3::so3_between;
 use dpm_device::pose::Pose;
 use dpm_device::time::{FrameRate, HostTime};
 use dpm_device::tracker::{BodyIndex, Tracker};
+use dpm_mock::motion::{Motion, MotionError, MotionSpec};
+use dpm_mock::tracker::{MockTracker, MockTrackerConfig, MockTrackerError};
 use glam::{DQuat, DVec3};
-use hil_mock::motion::{Motion, MotionError, MotionSpec};
-use hil_mock::tracker::{MockTracker, MockTrackerConfig, MockTrackerError};
 use std::fmt::Write;
 
 /// The rig around the filter.

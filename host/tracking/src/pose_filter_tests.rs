@@ -8,7 +8,7 @@ use super::*;
 use dpm_common::so3::so3_exp;
 use dpm_device::pose::Pose;
 use dpm_device::tracker::BodyIndex;
-use hil_mock::motion::MotionSpec;
+use dpm_mock::motion::MotionSpec;
 use proptest::prelude::*;
 
 const MS: i64 = 1_000_000;

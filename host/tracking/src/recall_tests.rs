@@ -9,7 +9,7 @@ use super::*;
 use dpm_device::pose::Pose;
 use dpm_device::time::HostTime;
 use dpm_device::tracker::{BodyIndex, TrackerSample};
-use hil_mock::motion::{Motion, MotionSpec};
+use dpm_mock::motion::{Motion, MotionSpec};
 
 const SIGMA: f64 = 1e-4;
 const STEP_NS: i64 = 2_000_000;

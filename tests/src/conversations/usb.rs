@@ -2,9 +2,9 @@
 //! against any client.
 
 use super::{step, taken, Script};
-use dpm_device::dlpc900::command::{Command, Opcode, Reply, ReplyAssembler, REPORT_BYTES};
-use dpm_device::dlpc900::driver::{Dlpc900, HidPort, PortError};
 use dpm_device::time::HostTime;
+use dpm_dlpc900::command::{Command, Opcode, Reply, ReplyAssembler, REPORT_BYTES};
+use dpm_dlpc900::driver::{Dlpc900, HidPort, PortError};
 use hil_mock::dlpc900::{Dlpc900Model, Options};
 use hil_mock::usb_model::{Speed, UsbDeviceModel};
 use hil_mock::usb_plug::{Completed, Request, Status, UsbCable};

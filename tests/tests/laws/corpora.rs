@@ -6,8 +6,6 @@
 
 use crate::common::{png, tetrahedra, with_image, Glb};
 use dpm_device::cobs::{encode, encoded_bytes};
-use dpm_device::dlpc900::command::{Command, Opcode};
-use dpm_device::dlpc900::image::{self, Compression, PlaneOrder};
 use dpm_device::link::{
     rle_encode, Area, Commit, Header, HostMessage, MessageType, Packet, Region, Tracks, MAX_CONTROL_BYTES,
 };
@@ -20,6 +18,8 @@ use dpm_device::tracker::natnet::Version;
 use dpm_device::tracker::record::SAMPLE_BYTES;
 use dpm_device::tracker::serial::wire::SerialMessage;
 use dpm_device::tracker::vrpn::wire as vrpn;
+use dpm_dlpc900::command::{Command, Opcode};
+use dpm_dlpc900::image::{self, Compression, PlaneOrder};
 use dpm_tests::decoders::ALL;
 use hil_mock::usbip::wire as usbip;
 use serde_json::json;

@@ -1,10 +1,10 @@
 //! Converts picture files to DLPC900 patterns.
 
-use dpm_device::dlpc900::image::{Compression, PlaneOrder};
-use dpm_device::dlpc900::lut::Dmd;
-use dpm_device::dlpc900::sequence::{Pattern, PatternSequence, Repeat, SequenceBuilder, SequenceError};
 use dpm_device::planes::Raster;
 use dpm_device::regular_file;
+use dpm_dlpc900::image::{Compression, PlaneOrder};
+use dpm_dlpc900::lut::Dmd;
+use dpm_dlpc900::sequence::{Pattern, PatternSequence, Repeat, SequenceBuilder, SequenceError};
 use image::ImageFormat;
 use std::path::{Path, PathBuf};
 

@@ -1,7 +1,7 @@
 //! Puts the DLPC900 of a killed run to rest.
 
 use dpm_common::clock::Stopwatch;
-use dpm_device::dlpc900::driver::{Dlpc900, Dlpc900Error, HidPort};
+use dpm_dlpc900::driver::{Dlpc900, Dlpc900Error, HidPort};
 use std::time::Duration;
 
 /// How long to try. Giving up leaves the light on.
@@ -40,10 +40,10 @@ fn rest<P: HidPort>(mut d: Dlpc900<P>) -> Result<(), Dlpc900Error> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use dpm_device::dlpc900::driver::PortError;
-    use dpm_device::dlpc900::lut::{led, Dmd, LutEntry};
-    use dpm_device::dlpc900::sequence::LedSetup;
-    use dpm_device::dlpc900::video::{Receiver, VideoPatterns};
+    use dpm_dlpc900::driver::PortError;
+    use dpm_dlpc900::lut::{led, Dmd, LutEntry};
+    use dpm_dlpc900::sequence::LedSetup;
+    use dpm_dlpc900::video::{Receiver, VideoPatterns};
     use hil_mock::dlpc900::{Dlpc900Model, Options, VirtualHid};
     use std::cell::Cell;
     use std::rc::Rc;

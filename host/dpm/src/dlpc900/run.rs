@@ -9,16 +9,14 @@
 mod word;
 
 use dpm_common::clock::Stopwatch;
-use dpm_device::dlpc900::driver::{Dlpc900, Dlpc900Error, HidPort, PortError};
-use dpm_device::dlpc900::image::PlaneOrder;
-use dpm_device::dlpc900::lut::{led, Dmd, LutEntry, IMAGE_PLANES, MAX_IMAGES};
-use dpm_device::dlpc900::sequence::{
-    LedSetup, Pattern, PatternSequence, Repeat, SequenceBuilder, SequenceError,
-};
-use dpm_device::dlpc900::usb::{self, UsbHid, UsbPlace};
-use dpm_device::dlpc900::video::{share_us, Receiver, VideoPatterns};
 use dpm_device::link::faults;
 use dpm_device::planes::{Channel, PlaneSchedule};
+use dpm_dlpc900::driver::{Dlpc900, Dlpc900Error, HidPort, PortError};
+use dpm_dlpc900::image::PlaneOrder;
+use dpm_dlpc900::lut::{led, Dmd, LutEntry, IMAGE_PLANES, MAX_IMAGES};
+use dpm_dlpc900::sequence::{LedSetup, Pattern, PatternSequence, Repeat, SequenceBuilder, SequenceError};
+use dpm_dlpc900::usb::{self, UsbHid, UsbPlace};
+use dpm_dlpc900::video::{share_us, Receiver, VideoPatterns};
 use dpm_render::pack::{pack, BitPlaneFrame, Kernel};
 use dpm_render::{RenderError, Renderer};
 use dpm_rig::config::RigConfig;

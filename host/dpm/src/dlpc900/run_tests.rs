@@ -1,9 +1,9 @@
 //! A DLPC900 run with the emulator: what is shown, the effect of orders, and what happens when the cable is pulled.
 
 use super::*;
-use dpm_device::dlpc900::command::Opcode;
-use dpm_device::dlpc900::lut::DisplayMode;
 use dpm_device::time::HostTime;
+use dpm_dlpc900::command::Opcode;
+use dpm_dlpc900::lut::DisplayMode;
 use dpm_render::pack::unpack;
 use dpm_rig::interlock::{Contact, Interlock};
 use dpm_rig::pack::prepared::PreparedFrames;
@@ -314,7 +314,7 @@ fn a_refusal_names_the_remedy_for_the_state_that_the_controller_is_in() {
         assert!(told.contains("(error 5") && told.contains(remedy), "{told}");
     }
     d.make_ready().unwrap();
-    let told = d.run(&dpm_device::dlpc900::sequence::pause(), &mut |_| ()).unwrap_err().to_string();
+    let told = d.run(&dpm_dlpc900::sequence::pause(), &mut |_| ()).unwrap_err().to_string();
     assert!(told.contains("stop the sequence and select the right display mode"), "{told}");
 }
 
@@ -351,7 +351,7 @@ impl HidPort for Sticky {
     fn now(&self) -> Duration {
         HidPort::now(&self.hid)
     }
-    fn second_line(&self) -> Option<Box<dyn dpm_device::dlpc900::driver::SecondLine>> {
+    fn second_line(&self) -> Option<Box<dyn dpm_dlpc900::driver::SecondLine>> {
         self.hid.second_line()
     }
 }
@@ -450,7 +450,7 @@ impl HidPort for LateStart {
     fn now(&self) -> Duration {
         HidPort::now(&self.hid)
     }
-    fn second_line(&self) -> Option<Box<dyn dpm_device::dlpc900::driver::SecondLine>> {
+    fn second_line(&self) -> Option<Box<dyn dpm_dlpc900::driver::SecondLine>> {
         self.hid.second_line()
     }
 }

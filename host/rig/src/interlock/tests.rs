@@ -145,7 +145,7 @@ fn a_file_closes_it_while_it_holds_a_one() {
 
 #[test]
 fn a_port_that_is_not_there_or_has_no_lines_is_open() {
-    let (_ours, path, _held) = hil_mock::serial_server::pseudo_terminal().unwrap();
+    let (_ours, path, _held) = dpm_mock::serial_server::pseudo_terminal().unwrap();
     for port in ["/dev/no-such-port".to_owned(), path] {
         let line = LineInterlockConfig { port: Some(port), ..Default::default() };
         stays(&of(InterlockConfig::Line(line)), false);

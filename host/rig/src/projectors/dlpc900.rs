@@ -4,12 +4,13 @@
 use super::keys::{DeviceName, FrameKeys, Look, ProjectorKeys};
 use super::kind::{FrameRoad, ProjectorKind, SlotClock};
 use super::light::{LitTime, PlaneTiming, PlaneWeights};
+use crate::failure::{Failure, FailureKind};
 use dpm_common::keys::read::{contradict, shown, Any, NotEmpty, Reader, Within};
 use dpm_common::{section, words};
-use dpm_device::dlpc900::driver::Dlpc900;
-use dpm_device::dlpc900::lut::Dmd;
-use dpm_device::dlpc900::usb::{describe, UsbHid, UsbPlace};
-use dpm_device::dlpc900::video::Receiver;
+use dpm_dlpc900::driver::{Dlpc900, Dlpc900Error};
+use dpm_dlpc900::lut::Dmd;
+use dpm_dlpc900::usb::{describe, UsbHid, UsbPlace, PRODUCT, VENDOR};
+use dpm_dlpc900::video::Receiver;
 
 /// What an operator of a DLPC900 must know.
 pub const NO_WATCHDOG: &str =
@@ -101,7 +102,18 @@ pub(super) static KIND: ProjectorKind = ProjectorKind::of::<Dlpc900Config>(
     "docs/DLPC900.md",
 )
 .on(FrameRoad::Loaded)
-.by_video(SlotClock::Firmware);
+.by_video(SlotClock::Firmware)
+.by_usb(VENDOR, PRODUCT, "TI DLPC900");
+
+impl From<Dlpc900Error> for Failure {
+    fn from(e: Dlpc900Error) -> Self {
+        let kind = match e {
+            Dlpc900Error::Sequence(_) => FailureKind::BadInput,
+            _ => FailureKind::Device,
+        };
+        Self::new(kind, e)
+    }
+}
 
 impl ProjectorKeys for Dlpc900Config {
     fn device(&self) -> DeviceName {

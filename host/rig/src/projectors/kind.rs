@@ -43,6 +43,8 @@ pub struct ProjectorKind {
     pub slots: SlotClock,
     /// A picture on a video cable reaches it, so another kind of which this is true may be the same projector.
     pub is_video: bool,
+    /// The USB device that it is by itself: vendor, product, and what it is called.
+    pub usb: Option<(u16, u16, &'static str)>,
     /// The page of the manual about it, with a heading: `docs/ALP.md#...`.
     pub page: &'static str,
     read: ReadKeys,
@@ -63,6 +65,7 @@ impl ProjectorKind {
             road: FrameRoad::Fed,
             slots: SlotClock::Firmware,
             is_video: false,
+            usb: None,
             page,
             read: read::<K>,
         }
@@ -76,6 +79,11 @@ impl ProjectorKind {
     /// The same on a video cable; with `slots` that follow its blanks or not.
     pub const fn by_video(self, slots: SlotClock) -> Self {
         Self { is_video: true, slots, ..self }
+    }
+
+    /// The same as a USB device with these numbers, called `name`.
+    pub const fn by_usb(self, vendor: u16, product: u16, name: &'static str) -> Self {
+        Self { usb: Some((vendor, product, name)), ..self }
     }
 
     /// True if its frames are loaded before their time.

@@ -5,16 +5,16 @@ use super::keys::{Cable, DeviceName, Medium, Opening, Panel, ProjectorKeys};
 use super::kind::ProjectorKind;
 use dpm_common::keys::read::{Any, NotEmpty, Within};
 use dpm_common::section;
-use dpm_device::transport::usb::{UsbSettings, UsbTransport};
+use dpm_device::transport::usb::{UsbSettings, UsbTransport, PRODUCT_ID, VENDOR_ID};
 use dpm_device::transport::TransportError;
 
 section! {
     /// A bit-plane projector on USB.
     pub struct UsbProjectorConfig {
         /// USB vendor id.
-        vendor_id: u16 = dpm_device::transport::usb::VENDOR_ID, "", Any;
+        vendor_id: u16 = VENDOR_ID, "", Any;
         /// USB product id.
-        product_id: u16 = dpm_device::transport::usb::PRODUCT_ID, "", Any;
+        product_id: u16 = PRODUCT_ID, "", Any;
         /// Serial number of the device; needed if several are plugged in.
         serial_number: Option<String> = None, "", NotEmpty;
         /// Frames queued at once. More frames bridge longer pauses of the host, and each adds a frame of latency to a
@@ -32,7 +32,8 @@ pub(super) static KIND: ProjectorKind = ProjectorKind::of::<UsbProjectorConfig>(
     "USB projector",
     "a bit-plane projector on USB.",
     "docs/PROTOCOL.md",
-);
+)
+.by_usb(VENDOR_ID, PRODUCT_ID, "bit-plane projector");
 
 impl UsbProjectorConfig {
     fn settings(&self, panel: &Panel) -> UsbSettings {

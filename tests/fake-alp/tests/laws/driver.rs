@@ -1,6 +1,6 @@
 //! The driver on the fake panel: the light is the planes, it ends by itself, and nothing of the device stays behind.
 
-use dpm_device::alp::{Alp, AlpError, Showing, Weights};
+use dpm_alp::{Alp, AlpError, Showing, Weights};
 use dpm_device::planes::{PlaneSchedule, Raster};
 use dpm_device::rng::Sampler;
 use dpm_device::time::{FrameRate, HostTime};

@@ -1,6 +1,6 @@
 //! The bit-plane projector whose panel is an ALP, at virtual pace: the host's own link on one side, the fake panel on the other.
 
-use dpm_device::alp::{Alp, AlpError, AlpProjector, Showing, Weights, MEMORY_SPARE};
+use dpm_alp::{Alp, AlpError, AlpProjector, Showing, Weights, MEMORY_SPARE};
 use dpm_device::link::{
     faults, Epoch, HostLink, LightLimits, LinkSettings, LinkState, SendOutcome, Underrun, Verb,
 };

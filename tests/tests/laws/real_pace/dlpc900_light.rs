@@ -3,11 +3,11 @@
 use std::path::Path;
 use std::sync::{Arc, Mutex};
 
-use dpm_device::dlpc900::driver::Dlpc900;
-use dpm_device::dlpc900::lut::led;
 use dpm_device::planes::Raster;
 use dpm_device::time::HostTime;
 use dpm_display::encoding::PixelMap;
+use dpm_dlpc900::driver::Dlpc900;
+use dpm_dlpc900::lut::led;
 use dpm_lab::reference::Sampler;
 use dpm_render::pack::{halftone, pack, BitPlaneFrame, Halftone, Kernel};
 use dpm_rig::config::{Overrides, ProjectorConfig, RigConfig};

@@ -5,8 +5,6 @@
 use std::path::Path;
 use std::sync::{Arc, Mutex};
 
-use dpm_device::dlpc900::driver::Dlpc900;
-use dpm_device::dlpc900::video::VideoPatterns;
 use dpm_device::planes::Raster;
 use dpm_device::time::HostTime;
 use dpm_display::dlpc900::behind;
@@ -14,6 +12,8 @@ use dpm_display::fake::{display, FakeKms, Scanned};
 use dpm_display::kms::Kms;
 use dpm_display::mode::Timing;
 use dpm_display::transport::{on_card, DisplayTransport};
+use dpm_dlpc900::driver::Dlpc900;
+use dpm_dlpc900::video::VideoPatterns;
 use dpm_handoff::path::Lock;
 use dpm_rig::config::{Overrides, RigConfig};
 use dpm_rig::pipeline::projector::{panel, Medium, OpenMedium};

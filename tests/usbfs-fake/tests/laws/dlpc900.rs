@@ -3,11 +3,11 @@
 use std::sync::{Arc, Mutex};
 use std::time::{Duration, Instant};
 
-use dpm_device::dlpc900::driver::{Dlpc900, Dlpc900Error, HidPort, PortError};
-use dpm_device::dlpc900::image::PlaneOrder;
-use dpm_device::dlpc900::lut::Dmd;
-use dpm_device::dlpc900::sequence::{LedSetup, Pattern, Repeat, SequenceBuilder};
-use dpm_device::dlpc900::usb::{self, UsbHid, UsbPlace};
+use dpm_dlpc900::driver::{Dlpc900, Dlpc900Error, HidPort, PortError};
+use dpm_dlpc900::image::PlaneOrder;
+use dpm_dlpc900::lut::Dmd;
+use dpm_dlpc900::sequence::{LedSetup, Pattern, Repeat, SequenceBuilder};
+use dpm_dlpc900::usb::{self, UsbHid, UsbPlace};
 use hil_mock::dlpc900::{Dlpc900Fault, Dlpc900Model, Options as Projector};
 use hil_mock::usb_plug::{monotonic_clock, Fault, UsbPlug};
 use usbfs_fake::{plug_in, Options, Socket};

@@ -6,10 +6,6 @@ use std::sync::{Arc, Mutex, MutexGuard};
 use std::time::{Duration, Instant};
 
 use crate::common::{link_settings, lit, planes, raster, run, settings, shared, with, PATIENCE};
-use dpm_device::dlpc900::command::{Opcode, REPORT_BYTES};
-use dpm_device::dlpc900::driver::{Dlpc900, HidPort, PortError};
-use dpm_device::dlpc900::lut::Dmd;
-use dpm_device::dlpc900::video::{exposure_us, Receiver, VideoBits, VideoPatterns};
 use dpm_device::link::{HostLink, LinkState};
 use dpm_device::time::{HostClock, HostTime};
 use dpm_device::transport::{Transport, TransportError};
@@ -18,6 +14,10 @@ use dpm_display::encoding::Encoding;
 use dpm_display::fake::{FakeKms, Shared};
 use dpm_display::kms::Kms;
 use dpm_display::transport::{on_card, DisplayTransport};
+use dpm_dlpc900::command::{Opcode, REPORT_BYTES};
+use dpm_dlpc900::driver::{Dlpc900, HidPort, PortError};
+use dpm_dlpc900::lut::Dmd;
+use dpm_dlpc900::video::{exposure_us, Receiver, VideoBits, VideoPatterns};
 use dpm_handoff::wake::WaitPolicy;
 use hil_mock::dlpc900::{Dlpc900Fault, Dlpc900Model};
 

@@ -418,13 +418,10 @@ pub(super) fn serial_ports() -> Vec<String> {
 /// The name of a USB device with these ids (four hexadecimal digits each), if it is a projector that this program
 /// drives.
 fn known_projector(vendor: &str, product: &str) -> Option<&'static str> {
-    use dpm_device::{dlpc900::usb as dlpc900, transport::usb as link};
     let number = |text: &str| u16::from_str_radix(text, 16).ok();
-    match (number(vendor)?, number(product)?) {
-        (dlpc900::VENDOR, dlpc900::PRODUCT) => Some("TI DLPC900"),
-        (link::VENDOR_ID, link::PRODUCT_ID) => Some("bit-plane projector"),
-        _ => None,
-    }
+    let asked = (number(vendor)?, number(product)?);
+    let devices = dpm_rig::projectors::kinds().into_iter().filter_map(|kind| kind.usb);
+    devices.into_iter().find(|(vendor, product, _)| (*vendor, *product) == asked).map(|(.., name)| name)
 }
 
 fn udev_rule(vendor: &str, product: &str) -> String {
@@ -495,7 +492,8 @@ mod tests {
     /// Found in use: the doctor looked for USB ids that no projector of the link has.
     #[test]
     fn a_projector_is_known_by_the_numbers_that_its_driver_opens() {
-        use dpm_device::{dlpc900::usb as dlpc900, transport::usb as link};
+        use dpm_device::transport::usb as link;
+        use dpm_dlpc900::usb as dlpc900;
         let known =
             |vendor: u16, product: u16| known_projector(&format!("{vendor:04x}"), &format!("{product:04x}"));
         assert_eq!(known(link::VENDOR_ID, link::PRODUCT_ID), Some("bit-plane projector"));

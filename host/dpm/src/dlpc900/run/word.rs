@@ -2,7 +2,7 @@
 
 use crate::signals;
 use dpm_common::clock::Stopwatch;
-use dpm_device::dlpc900::driver::DarkLine;
+use dpm_dlpc900::driver::DarkLine;
 use dpm_rig::order::Order;
 use dpm_rig::telemetry::monitor::RunMonitor;
 use std::sync::atomic::{AtomicBool, AtomicU32, AtomicU8, Ordering};

@@ -3,9 +3,9 @@
 
 use crate::cli_common;
 use crate::cli_common::{start_with, Running};
-use dpm_device::dlpc900::command::Opcode;
-use dpm_device::dlpc900::lut::{DisplayMode, Dmd};
 use dpm_device::time::HostTime;
+use dpm_dlpc900::command::Opcode;
+use dpm_dlpc900::lut::{DisplayMode, Dmd};
 use hil_mock::dlpc900::{Dlpc900Model, Options, Sequencer};
 use hil_mock::usb_plug::{monotonic_clock, UsbPlug};
 use hil_mock::usbip::{Export, Server};

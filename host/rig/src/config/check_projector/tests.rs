@@ -2,8 +2,8 @@
 
 use crate::config::*;
 use crate::projectors::display::{DisplayConfig, DisplayEncoding, DisplayLease};
-use dpm_device::dlpc900::lut::led;
 use dpm_device::planes::{Channel, PlaneSchedule};
+use dpm_dlpc900::lut::led;
 use std::path::Path;
 
 /// A template of a rig file, with some keys changed.

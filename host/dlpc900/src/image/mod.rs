@@ -14,7 +14,7 @@ mod encode;
 pub use decode::{decode, ImageDecoder};
 pub use encode::{encode, EncodedImage};
 
-use crate::planes::Raster;
+use dpm_device::planes::Raster;
 
 /// Bytes of the header.
 pub const HEADER_BYTES: usize = 48;

@@ -5,7 +5,7 @@
 //! rule. The emulator answers with the controller's error code for the same rule.
 //! \[DLPU018 tables 2-102, 2-103, section 2.4.4.3.5\]
 
-use crate::planes::Raster;
+use dpm_device::planes::Raster;
 
 /// Bytes of an entry on the wire.
 pub const ENTRY_BYTES: usize = 12;
@@ -463,7 +463,7 @@ pub fn step_us(entries: &[LutEntry], place: usize) -> u64 {
     u64::from(e.exposure_us) + u64::from(e.dark_us) + u64::from(black)
 }
 
-#[cfg(all(test, feature = "std"))]
+#[cfg(test)]
 mod tests {
     use super::*;
     use proptest::prelude::*;

@@ -12,12 +12,12 @@ use dpm_handoff::wake::WaitPolicy;
 use super::driver::{Alp, AlpFacts, Showing};
 use super::error::AlpError;
 use super::projector::{AlpProjector, MEMORY_SPARE};
-use crate::packet::Packet;
-use crate::planes::Raster;
-use crate::projector::Served;
-use crate::time::{HostClock, HostTime};
-use crate::transport::inproc::{threaded, DeviceEnd, HostEnd};
-use crate::transport::{Lane, LinkDevice, SendError, Transport, TransportError};
+use dpm_device::link::Packet;
+use dpm_device::planes::Raster;
+use dpm_device::projector::Served;
+use dpm_device::time::{HostClock, HostTime};
+use dpm_device::transport::inproc::{threaded, DeviceEnd, HostEnd};
+use dpm_device::transport::{Lane, LinkDevice, SendError, Transport, TransportError};
 
 /// Buffers of the cable: one is filled, one is read, one is spare.
 const CABLE_BUFFERS: usize = 3;

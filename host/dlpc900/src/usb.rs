@@ -7,7 +7,7 @@ use rusb::{Context, Device, DeviceHandle, Direction, TransferType, UsbContext};
 
 use super::command::REPORT_BYTES;
 use super::driver::{Dlpc900, Dlpc900Error, HidPort, PortError, SecondLine};
-use crate::usb_help::{node, node_of, remedy};
+use dpm_device::usb_help::{node, node_of, remedy};
 
 /// USB vendor, Texas Instruments.
 pub const VENDOR: u16 = 0x0451;

@@ -11,8 +11,8 @@ use std::time::Duration;
 use super::command::Opcode;
 use super::lut::{led, validate, DisplayMode, Dmd, Limits, LutEntry, LutError};
 use super::sequence::{stop, switch_mode, table, write, LedSetup, Step, Version, LEDS_OFF};
-use crate::planes::{Channel, PlaneSchedule, PlaneSpec};
-use crate::time::FrameRate;
+use dpm_device::planes::{Channel, PlaneSchedule, PlaneSpec};
+use dpm_device::time::FrameRate;
 
 /// What the patterns of a frame leave of it, microseconds. A sequence that has not ended when the next frame begins is
 /// aborted.
@@ -257,7 +257,7 @@ impl VideoPatterns {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::planes::Parts;
+    use dpm_device::planes::Parts;
 
     const NEW: Version = Version { major: 6, minor: 0, patch: 1 };
 

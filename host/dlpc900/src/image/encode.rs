@@ -3,8 +3,8 @@
 use std::ops::Range;
 
 use super::{pixel_row, Compression, ImageError, ImageHeader, Pixel, PlaneOrder, HEADER_BYTES};
-use crate::dlpc900::lut::IMAGE_PLANES;
-use crate::planes::Raster;
+use crate::lut::IMAGE_PLANES;
+use dpm_device::planes::Raster;
 
 /// Longest run or copy of an ERLE length.
 const MOST_ERLE: usize = 0x7fff;

@@ -8,8 +8,8 @@ use super::abi;
 use super::error::AlpError;
 use super::library::Library;
 use super::timing::{FrameTiming, Misfit, Part, Weights};
-use crate::planes::{PlaneSchedule, Raster};
-use crate::time::{FrameRate, HostTime};
+use dpm_device::planes::{PlaneSchedule, Raster};
+use dpm_device::time::{FrameRate, HostTime};
 
 /// Runs of a sequence at most, so that a host that dies leaves light for three frames at most.
 pub const MAX_RUNS: u32 = 3;

@@ -7,12 +7,12 @@
 
 use super::driver::{Alp, Showing, Temperatures};
 use super::error::AlpError;
-use crate::light::LightKind;
-use crate::link::faults;
-use crate::planes::PlaneSchedule;
-use crate::projector::{FirmwareConfig, ProjectorFirmware, Served};
-use crate::time::{FrameRate, HostTime};
-use crate::transport::{Lane, LinkDevice};
+use dpm_device::light::LightKind;
+use dpm_device::link::faults;
+use dpm_device::planes::PlaneSchedule;
+use dpm_device::projector::{FirmwareConfig, ProjectorFirmware, Served};
+use dpm_device::time::{FrameRate, HostTime};
+use dpm_device::transport::{Lane, LinkDevice};
 
 /// Time between two looks at the temperatures.
 const LOOK_EVERY_NS: i64 = 2_000_000_000;

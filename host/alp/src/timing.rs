@@ -1,7 +1,7 @@
 //! Picture times: how the planes of a frame share its time on a panel that shows a sequence at one picture time.
 
-use crate::planes::PlaneSchedule;
-use crate::time::FrameRate;
+use dpm_device::planes::PlaneSchedule;
+use dpm_device::time::FrameRate;
 
 /// How long the planes of a frame are lit.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
