@@ -2,6 +2,7 @@
 //! all bytes. The fuzz targets in `fuzz/` and the test over the committed seeds call the same entries.
 
 use crate::conversations::{link, sensor, trackers, usb};
+use dpm_camera_files::{self as camera_files, Form, LengthUnit, LensKind, ReadOptions, StorageError};
 use dpm_device::clock_map::{ClockMap, ExchangeOutcome};
 use dpm_device::cobs::{encode, encoded_bytes, Deframer};
 use dpm_device::link::crc32c;
@@ -21,7 +22,6 @@ use dpm_rig::order::Order;
 use dpm_rig::parameters::command::{Command, MAX_LINE};
 use dpm_rig::standing;
 use dpm_rig::trackers::kinds;
-use dpm_scene::camera_files::{self, Form, LengthUnit, LensKind, ReadOptions, StorageError};
 use hil_mock::faults::FaultPlan;
 use hil_mock::usbip::wire as usbip;
 use std::io::{self, Read, Write};

@@ -10,10 +10,8 @@
 pub mod body;
 pub mod check;
 mod dense;
-pub mod file;
 mod least_squares;
 pub mod light;
-pub mod model;
 pub mod nudge;
 pub mod outline;
 pub mod pinhole;
@@ -22,3 +20,6 @@ pub mod projector;
 pub mod rehearsal;
 pub mod sensor;
 pub mod trajectory;
+
+pub use dpm_calibration_file as file;
+pub use dpm_calibration_file::model;

@@ -1,6 +1,6 @@
 //! Small motions by hand, each of which can be taken back.
 
-use dpm_common::so3::{so3_exp, so3_log};
+use dpm_common::so3::so3_log;
 use glam::{DAffine3, DQuat, DVec3};
 
 /// Angle of one turn, degrees.
@@ -117,16 +117,10 @@ impl Nudges {
     }
 }
 
-/// `start` after a motion along and about its own axes: `centre`, a point of the frame it starts from, moves by `by_m`
-/// metres, and the frame turns about it by the rotation vector `turn_rad`. [`Nudges::offset`] tells such a motion.
-pub fn moved(start: &DAffine3, centre: DVec3, by_m: DVec3, turn_rad: DVec3) -> DAffine3 {
-    let rotation = so3_exp(turn_rad);
-    *start * DAffine3::from_rotation_translation(rotation, centre + by_m - rotation * centre)
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
+    use dpm_calibration_file::moved;
 
     fn start() -> DAffine3 {
         DAffine3::from_rotation_translation(DQuat::from_rotation_x(0.7), DVec3::new(0.3, -0.2, 1.1))

@@ -1,11 +1,11 @@
 //! Keeps the parameters of a run for the next one: numbers in the rig file, motions in the calibration file, which the rig
 //! file then names. The files that are replaced are kept beside the new ones.
 
-use crate::results::{check_known, keep, Moved, Results};
 use dpm_common::files::{keep_old, write_atomically};
 use dpm_device::regular_file;
 use dpm_rig::config::{Overrides, Purpose, RigConfig, MAX_FILE_BYTES};
 use dpm_rig::parameters::desk::{Saver, Setting, ToKeep};
+use dpm_rig::results::{check_known, keep, Moved, Results};
 use dpm_rig::rig::Rig;
 use std::io::Write;
 use std::path::{Path, PathBuf};

@@ -3,13 +3,10 @@
 // What only a satellite calls is dead in a program without it.
 #![cfg_attr(not(feature = "satellites"), allow(dead_code))]
 
-#[cfg(feature = "calibrate")]
-pub mod calibrate;
 pub mod cli;
 #[cfg(feature = "dlpc900")]
 mod dlpc900;
 mod keep_parameters;
 mod notify;
 mod own_run;
-pub mod results;
 pub mod signals;

@@ -1,12 +1,13 @@
 //! Calibration files into parts of a rig: files of other programs into the projector's camera, and what `dpm calibrate`
 //! measured into camera, bodies, latency and light.
 
-use crate::config::{CalibrationUnit, ProjectorConfig, RigConfig};
-use dpm_calibration::file::{self, CalibrationFile, LightSection, ProjectorSection};
+#[cfg(not(feature = "camera-files"))]
+use crate::config::ProjectorConfig;
+use crate::config::RigConfig;
+use dpm_calibration_file::{self as file, CalibrationFile, LightSection, ProjectorSection};
 use dpm_device::planes::Raster;
-use dpm_device::regular_file;
-use dpm_scene::camera_files::{self, Frame, LengthUnit, ReadOptions};
 use dpm_scene::geometry::projector::ProjectorCamera;
+#[cfg(not(feature = "camera-files"))]
 use std::path::Path;
 
 /// A calibration file cannot be used.
@@ -21,65 +22,24 @@ pub struct CameraFileError {
     pub message: String,
 }
 
-/// The projector that the file at `path` describes, at `raster`. Adds to `warnings` what was not read of the file.
-///
-/// # Errors
-/// The file cannot be read, or does not describe a projector of this rig. The error says what to change.
+#[cfg(feature = "camera-files")]
+pub(crate) use crate::camera_file::calibrated_camera;
+
+/// Refuses the file: this program was built without its readers.
+#[cfg(not(feature = "camera-files"))]
 pub(crate) fn calibrated_camera(
-    p: &ProjectorConfig,
+    _: &ProjectorConfig,
     path: &Path,
-    raster: Raster,
-    warnings: &mut Vec<String>,
+    _: Raster,
+    _: &mut Vec<String>,
 ) -> Result<ProjectorCamera, CameraFileError> {
-    let wrong = |message: String| CameraFileError {
+    Err(CameraFileError {
         key: "projector.calibration",
         path: path.display().to_string(),
-        message,
-    };
-    let unit = match p.calibration_unit {
-        Some(CalibrationUnit::Metre) => LengthUnit::Metre,
-        Some(CalibrationUnit::Centimetre) => LengthUnit::Centimetre,
-        Some(CalibrationUnit::Millimetre) => LengthUnit::Millimetre,
-        None => return Err(wrong("projector.calibration_unit is missing".into())),
-    };
-    let bytes = regular_file::read(path, camera_files::MAX_BYTES as u64).map_err(|e| wrong(e.to_string()))?;
-    let (lens, region) = (p.calibration_lens.lens(), p.calibration_region.as_deref());
-    let device = p.calibration_device.as_deref();
-    let options = ReadOptions { raster: p.calibrated_raster(), unit, lens, region, device };
-    let stored = camera_files::read(&bytes, &options).map_err(|e| wrong(e.to_string()))?;
-    if !stored.unread.is_empty() {
-        let names = stored.unread.join(", ");
-        warnings.push(format!("projector.calibration: {}: was not read: {names}", path.display()));
-    }
-    let told = |note: &String| format!("projector.calibration: {}: {note}", path.display());
-    warnings.extend(stored.notes.iter().map(told));
-    let place = p.calibration_camera.as_ref().map(|pose| pose.to_affine());
-    let camera = match (&stored.frame, place) {
-        (Frame::World, None) => stored.camera,
-        (Frame::WorldOfCamera { name }, None) => {
-            warnings.push(told(&format!(
-                "the origin of its world is {name:?}; if the tracker's is another, set projector.calibration_camera to the \
-                 camera's pose in the tracker's world"
-            )));
-            stored.camera
-        }
-        // A quaternion of length zero was refused when the configuration was read.
-        (Frame::Camera { .. } | Frame::WorldOfCamera { .. }, Some(place)) => stored.seen_from(place.unwrap_or_default()),
-        (Frame::Camera { name }, None) => {
-            return Err(wrong(format!(
-                "its origin is the camera that calibrated it ({name:?} shows that), so the projector's place in the world is \
-                 unknown; set projector.calibration_camera to the camera's pose in the world"
-            )))
-        }
-        (Frame::World, Some(_)) => {
-            return Err(wrong(
-                "projector.calibration_camera is set, but the file tells the projector's place in its own world and not in a \
-                 camera's frame; remove projector.calibration_camera"
-                    .into(),
-            ))
-        }
-    };
-    Ok(camera.at_raster(raster))
+        message: "this program was built without its feature \"camera-files\", which reads calibration files of other \
+                  programs; build it with that feature, or use [projector] and calibration.file"
+            .into(),
+    })
 }
 
 /// What `dpm calibrate` measured, if the rig file names it.
@@ -289,7 +249,7 @@ mod tests {
     /// A rig with a NatNet tracker and the demo's bodies, and the file that `dpm calibrate` would have written.
     fn measured_rig(file: &CalibrationFile, name: &str, keys: &[&str]) -> Result<Rig, String> {
         let path = std::env::temp_dir().join(format!("dpm-measured-{}-{name}.toml", std::process::id()));
-        dpm_calibration::file::save(file, &path).unwrap();
+        dpm_calibration_file::save(file, &path).unwrap();
         let text = format!(
             "[tracker]\nkind = \"natnet\"\n[real_time]\npace = \"real\"\n[run]\nseconds = 1\n[calibration]\nfile = {:?}\n\
              [[scene.bodies]]\nname = \"bunny\"\n[[scene.bodies]]\nname = \"venus\"\n",

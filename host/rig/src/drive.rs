@@ -2,7 +2,7 @@
 
 use crate::calibrated::measured_response;
 use crate::config::{ResponseConfig, RigConfig, TableResponseConfig};
-use dpm_calibration::file::{CalibrationFile, LightSection};
+use dpm_calibration_file::{CalibrationFile, LightSection};
 use dpm_device::planes::Raster;
 use dpm_device::regular_file;
 use dpm_render::drive::{Drive, Response};

@@ -30,6 +30,8 @@
 
 pub mod calibrated;
 pub mod calibration_steps;
+#[cfg(feature = "camera-files")]
+mod camera_file;
 pub mod config;
 pub mod control;
 pub mod drive;
@@ -50,6 +52,7 @@ pub mod plan;
 pub mod presence;
 pub mod projectors;
 mod render;
+pub mod results;
 pub mod rig;
 pub mod run_rig;
 pub mod standing;

@@ -9,7 +9,7 @@ use crate::config::{
 };
 use crate::drive::{albedo_of, drive, DriveError, MAX_PICTURE_BYTES};
 use crate::mock::{Motion, MotionError, MotionSpec};
-use dpm_calibration::file::CalibrationFile;
+use dpm_calibration_file::CalibrationFile;
 use dpm_device::planes::{PlaneSchedule, Raster};
 use dpm_device::pose::Pose;
 use dpm_device::regular_file;

@@ -21,7 +21,6 @@ pub mod albedo_table;
 mod body_picture;
 pub mod builtin;
 pub mod bvh;
-pub mod camera_files;
 mod deforming;
 mod environment;
 mod error;

@@ -5,44 +5,17 @@
 
 use crate::dense::{inverse_spd, solve_spd};
 use crate::sensor::Brightness;
+use dpm_calibration_file::light::{row, FlatField, TERMS};
 use dpm_device::planes::Raster;
 use glam::{DVec2, DVec3};
 use thiserror::Error;
 
-/// Terms: 1, x, y, x^2, x y, y^2, with x and y from -1 to 1 over the raster.
-const TERMS: usize = 6;
 /// Least cosine of the angle at which a sensor's reading is used.
 const LEAST_COSINE: f64 = 0.2;
 /// A field that is more uncertain than this anywhere is refused.
 const MOST_SIGMA: f64 = 0.01;
 /// A field darker than this anywhere is no flat field of a projector.
 const DARKEST: f64 = 0.05;
-
-/// Brightness over the raster, 1 in its middle.
-#[derive(Clone, Debug, PartialEq)]
-pub struct FlatField {
-    /// The raster.
-    pub raster: Raster,
-    /// Of 1, x, y, x^2, x y, y^2, where x and y run from -1 to 1 over the raster. The first is 1.
-    pub terms: [f64; TERMS],
-    /// Brightness in the middle at one metre, in the sensor's unit.
-    pub unit: f64,
-    /// Largest standard deviation over the raster.
-    pub sigma: f64,
-}
-
-impl FlatField {
-    /// A field that is equally bright everywhere.
-    pub fn even(raster: Raster) -> Self {
-        Self { raster, terms: [1.0, 0.0, 0.0, 0.0, 0.0, 0.0], unit: 1.0, sigma: 0.0 }
-    }
-
-    /// Brightness at a pixel over that in the middle.
-    pub fn at(&self, pixel: DVec2) -> f64 {
-        let row = row(self.raster, pixel);
-        row.iter().zip(&self.terms).map(|(a, b)| a * b).sum()
-    }
-}
 
 /// Why a sweep gives no field.
 #[derive(Clone, Copy, Debug, PartialEq, Error)]
@@ -76,12 +49,6 @@ pub enum FlatError {
 
 /// Fewest readings.
 const FEWEST: usize = 200;
-
-fn row(raster: Raster, pixel: DVec2) -> [f64; TERMS] {
-    let size = DVec2::new(f64::from(raster.width()), f64::from(raster.height()));
-    let p = 2.0 * pixel / size - 1.0;
-    [1.0, p.x, p.y, p.x * p.x, p.x * p.y, p.y * p.y]
-}
 
 /// Fits a field. `axis` is the direction in the wand's body frame into which a flat sensor looks; `None` for one behind
 /// a round diffuser.

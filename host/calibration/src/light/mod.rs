@@ -8,27 +8,10 @@ mod flat;
 mod response;
 mod steady;
 
-pub use flat::{flat_field, FlatError, FlatField};
-pub use response::{Channels, LightError, Next, Session, CURVE_POINTS};
+pub use dpm_calibration_file::light::{Channels, FlatField, LightModel, CURVE_POINTS};
+pub use flat::{flat_field, FlatError};
+pub use response::{LightError, Next, Session};
 pub use steady::{steady, Steady, SteadyError};
-
-use glam::DVec2;
-
-/// The light of a projector.
-#[derive(Clone, Debug, PartialEq)]
-pub struct LightModel {
-    /// Curves, brightness of the channels, darkness and ambient light.
-    pub channels: Channels,
-    /// Brightness over the raster.
-    pub flat: FlatField,
-}
-
-impl LightModel {
-    /// Light of one channel at a code of 0 to 1, without darkness, over full white in the middle of the raster.
-    pub fn level(&self, channel: usize, code: f64, pixel: DVec2) -> f64 {
-        self.flat.at(pixel) * self.channels.level(channel, code)
-    }
-}
 
 #[cfg(test)]
 mod tests;

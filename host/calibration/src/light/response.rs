@@ -5,40 +5,8 @@
 //! noise are pooled (\[Ayer55\]).
 
 use super::Steady;
+use dpm_calibration_file::light::{Channels, CURVE_POINTS};
 use thiserror::Error;
-
-/// Points of a curve, at equal distances of the code from 0 to 1.
-pub const CURVE_POINTS: usize = 33;
-
-/// Curves and brightness.
-#[derive(Clone, Debug, PartialEq)]
-pub struct Channels {
-    /// For each channel, light over that at code 1, at codes from 0 to 1 in equal steps: 0 first, 1 last, never falling.
-    pub curves: Vec<Vec<f64>>,
-    /// Light of each channel at code 1 over that of all; they add up to 1.
-    pub intensity: Vec<f64>,
-    /// Light at code 0 over that of all channels at code 1.
-    pub black: f64,
-    /// Ambient light over that of all channels at code 1, at the place of the readings.
-    pub ambient: f64,
-    /// Largest standard deviation of a reading over full white.
-    pub sigma: f64,
-}
-
-impl Channels {
-    /// Light of a channel at a code of 0 to 1, without darkness, over that of all channels at code 1. Codes outside are
-    /// taken as the nearest; a channel that is not there is dark.
-    pub fn level(&self, channel: usize, code: f64) -> f64 {
-        let (Some(curve), Some(intensity)) = (self.curves.get(channel), self.intensity.get(channel)) else {
-            return 0.0;
-        };
-        let at = code.clamp(0.0, 1.0) * (curve.len().max(1) - 1) as f64;
-        let low = at.floor() as usize;
-        let value = |i: usize| curve.get(i).or(curve.last()).copied().unwrap_or(0.0);
-        let share = at - low as f64;
-        intensity * (1.0 - self.black) * ((1.0 - share) * value(low) + share * value(low + 1))
-    }
-}
 
 /// Why readings are refused.
 #[derive(Clone, Debug, PartialEq, Error)]

@@ -9,6 +9,7 @@ mod refusal;
 mod solve;
 mod uncertainty;
 
+pub use dpm_calibration_file::Predicted;
 pub(crate) use fit::spread_of;
 use fit::{fit, Fit};
 pub use fit::{LensTerms, Priors};
@@ -16,7 +17,7 @@ pub use refusal::Refusal;
 pub(crate) use solve::{check_result, check_terms, look_for_motion, moved_px};
 pub use solve::{relocate, solve, Solved};
 pub(crate) use uncertainty::{percentile, variance};
-pub use uncertainty::{predict, Predicted, Volume};
+pub use uncertainty::{predict, Volume};
 
 use crate::model::ProjectorModel;
 use dpm_device::planes::Raster;

@@ -2,10 +2,11 @@
 
 use super::fit::{Task, OFFSET};
 use super::refusal::{check_distance, check_up};
-use super::uncertainty::{percentile, predict, Predicted, Volume};
+use super::uncertainty::{percentile, predict, Volume};
 use super::{fit, middle, misses, spread_of, Fit, Known, LensTerms, Options, Priors, Refusal, Sight};
 use crate::model::{ProjectorModel, INTRINSICS};
 use crate::pinhole::{calibrate, CalibrationError, CalibrationOptions, Pair};
+use dpm_calibration_file::Predicted;
 use dpm_common::so3::so3_log;
 use dpm_device::planes::Raster;
 use glam::{DQuat, DVec2, DVec3};

@@ -2,6 +2,7 @@
 
 use crate::dense::cholesky;
 use crate::model::{ProjectorModel, PARAMETERS};
+use dpm_calibration_file::Predicted;
 use dpm_device::planes::Raster;
 use dpm_device::rng::Draws;
 use glam::{DVec2, DVec3};
@@ -13,28 +14,6 @@ pub struct Volume {
     pub low: DVec3,
     /// The corner of the largest coordinates.
     pub high: DVec3,
-}
-
-/// The error that the light may have, pixels.
-#[derive(Clone, Copy, Debug, PartialEq)]
-pub struct Predicted {
-    /// Median over the volume of the standard deviation's length.
-    pub typical_px: f64,
-    /// Upper bound of the 99th percentile over the volume: it holds in 99 of 100 calibrations with this noise.
-    pub p99_px: f64,
-    /// Where the standard deviation is largest, metres.
-    pub worst: DVec3,
-    /// Its length there.
-    pub worst_px: f64,
-}
-
-impl Predicted {
-    /// The bound for a tracker whose reports are off by `bias_m` (root mean square along one axis, over time or space),
-    /// where a metre is `px_per_m` pixels. No data bound a bias; over simulated calibrations the 99th percentile was 2.7
-    /// times the bias in the median and 5.4 times at worst, and that is what is added here.
-    pub fn with_bias(&self, bias_m: f64, px_per_m: f64) -> f64 {
-        self.p99_px + 5.4 * bias_m * px_per_m
-    }
 }
 
 impl Volume {

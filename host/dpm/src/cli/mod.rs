@@ -231,6 +231,7 @@ fn features() -> String {
     let chosen = [
         ("alp", cfg!(feature = "alp")),
         ("calibrate", cfg!(feature = "calibrate")),
+        ("camera-files", cfg!(feature = "camera-files")),
         ("display", cfg!(feature = "display")),
         ("dlpc900", cfg!(feature = "dlpc900")),
         ("lab", cfg!(feature = "lab")),

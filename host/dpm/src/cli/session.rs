@@ -6,11 +6,11 @@
 //! that.
 
 use super::os;
-use crate::results::TRIAL;
-use dpm_calibration::file;
+use dpm_calibration_file as file;
 use dpm_common::unix::send_signal;
 use dpm_page::calibration::Session;
 use dpm_rig::calibration_steps::SENSOR;
+use dpm_rig::results::TRIAL;
 use std::fs;
 use std::io::{self, BufRead, BufReader, Read, Write};
 use std::path::{Path, PathBuf};

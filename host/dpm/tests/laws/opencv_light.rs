@@ -5,7 +5,7 @@
 //! [`TOLERANCE_PX`] from an outline must be lit inside and dark outside.
 
 use crate::cli_common::{code, dpm, err, out, Folder};
-use dpm_scene::camera_files::{self, LengthUnit, LensKind, ReadOptions};
+use dpm_camera_files::{self as camera_files, LengthUnit, LensKind, ReadOptions};
 use glam::{DVec2, DVec3};
 use std::path::{Path, PathBuf};
 

@@ -3,7 +3,7 @@
 use super::judged::{day, Judged, Part};
 use super::{State, Step, Way, SENSOR};
 use crate::config::PlaneTiming;
-use dpm_calibration::file::{CheckSection, Provenance};
+use dpm_calibration_file::{CheckSection, Provenance};
 use std::path::Path;
 
 /// The wand's name where the commands need no flag for it.

@@ -3,7 +3,7 @@
 use super::age::{aged, days_since, is_old, OLD_DAYS};
 use super::{About, Measured, State};
 use crate::standing::{seconds_of_utc, Identity};
-use dpm_calibration::file::{CalibrationFile, CheckSection, Provenance};
+use dpm_calibration_file::{CalibrationFile, CheckSection, Provenance};
 use std::time::UNIX_EPOCH;
 
 /// A calibration file in the light of the rig file.

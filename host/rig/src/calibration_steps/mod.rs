@@ -9,7 +9,7 @@ mod judged;
 
 use crate::config::RigConfig;
 use crate::trackers::PoseOrigin;
-use dpm_calibration::file::{self, CalibrationFile};
+use dpm_calibration_file::{self as file, CalibrationFile};
 use judged::Judged;
 use serde::Serialize;
 use std::path::{Path, PathBuf};

@@ -3,10 +3,10 @@
 use super::*;
 use crate::config::{Overrides, Purpose};
 use crate::standing::utc;
-use dpm_calibration::file::{
+use dpm_calibration_file::model::ProjectorModel;
+use dpm_calibration_file::{
     BodySection, CheckSection, LatencySection, LightSection, Pose, ProjectorSection, Provenance, WandSection,
 };
-use dpm_calibration::model::ProjectorModel;
 use dpm_device::planes::Raster;
 use dpm_scene::geometry::projector::ProjectorCamera;
 use glam::{DAffine3, DQuat, DVec3};

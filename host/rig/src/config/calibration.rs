@@ -2,7 +2,7 @@
 
 use super::check::refuse;
 use super::RigConfig;
-use dpm_calibration::file::{self, CalibrationFile};
+use dpm_calibration_file::{self as file, CalibrationFile};
 use dpm_common::keys::read::{NotEmpty, Reader};
 use dpm_common::section;
 use std::path::PathBuf;

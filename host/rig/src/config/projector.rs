@@ -9,7 +9,6 @@ use dpm_common::{kinds, section, words};
 use dpm_device::planes::{PlaneSchedule, Raster};
 use dpm_device::time::FrameRate;
 use dpm_render::warp::FOLLOW_SHARE;
-use dpm_scene::camera_files::LensKind;
 use glam::DAffine3;
 use std::path::PathBuf;
 
@@ -288,16 +287,6 @@ words! {
         Auto = "auto",
         /// OpenCV's fisheye.
         Fisheye = "fisheye",
-    }
-}
-
-impl CalibrationLens {
-    /// What the reader of the file is told.
-    pub const fn lens(self) -> LensKind {
-        match self {
-            Self::Auto => LensKind::Auto,
-            Self::Fisheye => LensKind::Fisheye,
-        }
     }
 }
 

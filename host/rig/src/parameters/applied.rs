@@ -2,7 +2,7 @@
 
 use super::{Nudge, Values};
 use crate::rig::Rig;
-use dpm_calibration::nudge::moved;
+use dpm_calibration_file::moved;
 use dpm_scene::geometry::projector::ProjectorCamera;
 use glam::{DAffine3, DVec3};
 

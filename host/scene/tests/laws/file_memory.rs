@@ -2,7 +2,7 @@
 
 use crate::common::{chance, with_image};
 use crate::ktx2_textures::greatest_in;
-use dpm_scene::camera_files::{self, LengthUnit, LensKind, ReadOptions};
+use dpm_camera_files::{self as camera_files, LengthUnit, LensKind, ReadOptions};
 use dpm_scene::{
     decode_environment, decode_picture_here, load_bytes_here, load_linear_picture, load_mesh_here,
     LoadOptions, MeshFormat,

@@ -2,15 +2,15 @@
 
 use super::projector::while_showing;
 use super::{tip_of, Common};
-use crate::calibrate::aim::Aim;
-use crate::calibrate::check::{self, judge, measure, RealBench, Target};
-use crate::calibrate::nudge::{self, help, Stage};
-use crate::calibrate::outline::Outlines;
-use crate::calibrate::poses::Poses;
 use crate::cli::watch::{print, watch_quietly};
-use crate::results::{check_known, keep, Moved};
+use dpm_calibrate::aim::Aim;
+use dpm_calibrate::check::{self, judge, measure, RealBench, Target};
+use dpm_calibrate::nudge::{self, help, Stage};
+use dpm_calibrate::outline::Outlines;
+use dpm_calibrate::poses::Poses;
 use dpm_common::clock::MonotonicClock;
 use dpm_rig::failure::{Failure, FailureKind};
+use dpm_rig::results::{check_known, keep, Moved};
 use std::sync::Arc;
 
 /// Pixels across the dot: an eye finds its middle to half a pixel.

@@ -1,14 +1,14 @@
 //! `dpm calibrate light` and `dpm calibrate latency`: what a light sensor tells once the projector is known.
 
 use super::{at_a_rate_that_is_carried, numbers, seconds, tip_and_sigma, Common, SensorArgs};
-use crate::calibrate::light::{self, FlatSource, Ways};
-use crate::calibrate::sensor;
 use crate::cli::watch::print;
-use crate::results::Results;
+use dpm_calibrate::light::{self, FlatSource, Ways};
+use dpm_calibrate::sensor;
 use dpm_calibration::projector::Known;
 use dpm_calibration::sensor::Brightness;
 use dpm_rig::config::RigConfig;
 use dpm_rig::failure::{Failure, FailureKind};
+use dpm_rig::results::Results;
 use glam::DVec3;
 use std::sync::{Arc, Mutex, PoisonError};
 

@@ -8,20 +8,20 @@ mod projector;
 
 use super::rig_args::RigArgs;
 use super::watch::{print, watch_quietly};
-use crate::calibrate::dialogue::Dialogue;
-use crate::calibrate::pace::{slower, Paced};
-use crate::calibrate::recorder::Port;
-use crate::calibrate::{body, sensor, wand};
-use crate::results::Results;
 use check::{check, nudge, CheckArgs, NudgeArgs};
+use dpm_calibrate::dialogue::Dialogue;
+use dpm_calibrate::pace::{slower, Paced};
+use dpm_calibrate::recorder::Port;
+use dpm_calibrate::{body, sensor, wand};
 use dpm_calibration::projector::{Known, LensTerms};
 use dpm_calibration::rehearsal::{rehearse_with, Bias};
+use dpm_camera_files::{export, Form};
 use dpm_rig::config::{PlaneTiming, RigConfig};
 use dpm_rig::failure::{Failure, FailureKind};
+use dpm_rig::results::Results;
 use dpm_rig::rig::Rig;
 use dpm_rig::telemetry::monitor::RunMonitor;
 use dpm_rig::telemetry::report::to_json;
-use dpm_scene::camera_files::{export, Form};
 use glam::DVec3;
 use light::{LatencyArgs, LightArgs};
 #[cfg(feature = "page")]

@@ -1,20 +1,20 @@
 //! `dpm calibrate projector`: by hand, from a file of points, or by the wand's light sensor.
 
 use super::{at_a_rate_that_is_carried, seconds, tip_and_sigma, tip_of, Common, SensorArgs};
-use crate::calibrate::aim::Aim;
-use crate::calibrate::dialogue::Dialogue;
-use crate::calibrate::poses::Poses;
-use crate::calibrate::projector::{aim_by_hand, keep, solve_file, told_of, Points};
-use crate::calibrate::shown::while_shown;
-use crate::calibrate::{light, sensor};
 use crate::cli::watch::{print, watch_quietly};
-use crate::results::Results;
+use dpm_calibrate::aim::Aim;
+use dpm_calibrate::dialogue::Dialogue;
+use dpm_calibrate::poses::Poses;
+use dpm_calibrate::projector::{aim_by_hand, keep, solve_file, told_of, Points};
+use dpm_calibrate::shown::while_shown;
+use dpm_calibrate::{light, sensor};
 use dpm_calibration::projector::{Known, LensTerms, Options, Solved};
 use dpm_common::clock::MonotonicClock;
 use dpm_rig::config::RigConfig;
 use dpm_rig::failure::Failure;
 use dpm_rig::pack::source::PatternSource;
 use dpm_rig::pattern::run_pattern;
+use dpm_rig::results::Results;
 use dpm_rig::telemetry::monitor::RunMonitor;
 use glam::DVec3;
 use std::path::PathBuf;

@@ -4,7 +4,7 @@
 use super::super::os;
 use super::devices;
 use super::{Finding, State};
-use dpm_calibration::file;
+use dpm_calibration_file as file;
 #[cfg(feature = "lab")]
 use dpm_lab::temporal_light::{mend, TemporalLight, NO_MEND};
 use dpm_rig::calibration_steps::age::{aged, days_since, OLD_DAYS};

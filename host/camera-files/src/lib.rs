@@ -22,9 +22,9 @@ mod tests;
 pub use entries::{Entries, Entry, Matrix};
 pub use export::{export, Form};
 
-use crate::geometry::lens::LensError;
-use crate::geometry::projector::{ProjectorCamera, ProjectorError};
 use dpm_device::planes::Raster;
+use dpm_scene::geometry::lens::LensError;
+use dpm_scene::geometry::projector::{ProjectorCamera, ProjectorError};
 use glam::{DAffine3, DMat3, DVec3};
 use thiserror::Error;
 

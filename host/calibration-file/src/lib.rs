@@ -1,12 +1,16 @@
-//! The calibration file: what the solvers found, with where it came from, as TOML that a rig file refers to.
+//! The calibration file and what its numbers mean. It has what the solvers found, with where it came from, as TOML that a rig file refers to.
 //!
 //! Every part is optional and carries its own provenance, since a wand is calibrated on another day than a body. A file
 //! that is replaced is kept beside the new one, with a number. Lengths are in metres, pixels count from the raster's
 //! upper left corner (the centre of the first pixel is 0.5, 0.5; OpenCV counts from that centre).
 
+pub mod light;
+pub mod model;
+mod place;
 mod sections;
 mod store;
 
+pub use place::{moved, Predicted};
 pub use sections::{
     BodySection, CheckSection, LatencySection, LightSection, Pose, ProjectorSection, Provenance, WandSection,
     Wrong,

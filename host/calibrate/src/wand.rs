@@ -2,12 +2,12 @@
 
 use super::dialogue::Dialogue;
 use super::poses::Poses;
-use crate::results::Results;
 use dpm_calibration::file::WandSection;
 use dpm_calibration::pivot::{trace, Pivot};
 use dpm_common::clock::MonotonicClock;
 use dpm_rig::config::RigConfig;
 use dpm_rig::failure::{Failure, FailureKind};
+use dpm_rig::results::Results;
 use glam::DVec3;
 use std::time::{Duration, Instant};
 

@@ -1,11 +1,11 @@
 //! Letters in, light and files out.
 
 use super::*;
-use crate::results::{check_known, keep, Results};
 use dpm_calibration::file::{load, ProjectorSection, Provenance};
 use dpm_calibration::model::ProjectorModel;
 use dpm_device::planes::Raster;
 use dpm_rig::config::{Overrides, RigConfig};
+use dpm_rig::results::{check_known, keep, Results};
 use glam::{DQuat, DVec2};
 use std::cell::RefCell;
 

@@ -1,11 +1,11 @@
 //! The calibration file of a rig: where it lies, what is in it already, and how new parts get into it.
 
-use dpm_calibration::file::{self, BodySection, CalibrationFile, Pose, Provenance};
-use dpm_rig::calibration_steps::calibration_file;
-use dpm_rig::config::RigConfig;
-use dpm_rig::failure::{Failure, FailureKind};
-use dpm_rig::rig::Rig;
-use dpm_rig::standing::{utc, Identity};
+use crate::calibration_steps::calibration_file;
+use crate::config::RigConfig;
+use crate::failure::{Failure, FailureKind};
+use crate::rig::Rig;
+use crate::standing::{utc, Identity};
+use dpm_calibration_file::{self as file, BodySection, CalibrationFile, Pose, Provenance};
 use glam::DAffine3;
 use std::path::{Path, PathBuf};
 use std::time::SystemTime;

@@ -1,7 +1,7 @@
 //! Files of other programs give the projector that those programs mean, whatever their form; whatever is wrong is named.
 
 use super::*;
-use crate::geometry::lens::{Lens, LensModel};
+use dpm_scene::geometry::lens::{Lens, LensModel};
 use glam::{DVec2, DVec4};
 use std::path::{Path, PathBuf};
 
@@ -374,7 +374,7 @@ fn the_largest_texts_are_read_in_a_moment() {
 }
 
 /// By the public example of Christie: Z is up and Y is forward.
-const MPCDI: &str = include_str!("../../../../tests/assets/mpcdi/shader_lamp.mpcdi.xml");
+const MPCDI: &str = include_str!("../../../tests/assets/mpcdi/shader_lamp.mpcdi.xml");
 
 #[test]
 fn a_region_of_mpcdi_looks_where_its_angles_say() {

@@ -4,13 +4,13 @@
 use super::dialogue::Dialogue;
 use super::lines::Lines;
 use super::poses::Poses;
-use crate::results::Results;
 use dpm_calibration::body::{tip_in_body, wander, Session, Surface, Touch};
 use dpm_calibration::file::{BodySection, Pose};
 use dpm_calibration::trajectory::{Stamped, Trajectory};
 use dpm_common::clock::MonotonicClock;
 use dpm_rig::config::RigConfig;
 use dpm_rig::failure::{Failure, FailureKind};
+use dpm_rig::results::Results;
 use dpm_scene::{Body, Scene};
 use glam::{DAffine3, DVec3};
 use std::time::Duration;

@@ -13,8 +13,8 @@
 
 use super::xml::Document;
 use super::{pose, rotation, Frame, Intrinsics, LengthUnit, ReadOptions, StorageError, StoredCalibration};
-use crate::geometry::projector::ProjectorCamera;
 use dpm_device::planes::Raster;
+use dpm_scene::geometry::projector::ProjectorCamera;
 use glam::{DMat3, DVec3};
 
 /// One region of a file.

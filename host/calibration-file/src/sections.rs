@@ -2,7 +2,7 @@
 
 use crate::light::{Channels, FlatField, LightModel, CURVE_POINTS};
 use crate::model::{ProjectorModel, LENS};
-use crate::projector::Predicted;
+use crate::Predicted;
 use dpm_device::planes::Raster;
 use dpm_scene::geometry::lens::Lens;
 use dpm_scene::geometry::projector::{ProjectorCamera, ProjectorError};

@@ -4,13 +4,13 @@ use super::aim::Aim;
 use super::dialogue::Dialogue;
 use super::lines::Lines;
 use super::poses::{held, Poses};
-use crate::results::Results;
 use dpm_calibration::file::ProjectorSection;
 use dpm_calibration::projector::{Options, Session, Sight, Solved, Volume};
 use dpm_device::planes::Raster;
 use dpm_device::regular_file;
 use dpm_rig::config::RigConfig;
 use dpm_rig::failure::{Failure, FailureKind};
+use dpm_rig::results::Results;
 use glam::{DVec2, DVec3};
 use std::path::Path;
 
@@ -181,7 +181,7 @@ mod tests {
         assert_eq!((read.len(), read[0].pixel.x, read[1].world.y), (4, 100.5, 0.9));
         assert!(read_points("x y z\n1 2 3 4\n").unwrap_err().contains("line 2 is not 5 numbers"));
         assert!(read_points("1 2 3 4 5\nx y z u v\n").is_err());
-        let told = read_points(include_str!("../../../../tests/assets/cases/c13-points-normalised.txt"));
+        let told = read_points(include_str!("../../../tests/assets/cases/c13-points-normalised.txt"));
         assert!(told.unwrap_err().contains("normalised coordinates?"));
     }
 }

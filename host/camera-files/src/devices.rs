@@ -6,9 +6,9 @@
 use super::entries::{joined, Entries, Entry, Matrix};
 use super::names::{meaning, Owner, Role};
 use super::{pose, rotation, Frame, Intrinsics, LensKind, ReadOptions, StorageError, StoredCalibration};
-use crate::geometry::lens::Lens;
-use crate::geometry::projector::ProjectorCamera;
 use dpm_device::planes::Raster;
+use dpm_scene::geometry::lens::Lens;
+use dpm_scene::geometry::projector::ProjectorCamera;
 use glam::{DMat3, DVec3};
 use std::collections::{BTreeMap, BTreeSet};
 

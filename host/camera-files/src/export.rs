@@ -1,7 +1,7 @@
 //! A projector into a calibration file of OpenCV's `FileStorage`.
 
-use crate::geometry::lens::LensModel;
-use crate::geometry::projector::ProjectorCamera;
+use dpm_scene::geometry::lens::LensModel;
+use dpm_scene::geometry::projector::ProjectorCamera;
 use glam::{DMat3, DQuat, DVec3};
 use std::fmt::Write;
 use std::path::Path;

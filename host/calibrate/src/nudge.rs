@@ -3,11 +3,11 @@
 use super::body::{carried, index_of, triangles_of};
 use super::outline::{Outlines, MOST_POINTS};
 use super::poses::Poses;
-use crate::results::Moved;
 use dpm_calibration::nudge::{Nudges, Order, TURN_DEG};
 use dpm_calibration::outline::Outline;
 use dpm_calibration::trajectory::Stamped;
 use dpm_rig::failure::{Failure, FailureKind};
+use dpm_rig::results::Moved;
 use dpm_rig::rig::Rig;
 use dpm_scene::geometry::projector::ProjectorCamera;
 use glam::{DAffine3, DVec3};
