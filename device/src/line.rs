@@ -21,7 +21,7 @@ enum State {
 
 /// What became of a line in a poll.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(crate) enum Polled {
+pub(crate) enum PollResult {
     /// It is not open.
     Closed,
     /// It has just been opened: whatever is known of the device is from before.
@@ -73,7 +73,7 @@ impl Line {
     }
 
     /// Opens the port if it is time to. Never waits.
-    pub(crate) fn poll(&mut self, now: HostTime) -> Polled {
+    pub(crate) fn poll(&mut self, now: HostTime) -> PollResult {
         match &self.state {
             State::Idle { retry_at } if now >= *retry_at => {
                 self.state = match self.opener.begin() {
@@ -86,13 +86,13 @@ impl Line {
                 None => {}
                 Some(Ok(port)) => {
                     self.take_over(port);
-                    return Polled::Opened;
+                    return PollResult::Opened;
                 }
                 Some(Err(why)) => self.lose(now, why),
             },
-            State::Open(_) => return Polled::Open,
+            State::Open(_) => return PollResult::Open,
         }
-        Polled::Closed
+        PollResult::Closed
     }
 
     fn lose(&mut self, now: HostTime, why: String) {
@@ -210,7 +210,7 @@ mod tests {
         let mut line = Line::new("/dev/no-such-port", 115_200);
         let begin = std::time::Instant::now();
         while line.problem.is_none() && begin.elapsed().as_secs() < 30 {
-            assert_eq!(line.poll(HostTime(0)), Polled::Closed);
+            assert_eq!(line.poll(HostTime(0)), PollResult::Closed);
             std::thread::yield_now();
         }
         assert!(line.status().contains("cannot open /dev/no-such-port"), "{}", line.status());

@@ -34,11 +34,11 @@ pub struct Request {
     /// OUT: the bytes to send. IN: its length is the requested number of bytes.
     pub buffer: Vec<u8>,
     /// Called exactly once, from a worker thread or from the call that ends the transfer.
-    pub done: Box<dyn FnOnce(Completed) + Send>,
+    pub done: Box<dyn FnOnce(Completion) + Send>,
 }
 
 /// How a transfer ended.
-pub struct Completed {
+pub struct Completion {
     /// The request's identifier.
     pub id: u64,
     /// Outcome.
@@ -100,12 +100,12 @@ pub enum Fault {
 /// The plug of one device. Cloning makes another handle on the same plug; dropping the last one pulls it.
 #[derive(Clone)]
 pub struct UsbPlug {
-    shared: Arc<Shared>,
+    shared: Arc<PlugState>,
     _last_handle: Arc<LastHandle>,
 }
 
 /// Dropped with the last handle on a plug: pulls it, which ends the workers.
-struct LastHandle(Arc<Shared>);
+struct LastHandle(Arc<PlugState>);
 
 impl Drop for LastHandle {
     fn drop(&mut self) {
@@ -113,7 +113,7 @@ impl Drop for LastHandle {
     }
 }
 
-struct Shared {
+struct PlugState {
     model: Arc<Mutex<dyn UsbDeviceModel>>,
     clock: Clock,
     state: Mutex<State>,
@@ -160,7 +160,7 @@ fn lock<T: ?Sized>(m: &Mutex<T>) -> MutexGuard<'_, T> {
 impl UsbPlug {
     /// Plugs `model` in. The caller may keep its own handle on the model for inspection.
     pub fn new(model: Arc<Mutex<dyn UsbDeviceModel>>, clock: Clock) -> Self {
-        let shared = Arc::new(Shared { model, clock, state: Mutex::default(), changed: Condvar::new() });
+        let shared = Arc::new(PlugState { model, clock, state: Mutex::default(), changed: Condvar::new() });
         Self { _last_handle: Arc::new(LastHandle(shared.clone())), shared }
     }
 
@@ -354,10 +354,10 @@ impl UsbCable for UsbPlug {
 }
 
 fn finish(request: Request, status: Status, actual: usize) {
-    (request.done)(Completed { id: request.id, status, actual, buffer: request.buffer });
+    (request.done)(Completion { id: request.id, status, actual, buffer: request.buffer });
 }
 
-impl Shared {
+impl PlugState {
     fn pull(&self) {
         let mut s = lock(&self.state);
         s.pulled = true;

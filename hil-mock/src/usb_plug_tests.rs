@@ -65,7 +65,7 @@ impl Bench {
     fn send(&mut self, endpoint: u8, setup: Option<Setup>, buffer: Vec<u8>) -> (u64, Ended) {
         let (tx, rx) = channel();
         self.next += 1;
-        let done = Box::new(move |c: Completed| tx.send((c.status, c.actual, c.buffer)).unwrap());
+        let done = Box::new(move |c: Completion| tx.send((c.status, c.actual, c.buffer)).unwrap());
         let sent = self.plug.submit(Request { id: self.next, endpoint, setup, buffer, done });
         assert!(sent.is_ok());
         (self.next, rx)

@@ -17,7 +17,7 @@ use dpm_dlpc900::command::{CommandAssembler, ReplyAssembler, REPORT_BYTES};
 use dpm_dlpc900::image;
 use dpm_rig::config::{Overrides, RigConfig};
 use dpm_rig::control::osc::decode as osc;
-use dpm_rig::control::{server, status_file, Asked};
+use dpm_rig::control::{server, status_file, ClientRequest};
 use dpm_rig::order::Order;
 use dpm_rig::parameters::command::{Command, MAX_LINE};
 use dpm_rig::standing;
@@ -377,13 +377,13 @@ pub fn control_words(bytes: &[u8]) {
         let line =
             bytes[..bytes.len().min(MAX_LINE)].split_inclusive(|b| *b == b'\n').next().unwrap_or_default();
         // A word is read by pieces, and what came with its line feed is part of it.
-        if let Some(Asked::Parameters(command)) = &order {
+        if let Some(ClientRequest::Parameters(command)) = &order {
             let again = Command::parse(&command.line());
             assert!(
                 matches!(&again, Ok(Some(back)) if format!("{back:?}") == format!("{command:?}")),
                 "{again:?}"
             );
-        } else if let Some(Asked::Order(order)) = order {
+        } else if let Some(ClientRequest::Order(order)) = order {
             assert!(word.starts_with(order.word().as_bytes()), "{order:?} from {word:?}");
         } else if let Some(exact) = Order::ALL.iter().find(|(_, w)| line == format!("{w}\n").as_bytes()) {
             assert!(bytes.len() > line.len(), "{} was not heard", exact.1);
@@ -410,8 +410,8 @@ pub fn osc_datagram(bytes: &[u8]) {
             assert!(said.token.is_none_or(|token| token.len() <= bytes.len()));
             said.heard
         });
-        assert_ne!(one, Ok(osc::Heard::Order(Order::Arm)));
-        if let Ok(osc::Heard::Set { name, numbers }) = one {
+        assert_ne!(one, Ok(osc::OscRequest::Order(Order::Arm)));
+        if let Ok(osc::OscRequest::Set { name, numbers }) = one {
             assert!(numbers.len() <= osc::MOST_NUMBERS && name.len() <= bytes.len());
         }
     });

@@ -6,7 +6,7 @@ use crate::time::FrameRate;
 
 /// One set of limits and its counts.
 #[derive(Clone, Debug)]
-struct Counted {
+struct LimitCounts {
     limits: LightLimits,
     rate: FrameRate,
     limiter: LightLimiter,
@@ -16,7 +16,7 @@ struct Counted {
 #[derive(Clone, Debug, Default)]
 pub(super) struct LightGuard {
     /// The limits of the host, and those of the device's owner.
-    counted: [Option<Counted>; 2],
+    counted: [Option<LimitCounts>; 2],
     /// Level of the frame on the mirrors.
     level: u32,
 }
@@ -27,7 +27,8 @@ impl LightGuard {
     pub(super) fn configure(&mut self, rate: FrameRate, host: LightLimits, owner: LightLimits) {
         for (counted, limits) in self.counted.iter_mut().zip([host, owner]) {
             if counted.as_ref().is_none_or(|c| (c.limits, c.rate) != (limits, rate)) {
-                *counted = LightLimiter::new(rate, &limits).map(|limiter| Counted { limits, rate, limiter });
+                *counted =
+                    LightLimiter::new(rate, &limits).map(|limiter| LimitCounts { limits, rate, limiter });
             }
         }
     }

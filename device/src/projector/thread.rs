@@ -34,7 +34,7 @@ pub fn serve_cable<P: Served>(
     mut witness: impl FnMut(&mut P, HostTime) + Send,
 ) {
     // Arrived packets come first: they may be older than now, and a projector never goes back in time.
-    while cable.serve(&clock, &mut Witnessed { projector, witness: &mut witness }) {
+    while cable.serve(&clock, &mut WitnessedProjector { projector, witness: &mut witness }) {
         witness(projector, clock());
         let limit = clock().plus_ns(REST_NS);
         cable.rest(projector.next_due().map_or(limit, |due| due.min(limit)), &clock);
@@ -43,12 +43,12 @@ pub fn serve_cable<P: Served>(
 }
 
 /// A projector whose light is taken before anything happens to it.
-struct Witnessed<'a, P, W> {
+struct WitnessedProjector<'a, P, W> {
     projector: &'a mut P,
     witness: &'a mut W,
 }
 
-impl<P: Served, W: FnMut(&mut P, HostTime) + Send> LinkDevice for Witnessed<'_, P, W> {
+impl<P: Served, W: FnMut(&mut P, HostTime) + Send> LinkDevice for WitnessedProjector<'_, P, W> {
     fn receive(&mut self, now: HostTime, lane: Lane, bytes: &[u8]) {
         (self.witness)(self.projector, now);
         self.projector.receive(now, lane, bytes);

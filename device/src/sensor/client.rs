@@ -7,7 +7,7 @@ use super::wire::{
 };
 use crate::clock_map::{ClockMap, Mapped};
 use crate::cobs::Deframer;
-use crate::line::{EchoPace, Line, Polled};
+use crate::line::{EchoPace, Line, PollResult};
 use crate::time::{DeviceTicks, HostClock, HostTime};
 use crate::tracker::Stream;
 use std::sync::Arc;
@@ -187,9 +187,9 @@ impl SensorClient {
     /// Reads what has arrived by `now` and passes blocks to `sink`, oldest first; returns their number.
     pub fn poll(&mut self, now: HostTime, sink: &mut dyn FnMut(SensorBlock<'_>)) -> usize {
         match self.line.poll(now) {
-            Polled::Closed => {}
-            Polled::Opened => self.begin(now),
-            Polled::Open => return self.listen(now, sink),
+            PollResult::Closed => {}
+            PollResult::Opened => self.begin(now),
+            PollResult::Open => return self.listen(now, sink),
         }
         0
     }

@@ -75,13 +75,13 @@ pub struct Recorder<T> {
     inner: T,
     queue: Option<Sender<TrackerSample>>,
     unrecorded: u64,
-    shared: Arc<Shared>,
+    shared: Arc<RecorderState>,
     thread: Option<JoinHandle<std::io::Result<()>>>,
     path: PathBuf,
 }
 
 #[derive(Default)]
-struct Shared {
+struct RecorderState {
     written: AtomicU64,
     failed: AtomicBool,
 }
@@ -94,7 +94,7 @@ impl<T: Tracker> Recorder<T> {
         let mut file = OpenOptions::new().write(true).create_new(true).open(path).map_err(failed)?;
         file.write_all(&header(bodies, start)).map_err(failed)?;
         let (queue, samples) = bounded(QUEUE);
-        let shared = Arc::new(Shared::default());
+        let shared = Arc::new(RecorderState::default());
         let thread = {
             let shared = shared.clone();
             let builder = std::thread::Builder::new().name("tracker-record".into());
@@ -194,7 +194,11 @@ impl<T: Tracker> Tracker for Recorder<T> {
     }
 }
 
-fn write_all(mut file: File, samples: &Receiver<TrackerSample>, shared: &Shared) -> std::io::Result<()> {
+fn write_all(
+    mut file: File,
+    samples: &Receiver<TrackerSample>,
+    shared: &RecorderState,
+) -> std::io::Result<()> {
     let disk = file.try_clone()?;
     let done = AtomicBool::new(false);
     // Synchronising to the disk can take longer than the promised 100 ms; it must not delay handing bytes to the
@@ -214,7 +218,11 @@ fn write_all(mut file: File, samples: &Receiver<TrackerSample>, shared: &Shared)
     file.sync_all()
 }
 
-fn write_frames(file: &mut File, samples: &Receiver<TrackerSample>, shared: &Shared) -> std::io::Result<()> {
+fn write_frames(
+    file: &mut File,
+    samples: &Receiver<TrackerSample>,
+    shared: &RecorderState,
+) -> std::io::Result<()> {
     let mut payload = Vec::with_capacity(MAX_PAYLOAD);
     let mut frame = Vec::with_capacity(MAX_PAYLOAD + 8);
     loop {

@@ -519,12 +519,12 @@ fn programs_that_never_read_and_configure_twice_are_served() {
 }
 
 /// A cable on which the controller answers so many reports and then nothing.
-struct Silent {
+struct SilentCable {
     hid: VirtualHid,
     answers: u32,
 }
 
-impl HidPort for Silent {
+impl HidPort for SilentCable {
     fn write_report(&mut self, report: &[u8; REPORT_BYTES], timeout: Duration) -> Result<(), PortError> {
         HidPort::write_report(&mut self.hid, report, timeout)
     }
@@ -549,7 +549,7 @@ impl HidPort for Silent {
 fn a_controller_that_falls_silent_as_it_wakes_is_given_up_in_time() {
     let hid = VirtualHid::new(Arc::new(Mutex::new(Dlpc900Model::default())));
     // The firmware, the DMD, and that the order to wake has arrived.
-    let mut driver = Dlpc900::new(Silent { hid, answers: 3 }).unwrap();
+    let mut driver = Dlpc900::new(SilentCable { hid, answers: 3 }).unwrap();
     assert!(driver.wake().is_err());
     let took = HidPort::now(&driver.into_port());
     assert!(took > Duration::from_secs(1) && took < Duration::from_secs(15), "{took:?}");

@@ -12,12 +12,12 @@ pub(super) const MAX_RADIUS: f64 = 1024.0;
 /// disc is cut exactly at the borders of rows, and each line's chord at those of pixels; a disc of less than a tenth of a
 /// pixel is a point.
 #[derive(Clone, Debug, Default)]
-pub(super) struct Seen {
+pub(super) struct Aperture {
     /// Byte of a plane, bit of it, and share.
     mirrors: Vec<(usize, u8, f64)>,
 }
 
-impl Seen {
+impl Aperture {
     /// Looks through a disc of `radius` pixels around `centre` (in pixels from the upper left corner).
     pub(super) fn look(&mut self, raster: Raster, centre: [f64; 2], radius: f64) {
         self.mirrors.clear();
@@ -79,7 +79,7 @@ mod tests {
     use super::*;
 
     fn covered(raster: Raster, plane: &[u8], centre: [f64; 2], radius: f64) -> f64 {
-        let mut seen = Seen::default();
+        let mut seen = Aperture::default();
         // What was seen before plays no part.
         seen.look(raster, [3.0, 2.0], 2.0);
         seen.look(raster, centre, radius);

@@ -12,7 +12,7 @@ mod optics;
 use crate::hand::Hand;
 use crate::motion::Motion;
 use crate::projector::Shown;
-use aperture::Seen;
+use aperture::Aperture;
 use dpm_device::planes::{Channel, PlaneSpec, Raster};
 use dpm_device::pose::Pose;
 use dpm_device::rng::Draws;
@@ -266,7 +266,7 @@ impl SensorWand {
         let planes: Vec<(PlaneSpec, &[u8])> =
             specs.iter().copied().zip(shown.planes.chunks_exact(plane_bytes)).collect();
         let last = (shown.event.last_photon_at.0 as f64).min(end as f64);
-        let mut seen = Seen::default();
+        let mut seen = Aperture::default();
         // All planes at once for the whole frame, or each for its share of it.
         let at_once = if self.scene.config.is_held { planes.len() } else { 1 };
         let share = if self.scene.config.is_held { 1.0 / planes.len() as f64 } else { 1.0 };
@@ -341,7 +341,7 @@ impl Scene {
     }
 
     /// The light of planes that are shown at once on the sensor at an instant, as a share of the converter's range.
-    fn projected(&self, planes: &[(PlaneSpec, &[u8])], t_ns: i64, seen: &mut Seen) -> f64 {
+    fn projected(&self, planes: &[(PlaneSpec, &[u8])], t_ns: i64, seen: &mut Aperture) -> f64 {
         let (c, raster) = (&self.config, self.raster);
         let index = t_ns.max(0) / c.obstruction_ns;
         if self.draws.stream(2).happens(index as u64, c.obstructed) {

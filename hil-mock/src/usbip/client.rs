@@ -10,7 +10,7 @@ use std::time::Duration;
 use super::server::Link;
 use super::wire::{read_import_reply, read_list_reply, DeviceRecord, Operation, Urb, URB_HEADER};
 use crate::usb_model::{Setup, Speed};
-use crate::usb_plug::{Completed, Request, Status, UsbCable};
+use crate::usb_plug::{Completion, Request, Status, UsbCable};
 
 /// Longest wait for a standard request.
 const PATIENCE: Duration = Duration::from_secs(5);
@@ -25,12 +25,12 @@ pub fn list(server: impl ToSocketAddrs) -> io::Result<Vec<DeviceRecord>> {
 
 /// An imported device. Dropping the last handle detaches it.
 pub struct RemoteCable {
-    shared: Arc<Shared>,
+    shared: Arc<ClientState>,
     record: DeviceRecord,
     descriptors: Vec<u8>,
 }
 
-struct Shared {
+struct ClientState {
     state: Mutex<State>,
     devid: u32,
 }
@@ -61,7 +61,8 @@ impl RemoteCable {
             signalled: false,
             listeners: Vec::new(),
         };
-        let shared = Arc::new(Shared { state: Mutex::new(state), devid: record.bus << 16 | record.device });
+        let shared =
+            Arc::new(ClientState { state: Mutex::new(state), devid: record.bus << 16 | record.device });
         let reader = shared.clone();
         std::thread::Builder::new().name("usbip-read".into()).spawn(move || reader.read(stream))?;
         let mut this = Self { shared, record, descriptors: Vec::new() };
@@ -81,7 +82,7 @@ impl RemoteCable {
     /// A control transfer without OUT data; blocks until it completes.
     pub fn control(&self, setup: Setup) -> io::Result<Vec<u8>> {
         let (tx, rx) = unbounded();
-        let done = Box::new(move |c: Completed| drop(tx.send((c.status, c.buffer, c.actual))));
+        let done = Box::new(move |c: Completion| drop(tx.send((c.status, c.buffer, c.actual))));
         // The identifiers of our own requests are beyond those that a front end uses.
         let request = Request {
             id: u64::MAX,
@@ -114,13 +115,13 @@ impl Drop for RemoteCable {
     }
 }
 
-impl Shared {
+impl ClientState {
     fn lock(&self) -> MutexGuard<'_, State> {
         self.state.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
     fn end(request: Request, status: Status, actual: usize) {
-        (request.done)(Completed { id: request.id, status, actual, buffer: request.buffer });
+        (request.done)(Completion { id: request.id, status, actual, buffer: request.buffer });
     }
 
     /// The reader's loop: completes transfers until the connection ends.

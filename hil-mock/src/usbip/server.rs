@@ -10,7 +10,7 @@ use std::time::Duration;
 
 use super::wire::{import_reply, list_reply, DeviceRecord, Operation, Urb, URB_HEADER};
 use crate::usb_model::{endpoints, interfaces};
-use crate::usb_plug::{Completed, Request, Status, UsbCable};
+use crate::usb_plug::{Completion, Request, Status, UsbCable};
 
 const SHORT_NOT_OK: u32 = 1;
 const ZERO_PACKET: u32 = 0x40;
@@ -242,7 +242,7 @@ impl<L: Link> Session<L> {
                         continue;
                     }
                     let session = self.clone();
-                    let done = Box::new(move |c: Completed| {
+                    let done = Box::new(move |c: Completion| {
                         session.completed(seqnum, c, is_in, flags, length as usize);
                     });
                     let bytes = buffer.len();
@@ -297,7 +297,7 @@ impl<L: Link> Session<L> {
         s.out.write_all(data)
     }
 
-    fn completed(&self, seqnum: u32, c: Completed, is_in: bool, flags: u32, asked: usize) {
+    fn completed(&self, seqnum: u32, c: Completion, is_in: bool, flags: u32, asked: usize) {
         let mut s = self.lock();
         let Some(unlink) = s.pending.remove(&seqnum) else { return };
         let mut result = Ok(());

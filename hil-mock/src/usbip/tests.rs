@@ -4,7 +4,7 @@ use super::wire::*;
 use super::*;
 use crate::dlpc900::Dlpc900Model;
 use crate::usb_model::Setup;
-use crate::usb_plug::{monotonic_clock, Completed, Fault, Request, Status, UsbCable, UsbPlug};
+use crate::usb_plug::{monotonic_clock, Completion, Fault, Request, Status, UsbCable, UsbPlug};
 use proptest::prelude::*;
 use std::io::{Read, Write};
 use std::net::TcpStream;
@@ -112,7 +112,7 @@ type Ended = Receiver<(Status, usize, Vec<u8>)>;
 
 fn send(cable: &RemoteCable, id: u64, endpoint: u8, buffer: Vec<u8>) -> Ended {
     let (tx, rx) = channel();
-    let done = Box::new(move |c: Completed| drop(tx.send((c.status, c.actual, c.buffer))));
+    let done = Box::new(move |c: Completion| drop(tx.send((c.status, c.actual, c.buffer))));
     assert!(cable.submit(Request { id, endpoint, setup: None, buffer, done }).is_ok());
     rx
 }

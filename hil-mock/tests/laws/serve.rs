@@ -6,9 +6,9 @@ use std::process::{Child, ChildStdout, Command, Stdio};
 use std::time::{Duration, Instant};
 
 /// The program, ended with the test, and its output, which must stay open as long as it speaks.
-struct Served(Child, Option<BufReader<ChildStdout>>);
+struct ServingProgram(Child, Option<BufReader<ChildStdout>>);
 
-impl Drop for Served {
+impl Drop for ServingProgram {
     fn drop(&mut self) {
         let _ = self.0.kill();
         let _ = self.0.wait();
@@ -26,8 +26,8 @@ fn command_for(words: &[&str], seconds: &str) -> Command {
 }
 
 /// Starts it and waits for its first line, which it prints once it serves.
-fn serve(words: &[&str]) -> Served {
-    let mut served = Served(command(words).stdout(Stdio::piped()).spawn().expect("starts"), None);
+fn serve(words: &[&str]) -> ServingProgram {
+    let mut served = ServingProgram(command(words).stdout(Stdio::piped()).spawn().expect("starts"), None);
     let mut line = String::new();
     let output = BufReader::new(served.0.stdout.take().expect("piped"));
     served.1.insert(output).read_line(&mut line).expect("a line");

@@ -19,13 +19,13 @@ use hil_mock::monotonic;
 const WATCHDOG_MS: i64 = 1500;
 
 /// The process, which ends with the test.
-struct Served {
+struct ServingProcess {
     child: Child,
     folder: PathBuf,
     port: String,
 }
 
-impl Served {
+impl ServingProcess {
     fn start(name: &str) -> Self {
         let folder = std::env::temp_dir().join(format!("dpm-serve-{name}-{}", std::process::id()));
         std::fs::create_dir_all(&folder).unwrap();
@@ -67,7 +67,7 @@ impl Served {
     }
 }
 
-impl Drop for Served {
+impl Drop for ServingProcess {
     fn drop(&mut self) {
         let _ = self.child.kill();
         let _ = self.child.wait();
@@ -151,7 +151,7 @@ fn brightness(path: &Path) -> f64 {
 /// R1: the last frame ends by itself; R3: the next connection lights at once.
 #[test]
 fn a_projector_that_hears_nothing_lives_on_and_the_next_host_lights() {
-    let served = Served::start("alone");
+    let served = ServingProcess::start("alone");
     for round in 0..3 {
         let mut host = Host::new(&served.port);
         let begun = Instant::now();
@@ -191,7 +191,7 @@ fn a_projector_that_hears_nothing_lives_on_and_the_next_host_lights() {
 /// Found in use, R2: the log is good for measuring, from outside, how long after an order it is dark.
 #[test]
 fn the_log_says_when_an_order_has_made_it_dark() {
-    let served = Served::start("order");
+    let served = ServingProcess::start("order");
     let mut host = Host::new(&served.port);
     for (verb, state) in [
         (Verb::Black, "dark black"),

@@ -110,7 +110,7 @@ pub struct Showing {
 
 /// A sequence that was started: its frame (`None` is the dark picture), and the time of its runs in microseconds.
 #[derive(Clone, Copy, Debug)]
-struct Started {
+struct SequenceStart {
     frame: Option<usize>,
     us: i64,
 }
@@ -131,7 +131,7 @@ pub struct Alp {
     times_us: Vec<i64>,
     slot_us: i64,
     runs: u32,
-    started: VecDeque<Started>,
+    started: VecDeque<SequenceStart>,
     /// Nothing with light was started since it went dark.
     is_dark: bool,
 }
@@ -525,7 +525,7 @@ impl Alp {
 
     fn start(&mut self, sequence: u32, frame: Option<usize>, us: i64) -> Result<(), AlpError> {
         self.called("AlpProjStart", self.library.proj_start(self.id, sequence))?;
-        self.started.push_back(Started { frame, us });
+        self.started.push_back(SequenceStart { frame, us });
         self.is_dark &= frame.is_none();
         Ok(())
     }

@@ -6,7 +6,7 @@ use super::lines::Lines;
 use super::poses::Poses;
 use dpm_calibration::body::{tip_in_body, wander, Session, Surface, Touch};
 use dpm_calibration::file::{BodySection, Pose};
-use dpm_calibration::trajectory::{Stamped, Trajectory};
+use dpm_calibration::trajectory::{TimedPose, Trajectory};
 use dpm_common::clock::MonotonicClock;
 use dpm_rig::config::RigConfig;
 use dpm_rig::failure::{Failure, FailureKind};
@@ -199,20 +199,20 @@ fn touch(
 }
 
 /// Poses of the wand with the body's pose at the same instants.
-fn together(poses: &[Vec<Stamped>]) -> Vec<(Stamped, Stamped)> {
+fn together(poses: &[Vec<TimedPose>]) -> Vec<(TimedPose, TimedPose)> {
     let [wand, body] = poses else { return Vec::new() };
     let path = Trajectory::new(body);
-    let at = |w: &Stamped| {
+    let at = |w: &TimedPose| {
         let moving = path.at(w.stamp_ns, 0.0)?;
-        let body = Stamped { stamp_ns: w.stamp_ns, position: moving.position, rotation: moving.rotation };
+        let body = TimedPose { stamp_ns: w.stamp_ns, position: moving.position, rotation: moving.rotation };
         Some((*w, body))
     };
     wand.iter().filter_map(at).collect()
 }
 
 /// Places of the tip in the body's frame.
-fn tips_in_body(poses: &[Vec<Stamped>], tip: DVec3) -> Vec<DVec3> {
+fn tips_in_body(poses: &[Vec<TimedPose>], tip: DVec3) -> Vec<DVec3> {
     let in_body =
-        |(wand, body): (Stamped, Stamped)| body.rotation.conjugate() * (wand.place(tip) - body.position);
+        |(wand, body): (TimedPose, TimedPose)| body.rotation.conjugate() * (wand.place(tip) - body.position);
     together(poses).into_iter().map(in_body).collect()
 }

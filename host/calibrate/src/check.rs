@@ -5,9 +5,9 @@ use super::body::{carried, index_of, triangles_of};
 use super::dialogue::Dialogue;
 use super::poses::{held, still, Poses};
 use dpm_calibration::body::Surface;
-use dpm_calibration::check::{spread, Checked, Fault, Offset, Reading, Summary, SurfacePoint};
+use dpm_calibration::check::{spread, CheckSummary, Fault, Offset, Reading, Summary, SurfacePoint};
 use dpm_calibration::file::{CalibrationFile, CheckSection};
-use dpm_calibration::trajectory::Stamped;
+use dpm_calibration::trajectory::TimedPose;
 use dpm_rig::config::RigConfig;
 use dpm_rig::failure::{Failure, FailureKind};
 use dpm_rig::results::Results;
@@ -81,7 +81,7 @@ pub trait Bench {
     /// Tells the operator something.
     fn tell(&self, text: &str);
     /// Poses of the wand and of the body in a moment in which nothing should move.
-    fn hold(&self) -> Vec<Vec<Stamped>>;
+    fn hold(&self) -> Vec<Vec<TimedPose>>;
     /// Lights a pixel and those around it.
     fn light(&self, pixel: [u32; 2]);
 }
@@ -105,7 +105,7 @@ impl Bench for RealBench<'_> {
         self.dialogue.tell(text);
     }
 
-    fn hold(&self) -> Vec<Vec<Stamped>> {
+    fn hold(&self) -> Vec<Vec<TimedPose>> {
         self.poses.hold()
     }
 
@@ -280,7 +280,7 @@ pub fn judge(
     body: &str,
     limit_px: f64,
 ) -> Result<(String, bool), Failure> {
-    let checked = Checked::of(offsets).ok_or_else(|| {
+    let checked = CheckSummary::of(offsets).ok_or_else(|| {
         Failure::new(FailureKind::BadInput, "no point was measured, so nothing was checked")
     })?;
     let mut told = String::from("point     light px   right    down      mm   projector px   body px\n");
@@ -325,7 +325,7 @@ pub fn judge(
 
 /// Puts what a check of `body` found into the results; nothing if no point was measured.
 pub fn keep(results: &mut Results, config: &RigConfig, body: &str, offsets: &[Offset], limit_px: f64) {
-    let Some(light) = Checked::of(offsets).map(|checked| checked.light) else { return };
+    let Some(light) = CheckSummary::of(offsets).map(|checked| checked.light) else { return };
     let data = format!("{} points of \"{body}\"", light.count);
     let section = CheckSection {
         points: light.count as u32,

@@ -3,7 +3,7 @@
 //! Every level stands between two of full white, its references, so that a slow change of the light is divided out. The
 //! levels go round and round, so a level is a function of the slot alone, whenever the measurement begins.
 
-use super::recorder::Timed;
+use super::recorder::TimedBlock;
 use super::showing::Showing;
 use dpm_calibration::light::{steady, Channels, Next, Session, Steady};
 use dpm_calibration::sensor::Block;
@@ -110,7 +110,12 @@ impl Levels {
     ///
     /// # Errors
     /// Too few samples, or a sensor on the border of two tiles; one sentence with what to do.
-    pub fn is_on_complement(&self, showing: &Showing, samples: &[Timed], room: Room) -> Result<bool, String> {
+    pub fn is_on_complement(
+        &self,
+        showing: &Showing,
+        samples: &[TimedBlock],
+        room: Room,
+    ) -> Result<bool, String> {
         let mut levels = [None; 2];
         for (run, frames) in by_run(self, showing, samples) {
             if frames.len() >= LEAST_FRAMES {
@@ -290,7 +295,7 @@ impl Readings {
         &mut self,
         levels: &Levels,
         showing: &Showing,
-        samples: &[Timed],
+        samples: &[TimedBlock],
         room: Room,
     ) -> Result<(), String> {
         let mut readings = BTreeMap::new();
@@ -364,7 +369,7 @@ impl Readings {
 
 /// The mean level of each lit frame that was sampled whole, by run. Planes come and go far faster than lamps flicker, so
 /// whole frames only are looked at.
-fn by_run(levels: &Levels, showing: &Showing, samples: &[Timed]) -> BTreeMap<u64, Vec<Block>> {
+fn by_run(levels: &Levels, showing: &Showing, samples: &[TimedBlock]) -> BTreeMap<u64, Vec<Block>> {
     let timing = &showing.timing;
     let margin_s = match levels.field {
         Field::Full(_) => MARGIN_S,
@@ -379,7 +384,7 @@ fn by_run(levels: &Levels, showing: &Showing, samples: &[Timed]) -> BTreeMap<u64
     // Slot by slot, the time that was sampled and the integral of the level over it, in frames.
     let mut sums: BTreeMap<u64, (f64, f64)> =
         showing.fresh().filter(is_inside).map(|s| (s, (0.0, 0.0))).collect();
-    for Timed { block, sensor_minus_host_ns } in samples {
+    for TimedBlock { block, sensor_minus_host_ns } in samples {
         let Some(offset) = sensor_minus_host_ns else { continue };
         let since = block.start_ns.saturating_sub(*offset).saturating_sub(timing.frame_zero_ns) as f64;
         let length = block.interval_ns / timing.frame_ns;

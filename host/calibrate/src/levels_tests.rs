@@ -82,13 +82,13 @@ struct Bench {
     levels: Levels,
     showing: Showing,
     lit: Vec<(u64, HostTime)>,
-    samples: Vec<Timed>,
+    samples: Vec<TimedBlock>,
     room: Room,
     config: SensorWandConfig,
 }
 
 /// One pass alone.
-fn solve(levels: &Levels, showing: &Showing, samples: &[Timed], room: Room) -> Result<Channels, String> {
+fn solve(levels: &Levels, showing: &Showing, samples: &[TimedBlock], room: Room) -> Result<Channels, String> {
     let mut readings = Readings::default();
     readings.add(levels, showing, samples, room)?;
     readings.solve(levels, room)
@@ -169,7 +169,7 @@ fn show(levels: Levels, config: &SensorWandConfig, scale: impl Fn(f64) -> f64) -
         lit.push((slot, HostTime(from)));
     }
     let ambient = steady(&blocks[..dark], 100.0).unwrap();
-    let timed = |block| Timed { block, sensor_minus_host_ns: Some(SENSOR_MINUS_HOST_NS) };
+    let timed = |block| TimedBlock { block, sensor_minus_host_ns: Some(SENSOR_MINUS_HOST_NS) };
     let samples = blocks.drain(dark..).map(timed).collect();
     let showing = Showing::of(&lit, rate()).unwrap();
     Bench { levels, showing, lit, samples, room: Room { flicker_hz: 100.0, ambient }, config }

@@ -3,9 +3,9 @@
 
 use super::dialogue::Dialogue;
 use super::levels::{Field, Levels, Readings, Room};
-use super::pace::{Light, Pace, Paced, MOST_INTERRUPTIONS, SPOILT};
+use super::pace::{Light, Pace, PaceResult, MOST_INTERRUPTIONS, SPOILT};
 use super::parts::Parts;
-use super::recorder::{wait_until_up, while_stamped, Port, Recorder, Timed};
+use super::recorder::{wait_until_up, while_stamped, Port, Recorder, TimedBlock};
 use super::showing::Showing;
 use dpm_calibration::file::LightSection;
 use dpm_calibration::light::{flat_field, steady, Channels, FlatField, LightModel, Steady};
@@ -66,7 +66,7 @@ pub fn measure(
     ways: &Ways,
     progress: &mut Progress,
     monitor: &Arc<RunMonitor>,
-) -> Result<Paced<Option<Channels>>, Failure> {
+) -> Result<PaceResult<Option<Channels>>, Failure> {
     let flicker_hz = ways.flicker_hz;
     let all = levels_of(config, ways, progress.is_on_complement)?;
     let Some(levels) = all.missing(&progress.readings).map_err(refused)?.map(Arc::new) else {
@@ -90,7 +90,7 @@ pub fn measure(
     let read = || {
         wait_until_up(monitor)?;
         if let Some(carried_hz) = Pace::of(config, monitor).try_out()? {
-            return Ok(Paced::TooFast { carried_hz });
+            return Ok(PaceResult::TooFast { carried_hz });
         }
         watch(&levels, &recorder, &dialogue, (Pace::of(config, monitor), monitor))
     };
@@ -182,11 +182,11 @@ fn watch(
     recorder: &Recorder,
     dialogue: &Dialogue,
     (mut pace, monitor): (Pace<'_>, &RunMonitor),
-) -> Result<Paced<(Vec<Timed>, bool)>, Failure> {
+) -> Result<PaceResult<(Vec<TimedBlock>, bool)>, Failure> {
     recorder.take();
     let (begin, mut told) = (Instant::now(), 0);
     let mut parts = Parts::new(Duration::from_secs_f64(levels.seconds()));
-    let all = |parts: Parts<Vec<Timed>>| parts.all().flatten().collect::<Vec<_>>();
+    let all = |parts: Parts<Vec<TimedBlock>>| parts.all().flatten().collect::<Vec<_>>();
     while begin.elapsed().as_secs_f64() < levels.seconds() {
         if monitor.stop_requested() {
             return Err(refused("the measurement was interrupted; run the same command again"));
@@ -195,10 +195,10 @@ fn watch(
         let before = begin.elapsed();
         match pace.look()? {
             Light::Enough => {}
-            Light::TooFew(carried_hz) => return Ok(Paced::TooFast { carried_hz }),
+            Light::TooFew(carried_hz) => return Ok(PaceResult::TooFast { carried_hz }),
             Light::Interrupted => {
                 parts.spoil(before.saturating_sub(SPOILT), begin.elapsed());
-                return Ok(Paced::Done((all(parts), true)));
+                return Ok(PaceResult::Done((all(parts), true)));
             }
         }
         if begin.elapsed() >= parts.next() {
@@ -219,7 +219,7 @@ fn watch(
         }
     }
     parts.add(recorder.take().0, begin.elapsed());
-    Ok(Paced::Done((all(parts), false)))
+    Ok(PaceResult::Done((all(parts), false)))
 }
 
 /// Writes the brightness along a sweep: column, row, distance in metres, direction to the lens in the wand's body, level.

@@ -5,9 +5,9 @@ use super::outline::{Outlines, MOST_POINTS};
 use super::poses::Poses;
 use dpm_calibration::nudge::{Nudges, Order, TURN_DEG};
 use dpm_calibration::outline::Outline;
-use dpm_calibration::trajectory::Stamped;
+use dpm_calibration::trajectory::TimedPose;
 use dpm_rig::failure::{Failure, FailureKind};
-use dpm_rig::results::Moved;
+use dpm_rig::results::NudgeTarget;
 use dpm_rig::rig::Rig;
 use dpm_scene::geometry::projector::ProjectorCamera;
 use glam::{DAffine3, DVec3};
@@ -18,7 +18,7 @@ use std::time::Duration;
 /// Time between two pictures.
 const EVERY: Duration = Duration::from_millis(33);
 
-struct Shown {
+struct NudgeView {
     name: String,
     mesh_to_body: DAffine3,
     outline: Outline,
@@ -26,9 +26,9 @@ struct Shown {
 
 /// Bodies whose outlines are shown, and the projector that shows them.
 pub struct Stage {
-    moved: Moved,
+    moved: NudgeTarget,
     camera: ProjectorCamera,
-    bodies: Vec<Shown>,
+    bodies: Vec<NudgeView>,
 }
 
 impl Stage {
@@ -36,14 +36,14 @@ impl Stage {
     ///
     /// # Errors
     /// The rig has no such body, or none at all.
-    pub fn of(rig: &Rig, moved: Moved, names: &[String]) -> Result<Self, Failure> {
+    pub fn of(rig: &Rig, moved: NudgeTarget, names: &[String]) -> Result<Self, Failure> {
         let all: Vec<String> = rig.config.scene.bodies.iter().map(|b| b.name.clone()).collect();
         let names = if names.is_empty() { &all[..] } else { names };
         let shown = |name: &String| {
             let index = index_of(&rig.config, name)?;
             let triangles = triangles_of(&carried(&rig.config, &rig.scene, name)?);
             let mesh_to_body = rig.bodies.get(index).map_or(DAffine3::IDENTITY, |b| b.mesh_to_body);
-            Ok(Shown { name: name.clone(), mesh_to_body, outline: Outline::new(&triangles) })
+            Ok(NudgeView { name: name.clone(), mesh_to_body, outline: Outline::new(&triangles) })
         };
         let bodies = names.iter().map(shown).collect::<Result<Vec<_>, Failure>>()?;
         if bodies.is_empty() {
@@ -62,8 +62,8 @@ impl Stage {
     /// projector about its lens.
     pub fn nudges(&self, step_m: f64) -> Nudges {
         let body = match &self.moved {
-            Moved::Body(name) => self.bodies.iter().find(|b| b.name == *name),
-            Moved::Projector => None,
+            NudgeTarget::Body(name) => self.bodies.iter().find(|b| b.name == *name),
+            NudgeTarget::Projector => None,
         };
         match body {
             Some(body) => Nudges::new(body.mesh_to_body, body.outline.middle(), step_m),
@@ -73,15 +73,15 @@ impl Stage {
 
     /// The pixels of all outlines, with what is moved at `now` and the bodies at `poses`; bodies that were not seen yet
     /// are left out.
-    fn draw(&self, now: DAffine3, poses: &[Option<Stamped>], pixels: &mut Vec<[u32; 2]>) {
+    fn draw(&self, now: DAffine3, poses: &[Option<TimedPose>], pixels: &mut Vec<[u32; 2]>) {
         pixels.clear();
         let mut camera = self.camera;
-        if self.moved == Moved::Projector {
+        if self.moved == NudgeTarget::Projector {
             camera.world_from_projector = now;
         }
         for (body, pose) in self.bodies.iter().zip(poses) {
             let Some(pose) = pose else { continue };
-            let is_moved = matches!(&self.moved, Moved::Body(name) if *name == body.name);
+            let is_moved = matches!(&self.moved, NudgeTarget::Body(name) if *name == body.name);
             let mesh_to_body = if is_moved { now } else { body.mesh_to_body };
             let world_from_body = DAffine3::from_rotation_translation(pose.rotation, pose.position);
             body.outline.draw(&camera, &(world_from_body * mesh_to_body), MOST_POINTS, pixels);
@@ -127,10 +127,10 @@ pub fn nudge(
 }
 
 /// What the letters do.
-pub fn help(moved: &Moved, step_m: f64) -> String {
+pub fn help(moved: &NudgeTarget, step_m: f64) -> String {
     let (what, axes) = match moved {
-        Moved::Body(name) => (format!("the mesh of \"{name}\""), "the mesh's own axes"),
-        Moved::Projector => ("the projector".into(), "its own axes (x right, y up, z backwards)"),
+        NudgeTarget::Body(name) => (format!("the mesh of \"{name}\""), "the mesh's own axes"),
+        NudgeTarget::Projector => ("the projector".into(), "its own axes (x right, y up, z backwards)"),
     };
     format!(
         "Letters move {what} along {axes}; type one or more and press Enter.\n\

@@ -28,7 +28,7 @@ pub const MOST_INTERRUPTIONS: u32 = 3;
 
 /// What a measurement came to.
 #[derive(Clone, Debug, PartialEq)]
-pub enum Paced<T> {
+pub enum PaceResult<T> {
     /// Its result.
     Done(T),
     /// The link carried only so many frames a second, so it was given up.
@@ -38,15 +38,15 @@ pub enum Paced<T> {
     },
 }
 
-impl<T> Paced<T> {
+impl<T> PaceResult<T> {
     /// Changes the result.
     ///
     /// # Errors
     /// That of `change`.
-    pub fn and_then<U, E>(self, change: impl FnOnce(T) -> Result<U, E>) -> Result<Paced<U>, E> {
+    pub fn and_then<U, E>(self, change: impl FnOnce(T) -> Result<U, E>) -> Result<PaceResult<U>, E> {
         match self {
-            Self::Done(result) => change(result).map(Paced::Done),
-            Self::TooFast { carried_hz } => Ok(Paced::TooFast { carried_hz }),
+            Self::Done(result) => change(result).map(PaceResult::Done),
+            Self::TooFast { carried_hz } => Ok(PaceResult::TooFast { carried_hz }),
         }
     }
 }

@@ -1,6 +1,6 @@
 //! Poses of tracked bodies in the world while a calibration goes on, collected by a thread of their own.
 
-use dpm_calibration::trajectory::Stamped;
+use dpm_calibration::trajectory::TimedPose;
 use dpm_common::clock::{Clock, MonotonicClock};
 use dpm_common::so3::{so3_between, so3_exp};
 use dpm_device::tracker::BodyKey;
@@ -28,15 +28,15 @@ const STILL_RAD: f64 = 5e-3;
 const FEWEST_HELD: usize = 20;
 
 #[derive(Default)]
-struct Shared {
-    poses: Vec<Vec<Stamped>>,
+struct PoseStore {
+    poses: Vec<Vec<TimedPose>>,
     status: String,
 }
 
 /// A tracker that is read until this is dropped.
 pub struct Poses {
     names: Vec<String>,
-    shared: Arc<Mutex<Shared>>,
+    shared: Arc<Mutex<PoseStore>>,
     is_over: Arc<AtomicBool>,
     thread: Option<std::thread::JoinHandle<()>>,
 }
@@ -62,7 +62,7 @@ impl Poses {
         let keys: Vec<BodyKey> = names.iter().map(of).collect();
         let sleeping = clock.sleeping();
         let mut tracker = open_in_world(config, keys, Arc::new(move || sleeping.now()))?;
-        let shared = Shared { poses: vec![Vec::new(); names.len()], status: String::new() };
+        let shared = PoseStore { poses: vec![Vec::new(); names.len()], status: String::new() };
         let (shared, is_over) = (Arc::new(Mutex::new(shared)), Arc::new(AtomicBool::new(false)));
         let (to, over) = (Arc::clone(&shared), Arc::clone(&is_over));
         let work = move || {
@@ -70,7 +70,7 @@ impl Poses {
             while !over.load(Ordering::Relaxed) {
                 let now = sleeping.now();
                 let result = tracker.poll(now, &mut |sample| {
-                    let pose = Stamped::new(sample.captured_at.0, &sample.pose).filter(|_| sample.tracked);
+                    let pose = TimedPose::new(sample.captured_at.0, &sample.pose).filter(|_| sample.tracked);
                     fresh.extend(pose.map(|p| (usize::from(sample.body.0), p)));
                 });
                 let mut shared = to.lock().unwrap_or_else(PoisonError::into_inner);
@@ -94,12 +94,12 @@ impl Poses {
         Ok(Self { names: names.to_vec(), shared, is_over, thread: Some(thread) })
     }
 
-    fn locked(&self) -> std::sync::MutexGuard<'_, Shared> {
+    fn locked(&self) -> std::sync::MutexGuard<'_, PoseStore> {
         self.shared.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
     /// Takes what has been collected of each body, in the order of the names.
-    pub fn take(&self) -> Vec<Vec<Stamped>> {
+    pub fn take(&self) -> Vec<Vec<TimedPose>> {
         let count = self.names.len();
         std::mem::replace(&mut self.locked().poses, vec![Vec::new(); count])
     }
@@ -128,7 +128,7 @@ impl Poses {
     }
 
     /// Collects poses of a moment in which nothing should move.
-    pub fn hold(&self) -> Vec<Vec<Stamped>> {
+    pub fn hold(&self) -> Vec<Vec<TimedPose>> {
         self.take();
         std::thread::sleep(HOLD);
         self.take()
@@ -148,7 +148,7 @@ impl Drop for Poses {
 ///
 /// # Errors
 /// Too few poses, or a body that moved; one sentence for the operator.
-pub fn still(name: &str, poses: &[Stamped]) -> Result<DAffine3, String> {
+pub fn still(name: &str, poses: &[TimedPose]) -> Result<DAffine3, String> {
     if poses.len() < FEWEST_HELD {
         return Err(format!(
             "the tracker reported \"{name}\" only {} times in {} ms; is it in view?",
@@ -156,7 +156,7 @@ pub fn still(name: &str, poses: &[Stamped]) -> Result<DAffine3, String> {
             HOLD.as_millis()
         ));
     }
-    let mean = |part: &[Stamped]| {
+    let mean = |part: &[TimedPose]| {
         let n = part.len().max(1) as f64;
         let first = part.first().map_or(DQuat::IDENTITY, |p| p.rotation);
         // Turns of a body that lies still are small, so their mean is that of their rotation vectors.
@@ -181,7 +181,7 @@ pub fn still(name: &str, poses: &[Stamped]) -> Result<DAffine3, String> {
 ///
 /// # Errors
 /// Too few poses, or a tip that moved; one sentence for the operator.
-pub fn held(tip: DVec3, poses: &[Stamped]) -> Result<DVec3, String> {
+pub fn held(tip: DVec3, poses: &[TimedPose]) -> Result<DVec3, String> {
     if poses.len() < FEWEST_HELD {
         return Err(format!(
             "the tracker reported the wand only {} times in {} ms; is it in view?",
@@ -189,7 +189,8 @@ pub fn held(tip: DVec3, poses: &[Stamped]) -> Result<DVec3, String> {
             HOLD.as_millis()
         ));
     }
-    let mean = |part: &[Stamped]| part.iter().map(|p| p.place(tip)).sum::<DVec3>() / part.len().max(1) as f64;
+    let mean =
+        |part: &[TimedPose]| part.iter().map(|p| p.place(tip)).sum::<DVec3>() / part.len().max(1) as f64;
     let (first, second) = poses.split_at(poses.len() / 2);
     let moved = (mean(first) - mean(second)).length();
     if moved > HELD_M {
@@ -202,17 +203,17 @@ pub fn held(tip: DVec3, poses: &[Stamped]) -> Result<DVec3, String> {
 mod tests {
     use super::*;
 
-    fn at(position: DVec3) -> Stamped {
-        Stamped { stamp_ns: 0, position, rotation: DQuat::from_rotation_z(std::f64::consts::FRAC_PI_2) }
+    fn at(position: DVec3) -> TimedPose {
+        TimedPose { stamp_ns: 0, position, rotation: DQuat::from_rotation_z(std::f64::consts::FRAC_PI_2) }
     }
 
     #[test]
     fn a_held_tip_is_the_mean_and_a_moving_one_is_refused() {
         let tip = DVec3::new(0.1, 0.0, 0.0);
-        let still: Vec<Stamped> = (0..100).map(|i| at(DVec3::X * 1e-4 * f64::from(i % 3 - 1))).collect();
+        let still: Vec<TimedPose> = (0..100).map(|i| at(DVec3::X * 1e-4 * f64::from(i % 3 - 1))).collect();
         let place = held(tip, &still).unwrap();
         assert!((place - DVec3::new(0.0, 0.1, 0.0)).length() < 1e-5, "{place}");
-        let moving: Vec<Stamped> = (0..100).map(|i| at(DVec3::X * 1e-4 * f64::from(i))).collect();
+        let moving: Vec<TimedPose> = (0..100).map(|i| at(DVec3::X * 1e-4 * f64::from(i))).collect();
         assert!(held(tip, &moving).unwrap_err().contains("moved by 5.0 mm"));
         assert!(super::still("box", &moving).unwrap_err().contains("\"box\" moved by 5.0 mm"));
         assert!(super::still("box", &still[..5]).unwrap_err().contains("only 5 times"));

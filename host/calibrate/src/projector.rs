@@ -5,7 +5,7 @@ use super::dialogue::Dialogue;
 use super::lines::Lines;
 use super::poses::{held, Poses};
 use dpm_calibration::file::ProjectorSection;
-use dpm_calibration::projector::{Options, Session, Sight, Solved, Volume};
+use dpm_calibration::projector::{Options, ProjectorFit, Session, Sight, Volume};
 use dpm_device::planes::Raster;
 use dpm_device::regular_file;
 use dpm_rig::config::RigConfig;
@@ -47,7 +47,7 @@ pub fn aim_by_hand(
     points: &mut Points,
     (poses, aim): (&Poses, &Aim),
     dialogue: &Dialogue,
-) -> Result<Solved, Failure> {
+) -> Result<ProjectorFit, Failure> {
     dialogue.tell(
         "Hold the tip of the wand into the middle of each cross and press Enter. Use at least 12 points, near and far: their\n\
          distances from the projector should differ by a quarter or more. u: take the last point back; d: done.",
@@ -95,7 +95,7 @@ fn pixel_of(raster: Raster, at: DVec2) -> [u32; 2] {
 }
 
 /// What the operator is told of a solution.
-pub fn told_of(solved: &Solved) -> String {
+pub fn told_of(solved: &ProjectorFit) -> String {
     let (p, at) = (&solved.predicted, solved.predicted.worst);
     let used = solved.inliers.iter().filter(|i| **i).count();
     let mut told = format!(
@@ -116,7 +116,7 @@ pub fn told_of(solved: &Solved) -> String {
 }
 
 /// Puts a solution into the results.
-pub fn keep(results: &mut Results, config: &RigConfig, solved: &Solved, bias_m: f64) {
+pub fn keep(results: &mut Results, config: &RigConfig, solved: &ProjectorFit, bias_m: f64) {
     let raster = config.projector.raster();
     let data = format!("{} points aimed at by hand", solved.inliers.len());
     let provenance = results.provenance(config, "", data, "least squares over lens and pose");
@@ -132,7 +132,7 @@ const MAX_POINTS_BYTES: u64 = 1 << 20;
 ///
 /// # Errors
 /// The file cannot be read, or its points do not make a projector.
-pub fn solve_file(path: &Path, raster: Raster, options: Options) -> Result<Solved, Failure> {
+pub fn solve_file(path: &Path, raster: Raster, options: Options) -> Result<ProjectorFit, Failure> {
     let bad = |e: String| Failure::new(FailureKind::BadInput, format!("{}: {e}", path.display()));
     let text = regular_file::read_text(path, MAX_POINTS_BYTES).map_err(|e| bad(e.to_string()))?;
     let sights = read_points(&text).map_err(bad)?;

@@ -36,14 +36,14 @@ pub struct Port {
 
 /// A sensor that is read by a thread of its own until this is dropped.
 pub struct Recorder {
-    shared: Arc<Mutex<Recorded>>,
+    shared: Arc<Mutex<SampleLog>>,
     is_over: Arc<AtomicBool>,
     thread: Option<std::thread::JoinHandle<()>>,
 }
 
 /// A block and where its clock was.
 #[derive(Clone, Debug, PartialEq)]
-pub struct Timed {
+pub struct TimedBlock {
     /// The samples, on the sensor's clock.
     pub block: Block,
     /// The sensor's clock less the host's when it came, nanoseconds; `None` before the clock was mapped.
@@ -51,8 +51,8 @@ pub struct Timed {
 }
 
 #[derive(Default)]
-struct Recorded {
-    blocks: Vec<Timed>,
+struct SampleLog {
+    blocks: Vec<TimedBlock>,
     samples: usize,
     /// The sensor's clock less the host's, nanoseconds, once it is known.
     sensor_minus_host_ns: Option<i64>,
@@ -76,7 +76,7 @@ impl Recorder {
         let sleeping = clock.sleeping();
         let mut client = SensorClient::open(config, Arc::new(move || sleeping.now()))
             .map_err(|e| Failure::new(FailureKind::BadInput, e))?;
-        let shared = Arc::new(Mutex::new(Recorded::default()));
+        let shared = Arc::new(Mutex::new(SampleLog::default()));
         let (to, is_over) = (Arc::clone(&shared), Arc::new(AtomicBool::new(false)));
         let over = Arc::clone(&is_over);
         let work = move || {
@@ -100,7 +100,7 @@ impl Recorder {
                     if shared.samples < MOST_SAMPLES {
                         shared.samples += levels.len();
                         let sensor_minus_host_ns = shared.sensor_minus_host_ns;
-                        shared.blocks.push(Timed { block, sensor_minus_host_ns });
+                        shared.blocks.push(TimedBlock { block, sensor_minus_host_ns });
                     }
                 }
                 shared.status = client.status();
@@ -115,12 +115,12 @@ impl Recorder {
         Ok(Self { shared, is_over, thread: Some(thread) })
     }
 
-    fn locked(&self) -> std::sync::MutexGuard<'_, Recorded> {
+    fn locked(&self) -> std::sync::MutexGuard<'_, SampleLog> {
         self.shared.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
     /// Takes the blocks that have been sampled since the last call; the number says how many of them are saturated.
-    pub fn take(&self) -> (Vec<Timed>, usize) {
+    pub fn take(&self) -> (Vec<TimedBlock>, usize) {
         let mut shared = self.locked();
         shared.samples = 0;
         let saturated = std::mem::take(&mut shared.saturated);

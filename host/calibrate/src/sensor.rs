@@ -3,21 +3,21 @@
 
 use super::codes::{CodeSource, InverseSource};
 use super::dialogue::Dialogue;
-use super::pace::{Light, Pace, Paced, SPOILT};
+use super::pace::{Light, Pace, PaceResult, SPOILT};
 use super::parts::Parts;
 use super::poses::Poses;
-use super::recorder::{wait_until_up, while_stamped, Port, Recorder, Timed};
+use super::recorder::{wait_until_up, while_stamped, Port, Recorder, TimedBlock};
 use super::showing::Showing;
 use dpm_calibration::file::{LatencySection, ProjectorSection, WandSection};
 use dpm_calibration::model::ProjectorModel;
 use dpm_calibration::pivot::trace;
-use dpm_calibration::projector::{Known, LensTerms, Priors, Volume};
+use dpm_calibration::projector::{LensTerms, PlaceHint, Priors, Volume};
 use dpm_calibration::sensor::{
     decode, decode_pairs, places_rested, solve, solve_latency, solve_latency_of_pairs, solve_pairs, Block,
-    Code, Coverage, Decoded, DecodedPairs, FrameLight, InverseCode, Latency, Mapped, SensorError, Settings,
+    Code, Coverage, DecodedPairs, Decoding, FrameLight, InverseCode, Latency, Mapped, SensorError, Settings,
     Solution, Timing, FEWEST_PLACES,
 };
-use dpm_calibration::trajectory::{Stamped, Trajectory};
+use dpm_calibration::trajectory::{TimedPose, Trajectory};
 use dpm_common::clock::MonotonicClock;
 use dpm_rig::config::{PlaneTiming, RigConfig};
 use dpm_rig::failure::{Failure, FailureKind};
@@ -41,7 +41,7 @@ pub struct Setup {
     /// Diameter of the sensor's aperture, metres.
     pub aperture_m: f64,
     /// What is known of the projector's place.
-    pub known: Known,
+    pub known: PlaceHint,
     /// Which numbers of the lens are solved for.
     pub lens: LensTerms,
     /// Frames a second of the rig file: at a lower rate the motion takes longer.
@@ -54,10 +54,10 @@ pub struct Setup {
 
 /// Everything that was recorded while the wand moved.
 struct Recording {
-    blocks: Vec<Timed>,
-    clipped: Clipped,
+    blocks: Vec<TimedBlock>,
+    clipped: ClipCount,
     sensor_minus_host_ns: i64,
-    poses: Vec<Stamped>,
+    poses: Vec<TimedPose>,
 }
 
 /// Frames of a sweep that are worth solving: fewer tell the projector badly, however long they took.
@@ -74,17 +74,17 @@ struct Sweep {
     seen: SeenCode,
     path: Trajectory,
     settings: Settings,
-    clipped: Clipped,
+    clipped: ClipCount,
 }
 
 /// How many of the sensor's blocks of samples were saturated.
 #[derive(Clone, Copy)]
-struct Clipped {
+struct ClipCount {
     blocks: usize,
     of: usize,
 }
 
-impl Clipped {
+impl ClipCount {
     /// Why a sweep is refused; a saturated sensor spoils what all solvers see.
     fn refused(self, error: impl std::fmt::Display) -> Failure {
         let Self { blocks, of } = self;
@@ -100,7 +100,7 @@ impl Clipped {
 
 /// A code, and what the sensor saw of it.
 enum SeenCode {
-    Planes(Box<Code>, Decoded),
+    Planes(Box<Code>, Decoding),
     Frames(InverseCode, DecodedPairs, Rests),
 }
 
@@ -143,21 +143,21 @@ pub fn calibrate(
     setup: &Setup,
     tip: (DVec3, f64),
     monitor: &Arc<RunMonitor>,
-) -> Result<Paced<Solution>, Failure> {
+) -> Result<PaceResult<Solution>, Failure> {
     let swept = match sweep(config, setup, tip, monitor)? {
-        Paced::Done(swept) => swept,
-        Paced::TooFast { carried_hz } => return Ok(Paced::TooFast { carried_hz }),
+        PaceResult::Done(swept) => swept,
+        PaceResult::TooFast { carried_hz } => return Ok(PaceResult::TooFast { carried_hz }),
     };
     let solved = match &swept.seen {
         SeenCode::Planes(code, decoded) => solve(code, decoded, &swept.path, &swept.settings),
         SeenCode::Frames(code, decoded, _) => solve_pairs(code, decoded, &swept.path, &swept.settings),
     };
     match (solved, &swept.seen) {
-        (Ok(solution), _) => Ok(Paced::Done(solution)),
+        (Ok(solution), _) => Ok(PaceResult::Done(solution)),
         (Err(error), SeenCode::Planes(..)) => Err(swept.clipped.refused(error)),
         (Err(error), SeenCode::Frames(_, decoded, rests)) => {
             match rests.carried_too_few(&error, decoded.carried, config.projector.frame_rate.hz()) {
-                Some(carried_hz) => Ok(Paced::TooFast { carried_hz }),
+                Some(carried_hz) => Ok(PaceResult::TooFast { carried_hz }),
                 None => Err(swept.clipped.refused(rests.told(&error, decoded))),
             }
         }
@@ -174,7 +174,7 @@ pub fn latency(
     tip: (DVec3, f64),
     model: &ProjectorModel,
     monitor: &Arc<RunMonitor>,
-) -> Result<Paced<Latency>, Failure> {
+) -> Result<PaceResult<Latency>, Failure> {
     sweep(config, setup, tip, monitor)?.and_then(|s| {
         let solved = match &s.seen {
             SeenCode::Planes(code, decoded) => solve_latency(code, decoded, &s.path, &s.settings, model),
@@ -195,7 +195,7 @@ fn sweep(
     setup: &Setup,
     (tip, tip_sigma_m): (DVec3, f64),
     monitor: &Arc<RunMonitor>,
-) -> Result<Paced<Sweep>, Failure> {
+) -> Result<PaceResult<Sweep>, Failure> {
     let raster = config.projector.raster();
     if !config.projector.is_lit_without_gap() {
         return Err(refused(
@@ -203,7 +203,7 @@ fn sweep(
              calibrate by hand: leave --sensor out",
         ));
     }
-    let settings = |timing: Timing, poses: &[Stamped]| {
+    let settings = |timing: Timing, poses: &[TimedPose]| {
         let tips = poses.iter().map(|p| p.place(tip));
         let volume = Volume::around(tips).ok_or_else(|| refused("the wand was not tracked"))?;
         Ok::<_, Failure>(Settings {
@@ -265,7 +265,7 @@ fn record(
     setup: &Setup,
     (source, guide): (Arc<dyn PatternSource>, Guide),
     monitor: &Arc<RunMonitor>,
-) -> Result<Paced<(Recording, Showing)>, Failure> {
+) -> Result<PaceResult<(Recording, Showing)>, Failure> {
     let clock = MonotonicClock::new(0);
     let stopped = Arc::clone(monitor);
     let dialogue = Dialogue::start(move || stopped.stop_requested())?;
@@ -281,7 +281,7 @@ fn record(
         wait_until_up(monitor)?;
         recorder.wait_until_mapped(monitor)?;
         if let Some(carried_hz) = Pace::of(config, monitor).try_out()? {
-            return Ok(Paced::TooFast { carried_hz });
+            return Ok(PaceResult::TooFast { carried_hz });
         }
         if is_again {
             dialogue.tell(&guide.again(seconds));
@@ -297,7 +297,7 @@ fn record(
         sweeping.follow((seconds, 1e9 / rate.hz()), guide, pace, monitor)?.and_then(
             |(blocks, clipped, poses)| {
                 let sensor_minus_host_ns = recorder.sensor_minus_host_ns()?;
-                let clipped = Clipped { blocks: clipped, of: blocks.len() };
+                let clipped = ClipCount { blocks: clipped, of: blocks.len() };
                 Ok(Recording { blocks, clipped, sensor_minus_host_ns, poses })
             },
         )
@@ -357,7 +357,7 @@ impl Guide {
     }
 
     /// What is next, from new samples and all poses.
-    fn next(&mut self, frame_ns: f64, fresh: &[Timed], poses: &[Stamped]) -> String {
+    fn next(&mut self, frame_ns: f64, fresh: &[TimedBlock], poses: &[TimedPose]) -> String {
         match self {
             Self::Coverage(coverage) => {
                 let fresh: Vec<Block> = fresh.iter().map(|timed| timed.block.clone()).collect();
@@ -374,7 +374,7 @@ impl Guide {
 }
 
 /// Samples, how many blocks of them are saturated, and poses.
-type Collected = (Vec<Timed>, usize, Vec<Stamped>);
+type Collected = (Vec<TimedBlock>, usize, Vec<TimedPose>);
 
 /// What a sweep goes on with.
 struct Sweeping<'a> {
@@ -391,7 +391,7 @@ impl Sweeping<'_> {
         mut guide: Guide,
         mut pace: Pace<'_>,
         monitor: &RunMonitor,
-    ) -> Result<Paced<Collected>, Failure> {
+    ) -> Result<PaceResult<Collected>, Failure> {
         let begin = Instant::now();
         let mut path = Vec::new();
         let mut parts = Parts::new(Duration::from_secs_f64(seconds));
@@ -403,7 +403,7 @@ impl Sweeping<'_> {
             let before = begin.elapsed();
             match pace.look()? {
                 Light::Enough => {}
-                Light::TooFew(carried_hz) => return Ok(Paced::TooFast { carried_hz }),
+                Light::TooFew(carried_hz) => return Ok(PaceResult::TooFast { carried_hz }),
                 Light::Interrupted => {
                     self.recorder.take();
                     let again = parts.spoil(before.saturating_sub(SPOILT), begin.elapsed());
@@ -431,7 +431,7 @@ impl Sweeping<'_> {
             blocks.extend(fresh);
             clipped += fresh_clipped;
         }
-        Ok(Paced::Done((blocks, clipped, path)))
+        Ok(PaceResult::Done((blocks, clipped, path)))
     }
 }
 

@@ -10,7 +10,7 @@ mod place;
 mod sections;
 mod store;
 
-pub use place::{moved, Predicted};
+pub use place::{moved, LightError};
 pub use sections::{
     BodySection, CheckSection, LatencySection, LightSection, Pose, ProjectorSection, Provenance, WandSection,
     Wrong,

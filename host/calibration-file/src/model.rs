@@ -40,7 +40,7 @@ pub struct ProjectorModel {
 
 /// A pixel and how it changes.
 #[derive(Clone, Copy, Debug)]
-pub struct Projected {
+pub struct PixelDerivative {
     /// The pixel.
     pub pixel: DVec2,
     /// Distance along the axis, metres.
@@ -118,7 +118,7 @@ impl ProjectorModel {
     }
 
     /// As [`Self::project`], with derivatives.
-    pub fn derive(&self, world: DVec3) -> Option<Projected> {
+    pub fn derive(&self, world: DVec3) -> Option<PixelDerivative> {
         let turned = self.rotation * (world - self.origin);
         let q = turned + self.translation;
         if q.z <= 1e-9 || !q.is_finite() {
@@ -144,7 +144,7 @@ impl ProjectorModel {
             row[INTRINSICS + 3..].copy_from_slice(&by_local.to_array());
             by_point[k] = self.rotation.transpose() * by_local;
         }
-        Some(Projected { pixel, depth: q.z, by_parameters, by_point })
+        Some(PixelDerivative { pixel, depth: q.z, by_parameters, by_point })
     }
 
     /// The model after a step of its numbers.

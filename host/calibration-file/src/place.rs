@@ -5,7 +5,7 @@ use glam::{DAffine3, DVec3};
 
 /// The error that the light may have, pixels.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub struct Predicted {
+pub struct LightError {
     /// Median over the volume of the standard deviation's length.
     pub typical_px: f64,
     /// Upper bound of the 99th percentile over the volume: it holds in 99 of 100 calibrations with this noise.
@@ -16,7 +16,7 @@ pub struct Predicted {
     pub worst_px: f64,
 }
 
-impl Predicted {
+impl LightError {
     /// The bound for a tracker whose reports are off by `bias_m` (root mean square along one axis, over time or space),
     /// where a metre is `px_per_m` pixels. No data bound a bias; over simulated calibrations the 99th percentile was 2.7
     /// times the bias in the median and 5.4 times at worst, and that is what is added here.

@@ -2,7 +2,7 @@
 
 use crate::light::{Channels, FlatField, LightModel, CURVE_POINTS};
 use crate::model::{ProjectorModel, LENS};
-use crate::Predicted;
+use crate::LightError;
 use dpm_device::planes::Raster;
 use dpm_scene::geometry::lens::Lens;
 use dpm_scene::geometry::projector::{ProjectorCamera, ProjectorError};
@@ -137,7 +137,7 @@ impl ProjectorSection {
     }
 
     /// The same for a tracker whose reports are off by `bias_m`, root mean square along one axis.
-    pub fn assuming(mut self, predicted: &Predicted, bias_m: f64) -> Self {
+    pub fn assuming(mut self, predicted: &LightError, bias_m: f64) -> Self {
         let camera = self.world_from_projector.to_affine();
         let distance = camera.translation.distance(predicted.worst).max(1e-6);
         self.predicted_p99_px = predicted.with_bias(bias_m, self.focal[0].max(self.focal[1]) / distance);

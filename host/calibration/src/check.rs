@@ -173,7 +173,7 @@ impl Summary {
 
 /// All points of a check.
 #[derive(Clone, Debug, PartialEq)]
-pub struct Checked {
+pub struct CheckSummary {
     /// Error of the light.
     pub light: Summary,
     /// The projector's part.
@@ -191,7 +191,7 @@ pub enum Fault {
     Body,
 }
 
-impl Checked {
+impl CheckSummary {
     /// `None` of no points.
     pub fn of(offsets: &[Offset]) -> Option<Self> {
         let all = |part: &dyn Fn(&Offset) -> Option<DVec2>| {

@@ -4,14 +4,14 @@
 //! turns must be large enough about two axes.
 
 use crate::dense::svd;
-use crate::trajectory::{Stamped, POSITION_NOISE_M, ROTATION_NOISE_RAD};
+use crate::trajectory::{TimedPose, POSITION_NOISE_M, ROTATION_NOISE_RAD};
 use glam::{DMat3, DVec3};
 use thiserror::Error;
 
 /// Poses that are collected while the wand is turned about its tip.
 #[derive(Clone, Debug, Default)]
 pub struct Pivot {
-    poses: Vec<Stamped>,
+    poses: Vec<TimedPose>,
 }
 
 /// A wand's tip.
@@ -63,7 +63,7 @@ pub const LEAST_TURN_DEG: f64 = 5.0;
 
 impl Pivot {
     /// Adds a pose of the wand.
-    pub fn add(&mut self, pose: Stamped) {
+    pub fn add(&mut self, pose: TimedPose) {
         self.poses.push(pose);
     }
 
@@ -164,7 +164,7 @@ mod tests {
             let normal = |k: u64| DVec3::from_array(draws.normal3(u64::from(i) * 2 + k));
             let rotation = so3_exp(normal(0) * ROTATION_NOISE_RAD * noise) * turn;
             let position = PLACE - turn * TIP + normal(1) * POSITION_NOISE_M * noise;
-            pivot.add(Stamped { stamp_ns: i64::from(i) * 4_000_000, position, rotation });
+            pivot.add(TimedPose { stamp_ns: i64::from(i) * 4_000_000, position, rotation });
         }
         pivot
     }

@@ -15,7 +15,7 @@ pub const ROTATION_NOISE_RAD: f64 = 0.05 * std::f64::consts::PI / 180.0;
 
 /// A pose at an instant.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub struct Stamped {
+pub struct TimedPose {
     /// The instant by the host's clock, nanoseconds.
     pub stamp_ns: i64,
     /// Of the body's origin, metres.
@@ -24,7 +24,7 @@ pub struct Stamped {
     pub rotation: DQuat,
 }
 
-impl Stamped {
+impl TimedPose {
     /// From the vocabulary of trackers; `None` where the pose is not a pose.
     pub fn new(stamp_ns: i64, pose: &Pose) -> Option<Self> {
         let rotation = DQuat::from_array(pose.rotation_xyzw);
@@ -76,7 +76,7 @@ const SIDE: usize = 2;
 impl Trajectory {
     /// From samples in any order; those at the same instant count once. Where the samples lie further apart than three
     /// times their usual distance, the path is unknown.
-    pub fn new(samples: &[Stamped]) -> Self {
+    pub fn new(samples: &[TimedPose]) -> Self {
         let mut sorted = samples.to_vec();
         sorted.sort_by_key(|s| s.stamp_ns);
         sorted.dedup_by_key(|s| s.stamp_ns);
@@ -135,7 +135,7 @@ impl Parabola {
     }
 }
 
-fn parabola(samples: &[Stamped], middle: usize, longest_gap_ns: i64) -> Parabola {
+fn parabola(samples: &[TimedPose], middle: usize, longest_gap_ns: i64) -> Parabola {
     let here = samples[middle];
     let near = |i: &usize| {
         let apart = samples[*i].stamp_ns.abs_diff(here.stamp_ns);
@@ -190,12 +190,12 @@ mod tests {
 
     fn path(noise: f64) -> Trajectory {
         let draws = Draws::new(5);
-        let samples: Vec<Stamped> = (0..480)
+        let samples: Vec<TimedPose> = (0..480)
             .map(|i| {
                 let (position, rotation) = truth(i as f64 / 240.0);
                 let stamp_ns = i * 1_000_000_000 / 240;
                 let e = DVec3::from_array(draws.normal3(i as u64)) * noise;
-                Stamped { stamp_ns, position: position + e, rotation }
+                TimedPose { stamp_ns, position: position + e, rotation }
             })
             .collect();
         Trajectory::new(&samples)
@@ -234,9 +234,9 @@ mod tests {
 
     #[test]
     fn outside_and_in_gaps_the_path_is_unknown() {
-        let samples: Vec<Stamped> = (0..100)
+        let samples: Vec<TimedPose> = (0..100)
             .filter(|i| !(40..60).contains(i))
-            .map(|i| Stamped { stamp_ns: i * 4_000_000, position: DVec3::ZERO, rotation: DQuat::IDENTITY })
+            .map(|i| TimedPose { stamp_ns: i * 4_000_000, position: DVec3::ZERO, rotation: DQuat::IDENTITY })
             .collect();
         let path = Trajectory::new(&samples);
         assert!(path.at(-1, 0.0).is_none() && path.at(400_000_000, 0.0).is_none());

@@ -24,7 +24,7 @@ const MOST_KNOWN: usize = 4096;
 const MOST_DEVICES: usize = 64;
 
 /// One entry whose name is known.
-struct Known<'a> {
+struct NamedEntry<'a> {
     section: &'a str,
     name: &'a str,
     owner: Owner,
@@ -33,7 +33,7 @@ struct Known<'a> {
     entry: &'a Entry,
 }
 
-impl Known<'_> {
+impl NamedEntry<'_> {
     fn path(&self) -> String {
         joined(self.section, self.name)
     }
@@ -59,7 +59,7 @@ struct Device<'a> {
 }
 
 /// Every entry whose name is known.
-fn known(all: &Entries) -> Vec<Known<'_>> {
+fn known(all: &Entries) -> Vec<NamedEntry<'_>> {
     let mut out = Vec::new();
     for (section, inside) in &all.sections {
         for (name, entry) in inside {
@@ -80,13 +80,13 @@ fn known(all: &Entries) -> Vec<Known<'_>> {
                 ) => continue,
                 _ => (owner, role),
             };
-            out.push(Known { section, name, owner, role, from_camera, entry });
+            out.push(NamedEntry { section, name, owner, role, from_camera, entry });
         }
     }
     out
 }
 
-fn devices<'a>(known: &[Known<'a>]) -> Vec<Device<'a>> {
+fn devices<'a>(known: &[NamedEntry<'a>]) -> Vec<Device<'a>> {
     let mut out: Vec<Device> = Vec::new();
     for k in known {
         let is_one = match k.role {
@@ -186,11 +186,11 @@ struct Parts<'a, 'k> {
     device: &'k Device<'a>,
     /// Whether the section has the intrinsics of another device too, so that entries without an owner are of both.
     is_shared: bool,
-    scope: Vec<&'k Known<'a>>,
+    scope: Vec<&'k NamedEntry<'a>>,
 }
 
 impl<'a, 'k> Parts<'a, 'k> {
-    fn of(device: &'k Device<'a>, devices: &[Device], known: &'k [Known<'a>]) -> Self {
+    fn of(device: &'k Device<'a>, devices: &[Device], known: &'k [NamedEntry<'a>]) -> Self {
         let base = device.section;
         let inside = |section: &str, of: &str| {
             of.is_empty() || section.strip_prefix(of).is_some_and(|s| s.is_empty() || s.starts_with('/'))
@@ -200,7 +200,7 @@ impl<'a, 'k> Parts<'a, 'k> {
             nearest.max_by_key(|d| d.section.len()).is_some_and(|d| d.section != base)
         };
         let has_camera = devices.iter().any(|d| d.section == base && d.owner == Owner::Camera);
-        let is_mine = |k: &Known| {
+        let is_mine = |k: &NamedEntry| {
             let is_owner = match &k.owner {
                 Owner::Own => true,
                 // Beside one device without a name, "camera_rotation" is that of this device.
@@ -213,7 +213,7 @@ impl<'a, 'k> Parts<'a, 'k> {
                 || k.section.is_empty() && devices.iter().all(|d| !d.section.is_empty());
             is_owner && (is_here || is_around)
         };
-        let mut scope: Vec<&Known> = known.iter().filter(|k| is_mine(k)).collect();
+        let mut scope: Vec<&NamedEntry> = known.iter().filter(|k| is_mine(k)).collect();
         // The device's own words first, then those of its section, then those around it.
         scope.sort_by_key(|k| {
             (k.owner != device.owner, !inside(k.section, base), std::cmp::Reverse(k.section.len()))
@@ -222,17 +222,17 @@ impl<'a, 'k> Parts<'a, 'k> {
         Self { device, is_shared, scope }
     }
 
-    fn with(&self, role: Role) -> impl Iterator<Item = &'k Known<'a>> + '_ {
+    fn with(&self, role: Role) -> impl Iterator<Item = &'k NamedEntry<'a>> + '_ {
         self.scope.iter().copied().filter(move |k| k.role == role)
     }
 
     /// Entries of this role that are the device's by its name; of those without an owner only where no other device is in
     /// the section.
-    fn own(&self, role: Role) -> impl Iterator<Item = &'k Known<'a>> + '_ {
+    fn own(&self, role: Role) -> impl Iterator<Item = &'k NamedEntry<'a>> + '_ {
         self.with(role).filter(|k| !self.is_shared || k.owner == self.device.owner)
     }
 
-    fn number(&self, role: Role) -> Option<(&'k Known<'a>, f64)> {
+    fn number(&self, role: Role) -> Option<(&'k NamedEntry<'a>, f64)> {
         self.own(role).find_map(|k| match k.entry {
             Entry::Number(v) => Some((k, *v)),
             _ => None,
@@ -242,25 +242,25 @@ impl<'a, 'k> Parts<'a, 'k> {
 
 /// What was used of a file, for the messages.
 #[derive(Default)]
-struct Used {
+struct UseNotes {
     paths: BTreeSet<String>,
     found: Vec<String>,
 }
 
-impl Used {
-    fn note(&mut self, part: &str, known: &Known) {
+impl UseNotes {
+    fn note(&mut self, part: &str, known: &NamedEntry) {
         self.paths.insert(known.path());
         self.found.push(format!("{part}: {}", known.path()));
     }
 }
 
 /// Two entries say the same thing differently.
-fn contradiction(a: &Known, b: &Known, what: &str) -> StorageError {
+fn contradiction(a: &NamedEntry, b: &NamedEntry, what: &str) -> StorageError {
     let problem = format!("and {:?} tell different {what}; leave the right one in the file", b.path());
     StorageError::value(&a.path(), problem)
 }
 
-fn intrinsics_of(k: &Known) -> Result<[f64; 4], StorageError> {
+fn intrinsics_of(k: &NamedEntry) -> Result<[f64; 4], StorageError> {
     let (m, name) = (k.matrix()?, k.path());
     let is_square = (m.rows, m.columns) == (3, 3) || (m.rows.min(m.columns) == 1 && m.data.len() == 9);
     if m.data.len() == 4 && m.rows.min(m.columns) == 1 {
@@ -285,8 +285,8 @@ fn intrinsics_of(k: &Known) -> Result<[f64; 4], StorageError> {
     Ok([fx, fy, cx, cy])
 }
 
-fn intrinsics(parts: &Parts, used: &mut Used) -> Result<(String, Intrinsics), StorageError> {
-    let mut first: Option<(&Known, [f64; 4])> = None;
+fn intrinsics(parts: &Parts, used: &mut UseNotes) -> Result<(String, Intrinsics), StorageError> {
+    let mut first: Option<(&NamedEntry, [f64; 4])> = None;
     for k in parts.own(Role::Intrinsics).filter(|k| matches!(k.entry, Entry::Matrix(_))) {
         let values = intrinsics_of(k)?;
         match &first {
@@ -316,7 +316,7 @@ fn intrinsics(parts: &Parts, used: &mut Used) -> Result<(String, Intrinsics), St
     Ok((k.path(), Intrinsics { fx, fy, cx: cx + 0.5, cy: cy + 0.5 }))
 }
 
-fn rotation_of(k: &Known) -> Result<DMat3, StorageError> {
+fn rotation_of(k: &NamedEntry) -> Result<DMat3, StorageError> {
     let (r, name) = (k.matrix()?, k.path());
     let matrix = match (r.rows, r.columns, r.data.len()) {
         (3, 3, _) | (1, 9, _) | (9, 1, _) => DMat3::from_cols_slice(&r.data).transpose(),
@@ -342,7 +342,7 @@ fn rotation_of(k: &Known) -> Result<DMat3, StorageError> {
 }
 
 /// Rotation and translation of a matrix of four columns.
-fn rigid(k: &Known) -> Result<(DMat3, DVec3), StorageError> {
+fn rigid(k: &NamedEntry) -> Result<(DMat3, DVec3), StorageError> {
     let (m, name) = (k.matrix()?, k.path());
     let wrong = |what: String| Err(StorageError::value(&name, what));
     let is_flat = m.rows.min(m.columns) == 1 && matches!(m.data.len(), 12 | 16);
@@ -363,14 +363,17 @@ fn rigid(k: &Known) -> Result<(DMat3, DVec3), StorageError> {
 }
 
 /// A pose with the entries that tell it.
-struct Told<'k, 'a> {
+struct PoseEntries<'k, 'a> {
     rotation: DMat3,
     translation: DVec3,
-    by: [&'k Known<'a>; 2],
+    by: [&'k NamedEntry<'a>; 2],
 }
 
-fn told_pose<'k, 'a>(parts: &Parts<'a, 'k>, used: &mut Used) -> Result<Option<Told<'k, 'a>>, StorageError> {
-    let mut told: Vec<Told> = Vec::new();
+fn told_pose<'k, 'a>(
+    parts: &Parts<'a, 'k>,
+    used: &mut UseNotes,
+) -> Result<Option<PoseEntries<'k, 'a>>, StorageError> {
+    let mut told: Vec<PoseEntries> = Vec::new();
     for role in [Role::Pose, Role::Placement] {
         for k in parts.with(role).filter(|k| matches!(k.entry, Entry::Matrix(_))) {
             let (r, t) = rigid(k)?;
@@ -379,11 +382,11 @@ fn told_pose<'k, 'a>(parts: &Parts<'a, 'k>, used: &mut Used) -> Result<Option<To
                 _ => (r, t),
             };
             used.note("pose", k);
-            told.push(Told { rotation, translation, by: [k, k] });
+            told.push(PoseEntries { rotation, translation, by: [k, k] });
         }
     }
     let is_near = |a: DMat3, b: DMat3| (a - b).to_cols_array().iter().all(|v| v.abs() < 2e-3);
-    let mut turn: Option<(&Known, DMat3)> = None;
+    let mut turn: Option<(&NamedEntry, DMat3)> = None;
     for k in parts.with(Role::Rotation).filter(|k| matches!(k.entry, Entry::Matrix(_))) {
         let r = rotation_of(k)?;
         if let Some((other, first)) = turn.filter(|(_, first)| !is_near(*first, r)) {
@@ -397,7 +400,7 @@ fn told_pose<'k, 'a>(parts: &Parts<'a, 'k>, used: &mut Used) -> Result<Option<To
         used.note("rotation", k);
         turn = turn.or(Some((k, r)));
     }
-    let mut shift: Option<(&Known, DVec3)> = None;
+    let mut shift: Option<(&NamedEntry, DVec3)> = None;
     for k in parts.with(Role::Translation).filter(|k| matches!(k.entry, Entry::Matrix(_))) {
         let t = k.matrix()?;
         if t.data.len() != 3 {
@@ -415,7 +418,7 @@ fn told_pose<'k, 'a>(parts: &Parts<'a, 'k>, used: &mut Used) -> Result<Option<To
     }
     match (turn, shift, told.is_empty()) {
         (Some((a, rotation)), Some((b, translation)), _) => {
-            told.push(Told { rotation, translation, by: [a, b] });
+            told.push(PoseEntries { rotation, translation, by: [a, b] });
         }
         (Some(_), None, true) => return Err(missing(parts, "translation")),
         (None, Some(_), true) => return Err(missing(parts, "rotation")),
@@ -462,7 +465,7 @@ fn no_pose(all: &Entries, parts: &Parts) -> StorageError {
 }
 
 /// Whether the file says that its lens is a fisheye's; `None` if it says nothing.
-fn says_fisheye(parts: &Parts, used: &mut Used) -> Result<Option<(String, bool)>, StorageError> {
+fn says_fisheye(parts: &Parts, used: &mut UseNotes) -> Result<Option<(String, bool)>, StorageError> {
     let mut said: Option<(String, bool)> = None;
     for k in parts.with(Role::LensModel) {
         used.paths.insert(k.path());
@@ -493,7 +496,7 @@ fn says_fisheye(parts: &Parts, used: &mut Used) -> Result<Option<(String, bool)>
 }
 
 /// The lens, by the coefficients in OpenCV's order.
-fn lens(parts: &Parts, kind: LensKind, used: &mut Used) -> Result<Lens, StorageError> {
+fn lens(parts: &Parts, kind: LensKind, used: &mut UseNotes) -> Result<Lens, StorageError> {
     let fisheye = match (kind, says_fisheye(parts, used)?) {
         (LensKind::Fisheye, Some((name, false))) => {
             let what =
@@ -504,7 +507,7 @@ fn lens(parts: &Parts, kind: LensKind, used: &mut Used) -> Result<Lens, StorageE
         (LensKind::Auto, said) => said.is_some_and(|(_, fisheye)| fisheye),
     };
     let mut first: Option<(String, Vec<f64>)> = None;
-    let mut from: Option<&Known> = None;
+    let mut from: Option<&NamedEntry> = None;
     for k in parts.own(Role::Distortion) {
         let data = match k.entry {
             Entry::Number(_) => continue,
@@ -549,8 +552,8 @@ fn lens(parts: &Parts, kind: LensKind, used: &mut Used) -> Result<Lens, StorageE
     }
 }
 
-fn image_size(parts: &Parts, used: &mut Used) -> Result<Option<(u32, u32)>, StorageError> {
-    let mut sizes: Vec<(&Known, f64, f64)> = Vec::new();
+fn image_size(parts: &Parts, used: &mut UseNotes) -> Result<Option<(u32, u32)>, StorageError> {
+    let mut sizes: Vec<(&NamedEntry, f64, f64)> = Vec::new();
     if let (Some((k, w)), Some((l, h))) = (parts.number(Role::Width), parts.number(Role::Height)) {
         used.paths.extend([k.path(), l.path()]);
         sizes.push((k, w, h));
@@ -579,7 +582,13 @@ fn image_size(parts: &Parts, used: &mut Used) -> Result<Option<(u32, u32)>, Stor
 }
 
 /// What was not used: entries by their paths, and other devices by their names.
-fn unread(all: &Entries, known: &[Known], devices: &[Device], parts: &Parts, used: &Used) -> Vec<String> {
+fn unread(
+    all: &Entries,
+    known: &[NamedEntry],
+    devices: &[Device],
+    parts: &Parts,
+    used: &UseNotes,
+) -> Vec<String> {
     let chosen = parts.device;
     let is_others = |section: &str, owner: &Owner| {
         let of = |d: &Device| {
@@ -591,7 +600,8 @@ fn unread(all: &Entries, known: &[Known], devices: &[Device], parts: &Parts, use
         devices.iter().find(|d| of(d)).map(|d| d.label.clone())
     };
     let mut out: Vec<String> = Vec::new();
-    let by_name: BTreeMap<(&str, &str), &Known> = known.iter().map(|k| ((k.section, k.name), k)).collect();
+    let by_name: BTreeMap<(&str, &str), &NamedEntry> =
+        known.iter().map(|k| ((k.section, k.name), k)).collect();
     for (section, inside) in &all.sections {
         for (name, entry) in inside {
             let path = joined(section, name);
@@ -623,7 +633,7 @@ fn unread(all: &Entries, known: &[Known], devices: &[Device], parts: &Parts, use
 }
 
 /// Whose frame the pose is told in.
-fn frame(told: &Told, parts: &Parts, devices: &[Device], known: &[Known]) -> Frame {
+fn frame(told: &PoseEntries, parts: &Parts, devices: &[Device], known: &[NamedEntry]) -> Frame {
     if let Some(k) = told.by.iter().find(|k| k.from_camera) {
         return Frame::Camera { name: k.path() };
     }
@@ -632,14 +642,15 @@ fn frame(told: &Told, parts: &Parts, devices: &[Device], known: &[Known]) -> Fra
     let mut others = devices.iter().filter(|d| *d != parts.device);
     let other = others.clone().find(|d| d.section == parts.device.section || !is_within(told, parts));
     if let Some(other) = other.filter(|_| is_between && (parts.is_shared || !is_within(told, parts))) {
-        let is_its =
-            |k: &&Known| k.section == other.section && k.owner == other.owner && k.role == Role::Intrinsics;
+        let is_its = |k: &&NamedEntry| {
+            k.section == other.section && k.owner == other.owner && k.role == Role::Intrinsics
+        };
         let name = known.iter().find(is_its);
-        return Frame::Camera { name: name.map_or(other.label.clone(), Known::path) };
+        return Frame::Camera { name: name.map_or(other.label.clone(), NamedEntry::path) };
     }
     let is_origin = |d: &&Device| {
         let theirs = Parts::of(d, devices, known);
-        told_pose(&theirs, &mut Used::default()).ok().flatten().is_some_and(|t| {
+        told_pose(&theirs, &mut UseNotes::default()).ok().flatten().is_some_and(|t| {
             t.translation == DVec3::ZERO
                 && (t.rotation - DMat3::IDENTITY).to_cols_array().iter().all(|v| *v == 0.0)
         })
@@ -651,7 +662,7 @@ fn frame(told: &Told, parts: &Parts, devices: &[Device], known: &[Known]) -> Fra
 }
 
 /// Whether the pose stands in the device's own section.
-fn is_within(told: &Told, parts: &Parts) -> bool {
+fn is_within(told: &PoseEntries, parts: &Parts) -> bool {
     told.by.iter().all(|k| k.section.starts_with(parts.device.section) || parts.device.section.is_empty())
 }
 
@@ -671,7 +682,7 @@ pub(super) fn read(all: &Entries, options: &ReadOptions) -> Result<StoredCalibra
     }
     let device = choose(all, &devices, options.device)?;
     let parts = Parts::of(&device, &devices, &known);
-    let mut used = Used::default();
+    let mut used = UseNotes::default();
     let (k_name, k) = intrinsics(&parts, &mut used)?;
     let size = image_size(&parts, &mut used)?;
     let columns = size.map_or(options.raster.width(), |s| s.0);

@@ -18,7 +18,7 @@ const DIGITS: usize = 12;
 pub fn commit(from_package_to_top: TokenStream) -> TokenStream {
     let way = from_package_to_top.to_string();
     let package = std::env::var_os("CARGO_MANIFEST_DIR").map(PathBuf::from).unwrap_or_default();
-    let found = Found::at(&package.join(way.trim_matches('"')));
+    let found = FolderCommit::at(&package.join(way.trim_matches('"')));
     // Named as read, so that only the using crate is recompiled when they change.
     let read: String = (found.read.iter().filter_map(|p| p.to_str()))
         .map(|path| format!("const _: &[u8] = include_bytes!({path:?});\n"))
@@ -29,13 +29,13 @@ pub fn commit(from_package_to_top: TokenStream) -> TokenStream {
 
 /// The commit of a folder.
 #[derive(Debug, PartialEq)]
-struct Found {
+struct FolderCommit {
     text: String,
     /// Files that change when the commit does.
     read: Vec<PathBuf>,
 }
 
-impl Found {
+impl FolderCommit {
     /// For the work tree whose top is `top`. A work tree further up belongs to another project that happens to
     /// contain the sources.
     fn at(top: &Path) -> Self {
@@ -161,11 +161,11 @@ mod tests {
         let root = Folder::new("archive");
         root.write(".git/HEAD", &"a".repeat(40));
         root.write("unpacked/Cargo.toml", "");
-        let unknown = Found { text: "unknown".into(), read: Vec::new() };
-        assert_eq!(Found::at(&root.0.join("unpacked")), unknown);
-        assert_eq!(Found::at(&root.0.join("nowhere")), unknown);
+        let unknown = FolderCommit { text: "unknown".into(), read: Vec::new() };
+        assert_eq!(FolderCommit::at(&root.0.join("unpacked")), unknown);
+        assert_eq!(FolderCommit::at(&root.0.join("nowhere")), unknown);
         // The folder itself has a commit, but it is not a work tree that Git knows, so nothing is said about changes.
-        assert_eq!(Found::at(&root.0).text, "a".repeat(12));
+        assert_eq!(FolderCommit::at(&root.0).text, "a".repeat(12));
     }
 
     #[test]
@@ -184,14 +184,14 @@ mod tests {
         }
         root.write("tracked", "1");
         assert!(git(&["add", "tracked"]) && git(&["commit", "-q", "-m", "first"]));
-        let clean = Found::at(&root.0).text;
+        let clean = FolderCommit::at(&root.0).text;
         assert!(clean.len() == 12 && clean.chars().all(|c| c.is_ascii_hexdigit()), "{clean}");
         root.write("untracked", "1");
-        assert_eq!(Found::at(&root.0).text, clean);
+        assert_eq!(FolderCommit::at(&root.0).text, clean);
         root.write("tracked", "2");
-        assert_eq!(Found::at(&root.0).text, format!("{clean}-dirty"));
+        assert_eq!(FolderCommit::at(&root.0).text, format!("{clean}-dirty"));
         assert!(git(&["commit", "-q", "-a", "-m", "second"]));
-        let next = Found::at(&root.0).text;
+        let next = FolderCommit::at(&root.0).text;
         assert!(next.len() == 12 && next != clean, "{next}");
     }
 }

@@ -59,7 +59,8 @@ pub fn behind<P: HidPort + Send + 'static>(
             return Err(failed(e));
         }
         shown.name = format!("{} behind {}", found.name(), shown.name);
-        shown.out = Box::new(Fed { out: shown.out, watch: Watch::start(controller).map_err(no_thread)? });
+        shown.out =
+            Box::new(ControllerFeed { out: shown.out, watch: Watch::start(controller).map_err(no_thread)? });
         Ok(shown)
     })
 }
@@ -151,13 +152,13 @@ fn look_until<P: HidPort>(controller: &mut Dlpc900<P>, over: &AtomicBool) -> Opt
 }
 
 /// A display in front of a controller.
-struct Fed {
+struct ControllerFeed {
     // Dropped first: the controller rests while the display still shows black.
     watch: Watch,
     out: Box<dyn ScanOut>,
 }
 
-impl ScanOut for Fed {
+impl ScanOut for ControllerFeed {
     fn pixels(&mut self, frame: usize) -> Pixels<'_> {
         self.out.pixels(frame)
     }

@@ -16,7 +16,7 @@ use crate::scan_out::{DisplayError, Flip, Picture, Pixels, ScanOut};
 
 /// One scanned frame.
 #[derive(Clone, Debug, PartialEq, Eq)]
-pub struct Scanned {
+pub struct ScanFrame {
     /// The kernel's count of this blank.
     pub sequence: u32,
     /// When its first pixel was sent, on the rig's clock, nanoseconds.
@@ -49,7 +49,7 @@ pub struct FakeState {
     /// What was started last.
     pub setup: Option<Setup>,
     /// Everything that was scanned out, oldest first.
-    pub scanned: Vec<Scanned>,
+    pub scanned: Vec<ScanFrame>,
     /// A picture was written to while it was scanned out or waited.
     pub torn: u64,
     /// What is scanned out now is black.
@@ -184,7 +184,7 @@ impl FakeKms {
             let is_black = pixels.iter().all(|b| *b == 0);
             self.with(|s| {
                 s.is_black = is_black;
-                s.scanned.push(Scanned { sequence, at_ns, pixels });
+                s.scanned.push(ScanFrame { sequence, at_ns, pixels });
             });
             self.next += 1;
         }

@@ -48,12 +48,12 @@ pub struct Plan {
 struct Wish {
     owner: Owner,
     name: &'static str,
-    value: Wished,
+    value: Wishes,
     /// Bits are lost on a physical connector without it.
     is_needed: bool,
 }
 
-enum Wished {
+enum Wishes {
     Number(u64),
     Word(&'static [&'static str]),
 }
@@ -62,26 +62,26 @@ enum Wished {
 /// refresh. Names are the kernel's; each driver has some of them.
 const WISHES: [Wish; 16] = {
     use Owner::{Connector as C, Crtc, Plane};
-    const fn wish(owner: Owner, name: &'static str, value: Wished, is_needed: bool) -> Wish {
+    const fn wish(owner: Owner, name: &'static str, value: Wishes, is_needed: bool) -> Wish {
         Wish { owner, name, value, is_needed }
     }
     [
-        wish(C, "max bpc", Wished::Number(8), true),
-        wish(C, "Broadcast RGB", Wished::Word(&["Full"]), true),
-        wish(C, "Colorspace", Wished::Word(&["Default", "RGB_Wide_Gamut_Fixed_Point"]), false),
-        wish(C, "color format", Wished::Word(&["rgb", "RGB"]), false),
-        wish(C, "dithering mode", Wished::Word(&["off"]), false),
-        wish(C, "dither", Wished::Word(&["off"]), false),
-        wish(C, "underscan", Wished::Word(&["off"]), false),
-        wish(C, "scaling mode", Wished::Word(&["None"]), false),
-        wish(C, "HDR_OUTPUT_METADATA", Wished::Number(0), false),
-        wish(Crtc, "DEGAMMA_LUT", Wished::Number(0), false),
-        wish(Crtc, "CTM", Wished::Number(0), false),
-        wish(Crtc, "GAMMA_LUT", Wished::Number(0), false),
-        wish(Crtc, "VRR_ENABLED", Wished::Number(0), false),
-        wish(Plane, "rotation", Wished::Word(&["rotate-0"]), false),
-        wish(Plane, "alpha", Wished::Number(0xffff), false),
-        wish(Plane, "pixel blend mode", Wished::Word(&["None", "Pre-multiplied"]), false),
+        wish(C, "max bpc", Wishes::Number(8), true),
+        wish(C, "Broadcast RGB", Wishes::Word(&["Full"]), true),
+        wish(C, "Colorspace", Wishes::Word(&["Default", "RGB_Wide_Gamut_Fixed_Point"]), false),
+        wish(C, "color format", Wishes::Word(&["rgb", "RGB"]), false),
+        wish(C, "dithering mode", Wishes::Word(&["off"]), false),
+        wish(C, "dither", Wishes::Word(&["off"]), false),
+        wish(C, "underscan", Wishes::Word(&["off"]), false),
+        wish(C, "scaling mode", Wishes::Word(&["None"]), false),
+        wish(C, "HDR_OUTPUT_METADATA", Wishes::Number(0), false),
+        wish(Crtc, "DEGAMMA_LUT", Wishes::Number(0), false),
+        wish(Crtc, "CTM", Wishes::Number(0), false),
+        wish(Crtc, "GAMMA_LUT", Wishes::Number(0), false),
+        wish(Crtc, "VRR_ENABLED", Wishes::Number(0), false),
+        wish(Plane, "rotation", Wishes::Word(&["rotate-0"]), false),
+        wish(Plane, "alpha", Wishes::Number(0xffff), false),
+        wish(Plane, "pixel blend mode", Wishes::Word(&["None", "Pre-multiplied"]), false),
     ]
 };
 
@@ -208,9 +208,9 @@ fn check_timing(timing: &Timing, settings: &DisplaySettings) -> Result<(), Refus
 /// The value of `wish` for `property`; `None` if it does not take it.
 fn value_for(wish: &Wish, property: &Property) -> Option<u64> {
     match (&wish.value, &property.domain) {
-        (Wished::Number(n), Domain::Range(low, high)) => (low..=high).contains(&n).then_some(*n),
-        (Wished::Number(0), Domain::Blob) => Some(0),
-        (Wished::Word(words), Domain::Words(known)) => words.iter().find_map(|word| {
+        (Wishes::Number(n), Domain::Range(low, high)) => (low..=high).contains(&n).then_some(*n),
+        (Wishes::Number(0), Domain::Blob) => Some(0),
+        (Wishes::Word(words), Domain::Words(known)) => words.iter().find_map(|word| {
             known.iter().find(|(name, _)| name.eq_ignore_ascii_case(word)).map(|(_, value)| *value)
         }),
         _ => None,

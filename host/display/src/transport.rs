@@ -31,7 +31,7 @@ const REST_NS: i64 = 100_000_000;
 const END_WITHIN: Duration = Duration::from_millis(500);
 
 /// What shows pictures and shows black now, and what a panel must know of it.
-pub struct Shown {
+pub struct Showing {
     /// What shows pictures.
     pub out: Box<dyn ScanOut>,
     /// What the panel has to know.
@@ -43,7 +43,7 @@ pub struct Shown {
 }
 
 /// Opens a display, sets it up, and shows black. It may take seconds.
-pub type Opener = Arc<dyn Fn() -> Result<Shown, TransportError> + Send + Sync>;
+pub type Opener = Arc<dyn Fn() -> Result<Showing, TransportError> + Send + Sync>;
 
 /// The opener of a display on a graphics card that `card` opens, set up as `settings` say.
 pub fn on_card(
@@ -60,7 +60,7 @@ pub fn on_card(
         kms.start(&plan.setup).map_err(failed)?;
         let lent = kms.lender().map(|lender| format!(", lent by {lender}")).unwrap_or_default();
         let name = format!("display {} ({}){lent}", plan.setup.connector, plan.setup.timing);
-        Ok(Shown { out: kms, panel: plan.panel, name, warnings: plan.warnings })
+        Ok(Showing { out: kms, panel: plan.panel, name, warnings: plan.warnings })
     })
 }
 
@@ -94,8 +94,8 @@ pub fn set_guardian(command: Vec<OsString>) {
 }
 
 /// A display that shows black, with its guardian.
-struct Opened {
-    shown: Shown,
+struct OpenDisplay {
+    shown: Showing,
     guardian: Option<Guardian>,
 }
 
@@ -114,13 +114,13 @@ pub struct DisplayTransport {
     priority: u32,
     name: String,
     clock: Option<Arc<dyn HostClock>>,
-    opened: Option<Opened>,
+    opened: Option<OpenDisplay>,
     line: Option<Line>,
-    opening: Option<Receiver<Result<Opened, TransportError>>>,
+    opening: Option<Receiver<Result<OpenDisplay, TransportError>>>,
     warnings: Vec<String>,
 }
 
-fn open(opener: &Opener) -> Result<Opened, TransportError> {
+fn open(opener: &Opener) -> Result<OpenDisplay, TransportError> {
     let mut shown = opener()?;
     let guardian = match guardian(shown.out.as_ref()) {
         Ok(guardian) => guardian,
@@ -131,7 +131,7 @@ fn open(opener: &Opener) -> Result<Opened, TransportError> {
             None
         }
     };
-    Ok(Opened { shown, guardian })
+    Ok(OpenDisplay { shown, guardian })
 }
 
 fn guardian(out: &dyn ScanOut) -> std::io::Result<Option<Guardian>> {
@@ -170,7 +170,7 @@ impl DisplayTransport {
 
     /// Starts the thread of a panel that was opened.
     fn run(&mut self, now: HostTime) {
-        let Some(Opened { shown, guardian }) = self.opened.take() else { return };
+        let Some(OpenDisplay { shown, guardian }) = self.opened.take() else { return };
         let clock = self.clock.get_or_insert_with(|| {
             // Nobody gave a clock: the caller's time goes on from here.
             let start = Instant::now();
@@ -307,7 +307,7 @@ impl Transport for DisplayTransport {
 impl Drop for DisplayTransport {
     fn drop(&mut self) {
         self.end();
-        if let Some(Opened { mut shown, guardian }) = self.opened.take() {
+        if let Some(OpenDisplay { mut shown, guardian }) = self.opened.take() {
             shown.out.blacken();
             if let Some(guardian) = guardian {
                 guardian.dismiss();

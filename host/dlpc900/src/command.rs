@@ -297,14 +297,14 @@ impl<'a> Reply<'a> {
 
 /// Why a report was dropped.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Malformed {
+pub enum ReportFault {
     /// Shorter than a header.
     Short(usize),
     /// The header's length does not fit the controller's buffer, or leaves no room for an opcode.
     Length(u16),
 }
 
-impl core::fmt::Display for Malformed {
+impl core::fmt::Display for ReportFault {
     fn fmt(&self, f: &mut core::fmt::Formatter<'_>) -> core::fmt::Result {
         match self {
             Self::Short(n) => write!(f, "a report of {n} bytes is shorter than a header"),
@@ -328,16 +328,16 @@ impl Assembler {
 
     /// Adds a report; true when the message in `buffer[..wanted]` is complete. `least` and `total` interpret the
     /// header.
-    fn push(&mut self, report: &[u8], header: usize, least: u16) -> Result<bool, Malformed> {
+    fn push(&mut self, report: &[u8], header: usize, least: u16) -> Result<bool, ReportFault> {
         if self.filled >= self.wanted {
             if report.len() < header {
-                return Err(Malformed::Short(report.len()));
+                return Err(ReportFault::Short(report.len()));
             }
             let length = u16::from_le_bytes([report[2], report[3]]);
             // A command's length counts its opcode, which the header holds too.
             let total = 4 + usize::from(length);
             if length < least || total > BUFFER_BYTES {
-                return Err(Malformed::Length(length));
+                return Err(ReportFault::Length(length));
             }
             (self.filled, self.wanted) = (0, total);
         }
@@ -361,7 +361,7 @@ impl Default for CommandAssembler {
 impl CommandAssembler {
     /// Adds one report; returns the command when it is complete. A malformed first report is dropped, and the next one
     /// starts anew.
-    pub fn push(&mut self, report: &[u8]) -> Result<Option<Command<'_>>, Malformed> {
+    pub fn push(&mut self, report: &[u8]) -> Result<Option<Command<'_>>, ReportFault> {
         if !self.0.push(report, COMMAND_HEADER, 2)? {
             return Ok(None);
         }
@@ -389,7 +389,7 @@ impl Default for ReplyAssembler {
 
 impl ReplyAssembler {
     /// Adds one report; returns the reply when it is complete.
-    pub fn push(&mut self, report: &[u8]) -> Result<Option<Reply<'_>>, Malformed> {
+    pub fn push(&mut self, report: &[u8]) -> Result<Option<Reply<'_>>, ReportFault> {
         if !self.0.push(report, REPLY_HEADER, 0)? {
             return Ok(None);
         }
@@ -465,9 +465,9 @@ mod tests {
     #[test]
     fn lengths_that_cannot_be_are_refused_and_the_next_report_is_read_afresh() {
         let mut a = CommandAssembler::default();
-        assert_eq!(a.push(&[0x40, 0, 1, 0, 0, 0x11]), Err(Malformed::Length(1)));
-        assert_eq!(a.push(&[0x40, 0, 0xfd, 1, 0, 0x11]), Err(Malformed::Length(509)));
-        assert_eq!(a.push(&[0x40, 0, 2]), Err(Malformed::Short(3)));
+        assert_eq!(a.push(&[0x40, 0, 1, 0, 0, 0x11]), Err(ReportFault::Length(1)));
+        assert_eq!(a.push(&[0x40, 0, 0xfd, 1, 0, 0x11]), Err(ReportFault::Length(509)));
+        assert_eq!(a.push(&[0x40, 0, 2]), Err(ReportFault::Short(3)));
         let c = Command::read(1, Opcode::MAIN_STATUS, &[]);
         assert_eq!(a.push(&only_report(&c)), Ok(Some(c)));
     }

@@ -5,7 +5,7 @@ use std::sync::{Arc, Mutex, PoisonError};
 use std::time::Duration;
 
 use super::command::{
-    Command, Malformed, Opcode, ReplyAssembler, TooLong, MAX_BMP_BYTES, MAX_REPLY_DATA, REPORT_BYTES,
+    Command, Opcode, ReplyAssembler, ReportFault, TooLong, MAX_BMP_BYTES, MAX_REPLY_DATA, REPORT_BYTES,
 };
 use super::lut::{DisplayMode, Dmd};
 use super::port::POLL;
@@ -225,7 +225,7 @@ impl<P: HidPort> Dlpc900<P> {
                     self.counters.replies += 1;
                     return Ok((refused, data));
                 }
-                Ok(Some(_)) | Err(Malformed::Short(_) | Malformed::Length(_)) => {
+                Ok(Some(_)) | Err(ReportFault::Short(_) | ReportFault::Length(_)) => {
                     stale += 1;
                     self.counters.stale += 1;
                     if stale > MOST_STALE {

@@ -5,7 +5,7 @@ use dpm_common::files::{keep_old, write_atomically};
 use dpm_device::regular_file;
 use dpm_rig::config::{Overrides, Purpose, RigConfig, MAX_FILE_BYTES};
 use dpm_rig::parameters::desk::{Saver, Setting, ToKeep};
-use dpm_rig::results::{check_known, keep, Moved, Results};
+use dpm_rig::results::{check_known, keep, NudgeTarget, Results};
 use dpm_rig::rig::Rig;
 use std::io::Write;
 use std::path::{Path, PathBuf};
@@ -71,8 +71,8 @@ fn motions(path: &Path, rig: &Rig, kept: &ToKeep) -> Result<Option<Results>, Str
         );
     }
     let mut results = Results::open(None, path, &rig.config).map_err(|e| e.to_string())?;
-    let moved = kept.projector.iter().map(|motion| (Moved::Projector, motion));
-    let bodies = kept.bodies.iter().map(|(name, motion)| (Moved::Body(name.clone()), motion));
+    let moved = kept.projector.iter().map(|motion| (NudgeTarget::Projector, motion));
+    let bodies = kept.bodies.iter().map(|(name, motion)| (NudgeTarget::Body(name.clone()), motion));
     for (what, motion) in moved.chain(bodies) {
         check_known(&results, &what).map_err(|e| e.to_string())?;
         keep(&mut results, &rig.config, &what, motion);

@@ -14,7 +14,7 @@ const FRESH: u8 = 0b100;
 const INDEX: u8 = 0b011;
 
 #[derive(Debug)]
-struct Shared<T> {
+struct Slots<T> {
     cells: [UnsafeCell<T>; 3],
     /// Index of the middle cell, and [`FRESH`].
     middle: CachePadded<AtomicU8>,
@@ -23,26 +23,26 @@ struct Shared<T> {
 // SAFETY: a cell is accessed only by the side that owns its index at the time; ownership moves through `middle` with
 // acquire and release on both sides. Values cross threads, so T must be Send; two threads never share a reference to
 // one.
-unsafe impl<T: Send> Sync for Shared<T> {}
+unsafe impl<T: Send> Sync for Slots<T> {}
 
 /// The writing side.
 #[derive(Debug)]
 pub struct Publisher<T> {
-    shared: Arc<Shared<T>>,
+    shared: Arc<Slots<T>>,
     back: u8,
 }
 
 /// The reading side.
 #[derive(Debug)]
 pub struct Reader<T> {
-    shared: Arc<Shared<T>>,
+    shared: Arc<Slots<T>>,
     front: u8,
 }
 
 /// A slot in which the newest value wins. The reader sees `initial` until something is published.
 pub fn latest<T: Clone + Send>(initial: T) -> (Publisher<T>, Reader<T>) {
     let cells = [initial.clone(), initial.clone(), initial].map(UnsafeCell::new);
-    let shared = Arc::new(Shared { cells, middle: CachePadded::new(AtomicU8::new(1)) });
+    let shared = Arc::new(Slots { cells, middle: CachePadded::new(AtomicU8::new(1)) });
     (Publisher { shared: shared.clone(), back: 0 }, Reader { shared, front: 2 })
 }
 

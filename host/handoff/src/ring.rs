@@ -9,7 +9,7 @@ use crate::sync::{Arc, AtomicUsize, Ordering, UnsafeCell};
 use crossbeam::utils::CachePadded;
 use std::mem::MaybeUninit;
 
-struct Shared<T> {
+struct RingState<T> {
     cells: Box<[UnsafeCell<MaybeUninit<T>>]>,
     /// Number of values ever taken.
     head: CachePadded<AtomicUsize>,
@@ -20,16 +20,16 @@ struct Shared<T> {
 // SAFETY: the producer accesses the cell at a position before it stores a greater `tail` (release), and the consumer
 // accesses it after it loads that `tail` (acquire), and the other way round through `head`. So accesses never overlap;
 // values move, hence Send.
-unsafe impl<T: Send> Sync for Shared<T> {}
+unsafe impl<T: Send> Sync for RingState<T> {}
 
-impl<T> Shared<T> {
+impl<T> RingState<T> {
     fn cell(&self, position: usize) -> &UnsafeCell<MaybeUninit<T>> {
         // The capacity is a power of two, so wrapping positions stay consistent.
         &self.cells[position & (self.cells.len() - 1)]
     }
 }
 
-impl<T> Drop for Shared<T> {
+impl<T> Drop for RingState<T> {
     fn drop(&mut self) {
         let (mut head, tail) = (self.head.load(Ordering::Relaxed), self.tail.load(Ordering::Relaxed));
         while head != tail {
@@ -44,7 +44,7 @@ impl<T> Drop for Shared<T> {
 
 /// The producer's side.
 pub struct Producer<T> {
-    shared: Arc<Shared<T>>,
+    shared: Arc<RingState<T>>,
     tail: usize,
     head_seen: usize,
     capacity: usize,
@@ -52,7 +52,7 @@ pub struct Producer<T> {
 
 /// The consumer's side.
 pub struct Consumer<T> {
-    shared: Arc<Shared<T>>,
+    shared: Arc<RingState<T>>,
     head: usize,
     tail_seen: usize,
 }
@@ -73,7 +73,7 @@ impl<T> std::fmt::Debug for Consumer<T> {
 pub fn ring<T: Send>(capacity: usize) -> (Producer<T>, Consumer<T>) {
     let capacity = capacity.max(1);
     let cells = (0..capacity.next_power_of_two()).map(|_| UnsafeCell::new(MaybeUninit::uninit())).collect();
-    let shared = Arc::new(Shared {
+    let shared = Arc::new(RingState {
         cells,
         head: CachePadded::new(AtomicUsize::new(0)),
         tail: CachePadded::new(AtomicUsize::new(0)),
@@ -265,8 +265,8 @@ mod tests {
 
     #[test]
     fn drops_each_value_once() {
-        struct Counted<'a>(&'a Count);
-        impl Drop for Counted<'_> {
+        struct DropCount<'a>(&'a Count);
+        impl Drop for DropCount<'_> {
             fn drop(&mut self) {
                 self.0.fetch_add(1, SeqCst);
             }
@@ -274,7 +274,7 @@ mod tests {
         let dropped = Count::new(0);
         let (mut producer, mut consumer) = ring(4);
         for _ in 0..4 {
-            assert!(producer.push(Counted(&dropped)).is_ok());
+            assert!(producer.push(DropCount(&dropped)).is_ok());
         }
         drop(consumer.pop());
         assert_eq!(dropped.load(SeqCst), 1);

@@ -39,7 +39,7 @@ impl WaitPolicy {
 }
 
 #[derive(Debug)]
-struct Shared {
+struct WakeState {
     /// The waiting thread is about to park or has parked.
     parked: AtomicBool,
     /// The waiting thread: the first one that waited.
@@ -49,14 +49,14 @@ struct Shared {
 /// Wakes one waiting thread. Any number of clones.
 #[derive(Clone, Debug)]
 pub struct Waker {
-    shared: Arc<Shared>,
+    shared: Arc<WakeState>,
 }
 
 /// The waiting side. It may be made anywhere and moved to the waiting thread; from its first wait on it belongs to that
 /// thread.
 #[derive(Debug)]
 pub struct Waiter {
-    shared: Arc<Shared>,
+    shared: Arc<WakeState>,
     policy: WaitPolicy,
     /// Only one thread waits: this is not shared between several.
     _not_sync: std::marker::PhantomData<std::cell::Cell<()>>,
@@ -66,7 +66,7 @@ impl Waiter {
     /// A new waiter; pass [`Waiter::waker`] to the producer.
     pub fn new(policy: WaitPolicy) -> Self {
         Self {
-            shared: Arc::new(Shared { parked: AtomicBool::new(false), thread: WaitingThread::new() }),
+            shared: Arc::new(WakeState { parked: AtomicBool::new(false), thread: WaitingThread::new() }),
             policy,
             _not_sync: std::marker::PhantomData,
         }

@@ -12,7 +12,7 @@ use dpm_render::{FrameCost, FrameSlot, RenderError, Renderer, RendererSettings, 
 use dpm_rig::pipeline::renderer_settings;
 use dpm_rig::rig::Rig;
 use dpm_rig::still::tracked_poses;
-pub use dpm_rig::still::{draw, poses_at, submit, Placed, FRAME_WAIT_NS};
+pub use dpm_rig::still::{draw, poses_at, submit, BodyPlaces, FRAME_WAIT_NS};
 use dpm_shaders::structs::NO_HIT;
 use glam::{DAffine3, DVec2, DVec3, Vec3};
 use std::sync::Arc;
@@ -191,7 +191,7 @@ impl Theatre {
     }
 
     /// Poses of frame `k` of `total`, the last of which is that of the span.
-    fn poses(&self, k: u32, total: u32) -> Placed {
+    fn poses(&self, k: u32, total: u32) -> BodyPlaces {
         let before = if self.frozen { 0 } else { u64::from(total - 1 - k) };
         poses_at(&self.rig, self.span.last_slot.saturating_sub(before))
     }
@@ -251,7 +251,8 @@ impl Theatre {
     pub(crate) fn speed_px(&self) -> f64 {
         let last = self.span.last_slot;
         let [before, now] = [last.saturating_sub(1), last].map(|slot| poses_at(&self.rig, slot));
-        let at = |poses: &Placed, p: &Probe| self.rig.camera.project(poses[p.body].transform_point3(p.point));
+        let at =
+            |poses: &BodyPlaces, p: &Probe| self.rig.camera.project(poses[p.body].transform_point3(p.point));
         let moved = self.probes.iter().filter_map(|p| Some(at(&now, p)?.distance(at(&before, p)?)));
         let moved: Vec<f64> = moved.collect();
         if moved.is_empty() {

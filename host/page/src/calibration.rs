@@ -69,7 +69,7 @@ pub struct Session {
 
 /// What is told of a calibration.
 #[derive(Debug, serde::Serialize)]
-pub(crate) struct Told {
+pub(crate) struct CalibrationView {
     /// A rig runs, so its projector is taken.
     runs: bool,
     #[serde(flatten)]
@@ -80,9 +80,14 @@ pub(crate) struct Told {
 }
 
 /// What there is to tell, where a rig `runs` or not; `None` if reading it failed in a way that nobody foresaw.
-pub(crate) async fn told(guide: &Arc<dyn Guide>, runs: bool) -> Option<Told> {
+pub(crate) async fn told(guide: &Arc<dyn Guide>, runs: bool) -> Option<CalibrationView> {
     let guide = guide.clone();
-    let tell = move || Told { runs, steps: guide.steps(), ports: guide.ports(), session: guide.session() };
+    let tell = move || CalibrationView {
+        runs,
+        steps: guide.steps(),
+        ports: guide.ports(),
+        session: guide.session(),
+    };
     // The disk may be slow, and an order must not wait for it.
     tokio::task::spawn_blocking(tell).await.ok()
 }

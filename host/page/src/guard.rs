@@ -3,7 +3,7 @@
 //! A browser runs scripts of other sites on this machine. The header `Host` tells a page that was reached under a
 //! foreign name (DNS rebinding), `Origin` and `Sec-Fetch-Site` tell a request that another site caused.
 
-use crate::proof::{is_number, Prover, Unproven};
+use crate::proof::{is_number, ProofError, Prover};
 use crate::token::Token;
 use hyper::header::{HeaderMap, HeaderName, HOST, ORIGIN};
 use hyper::Request;
@@ -21,15 +21,15 @@ const FETCH_DEST: HeaderName = HeaderName::from_static("sec-fetch-dest");
 
 /// What a request is refused for.
 #[derive(Clone, Debug, PartialEq, Eq)]
-pub(crate) struct Refused {
+pub(crate) struct Refusal {
     /// The HTTP status.
     pub status: u16,
     /// What to tell.
     pub told: String,
 }
 
-fn refused(status: u16, told: impl Into<String>) -> Refused {
-    Refused { status, told: told.into() }
+fn refused(status: u16, told: impl Into<String>) -> Refusal {
+    Refusal { status, told: told.into() }
 }
 
 /// The names under which the page may be asked for.
@@ -64,7 +64,7 @@ impl Guard {
     }
 
     /// Any request: it was sent to this page by name, and not by another site.
-    pub(crate) fn check(&self, headers: &HeaderMap) -> Result<(), Refused> {
+    pub(crate) fn check(&self, headers: &HeaderMap) -> Result<(), Refusal> {
         let named = single(headers, &HOST).filter(|host| self.is_mine(host));
         let Some(host) = named else {
             let names = self.hosts.join(", ");
@@ -100,12 +100,12 @@ impl Guard {
     }
 
     /// A new challenge for a page that wants to ask for something.
-    pub(crate) fn challenge(&self) -> Result<String, Refused> {
+    pub(crate) fn challenge(&self) -> Result<String, Refusal> {
         self.prover()?.challenge().ok_or_else(|| refused(503, "the operating system gave no random bytes"))
     }
 
     /// A request that does something: it is signed by the secret over a challenge of this process, and has no body.
-    pub(crate) fn check_order<B: hyper::body::Body>(&self, request: &Request<B>) -> Result<(), Refused> {
+    pub(crate) fn check_order<B: hyper::body::Body>(&self, request: &Request<B>) -> Result<(), Refusal> {
         let prover = self.prover()?;
         let told = single(request.headers(), &ORDER);
         let told = match (told, request.headers().contains_key(ORDER)) {
@@ -119,9 +119,9 @@ impl Guard {
             return Err(refused(400, "a signed request has no body"));
         }
         prover.check(request.method().as_str(), path_of(request), told).map_err(|unproven| match unproven {
-            Unproven::Form => refused(403, "not signed as docs/PAGE.md says"),
-            Unproven::Challenge => refused(403, "the challenge is old, used, or of another run: ask again"),
-            Unproven::Signature => {
+            ProofError::Form => refused(403, "not signed as docs/PAGE.md says"),
+            ProofError::Challenge => refused(403, "the challenge is old, used, or of another run: ask again"),
+            ProofError::Signature => {
                 refused(403, "signed by another key: open the page by the link that `dpm page` prints")
             }
         })
@@ -139,7 +139,7 @@ impl Guard {
         Some(self.prover.as_ref()?.sign_event(number, count, name, data))
     }
 
-    fn prover(&self) -> Result<&Prover, Refused> {
+    fn prover(&self) -> Result<&Prover, Refusal> {
         self.prover.as_ref().ok_or_else(|| {
             refused(503, "this page gives no orders, because it has no token; use `dpm black`")
         })

@@ -1,6 +1,6 @@
 //! An order that came over HTTP: given as the control socket gives it, and answered when it was carried out.
 
-use crate::shared::Shared;
+use crate::shared::RunView;
 use dpm_rig::control::answer::{answer_to, is_obeyed};
 use dpm_rig::order::Order;
 use dpm_rig::standing::By;
@@ -11,7 +11,7 @@ const LOOK: Duration = Duration::from_millis(1);
 
 /// What is answered to an order.
 #[derive(Debug, serde::Serialize)]
-pub(crate) struct Answered {
+pub(crate) struct OrderAnswer {
     /// Its name.
     order: &'static str,
     /// The projector has confirmed it, and it is kept over restarts where it should be.
@@ -23,7 +23,7 @@ pub(crate) struct Answered {
 }
 
 /// Gives `order` and waits for its result, for a second at most.
-pub(crate) async fn give(order: Order, shared: &Shared) -> Answered {
+pub(crate) async fn give(order: Order, shared: &RunView) -> OrderAnswer {
     let begin = Instant::now();
     let ticket = shared.orders.give(order, By::Page);
     let mut obeyed_ms = None;
@@ -37,5 +37,5 @@ pub(crate) async fn give(order: Order, shared: &Shared) -> Answered {
         tokio::time::sleep(LOOK).await;
     };
     shared.monitor.note(format!("page: {}: {}", order.word(), answer.text));
-    Answered { order: order.word(), done: answer.is_done, text: answer.text, obeyed_ms }
+    OrderAnswer { order: order.word(), done: answer.is_done, text: answer.text, obeyed_ms }
 }

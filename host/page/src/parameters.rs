@@ -2,9 +2,9 @@
 //! uses it or the disk has it.
 
 use crate::query::part;
-use crate::shared::Shared;
+use crate::shared::RunView;
 use dpm_rig::control::parameters;
-use dpm_rig::parameters::{Command, Refused};
+use dpm_rig::parameters::{ChangeRefusal, Command};
 use std::time::{Duration, Instant};
 
 /// How often to look whether a change is in use.
@@ -12,7 +12,7 @@ const LOOK: Duration = Duration::from_millis(2);
 
 /// What is answered to a change.
 #[derive(Debug, serde::Serialize)]
-pub(crate) struct Answered {
+pub(crate) struct ChangeAnswer {
     /// Planning uses it, or the disk has it.
     pub done: bool,
     /// One line for the operator.
@@ -20,7 +20,7 @@ pub(crate) struct Answered {
 }
 
 /// The command that a path below `/api/parameters/` and its query mean; `None` if there is none at this path.
-pub(crate) fn asked(word: &str, query: &str) -> Option<Result<Command, Refused>> {
+pub(crate) fn asked(word: &str, query: &str) -> Option<Result<Command, ChangeRefusal>> {
     match word {
         "undo" => Some(Ok(Command::Undo)),
         "save" => Some(Ok(Command::Save)),
@@ -30,8 +30,8 @@ pub(crate) fn asked(word: &str, query: &str) -> Option<Result<Command, Refused>>
 }
 
 /// `name=NAME&value=NUMBERS`, percent-encoded.
-fn change(query: &str) -> Result<Command, Refused> {
-    let wrong = || Refused::Syntax("write ?name=exposure&value=1.5".into());
+fn change(query: &str) -> Result<Command, ChangeRefusal> {
+    let wrong = || ChangeRefusal::Syntax("write ?name=exposure&value=1.5".into());
     let part = |key: &str| part(query, key).ok_or_else(wrong);
     Command::parse_change(&format!("{}={}", part("name")?, part("value")?))
 }
@@ -40,12 +40,12 @@ fn change(query: &str) -> Result<Command, Refused> {
 ///
 /// # Errors
 /// It was refused.
-pub(crate) async fn give(command: &Command, shared: &Shared) -> Result<Answered, Refused> {
+pub(crate) async fn give(command: &Command, shared: &RunView) -> Result<ChangeAnswer, ChangeRefusal> {
     let begin = Instant::now();
     let sent = parameters::give(&shared.monitor, command, "page")?;
     loop {
         if let Some(answer) = sent.answer(begin.elapsed(), shared.monitor.parameters()) {
-            return Ok(Answered { done: answer.is_done, text: answer.text });
+            return Ok(ChangeAnswer { done: answer.is_done, text: answer.text });
         }
         tokio::time::sleep(LOOK).await;
     }

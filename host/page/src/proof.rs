@@ -106,7 +106,7 @@ pub(crate) fn is_number(text: &str) -> bool {
 
 /// Why a signed request is refused.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(crate) enum Unproven {
+pub(crate) enum ProofError {
     /// It is not of the form `CHALLENGE SIGNATURE`.
     Form,
     /// The challenge is not of this process, too old, or used.
@@ -170,24 +170,24 @@ impl Prover {
     }
 
     /// Checks a request that has `told` as its proof: `CHALLENGE SIGNATURE`. A right one is used up.
-    pub(crate) fn check(&self, method: &str, path: &str, told: &str) -> Result<(), Unproven> {
+    pub(crate) fn check(&self, method: &str, path: &str, told: &str) -> Result<(), ProofError> {
         self.check_at(self.now_ms(), method, path, told)
     }
 
-    fn check_at(&self, now_ms: u64, method: &str, path: &str, told: &str) -> Result<(), Unproven> {
-        let (challenge, signature) = told.split_once(' ').ok_or(Unproven::Form)?;
+    fn check_at(&self, now_ms: u64, method: &str, path: &str, told: &str) -> Result<(), ProofError> {
+        let (challenge, signature) = told.split_once(' ').ok_or(ProofError::Form)?;
         let holds_ms = HOLDS.as_millis() as u64;
         let is_fresh = |at: u64| at <= now_ms && now_ms - at <= holds_ms;
-        let drawn_at = self.drawn_at(challenge).filter(|at| is_fresh(*at)).ok_or(Unproven::Challenge)?;
+        let drawn_at = self.drawn_at(challenge).filter(|at| is_fresh(*at)).ok_or(ProofError::Challenge)?;
         if !self.orders.verifies(&request_parts(method, path, challenge), signature) {
-            return Err(Unproven::Signature);
+            return Err(ProofError::Signature);
         }
         let mut used = self.used.lock().unwrap_or_else(PoisonError::into_inner);
         while used.front().is_some_and(|(at, _)| !is_fresh(*at)) {
             used.pop_front();
         }
         if used.len() >= USED || used.iter().any(|(_, other)| other == challenge) {
-            return Err(Unproven::Challenge);
+            return Err(ProofError::Challenge);
         }
         used.push_back((drawn_at, challenge.to_owned()));
         Ok(())
@@ -240,30 +240,30 @@ mod tests {
         let signed = |challenge: &str| format!("{challenge} {}", sign_request(&key, "POST", path, challenge));
         let challenge = rig.challenge_at(1_000).unwrap();
         let told = signed(&challenge);
-        assert_eq!(rig.check_at(2_000, "POST", "/api/orders/black", &told), Err(Unproven::Signature));
-        assert_eq!(rig.check_at(2_000, "POST", "/api/orders/arm?x", &told), Err(Unproven::Signature));
-        assert_eq!(rig.check_at(2_000, "GET", path, &told), Err(Unproven::Signature));
+        assert_eq!(rig.check_at(2_000, "POST", "/api/orders/black", &told), Err(ProofError::Signature));
+        assert_eq!(rig.check_at(2_000, "POST", "/api/orders/arm?x", &told), Err(ProofError::Signature));
+        assert_eq!(rig.check_at(2_000, "GET", path, &told), Err(ProofError::Signature));
         assert_eq!(rig.check_at(2_000, "POST", path, &told), Ok(()));
-        assert_eq!(rig.check_at(2_001, "POST", path, &told), Err(Unproven::Challenge), "a second time");
+        assert_eq!(rig.check_at(2_001, "POST", path, &told), Err(ProofError::Challenge), "a second time");
         // Too late, and from the future.
         let late = signed(&rig.challenge_at(3_000).unwrap());
-        assert_eq!(rig.check_at(13_001, "POST", path, &late), Err(Unproven::Challenge));
-        assert_eq!(rig.check_at(2_999, "POST", path, &late), Err(Unproven::Challenge));
+        assert_eq!(rig.check_at(13_001, "POST", path, &late), Err(ProofError::Challenge));
+        assert_eq!(rig.check_at(2_999, "POST", path, &late), Err(ProofError::Challenge));
         assert_eq!(rig.check_at(13_000, "POST", path, &late), Ok(()));
         // What another process has drawn, with the same secret: an impostor's number, or that of the run before.
         let before = Prover::new(&token).unwrap();
         let drawn = signed(&before.challenge_at(13_000).unwrap());
-        assert_eq!(rig.check_at(13_000, "POST", path, &drawn), Err(Unproven::Challenge));
+        assert_eq!(rig.check_at(13_000, "POST", path, &drawn), Err(ProofError::Challenge));
         assert_eq!(before.check_at(13_000, "POST", path, &drawn), Ok(()));
         // Another secret.
         let (_, other) = prover();
         let challenge = rig.challenge_at(13_000).unwrap();
         let foreign = sign_request(&Key::of_orders(&other), "POST", path, &challenge);
         let told = format!("{challenge} {foreign}");
-        assert_eq!(rig.check_at(13_000, "POST", path, &told), Err(Unproven::Signature));
+        assert_eq!(rig.check_at(13_000, "POST", path, &told), Err(ProofError::Signature));
         // The key that a browser keeps signs nothing.
         let told = format!("{challenge} {}", sign_request(&Key::of_rig(&token), "POST", path, &challenge));
-        assert_eq!(rig.check_at(13_000, "POST", path, &told), Err(Unproven::Signature));
+        assert_eq!(rig.check_at(13_000, "POST", path, &told), Err(ProofError::Signature));
         for bad in ["", " ", "x y", &challenge, &format!("{challenge} "), &format!("é{challenge} 00")] {
             assert!(rig.check_at(13_000, "POST", path, bad).is_err(), "{bad}");
         }
@@ -272,7 +272,11 @@ mod tests {
             let mut other = challenge.clone().into_bytes();
             other[k] = if other[k] == b'0' { b'1' } else { b'0' };
             let other = String::from_utf8(other).unwrap();
-            assert_eq!(rig.check_at(13_000, "POST", path, &signed(&other)), Err(Unproven::Challenge), "{k}");
+            assert_eq!(
+                rig.check_at(13_000, "POST", path, &signed(&other)),
+                Err(ProofError::Challenge),
+                "{k}"
+            );
         }
     }
 

@@ -1,7 +1,7 @@
 //! The room of a run, in three dimensions: the shapes, which stay, and where everything is, which changes.
 
 use crate::pictures::mesh::CoarseMesh;
-use crate::shared::Shared;
+use crate::shared::RunView;
 use dpm_rig::rig::{affine, Rig};
 use glam::{DAffine3, DVec2, DVec3};
 use serde_json::{json, Value};
@@ -42,7 +42,7 @@ pub(crate) fn shapes(rig: &Rig) -> Value {
 
 /// Where everything is now: world-from-mesh of every body and world-from-projector as four columns each, and the
 /// observer's eye and gaze point, metres. `None` before the run begins.
-pub(crate) fn places(shared: &Shared) -> Option<Value> {
+pub(crate) fn places(shared: &RunView) -> Option<Value> {
     let live = shared.monitor.live();
     let rig = live.rig()?;
     // Before the first frame the bodies stand where the rig file puts them.

@@ -3,14 +3,14 @@
 use crate::calibration::{self, Guide};
 use crate::connections::{Connection, Doing};
 use crate::events::Events;
-use crate::guard::{Refused, PROOF};
+use crate::guard::{Refusal, PROOF};
 use crate::metrics;
 use crate::orders;
 use crate::parameters;
 use crate::proof::is_number;
 use crate::query::part;
 use crate::rigs::Rigs;
-use crate::shared::Shared;
+use crate::shared::RunView;
 use crate::site::{Serves, Site};
 use crate::state::State;
 use base64::prelude::{Engine, BASE64_STANDARD};
@@ -93,7 +93,7 @@ fn json(status: StatusCode, value: &impl serde::Serialize) -> Response<Answer> {
     whole(status, "application/json", serde_json::to_string(value).unwrap_or_default())
 }
 
-fn refusal(refused: Refused) -> Response<Answer> {
+fn refusal(refused: Refusal) -> Response<Answer> {
     plain(StatusCode::from_u16(refused.status).unwrap_or(StatusCode::FORBIDDEN), refused.told)
 }
 
@@ -169,7 +169,7 @@ async fn of_rig(
     request: &Request<Incoming>,
     connection: &Arc<Connection>,
     site: &Arc<Site>,
-    (guide, run): (&Arc<dyn Guide>, Option<&Arc<Shared>>),
+    (guide, run): (&Arc<dyn Guide>, Option<&Arc<RunView>>),
 ) -> Response<Answer> {
     let path = request.uri().path();
     if let (Some(word), Some(run)) = (path.strip_prefix("/api/parameters/"), run) {
@@ -213,7 +213,7 @@ fn of_rigs(request: &Request<Incoming>, rigs: &Rigs) -> Response<Answer> {
 async fn of_run(
     request: &Request<Incoming>,
     connection: &Arc<Connection>,
-    (site, shared): (&Arc<Site>, &Arc<Shared>),
+    (site, shared): (&Arc<Site>, &Arc<RunView>),
 ) -> Response<Answer> {
     let path = request.uri().path();
     match path {
@@ -270,7 +270,7 @@ async fn order(
     request: &Request<Incoming>,
     word: &str,
     connection: &Arc<Connection>,
-    (site, shared): (&Site, &Arc<Shared>),
+    (site, shared): (&Site, &Arc<RunView>),
 ) -> Response<Answer> {
     if let Err(refused) = site.door.guard.check_order(request) {
         tokio::time::sleep(site.door.pace()).await;
@@ -291,7 +291,7 @@ async fn order(
 async fn change(
     request: &Request<Incoming>,
     word: &str,
-    (site, shared): (&Site, &Arc<Shared>),
+    (site, shared): (&Site, &Arc<RunView>),
 ) -> Response<Answer> {
     if let Err(refused) = site.door.guard.check_order(request) {
         return refusal(refused);
@@ -332,7 +332,7 @@ async fn calibrate(
 }
 
 /// The page of the flight recorder about a flight.
-async fn flight(path: &str, shared: &Arc<Shared>) -> Response<Answer> {
+async fn flight(path: &str, shared: &Arc<RunView>) -> Response<Answer> {
     let number = path.rsplit('/').next().and_then(|number| number.parse().ok());
     let rig = shared.monitor.live().rig().filter(|rig| rig.config.output.flight_recorder);
     let Some(file) = rig.zip(number).and_then(|(rig, number)| page_path(&rig.config.output.dir, number))
@@ -348,7 +348,7 @@ async fn flight(path: &str, shared: &Arc<Shared>) -> Response<Answer> {
 }
 
 /// The state with figures that were made for this request, if they come at once.
-async fn fresh(shared: &Arc<Shared>) -> State {
+async fn fresh(shared: &Arc<RunView>) -> State {
     let live = shared.monitor.live();
     let before = live.snapshot();
     live.look();

@@ -6,7 +6,7 @@ use crate::guard::Guard;
 use crate::pictures::Pictures;
 use crate::rigs::Rigs;
 use crate::routes;
-use crate::shared::Shared;
+use crate::shared::RunView;
 use crate::site::{Door, Serves, Site};
 use crate::stream::Stream;
 use crate::token::Token;
@@ -108,7 +108,7 @@ impl Page {
         let guard = settings.guard();
         Self::start(settings.address, guard, || {
             let pictures = Pictures::start(monitor.clone()).map_err(PageError::Thread)?;
-            Ok(Serves::Run(Arc::new(Shared::new(monitor, orders, notes, pictures)), settings.guide))
+            Ok(Serves::Run(Arc::new(RunView::new(monitor, orders, notes, pictures)), settings.guide))
         })
     }
 
@@ -240,9 +240,9 @@ async fn serve(stream: TcpStream, connection: Arc<Connection>, site: Arc<Site>) 
 #[derive(Clone, Debug)]
 struct Clock;
 
-struct Slept(Pin<Box<tokio::time::Sleep>>);
+struct SleepLog(Pin<Box<tokio::time::Sleep>>);
 
-impl Future for Slept {
+impl Future for SleepLog {
     type Output = ();
 
     fn poll(mut self: Pin<&mut Self>, cx: &mut Context<'_>) -> Poll<()> {
@@ -250,14 +250,14 @@ impl Future for Slept {
     }
 }
 
-impl Sleep for Slept {}
+impl Sleep for SleepLog {}
 
 impl Timer for Clock {
     fn sleep(&self, duration: Duration) -> Pin<Box<dyn Sleep>> {
-        Box::pin(Slept(Box::pin(tokio::time::sleep(duration))))
+        Box::pin(SleepLog(Box::pin(tokio::time::sleep(duration))))
     }
 
     fn sleep_until(&self, deadline: Instant) -> Pin<Box<dyn Sleep>> {
-        Box::pin(Slept(Box::pin(tokio::time::sleep_until(deadline.into()))))
+        Box::pin(SleepLog(Box::pin(tokio::time::sleep_until(deadline.into()))))
     }
 }

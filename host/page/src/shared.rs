@@ -10,7 +10,7 @@ use std::sync::{Arc, OnceLock};
 use std::time::Instant;
 
 /// A run as every request about it may use it.
-pub(crate) struct Shared {
+pub(crate) struct RunView {
     pub(crate) monitor: Arc<RunMonitor>,
     pub(crate) orders: Arc<Orders>,
     pub(crate) notes: Arc<Notes>,
@@ -21,7 +21,7 @@ pub(crate) struct Shared {
     viewers: AtomicUsize,
 }
 
-impl Shared {
+impl RunView {
     pub(crate) fn new(
         monitor: Arc<RunMonitor>,
         orders: Arc<Orders>,
@@ -53,7 +53,7 @@ impl Shared {
 }
 
 /// One who follows the rig's events, until this is dropped.
-pub(crate) struct Viewer(pub(crate) Arc<Shared>);
+pub(crate) struct Viewer(pub(crate) Arc<RunView>);
 
 impl Drop for Viewer {
     fn drop(&mut self) {
@@ -74,7 +74,7 @@ mod tests {
         let (file, _, _) = OrderFile::open(None, identity);
         let orders = Arc::new(Orders::start(monitor.clone(), file, false, None).unwrap());
         let pictures = Pictures::start(monitor.clone()).unwrap();
-        let shared = Arc::new(Shared::new(monitor, orders, Arc::default(), pictures));
+        let shared = Arc::new(RunView::new(monitor, orders, Arc::default(), pictures));
         let all: Vec<_> = (0..VIEWERS).map(|_| shared.viewer().unwrap()).collect();
         assert!(shared.viewer().is_none() && shared.viewers() == VIEWERS);
         drop(all);

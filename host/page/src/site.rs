@@ -3,7 +3,7 @@
 use crate::calibration::Guide;
 use crate::guard::Guard;
 use crate::rigs::Rigs;
-use crate::shared::Shared;
+use crate::shared::RunView;
 use std::sync::{Arc, Mutex, PoisonError};
 use std::time::{Duration, Instant};
 
@@ -44,7 +44,7 @@ pub(crate) struct Site {
 /// What a server serves.
 pub(crate) enum Serves {
     /// A run, and the steps of its rig's calibration.
-    Run(Arc<Shared>, Arc<dyn Guide>),
+    Run(Arc<RunView>, Arc<dyn Guide>),
     /// The steps of the calibration of a rig that does not run.
     Calibration(Arc<dyn Guide>),
     /// What several rigs say of themselves.
@@ -53,7 +53,7 @@ pub(crate) enum Serves {
 
 impl Serves {
     /// The run, where one is served.
-    pub(crate) fn run(&self) -> Option<&Arc<Shared>> {
+    pub(crate) fn run(&self) -> Option<&Arc<RunView>> {
         match self {
             Self::Run(run, _) => Some(run),
             Self::Calibration(_) | Self::Rigs(_) => None,

@@ -1,6 +1,6 @@
 //! What the page shows, as JSON.
 
-use crate::shared::Shared;
+use crate::shared::RunView;
 use dpm_rig::control::rig_name;
 use dpm_rig::plan::dark::DarkCause;
 use dpm_rig::telemetry::histogram_steps::UPPER_NS;
@@ -77,7 +77,7 @@ pub(crate) struct StateJson<'a> {
 }
 
 impl State {
-    pub(crate) fn of(shared: &Shared) -> Self {
+    pub(crate) fn of(shared: &RunView) -> Self {
         let monitor = &shared.monitor;
         let now = Now {
             pid: std::process::id(),
@@ -171,7 +171,7 @@ impl State {
 }
 
 /// What stays the same for the whole run.
-fn setup(shared: &Shared) -> Value {
+fn setup(shared: &RunView) -> Value {
     let mut all = json!({
         "rig": rig_name(),
         "version": env!("CARGO_PKG_VERSION"),

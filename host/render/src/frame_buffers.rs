@@ -21,10 +21,10 @@ use std::sync::Arc;
 pub(super) struct FrameBuffers {
     /// What the host writes in every frame, and the copies that the shaders read. Every ray reads the poses, so they have to lie in the GPU's own
     /// memory: the host's lies behind a bus.
-    pub frame: Latched,
-    pub instances: Latched,
+    pub frame: LatchBuffer,
+    pub instances: LatchBuffer,
     /// The tree over the bodies; of no use where rays ask each body.
-    pub body_nodes: Latched,
+    pub body_nodes: LatchBuffer,
     /// Builds it.
     pub body_tree: BodyTree,
     pub arguments: Buffer,
@@ -55,19 +55,19 @@ pub(super) struct FrameBuffers {
     /// What was drawn, from which planes that follow are taken, and how it moves while the planes last.
     pub motion: Buffer,
     /// The bodies that move while the planes last.
-    pub movers: Latched,
+    pub movers: LatchBuffer,
     /// The tree over the bodies, in which the device finds what a ray meets; `None`: the shaders walk.
     pub device_tree: Option<FrameTree>,
     /// The tables of a scene in which bodies deform.
     pub deformed: Option<DeformedTables>,
     /// The texture table of a scene with clips or live textures.
-    pub textures: Option<Latched>,
+    pub textures: Option<LatchBuffer>,
     /// What goes to the GPU of live pictures.
     pub piece: Option<Piece>,
 }
 
 /// A buffer that the host writes, with its copy for the shaders. The frame's first commands make the copy.
-pub(super) struct Latched {
+pub(super) struct LatchBuffer {
     pub host: Buffer,
     pub device: Buffer,
     pub len_bytes: usize,
@@ -108,9 +108,9 @@ impl FrameBuffers {
         let pixels = in_blocks(settings.raster.pixel_count());
         let size = |what, bytes, kind| Buffer::new(gpu, what, bytes, kind);
         let table = |what, bytes, kind| table_buffer(gpu, what, bytes, kind);
-        let latched = |what, len_bytes| -> Result<Latched, GpuError> {
+        let latched = |what, len_bytes| -> Result<LatchBuffer, GpuError> {
             let host = size(what, len_bytes, Upload)?;
-            Ok(Latched { host, device: table(what, len_bytes, Device)?, len_bytes })
+            Ok(LatchBuffer { host, device: table(what, len_bytes, Device)?, len_bytes })
         };
         let each = BytesPerPixel::of(&settings.method).and_planes_follow(!settings.plane_groups.is_empty());
         // A buffer that the method does not need is bound all the same, but is as small as possible.
@@ -292,14 +292,18 @@ impl FrameBuffers {
 }
 
 /// The texture table of a frame in flight; `None` if the pictures of the scene stay.
-fn texture_table(gpu: &Arc<Gpu>, data: &SceneData) -> Result<Option<Latched>, GpuError> {
+fn texture_table(gpu: &Arc<Gpu>, data: &SceneData) -> Result<Option<LatchBuffer>, GpuError> {
     if data.clips.is_empty() && data.live.is_empty() {
         return Ok(None);
     }
     let len_bytes = size_of_val(&data.textures[..]);
     let mut host = Buffer::new(gpu, "texture table", len_bytes, MemoryKind::Upload)?;
     host.write(&data.textures);
-    Ok(Some(Latched { host, device: Buffer::from_slice(gpu, "texture table", &data.textures)?, len_bytes }))
+    Ok(Some(LatchBuffer {
+        host,
+        device: Buffer::from_slice(gpu, "texture table", &data.textures)?,
+        len_bytes,
+    }))
 }
 
 impl DebugBuffers {

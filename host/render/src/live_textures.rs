@@ -27,7 +27,7 @@ pub struct LiveTexture {
 
 /// The live textures of one renderer.
 pub(super) struct LiveTextures {
-    each: Vec<Followed>,
+    each: Vec<ReadTexture>,
     /// The texture that is asked first for a piece, so that none waits for ever.
     first: usize,
     /// Most texels that a frame copies.
@@ -40,7 +40,7 @@ pub(super) struct LiveTextures {
 }
 
 /// One of them.
-struct Followed {
+struct ReadTexture {
     texture: LiveTexture,
     reader: Reader<LivePicture>,
     /// The number of the picture that the renderer has, or is copying.
@@ -78,7 +78,7 @@ impl LiveTextures {
     /// For the live textures of a scene; `None` if it has none. A frame copies at most `most` texels.
     pub(super) fn new(textures: &[LiveTexture], most: usize) -> Option<Self> {
         let longest = textures.iter().map(|texture| texture.len).max()?;
-        let each = textures.iter().map(Followed::new).collect();
+        let each = textures.iter().map(ReadTexture::new).collect();
         Some(Self { each, first: 0, most: most.clamp(1, longest.max(1)), frames: 0, ended: 0, before: None })
     }
 
@@ -139,7 +139,7 @@ impl LiveTextures {
     }
 }
 
-impl Followed {
+impl ReadTexture {
     fn new(texture: &LiveTexture) -> Self {
         let reader = texture.pictures.follow();
         let state = State { shown: 0, copying: None };
@@ -188,9 +188,9 @@ mod tests {
 
     const LEN: usize = 10;
 
-    fn followed(pictures: &Arc<LivePictures>) -> Followed {
+    fn followed(pictures: &Arc<LivePictures>) -> ReadTexture {
         let places = (0..PLACES as u32).map(|k| 100 + k * LEN as u32).collect();
-        Followed::new(&LiveTexture { texture: 0, places, len: LEN, pictures: pictures.clone() })
+        ReadTexture::new(&LiveTexture { texture: 0, places, len: LEN, pictures: pictures.clone() })
     }
 
     fn picture(value: u8) -> Vec<[u8; 4]> {

@@ -1,46 +1,10 @@
-//! Calibration files into parts of a rig: files of other programs into the projector's camera, and what `dpm calibrate`
-//! measured into camera, bodies, latency and light.
+//! The calibration file into parts of a rig: what `dpm calibrate` measured into camera, bodies, latency and light.
 
-#[cfg(not(feature = "camera-files"))]
-use crate::config::ProjectorConfig;
+use crate::camera_file::CameraFileError;
 use crate::config::RigConfig;
 use dpm_calibration_file::{self as file, CalibrationFile, LightSection, ProjectorSection};
 use dpm_device::planes::Raster;
 use dpm_scene::geometry::projector::ProjectorCamera;
-#[cfg(not(feature = "camera-files"))]
-use std::path::Path;
-
-/// A calibration file cannot be used.
-#[derive(Clone, Debug, thiserror::Error)]
-#[error("{key}: {path}: {message}")]
-pub struct CameraFileError {
-    /// Configuration key.
-    pub key: &'static str,
-    /// Path of the file.
-    pub path: String,
-    /// What is wrong.
-    pub message: String,
-}
-
-#[cfg(feature = "camera-files")]
-pub(crate) use crate::camera_file::calibrated_camera;
-
-/// Refuses the file: this program was built without its readers.
-#[cfg(not(feature = "camera-files"))]
-pub(crate) fn calibrated_camera(
-    _: &ProjectorConfig,
-    path: &Path,
-    _: Raster,
-    _: &mut Vec<String>,
-) -> Result<ProjectorCamera, CameraFileError> {
-    Err(CameraFileError {
-        key: "projector.calibration",
-        path: path.display().to_string(),
-        message: "this program was built without its feature \"camera-files\", which reads calibration files of other \
-                  programs; build it with that feature, or use [projector] and calibration.file"
-            .into(),
-    })
-}
 
 /// What `dpm calibrate` measured, if the rig file names it.
 ///

@@ -1,23 +1,35 @@
 //! A calibration file of another program into the projector's camera.
 
-use crate::calibrated::CameraFileError;
-use crate::config::{CalibrationLens, CalibrationUnit, ProjectorConfig};
-use dpm_camera_files::{self as camera_files, Frame, LengthUnit, LensKind, ReadOptions};
+use crate::config::ProjectorConfig;
 use dpm_device::planes::Raster;
-use dpm_device::regular_file;
 use dpm_scene::geometry::projector::ProjectorCamera;
 use std::path::Path;
+
+/// A calibration file cannot be used.
+#[derive(Clone, Debug, thiserror::Error)]
+#[error("{key}: {path}: {message}")]
+pub struct CameraFileError {
+    /// Configuration key.
+    pub key: &'static str,
+    /// Path of the file.
+    pub path: String,
+    /// What is wrong.
+    pub message: String,
+}
 
 /// The projector that the file at `path` describes, at `raster`. Adds to `warnings` what was not read of the file.
 ///
 /// # Errors
 /// The file cannot be read, or does not describe a projector of this rig. The error says what to change.
+#[cfg(feature = "camera-files")]
 pub(crate) fn calibrated_camera(
     p: &ProjectorConfig,
     path: &Path,
     raster: Raster,
     warnings: &mut Vec<String>,
 ) -> Result<ProjectorCamera, CameraFileError> {
+    use crate::config::{CalibrationLens, CalibrationUnit};
+    use dpm_camera_files::{self as camera_files, Frame, LengthUnit, LensKind, ReadOptions};
     let wrong = |message: String| CameraFileError {
         key: "projector.calibration",
         path: path.display().to_string(),
@@ -33,7 +45,8 @@ pub(crate) fn calibrated_camera(
         CalibrationLens::Auto => LensKind::Auto,
         CalibrationLens::Fisheye => LensKind::Fisheye,
     };
-    let bytes = regular_file::read(path, camera_files::MAX_BYTES as u64).map_err(|e| wrong(e.to_string()))?;
+    let bytes = dpm_device::regular_file::read(path, camera_files::MAX_BYTES as u64)
+        .map_err(|e| wrong(e.to_string()))?;
     let region = p.calibration_region.as_deref();
     let device = p.calibration_device.as_deref();
     let options = ReadOptions { raster: p.calibrated_raster(), unit, lens, region, device };
@@ -71,4 +84,21 @@ pub(crate) fn calibrated_camera(
         }
     };
     Ok(camera.at_raster(raster))
+}
+
+/// Refuses the file: this program was built without its readers.
+#[cfg(not(feature = "camera-files"))]
+pub(crate) fn calibrated_camera(
+    _: &ProjectorConfig,
+    path: &Path,
+    _: Raster,
+    _: &mut Vec<String>,
+) -> Result<ProjectorCamera, CameraFileError> {
+    Err(CameraFileError {
+        key: "projector.calibration",
+        path: path.display().to_string(),
+        message: "this program was built without its feature \"camera-files\", which reads calibration files of other \
+                  programs; build it with that feature, or use [projector] and calibration.file"
+            .into(),
+    })
 }

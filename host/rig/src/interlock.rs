@@ -32,7 +32,7 @@ pub trait Contact: Send {
 
 /// What the asking thread shares with all others.
 #[derive(Debug)]
-struct Shared {
+struct InterlockState {
     clock: Arc<dyn Clock>,
     /// When the contact was last found closed; [`NEVER`] since it was found open.
     closed_at: AtomicI64,
@@ -42,7 +42,7 @@ struct Shared {
     stop: AtomicBool,
 }
 
-impl Shared {
+impl InterlockState {
     fn new(clock: Arc<dyn Clock>, release_ms: u32) -> Arc<Self> {
         Arc::new(Self {
             clock,
@@ -60,7 +60,7 @@ impl Shared {
 
 /// The side that asks the contact.
 pub struct Asking {
-    shared: Arc<Shared>,
+    shared: Arc<InterlockState>,
     contact: Box<dyn Contact>,
 }
 
@@ -101,7 +101,7 @@ impl HeldKey {
 /// An interlock and the thread that asks its contact. The thread ends when this is dropped.
 #[derive(Debug)]
 pub struct Interlock {
-    shared: Arc<Shared>,
+    shared: Arc<InterlockState>,
     key: Option<u8>,
     what: String,
     reset: Restart,
@@ -160,7 +160,7 @@ impl Interlock {
 
     /// The same without a thread: whoever moves `clock` asks the contact every few milliseconds.
     pub fn stepped(what: &str, clock: Arc<dyn Clock>, contact: impl Contact + 'static) -> (Self, Asking) {
-        let shared = Shared::new(clock, 0);
+        let shared = InterlockState::new(clock, 0);
         let asking = Asking { shared: shared.clone(), contact: Box::new(contact) };
         (Self { shared, key: None, what: what.to_owned(), reset: Restart::ByItself, thread: None }, asking)
     }
@@ -169,9 +169,9 @@ impl Interlock {
         what: String,
         key: Option<u8>,
         release_ms: u32,
-        contact: impl FnOnce(&Arc<Shared>) -> Box<dyn Contact>,
+        contact: impl FnOnce(&Arc<InterlockState>) -> Box<dyn Contact>,
     ) -> Result<Self, Failure> {
-        let shared = Shared::new(Arc::new(MonotonicClock::new(0)), release_ms);
+        let shared = InterlockState::new(Arc::new(MonotonicClock::new(0)), release_ms);
         let mut asking = Asking { contact: contact(&shared), shared: shared.clone() };
         let (asked, first) = crossbeam::channel::unbounded();
         let thread = std::thread::Builder::new()

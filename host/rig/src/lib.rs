@@ -30,8 +30,7 @@
 
 pub mod calibrated;
 pub mod calibration_steps;
-#[cfg(feature = "camera-files")]
-mod camera_file;
+pub mod camera_file;
 pub mod config;
 pub mod control;
 pub mod drive;

@@ -189,7 +189,7 @@ fn viewer_camera(rig: &Rig, eye: DVec3, poses: &[DAffine3]) -> Option<ProjectorC
 }
 
 /// The surface point that a picture pixel shows at the last instant.
-struct Seen {
+struct SurfacePoint {
     /// Body of the scene.
     body: usize,
     position: DVec3,
@@ -205,7 +205,7 @@ fn integrate(
     other: DVec3,
     poses: &[DAffine3],
     window: &Window<'_>,
-    shade: impl Fn(&Seen, Vec3) -> Vec3,
+    shade: impl Fn(&SurfacePoint, Vec3) -> Vec3,
 ) -> Result<Vec<Vec3>, GpuError> {
     let mut slot = renderer.create_slot(true)?;
     let inputs =
@@ -226,7 +226,7 @@ fn integrate(
         let in_body = poses[body].inverse().transform_point3(position);
         let normal =
             poses[body].transform_vector3(renderer.shading_normal(surface).as_dvec3()).normalize_or_zero();
-        let seen = Seen { body, position, normal, uv: renderer.texture_coordinates(surface) };
+        let seen = SurfacePoint { body, position, normal, uv: renderer.texture_coordinates(surface) };
         let mut sum = Vec3::ZERO;
         for (frame, all) in &window.frames {
             if let Some(p) = rig.camera.project(all[body].transform_point3(in_body)) {

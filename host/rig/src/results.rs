@@ -105,7 +105,7 @@ impl Results {
 
 /// What is moved.
 #[derive(Clone, Debug, PartialEq, Eq)]
-pub enum Moved {
+pub enum NudgeTarget {
     /// The mesh in the tracked body of this name.
     Body(String),
     /// The projector in the world.
@@ -116,8 +116,8 @@ pub enum Moved {
 ///
 /// # Errors
 /// It was not (exit code 2).
-pub fn check_known(results: &Results, moved: &Moved) -> Result<(), Failure> {
-    if *moved == Moved::Projector && results.file.projector.is_none() {
+pub fn check_known(results: &Results, moved: &NudgeTarget) -> Result<(), Failure> {
+    if *moved == NudgeTarget::Projector && results.file.projector.is_none() {
         let told = "the calibration file has no projector yet: run `dpm calibrate projector` first";
         return Err(Failure::new(FailureKind::BadInput, told));
     }
@@ -125,10 +125,10 @@ pub fn check_known(results: &Results, moved: &Moved) -> Result<(), Failure> {
 }
 
 /// Puts a motion into the results.
-pub fn keep(results: &mut Results, config: &RigConfig, moved: &Moved, motion: &DAffine3) {
+pub fn keep(results: &mut Results, config: &RigConfig, moved: &NudgeTarget, motion: &DAffine3) {
     let place = Pose::new(motion);
     match moved {
-        Moved::Body(name) => {
+        NudgeTarget::Body(name) => {
             let old = results.file.bodies.get(name);
             let data = old.map_or(String::new(), |b| b.provenance.data.clone());
             let provenance = results.provenance(config, name, data, Provenance::BY_EYE);
@@ -136,7 +136,7 @@ pub fn keep(results: &mut Results, config: &RigConfig, moved: &Moved, motion: &D
             let section = BodySection { mesh_to_body: place, residual_m: None, provenance };
             results.file.bodies.insert(name.clone(), section);
         }
-        Moved::Projector => {
+        NudgeTarget::Projector => {
             let data = results.file.projector.as_ref().map_or(String::new(), |p| p.provenance.data.clone());
             let provenance = results.provenance(config, "", data, Provenance::BY_EYE);
             if let Some(section) = &mut results.file.projector {

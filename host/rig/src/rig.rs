@@ -2,7 +2,8 @@
 
 pub mod plausible;
 
-use crate::calibrated::{calibrated_camera, measured, measured_camera, told_of_measured, CameraFileError};
+use crate::calibrated::{measured, measured_camera, told_of_measured};
+use crate::camera_file::{calibrated_camera, CameraFileError};
 use crate::config::{
     BodyConfig, BuiltinScene, EnvironmentConfig, FileAxis, GazeConfig, LiveSource, PictureSource, RigConfig,
     Tracing, TracksUse, MAX_TRACKED,

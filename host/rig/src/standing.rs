@@ -358,7 +358,7 @@ impl OrderFile {
     /// The orders on the disk that name a projector by its serial number, whatever else they name.
     pub(crate) fn by_serial_number(&self) -> Vec<(u64, Order)> {
         let Some(folder) = &self.folder else { return Vec::new() };
-        let named = |order: Told| Some((order.device()?, order.stands.order));
+        let named = |order: StandingOrder| Some((order.device()?, order.stands.order));
         all_told(Some(&**folder), self.others.as_ref()).into_iter().flatten().filter_map(named).collect()
     }
 
@@ -429,7 +429,7 @@ impl OrderFile {
         let Some(folder) = &self.folder else { return Ok(()) };
         let device = self.device();
         let held = holding(Some(&**folder), self.others.as_ref(), &self.identity, device)?;
-        for Held { told: Told { name, is_own, stands, content }, is_same } in held {
+        for Held { told: StandingOrder { name, is_own, stands, content }, is_same } in held {
             // Before HELLO nobody has said whether the projector is the one whose serial number the order names: it is lifted
             // for this port, and given again where that one says HELLO.
             let is_named = device.is_none() && content.as_ref().is_some_and(|c| c.serial.is_some());
@@ -483,7 +483,7 @@ fn reserve(folder: &dyn StateFolder, identity: &Identity) -> Result<(), FolderEr
 }
 
 /// An order on the disk.
-struct Told {
+struct StandingOrder {
     name: String,
     /// It lies in this user's folder, and not among the orders of others.
     is_own: bool,
@@ -492,7 +492,7 @@ struct Told {
     content: Option<Content>,
 }
 
-impl Told {
+impl StandingOrder {
     /// The serial number for which it stands.
     fn device(&self) -> Option<u64> {
         let content = self.content.as_ref()?;
@@ -502,7 +502,7 @@ impl Told {
 
 /// An order that holds a projector.
 struct Held {
-    told: Told,
+    told: StandingOrder,
     /// It was given to this projector, as far as can be told.
     is_same: bool,
 }
@@ -513,7 +513,10 @@ fn by_serial(serial: u64) -> String {
 }
 
 /// All orders on the disk: those in `folder`, and those of other users with what this user has lifted of them.
-fn all_told(folder: Option<&dyn StateFolder>, others: Option<&Others>) -> Result<Vec<Told>, FolderError> {
+fn all_told(
+    folder: Option<&dyn StateFolder>,
+    others: Option<&Others>,
+) -> Result<Vec<StandingOrder>, FolderError> {
     let mut all = Vec::new();
     let own = folder.map_or(Ok(Vec::new()), |folder| folder.names())?;
     let read = |name: &str| {
@@ -523,7 +526,7 @@ fn all_told(folder: Option<&dyn StateFolder>, others: Option<&Others>) -> Result
     for name in own.into_iter().filter(|name| name.ends_with(ENDING)) {
         let path = folder.map_or(name.clone(), |folder| folder.path().join(&name).display().to_string());
         let (stands, content) = stands_in(read(&name), &path);
-        all.push(Told { name, is_own: true, stands, content });
+        all.push(StandingOrder { name, is_own: true, stands, content });
     }
     for (name, bytes) in others.map(Others::orders).unwrap_or_default() {
         let (stands, content) = stands_in(Ok(bytes), &name);
@@ -533,7 +536,7 @@ fn all_told(folder: Option<&dyn StateFolder>, others: Option<&Others>) -> Result
         if let Some(note) = stands_in(note, &name).1.filter(|note| note.is_about(&content)) {
             content.lifted = note.lifted;
         }
-        all.push(Told { name, is_own: false, stands, content: Some(content) });
+        all.push(StandingOrder { name, is_own: false, stands, content: Some(content) });
     }
     Ok(all)
 }

@@ -7,14 +7,14 @@ use glam::DAffine3;
 
 /// Where the bodies of a scene are, and what shape they have.
 #[derive(Clone, Debug, Default)]
-pub struct Placed {
+pub struct BodyPlaces {
     /// world-from-body of each.
     pub poses: Vec<DAffine3>,
     /// The time of the shapes of those that deform, and of the pictures of clips, nanoseconds.
     pub animated_at_ns: i64,
 }
 
-impl std::ops::Deref for Placed {
+impl std::ops::Deref for BodyPlaces {
     type Target = [DAffine3];
 
     fn deref(&self) -> &[DAffine3] {
@@ -23,13 +23,13 @@ impl std::ops::Deref for Placed {
 }
 
 /// All bodies of the scene in the middle of a slot.
-pub fn poses_at(rig: &Rig, slot: u64) -> Placed {
+pub fn poses_at(rig: &Rig, slot: u64) -> BodyPlaces {
     let rate = rig.rate();
     let t = rate.slot_start_ns(slot) + rate.slot_len_ns(slot) / 2;
     let tracked = rig.true_poses(t).unwrap_or_else(|| rig.tracked().map(|b| affine(&b.rest)).collect());
     let mut poses = Vec::new();
     rig.scene_poses(&tracked, t, &mut poses);
-    Placed { poses, animated_at_ns: t }
+    BodyPlaces { poses, animated_at_ns: t }
 }
 
 /// Samples a pixel as a rational stream: a fraction becomes frames of either neighbour.
@@ -39,7 +39,7 @@ fn spp_of_frame(spp: f32, frame: u32) -> u32 {
 }
 
 /// Poses of all that is tracked: the bodies among those of the scene's, and what people wear.
-pub fn tracked_poses(rig: &Rig, poses: &Placed) -> Vec<DAffine3> {
+pub fn tracked_poses(rig: &Rig, poses: &BodyPlaces) -> Vec<DAffine3> {
     let carried = |i: usize| rig.scene.bodies.iter().position(|b| b.tracked == Some(i as u16));
     let bodies = (0..rig.bodies.len()).map(|i| carried(i).map_or(DAffine3::IDENTITY, |b| poses[b]));
     let place = |worn: &RigBody| {
@@ -56,7 +56,7 @@ pub fn draw(
     rig: &Rig,
     renderer: &mut Renderer,
     slot: &mut FrameSlot,
-    bodies: &Placed,
+    bodies: &BodyPlaces,
     frame: u32,
     spp: f32,
 ) -> Result<FrameCost, GpuError> {
@@ -75,7 +75,7 @@ pub fn submit(
     rig: &Rig,
     renderer: &mut Renderer,
     slot: &mut FrameSlot,
-    bodies: &Placed,
+    bodies: &BodyPlaces,
     frame: u32,
     spp: f32,
 ) -> Result<(), GpuError> {

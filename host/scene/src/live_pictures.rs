@@ -10,12 +10,12 @@ use std::sync::{Mutex, MutexGuard, PoisonError};
 pub struct LivePictures {
     size: [u32; 2],
     to_linear: ToLinear,
-    shown: Mutex<Shown>,
+    shown: Mutex<ShownPictures>,
 }
 
 /// What has been shown, and to whom. No frame waits for this lock: a renderer takes it once, before its first frame.
 #[derive(Debug)]
-struct Shown {
+struct ShownPictures {
     newest: LivePicture,
     srgb: Vec<[u8; 4]>,
     /// Pictures of the other program so far.
@@ -42,7 +42,11 @@ impl LivePictures {
         let to_linear = ToLinear::new(true);
         let texels = srgb.iter().map(|texel| to_linear.texel(*texel)).collect();
         let newest = LivePicture { number: 0, texels };
-        Self { size, to_linear, shown: Mutex::new(Shown { newest, srgb, count: 0, followers: vec![] }) }
+        Self {
+            size,
+            to_linear,
+            shown: Mutex::new(ShownPictures { newest, srgb, count: 0, followers: vec![] }),
+        }
     }
 
     /// Columns and rows of every picture.
@@ -65,8 +69,8 @@ impl LivePictures {
         self.publish(&mut self.lock(), std::iter::repeat(BLACK));
     }
 
-    fn publish(&self, shown: &mut Shown, picture: impl Iterator<Item = [u8; 4]>) {
-        let Shown { newest, srgb, followers, .. } = shown;
+    fn publish(&self, shown: &mut ShownPictures, picture: impl Iterator<Item = [u8; 4]>) {
+        let ShownPictures { newest, srgb, followers, .. } = shown;
         for ((kept, texel), [r, g, b, _]) in srgb.iter_mut().zip(&mut newest.texels).zip(picture) {
             *kept = [r, g, b, 255];
             *texel = self.to_linear.texel(*kept);
@@ -97,7 +101,7 @@ impl LivePictures {
         reader
     }
 
-    fn lock(&self) -> MutexGuard<'_, Shown> {
+    fn lock(&self) -> MutexGuard<'_, ShownPictures> {
         // A picture is whole or not yet shown, so nothing is left half done by a panic.
         self.shown.lock().unwrap_or_else(PoisonError::into_inner)
     }

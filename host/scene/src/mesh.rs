@@ -13,16 +13,16 @@ const MIN_RELATIVE_AREA: f64 = 1.0e-12;
 
 /// Counts of what [`TriangleMesh::drop_unusable`] removed.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
-pub(crate) struct Dropped {
+pub(crate) struct DropCounts {
     /// Triangles with a corner that is NaN, infinite or beyond [`MAX_COORDINATE_M`].
     pub not_finite: usize,
     /// Triangles without area.
     pub degenerate: usize,
 }
 
-impl Dropped {
+impl DropCounts {
     /// Adds the counts of another mesh.
-    pub(crate) fn add(&mut self, other: Dropped) {
+    pub(crate) fn add(&mut self, other: DropCounts) {
         self.not_finite += other.not_finite;
         self.degenerate += other.degenerate;
     }
@@ -54,8 +54,8 @@ impl TriangleMesh {
 
     /// Removes triangles that no ray could meaningfully hit (non-finite corners, no area), then the vertices that are
     /// no longer used.
-    pub(crate) fn drop_unusable(&mut self) -> Dropped {
-        let mut dropped = Dropped::default();
+    pub(crate) fn drop_unusable(&mut self) -> DropCounts {
+        let mut dropped = DropCounts::default();
         let mut keep = Vec::with_capacity(self.triangles.len());
         for triangle in &self.triangles {
             let corners = triangle.map(|i| self.positions[i as usize]);
@@ -75,7 +75,7 @@ impl TriangleMesh {
             }
             keep.push(has_area);
         }
-        if dropped != Dropped::default() {
+        if dropped != DropCounts::default() {
             let mut flags = keep.iter();
             self.triangles.retain(|_| *flags.next().unwrap_or(&true));
             let mut flags = keep.iter();
@@ -378,7 +378,7 @@ mod tests {
         mesh.triangles.extend([[0, 1, 4], [0, 2, 5], [1, 1, 2]]);
         mesh.materials.extend([1, 2, 3]);
         let dropped = mesh.drop_unusable();
-        assert_eq!(dropped, Dropped { not_finite: 1, degenerate: 2 });
+        assert_eq!(dropped, DropCounts { not_finite: 1, degenerate: 2 });
         assert_eq!((mesh.triangles.len(), mesh.materials.len(), mesh.positions.len()), (2, 2, 4));
         assert_eq!(mesh.materials, vec![0, 0]);
     }

@@ -305,7 +305,7 @@ const ACCELERATES_S: f64 = 0.012;
 
 /// The motion of a body the last time that it passed this place, over one step ([`super::recall`]).
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub struct Recalled {
+pub struct PastMotion {
     /// Its displacement beyond that of its velocity at the step's begin, m or rad.
     pub moved: DVec3,
     /// Its change of velocity, per second.
@@ -317,7 +317,7 @@ pub struct Recalled {
     pub matters: [bool; 3],
 }
 
-/// One axis of [`Recalled`].
+/// One axis of [`PastMotion`].
 #[derive(Clone, Copy, Debug)]
 struct RecalledAxis {
     moved: f64,
@@ -623,7 +623,7 @@ impl<C: Chart> Imm<C> {
     }
 
     /// Mixes the modes and propagates all of them by `h` >= 0 seconds, [`RECALLED`] according to `recalled`.
-    pub fn advance(&mut self, config: &ImmConfig, h: f64, recalled: Option<Recalled>) {
+    pub fn advance(&mut self, config: &ImmConfig, h: f64, recalled: Option<PastMotion>) {
         let step = config.step(h);
         for (i, axis) in self.axes.iter_mut().enumerate() {
             let along = recalled.filter(|r| r.matters[i]).map(|r| RecalledAxis {

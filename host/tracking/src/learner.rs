@@ -10,7 +10,9 @@
 //! A rung is cheap: its gains depend on the stamps and the noise alone, so the three axes share them, and all rungs
 //! share the tangent space of one base point.
 
-use super::imm::{models_for, Chart, Covariance, Imm, ImmConfig, Kinematics, Motion, MotionModel, Recalled};
+use super::imm::{
+    models_for, Chart, Covariance, Imm, ImmConfig, Kinematics, Motion, MotionModel, PastMotion,
+};
 use glam::DVec3;
 
 /// Rungs of the ladder, and the one that fits the acceleration of the settings.
@@ -36,20 +38,20 @@ const SETTLES: u32 = 32;
 /// A filter of constant acceleration. Its position is an offset from the ladder's base.
 #[derive(Clone, Copy, Debug, Default)]
 struct Rung {
-    mean: Accelerated,
+    mean: Acceleration,
     /// Of each axis.
     covariance: Covariance,
 }
 
 /// A motion of constant acceleration, from the ladder's base.
 #[derive(Clone, Copy, Debug, Default)]
-struct Accelerated {
+struct Acceleration {
     offset: DVec3,
     velocity: DVec3,
     acceleration: DVec3,
 }
 
-impl Accelerated {
+impl Acceleration {
     fn offset_after(&self, h: f64) -> DVec3 {
         self.offset + (self.velocity + self.acceleration * (0.5 * h)) * h
     }
@@ -61,7 +63,7 @@ struct Past<P> {
     at_ns: i64,
     bank: Motion<P>,
     base: P,
-    rungs: [Accelerated; RUNGS],
+    rungs: [Acceleration; RUNGS],
 }
 
 /// What a step of time changes, which a sample that cannot be true takes back.
@@ -178,7 +180,7 @@ impl<C: Chart> Learner<C> {
     }
 
     /// Advances all filters by `h` >= 0 seconds, the bank according to `recalled`.
-    pub(crate) fn advance(&mut self, h: f64, recalled: Option<Recalled>) {
+    pub(crate) fn advance(&mut self, h: f64, recalled: Option<PastMotion>) {
         let config = self.config();
         self.now.bank.advance(&config, h, recalled);
         // What a noise of 1 makes of a step, of which each rung has its share.

@@ -198,7 +198,7 @@ impl PoseFilterCounters {
 
 /// A checked measurement.
 #[derive(Clone, Copy, Debug, PartialEq)]
-struct Measured {
+struct PoseReading {
     at: HostTime,
     position: DVec3,
     rotation: DQuat,
@@ -208,7 +208,7 @@ struct Measured {
 struct Track {
     position: Learner<Translations>,
     rotation: Learner<Rotations>,
-    newest: Measured,
+    newest: PoseReading,
     /// Length of the current run of identical poses, and whether the body moved before it.
     repeats: u32,
     moved_before_repeats: bool,
@@ -220,7 +220,7 @@ struct Track {
 pub struct PoseFilter {
     config: PoseFilterConfig,
     track: Option<Track>,
-    candidates: [Option<Measured>; ACQUIRE_SAMPLES],
+    candidates: [Option<PoseReading>; ACQUIRE_SAMPLES],
     position_noise: NoiseEstimator<Translations>,
     rotation_noise: NoiseEstimator<Rotations>,
     position_recall: Recall<Translations>,
@@ -374,7 +374,7 @@ impl PoseFilter {
         }
     }
 
-    fn take(&mut self, z: Measured) -> Verdict {
+    fn take(&mut self, z: PoseReading) -> Verdict {
         let (rp, rr) = self.variances();
         let c = self.config;
         let carried_for_ns = self.carried_for_ns();
@@ -422,7 +422,7 @@ impl PoseFilter {
     }
 
     /// Collects samples that agree; the third in a row starts a new track.
-    fn acquire(&mut self, z: Measured, rp: f64, rr: f64) -> Verdict {
+    fn acquire(&mut self, z: PoseReading, rp: f64, rr: f64) -> Verdict {
         let c = self.config;
         if let [.., Some(last)] = self.candidates {
             let gap_ns = z.at.ns_since(last.at);
@@ -467,7 +467,7 @@ impl PoseFilter {
 
     /// Whether `z` continues the candidates: no faster than the fastest plausible motion, and no sharper turn than the
     /// strongest plausible one.
-    fn agrees(&self, z: Measured, rp: f64) -> bool {
+    fn agrees(&self, z: PoseReading, rp: f64) -> bool {
         let c = &self.config;
         let [.., previous, Some(last)] = self.candidates else {
             return true;
@@ -488,7 +488,7 @@ impl PoseFilter {
 }
 
 impl Track {
-    fn accept(&mut self, z: Measured, stuck_after: u32) -> Verdict {
+    fn accept(&mut self, z: PoseReading, stuck_after: u32) -> Verdict {
         let identical = z.position == self.newest.position && z.rotation == self.newest.rotation;
         if identical {
             self.repeats += 1;
@@ -509,7 +509,7 @@ impl Track {
     }
 }
 
-fn check(sample: &TrackerSample) -> Result<Measured, Verdict> {
+fn check(sample: &TrackerSample) -> Result<PoseReading, Verdict> {
     if !sample.tracked {
         return Err(Verdict::Untracked);
     }
@@ -523,7 +523,7 @@ fn check(sample: &TrackerSample) -> Result<Measured, Verdict> {
     if sample.captured_at.ns_since(sample.received_at) > FUTURE_TOLERANCE_NS {
         return Err(Verdict::FromFuture);
     }
-    Ok(Measured {
+    Ok(PoseReading {
         at: sample.captured_at,
         position: DVec3::from_array(sample.pose.position_m),
         rotation: DQuat::from_array(sample.pose.rotation_xyzw).normalize(),

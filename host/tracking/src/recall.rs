@@ -6,8 +6,8 @@
 //! bank weights it by how much better than the others it predicts the samples. Without such a past nothing is offered,
 //! and nothing changes.
 
-use super::imm::{Chart, Recalled};
-use super::smooth::{smoothed, Smoothed, MARGIN_NS};
+use super::imm::{Chart, PastMotion};
+use super::smooth::{smoothed, SmoothMotion, MARGIN_NS};
 use glam::DVec3;
 
 /// Samples kept to smooth from; at least [`MARGIN_NS`] to either side of a point, at [`SAMPLE_NS`].
@@ -53,7 +53,7 @@ const WORST_MISFIT: f64 = 5.0;
 #[derive(Clone, Copy, Debug)]
 struct Point<P> {
     at_ns: i64,
-    motion: Smoothed<P>,
+    motion: SmoothMotion<P>,
     passes: f64,
     /// The first point of a track: between it and the point before it, nothing is known.
     begins: bool,
@@ -122,7 +122,7 @@ impl<C: Chart> Recall<C> {
 
     /// The body's motion between `from_ns` and `to_ns` the last time; `None` if its acceleration was beyond `most`, per
     /// second squared. A tracker that jumped, or whose clock did, leaves such a past.
-    pub(crate) fn between(&self, from_ns: i64, to_ns: i64, most: f64) -> Option<Recalled> {
+    pub(crate) fn between(&self, from_ns: i64, to_ns: i64, most: f64) -> Option<PastMotion> {
         let lag = self.lag_ns?;
         let then_ns = to_ns.saturating_sub(lag);
         let from = self.at(from_ns.saturating_sub(lag))?.motion;
@@ -134,7 +134,7 @@ impl<C: Chart> Recall<C> {
         if acceleration.length() > most || faster.length() > most * h {
             return None;
         }
-        Some(Recalled {
+        Some(PastMotion {
             moved: C::between(from.point, to.point) - from.velocity * h,
             faster,
             acceleration,
@@ -200,7 +200,7 @@ impl<C: Chart> Recall<C> {
         let by_b = C::between(from.point, to.point) - (to.velocity - to.acceleration * (0.5 * until)) * until;
         Some(Point {
             at_ns: t_ns,
-            motion: Smoothed {
+            motion: SmoothMotion {
                 point: C::moved(from.point, by_a.lerp(by_b, w)),
                 velocity: from.velocity.lerp(to.velocity, w),
                 acceleration: from.acceleration.lerp(to.acceleration, w),
@@ -253,7 +253,7 @@ impl<C: Chart> Recall<C> {
 
     /// Distance of a point from the path through a point of the past, squared and in tolerances, and how much later on
     /// that path it is, s. The tolerance is half a millisecond of clock and four standard deviations.
-    fn mismatch(past: &Smoothed<C::Point>, point: C::Point, sigma: f64) -> (f64, f64) {
+    fn mismatch(past: &SmoothMotion<C::Point>, point: C::Point, sigma: f64) -> (f64, f64) {
         let e = C::between(past.point, point);
         let speed2 = past.velocity.length_squared();
         let telling = TELLING_SPEED * sigma;

@@ -38,7 +38,7 @@ const EXCESS: f64 = 2.0;
 
 /// A motion at one instant.
 #[derive(Clone, Copy, Debug)]
-pub(crate) struct Smoothed<P> {
+pub(crate) struct SmoothMotion<P> {
     /// Position or rotation.
     pub point: P,
     /// Per second, world frame.
@@ -58,7 +58,7 @@ pub(crate) fn smoothed<C: Chart>(
     samples: &[Option<(i64, C::Point)>],
     middle: usize,
     sigma: f64,
-) -> Option<(i64, Smoothed<C::Point>)> {
+) -> Option<(i64, SmoothMotion<C::Point>)> {
     let (at_ns, origin) = (*samples.get(middle)?)?;
     // Each tangent is taken once, for all windows.
     let (mut tangents, mut around) = ([(0.0, DVec3::ZERO); MOST_SAMPLES], 0);
@@ -100,7 +100,7 @@ pub(crate) fn smoothed<C: Chart>(
     let axes = [x?, y?, z?];
     let pick = |k: usize| DVec3::new(axes[0].terms[k].x, axes[1].terms[k].y, axes[2].terms[k].z);
     let variance = DVec3::from_array(axes.map(|p| p.curvature_variance));
-    let motion = Smoothed {
+    let motion = SmoothMotion {
         point: C::moved(origin, pick(0)),
         velocity: pick(1) * 1e3,
         acceleration: pick(2) * 2e6,

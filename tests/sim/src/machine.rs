@@ -12,7 +12,7 @@ use dpm_device::tracker::serial::client::{SerialTracker, SerialTrackerConfig};
 use dpm_device::tracker::vrpn::client::{VrpnClient, VrpnConfig};
 use dpm_device::tracker::{BodyKey, Tracker};
 use dpm_render::gpu::{GpuError, MemoryPool};
-use dpm_rig::pipeline::stepped::{Machine, Part, Rendered, SentFrame, Takes};
+use dpm_rig::pipeline::stepped::{GpuWork, Machine, Part, SentFrame, Takes};
 use glam::DAffine3;
 use std::collections::VecDeque;
 use std::net::Ipv4Addr;
@@ -277,18 +277,18 @@ impl Machine for SimMachine {
         Takes::Ns(ns)
     }
 
-    fn renders(&mut self, _: u64, _: HostTime) -> Rendered {
+    fn renders(&mut self, _: u64, _: HostTime) -> GpuWork {
         let mut beneath = lock(&self.beneath);
         let spread = beneath.dice.between(900, 1_100);
         let ns = beneath.frame_ns * spread / 1000 * beneath.load_milli.min(2_000) / 1000;
         let trap = beneath.gpu_traps.pop_front();
         beneath.met[1] += u64::from(trap.is_some());
         match trap {
-            None => Rendered::After(ns),
-            Some(GpuTrap::Late(more)) => Rendered::After(ns + more),
-            Some(GpuTrap::Hangs) => Rendered::Never,
+            None => GpuWork::After(ns),
+            Some(GpuTrap::Late(more)) => GpuWork::After(ns + more),
+            Some(GpuTrap::Hangs) => GpuWork::Never,
             Some(GpuTrap::Lost) => {
-                Rendered::Lost(ns, GpuError::DeviceLost { operation: "rendering", device: device() })
+                GpuWork::Lost(ns, GpuError::DeviceLost { operation: "rendering", device: device() })
             }
         }
     }

@@ -18,7 +18,7 @@ use dpm_device::planes::Raster;
 use dpm_device::time::HostTime;
 use dpm_device::transport::{Lane, LinkDevice};
 use dpm_rig::config::{Overrides, Restart, RigConfig};
-use dpm_rig::control::osc::decode::Heard;
+use dpm_rig::control::osc::decode::OscRequest;
 use dpm_rig::control::osc::Doorkeeper;
 use dpm_rig::order::Order;
 use dpm_rig::pipeline::stepped::Part;
@@ -919,7 +919,7 @@ impl World {
         let door = Doorkeeper { from: vec![OSC_DESK], token: Some(OSC_TOKEN.into()) };
         let heard = door.hear(&bytes, if is_listed { OSC_DESK } else { OSC_STRANGER });
         let orders = heard.into_iter().filter_map(|one| match one {
-            Ok(Heard::Order(order)) => Some(order),
+            Ok(OscRequest::Order(order)) => Some(order),
             _ => None,
         });
         let orders: Vec<Order> = orders.collect();

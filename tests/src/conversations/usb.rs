@@ -7,7 +7,7 @@ use dpm_dlpc900::command::{Command, Opcode, Reply, ReplyAssembler, REPORT_BYTES}
 use dpm_dlpc900::driver::{Dlpc900, HidPort, PortError};
 use hil_mock::dlpc900::{Dlpc900Model, Options};
 use hil_mock::usb_model::{Speed, UsbDeviceModel};
-use hil_mock::usb_plug::{Completed, Request, Status, UsbCable};
+use hil_mock::usb_plug::{Completion, Request, Status, UsbCable};
 use hil_mock::usbip::wire::{self, Urb};
 use hil_mock::usbip::{serve, Export, Link};
 use std::collections::{BTreeMap, VecDeque};
@@ -234,14 +234,14 @@ impl UsbCable for Bench {
         let status = if request.endpoint & 0x7f == 4 { Status::Stall } else { Status::Ok };
         let actual =
             if request.endpoint & 0x7f == 5 { request.buffer.len() / 2 } else { request.buffer.len() };
-        (request.done)(Completed { id: request.id, status, actual, buffer: request.buffer });
+        (request.done)(Completion { id: request.id, status, actual, buffer: request.buffer });
         Ok(())
     }
     fn cancel(&self, id: u64) -> bool {
         let found = self.waiting.lock().expect("no panic").remove(&id);
         let is_found = found.is_some();
         if let Some(request) = found {
-            (request.done)(Completed { id, status: Status::Cancelled, actual: 0, buffer: request.buffer });
+            (request.done)(Completion { id, status: Status::Cancelled, actual: 0, buffer: request.buffer });
         }
         is_found
     }

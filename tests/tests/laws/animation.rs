@@ -3,7 +3,7 @@
 
 use crate::scene_files::common::Glb;
 use crate::scene_files::{animate, rig_of, with_material, TempFile};
-use dpm_lab::sequence::{draw, Placed};
+use dpm_lab::sequence::{draw, BodyPlaces};
 use dpm_render::Renderer;
 use dpm_rig::pipeline::renderer_settings;
 use dpm_tests::gpu::with_gpu;
@@ -53,7 +53,7 @@ fn the_light_is_that_of_the_part_at_the_centre_of_each_frames_light() {
         assert_eq!((outcome.light_mismatches, outcome.light.len()), (0, 20));
         let mut renderer = Renderer::new(gpu, &rig.scene, renderer_settings(&rig)).unwrap();
         let mut slot = renderer.create_slot(false).unwrap();
-        let (mut bodies, mut lit) = (Placed::default(), 0);
+        let (mut bodies, mut lit) = (BodyPlaces::default(), 0);
         for (light, record) in outcome.light.iter().zip(&outcome.recent) {
             rig.scene_poses(&record.tracked_poses, record.drawn_for.0, &mut bodies.poses);
             let at = (record.tracked_poses[0].inverse() * bodies[slide]).translation;
@@ -61,7 +61,7 @@ fn the_light_is_that_of_the_part_at_the_centre_of_each_frames_light() {
             // What was planned is what came.
             let centre = record.timeline.centre_at.expect("it was lit");
             assert!(centre.ns_since(record.drawn_for).abs() < 1_000, "{centre:?} {:?}", record.drawn_for);
-            let mut drawn = |bodies: &Placed| {
+            let mut drawn = |bodies: &BodyPlaces| {
                 draw(&rig, &mut renderer, &mut slot, bodies, light.frame, rig.config.render.spp as f32)
                     .unwrap();
                 let fell = slot.codes().iter().zip(&light.codes);

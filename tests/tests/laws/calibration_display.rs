@@ -1,12 +1,12 @@
 //! Calibration of a projector that holds a picture for a whole frame, as displays do: the code whose pictures are followed
 //! by their inverse, against the mock's photodiode.
 
-use dpm_calibration::projector::{predict, Known, Priors, Refusal, Volume};
+use dpm_calibration::projector::{predict, PlaceHint, Priors, Refusal, Volume};
 use dpm_calibration::sensor::{
     decode_pairs, solve_latency_of_pairs, solve_pairs, Block, DecodeError, DecodedPairs, FrameLight,
     InverseCode, Mapped, SensorError, Settings, Solution, Timing,
 };
-use dpm_calibration::trajectory::{Stamped, Trajectory};
+use dpm_calibration::trajectory::{TimedPose, Trajectory};
 use dpm_common::so3::so3_exp;
 use dpm_device::light::{LightEvent, LightKind};
 use dpm_device::planes::{Channel, PlaneSchedule, PlaneSpec, Raster};
@@ -89,7 +89,7 @@ impl Rig {
 
     /// Samples on the sensor's clock, each block with the difference of the clocks, and poses of a hand that rests at one
     /// place after another.
-    fn record(&self, code: &InverseCode, hand: &Arc<Hand>, seconds: f64) -> (Vec<Mapped>, Vec<Stamped>) {
+    fn record(&self, code: &InverseCode, hand: &Arc<Hand>, seconds: f64) -> (Vec<Mapped>, Vec<TimedPose>) {
         let config = SensorWandConfig {
             seed: self.seed,
             tip_m: TIP,
@@ -146,7 +146,7 @@ impl Rig {
         planes.repeat(self.schedule.planes().len()).into()
     }
 
-    fn poses(&self, hand: &Hand, seconds: f64) -> Vec<Stamped> {
+    fn poses(&self, hand: &Hand, seconds: f64) -> Vec<TimedPose> {
         let draws = Draws::new(self.seed).stream(9);
         let normal = |i: u64| DVec3::from_array(draws.normal3(i));
         (0..(240.0 * (seconds + 3.0)) as u64)
@@ -154,7 +154,7 @@ impl Rig {
                 let at = (i as f64 * 1e9 / 240.0) as i64;
                 let pose = hand.pose_at(at);
                 let turn = DQuat::from_array(pose.rotation_xyzw);
-                Stamped {
+                TimedPose {
                     stamp_ns: at + self.tracker_latency_ns,
                     position: DVec3::from_array(pose.position_m) + 1e-4 * normal(2 * i),
                     rotation: so3_exp(0.05f64.to_radians() * normal(2 * i + 1)) * turn,
@@ -171,7 +171,7 @@ impl Rig {
             tip_sigma_m: 1e-4,
             aperture_m: 2.5e-3,
             priors: Priors::many_points(self.raster),
-            known: Known::default(),
+            known: PlaceHint::default(),
             volume: Volume { low: DVec3::new(-0.2, -0.15, -0.03), high: DVec3::new(0.2, 0.15, 0.27) },
             seed: 1,
         }
@@ -254,7 +254,7 @@ fn by_ruler(
     rig: &Rig,
     hand: &Arc<Hand>,
     seconds: f64,
-    change: impl Fn(usize, &mut Stamped),
+    change: impl Fn(usize, &mut TimedPose),
 ) -> Result<Solution, SensorError> {
     let code = InverseCode::new(rig.raster);
     let (blocks, mut poses) = rig.record(&code, hand, seconds);
@@ -412,7 +412,7 @@ mod breadth {
         let display = Rig { schedule: PlaneSchedule::rgb24(), ..Rig::new(512, 384, 120.0, 3) };
         for (rig, hand) in [begun(3, 0.02, 0), begun(3, 0.15, 11_000_000_000), (display, visiting())] {
             for moved_mm in [2.0, 15.0] {
-                let moved = |i: usize, pose: &mut Stamped| {
+                let moved = |i: usize, pose: &mut TimedPose| {
                     pose.position.x += if i > 5500 { 1e-3 * moved_mm } else { 0.0 };
                 };
                 let told =

@@ -1,7 +1,7 @@
 //! Clips, which are animated PNG files: each frame shows the picture of the centre of its light.
 
 use crate::scene_files::TempFile;
-use dpm_lab::sequence::{draw, Placed};
+use dpm_lab::sequence::{draw, BodyPlaces};
 use dpm_render::Renderer;
 use dpm_rig::pipeline::renderer_settings;
 use dpm_rig::rig::Rig;
@@ -146,7 +146,7 @@ mod breadth {
             let rig = rig_with(&clip, &["render.method=\"full\"", "projector.plane_poses=\"frame\""]);
             let (outcome, _) = run(gpu, &rig, 60, 40);
             assert_eq!((outcome.light_mismatches, outcome.light.len()), (0, 40));
-            let alone = |scene: &Scene, bodies: &Placed, frame: u32| {
+            let alone = |scene: &Scene, bodies: &BodyPlaces, frame: u32| {
                 let mut renderer = Renderer::new(gpu, scene, renderer_settings(&rig)).unwrap();
                 let mut slot = renderer.create_slot(false).unwrap();
                 draw(&rig, &mut renderer, &mut slot, bodies, frame, rig.config.render.spp as f32).unwrap();
@@ -157,7 +157,7 @@ mod breadth {
                 let at = record.drawn_for.0;
                 let k = rig.scene.textures.iter().map(|t| t.picture_at(at)).max().unwrap();
                 seen[k] += 1;
-                let mut bodies = Placed { animated_at_ns: at, ..Placed::default() };
+                let mut bodies = BodyPlaces { animated_at_ns: at, ..BodyPlaces::default() };
                 rig.scene_poses(&record.tracked_poses, at, &mut bodies.poses);
                 let fell: Vec<u32> =
                     light.codes.iter().map(|c| u32::from_le_bytes([c[0], c[1], c[2], 0])).collect();

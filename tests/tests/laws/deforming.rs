@@ -2,7 +2,7 @@
 //! light that a scene of that shape gives, whatever other frames are in flight.
 
 use crate::scene_files::{flag, rig_of};
-use dpm_lab::sequence::{draw, submit, Placed, FRAME_WAIT_NS};
+use dpm_lab::sequence::{draw, submit, BodyPlaces, FRAME_WAIT_NS};
 use dpm_render::gpu::Gpu;
 use dpm_render::{Keep, Overlapping, Renderer, RendererSettings};
 use dpm_rig::pipeline::renderer_settings;
@@ -14,7 +14,7 @@ use glam::DAffine3;
 use std::sync::Arc;
 
 /// The code values of frame `frame`, drawn alone from a scene.
-fn alone(gpu: &Arc<Gpu>, rig: &Rig, scene: &Scene, bodies: &Placed, frame: u32) -> Vec<u32> {
+fn alone(gpu: &Arc<Gpu>, rig: &Rig, scene: &Scene, bodies: &BodyPlaces, frame: u32) -> Vec<u32> {
     let mut renderer = Renderer::new(gpu, scene, renderer_settings(rig)).unwrap();
     let mut slot = renderer.create_slot(false).unwrap();
     draw(rig, &mut renderer, &mut slot, bodies, frame, rig.config.render.spp as f32).unwrap();
@@ -42,7 +42,7 @@ fn the_light_is_that_of_the_shape_at_the_centre_of_each_frames_light() {
         assert_eq!((outcome.light_mismatches, outcome.light.len()), (0, 12));
         for (light, record) in outcome.light.iter().zip(&outcome.recent).step_by(3) {
             let at = record.drawn_for.0;
-            let mut bodies = Placed { animated_at_ns: at, ..Placed::default() };
+            let mut bodies = BodyPlaces { animated_at_ns: at, ..BodyPlaces::default() };
             rig.scene_poses(&record.tracked_poses, at, &mut bodies.poses);
             let fell: Vec<u32> =
                 light.codes.iter().map(|c| u32::from_le_bytes([c[0], c[1], c[2], 0])).collect();
@@ -61,9 +61,9 @@ fn frames_in_flight_show_their_own_shapes() {
     with_gpu(|gpu| {
         let rig = rig_of(&flag, SIZE, "translate", &ALONE);
         let poses = vec![DAffine3::IDENTITY; rig.scene.bodies.len()];
-        let placed = |k: i64| Placed { poses: poses.clone(), animated_at_ns: 13_000_000 * k };
+        let placed = |k: i64| BodyPlaces { poses: poses.clone(), animated_at_ns: 13_000_000 * k };
         let shape =
-            |at: &Placed, t_ns: i64, frame: u32| alone(gpu, &rig, &rig.scene.still_at(t_ns), at, frame);
+            |at: &BodyPlaces, t_ns: i64, frame: u32| alone(gpu, &rig, &rig.scene.still_at(t_ns), at, frame);
         let wanted: Vec<Vec<u32>> =
             (0..6).map(|k| shape(&placed(k), placed(k).animated_at_ns, k as u32)).collect();
         for (k, wanted) in wanted.iter().enumerate() {
@@ -115,7 +115,7 @@ fn histories_follow_what_deforms() {
         let mut renderer = Renderer::new(gpu, &rig.scene, renderer_settings(&rig)).unwrap();
         let mut slot = renderer.create_slot(false).unwrap();
         let poses = vec![DAffine3::IDENTITY; rig.scene.bodies.len()];
-        let placed = |k: i64| Placed { poses: poses.clone(), animated_at_ns: k * 1_055_966 };
+        let placed = |k: i64| BodyPlaces { poses: poses.clone(), animated_at_ns: k * 1_055_966 };
         let off = |a: &[u32], b: &[u32]| -> f64 {
             let bytes = |codes: &[u32]| codes.iter().flat_map(|c| c.to_le_bytes()).collect::<Vec<u8>>();
             let squares =

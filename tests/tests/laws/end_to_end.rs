@@ -4,7 +4,7 @@
 use dpm_device::planes::{Channel, PlaneSpec};
 use dpm_device::time::HostTime;
 use dpm_lab::error::planes::{centre_of, middle_of};
-use dpm_lab::sequence::{draw, Placed};
+use dpm_lab::sequence::{draw, BodyPlaces};
 use dpm_render::Renderer;
 use dpm_rig::light::recorder::LightFrame;
 use dpm_rig::pipeline::{self, renderer_settings, RunOptions};
@@ -37,7 +37,7 @@ fn the_light_is_the_rendered_picture_in_all_24_planes() {
         let mut renderer = Renderer::new(gpu, &rig.scene, renderer_settings(&rig)).unwrap();
         let mut slot = renderer.create_slot(false).unwrap();
         assert_eq!((outcome.light.len(), outcome.recent.len()), (12, 12));
-        let mut bodies = Placed::default();
+        let mut bodies = BodyPlaces::default();
         let (mut lit_pixels, mut levels) = (0, [[false; 256]; 3]);
         for (light, record) in outcome.light.iter().zip(&outcome.recent) {
             assert_eq!(light.frame, record.id.0 as u32);

@@ -180,7 +180,7 @@ mod real_pace {
             let (light, record) = newest
                 .find_map(|light| Some((light, drawn(light.frame)?)))
                 .expect("a lit frame with its record");
-            let mut bodies = dpm_lab::sequence::Placed::default();
+            let mut bodies = dpm_lab::sequence::BodyPlaces::default();
             rig.scene_poses(&record.tracked_poses, record.drawn_for.0, &mut bodies.poses);
             let fell: Vec<u32> =
                 light.codes.iter().map(|c| u32::from_le_bytes([c[0], c[1], c[2], 0])).collect();

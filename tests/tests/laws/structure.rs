@@ -229,6 +229,85 @@ fn circle(all: &Arrows) -> Option<Vec<String>> {
     all.keys().find_map(|module| walk(all, &mut vec![module.as_str()], &mut done))
 }
 
+/// True for a word that is a bare participle by its ending: a type is a noun.
+fn is_participle(name: &str) -> bool {
+    const ENDINGS: [&str; 12] =
+        ["ed", "wn", "ven", "ken", "ept", "ent", "old", "eard", "ead", "eft", "ound", "een"];
+    const NOUNS: [&str; 34] = [
+        "Agent",
+        "Agreement",
+        "Alignment",
+        "Argument",
+        "Bound",
+        "Client",
+        "Comment",
+        "Component",
+        "Content",
+        "Current",
+        "Descent",
+        "Document",
+        "Element",
+        "Environment",
+        "Event",
+        "Extent",
+        "Feed",
+        "Fragment",
+        "Instrument",
+        "Judgement",
+        "Moment",
+        "Movement",
+        "Need",
+        "Placement",
+        "Present",
+        "Read",
+        "Round",
+        "Seed",
+        "Segment",
+        "Sheen",
+        "Sound",
+        "Speed",
+        "Thread",
+        "Token",
+    ];
+    let is_one_word = name.chars().skip(1).all(|c| c.is_ascii_lowercase());
+    is_one_word && !NOUNS.contains(&name) && ENDINGS.iter().any(|ending| name.ends_with(ending))
+}
+
+/// Types that are named so all the same, by their crate, because many files name them. A new one takes another name.
+const PARTICIPLES: [(&str, &str); 13] = [
+    ("device", "Mapped"),
+    ("device", "Shown"),
+    ("hil-mock", "Executed"),
+    ("host/lab", "Explained"),
+    ("host/lab", "Measured"),
+    ("host/lab", "Modelled"),
+    ("host/lab", "Noticed"),
+    ("host/lab", "Seen"),
+    ("host/render", "Drawn"),
+    ("host/render", "Shown"),
+    ("host/render", "Spread"),
+    ("host/rig", "Ended"),
+    ("host/scene", "Deformed"),
+];
+
+#[test]
+fn types_are_nouns() {
+    let mut found = BTreeSet::new();
+    for krate in CRATES {
+        for (_, text) in sources(&root().join(krate).join("src")) {
+            for word in ["struct ", "enum "] {
+                found.extend(
+                    names_after(&code(&text), word)
+                        .filter(|n| is_participle(n))
+                        .map(|n| (krate, n.to_owned())),
+                );
+            }
+        }
+    }
+    let listed: BTreeSet<(&str, String)> = PARTICIPLES.iter().map(|(k, n)| (*k, (*n).to_owned())).collect();
+    assert_eq!(found, listed);
+}
+
 #[test]
 fn no_circle_joins_the_folders_of_a_crate() {
     for krate in CRATES {

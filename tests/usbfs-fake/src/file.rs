@@ -11,7 +11,7 @@ use std::sync::{mpsc, Arc, Condvar, Mutex, PoisonError};
 use std::time::Duration;
 
 use hil_mock::usb_model::{endpoints, Setup};
-use hil_mock::usb_plug::{Completed, Request, Status};
+use hil_mock::usb_plug::{Completion, Request, Status};
 
 use crate::bus::{lock, release, reserve, Device, Holder};
 use crate::hooks::raw;
@@ -295,7 +295,7 @@ impl OpenFile {
         }
         let (tx, rx) = mpsc::channel();
         let id = NEXT_ID.fetch_add(1, Ordering::Relaxed);
-        let done = Box::new(move |c: Completed| drop(tx.send(c)));
+        let done = Box::new(move |c: Completion| drop(tx.send(c)));
         let request = Request { id, endpoint: 0, setup: Some(setup), buffer, done };
         self.device.cable.submit(request).map_err(|_| libc::ENODEV)?;
         let wait = if c.timeout_ms == 0 { 3_600_000 } else { c.timeout_ms };
@@ -351,7 +351,7 @@ impl OpenFile {
         let (file, address) = (self.clone(), urb as usize);
         let short_is_error = is_in && u.flags & FLAG_SHORT_NOT_OK != 0;
         let done =
-            Box::new(move |c: Completed| file.completed(address, c, is_in.then_some(head), short_is_error));
+            Box::new(move |c: Completion| file.completed(address, c, is_in.then_some(head), short_is_error));
         let mut inner = lock(&self.inner);
         inner.running.insert(address, (id, payload));
         drop(inner);
@@ -371,7 +371,7 @@ impl OpenFile {
     }
 
     /// Writes a transfer's outcome into the caller's URB and makes it reapable.
-    fn completed(&self, address: usize, c: Completed, copy_at: Option<usize>, short_is_error: bool) {
+    fn completed(&self, address: usize, c: Completion, copy_at: Option<usize>, short_is_error: bool) {
         let urb = address as *mut Urb;
         let mut inner = lock(&self.inner);
         // SAFETY: the URB and its buffer are the caller's until reaped or closed, and `close` waits until `running` is empty.

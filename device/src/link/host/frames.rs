@@ -1,6 +1,6 @@
 //! Sends one frame's planes as packets: whole or not at all.
 
-use super::light::{Reached, Shown};
+use super::light::{LimitHit, SlotLight};
 use super::{DropReason, HostLink, LinkState, SendOutcome, Verb};
 use crate::link::compact::PlaneForm;
 use crate::link::flash::REST_US;
@@ -181,15 +181,15 @@ impl HostLink {
         let Some(slots) = self.slots else { return Ok(()) };
         // Frames are sent even while an order keeps them dark.
         let shown = match self.ordered {
-            None => Shown::New(planes),
-            Some(Verb::Freeze) => Shown::Same,
-            Some(Verb::Black) => Shown::Dark,
-            Some(_) => Shown::Nothing,
+            None => SlotLight::New(planes),
+            Some(Verb::Freeze) => SlotLight::Same,
+            Some(Verb::Black) => SlotLight::Dark,
+            Some(_) => SlotLight::Nothing,
         };
         let (rest_us, reason) = match self.field.slot(&slots, [target_at, dark_from], shown) {
             None => return Ok(()),
-            Some(Reached::Flashes) => (u64::from(REST_US), DropReason::FlashLimit),
-            Some(Reached::Light(limit)) => {
+            Some(LimitHit::Flashes) => (u64::from(REST_US), DropReason::FlashLimit),
+            Some(LimitHit::Light(limit)) => {
                 (self.settings.limits.rest_us(limit), DropReason::LightLimit(limit))
             }
         };

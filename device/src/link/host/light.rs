@@ -12,7 +12,7 @@ const OBEYED_WITHIN_MS: u32 = 50;
 
 /// What a slot shows.
 #[derive(Clone, Copy, Debug)]
-pub(super) enum Shown<'a> {
+pub(super) enum SlotLight<'a> {
     /// A frame of these planes.
     New(&'a [u8]),
     /// The frame on the mirrors.
@@ -25,7 +25,7 @@ pub(super) enum Shown<'a> {
 
 /// Which limit the field would exceed.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(super) enum Reached {
+pub(super) enum LimitHit {
     /// That of flashes.
     Flashes,
     /// One of those on light.
@@ -88,16 +88,16 @@ impl FieldCount {
         &mut self,
         clock: &SlotClock,
         times: [DeviceTicks; 2],
-        shown: Shown<'_>,
-    ) -> Option<Reached> {
+        shown: SlotLight<'_>,
+    ) -> Option<LimitHit> {
         let (slot, before) = self.on_to(clock, times);
         match shown {
-            Shown::New(planes) => self.held = self.brightness(planes),
-            Shown::Same => self.over = u64::MAX,
-            Shown::Dark | Shown::Nothing => self.held = Brightness::default(),
+            SlotLight::New(planes) => self.held = self.brightness(planes),
+            SlotLight::Same => self.over = u64::MAX,
+            SlotLight::Dark | SlotLight::Nothing => self.held = Brightness::default(),
         }
         let flashes = self.flash.as_mut().is_some_and(|limiter| {
-            if matches!(shown, Shown::Nothing) {
+            if matches!(shown, SlotLight::Nothing) {
                 return false;
             }
             let mut first = slot - before.iter().map(|(_, slots)| slots).sum::<u64>();
@@ -117,7 +117,7 @@ impl FieldCount {
             limiter.repeated(dark.0.level, dark.1);
             limiter.observe(self.held.level)
         });
-        let reached = light.map(Reached::Light).or(flashes.then_some(Reached::Flashes));
+        let reached = light.map(LimitHit::Light).or(flashes.then_some(LimitHit::Flashes));
         if reached.is_some() {
             self.held = Brightness::default();
         }
@@ -218,8 +218,8 @@ mod tests {
                     let luminance = if on { lit } else { 0 };
                     let times = [slot, slot + 100].map(|slot| clock.start(slot));
                     let planes = [if on || is_ordered { pixels } else { 0 }; 8];
-                    let shown = if on || !is_ordered { Shown::New(&planes) } else { Shown::Dark };
-                    if host.slot(&clock, times, shown) == Some(Reached::Flashes) {
+                    let shown = if on || !is_ordered { SlotLight::New(&planes) } else { SlotLight::Dark };
+                    if host.slot(&clock, times, shown) == Some(LimitHit::Flashes) {
                         strikes += 1;
                         break;
                     }

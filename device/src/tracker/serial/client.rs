@@ -4,7 +4,7 @@
 use super::wire::{SerialMessage, MAX_PACKET, VERSION};
 use crate::clock_map::{ClockMap, ExchangeOutcome};
 use crate::cobs::Deframer;
-use crate::line::{EchoPace, Line, Polled};
+use crate::line::{EchoPace, Line, PollResult};
 use crate::pose::Pose;
 use crate::stream::Opener;
 use crate::time::{DeviceTicks, HostClock, HostTime};
@@ -308,9 +308,9 @@ impl SerialTracker {
 impl Tracker for SerialTracker {
     fn poll(&mut self, now: HostTime, sink: &mut dyn FnMut(&TrackerSample)) -> Result<usize, TrackerError> {
         match self.line.poll(now) {
-            Polled::Closed => {}
-            Polled::Opened => self.begin(now),
-            Polled::Open => return Ok(self.listen(now, sink)),
+            PollResult::Closed => {}
+            PollResult::Opened => self.begin(now),
+            PollResult::Open => return Ok(self.listen(now, sink)),
         }
         Ok(0)
     }

@@ -44,7 +44,7 @@ pub(super) enum Status {
 
 /// A transfer that ended, in the order of submission.
 #[derive(Clone, Copy, Debug)]
-pub(super) struct Ended {
+pub(super) struct TransferEnd {
     pub slot: usize,
     pub status: Status,
     /// Bytes moved, on every status.
@@ -212,7 +212,7 @@ impl Ring {
     }
 
     /// The oldest transfer, if it has ended. Its slot is idle from here on.
-    pub(super) fn take_ended(&mut self) -> Option<Ended> {
+    pub(super) fn take_ended(&mut self) -> Option<TransferEnd> {
         let slot = *self.order.front()?;
         let s = &mut self.slots[slot];
         if !s.mark.ended.load(Ordering::Acquire) {
@@ -235,7 +235,7 @@ impl Ring {
             ns => Some(HostTime(ns)),
         };
         // Limited to the buffer, whatever a device or a driver claims.
-        Some(Ended { slot, status, actual: (actual.max(0) as usize).min(s.buffer.len()), at })
+        Some(TransferEnd { slot, status, actual: (actual.max(0) as usize).min(s.buffer.len()), at })
     }
 
     /// Cancels every transfer in flight. They end later, through [`Ring::take_ended`].

@@ -71,12 +71,12 @@ impl Bench for World {
         self.told.borrow_mut().push(text.to_owned());
     }
 
-    fn hold(&self) -> Vec<Vec<Stamped>> {
+    fn hold(&self) -> Vec<Vec<TimedPose>> {
         let rotation = DQuat::from_rotation_x(-0.6);
-        let wand = |stamp_ns| Stamped { stamp_ns, position: self.tip.get() - rotation * TIP, rotation };
+        let wand = |stamp_ns| TimedPose { stamp_ns, position: self.tip.get() - rotation * TIP, rotation };
         let body = self.body.get();
         let rotation = DQuat::from_mat3(&body.matrix3);
-        let lies = |stamp_ns| Stamped { stamp_ns, position: body.translation, rotation };
+        let lies = |stamp_ns| TimedPose { stamp_ns, position: body.translation, rotation };
         vec![(0..60).map(wand).collect(), (0..60).map(lies).collect()]
     }
 

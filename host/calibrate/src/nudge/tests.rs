@@ -15,12 +15,12 @@ fn camera() -> ProjectorCamera {
 }
 
 /// A plate of 20 cm, in a body whose frame is turned.
-fn stage(moved: Moved) -> (Stage, Stamped) {
+fn stage(moved: NudgeTarget) -> (Stage, TimedPose) {
     let [a, b] = [DVec3::new(-0.1, -0.1, 0.0), DVec3::new(0.1, -0.1, 0.0)];
     let [c, d] = [DVec3::new(0.1, 0.1, 0.0), DVec3::new(-0.1, 0.1, 0.0)];
     let rotation = DQuat::from_rotation_y(0.4);
-    let pose = Stamped { stamp_ns: 0, position: DVec3::new(0.01, 0.02, 0.0), rotation };
-    let body = Shown {
+    let pose = TimedPose { stamp_ns: 0, position: DVec3::new(0.01, 0.02, 0.0), rotation };
+    let body = NudgeView {
         name: "plate".into(),
         mesh_to_body: DAffine3::from_quat(rotation.inverse()),
         outline: Outline::new(&[[a, b, c], [a, c, d]]),
@@ -28,7 +28,7 @@ fn stage(moved: Moved) -> (Stage, Stamped) {
     (Stage { moved, camera: camera(), bodies: vec![body] }, pose)
 }
 
-fn middle(stage: &Stage, now: DAffine3, pose: Stamped) -> DVec2 {
+fn middle(stage: &Stage, now: DAffine3, pose: TimedPose) -> DVec2 {
     let mut pixels = Vec::new();
     stage.draw(now, &[Some(pose)], &mut pixels);
     assert!(pixels.len() > 100);
@@ -62,7 +62,7 @@ fn typed(nudges: &mut Nudges, lines: &[&str]) -> (Vec<DAffine3>, Vec<String>, Re
 
 #[test]
 fn letters_move_the_light_of_a_body_by_their_projection() {
-    let (stage, pose) = stage(Moved::Body("plate".into()));
+    let (stage, pose) = stage(NudgeTarget::Body("plate".into()));
     let mut nudges = stage.nudges(2e-3);
     let before = middle(&stage, nudges.now(), pose);
     let (saved, asked, end) = typed(&mut nudges, &["xxxxx", "yyyyyw", "q"]);
@@ -78,7 +78,7 @@ fn letters_move_the_light_of_a_body_by_their_projection() {
 
 #[test]
 fn letters_move_the_projector_with_its_light() {
-    let (stage, pose) = stage(Moved::Projector);
+    let (stage, pose) = stage(NudgeTarget::Projector);
     let mut nudges = stage.nudges(2e-3);
     let before = middle(&stage, nudges.now(), pose);
     // A projector that is further to the right must light further to the left to hit the same body.
@@ -94,7 +94,7 @@ fn letters_move_the_projector_with_its_light() {
 
 #[test]
 fn what_is_not_written_is_said() {
-    let (stage, _) = stage(Moved::Projector);
+    let (stage, _) = stage(NudgeTarget::Projector);
     let mut nudges = stage.nudges(1e-3);
     let (saved, asked, end) = typed(&mut nudges, &["x?", "xu", "u", "x", "q"]);
     assert!(saved.is_empty());
@@ -111,15 +111,15 @@ fn the_calibration_file_gets_the_place_and_the_old_one_is_kept() {
     let path = std::env::temp_dir().join(format!("dpm-nudge-{}.toml", std::process::id()));
     let config = RigConfig::demo(&Overrides { variables: vec![], flags: vec![] }).unwrap();
     let mut results = Results::open(Some(&path), std::path::Path::new("rig.toml"), &config).unwrap();
-    assert!(check_known(&results, &Moved::Projector).is_err());
+    assert!(check_known(&results, &NudgeTarget::Projector).is_err());
     let model = ProjectorModel::from_camera(&camera(), [-0.1, 0.0, 0.0, 0.0, 0.0], DVec3::ZERO);
     let section = ProjectorSection::new(camera().raster, &model, 0.2, 0.1, Provenance::default());
     results.file.projector = Some(section.clone());
-    assert!(check_known(&results, &Moved::Projector).is_ok());
+    assert!(check_known(&results, &NudgeTarget::Projector).is_ok());
     results.save(&config).unwrap();
     let motion = DAffine3::from_rotation_translation(DQuat::from_rotation_x(0.3), DVec3::new(0.1, 0.2, 0.9));
-    keep(&mut results, &config, &Moved::Projector, &motion);
-    keep(&mut results, &config, &Moved::Body("plate".into()), &motion);
+    keep(&mut results, &config, &NudgeTarget::Projector, &motion);
+    keep(&mut results, &config, &NudgeTarget::Body("plate".into()), &motion);
     let told = results.save(&config).unwrap();
     assert!(told.contains(".1.old"), "{told}");
     let file = load(&path).unwrap();

@@ -9,8 +9,8 @@ mod touch;
 mod wander;
 
 pub use nearest::Surface;
-pub use touch::{tip_in_body, Contact, Session, Touch, TouchError, Touched};
-pub use wander::{wander, WanderError, Wandered};
+pub use touch::{tip_in_body, Contact, Session, Touch, TouchError, TouchFit};
+pub use wander::{wander, WanderError, WanderFit};
 
 #[cfg(test)]
 mod tests;

@@ -1,7 +1,7 @@
 //! Laws of both ways, against a drawn truth.
 
 use super::*;
-use crate::trajectory::Stamped;
+use crate::trajectory::TimedPose;
 use dpm_common::so3::{so3_exp, so3_log};
 use dpm_device::rng::Draws;
 use glam::{DAffine3, DQuat, DVec3};
@@ -30,7 +30,7 @@ fn touches(truth: &DAffine3, n: u64, sigma: f64, seed: u64) -> Vec<Touch> {
         .collect()
 }
 
-fn solve(touches: &[Touch]) -> Result<Touched, TouchError> {
+fn solve(touches: &[Touch]) -> Result<TouchFit, TouchError> {
     let mut session = Session::default();
     touches.iter().for_each(|t| session.add(*t));
     session.solve()
@@ -92,11 +92,11 @@ fn a_tip_is_averaged_over_a_moving_body_and_one_that_slides_is_refused() {
     let tip = DVec3::new(0.0, 0.1, 0.05);
     let on_body = DVec3::new(0.03, -0.02, 0.07);
     let d = Draws::new(4);
-    let poses = |slide: f64| -> Vec<(Stamped, Stamped)> {
+    let poses = |slide: f64| -> Vec<(TimedPose, TimedPose)> {
         (0..120)
             .map(|i| {
                 let s = i as f64 / 240.0;
-                let body = Stamped {
+                let body = TimedPose {
                     stamp_ns: i,
                     position: DVec3::new(0.1 * s, s.sin(), 0.0),
                     rotation: so3_exp(DVec3::Y * s),
@@ -104,7 +104,7 @@ fn a_tip_is_averaged_over_a_moving_body_and_one_that_slides_is_refused() {
                 let rotation = so3_exp(DVec3::new(s, 0.3, -s));
                 let position = body.place(on_body + DVec3::X * slide * s) - rotation * tip
                     + DVec3::from_array(d.normal3(i as u64)) * 1e-4;
-                (Stamped { stamp_ns: i, position, rotation }, body)
+                (TimedPose { stamp_ns: i, position, rotation }, body)
             })
             .collect()
     };

@@ -1,7 +1,7 @@
 //! Touched points of a mesh into its place in the body's frame, by the rotation of least squares (\[Kabsch76\]).
 
 use crate::dense::svd;
-use crate::trajectory::Stamped;
+use crate::trajectory::TimedPose;
 use glam::{DAffine3, DMat3, DVec3};
 use thiserror::Error;
 
@@ -32,7 +32,7 @@ const HELD_M: f64 = 1e-3;
 ///
 /// # Errors
 /// [`TouchError::NotHeld`] for a tip that moved, or for too few poses.
-pub fn tip_in_body(tip: DVec3, poses: &[(Stamped, Stamped)]) -> Result<Contact, TouchError> {
+pub fn tip_in_body(tip: DVec3, poses: &[(TimedPose, TimedPose)]) -> Result<Contact, TouchError> {
     let points: Vec<DVec3> = poses
         .iter()
         .map(|(wand, body)| body.rotation.conjugate() * (wand.place(tip) - body.position))
@@ -51,7 +51,7 @@ pub fn tip_in_body(tip: DVec3, poses: &[(Stamped, Stamped)]) -> Result<Contact, 
 
 /// The place of a mesh.
 #[derive(Clone, Debug, PartialEq)]
-pub struct Touched {
+pub struct TouchFit {
     /// Body from mesh; rigid.
     pub mesh_to_body: DAffine3,
     /// Root mean square distance of the touched points from the mesh's, metres.
@@ -64,7 +64,7 @@ pub struct Touched {
     pub centre: DVec3,
 }
 
-impl Touched {
+impl TouchFit {
     /// Standard deviation of the place of a point of the mesh, metres, root of the sum over three axes.
     pub fn deviation_m(&self, mesh: DVec3) -> f64 {
         let lever = self.mesh_to_body.transform_point3(mesh) - self.centre;
@@ -164,7 +164,7 @@ impl Session {
     ///
     /// # Errors
     /// Each reason of [`TouchError`].
-    pub fn solve(&self) -> Result<Touched, TouchError> {
+    pub fn solve(&self) -> Result<TouchFit, TouchError> {
         solve(&self.touches)
     }
 }
@@ -175,7 +175,7 @@ const MOST_RESIDUAL_M: f64 = 3e-3;
 const TOUCH_M: f64 = 5e-5;
 
 /// Finds the rigid motion that takes the mesh's points onto the touched ones.
-pub(super) fn solve(touches: &[Touch]) -> Result<Touched, TouchError> {
+pub(super) fn solve(touches: &[Touch]) -> Result<TouchFit, TouchError> {
     if let Some(bad) = touches.iter().position(|t| !(t.mesh.is_finite() && t.body.is_finite())) {
         return Err(TouchError::NotFinite(bad));
     }
@@ -216,7 +216,7 @@ pub(super) fn solve(touches: &[Touch]) -> Result<Touched, TouchError> {
         let lever = dpm_common::so3::hat(straight.transform_vector3(t.mesh - mesh));
         inertia += lever.transpose() * lever;
     }
-    Ok(Touched {
+    Ok(TouchFit {
         mesh_to_body: straight,
         residual_m,
         residuals_m: distances(&straight, touches),

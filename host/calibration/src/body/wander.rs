@@ -9,7 +9,7 @@ use thiserror::Error;
 
 /// The place of a mesh.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub struct Wandered {
+pub struct WanderFit {
     /// Body from mesh; rigid.
     pub mesh_to_body: DAffine3,
     /// Root mean square distance of the points used from the surface, metres.
@@ -68,7 +68,7 @@ pub fn wander(
     points: &[DVec3],
     tip_radius_m: f64,
     start: &DAffine3,
-) -> Result<Wandered, WanderError> {
+) -> Result<WanderFit, WanderError> {
     if let Some(bad) = points.iter().position(|p| !p.is_finite()) {
         return Err(WanderError::NotFinite(bad));
     }
@@ -106,7 +106,7 @@ pub fn wander(
         return Err(WanderError::DoesNotFit { residual_mm: 1e3 * step.rms });
     }
     let weakest = step.eigenvalues().last().copied().unwrap_or(0.0);
-    Ok(Wandered {
+    Ok(WanderFit {
         mesh_to_body: rigid(&motion.inverse()),
         residual_m: step.rms,
         used: step.used,

@@ -55,12 +55,12 @@ fn a_shifted_body_gives_the_shift_that_was_put_in() {
         // Along the surface the light is as far from the point as the body was shifted, up to the curvature of the view.
         assert!((o.light_m - shift.length()).abs() < 0.005 * shift.length(), "{}", o.light_m);
     }
-    let checked = Checked::of(&all).unwrap();
+    let checked = CheckSummary::of(&all).unwrap();
     let (fault, part) = checked.fault(1.0).unwrap();
     assert_eq!((fault, part.is_shift()), (Fault::Body, true));
     assert!(checked.fault(checked.light.largest_px).is_none());
     // Touching nothing leaves the body's fault unseen, and says so.
-    let unseen = Checked::of(&offsets(&c, &c, shift, false)).unwrap();
+    let unseen = CheckSummary::of(&offsets(&c, &c, shift, false)).unwrap();
     assert!(unseen.body.is_none() && unseen.light.largest_px < 1e-6);
 }
 
@@ -70,7 +70,7 @@ fn a_shifted_projector_is_told_from_a_shifted_body() {
     let mut truth = rig;
     truth.world_from_projector.translation += DVec3::new(4e-3, 0.0, 0.0);
     let all = offsets(&rig, &truth, DVec3::new(0.0, 5e-4, 0.0), true);
-    let (fault, part) = Checked::of(&all).unwrap().fault(2.0).unwrap();
+    let (fault, part) = CheckSummary::of(&all).unwrap().fault(2.0).unwrap();
     assert_eq!((fault, part.is_shift()), (Fault::Projector, true));
     for o in &all {
         // The light moves with the projector.
@@ -95,7 +95,7 @@ fn a_turned_body_scatters_about_no_shift() {
             Offset::of(&c, &reading).unwrap()
         })
         .collect();
-    let (fault, part) = Checked::of(&all).unwrap().fault(1.0).unwrap();
+    let (fault, part) = CheckSummary::of(&all).unwrap().fault(1.0).unwrap();
     assert_eq!((fault, part.is_shift()), (Fault::Body, false));
 }
 

@@ -12,7 +12,7 @@ use dpm_device::planes::Raster;
 use dpm_scene::geometry::lens::Lens;
 use dpm_scene::geometry::projector::ProjectorCamera;
 use glam::{DMat3, DVec2, DVec3};
-use refine::{refine, Expected, Pinhole, Refined};
+use refine::{refine, LensFit, LensPrior, Pinhole};
 use thiserror::Error;
 
 /// A point of the world and the pixel position that lights it.
@@ -174,7 +174,7 @@ pub fn recalibrate(start: &ProjectorCamera, pairs: &[Pair]) -> Result<Calibratio
 
 fn finish(
     raster: Raster,
-    refined: Refined,
+    refined: LensFit,
     frame: &Normalisation,
     used: &[Pair],
     inliers: Vec<bool>,
@@ -426,10 +426,10 @@ impl Normalisation {
     }
 
     /// What is expected of the projector of a raster, for pairs that are off by `sigma`.
-    fn expected(&self, raster: Raster, sigma: f64) -> Expected {
+    fn expected(&self, raster: Raster, sigma: f64) -> LensPrior {
         let size = DVec2::new(f64::from(raster.width()), f64::from(raster.height()));
         let centre = (0.5 * size - self.pixel_centre) * self.pixel_scale;
-        Expected { centre, size: size * self.pixel_scale, sigma }
+        LensPrior { centre, size: size * self.pixel_scale, sigma }
     }
 
     fn to_camera(&self, raster: Raster, m: &Pinhole) -> ProjectorCamera {

@@ -34,7 +34,7 @@ impl Pinhole {
         self.centre + self.focal * q.truncate() / q.z - p.pixel
     }
 
-    fn cost(&self, pairs: &[Pair], expected: Option<&Expected>) -> f64 {
+    fn cost(&self, pairs: &[Pair], expected: Option<&LensPrior>) -> f64 {
         let seen: f64 = pairs.iter().map(|p| self.residual(p).length_squared()).sum();
         seen + expected.map_or(0.0, |e| e.rows(self).iter().map(|(r, _)| r * r).sum())
     }
@@ -80,7 +80,7 @@ impl Pinhole {
 /// What is expected of a projector before any pair is seen, in the units of the pairs: soft, so that only what the pairs
 /// leave open follows it.
 #[derive(Clone, Copy, Debug)]
-pub(super) struct Expected {
+pub(super) struct LensPrior {
     /// The middle of the picture.
     pub centre: DVec2,
     /// Width and height of the picture.
@@ -97,7 +97,7 @@ const CENTRE_SIGMA: DVec2 = DVec2::new(0.5, 1.0);
 const THROW: f64 = 1.5;
 const THROW_SIGMA: f64 = 1.0;
 
-impl Expected {
+impl LensPrior {
     /// What a pinhole misses of the expectations, and the derivatives by its ten parameters, in the pairs' units.
     fn rows(&self, m: &Pinhole) -> [(f64, [f64; 10]); 4] {
         let throw = 0.5 * (m.focal.x.ln() + m.focal.y.ln()) - (THROW * self.size.x).ln();
@@ -120,7 +120,7 @@ impl Expected {
 }
 
 /// The result of the refinement.
-pub(super) struct Refined {
+pub(super) struct LensFit {
     pub model: Pinhole,
     pub rms: f64,
     pub converged: bool,
@@ -132,7 +132,7 @@ pub(super) struct Refined {
 const STEPS: usize = 400;
 
 /// Refines a pinhole, by the pairs alone or with what is expected of it.
-pub(super) fn refine(start: Pinhole, pairs: &[Pair], expected: Option<&Expected>) -> Refined {
+pub(super) fn refine(start: Pinhole, pairs: &[Pair], expected: Option<&LensPrior>) -> LensFit {
     let n = pairs.len() as f64;
     let mut model = start;
     let mut cost = model.cost(pairs, expected);
@@ -198,5 +198,5 @@ pub(super) fn refine(start: Pinhole, pairs: &[Pair], expected: Option<&Expected>
     } else {
         inverse_diagonal(&normal).map_or(f64::INFINITY, |d| (d[0].max(d[1]) * squares / freedom).sqrt())
     };
-    Refined { model, rms: (squares / n).sqrt(), converged, iterations, focal_uncertainty }
+    LensFit { model, rms: (squares / n).sqrt(), converged, iterations, focal_uncertainty }
 }

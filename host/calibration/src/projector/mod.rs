@@ -9,13 +9,13 @@ mod refusal;
 mod solve;
 mod uncertainty;
 
-pub use dpm_calibration_file::Predicted;
+pub use dpm_calibration_file::LightError;
 pub(crate) use fit::spread_of;
 use fit::{fit, Fit};
 pub use fit::{LensTerms, Priors};
 pub use refusal::Refusal;
 pub(crate) use solve::{check_result, check_terms, look_for_motion, moved_px};
-pub use solve::{relocate, solve, Solved};
+pub use solve::{relocate, solve, ProjectorFit};
 pub(crate) use uncertainty::{percentile, variance};
 pub use uncertainty::{predict, Volume};
 
@@ -43,7 +43,7 @@ impl Sight {
 
 /// What is known of the place of the projector without any measurement. It catches a wrong unit and exchanged axes.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
-pub struct Known {
+pub struct PlaceHint {
     /// Distance from the projector's lens to the middle of the points by a tape measure, metres; right within 30 %.
     pub distance_m: Option<f64>,
     /// Direction of the world in which the upper edge of the picture lies, seen from its middle: +Y for a projector
@@ -59,7 +59,7 @@ pub struct Options {
     /// What is expected of the lens before any measurement.
     pub priors: Priors,
     /// What is known of the projector's place.
-    pub known: Known,
+    pub known: PlaceHint,
     /// Seed of the random samples.
     pub seed: u64,
 }
@@ -67,7 +67,7 @@ pub struct Options {
 impl Options {
     /// For points that are aimed at by hand.
     pub fn by_hand(raster: Raster) -> Self {
-        Self { aim_px: 0.3, priors: Priors::few_points(raster), known: Known::default(), seed: 1 }
+        Self { aim_px: 0.3, priors: Priors::few_points(raster), known: PlaceHint::default(), seed: 1 }
     }
 }
 
@@ -122,7 +122,7 @@ impl Session {
     ///
     /// # Errors
     /// Each reason of [`Refusal`].
-    pub fn solve(&self) -> Result<Solved, Refusal> {
+    pub fn solve(&self) -> Result<ProjectorFit, Refusal> {
         solve(self.raster, &self.sights, &self.options, &self.volume)
     }
 

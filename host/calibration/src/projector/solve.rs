@@ -3,23 +3,23 @@
 use super::fit::{Task, OFFSET};
 use super::refusal::{check_distance, check_up};
 use super::uncertainty::{percentile, predict, Volume};
-use super::{fit, middle, misses, spread_of, Fit, Known, LensTerms, Options, Priors, Refusal, Sight};
+use super::{fit, middle, misses, spread_of, Fit, LensTerms, Options, PlaceHint, Priors, Refusal, Sight};
 use crate::model::{ProjectorModel, INTRINSICS};
 use crate::pinhole::{calibrate, CalibrationError, CalibrationOptions, Pair};
-use dpm_calibration_file::Predicted;
+use dpm_calibration_file::LightError;
 use dpm_common::so3::so3_log;
 use dpm_device::planes::Raster;
 use glam::{DQuat, DVec2, DVec3};
 
 /// A projector, and how far to trust it.
 #[derive(Clone, Debug)]
-pub struct Solved {
+pub struct ProjectorFit {
     /// Lens and pose.
     pub model: ProjectorModel,
     /// Covariance of its numbers.
     pub covariance: Vec<Vec<f64>>,
     /// The error that the light may have over the volume.
-    pub predicted: Predicted,
+    pub predicted: LightError,
     /// Root mean square residual of the points used, along one axis, pixels.
     pub rms_px: f64,
     /// Which points were used.
@@ -50,7 +50,7 @@ pub fn solve(
     sights: &[Sight],
     options: &Options,
     volume: &Volume,
-) -> Result<Solved, Refusal> {
+) -> Result<ProjectorFit, Refusal> {
     check_numbers(raster, sights, 6)?;
     let [_, second, third] = spread_of(sights);
     if third < THINNEST * second {
@@ -96,7 +96,7 @@ pub(crate) fn check_terms(
     raster: Raster,
     model: &ProjectorModel,
     simple: Option<ProjectorModel>,
-    predicted: &Predicted,
+    predicted: &LightError,
     volume: &Volume,
 ) -> Result<(), Refusal> {
     let Some(simple) = simple else { return Ok(()) };
@@ -129,7 +129,7 @@ pub fn relocate(
     sights: &[Sight],
     options: &Options,
     volume: &Volume,
-) -> Result<Solved, Refusal> {
+) -> Result<ProjectorFit, Refusal> {
     check_numbers(raster, sights, 5)?;
     let priors = Priors::held(before);
     let task = Task { priors: &priors, focal: false, offset: false, sigma_px: options.aim_px };
@@ -277,7 +277,7 @@ fn judge(
     options: &Options,
     volume: &Volume,
     moving: bool,
-) -> Result<Solved, Refusal> {
+) -> Result<ProjectorFit, Refusal> {
     let model = &fitted.model;
     let depths: Vec<f64> = chosen(sights, &inliers).iter().map(|s| model.local(s.world).z).collect();
     let (mean, range) = check_result(model, &depths, &options.known)?;
@@ -305,7 +305,7 @@ fn judge(
 pub(crate) fn check_result(
     model: &ProjectorModel,
     depths: &[f64],
-    known: &Known,
+    known: &PlaceHint,
 ) -> Result<(f64, f64), Refusal> {
     let mean = depths.iter().sum::<f64>() / depths.len().max(1) as f64;
     let range = percentile(depths.to_vec(), 1.0) - percentile(depths.to_vec(), 0.0);
@@ -324,7 +324,7 @@ fn judge_uncertainty(
     inliers: Vec<bool>,
     options: &Options,
     volume: &Volume,
-) -> Result<Solved, Refusal> {
+) -> Result<ProjectorFit, Refusal> {
     if fitted.model.camera(raster).is_err() {
         return Err(Refusal::LensFolds);
     }
@@ -352,7 +352,7 @@ fn judge_uncertainty(
         let share = 100.0 * covariance[0][0].sqrt();
         notes.push(format!("the focal length is uncertain by {share:.0} %: add points nearer and farther"));
     }
-    Ok(Solved {
+    Ok(ProjectorFit {
         model: fitted.model,
         covariance,
         predicted,

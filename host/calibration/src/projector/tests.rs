@@ -65,7 +65,7 @@ fn p99_in_hull(got: &ProjectorModel, truth: &ProjectorModel, sights: &[Sight]) -
     uncertainty::percentile(errors.collect(), 0.99)
 }
 
-fn solved(sights: &[Sight]) -> Result<Solved, Refusal> {
+fn solved(sights: &[Sight]) -> Result<ProjectorFit, Refusal> {
     solve(raster(), sights, &Options::by_hand(raster()), &volume())
 }
 
@@ -198,7 +198,7 @@ fn a_mirror_image_is_refused_by_name() {
 fn a_wrong_unit_is_refused_by_name() {
     let truth = truth(9);
     let sights = aimed(&truth, 24, 0.2, 9);
-    let known = Known { distance_m: Some(1.1 * truth.local(DVec3::ZERO).z), up: None };
+    let known = PlaceHint { distance_m: Some(1.1 * truth.local(DVec3::ZERO).z), up: None };
     let options = Options { known, ..Options::by_hand(raster()) };
     solve(raster(), &sights, &options, &volume()).unwrap();
     for factor in [1000.0, 25.4, 0.01, 0.001, 100.0, 39.37] {
@@ -219,7 +219,7 @@ fn a_wrong_unit_is_refused_by_name() {
 #[test]
 fn a_world_with_another_axis_up_is_refused_by_name() {
     let sights = aimed(&truth(10), 24, 0.2, 10);
-    let known = Known { distance_m: None, up: Some(DVec3::Y) };
+    let known = PlaceHint { distance_m: None, up: Some(DVec3::Y) };
     let options = Options { known, ..Options::by_hand(raster()) };
     solve(raster(), &sights, &options, &volume()).unwrap();
     let mut z_up = sights.clone();
@@ -289,7 +289,7 @@ fn wide() -> ProjectorModel {
     ProjectorModel::from_camera(&camera, lens, DVec3::ZERO)
 }
 
-fn with_lens(terms: LensTerms, sights: &[Sight]) -> Result<Solved, Refusal> {
+fn with_lens(terms: LensTerms, sights: &[Sight]) -> Result<ProjectorFit, Refusal> {
     let priors = Priors::many_points(raster()).with_lens(terms);
     let options = Options { priors, aim_px: 0.1, ..Options::by_hand(raster()) };
     solve(raster(), sights, &options, &Volume { low: DVec3::splat(-0.2), high: DVec3::splat(0.2) })
@@ -299,7 +299,7 @@ fn with_lens(terms: LensTerms, sights: &[Sight]) -> Result<Solved, Refusal> {
 fn a_tilted_lens_needs_terms_that_a_narrow_one_does_not_tell() {
     let truth = wide();
     let sights = aimed(&truth, 1500, 0.05, 1);
-    let p99 = |solved: &Solved| p99_in_hull(&solved.model, &truth, &sights);
+    let p99 = |solved: &ProjectorFit| p99_in_hull(&solved.model, &truth, &sights);
     let prism = with_lens(LensTerms::ThinPrism, &sights).unwrap();
     let brown = with_lens(LensTerms::Brown, &sights).unwrap();
     println!("{} px with all terms, {} px with five", p99(&prism), p99(&brown));

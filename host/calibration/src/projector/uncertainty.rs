@@ -2,7 +2,7 @@
 
 use crate::dense::cholesky;
 use crate::model::{ProjectorModel, PARAMETERS};
-use dpm_calibration_file::Predicted;
+use dpm_calibration_file::LightError;
 use dpm_device::planes::Raster;
 use dpm_device::rng::Draws;
 use glam::{DVec2, DVec3};
@@ -47,7 +47,7 @@ const DRAWS: u64 = 400;
 
 /// The error over `points` of a projector whose numbers have the given covariance, and whose points in the
 /// world are known to `point_m` along each axis (0 where they are exact).
-pub fn predict(model: &ProjectorModel, covariance: &[Vec<f64>], points: &[DVec3]) -> Predicted {
+pub fn predict(model: &ProjectorModel, covariance: &[Vec<f64>], points: &[DVec3]) -> LightError {
     let n = PARAMETERS;
     let slopes: Vec<_> =
         points.iter().filter_map(|p| model.derive(*p).map(|d| (*p, d.by_parameters))).collect();
@@ -56,7 +56,7 @@ pub fn predict(model: &ProjectorModel, covariance: &[Vec<f64>], points: &[DVec3]
     let mut deviations: Vec<(f64, DVec3)> = slopes.iter().map(|(p, rows)| (deviation(rows), *p)).collect();
     deviations.sort_by(|a, b| a.0.total_cmp(&b.0));
     let Some(&(worst_px, worst)) = deviations.last() else {
-        return Predicted {
+        return LightError {
             typical_px: f64::INFINITY,
             p99_px: f64::INFINITY,
             worst: DVec3::ZERO,
@@ -65,7 +65,7 @@ pub fn predict(model: &ProjectorModel, covariance: &[Vec<f64>], points: &[DVec3]
     };
     let typical_px = deviations[deviations.len() / 2].0;
     let Some(root) = root(covariance) else {
-        return Predicted { typical_px, p99_px: f64::INFINITY, worst, worst_px };
+        return LightError { typical_px, p99_px: f64::INFINITY, worst, worst_px };
     };
     let draws = Draws::new(0x0ca1_1b8a);
     let mut bounds: Vec<f64> = (0..DRAWS)
@@ -78,7 +78,7 @@ pub fn predict(model: &ProjectorModel, covariance: &[Vec<f64>], points: &[DVec3]
         .collect();
     bounds.sort_by(f64::total_cmp);
     let p99_px = bounds[(0.99 * (bounds.len() - 1) as f64).round() as usize];
-    Predicted { typical_px, p99_px, worst, worst_px }
+    LightError { typical_px, p99_px, worst, worst_px }
 }
 
 /// The variance of what changes by `row` with the projector's numbers.

@@ -3,21 +3,21 @@
 use super::photodiode::{normal, record, UNIT_DISTANCE_M};
 use super::tracker::Tracker;
 use super::truth::{Bias, Hand, Truth};
-use crate::body::{self, tip_in_body, Touch, Touched};
+use crate::body::{self, tip_in_body, Touch, TouchFit};
 use crate::light::{self, flat_field, steady, LightModel, Next, Steady};
 use crate::pivot::Pivot;
-use crate::projector::{Known, Priors};
+use crate::projector::{PlaceHint, Priors};
 use crate::sensor::{decode, solve, Block, Code, Settings, Solution, Timing};
-use crate::trajectory::{Stamped, Trajectory};
+use crate::trajectory::{TimedPose, Trajectory};
 use dpm_common::so3::so3_exp;
 use dpm_device::rng::Sampler;
 use glam::{DAffine3, DQuat, DVec2, DVec3};
 use std::f64::consts::TAU;
 
 /// What was calibrated.
-pub(super) struct Found {
+pub(super) struct BenchResult {
     pub sensor: Solution,
-    pub bodies: Vec<Touched>,
+    pub bodies: Vec<TouchFit>,
     pub light: LightModel,
 }
 
@@ -31,7 +31,7 @@ const TOUCH_S: f64 = 0.5;
 /// Seconds of a reading of light, at 100 kS/s.
 const READING_S: f64 = 0.1;
 
-pub(super) fn calibrate(truth: &Truth, seed: u64, bias: Bias) -> Result<Found, String> {
+pub(super) fn calibrate(truth: &Truth, seed: u64, bias: Bias) -> Result<BenchResult, String> {
     let middle = 0.5 * (truth.volume.low + truth.volume.high);
     let tracker = |stream: u64| Tracker {
         seed: seed.wrapping_mul(1000).wrapping_add(stream),
@@ -56,7 +56,7 @@ pub(super) fn calibrate(truth: &Truth, seed: u64, bias: Bias) -> Result<Found, S
         tip_sigma_m: crate::pivot::trace(&tip.covariance).sqrt(),
         aperture_m: 2.5e-3,
         priors: Priors::many_points(truth.raster),
-        known: Known { distance_m: None, up: Some(DVec3::Y) },
+        known: PlaceHint { distance_m: None, up: Some(DVec3::Y) },
         volume: truth.volume,
         seed,
     };
@@ -65,7 +65,7 @@ pub(super) fn calibrate(truth: &Truth, seed: u64, bias: Bias) -> Result<Found, S
     let bodies = (0..truth.mesh_to_body.len()).map(|body| touch(truth, body, sensor.tip, &tracker, seed));
     let bodies = bodies.collect::<Result<_, _>>()?;
     let light = measure_light(truth, &sensor, seed)?;
-    Ok(Found { sensor, bodies, light })
+    Ok(BenchResult { sensor, bodies, light })
 }
 
 /// Touches the corners of a body's mesh, each with the wand at another angle.
@@ -75,7 +75,7 @@ fn touch(
     tip: DVec3,
     tracker: &dyn Fn(u64) -> Tracker,
     seed: u64,
-) -> Result<Touched, String> {
+) -> Result<TouchFit, String> {
     let mut s = Sampler::new(seed, 0x70c4 + body as u64);
     let mut turn = |size: f64| {
         let v = DVec3::new(s.uniform(), s.uniform(), s.uniform()) * 2.0 - 1.0;
@@ -91,7 +91,7 @@ fn touch(
         let point = place.transform_point3(truth.mesh_to_body[body].transform_point3(mesh));
         let rotation = turn(1.0);
         let (of_wand, of_body) = (tracker(10 + 2 * body as u64), tracker(11 + 2 * body as u64));
-        let poses: Vec<(Stamped, Stamped)> = (0..(TOUCH_S * 240.0) as u64)
+        let poses: Vec<(TimedPose, TimedPose)> = (0..(TOUCH_S * 240.0) as u64)
             .map(|i| {
                 let (number, seconds) =
                     (u64::from(corner) * 1000 + i, 100.0 + f64::from(corner) + i as f64 / 240.0);

@@ -5,9 +5,9 @@ use super::photodiode::record;
 use super::tracker::Tracker;
 use super::truth::{Bias, Hand, Truth};
 use crate::model::ProjectorModel;
-use crate::projector::{Known, Priors};
+use crate::projector::{PlaceHint, Priors};
 use crate::sensor::{decode, solve_latency, Code, Latency, SensorError, Settings};
-use crate::trajectory::{Stamped, Trajectory};
+use crate::trajectory::{TimedPose, Trajectory};
 use glam::DVec3;
 
 /// Ten seconds of motion.
@@ -18,7 +18,8 @@ fn latency(truth: &Truth, known: &ProjectorModel, seed: u64, late_ns: i64) -> Re
     let code = Code::new(truth.raster).expect("a usual raster");
     let hand = Hand::sweeping(&truth.volume, seed);
     let tracker = Tracker { seed: seed + 7000, latency_ns: truth.latency_ns, bias: Bias::None };
-    let mut poses: Vec<Stamped> = tracker.wand(&hand, truth.tip, middle, SWEEP_S[0] - 1.0, SWEEP_S[1] + 1.0);
+    let mut poses: Vec<TimedPose> =
+        tracker.wand(&hand, truth.tip, middle, SWEEP_S[0] - 1.0, SWEEP_S[1] + 1.0);
     poses.iter_mut().for_each(|p| p.stamp_ns += late_ns);
     let blocks = record(truth, &code, &TIMING, &hand, SWEEP_S, seed);
     let decoded = decode(&code, &TIMING, &blocks, truth.sensor_offset_ns, &|slot| slot).expect("lit");
@@ -29,7 +30,7 @@ fn latency(truth: &Truth, known: &ProjectorModel, seed: u64, late_ns: i64) -> Re
         tip_sigma_m: 5e-4,
         aperture_m: 2.5e-3,
         priors: Priors::held(known),
-        known: Known::default(),
+        known: PlaceHint::default(),
         volume: truth.volume,
         seed,
     };

@@ -12,7 +12,7 @@ mod truth;
 
 pub use truth::Bias;
 
-use crate::body::Touched;
+use crate::body::TouchFit;
 use crate::light::LightModel;
 use crate::projector::percentile;
 use crate::sensor::Solution;
@@ -163,7 +163,7 @@ const POINTS: usize = 2000;
 /// Distances between the pixels that are lit and those that should be, for points of bodies that lie anywhere in the
 /// volume, turned in any way, and move at `speed_m_s` in any direction. A wrong latency lights them where they were or will
 /// be.
-fn light_errors(truth: &Truth, got: &Solution, bodies: &[Touched], seed: u64, speed_m_s: f64) -> Vec<f64> {
+fn light_errors(truth: &Truth, got: &Solution, bodies: &[TouchFit], seed: u64, speed_m_s: f64) -> Vec<f64> {
     let late_s = 1e-9 * (got.latency_ns as f64 - truth.latency_ns);
     let mut s = Sampler::new(seed, 0xe4404);
     let mut cube = || DVec3::new(s.uniform(), s.uniform(), s.uniform());
@@ -190,7 +190,7 @@ fn light_errors(truth: &Truth, got: &Solution, bodies: &[Touched], seed: u64, sp
 }
 
 /// The solvers' bound of the 99th percentile of [`light_errors`].
-fn predicted(truth: &Truth, got: &Solution, bodies: &[Touched]) -> f64 {
+fn predicted(truth: &Truth, got: &Solution, bodies: &[TouchFit]) -> f64 {
     let corners =
         (0..8u32).map(|i| DVec3::new(f64::from(i & 1), f64::from(i >> 1 & 1), f64::from(i >> 2)) * 2.0 - 1.0);
     let deviations = corners.flat_map(|c| bodies.iter().map(move |b| b.deviation_m(c * MESH_M)));

@@ -3,11 +3,11 @@
 use super::photodiode::record;
 use super::tracker::Tracker;
 use super::truth::{Bias, Hand, Truth};
-use crate::projector::{moved_px, Known, Priors, Refusal};
+use crate::projector::{moved_px, PlaceHint, Priors, Refusal};
 use crate::sensor::{
-    decode, solve, Block, Code, Coverage, Decoded, Role, SensorError, Settings, Solution, Timing, PLANES,
+    decode, solve, Block, Code, Coverage, Decoding, Role, SensorError, Settings, Solution, Timing, PLANES,
 };
-use crate::trajectory::{Stamped, Trajectory};
+use crate::trajectory::{TimedPose, Trajectory};
 use glam::{DQuat, DVec2, DVec3};
 
 const TIMING: Timing = Timing { frame_zero_ns: 1_000_000_123, frame_ns: 1_055_966.2 };
@@ -16,8 +16,8 @@ struct Sweep {
     truth: Truth,
     code: Code,
     blocks: Vec<Block>,
-    decoded: Decoded,
-    poses: Vec<Stamped>,
+    decoded: Decoding,
+    poses: Vec<TimedPose>,
 }
 
 fn settings(truth: &Truth) -> Settings {
@@ -27,7 +27,7 @@ fn settings(truth: &Truth) -> Settings {
         tip_sigma_m: 1e-4,
         aperture_m: 3e-3,
         priors: Priors::many_points(truth.raster),
-        known: Known { distance_m: None, up: Some(DVec3::Y) },
+        known: PlaceHint { distance_m: None, up: Some(DVec3::Y) },
         volume: truth.volume,
         seed: 1,
     }
@@ -46,12 +46,12 @@ fn sweep(seed: u64, seconds: f64) -> Sweep {
 
 impl Sweep {
     /// Solves from poses that were changed.
-    fn with(&self, change: impl Fn(usize, &mut Stamped)) -> Result<Solution, SensorError> {
+    fn with(&self, change: impl Fn(usize, &mut TimedPose)) -> Result<Solution, SensorError> {
         self.with_tip(self.truth.tip, change)
     }
 
     /// The same, for a wand whose tip came out elsewhere.
-    fn with_tip(&self, tip: DVec3, change: impl Fn(usize, &mut Stamped)) -> Result<Solution, SensorError> {
+    fn with_tip(&self, tip: DVec3, change: impl Fn(usize, &mut TimedPose)) -> Result<Solution, SensorError> {
         let mut poses = self.poses.clone();
         poses.iter_mut().enumerate().for_each(|(i, pose)| change(i, pose));
         let settings = Settings { tip, ..settings(&self.truth) };

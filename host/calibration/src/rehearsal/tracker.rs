@@ -1,7 +1,7 @@
 //! The tracker of the rehearsal: true poses into noisy, late reports.
 
 use super::truth::{Bias, Hand};
-use crate::trajectory::{Stamped, POSITION_NOISE_M, ROTATION_NOISE_RAD};
+use crate::trajectory::{TimedPose, POSITION_NOISE_M, ROTATION_NOISE_RAD};
 use dpm_common::so3::so3_exp;
 use dpm_device::rng::Draws;
 use glam::{DQuat, DVec3};
@@ -27,7 +27,7 @@ impl Tracker {
         middle: DVec3,
         from_s: f64,
         to_s: f64,
-    ) -> Vec<Stamped> {
+    ) -> Vec<TimedPose> {
         let count = ((to_s - from_s) * RATE_HZ) as u64;
         (0..count)
             .map(|i| {
@@ -39,11 +39,11 @@ impl Tracker {
     }
 
     /// The report number `i` of a pose taken at `s` seconds.
-    pub(super) fn report(&self, i: u64, s: f64, position: DVec3, rotation: DQuat) -> Stamped {
+    pub(super) fn report(&self, i: u64, s: f64, position: DVec3, rotation: DQuat) -> TimedPose {
         let d = Draws::new(self.seed).stream(0x7ac4);
         let normal = |k: u64| DVec3::from_array(d.normal3(2 * i + k));
         let off = self.bias.at(position, s, self.seed);
-        Stamped {
+        TimedPose {
             stamp_ns: (1e9 * s + self.latency_ns).round() as i64,
             position: position + off + normal(0) * POSITION_NOISE_M,
             rotation: so3_exp(normal(1) * ROTATION_NOISE_RAD) * rotation,

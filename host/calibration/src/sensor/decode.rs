@@ -38,7 +38,7 @@ impl Frame {
 
 /// What the samples say.
 #[derive(Clone, Debug)]
-pub struct Decoded {
+pub struct Decoding {
     /// Frames that are whole and lit, in order.
     pub frames: Vec<Frame>,
     /// Frames during which the sensor was covered, outside the picture, or moved out of it.
@@ -118,21 +118,21 @@ pub fn decode(
     blocks: &[Block],
     sensor_minus_host_ns: i64,
     shown: &dyn Fn(u64) -> u64,
-) -> Result<Decoded, DecodeError> {
-    let Seen { lock, planes, start } = seen(timing.frame_ns / PLANES as f64, blocks)?;
+) -> Result<Decoding, DecodeError> {
+    let PlaneTimes { lock, planes, start } = seen(timing.frame_ns / PLANES as f64, blocks)?;
     let whole = frames_from(&planes, start);
     let numbered = number((code, shown), timing, &lock, &planes, start, whole, sensor_minus_host_ns)?;
-    Ok(Decoded { lock, centre: planes.centre, ..numbered })
+    Ok(Decoding { lock, centre: planes.centre, ..numbered })
 }
 
 /// Where the planes and the frames are in samples.
-struct Seen {
+struct PlaneTimes {
     lock: Lock,
     planes: Planes,
     start: usize,
 }
 
-fn seen(plane_ns: f64, blocks: &[Block]) -> Result<Seen, DecodeError> {
+fn seen(plane_ns: f64, blocks: &[Block]) -> Result<PlaneTimes, DecodeError> {
     if let Some(bad) = blocks.iter().position(|b| !b.levels.iter().all(|l| l.is_finite())) {
         return Err(DecodeError::NotFinite(bad));
     }
@@ -149,7 +149,7 @@ fn seen(plane_ns: f64, blocks: &[Block]) -> Result<Seen, DecodeError> {
     let lock = lock(blocks, plane_ns)?;
     let planes = average(blocks, &lock, slowest)?;
     let start = find_start(&planes)?;
-    Ok(Seen { lock, planes, start })
+    Ok(PlaneTimes { lock, planes, start })
 }
 
 /// The frames in samples; each with its place among them instead of its number.
@@ -157,7 +157,7 @@ fn seen(plane_ns: f64, blocks: &[Block]) -> Result<Seen, DecodeError> {
 /// # Errors
 /// As [`decode`], but for the identity.
 pub(super) fn frames_seen(plane_ns: f64, blocks: &[Block]) -> Result<Vec<Frame>, DecodeError> {
-    let Seen { planes, start, .. } = seen(plane_ns, blocks)?;
+    let PlaneTimes { planes, start, .. } = seen(plane_ns, blocks)?;
     Ok(frames_from(&planes, start))
 }
 
@@ -261,7 +261,7 @@ fn number(
     start: usize,
     mut frames: Vec<Frame>,
     sensor_minus_host_ns: i64,
-) -> Result<Decoded, DecodeError> {
+) -> Result<Decoding, DecodeError> {
     let bit = |f: &Frame| f.levels[PLANES - 2] > f.levels[PLANES - 1];
     let told: Vec<(usize, bool)> = frames.iter().take(1000).map(|f| (f.number as usize, bit(f))).collect();
     let n = told.len();
@@ -294,7 +294,7 @@ fn number(
     let right = frames.iter().filter(|f| code.identity(shown(f.number)) == bit(f)).count();
     let whole = planes.levels.len().saturating_sub(start) / PLANES;
     let noise = noise(&frames);
-    Ok(Decoded {
+    Ok(Decoding {
         dropped: whole - frames.len(),
         identity_percent: 100.0 * right as f64 / frames.len().max(1) as f64,
         frames,

@@ -10,15 +10,17 @@
 
 use super::change::largest_change;
 use super::code::{Code, PLANES};
-use super::decode::Decoded;
+use super::decode::Decoding;
 use super::lens::finish_told;
-use super::problem::{Fix, Limits, Measured, Planes, Problem, Seen, State, Tally, LATENCY, TIP, UNKNOWNS};
+use super::problem::{
+    Fix, FrameFix, Limits, Measured, Planes, Problem, State, Tally, LATENCY, TIP, UNKNOWNS,
+};
 use super::start::{prepare, start, thin, why_no_fit};
 use super::Timing;
 use crate::dense::inverse_spd;
 use crate::least_squares::{descend, Equations};
 use crate::model::ProjectorModel;
-use crate::projector::{check_result, predict, Known, Predicted, Priors, Refusal, Volume};
+use crate::projector::{check_result, predict, LightError, PlaceHint, Priors, Refusal, Volume};
 use crate::trajectory::Trajectory;
 use dpm_device::planes::Raster;
 use glam::{DMat3, DVec2, DVec3};
@@ -38,7 +40,7 @@ pub struct Settings {
     /// What is expected of the lens.
     pub priors: Priors,
     /// What is known of the projector's place.
-    pub known: Known,
+    pub known: PlaceHint,
     /// Where light will be needed.
     pub volume: Volume,
     /// Seed of the random samples.
@@ -66,7 +68,7 @@ pub struct Solution {
     /// Covariance of the model's numbers.
     pub covariance: Vec<Vec<f64>>,
     /// The error that the light may have over the volume, if the tracker has no bias.
-    pub predicted: Predicted,
+    pub predicted: LightError,
     /// The data leave the lens open near the raster's border, where a usual lens was expected.
     pub is_lens_open: bool,
     /// The tip in the wand's body frame, metres.
@@ -168,7 +170,7 @@ pub(super) const BLOCK_S: f64 = 0.1;
 /// Each reason of [`SensorError`].
 pub fn solve(
     code: &Code,
-    decoded: &Decoded,
+    decoded: &Decoding,
     path: &Trajectory,
     settings: &Settings,
 ) -> Result<Solution, SensorError> {
@@ -182,14 +184,17 @@ pub fn solve(
 }
 
 /// The planes of frames, and when their levels were.
-pub(super) fn planes_of<'a>(code: &'a Code, decoded: &Decoded, settings: &Settings) -> Planes<'a> {
+pub(super) fn planes_of<'a>(code: &'a Code, decoded: &Decoding, settings: &Settings) -> Planes<'a> {
     let plane_s = 1e-9 * settings.timing.frame_ns / PLANES as f64;
     let times = std::array::from_fn(|p| (p as f64 + decoded.centre - (PLANES / 2) as f64) * plane_s);
     Planes { code, times }
 }
 
 /// The frames, if they are enough.
-pub(super) fn enough<'a>(seen: Vec<Seen<'a>>, settings: &Settings) -> Result<Vec<Seen<'a>>, SensorError> {
+pub(super) fn enough<'a>(
+    seen: Vec<FrameFix<'a>>,
+    settings: &Settings,
+) -> Result<Vec<FrameFix<'a>>, SensorError> {
     if seen.len() < FEWEST {
         let seconds = (2 * FEWEST - seen.len()) as f64 * 1e-9 * settings.timing.frame_ns;
         return Err(SensorError::TooFew { frames: seen.len(), need: FEWEST, seconds: seconds.max(1.0) });
@@ -240,13 +245,13 @@ impl Scores {
 }
 
 /// A state with its equations, and the root mean square of the levels' residuals.
-pub(super) struct Fitted {
+pub(super) struct FitState {
     pub state: State,
     pub equations: Equations,
     pub rms_level: f64,
 }
 
-impl Fitted {
+impl FitState {
     /// The deviation of a level that the weights are made of.
     pub(super) fn sigma(&self) -> f64 {
         self.rms_level.clamp(0.005, 0.15)
@@ -262,7 +267,7 @@ pub(super) fn refine<M: Measured>(
     start: State,
     seen: &[M],
     stages: &[(f64, bool)],
-) -> Result<Fitted, SensorError> {
+) -> Result<FitState, SensorError> {
     let few: Vec<&M> = thin(seen, 3000).collect();
     let every: Vec<&M> = seen.iter().collect();
     let mut state = start;
@@ -288,20 +293,20 @@ pub(super) fn refine<M: Measured>(
         last = Some((found.equations, rms));
     }
     let (equations, rms_level) = last.ok_or(failed)?;
-    Ok(Fitted { state, equations, rms_level })
+    Ok(FitState { state, equations, rms_level })
 }
 
 /// What the measurements say of a fit.
 #[derive(Default)]
-struct Told {
+struct Evidence {
     scores: Scores,
     brightness: Vec<Brightness>,
     /// Distances of the tip along the projector's axis, metres.
     depths: Vec<f64>,
 }
 
-impl Told {
-    fn of<M: Measured>(problem: &Problem, fitted: &Fitted, seen: &[M]) -> Self {
+impl Evidence {
+    fn of<M: Measured>(problem: &Problem, fitted: &FitState, seen: &[M]) -> Self {
         let (state, mut told) = (&fitted.state, Self::default());
         let position = state.model.position();
         for one in seen {
@@ -329,11 +334,11 @@ impl Told {
 /// raster is not asked here.
 pub(super) fn finish<M: Measured>(
     problem: &Problem,
-    fitted: &Fitted,
+    fitted: &FitState,
     (seen, fixes): (&[M], &[Fix]),
 ) -> Result<Solution, SensorError> {
     let (settings, state) = (problem.settings, &fitted.state);
-    let Told { scores, brightness, depths } = Told::of(problem, fitted, seen);
+    let Evidence { scores, brightness, depths } = Evidence::of(problem, fitted, seen);
     let rms_px = scores.rms_px();
     if rms_px > MOST_RMS_PX || fitted.rms_level > MOST_MISFIT {
         return Err(why_no_fit(problem, fixes, state, rms_px));

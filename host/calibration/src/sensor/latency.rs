@@ -1,8 +1,8 @@
 //! The latency alone, with lens and pose of the projector known: some seconds of motion suffice.
 
 use super::code::Code;
-use super::decode::Decoded;
-use super::fit::{enough, planes_of, refine, sandwich, Fitted, Scores, SensorError, Settings, FINEST};
+use super::decode::Decoding;
+use super::fit::{enough, planes_of, refine, sandwich, FitState, Scores, SensorError, Settings, FINEST};
 use super::problem::{Fix, Measured, Moment, Problem, State, LATENCY};
 use super::start::{from_bits, prepare, MOST_START_PX};
 use crate::dense::inverse_spd;
@@ -36,7 +36,7 @@ const MOST_TIP_SIGMAS: f64 = 5.0;
 /// [`SensorError::OtherProjector`] if the light is not where `model` says.
 pub fn solve_latency(
     code: &Code,
-    decoded: &Decoded,
+    decoded: &Decoding,
     path: &Trajectory,
     settings: &Settings,
     model: &ProjectorModel,
@@ -73,7 +73,7 @@ fn apart<'a>(problem: &Problem, a: &State, b: &State, moments: impl Iterator<Ite
 
 pub(super) fn finish<M: Measured>(
     problem: &Problem,
-    fitted: &Fitted,
+    fitted: &FitState,
     seen: &[M],
 ) -> Result<Latency, SensorError> {
     let state = &fitted.state;

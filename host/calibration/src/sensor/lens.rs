@@ -1,7 +1,7 @@
 //! How much of a lens the levels tell: terms that were asked for must be more than noise, and where no light was seen near
 //! the raster's border, the lens there is expected to be a usual one.
 
-use super::fit::{finish, refine, Fitted, SensorError, Settings, Solution};
+use super::fit::{finish, refine, FitState, SensorError, Settings, Solution};
 use super::problem::{Fix, Measured, Problem, State};
 use crate::model::ProjectorModel;
 use crate::projector::{check_terms, moved_px, predict, LensTerms, Refusal};
@@ -16,7 +16,7 @@ const MOST_OPEN: f64 = 0.01;
 /// Each reason of [`SensorError`].
 pub(super) fn finish_told<M: Measured>(
     problem: &Problem,
-    fitted: &Fitted,
+    fitted: &FitState,
     (seen, fixes): (&[M], &[Fix]),
     stages: &[(f64, bool)],
 ) -> Result<Solution, SensorError> {
@@ -86,7 +86,7 @@ fn refit<M: Measured>(
     mut begun: State,
     seen: &[M],
     stages: &[(f64, bool)],
-) -> Result<Fitted, SensorError> {
+) -> Result<FitState, SensorError> {
     let pinhole = begun.model.pinhole(problem.raster).map_err(|_| Refusal::LensFolds)?;
     begun.model = ProjectorModel::from_camera(&pinhole, [0.0; 5], begun.model.origin);
     refine(problem, begun, seen, stages)

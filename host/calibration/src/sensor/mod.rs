@@ -20,7 +20,7 @@ mod stripes;
 
 pub use code::{Code, CodeError, Role, PLANES};
 pub use coverage::Coverage;
-pub use decode::{decode, DecodeError, Decoded, Frame};
+pub use decode::{decode, DecodeError, Decoding, Frame};
 pub use fit::{solve, Brightness, SensorError, Settings, Solution};
 pub use inverse::{
     decode_pairs, places_rested, solve_latency_of_pairs, solve_pairs, DecodedPairs, FrameLight, InverseCode,

@@ -41,7 +41,7 @@ pub(super) struct Planes<'a> {
 }
 
 /// A frame prepared for the fit.
-pub(super) struct Seen<'a> {
+pub(super) struct FrameFix<'a> {
     pub planes: &'a Planes<'a>,
     /// The instant is that of the frame's middle plane.
     pub fix: Fix,
@@ -238,7 +238,7 @@ impl<M: Measured> Measured for &M {
     }
 }
 
-impl Measured for Seen<'_> {
+impl Measured for FrameFix<'_> {
     fn moment(&self) -> &Moment {
         &self.fix.moment
     }
@@ -265,7 +265,7 @@ impl Measured for Seen<'_> {
     }
 }
 
-impl Seen<'_> {
+impl FrameFix<'_> {
     /// Residuals of the levels: summed products of slopes and residuals.
     fn sums(&self, at: &Sighting, sigma: f64, finest: f64) -> Sums {
         let mut sums = Sums::default();

@@ -1,9 +1,9 @@
 //! Frames into a state from which the levels can be fitted: pixels from the bits, a pinhole, then tip and latency.
 
 use super::code::{Code, Role, PLANES};
-use super::decode::{Decoded, Frame};
+use super::decode::{Decoding, Frame};
 use super::fit::{SensorError, Settings, MOST_LATENCY_S};
-use super::problem::{Fix, Moment, Planes, Problem, Seen, State};
+use super::problem::{Fix, FrameFix, Moment, Planes, Problem, State};
 use crate::least_squares::descend;
 use crate::model::ProjectorModel;
 use crate::pinhole::{calibrate, CalibrationError, CalibrationOptions, Pair};
@@ -18,10 +18,10 @@ const BORDER_PX: f64 = 10.0;
 /// Frames with a pose, away from the raster's border, with their levels over the contrast and the pixel of the bits.
 pub(super) fn prepare<'a>(
     planes: &'a Planes<'a>,
-    decoded: &Decoded,
+    decoded: &Decoding,
     path: &Trajectory,
     settings: &Settings,
-) -> Vec<Seen<'a>> {
+) -> Vec<FrameFix<'a>> {
     let Some((first, last)) = path.span_ns() else { return Vec::new() };
     let middle_ns = first / 2 + last / 2;
     let seen = |frame: &Frame| {
@@ -30,7 +30,7 @@ pub(super) fn prepare<'a>(
         let pixel = pixel_of_bits(planes.code, &levels);
         let from_middle_s = 1e-9 * instant.0.saturating_sub(middle_ns) as f64;
         let fix = Fix { moment: Moment { instant, from_middle_s }, pixel };
-        is_inside(planes.code.raster(), pixel).then(|| Seen {
+        is_inside(planes.code.raster(), pixel).then(|| FrameFix {
             planes,
             fix,
             levels,
@@ -39,7 +39,7 @@ pub(super) fn prepare<'a>(
     };
     // Whatever the latency is, there must be a pose.
     let reach = (1e9 * MOST_LATENCY_S) as i64;
-    let known = |s: &Seen| {
+    let known = |s: &FrameFix| {
         let at = s.fix.moment.instant.0;
         at - reach > first && at + reach < last && path.at(at, 0.0).is_some()
     };

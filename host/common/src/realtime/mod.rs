@@ -38,7 +38,7 @@ pub struct Refusal {
 
 /// The rights that a thread got.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
-pub struct Granted {
+pub struct Grant {
     /// SCHED_FIFO priority in force; 0 is the normal scheduler.
     pub priority: u32,
     /// Core it is bound to.
@@ -49,8 +49,8 @@ pub struct Granted {
 
 /// Requests `rights` for the calling thread. Call once at the start of the thread: it allocates and makes system
 /// calls.
-pub fn enter_frame_path(rights: ThreadRights) -> Granted {
-    let mut granted = Granted::default();
+pub fn enter_frame_path(rights: ThreadRights) -> Grant {
+    let mut granted = Grant::default();
     // Makes sleeps end within a microsecond instead of 50. Needs no right and has no effect under SCHED_FIFO.
     if let Err(refusal) = os::set_timer_slack_ns(1) {
         granted.refusals.push(refusal);

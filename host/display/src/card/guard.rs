@@ -45,11 +45,11 @@ pub fn show_black(descriptor: OwnedFd, crtc: u32, black: u32, hold: Duration) ->
     let end = Instant::now() + hold;
     // The holder of a lease is no master that could let go.
     let is_lease = node.release_master_lock().is_err();
-    let asked = if is_lease { Asked::of(&node) } else { None };
+    let asked = if is_lease { EndRequest::of(&node) } else { None };
     while Instant::now() < end {
         std::thread::sleep(STEP.saturating_mul(250));
         if is_lease {
-            if !node.is_lent() || asked.as_ref().is_some_and(Asked::is_asked) {
+            if !node.is_lent() || asked.as_ref().is_some_and(EndRequest::is_asked) {
                 break;
             }
             continue;
@@ -63,12 +63,12 @@ pub fn show_black(descriptor: OwnedFd, crtc: u32, black: u32, hold: Duration) ->
 }
 
 /// Where a guardian is asked to end. The file is gone when it does.
-struct Asked {
+struct EndRequest {
     socket: UnixDatagram,
     path: PathBuf,
 }
 
-impl Asked {
+impl EndRequest {
     fn of(node: &Node) -> Option<Self> {
         let (_, connector) = node.connector_names().into_iter().next()?;
         Self::at(&runtime_folder()?, &connector)
@@ -88,7 +88,7 @@ impl Asked {
     }
 }
 
-impl Drop for Asked {
+impl Drop for EndRequest {
     fn drop(&mut self) {
         let _ = std::fs::remove_file(&self.path);
     }
@@ -142,7 +142,7 @@ mod tests {
     }
 
     fn keep(folder: &Path, connector: &str) -> std::thread::JoinHandle<bool> {
-        let asked = Asked::at(folder, connector).expect("a socket");
+        let asked = EndRequest::at(folder, connector).expect("a socket");
         std::thread::spawn(move || {
             let limit = Instant::now() + Duration::from_secs(10);
             while !asked.is_asked() && Instant::now() < limit {

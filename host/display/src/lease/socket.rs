@@ -36,12 +36,12 @@ pub(super) mod tests {
     use std::time::Duration;
 
     /// A descriptor that a fake server hands out, and what tells whether another one is the same.
-    pub(in super::super) struct Handed {
+    pub(in super::super) struct HandedSocket {
         pub(in super::super) given: OwnedFd,
         heard: std::io::PipeReader,
     }
 
-    impl Handed {
+    impl HandedSocket {
         pub(in super::super) fn new() -> Self {
             let (heard, given) = std::io::pipe().unwrap();
             Self { given: given.into(), heard }

@@ -102,7 +102,7 @@ enum Answer {
 
 /// What the compositor has said so far.
 #[derive(Default)]
-struct Heard {
+struct Answers {
     cards: Vec<Offers>,
     has_listed: bool,
     answer: Option<Answer>,
@@ -119,7 +119,7 @@ pub(super) fn lease_over(
         .map_err(|e| Refusal::new(format!("its socket cannot be used: {e}")))?;
     let mut queue = connection.new_event_queue();
     let handle = queue.handle();
-    let mut heard = Heard::default();
+    let mut heard = Answers::default();
     let registry = connection.display().get_registry(&handle, ());
     connection.display().sync(&handle, ());
     until_true(&connection, &mut queue, &mut heard, until, |heard| heard.has_listed)?;
@@ -196,10 +196,10 @@ fn choose(
 /// Reads what the compositor says until `is_enough`.
 fn until_true(
     connection: &Connection,
-    queue: &mut EventQueue<Heard>,
-    heard: &mut Heard,
+    queue: &mut EventQueue<Answers>,
+    heard: &mut Answers,
     until: Instant,
-    is_enough: impl Fn(&Heard) -> bool,
+    is_enough: impl Fn(&Answers) -> bool,
 ) -> Result<(), Refusal> {
     let gone = |e: &dyn std::fmt::Display| {
         Refusal::new(format!("it went away, or does not keep to the protocol: {e}"))
@@ -243,7 +243,7 @@ impl Drop for Back {
     }
 }
 
-impl Dispatch<WlRegistry, ()> for Heard {
+impl Dispatch<WlRegistry, ()> for Answers {
     fn event(
         heard: &mut Self,
         registry: &WlRegistry,
@@ -261,7 +261,7 @@ impl Dispatch<WlRegistry, ()> for Heard {
     }
 }
 
-impl Dispatch<WlCallback, ()> for Heard {
+impl Dispatch<WlCallback, ()> for Answers {
     fn event(
         heard: &mut Self,
         _: &WlCallback,
@@ -274,7 +274,7 @@ impl Dispatch<WlCallback, ()> for Heard {
     }
 }
 
-impl Dispatch<WpDrmLeaseDeviceV1, ()> for Heard {
+impl Dispatch<WpDrmLeaseDeviceV1, ()> for Answers {
     fn event(
         heard: &mut Self,
         device: &WpDrmLeaseDeviceV1,
@@ -298,10 +298,10 @@ impl Dispatch<WpDrmLeaseDeviceV1, ()> for Heard {
         }
     }
 
-    event_created_child!(Heard, WpDrmLeaseDeviceV1, [EVT_CONNECTOR_OPCODE => (WpDrmLeaseConnectorV1, ())]);
+    event_created_child!(Answers, WpDrmLeaseDeviceV1, [EVT_CONNECTOR_OPCODE => (WpDrmLeaseConnectorV1, ())]);
 }
 
-impl Dispatch<WpDrmLeaseConnectorV1, ()> for Heard {
+impl Dispatch<WpDrmLeaseConnectorV1, ()> for Answers {
     fn event(
         heard: &mut Self,
         connector: &WpDrmLeaseConnectorV1,
@@ -323,7 +323,7 @@ impl Dispatch<WpDrmLeaseConnectorV1, ()> for Heard {
     }
 }
 
-impl Dispatch<WpDrmLeaseRequestV1, ()> for Heard {
+impl Dispatch<WpDrmLeaseRequestV1, ()> for Answers {
     fn event(
         _: &mut Self,
         _: &WpDrmLeaseRequestV1,
@@ -335,7 +335,7 @@ impl Dispatch<WpDrmLeaseRequestV1, ()> for Heard {
     }
 }
 
-impl Dispatch<WpDrmLeaseV1, ()> for Heard {
+impl Dispatch<WpDrmLeaseV1, ()> for Answers {
     fn event(
         heard: &mut Self,
         _: &WpDrmLeaseV1,

@@ -76,22 +76,22 @@ fn connect(path: &str, display: u16, until: Instant) -> Result<Server, Refusal> 
     let (stream, (family, peer)) = DefaultStream::from_unix_stream(stream).map_err(|e| does_not(&e))?;
     // Without a key the server itself says whether it wants one.
     let (key, value) = get_auth(family, &peer, display).ok().flatten().unwrap_or_default();
-    let stream = Bounded::new(stream, until);
+    let stream = BoundedStream::new(stream, until);
     RustConnection::connect_to_stream_with_auth_info(stream, 0, key, value).map_err(|e| does_not(&e))
 }
 
 /// A connection whose waits end.
-type Server = RustConnection<Bounded>;
+type Server = RustConnection<BoundedStream>;
 
 /// A stream that is never waited for after a limit.
-pub(super) struct Bounded {
+pub(super) struct BoundedStream {
     stream: DefaultStream,
     start: Instant,
     /// The limit, in nanoseconds from the start.
     limit_ns: AtomicU64,
 }
 
-impl Bounded {
+impl BoundedStream {
     pub(super) fn new(stream: DefaultStream, until: Instant) -> Self {
         let bounded = Self { stream, start: Instant::now(), limit_ns: AtomicU64::new(0) };
         bounded.wait_until(until);
@@ -104,7 +104,7 @@ impl Bounded {
     }
 }
 
-impl Stream for Bounded {
+impl Stream for BoundedStream {
     fn poll(&self, mode: PollMode) -> std::io::Result<()> {
         let mut flags = PollFlags::empty();
         flags.set(PollFlags::IN, mode.readable());

@@ -21,7 +21,7 @@ use super::WindowSettings;
 use crate::encoding::{Encoding, PixelMap};
 use crate::panel::PanelSettings;
 use crate::scan_out::{DisplayError, Flip, Picture, Pixels, ScanOut};
-use crate::transport::{Opener, Shown};
+use crate::transport::{Opener, Showing};
 
 /// Pictures in the server's memory beside the black one: the two of the panel, and two that the server may still read.
 const PIXMAPS: usize = 4;
@@ -46,7 +46,7 @@ pub fn opener(settings: WindowSettings, on_close: impl Fn() + Send + Sync + 'sta
         let window =
             Window::open(&settings, is_closed.clone(), on_close.clone()).map_err(|e| e.of(name.clone()))?;
         let warnings = window.warnings.clone();
-        Ok(Shown { out: Box::new(window), panel, name, warnings })
+        Ok(Showing { out: Box::new(window), panel, name, warnings })
     })
 }
 
@@ -91,7 +91,7 @@ type OnClose = Arc<dyn Fn() + Send + Sync>;
 
 /// A picture in the server's memory.
 #[derive(Clone, Copy, Debug)]
-struct Stored {
+struct StoredPicture {
     pixmap: Pixmap,
     /// The server does not read it.
     is_idle: bool,
@@ -115,7 +115,7 @@ pub struct Window {
     gc: Gcontext,
     raster: Raster,
     black: Pixmap,
-    stored: [Stored; PIXMAPS],
+    stored: [StoredPicture; PIXMAPS],
     frames: [Frame; 2],
     /// The number of the newest picture that was handed over, and whether it was taken.
     newest: (u32, bool),
@@ -147,7 +147,7 @@ impl Window {
             Ok(pixmap)
         };
         let black = new_pixmap().map_err(of_id)?;
-        let mut stored = [Stored { pixmap: black, is_idle: true }; PIXMAPS];
+        let mut stored = [StoredPicture { pixmap: black, is_idle: true }; PIXMAPS];
         for one in &mut stored {
             one.pixmap = new_pixmap().map_err(of_id)?;
         }

@@ -23,7 +23,7 @@ use drm::control::{connector, crtc, plane, Device as ControlDevice, LeaseId, Raw
 use drm::{ClientCapability, Device};
 
 use crate::checksum::{checksum, checksums, wait_for};
-use crate::compositor::{Compositor, Manner, Seen};
+use crate::compositor::{Compositor, LeaseLog, Manner};
 use crate::rig::{pixels, settings, stream, CONNECTOR, PATIENCE};
 use crate::ways_out::{this_program, HOLD};
 
@@ -93,7 +93,7 @@ impl Desktop {
             offers: vec![("Projector", self.connector.into())],
             card: File::options().read(true).write(true).open(&cards()[0]).unwrap().into(),
             lend: Box::new(move || desktop.lend()),
-            seen: Seen::default(),
+            seen: LeaseLog::default(),
         };
         compositor.serve();
         if self.takes_back.load(Ordering::Relaxed) {

@@ -17,14 +17,14 @@ use dpm_display::set_up::{plan, DisplaySettings};
 use crate::demo::{cases, Case};
 use crate::oracle;
 use crate::rig::{clock, link_settings, settings, timing, CONNECTOR, PATIENCE};
-use crate::witness::{Disturbance, Shared, Witness};
+use crate::witness::{Disturbance, Witness, WitnessLog};
 
 /// A rig whose thread is the test's: nothing happens but by a call.
 struct Rig {
     link: HostLink,
     cable: Direct<Panel<Witness>>,
     clock: Arc<dyn HostClock>,
-    log: Shared,
+    log: WitnessLog,
     /// Planes of the frames, and the pixels that they must become. Frame `id` is number `id - 1`, again and again.
     frames: Vec<(Vec<u8>, Vec<u8>)>,
     /// Frames that were sent.
@@ -60,7 +60,7 @@ impl Rig {
         let settings = DisplaySettings { schedule: case.schedule, ..settings(case.encoding) };
         let raster = settings.raster;
         let clock = clock();
-        let log = Shared::default();
+        let log = WitnessLog::default();
         let mut card = open_for(None, Some(CONNECTOR)).expect("vkms");
         let plan = plan(&card.connectors().unwrap(), &settings).expect("it can be used");
         card.start(&plan.setup).expect("it starts");

@@ -17,7 +17,7 @@ use dpm_display::transport::set_guardian;
 use rustix::process::{pidfd_getfd, pidfd_open, Pid, PidfdFlags, PidfdGetfdFlags};
 
 use crate::rig::{open_by, opener, pixels, stream, timing, CONNECTOR, PATIENCE};
-use crate::witness::{witnessed, Shared};
+use crate::witness::{witnessed, WitnessLog};
 use crate::writeback::{driven, Reader};
 
 /// How long a guardian of this test keeps a display.
@@ -51,7 +51,7 @@ enum Phase {
 
 /// The kernel says that the display is unplugged, and later that it is back.
 pub(crate) fn unplugged() {
-    let log = Shared::default();
+    let log = WitnessLog::default();
     let (mut display, clock) = open_by(witnessed(opener(Encoding::Rgb8), &log));
     let mut phase = Phase::Plugged;
     let lit = |from: usize| {

@@ -14,7 +14,7 @@ use crate::writeback::Reader;
 
 /// A picture that the card took.
 #[derive(Clone, Debug)]
-pub(crate) struct Taken {
+pub(crate) struct CardPicture {
     /// The kernel's count of the blank from which on it is scanned out, and its stamp.
     pub(crate) flip: Flip,
     /// Which one.
@@ -45,7 +45,7 @@ pub(crate) struct Log {
     /// Pictures are not read back, which would take a blank each.
     pub(crate) is_blind: bool,
     /// Pictures that it took, oldest first.
-    pub(crate) taken: Vec<Taken>,
+    pub(crate) taken: Vec<CardPicture>,
     /// What was composed after each call for black on a way out.
     pub(crate) blackened: Vec<Vec<u8>>,
     /// What is to happen next.
@@ -55,9 +55,9 @@ pub(crate) struct Log {
 
 /// The log, shared with the test.
 #[derive(Clone, Default)]
-pub(crate) struct Shared(Arc<Mutex<Log>>);
+pub(crate) struct WitnessLog(Arc<Mutex<Log>>);
 
-impl Shared {
+impl WitnessLog {
     pub(crate) fn lock(&self) -> MutexGuard<'_, Log> {
         self.0.lock().unwrap_or_else(PoisonError::into_inner)
     }
@@ -67,13 +67,13 @@ impl Shared {
 pub(crate) struct Witness {
     out: Box<dyn ScanOut>,
     pub(crate) reader: Reader,
-    log: Shared,
+    log: WitnessLog,
     waiting: Option<Picture>,
 }
 
 impl Witness {
     /// In front of `out`, a card that was started.
-    pub(crate) fn new(out: Box<dyn ScanOut>, log: Shared) -> Self {
+    pub(crate) fn new(out: Box<dyn ScanOut>, log: WitnessLog) -> Self {
         let (descriptor, arguments) = out.guarded().expect("a card");
         let at = arguments.iter().position(|a| a == "--crtc").expect("the CRTC is named");
         let crtc = arguments[at + 1].to_string_lossy().parse().expect("by its number");
@@ -82,7 +82,7 @@ impl Witness {
 }
 
 /// Puts a witness before everything that `opener` opens.
-pub(crate) fn witnessed(opener: Opener, log: &Shared) -> Opener {
+pub(crate) fn witnessed(opener: Opener, log: &WitnessLog) -> Opener {
     let log = log.clone();
     Arc::new(move || {
         let mut shown = opener()?;
@@ -129,7 +129,7 @@ impl ScanOut for Witness {
             let picture = self.waiting.take().expect("it was handed over");
             let mut log = self.log.lock();
             log.front = Some(picture);
-            log.taken.push(Taken { flip, picture, pixels });
+            log.taken.push(CardPicture { flip, picture, pixels });
             drop(log);
             sink(flip);
         }

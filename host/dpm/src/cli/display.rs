@@ -73,7 +73,7 @@ fn guard(crtc: u32, black: u32) -> Result<(), Failure> {
 }
 
 /// A graphics card, and what is at its connectors.
-pub(super) struct Seen {
+pub(super) struct CardView {
     /// Its device file.
     pub(super) path: PathBuf,
     /// Another program drives its displays.
@@ -83,24 +83,24 @@ pub(super) struct Seen {
 }
 
 /// All graphics cards of this machine.
-pub(super) fn look() -> Vec<Seen> {
+pub(super) fn look() -> Vec<CardView> {
     cards().into_iter().map(|path| seen(&path)).collect()
 }
 
-fn seen(path: &Path) -> Seen {
+fn seen(path: &Path) -> CardView {
     let (is_in_use, connectors) = match Card::look(path) {
         Ok(mut card) => (card.is_in_use(), card.connectors()),
         Err(e) => (false, Err(e)),
     };
-    Seen { path: path.into(), is_in_use, connectors }
+    CardView { path: path.into(), is_in_use, connectors }
 }
 
-fn listed(all: &[Seen]) -> String {
+fn listed(all: &[CardView]) -> String {
     if all.is_empty() {
         return "no graphics card that can set modes: /dev/dri has no card\n".into();
     }
     let mut text = String::new();
-    for Seen { path, is_in_use, connectors } in all {
+    for CardView { path, is_in_use, connectors } in all {
         let used = if *is_in_use {
             ", driven by another program (a desktop may lend one of them: docs/DISPLAY.md)"
         } else {
@@ -152,7 +152,7 @@ mod tests {
             modes: vec![other, full],
             properties: Vec::new(),
         };
-        let text = listed(&[Seen {
+        let text = listed(&[CardView {
             path: "/dev/dri/card7".into(),
             is_in_use: true,
             connectors: Ok(vec![connector]),
@@ -162,7 +162,7 @@ mod tests {
         let mode = line.split('"').nth(1).unwrap().parse::<ModeWish>().unwrap();
         assert_eq!(mode.choose(&[other, full]), Ok(full));
         assert!(listed(&[]).contains("no graphics card"));
-        let gone = Seen {
+        let gone = CardView {
             path: "/dev/dri/card0".into(),
             is_in_use: false,
             connectors: Err(DisplayError::Denied("x".into())),

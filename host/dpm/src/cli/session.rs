@@ -30,7 +30,7 @@ const LOOK: Duration = Duration::from_millis(50);
 
 /// What the threads of a step share.
 #[derive(Debug, Default)]
-struct Shared {
+struct StepState {
     session: Session,
     /// The input and the number of the step's process, while it runs.
     process: Option<(ChildStdin, i32)>,
@@ -45,10 +45,10 @@ pub(super) struct Runner {
     file: PathBuf,
     /// Flags of `--set` that every step gets.
     flags: Vec<String>,
-    shared: Arc<Mutex<Shared>>,
+    shared: Arc<Mutex<StepState>>,
 }
 
-fn held(shared: &Mutex<Shared>) -> MutexGuard<'_, Shared> {
+fn held(shared: &Mutex<StepState>) -> MutexGuard<'_, StepState> {
     shared.lock().unwrap_or_else(PoisonError::into_inner)
 }
 
@@ -108,7 +108,7 @@ impl Runner {
         }
         let arguments = self.arguments(words, sensor, gain)?;
         self.prepare().map_err(|e| format!("{}: {e}", self.trial().display()))?;
-        *shared = Shared::default();
+        *shared = StepState::default();
         shared.session = Session { step: Some(step.into()), way, is_running: true, ..Session::default() };
         drop(shared);
         let (started, heard) = channel();
@@ -228,7 +228,7 @@ impl Drop for Runner {
 }
 
 /// Starts a step and follows it to its end. Its process ends with this thread.
-fn follow(arguments: &[String], shared: &Arc<Mutex<Shared>>, started: &Sender<Result<(), String>>) {
+fn follow(arguments: &[String], shared: &Arc<Mutex<StepState>>, started: &Sender<Result<(), String>>) {
     let begin = || {
         let mut command = Command::new(std::env::current_exe()?);
         command.args(arguments).stdin(Stdio::piped()).stdout(Stdio::piped()).stderr(Stdio::piped());
@@ -263,7 +263,7 @@ fn told_of(status: ExitStatus) -> String {
 }
 
 /// Waits for the end of a step, and kills it if it was asked to end and does not.
-fn wait(child: &mut Child, shared: &Mutex<Shared>) -> io::Result<ExitStatus> {
+fn wait(child: &mut Child, shared: &Mutex<StepState>) -> io::Result<ExitStatus> {
     loop {
         let mut held = held(shared);
         if let Some(status) = child.try_wait()? {
@@ -280,7 +280,7 @@ fn wait(child: &mut Child, shared: &Mutex<Shared>) -> io::Result<ExitStatus> {
 }
 
 /// Reads what a step says, to its end. A question has no end of line, so nothing waits for one.
-fn read(mut from: impl Read, shared: &Mutex<Shared>) {
+fn read(mut from: impl Read, shared: &Mutex<StepState>) {
     let mut bytes = [0; 1024];
     while let Ok(n) = from.read(&mut bytes) {
         if n == 0 {
@@ -291,7 +291,7 @@ fn read(mut from: impl Read, shared: &Mutex<Shared>) {
 }
 
 /// Reads a step's notes, which are JSON where no terminal reads them, and its errors.
-fn read_notes(from: impl Read, shared: &Mutex<Shared>) {
+fn read_notes(from: impl Read, shared: &Mutex<StepState>) {
     for line in BufReader::new(from.take(MOST_NOTES)).lines().map_while(Result::ok) {
         let note = serde_json::from_str::<serde_json::Value>(&line).ok();
         let text = note.as_ref().and_then(|note| note["note"].as_str()).unwrap_or(&line);

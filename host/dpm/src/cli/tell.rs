@@ -175,7 +175,7 @@ fn told(light: LightState, counts: &RunCounts, total: u64, rate: f64) -> String 
     text
 }
 
-enum Shown {
+enum TellView {
     #[cfg(feature = "terminal")]
     Bar(ProgressBar),
     Lines {
@@ -211,15 +211,15 @@ struct Progress {
     /// When the first frame was planned; an end in time counts from there.
     began: Option<Instant>,
     rate: Rate,
-    shown: Shown,
+    shown: TellView,
 }
 
 impl Progress {
     /// For `total` frames, or else `seconds` of time; 0 means without an end.
     fn new(total: u64, seconds: f64, every: Option<Duration>) -> Self {
-        let lines = Shown::Lines { next: every.unwrap_or_default(), every };
+        let lines = TellView::Lines { next: every.unwrap_or_default(), every };
         #[cfg(feature = "terminal")]
-        let shown = bar(total, seconds).map_or(lines, Shown::Bar);
+        let shown = bar(total, seconds).map_or(lines, TellView::Bar);
         #[cfg(not(feature = "terminal"))]
         let shown = lines;
         let rate = Rate { seen: VecDeque::new() };
@@ -240,8 +240,8 @@ impl Progress {
     fn note(&self, text: &str) {
         match &self.shown {
             #[cfg(feature = "terminal")]
-            Shown::Bar(bar) => bar.println(text),
-            Shown::Lines { .. } => {
+            TellView::Bar(bar) => bar.println(text),
+            TellView::Lines { .. } => {
                 let _ = writeln!(std::io::stderr(), "{}", serde_json::json!({ "note": text }));
             }
         }
@@ -254,12 +254,12 @@ impl Progress {
         let done = self.position(&counts);
         match &mut self.shown {
             #[cfg(feature = "terminal")]
-            Shown::Bar(bar) => {
+            TellView::Bar(bar) => {
                 bar.set_position(done);
                 bar.set_message(told(light, &counts, self.total, rate));
                 bar.tick();
             }
-            Shown::Lines { next, every } => {
+            TellView::Lines { next, every } => {
                 if let Some(every) = every.filter(|_| elapsed >= *next) {
                     // After a pause of this thread the next line follows at its usual distance, not a burst of lines
                     // at once.
@@ -288,7 +288,7 @@ impl Progress {
     fn finish(mut self, light: LightState, counts: RunCounts) {
         self.tick(light, counts);
         #[cfg(feature = "terminal")]
-        if let Shown::Bar(bar) = self.shown {
+        if let TellView::Bar(bar) = self.shown {
             bar.finish_and_clear();
         }
     }

@@ -50,13 +50,13 @@ mod tests {
     use std::sync::{Arc, Mutex};
 
     /// A cable that carries so many reports, and then acts as told.
-    struct Limited {
+    struct LimitedCable {
         hid: VirtualHid,
         left: Rc<Cell<usize>>,
         then: PortError,
     }
 
-    impl HidPort for Limited {
+    impl HidPort for LimitedCable {
         fn write_report(&mut self, report: &[u8; 64], timeout: Duration) -> Result<(), PortError> {
             if self.left.get() == 0 {
                 return Err(self.then.clone());
@@ -94,7 +94,8 @@ mod tests {
     /// Sets up what a run in video mode sets up, until the cable ends it. Returns the number of reports written.
     fn run(model: &Arc<Mutex<Dlpc900Model>>, reports: usize) -> usize {
         let left = Rc::new(Cell::new(reports));
-        let port = Limited { hid: VirtualHid::new(model.clone()), left: left.clone(), then: PortError::Gone };
+        let port =
+            LimitedCable { hid: VirtualHid::new(model.clone()), left: left.clone(), then: PortError::Gone };
         let _ = Dlpc900::new(port).and_then(|mut d| {
             d.make_ready()?;
             d.stop()?;
@@ -122,7 +123,7 @@ mod tests {
                 let mut open = || {
                     opened += 1;
                     let reports = [0, 3, usize::MAX][(opened - 1).min(2)];
-                    Dlpc900::new(Limited {
+                    Dlpc900::new(LimitedCable {
                         hid: VirtualHid::new(model.clone()),
                         left: Rc::new(Cell::new(reports)),
                         then: PortError::Timeout,

@@ -51,7 +51,7 @@ pub struct Medium<'a> {
 
 /// A message of the device, and when it arrived.
 #[derive(Clone, Copy, Debug)]
-pub(super) struct Heard {
+pub(super) struct DeviceWord {
     /// Host's clock.
     pub at: HostTime,
     /// Session field of its header.
@@ -65,7 +65,7 @@ pub(super) struct Heard {
 struct Inbox {
     now: HostTime,
     assembly: Option<Assembly>,
-    heard: VecDeque<Heard>,
+    heard: VecDeque<DeviceWord>,
     laws: Laws,
 }
 
@@ -92,7 +92,7 @@ impl PacketSink for Inbox {
                 if self.heard.len() >= 4096 {
                     self.heard.pop_front();
                 }
-                self.heard.push_back(Heard { at: self.now, session: header.session, message });
+                self.heard.push_back(DeviceWord { at: self.now, session: header.session, message });
             }
             Err(e) => self.laws.unreadable(&e),
         }
@@ -297,7 +297,7 @@ impl<'a> Bench<'a> {
     pub(super) fn wait<T>(
         &mut self,
         limit_ns: i64,
-        mut wanted: impl FnMut(&Heard) -> Option<T>,
+        mut wanted: impl FnMut(&DeviceWord) -> Option<T>,
     ) -> R<Option<T>> {
         let end = self.now().plus_ns(limit_ns);
         loop {

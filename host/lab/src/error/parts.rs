@@ -17,7 +17,7 @@ pub(super) struct Part {
 
 /// The file. Colours as bits: a probe that was never lit is NaN, which JSON does not know.
 #[derive(Serialize, Deserialize)]
-struct Kept {
+struct PartFile {
     row: ErrorRow,
     eye: Vec<[u32; 3]>,
 }
@@ -33,7 +33,7 @@ impl Part {
 
     /// The row, and what the eye saw at each of `probes`. `None` when nothing is there that fits.
     pub(super) fn read(&self, probes: usize) -> Option<(ErrorRow, Vec<Vec3>)> {
-        let kept: Kept =
+        let kept: PartFile =
             serde_json::from_slice(&regular_file::read(&self.path, MAX_PART_BYTES).ok()?).ok()?;
         let eye: Vec<Vec3> = kept.eye.into_iter().map(|v| Vec3::from(v.map(f32::from_bits))).collect();
         (eye.len() == probes).then_some((kept.row, eye))
@@ -45,7 +45,7 @@ impl Part {
     /// The file system's.
     pub(super) fn write(&self, (row, eye): &(ErrorRow, Vec<Vec3>)) -> io::Result<()> {
         let eye = eye.iter().map(|v| v.to_array().map(f32::to_bits)).collect();
-        let bytes = serde_json::to_vec(&Kept { row: row.clone(), eye })?;
+        let bytes = serde_json::to_vec(&PartFile { row: row.clone(), eye })?;
         write_atomically(&self.path, |out| out.write_all(&bytes))
     }
 

@@ -43,7 +43,7 @@ impl FilmFormat {
 }
 
 /// A film in colours of a palette.
-struct Indexed {
+struct PaletteFilm {
     width: u16,
     height: u16,
     /// Red, green, blue of 256 colours.
@@ -91,7 +91,7 @@ impl Palette {
         Self { colours: NeuQuant::new(1, COLOURS, &rgba) }
     }
 
-    fn index(&self, pictures: &[Canvas], tolerance: u8) -> Indexed {
+    fn index(&self, pictures: &[Canvas], tolerance: u8) -> PaletteFilm {
         let (width, height) = (pictures[0].width, pictures[0].height);
         let mut palette = self.colours.color_map_rgb();
         palette.resize(3 * 256, 0);
@@ -123,7 +123,7 @@ impl Palette {
             });
             indexed.push(pixels.collect());
         }
-        Indexed { width: width as u16, height: height as u16, palette, pictures: indexed }
+        PaletteFilm { width: width as u16, height: height as u16, palette, pictures: indexed }
     }
 }
 
@@ -133,7 +133,7 @@ fn hundredths(n: usize, per_second: u32) -> u16 {
     (end(n + 1) - end(n)) as u16
 }
 
-fn gif(film: &Indexed, per_second: u32) -> io::Result<Vec<u8>> {
+fn gif(film: &PaletteFilm, per_second: u32) -> io::Result<Vec<u8>> {
     let mut bytes = Vec::new();
     let mut encoder =
         gif::Encoder::new(&mut bytes, film.width, film.height, &film.palette).map_err(io::Error::other)?;
@@ -154,7 +154,7 @@ fn gif(film: &Indexed, per_second: u32) -> io::Result<Vec<u8>> {
     Ok(bytes)
 }
 
-fn animated_png(film: &Indexed, per_second: u32) -> io::Result<Vec<u8>> {
+fn animated_png(film: &PaletteFilm, per_second: u32) -> io::Result<Vec<u8>> {
     let mut bytes = Vec::new();
     let mut encoder = png::Encoder::new(&mut bytes, film.width.into(), film.height.into());
     encoder.set_color(png::ColorType::Indexed);

@@ -44,7 +44,7 @@ pub(crate) fn flip(
         return Err(MetricError::Parameter("pixels per degree"));
     }
     let (seen_test, seen_reference) =
-        (Seen::new(test, pixels_per_degree), Seen::new(reference, pixels_per_degree));
+        (FlipPicture::new(test, pixels_per_degree), FlipPicture::new(reference, pixels_per_degree));
     let greatest = greatest_color_difference();
     let at = |i: usize| {
         let color = map_to_unit(hyab(seen_test.lab[i], seen_reference.lab[i]).powf(COLOR_EXPONENT), greatest);
@@ -70,14 +70,14 @@ pub(crate) fn mean_flip(
 }
 
 /// A picture as the metric sees it.
-struct Seen {
+struct FlipPicture {
     /// Blurred colour in Hunt-adjusted L*a*b*.
     lab: Vec<DVec3>,
     edges: Vec<f64>,
     points: Vec<f64>,
 }
 
-impl Seen {
+impl FlipPicture {
     fn new(picture: &Picture, pixels_per_degree: f64) -> Self {
         let (width, height) = picture.size();
         let clean = |c: &glam::Vec3| c.as_dvec3().map(|x| if x.is_nan() { 0.0 } else { x.clamp(0.0, 1.0) });

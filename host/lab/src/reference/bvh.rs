@@ -52,7 +52,7 @@ const DEPTH_OF_MEDIAN: u32 = 48;
 const STACK: usize = 96;
 
 /// A ray prepared for the triangle test: the largest direction component becomes z, the others are sheared away.
-struct Prepared {
+struct RayFrame {
     origin: DVec3,
     direction: DVec3,
     inverse: DVec3,
@@ -60,7 +60,7 @@ struct Prepared {
     shear: DVec3,
 }
 
-impl Prepared {
+impl RayFrame {
     fn new(origin: DVec3, direction: DVec3) -> Self {
         let a = direction.abs();
         let kz = if a.x > a.y && a.x > a.z {
@@ -203,7 +203,7 @@ impl Bvh {
         if !(origin.is_finite() && direction.is_finite()) || direction == DVec3::ZERO {
             return None;
         }
-        let ray = Prepared::new(origin, direction);
+        let ray = RayFrame::new(origin, direction);
         let mut best: Option<Hit> = None;
         for (i, triangle) in self.triangles.iter().enumerate() {
             if let Some((t, weights)) = ray.triangle(&triangle.p) {
@@ -227,7 +227,7 @@ impl Bvh {
         {
             return;
         }
-        let ray = Prepared::new(origin, direction);
+        let ray = RayFrame::new(origin, direction);
         let mut stack = [(0usize, 0.0f64); STACK];
         let mut top = 0;
         if let Some(t) = ray.enter(&self.nodes[0], limit) {

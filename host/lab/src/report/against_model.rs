@@ -1,6 +1,6 @@
 //! What was measured on a GPU beside what the model of `dpm bench --model` expects of it, for reports of any machines.
 
-use super::folder::Found;
+use super::folder::FolderEntry;
 use super::html::Part;
 use super::table::{Cell, Table};
 use serde_json::Value;
@@ -25,7 +25,7 @@ const HEAD: [&str; 11] = [
 ];
 
 /// A table with a row for every method of every bench report among `results`; nothing where there is none.
-pub(super) fn against_model(results: &[Found]) -> Vec<Part> {
+pub(super) fn against_model(results: &[FolderEntry]) -> Vec<Part> {
     let rows: Vec<Vec<Cell>> = results.iter().flat_map(rows).collect();
     if rows.is_empty() {
         return Vec::new();
@@ -41,7 +41,7 @@ pub(super) fn against_model(results: &[Found]) -> Vec<Part> {
     ]
 }
 
-fn rows(found: &Found) -> Vec<Vec<Cell>> {
+fn rows(found: &FolderEntry) -> Vec<Vec<Cell>> {
     let list = |key: &str| found.figures.get(key).and_then(Value::as_array).map_or(&[][..], Vec::as_slice);
     let device = found.figures.get("stamp").and_then(|stamp| stamp.get("device")).and_then(Value::as_str);
     let device = device.unwrap_or("unknown");
@@ -105,7 +105,7 @@ mod tests {
     use super::*;
     use serde_json::json;
 
-    fn bench(device: &str) -> Found {
+    fn bench(device: &str) -> FolderEntry {
         let report = json!({
             "stamp": {"device": device},
             "methods": [{"method": "dpm", "gpu_ms": 0.9, "passes": [
@@ -119,10 +119,10 @@ mod tests {
                  "readback_ms": 0.09, "frame_ms": [0.38, 0.45]}],
         });
         let Value::Object(figures) = report else { unreachable!("an object") };
-        Found { name: "Bench".into(), figures, text: None, written_s: 0 }
+        FolderEntry { name: "Bench".into(), figures, text: None, written_s: 0 }
     }
 
-    fn shown(results: &[Found]) -> Vec<Vec<String>> {
+    fn shown(results: &[FolderEntry]) -> Vec<Vec<String>> {
         let parts = against_model(results);
         let Some(Part::Table(table)) = parts.last() else { return Vec::new() };
         assert!(table.rows.iter().all(|row| row.len() == table.head.len()));

@@ -30,7 +30,7 @@ const MAX_ITEMS: usize = 64;
 const MAX_FILES: usize = 10_000;
 
 /// A measurement.
-pub(super) struct Found {
+pub(super) struct FolderEntry {
     /// What it is called.
     pub(super) name: String,
     /// Its figures.
@@ -44,7 +44,7 @@ pub(super) struct Found {
 /// What is in a folder.
 #[derive(Default)]
 pub(super) struct Folder {
-    pub(super) results: Vec<Found>,
+    pub(super) results: Vec<FolderEntry>,
     /// SVG texts.
     pub(super) plots: Vec<String>,
     /// Names and bytes of PNG files.
@@ -168,7 +168,7 @@ fn files(dir: &Path) -> Result<Vec<(String, u64)>, Failure> {
     Ok(files)
 }
 
-fn result(path: &PathBuf, name: String, keys: &[&str]) -> Result<Found, Failure> {
+fn result(path: &PathBuf, name: String, keys: &[&str]) -> Result<FolderEntry, Failure> {
     let text = regular_file::read_text(path, MAX_RESULT_BYTES)
         .map_err(|e| bad(path, format!("cannot read it: {e}")))?;
     let value: Value = serde_json::from_str(&text)
@@ -191,5 +191,5 @@ fn result(path: &PathBuf, name: String, keys: &[&str]) -> Result<Found, Failure>
     let written =
         std::fs::metadata(path).and_then(|about| about.modified()).unwrap_or(SystemTime::UNIX_EPOCH);
     let written_s = written.duration_since(UNIX_EPOCH).map_or(0, |d| d.as_secs());
-    Ok(Found { name, figures, text, written_s })
+    Ok(FolderEntry { name, figures, text, written_s })
 }

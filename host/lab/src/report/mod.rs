@@ -13,7 +13,7 @@ use dpm_common::files::write_atomically;
 use dpm_profile::civil;
 use dpm_rig::failure::Failure;
 use dpm_rig::run_rig::cannot_write;
-use folder::{Folder, Found};
+use folder::{Folder, FolderEntry};
 use html::{page, Part};
 use markdown::blocks;
 use serde::Serialize;
@@ -143,7 +143,7 @@ const TOLD: [&str; 9] = [
 ];
 
 /// Date, program, machine and sample counts of a measurement.
-fn facts(found: &Found) -> Table {
+fn facts(found: &FolderEntry) -> Table {
     let figures = &found.figures;
     let group = figures.get("groups").and_then(|groups| groups.get(0));
     let inner = [figures.get("setup"), figures.get("stamp"), group.and_then(|group| group.get("stamp"))];
@@ -168,13 +168,13 @@ fn date(seconds: u64) -> String {
     format!("{year:04}-{month:02}-{day:02} {hour:02}:{minute:02} UTC")
 }
 
-fn warnings(found: &Found) -> Vec<String> {
+fn warnings(found: &FolderEntry) -> Vec<String> {
     let list = found.figures.get("warnings").and_then(Value::as_array);
     list.into_iter().flatten().filter_map(Value::as_str).map(str::to_owned).collect()
 }
 
 /// How many slots were missed, and why; nothing for a measurement without slots.
-fn missed(found: &Found) -> Vec<Part> {
+fn missed(found: &FolderEntry) -> Vec<Part> {
     let count = |key: &str| found.figures.get(key).and_then(Value::as_u64);
     let (Some(slots), Some(missed)) = (count("slots"), count("missed_slots")) else { return Vec::new() };
     let share = found.figures.get("missed_share").and_then(Value::as_f64).unwrap_or(0.0);

@@ -1,6 +1,6 @@
 //! Bodies of any size and place into a view that shows all of them: where the projector and the eye stand, and how bright both are.
 
-use crate::sequence::{draw, Placed};
+use crate::sequence::{draw, BodyPlaces};
 use dpm_device::planes::Raster;
 use dpm_render::gpu::Gpu;
 use dpm_render::method::Method;
@@ -154,7 +154,7 @@ const CLIPPED: f64 = 0.01;
 ///
 /// # Errors
 /// The renderer's.
-pub(crate) fn exposure(rig: &Rig, gpu: &Arc<Gpu>, poses: &Placed) -> Result<f64, RenderError> {
+pub(crate) fn exposure(rig: &Rig, gpu: &Arc<Gpu>, poses: &BodyPlaces) -> Result<f64, RenderError> {
     let settings = RendererSettings {
         method: Method::full(EXPOSURE_SPP),
         halftone: None,

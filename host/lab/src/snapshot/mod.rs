@@ -7,7 +7,7 @@ pub mod views;
 
 pub use fit::{FittedView, SnapshotView};
 
-use super::sequence::{draw, poses_at, Placed};
+use super::sequence::{draw, poses_at, BodyPlaces};
 use crate::paint::Canvas;
 use crate::room::furniture::Bounds;
 use crate::room::{raster, RoomPicture};
@@ -304,7 +304,7 @@ struct Player<'a> {
     renderer: Renderer,
     slot: FrameSlot,
     /// The bodies in the last frame.
-    poses: Placed,
+    poses: BodyPlaces,
     /// See [`tile_errors`].
     errors: Vec<Option<f32>>,
     /// Of the last frames, as many as an eye integrates.
@@ -321,7 +321,7 @@ impl<'a> Player<'a> {
         let renderer = Renderer::keeping(gpu, &rig.scene, settings, keep).map_err(gpu_failure)?;
         let slot = renderer.create_slot(true).map_err(gpu_failure)?;
         let method = rig.config.render.to_method();
-        let (poses, errors, light) = (Placed::default(), Vec::new(), VecDeque::new());
+        let (poses, errors, light) = (BodyPlaces::default(), Vec::new(), VecDeque::new());
         Ok(Self { rig, gpu, method, renderer, slot, poses, errors, light })
     }
 

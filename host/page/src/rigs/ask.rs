@@ -25,7 +25,7 @@ const BODY_BYTES: usize = 256 * 1024;
 
 /// Why a rig has not told its state, and what to do about it.
 #[derive(Debug, thiserror::Error)]
-pub(super) enum Unheard {
+pub(super) enum AskError {
     #[error("nobody listens there; start the rig with --page at this address, or the tunnel to it")]
     Refused,
     #[error("no connection: {0}")]
@@ -56,7 +56,7 @@ pub(super) enum Unheard {
     NotState,
 }
 
-impl From<hyper::Error> for Unheard {
+impl From<hyper::Error> for AskError {
     fn from(e: hyper::Error) -> Self {
         if e.is_parse() {
             Self::NotHttp
@@ -67,19 +67,19 @@ impl From<hyper::Error> for Unheard {
 }
 
 /// Asks a rig for its state.
-pub(super) async fn ask(rig: &RigAddress) -> Result<Answer, Unheard> {
+pub(super) async fn ask(rig: &RigAddress) -> Result<Answer, AskError> {
     let stream = match timeout(CONNECT_WITHIN, TcpStream::connect(rig.address())).await {
         Ok(Ok(stream)) => stream,
-        Ok(Err(e)) if e.kind() == io::ErrorKind::ConnectionRefused => return Err(Unheard::Refused),
-        Ok(Err(e)) => return Err(Unheard::Connect(e)),
-        Err(_) => return Err(Unheard::Unconnected),
+        Ok(Err(e)) if e.kind() == io::ErrorKind::ConnectionRefused => return Err(AskError::Refused),
+        Ok(Err(e)) => return Err(AskError::Connect(e)),
+        Err(_) => return Err(AskError::Unconnected),
     };
-    let body = timeout(ANSWER_WITHIN, exchange(stream, rig.host())).await.map_err(|_| Unheard::Slow)??;
-    serde_json::from_slice(&body).map_err(|_| Unheard::NotState)
+    let body = timeout(ANSWER_WITHIN, exchange(stream, rig.host())).await.map_err(|_| AskError::Slow)??;
+    serde_json::from_slice(&body).map_err(|_| AskError::NotState)
 }
 
 /// Asks over `stream` for the state of the rig that answers to `host`, and returns the body of the answer.
-async fn exchange(stream: TcpStream, host: String) -> Result<Vec<u8>, Unheard> {
+async fn exchange(stream: TcpStream, host: String) -> Result<Vec<u8>, AskError> {
     let _ = stream.set_nodelay(true);
     let stream = Stream::new(stream, Connection::new());
     let (mut sender, connection) =
@@ -91,20 +91,20 @@ async fn exchange(stream: TcpStream, host: String) -> Result<Vec<u8>, Unheard> {
         .header(header::HOST, &host)
         .header(header::CONNECTION, "close")
         .body(String::new())
-        .map_err(|_| Unheard::Misdirected(host.clone()))?;
+        .map_err(|_| AskError::Misdirected(host.clone()))?;
     let response = sender.send_request(request).await?;
     match response.status() {
         StatusCode::OK => {}
-        StatusCode::MISDIRECTED_REQUEST => return Err(Unheard::Misdirected(host)),
-        StatusCode::NOT_FOUND => return Err(Unheard::NoRun),
-        status => return Err(Unheard::Status(status.as_u16())),
+        StatusCode::MISDIRECTED_REQUEST => return Err(AskError::Misdirected(host)),
+        StatusCode::NOT_FOUND => return Err(AskError::NoRun),
+        status => return Err(AskError::Status(status.as_u16())),
     }
     let (mut body, mut bytes) = (response.into_body(), Vec::new());
     while let Some(frame) = poll_fn(|cx| Pin::new(&mut body).poll_frame(cx)).await {
         let frame = frame?;
         let data = frame.data_ref().map_or(&[][..], |data| data);
         if bytes.len() + data.len() > BODY_BYTES {
-            return Err(Unheard::TooLong);
+            return Err(AskError::TooLong);
         }
         bytes.extend_from_slice(data);
     }

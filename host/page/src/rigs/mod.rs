@@ -10,11 +10,11 @@ mod told;
 
 pub use address::{BadAddress, RigAddress};
 
-use ask::{ask, Unheard};
+use ask::{ask, AskError};
 use std::sync::{Arc, Mutex, PoisonError};
 use std::time::{Duration, Instant};
 use tokio::sync::watch;
-use told::{Answer, Minute, Told};
+use told::{Answer, Minute, RigView};
 
 /// Where an overview listens if nobody says otherwise.
 pub const DEFAULT_LISTEN: &str = "127.0.0.1:8940";
@@ -46,12 +46,12 @@ pub enum BadRigs {
 pub struct Rigs {
     all: Vec<Arc<Rig>>,
     /// When somebody looked; `None` before the first time.
-    looked: watch::Sender<Option<Looked>>,
+    looked: watch::Sender<Option<LastLook>>,
 }
 
 /// When somebody looked.
 #[derive(Clone, Copy, Debug)]
-struct Looked {
+struct LastLook {
     /// The first time without a pause since.
     since: Instant,
     /// The last time.
@@ -62,16 +62,16 @@ struct Looked {
 #[derive(Debug)]
 struct Rig {
     address: RigAddress,
-    heard: Mutex<Heard>,
+    heard: Mutex<RigNews>,
 }
 
 /// What a rig told last, and what went wrong since.
 #[derive(Debug, Default)]
-struct Heard {
+struct RigNews {
     minute: Minute,
-    told: Option<(Instant, Told)>,
+    told: Option<(Instant, RigView)>,
     /// The newest attempt, if it failed.
-    failed: Option<(Instant, Unheard)>,
+    failed: Option<(Instant, AskError)>,
 }
 
 /// Whether a rig answers.
@@ -98,7 +98,7 @@ struct RigJson {
     heard_s_ago: Option<f64>,
     /// Why there is no contact.
     why: Option<String>,
-    told: Option<Told>,
+    told: Option<RigView>,
 }
 
 /// All rigs as the overview shows them.
@@ -143,14 +143,14 @@ impl Rigs {
         let mut since = now;
         self.looked.send_modify(|looked| {
             since = looked.filter(|looked| now - looked.last < LOOKED_WITHIN).map_or(now, |l| l.since);
-            *looked = Some(Looked { since, last: now });
+            *looked = Some(LastLook { since, last: now });
         });
         RigsJson { rigs: self.all.iter().map(|rig| rig.shown(now, since)).collect() }
     }
 }
 
-async fn follow(rig: Arc<Rig>, mut looked: watch::Receiver<Option<Looked>>) {
-    let is_looking = |looked: &Option<Looked>| looked.is_some_and(|l| l.last.elapsed() < LOOKED_WITHIN);
+async fn follow(rig: Arc<Rig>, mut looked: watch::Receiver<Option<LastLook>>) {
+    let is_looking = |looked: &Option<LastLook>| looked.is_some_and(|l| l.last.elapsed() < LOOKED_WITHIN);
     while looked.wait_for(is_looking).await.is_ok() {
         let begin = Instant::now();
         rig.note(ask(&rig.address).await);
@@ -160,7 +160,7 @@ async fn follow(rig: Arc<Rig>, mut looked: watch::Receiver<Option<Looked>>) {
 
 impl Rig {
     /// Keeps the outcome of an attempt.
-    fn note(&self, outcome: Result<Answer, Unheard>) {
+    fn note(&self, outcome: Result<Answer, AskError>) {
         let mut heard = self.heard.lock().unwrap_or_else(PoisonError::into_inner);
         let now = Instant::now();
         match outcome {
@@ -182,7 +182,7 @@ impl Rig {
             _ if failed.is_some() || now - since >= HEARD_WITHIN => Contact::No,
             _ => Contact::Asked,
         };
-        let why = || failed.map_or_else(|| Unheard::Slow.to_string(), Unheard::to_string);
+        let why = || failed.map_or_else(|| AskError::Slow.to_string(), AskError::to_string);
         RigJson {
             name: self.address.name().to_owned(),
             address: self.address.address().to_string(),
@@ -233,7 +233,7 @@ mod tests {
         // Whoever looks again after a minute is shown what was known, but not that the rig is silent.
         let later = Instant::now() + s(60);
         assert_eq!(rig.shown(later, later).contact, Contact::Asked);
-        rig.note(Err(Unheard::Refused));
+        rig.note(Err(AskError::Refused));
         assert_eq!(rig.shown(Instant::now(), begin).contact, Contact::Yes, "one failure is no silence");
         let lost = rig.shown(Instant::now() + s(4), begin);
         assert!(lost.contact == Contact::No && lost.why.unwrap().contains("nobody listens"));

@@ -114,7 +114,7 @@ pub(super) struct Body {
 
 /// What the overview shows of a rig.
 #[derive(Clone, Debug, Serialize)]
-pub(super) struct Told {
+pub(super) struct RigView {
     #[serde(flatten)]
     state: State,
     /// Frames lit a second, over the last seconds; `None` before the second answer.
@@ -132,11 +132,11 @@ pub(super) struct Told {
 
 impl Answer {
     /// What is kept of it. Its counters are added to `minute`, which gives the rates.
-    pub(super) fn told(self, minute: &mut Minute) -> Told {
+    pub(super) fn told(self, minute: &mut Minute) -> RigView {
         let (now, mut figures) = (self.now, self.figures);
-        minute.add(Counted { pid: now.pid, up_s: now.up_s, counts: now.counts });
+        minute.add(CounterSample { pid: now.pid, up_s: now.up_s, counts: now.counts });
         figures.bodies.truncate(MAX_BODIES);
-        Told {
+        RigView {
             state: now.state,
             lit_per_s: minute.lit_per_s(),
             missed: minute.missed(),
@@ -151,7 +151,7 @@ impl Answer {
 
 /// Counters of a process at one moment of its own clock.
 #[derive(Clone, Copy, Debug)]
-struct Counted {
+struct CounterSample {
     pid: u32,
     up_s: f64,
     counts: Counts,
@@ -159,11 +159,11 @@ struct Counted {
 
 /// The counters of the last minute, oldest first.
 #[derive(Debug, Default)]
-pub(super) struct Minute(VecDeque<Counted>);
+pub(super) struct Minute(VecDeque<CounterSample>);
 
 impl Minute {
     /// Adds the newest. A new process, a new run and a pause begin a new minute.
-    fn add(&mut self, now: Counted) {
+    fn add(&mut self, now: CounterSample) {
         let goes_on = self.0.back().is_some_and(|last| {
             last.pid == now.pid
                 && last.counts.slots <= now.counts.slots
@@ -200,8 +200,8 @@ impl Minute {
 mod tests {
     use super::*;
 
-    fn counted(pid: u32, up_s: f64, frames_lit: u64, slots: u64, slots_missed: u64) -> Counted {
-        Counted { pid, up_s, counts: Counts { frames_lit, slots, slots_missed } }
+    fn counted(pid: u32, up_s: f64, frames_lit: u64, slots: u64, slots_missed: u64) -> CounterSample {
+        CounterSample { pid, up_s, counts: Counts { frames_lit, slots, slots_missed } }
     }
 
     #[test]

@@ -1,6 +1,6 @@
 //! The guided page of a calibration over HTTP, with a run and without one.
 
-use crate::common::{ask, Running, Shown};
+use crate::common::{ask, NoSteps, Running};
 use dpm_page::{Page, Settings};
 use dpm_rig::config::{Overrides, Purpose, RigConfig};
 use serde_json::Value;
@@ -36,7 +36,7 @@ fn a_rig_that_is_only_calibrated_has_steps_and_no_orders() {
     let purpose = Purpose { at_rest: true, calibrates: true, ..Purpose::default() };
     let config =
         RigConfig::parse_for("rig.toml", text, Path::new(""), &Overrides::default(), purpose).unwrap();
-    let guide = Arc::new(Shown { rig: "/nowhere/rig.toml".into(), config });
+    let guide = Arc::new(NoSteps { rig: "/nowhere/rig.toml".into(), config });
     let address = "127.0.0.1:0".parse().unwrap();
     let settings = Settings { address, hosts: Vec::new(), token: None, guide };
     let page = Page::serve_calibration(settings).unwrap();

@@ -7,7 +7,7 @@ use super::devices::{
 };
 use super::error::GpuError;
 use super::instance::{create_instance, Instance};
-use super::kept::Kept;
+use super::kept::DeviceStore;
 use super::leftovers::Leftovers;
 use super::turn::{Held, Turn};
 use ash::{khr, vk};
@@ -63,7 +63,7 @@ pub struct Gpu {
     /// At which multiples of an address such trees may be built, bytes.
     pub(super) scratch_alignment: u64,
     /// Layouts and compiled pipelines of renderers that are gone.
-    pub(super) kept: Kept,
+    pub(super) kept: DeviceStore,
     /// What was dropped while the device, given up, may still use it.
     pub(super) leftovers: Leftovers,
     instance: ManuallyDrop<Instance>,
@@ -116,7 +116,7 @@ pub fn memory_given_up() -> MemoryGivenUp {
 }
 
 /// What [`create`] has made.
-struct Created {
+struct NewDevice {
     device: ash::Device,
     queue_family: u32,
     queues: [vk::Queue; 2],
@@ -132,7 +132,7 @@ fn create(
     physical: vk::PhysicalDevice,
     summary: &DeviceSummary,
     options: &GpuOptions,
-) -> Result<Created, GpuError> {
+) -> Result<NewDevice, GpuError> {
     let name: Arc<str> = summary.name.as_str().into();
     let most_bytes =
         if summary.software { address_space::for_buffers().map_err(|e| e.on(&name))? } else { None };
@@ -161,7 +161,7 @@ fn create(
     };
     // SAFETY: the device was created with so many queues of this family.
     let queues = [0, queue_count - 1].map(|i| unsafe { device.get_device_queue(queue_family, i) });
-    Ok(Created { device, queue_family, queues, goes_first, most_bytes })
+    Ok(NewDevice { device, queue_family, queues, goes_first, most_bytes })
 }
 
 /// The device with the features that the shaders need, and with semaphores that count and ray queries where it has them. `first`: the extension by
@@ -283,7 +283,7 @@ impl Gpu {
         let mut first_error = None;
         for Candidate { physical, summary, id } in usable {
             let name: Arc<str> = summary.name.as_str().into();
-            let Created { device, queue_family, queues, goes_first, most_bytes } =
+            let NewDevice { device, queue_family, queues, goes_first, most_bytes } =
                 match create(&instance, physical, &summary, options) {
                     Ok(created) => created,
                     Err(error) => {
@@ -322,7 +322,7 @@ impl Gpu {
                 statistics,
                 acceleration,
                 scratch_alignment,
-                kept: Kept::default(),
+                kept: DeviceStore::default(),
                 leftovers: Leftovers::default(),
                 instance: ManuallyDrop::new(instance),
                 state: AtomicU8::new(State::Well as u8),

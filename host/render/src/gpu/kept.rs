@@ -18,7 +18,7 @@ const MOST_KEPT: usize = 96;
 /// What a pipeline was compiled from.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub(super) struct PipelineKey {
-    /// The layout of its bindings. There is one of each kind on a device ([`Kept::layouts`]).
+    /// The layout of its bindings. There is one of each kind on a device ([`DeviceStore::layouts`]).
     pub layout: vk::PipelineLayout,
     /// Its shader.
     pub spirv: &'static [u8],
@@ -39,13 +39,13 @@ pub(super) struct Layouts {
 /// What a device keeps. Its locks are held for some comparisons only and never for a call of the driver, so a thread that
 /// hangs in the driver holds up no other one.
 #[derive(Debug, Default)]
-pub(super) struct Kept {
+pub(super) struct DeviceStore {
     layouts: Lock<Vec<(Bindings, Layouts)>>,
     /// The one that was given back last is at the end.
     pipelines: Lock<VecDeque<(PipelineKey, vk::Pipeline)>>,
 }
 
-impl Kept {
+impl DeviceStore {
     /// The layouts of these bindings, if there are any yet.
     pub(super) fn layouts(&self, bindings: &[(u32, BindingKind)]) -> Option<Layouts> {
         held(&self.layouts).iter().find(|(known, _)| known == bindings).map(|(_, layouts)| *layouts)
@@ -108,7 +108,7 @@ mod tests {
 
     #[test]
     fn a_pipeline_is_taken_once_and_only_by_who_asks_for_its_program() {
-        let kept = Kept::default();
+        let kept = DeviceStore::default();
         let [one, two] = [1, 2].map(vk::Pipeline::from_raw);
         assert_eq!(kept.give_back(key(b"a", 1), one), None);
         assert_eq!(kept.give_back(key(b"a", 2), two), None);
@@ -123,7 +123,7 @@ mod tests {
 
     #[test]
     fn what_was_not_used_for_longest_goes_first() {
-        let mut kept = Kept::default();
+        let mut kept = DeviceStore::default();
         let pipeline = |n: usize| vk::Pipeline::from_raw(n as u64 + 1);
         for n in 0..MOST_KEPT {
             assert_eq!(kept.give_back(key(b"a", n as u32), pipeline(n)), None);
@@ -138,7 +138,7 @@ mod tests {
 
     #[test]
     fn bindings_have_one_layout_each() {
-        let kept = Kept::default();
+        let kept = DeviceStore::default();
         let layouts = |n| Layouts {
             set: vk::DescriptorSetLayout::from_raw(n),
             pipeline: vk::PipelineLayout::from_raw(n),

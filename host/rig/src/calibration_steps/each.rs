@@ -1,6 +1,6 @@
 //! The steps one by one, with their needs and commands.
 
-use super::judged::{day, Judged, Part};
+use super::judged::{day, FileVerdict, Part};
 use super::{State, Step, Way, SENSOR};
 use crate::config::PlaneTiming;
 use dpm_calibration_file::{CheckSection, Provenance};
@@ -10,7 +10,7 @@ use std::path::Path;
 const USUAL_WAND: &str = "wand";
 
 /// All steps, in the order of `docs/CALIBRATION.md`.
-pub(super) fn steps(judged: &Judged) -> Vec<Step> {
+pub(super) fn steps(judged: &FileVerdict) -> Vec<Step> {
     let names: Vec<&str> = judged.about.config.scene.bodies.iter().map(|b| b.name.as_str()).collect();
     let mut all = vec![aim(judged), wand(judged), projector(judged)];
     all.extend(names.iter().map(|name| body(judged, name)));
@@ -30,7 +30,7 @@ fn quoted(word: &str) -> String {
 }
 
 /// A command of `dpm`: its words before and after the rig file.
-fn way(judged: &Judged, told: &str, before: &[&str], after: &[&str]) -> Way {
+fn way(judged: &FileVerdict, told: &str, before: &[&str], after: &[&str]) -> Way {
     let rig = judged.about.rig.display().to_string();
     let words: Vec<String> =
         before.iter().copied().chain([rig.as_str()]).chain(after.iter().copied()).map(String::from).collect();
@@ -39,7 +39,7 @@ fn way(judged: &Judged, told: &str, before: &[&str], after: &[&str]) -> Way {
 }
 
 /// A command of `dpm calibrate`, with the wand's name where it is not the usual one.
-fn calibrate(judged: &Judged, told: &str, what: &str, after: &[&str]) -> Way {
+fn calibrate(judged: &FileVerdict, told: &str, what: &str, after: &[&str]) -> Way {
     let name = wand_name(judged);
     let mut words = after.to_vec();
     if name != USUAL_WAND {
@@ -56,13 +56,13 @@ impl Way {
 }
 
 /// The wand by its name in the tracking software, as far as it is known.
-fn wand_name<'a>(judged: &'a Judged) -> &'a str {
+fn wand_name<'a>(judged: &'a FileVerdict) -> &'a str {
     let device = judged.file.wand.as_ref().map(|wand| wand.provenance.device.as_str());
     device.filter(|name| !name.is_empty()).unwrap_or(USUAL_WAND)
 }
 
 /// The wand, and where it is tracked.
-fn need_wand(judged: &Judged) -> String {
+fn need_wand(judged: &FileVerdict) -> String {
     let from = judged.about.config.tracker.place();
     format!("the wand, which {from} reports as \"{}\"", wand_name(judged))
 }
@@ -80,7 +80,7 @@ impl Step {
     }
 
     /// A step that was not measured and needs the wand's tip.
-    fn after_wand(mut self, judged: &Judged) -> Self {
+    fn after_wand(mut self, judged: &FileVerdict) -> Self {
         if self.measured.is_none() && self.state == State::Missing && judged.file.wand.is_none() {
             (self.state, self.told) = (State::Waits, "It needs the wand's tip first.".into());
         }
@@ -88,7 +88,7 @@ impl Step {
     }
 }
 
-fn aim(judged: &Judged) -> Step {
+fn aim(judged: &FileVerdict) -> Step {
     let mut step = step("pattern", "Sharpen and aim the picture", "a sharp picture where the bodies move");
     step.state = State::Unrecorded;
     step.needs = vec!["the projector, and your eyes".into()];
@@ -104,7 +104,7 @@ fn aim(judged: &Judged) -> Step {
     step
 }
 
-fn wand(judged: &Judged) -> Step {
+fn wand(judged: &FileVerdict) -> Step {
     let mut step = step("wand", "Find the tip of the wand", "where the tip is in the wand's body");
     step.needs = vec![need_wand(judged), "a small dent in which the tip can turn, for 15 s".into()];
     step.ways = vec![calibrate(judged, "Turn the wand about its tip.", "wand", &[])];
@@ -117,7 +117,7 @@ fn wand(judged: &Judged) -> Step {
     }
 }
 
-fn projector(judged: &Judged) -> Step {
+fn projector(judged: &FileVerdict) -> Step {
     let config = &judged.about.config.projector;
     let mut step = step(
         "projector",
@@ -152,7 +152,7 @@ fn projector(judged: &Judged) -> Step {
     step.after_wand(judged)
 }
 
-fn body(judged: &Judged, name: &str) -> Step {
+fn body(judged: &FileVerdict, name: &str) -> Step {
     let title = format!("Find the mesh in \"{name}\"");
     let mut step =
         step(&format!("body:{name}"), &title, "where the mesh is in the body that the tracker reports");
@@ -177,7 +177,7 @@ fn body(judged: &Judged, name: &str) -> Step {
     step.after_wand(judged)
 }
 
-fn light(judged: &Judged) -> Step {
+fn light(judged: &FileVerdict) -> Step {
     let config = &judged.about.config.projector;
     let mut step = step(
         "light",
@@ -202,7 +202,7 @@ fn light(judged: &Judged) -> Step {
     step.with((State::Optional, told.into(), None))
 }
 
-fn check(judged: &Judged, name: &str) -> Step {
+fn check(judged: &FileVerdict, name: &str) -> Step {
     let title = format!("Check the light on \"{name}\"");
     let mut step =
         step(&format!("check:{name}"), &title, "the error of the light, and what to measure again");
@@ -239,7 +239,7 @@ fn check(judged: &Judged, name: &str) -> Step {
     step.with((state, told, measured))
 }
 
-fn nudge(judged: &Judged, names: &[&str]) -> Step {
+fn nudge(judged: &FileVerdict, names: &[&str]) -> Step {
     let mut step =
         step("nudge", "Move things by eye", "a mesh or a projector that was moved until its outlines fit");
     step.needs = vec!["your eyes, and a body at rest in the light".into()];
@@ -280,7 +280,7 @@ const KEYS: [(&str, &str); 15] = [
     ("q", "end"),
 ];
 
-fn export(judged: &Judged) -> Step {
+fn export(judged: &FileVerdict) -> Step {
     let mut step = step("export", "Write lens and pose for OpenCV", "a file that other programs read");
     let out = judged.about.rig.with_file_name("projector.yml");
     step.ways = vec![way(judged, "", &["calibrate", "export"], &[&out.display().to_string()])];
@@ -292,7 +292,7 @@ fn export(judged: &Judged) -> Step {
     step.with((State::Optional, told, None))
 }
 
-fn latency(judged: &Judged) -> Step {
+fn latency(judged: &FileVerdict) -> Step {
     let mut step = step(
         "latency",
         "Measure the latency alone",

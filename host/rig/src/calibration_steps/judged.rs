@@ -1,24 +1,24 @@
 //! What speaks for and against a part of a calibration file.
 
 use super::age::{aged, days_since, is_old, OLD_DAYS};
-use super::{About, Measured, State};
+use super::{About, State, StepQuantity};
 use crate::standing::{seconds_of_utc, Identity};
 use dpm_calibration_file::{CalibrationFile, CheckSection, Provenance};
 use std::time::UNIX_EPOCH;
 
 /// A calibration file in the light of the rig file.
-pub(super) struct Judged<'a> {
+pub(super) struct FileVerdict<'a> {
     pub(super) about: &'a About<'a>,
     pub(super) file: &'a CalibrationFile,
 }
 
 /// A part of the file, and how it stands with it.
-pub(super) type Part = (State, String, Option<Measured>);
+pub(super) type Part = (State, String, Option<StepQuantity>);
 
-impl Judged<'_> {
+impl FileVerdict<'_> {
     /// What was measured, with its age; `None` for what was moved by eye since: nothing of it is measured.
-    pub(super) fn measured(&self, quality: String, from: &Provenance) -> Option<Measured> {
-        (!from.is_by_eye()).then(|| Measured {
+    pub(super) fn measured(&self, quality: String, from: &Provenance) -> Option<StepQuantity> {
+        (!from.is_by_eye()).then(|| StepQuantity {
             date: from.date.clone(),
             age: aged(days_since(&from.date, self.about.now)),
             quality,

@@ -10,7 +10,7 @@ mod judged;
 use crate::config::RigConfig;
 use crate::trackers::PoseOrigin;
 use dpm_calibration_file::{self as file, CalibrationFile};
-use judged::Judged;
+use judged::FileVerdict;
 use serde::Serialize;
 use std::path::{Path, PathBuf};
 use std::time::SystemTime;
@@ -56,7 +56,7 @@ pub enum State {
 
 /// What was measured.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize)]
-pub struct Measured {
+pub struct StepQuantity {
     /// Date and time, UTC, RFC 3339.
     pub date: String,
     /// Its age in words.
@@ -103,7 +103,7 @@ pub struct Step {
     /// Why, one sentence; empty where the state says it all.
     pub told: String,
     /// What was measured, if it was.
-    pub measured: Option<Measured>,
+    pub measured: Option<StepQuantity>,
     /// How to do it; the first way is the better one.
     pub ways: Vec<Way>,
 }
@@ -165,7 +165,7 @@ impl Steps {
         if this.none.is_some() {
             return this;
         }
-        let judged = Judged { about, file: &measured };
+        let judged = FileVerdict { about, file: &measured };
         if path.exists() && about.config.calibration.file.is_none() {
             this.unnamed = Some(format!("[calibration]\nfile = {:?}", path.display().to_string()));
         }

@@ -2,7 +2,7 @@
 //! longer would help nobody.
 
 pub use super::is_obeyed;
-use super::orders::{Kept, Orders, Ticket};
+use super::orders::{KeepResult, Orders, Ticket};
 use crate::order::Order;
 use crate::telemetry::monitor::RunMonitor;
 use std::time::Duration;
@@ -33,7 +33,7 @@ pub fn answer_to(
     let is_done = is_obeyed(order, health);
     let kept = orders.outcome(ticket);
     let failed = |text| Some(Answer { is_done: false, text });
-    if let (Order::Arm, Some(Kept::Not(why))) = (order, &kept) {
+    if let (Order::Arm, Some(KeepResult::Not(why))) = (order, &kept) {
         return failed(format!("not armed: the standing order cannot be removed: {why}; projector {health}"));
     }
     let hope = if is_done { kept.is_none() && ago < KEPT_WITHIN } else { ago < OBEYED_WITHIN };
@@ -46,11 +46,11 @@ pub fn answer_to(
         (false, _) => "not yet",
     };
     let on_disk = match kept {
-        Some(Kept::In(path)) => format!("; kept in {}", path.display()),
-        Some(Kept::Forgotten) => String::new(),
-        Some(Kept::Nowhere) if order == Order::Arm => String::new(),
-        Some(Kept::Nowhere) => "; not kept over a restart (a mock without a state folder)".into(),
-        Some(Kept::Not(why)) => {
+        Some(KeepResult::In(path)) => format!("; kept in {}", path.display()),
+        Some(KeepResult::Forgotten) => String::new(),
+        Some(KeepResult::Nowhere) if order == Order::Arm => String::new(),
+        Some(KeepResult::Nowhere) => "; not kept over a restart (a mock without a state folder)".into(),
+        Some(KeepResult::Not(why)) => {
             return failed(format!("{done}, but NOT kept over a restart: {why}; projector {health}"))
         }
         None => {

@@ -201,7 +201,7 @@ fn foreign(path: &Path, why: &FolderError) -> Option<String> {
 
 /// The result of an order.
 #[derive(Debug)]
-pub struct Told {
+pub struct OrderResult {
     /// Answers of all rigs that were reached.
     pub answers: Vec<Answer>,
     /// Rigs that were not reached.
@@ -210,7 +210,7 @@ pub struct Told {
     pub closed: Vec<PathBuf>,
 }
 
-impl Told {
+impl OrderResult {
     /// True if every rig that was reached has obeyed, and one of them is this user's or a service's.
     pub fn is_done(&self) -> bool {
         self.answers.iter().all(|a| a.done) && self.answers.iter().any(|a| a.is_vouched_for)
@@ -222,11 +222,15 @@ impl Told {
 ///
 /// # Errors
 /// No rig runs there, or several do and `order` lets light through.
-pub fn tell(pid: Option<u32>, order: Order) -> Result<Told, ControlError> {
+pub fn tell(pid: Option<u32>, order: Order) -> Result<OrderResult, ControlError> {
     tell_in(&folders(), pid, order)
 }
 
-pub(super) fn tell_in(folders: &[PathBuf], pid: Option<u32>, order: Order) -> Result<Told, ControlError> {
+pub(super) fn tell_in(
+    folders: &[PathBuf],
+    pid: Option<u32>,
+    order: Order,
+) -> Result<OrderResult, ControlError> {
     let Search { rigs, refused, closed, looked } = search(folders);
     let mut rigs: Vec<Place> =
         rigs.into_iter().filter(|place| pid.is_none_or(|pid| pid == place.pid)).collect();
@@ -278,7 +282,7 @@ pub(super) fn tell_in(folders: &[PathBuf], pid: Option<u32>, order: Order) -> Re
     if answers.is_empty() && (refused.is_empty() || pid.is_some()) {
         return Err(none());
     }
-    Ok(Told { answers, refused, closed })
+    Ok(OrderResult { answers, refused, closed })
 }
 
 fn by_hand(order: Order, pid: u32) -> String {

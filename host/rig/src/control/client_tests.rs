@@ -62,7 +62,7 @@ fn r8_only_the_folders_own_user_is_believed() {
         done: true,
         is_vouched_for: false,
     };
-    let told = |answers: Vec<Answer>| Told { answers, refused: vec![], closed: vec![] };
+    let told = |answers: Vec<Answer>| OrderResult { answers, refused: vec![], closed: vec![] };
     assert!(!told(vec![]).is_done() && !told(vec![answer.clone()]).is_done());
     let mine = Answer { is_vouched_for: true, ..answer.clone() };
     assert!(told(vec![answer.clone(), mine.clone()]).is_done());

@@ -35,7 +35,7 @@ const HEARD: &str = "heard";
 
 /// What a client asks for.
 #[derive(Clone, Debug, PartialEq)]
-pub enum Asked {
+pub enum ClientRequest {
     /// An order.
     Order(Order),
     /// A look at the parameters, or a change of them.

@@ -26,7 +26,7 @@ pub struct Ticket(u64);
 
 /// What happened to an order on the disk.
 #[derive(Clone, Debug, PartialEq, Eq)]
-pub(crate) enum Kept {
+pub(crate) enum KeepResult {
     /// It is kept over restarts, in this file.
     In(PathBuf),
     /// The standing order is forgotten (after ARM).
@@ -40,7 +40,7 @@ pub(crate) enum Kept {
 
 /// An order on its way to the disk.
 #[derive(Debug)]
-pub(crate) struct Given {
+pub(crate) struct OrderOnItsWay {
     /// Number of the order.
     number: u64,
     order: Order,
@@ -50,25 +50,25 @@ pub(crate) struct Given {
     /// It changes the standing order. Otherwise the file stays as it is, including who gave the order.
     changes: bool,
     /// What became of the order before it.
-    before: Option<Kept>,
+    before: Option<KeepResult>,
     /// The projector's serial number, if it has given one.
     device: Option<u64>,
 }
 
-impl Given {
+impl OrderOnItsWay {
     /// Writes the order down, or forgets what stands. This may take as long as the disk takes.
-    pub(crate) fn write(&self, file: &OrderFile, keeps: bool) -> Kept {
+    pub(crate) fn write(&self, file: &OrderFile, keeps: bool) -> KeepResult {
         file.hear(self.device);
         match &self.before {
-            Some(kept @ Kept::In(_)) if !self.changes => return kept.clone(),
-            _ if !keeps => return Kept::Nowhere,
+            Some(kept @ KeepResult::In(_)) if !self.changes => return kept.clone(),
+            _ if !keeps => return KeepResult::Nowhere,
             _ => {}
         }
         let done = match self.order {
-            Order::Arm => file.forget().map(|()| Kept::Forgotten),
-            order => file.keep(order, self.by).map(Kept::In),
+            Order::Arm => file.forget().map(|()| KeepResult::Forgotten),
+            order => file.keep(order, self.by).map(KeepResult::In),
         };
-        done.unwrap_or_else(|e| Kept::Not(e.to_string()))
+        done.unwrap_or_else(|e| KeepResult::Not(e.to_string()))
     }
 }
 
@@ -80,10 +80,10 @@ pub(crate) struct Desk {
     /// Number of the newest order.
     newest: u64,
     /// The newest order, until it is taken to be written.
-    waiting: Option<Given>,
+    waiting: Option<OrderOnItsWay>,
     /// Orders up to this number are settled.
     settled: u64,
-    outcome: Option<Kept>,
+    outcome: Option<KeepResult>,
     /// The standing order, whether or not it could be written down.
     stands: Option<Order>,
 }
@@ -93,7 +93,8 @@ impl Desk {
     /// that the link comes up dark.
     pub(crate) fn new(monitor: Arc<RunMonitor>, stands: Option<&Stands>, path: PathBuf) -> Self {
         stands.into_iter().for_each(|stands| monitor.give_order(stands.order));
-        let outcome = stands.map(|stands| if stands.is_on_disk { Kept::In(path) } else { Kept::Nowhere });
+        let outcome =
+            stands.map(|stands| if stands.is_on_disk { KeepResult::In(path) } else { KeepResult::Nowhere });
         Self { monitor, newest: 0, waiting: None, settled: 0, outcome, stands: stands.map(|s| s.order) }
     }
 
@@ -119,7 +120,8 @@ impl Desk {
             waiting => {
                 let (order, changes) = standing.map_or((order, true), |standing| (standing, false));
                 let signals = stopping::orders();
-                *waiting = Some(Given { number, order, by, signals, changes, before: None, device: None });
+                *waiting =
+                    Some(OrderOnItsWay { number, order, by, signals, changes, before: None, device: None });
             }
         }
         Ticket(number)
@@ -159,16 +161,16 @@ impl Desk {
     }
 
     /// The next order to be written; pass the result to [`Desk::settle`].
-    pub(crate) fn next(&mut self) -> Option<Given> {
+    pub(crate) fn next(&mut self) -> Option<OrderOnItsWay> {
         self.absorb();
         let given = self.waiting.take()?;
-        Some(Given { before: self.outcome.take(), device: self.monitor.device(), ..given })
+        Some(OrderOnItsWay { before: self.outcome.take(), device: self.monitor.device(), ..given })
     }
 
     /// `given` was written with this outcome.
-    pub(crate) fn settle(&mut self, given: &Given, outcome: Kept) {
+    pub(crate) fn settle(&mut self, given: &OrderOnItsWay, outcome: KeepResult) {
         self.absorb();
-        if given.order == Order::Arm && !matches!(outcome, Kept::Not(_)) {
+        if given.order == Order::Arm && !matches!(outcome, KeepResult::Not(_)) {
             // An order that came while the disk was busy is newer than this one.
             if self.newest == given.number {
                 self.stands = None;
@@ -201,13 +203,13 @@ impl Desk {
 
     /// What happened to the order on the disk; `None` while it is not settled. For orders in quick succession the
     /// result of the newest one applies to all.
-    pub(crate) fn outcome(&self, ticket: Ticket) -> Option<Kept> {
+    pub(crate) fn outcome(&self, ticket: Ticket) -> Option<KeepResult> {
         self.outcome.clone().filter(|_| self.settled >= ticket.0)
     }
 
     /// The standing order, once it is kept over restarts (or the rig does without, as a mock may).
     pub(crate) fn kept(&self) -> Option<Order> {
-        let is_kept = matches!(self.outcome, Some(Kept::In(_) | Kept::Nowhere));
+        let is_kept = matches!(self.outcome, Some(KeepResult::In(_) | KeepResult::Nowhere));
         self.stands.filter(|_| is_kept && self.settled == self.newest)
     }
 }
@@ -269,7 +271,7 @@ impl Orders {
 
     /// What happened to the order on the disk; `None` while it is not settled. For orders in quick succession the
     /// result of the newest one applies to all.
-    pub(crate) fn outcome(&self, ticket: Ticket) -> Option<Kept> {
+    pub(crate) fn outcome(&self, ticket: Ticket) -> Option<KeepResult> {
         self.inner.state().desk.outcome(ticket)
     }
 
@@ -383,7 +385,7 @@ mod tests {
         }
     }
 
-    fn settled(orders: &Orders, ticket: Ticket) -> Kept {
+    fn settled(orders: &Orders, ticket: Ticket) -> KeepResult {
         let begin = Instant::now();
         loop {
             if let Some(kept) = orders.outcome(ticket) {
@@ -403,15 +405,15 @@ mod tests {
         let ticket = orders.give(Order::Safe, By::Key);
         // The light receives it before the disk can.
         assert_eq!(rig.monitor.take_order(), Some(Order::Safe));
-        let Kept::In(path) = settled(&orders, ticket) else { panic!("not kept") };
+        let KeepResult::In(path) = settled(&orders, ticket) else { panic!("not kept") };
         assert!(path.starts_with(&rig.dir));
         // A weaker order does not replace it, on the disk or in memory.
         let ticket = orders.give(Order::Freeze, By::Key);
-        assert!(matches!(settled(&orders, ticket), Kept::In(_)));
+        assert!(matches!(settled(&orders, ticket), KeepResult::In(_)));
         assert_eq!((rig.on_disk(), orders.standing()), (Some(Order::Safe), Some(Order::Safe)));
         let _ = rig.monitor.take_order();
         let ticket = orders.give(Order::Arm, By::Key);
-        assert_eq!(settled(&orders, ticket), Kept::Forgotten);
+        assert_eq!(settled(&orders, ticket), KeepResult::Forgotten);
         assert_eq!((rig.on_disk(), rig.monitor.take_order()), (None, Some(Order::Arm)));
         orders.end(true);
     }
@@ -457,7 +459,7 @@ mod tests {
             assert_eq!((rig.monitor.take_order(), orders.kept()), (Some(Order::Black), Some(Order::Black)));
             assert_eq!(rig.on_disk(), None, "the rig file holds it, and no order of a person");
             let ticket = orders.give(Order::Arm, By::Key);
-            assert_eq!(settled(&orders, ticket), Kept::Forgotten);
+            assert_eq!(settled(&orders, ticket), KeepResult::Forgotten);
             assert_eq!((rig.monitor.take_order(), orders.kept()), (Some(Order::Arm), None));
             orders.end(true);
         }
@@ -465,7 +467,7 @@ mod tests {
         rig.monitor = Arc::default();
         let orders = rig.start_by(Restart::ByHand);
         let ticket = orders.give(Order::Freeze, By::Key);
-        assert!(matches!(settled(&orders, ticket), Kept::In(_)));
+        assert!(matches!(settled(&orders, ticket), KeepResult::In(_)));
         orders.end(false);
         assert_eq!(rig.on_disk(), Some(Order::Black));
     }
@@ -521,7 +523,7 @@ mod tests {
             orders.give(Order::Safe, By::Key);
             orders.give(Order::Arm, By::Key);
             let ticket = orders.give(Order::Safe, By::Key);
-            assert!(matches!(settled(&orders, ticket), Kept::In(_)));
+            assert!(matches!(settled(&orders, ticket), KeepResult::In(_)));
             assert_eq!(rig.on_disk(), Some(Order::Safe));
             assert_eq!(rig.monitor.take_order(), Some(Order::Safe));
             assert_eq!(rig.monitor.take_order(), None, "the ARM before it is not taken after it");
@@ -543,9 +545,9 @@ mod tests {
         std::fs::write(path.join("x"), b"").unwrap();
         let ticket = orders.give(Order::Safe, By::Key);
         assert_eq!(rig.monitor.take_order(), Some(Order::Safe));
-        assert!(matches!(settled(&orders, ticket), Kept::Not(why) if why.contains("mock-projector")));
+        assert!(matches!(settled(&orders, ticket), KeepResult::Not(why) if why.contains("mock-projector")));
         let ticket = orders.give(Order::Arm, By::Key);
-        assert!(matches!(settled(&orders, ticket), Kept::Not(_)));
+        assert!(matches!(settled(&orders, ticket), KeepResult::Not(_)));
         assert_eq!(rig.monitor.take_order(), None);
         orders.end(true);
     }

@@ -2,8 +2,8 @@
 //! planning uses the change, or the disk has it.
 
 use super::answer::Answer;
-use crate::parameters::desk::{AllShown, ParameterDesk, Shown, ToKeep};
-use crate::parameters::{told_of, Command, Refused};
+use crate::parameters::desk::{AllShown, ParameterDesk, ParameterView, ToKeep};
+use crate::parameters::{told_of, ChangeRefusal, Command};
 use crate::telemetry::monitor::RunMonitor;
 use dpm_common::unix::monotonic_ns;
 use std::sync::{Arc, OnceLock};
@@ -19,7 +19,7 @@ type Writing = Arc<OnceLock<Result<String, String>>>;
 
 /// A request that was not refused.
 #[derive(Clone, Debug)]
-pub enum Sent {
+pub enum ChangeResult {
     /// It is answered by this text.
     Told(String),
     /// Planning uses it from this version on.
@@ -37,7 +37,7 @@ pub enum Sent {
 #[derive(Clone, Debug)]
 pub struct Saving(Writing);
 
-impl Sent {
+impl ChangeResult {
     /// The answer to a request that was made `ago`; `None` while a better one is possible.
     pub fn answer(&self, ago: Duration, desk: &ParameterDesk) -> Option<Answer> {
         let answer = |is_done, text| Some(Answer { is_done, text });
@@ -62,7 +62,7 @@ impl Sent {
 ///
 /// # Errors
 /// The command was refused, and nothing has changed.
-pub fn give(monitor: &Arc<RunMonitor>, command: &Command, by: &str) -> Result<Sent, Refused> {
+pub fn give(monitor: &Arc<RunMonitor>, command: &Command, by: &str) -> Result<ChangeResult, ChangeRefusal> {
     let desk = monitor.parameters();
     match command {
         Command::Set { name, numbers } => {
@@ -70,31 +70,31 @@ pub fn give(monitor: &Arc<RunMonitor>, command: &Command, by: &str) -> Result<Se
             if is_step {
                 monitor.note(format!("{by}: {told}"));
             }
-            Ok(Sent::Changed { version, told })
+            Ok(ChangeResult::Changed { version, told })
         }
         Command::Undo => {
             let (version, told) = desk.undo()?;
             monitor.note(format!("{by}: undo: {told}"));
-            Ok(Sent::Changed { version, told })
+            Ok(ChangeResult::Changed { version, told })
         }
         Command::Save => save(monitor, by),
         Command::List => {
-            let shown = desk.shown().ok_or(Refused::NoRun)?;
-            Ok(Sent::Told(list(&shown)))
+            let shown = desk.shown().ok_or(ChangeRefusal::NoRun)?;
+            Ok(ChangeResult::Told(list(&shown)))
         }
     }
 }
 
 /// Starts a thread that writes the files: neither a client nor an order waits for the disk.
-fn save(monitor: &Arc<RunMonitor>, by: &str) -> Result<Sent, Refused> {
+fn save(monitor: &Arc<RunMonitor>, by: &str) -> Result<ChangeResult, ChangeRefusal> {
     let desk = monitor.parameters();
-    let not = |why: &str| Refused::NotSaved(why.to_owned());
+    let not = |why: &str| ChangeRefusal::NotSaved(why.to_owned());
     let (rig, values, keep) = desk.to_keep()?;
     if desk.saver().is_none() {
         return Err(not("this run knows no rig file to write to"));
     }
     if keep == ToKeep::default() {
-        return Ok(Sent::Told("ok: nothing has changed since the files were read or written".into()));
+        return Ok(ChangeResult::Told("ok: nothing has changed since the files were read or written".into()));
     }
     if !desk.begin_saving() {
         return Err(not("the files are being written; save again in a moment"));
@@ -121,12 +121,12 @@ fn save(monitor: &Arc<RunMonitor>, by: &str) -> Result<Sent, Refused> {
         desk.end_saving();
         return Err(not(&format!("no thread can be started: {e}")));
     }
-    Ok(Sent::Saving(Saving(writing)))
+    Ok(ChangeResult::Saving(Saving(writing)))
 }
 
 /// All values, a line each.
 fn list(shown: &AllShown) -> String {
-    let line = |p: &Shown| {
+    let line = |p: &ParameterView| {
         let range = match p.fields.as_slice() {
             [one] => format!("{} to {} {}", one.low, one.high, one.unit).trim_end().to_owned(),
             all => all.iter().map(|f| format!("{} {}", f.label, f.unit)).collect::<Vec<_>>().join(", "),

@@ -2,8 +2,8 @@
 
 use super::answer::answer_to;
 use super::orders::{Orders, Ticket};
-use super::parameters::{self, Sent};
-use super::{rig_name, socket_name, Asked, HEARD, MAX_WORD};
+use super::parameters::{self, ChangeResult};
+use super::{rig_name, socket_name, ClientRequest, HEARD, MAX_WORD};
 use crate::order::Order;
 use crate::parameters::Command;
 use crate::standing::By;
@@ -91,13 +91,13 @@ struct Client {
     uid: u32,
     word: Vec<u8>,
     /// What it has asked for, once received.
-    given: Option<Given>,
+    given: Option<PendingAnswer>,
 }
 
 /// What waits for its answer.
-enum Given {
+enum PendingAnswer {
     Order(Order, Ticket),
-    Change(Sent),
+    Change(ChangeResult),
 }
 
 struct Desk {
@@ -188,14 +188,14 @@ impl Desk {
             }
             match client.read_word() {
                 Ok(None) => client.since.elapsed() < PATIENCE,
-                Ok(Some(Asked::Order(order))) => {
+                Ok(Some(ClientRequest::Order(order))) => {
                     let by = By::Socket { uid: client.uid };
-                    client.given = Some(Given::Order(order, orders.give(order, by)));
+                    client.given = Some(PendingAnswer::Order(order, orders.give(order, by)));
                     // A client that has disconnected has given its order all the same.
                     let _ = writeln!(client.stream, "{HEARD} {}", rig_name());
                     true
                 }
-                Ok(Some(Asked::Parameters(command))) => client.change(&command, monitor),
+                Ok(Some(ClientRequest::Parameters(command))) => client.change(&command, monitor),
                 Err(_) => false,
             }
         });
@@ -206,8 +206,8 @@ impl Desk {
         clients.retain_mut(|client| {
             let ago = client.since.elapsed();
             let answer = match &client.given {
-                Some(Given::Order(order, ticket)) => answer_to(*order, *ticket, ago, monitor, orders),
-                Some(Given::Change(sent)) => sent.answer(ago, monitor.parameters()),
+                Some(PendingAnswer::Order(order, ticket)) => answer_to(*order, *ticket, ago, monitor, orders),
+                Some(PendingAnswer::Change(sent)) => sent.answer(ago, monitor.parameters()),
                 None => None,
             };
             let Some(answer) = answer else { return true };
@@ -223,7 +223,7 @@ fn may_give_orders(client: u32, me: u32) -> bool {
 }
 
 impl Client {
-    fn read_word(&mut self) -> io::Result<Option<Asked>> {
+    fn read_word(&mut self) -> io::Result<Option<ClientRequest>> {
         read_word(&mut self.stream, &mut self.word)
     }
 
@@ -231,7 +231,7 @@ impl Client {
     fn change(&mut self, command: &Command, monitor: &Arc<RunMonitor>) -> bool {
         match parameters::give(monitor, command, &format!("user {}", user_name(self.uid))) {
             Ok(sent) => {
-                self.given = Some(Given::Change(sent));
+                self.given = Some(PendingAnswer::Change(sent));
                 true
             }
             Err(refused) => {
@@ -247,7 +247,7 @@ impl Client {
 /// # Errors
 /// The client disconnected, or sent something else (and is informed).
 #[doc(hidden)]
-pub fn read_word(stream: &mut (impl Read + Write), word: &mut Vec<u8>) -> io::Result<Option<Asked>> {
+pub fn read_word(stream: &mut (impl Read + Write), word: &mut Vec<u8>) -> io::Result<Option<ClientRequest>> {
     let mut bytes = [0u8; MAX_WORD];
     while word.len() < MAX_WORD && !word.contains(&b'\n') {
         let room = MAX_WORD - word.len();
@@ -262,10 +262,10 @@ pub fn read_word(stream: &mut (impl Read + Write), word: &mut Vec<u8>) -> io::Re
     }
     let text = std::str::from_utf8(word).map_or("", str::trim_end);
     if let Some(order) = Order::from_word(text) {
-        return Ok(Some(Asked::Order(order)));
+        return Ok(Some(ClientRequest::Order(order)));
     }
     let told = match Command::parse(text) {
-        Ok(Some(command)) => return Ok(Some(Asked::Parameters(command))),
+        Ok(Some(command)) => return Ok(Some(ClientRequest::Parameters(command))),
         Ok(None) => {
             let known: Vec<_> = Order::ALL.iter().map(|(_, word)| *word).collect();
             format!("unknown order; known: {}, set NAME=VALUE, undo, save, list", known.join(", "))

@@ -58,7 +58,7 @@ impl Rig {
         self.socket.as_ref().unwrap().path()
     }
 
-    fn tell(&self, order: Order) -> Result<client::Told, client::ControlError> {
+    fn tell(&self, order: Order) -> Result<client::OrderResult, client::ControlError> {
         client::tell_in(&[self.dir.join("run")], None, order)
     }
 

@@ -99,7 +99,7 @@ fn corners_of(lower: DVec3, upper: DVec3) -> [DVec3; 8] {
 }
 
 /// What a sent frame was drawn for.
-struct Drawn {
+struct FrameAim {
     frame: u32,
     due_at: HostTime,
     /// From then on there is no light of it.
@@ -116,7 +116,7 @@ struct Drawn {
     lost: Vec<bool>,
 }
 
-impl Drawn {
+impl FrameAim {
     fn empty(rig: &Rig) -> Self {
         let bodies = rig.bodies.len();
         Self {
@@ -167,7 +167,7 @@ pub(crate) struct Follower {
     shapes: Vec<Option<Shape>>,
     light_delay_ns: i64,
     newest: Reader<TrackSnapshot>,
-    drawn: [Drawn; REMEMBERED],
+    drawn: [FrameAim; REMEMBERED],
     next: usize,
     due_at: HostTime,
     /// Regions of the message under construction with the distance of their bodies from the projector, nearest first.
@@ -182,7 +182,7 @@ impl Follower {
             shapes: (0..rig.bodies.len()).map(|i| Shape::of(rig, i)).collect(),
             light_delay_ns: rig.config.projector.light_delay_ns(),
             newest,
-            drawn: std::array::from_fn(|_| Drawn::empty(rig)),
+            drawn: std::array::from_fn(|_| FrameAim::empty(rig)),
             next: 0,
             due_at: HostTime(i64::MAX),
             regions: [(0.0, Region::default()); MAX_REGIONS],
@@ -215,8 +215,8 @@ impl Follower {
         self.due_at = now.plus_ns(EVERY_NS);
         let Some(most) = link.greatest_shift() else { return };
         let soon = now.plus_ns(AHEAD_NS);
-        let is_lit = |drawn: &&Drawn| drawn.due_at <= now;
-        let is_next = |drawn: &&Drawn| drawn.due_at > now && drawn.due_at <= soon;
+        let is_lit = |drawn: &&FrameAim| drawn.due_at <= now;
+        let is_next = |drawn: &&FrameAim| drawn.due_at > now && drawn.due_at <= soon;
         let lit = self.drawn.iter().filter(is_lit).max_by_key(|drawn| drawn.due_at);
         let next = self.drawn.iter().filter(is_next).min_by_key(|drawn| drawn.due_at);
         let frames = [lit, next].map(|drawn| drawn.filter(|d| d.due_at.0 != i64::MIN));
@@ -247,7 +247,7 @@ impl Scene<'_> {
     /// The tracks of a frame at `now`, with a region for each body on which light falls.
     fn tracks(
         &self,
-        drawn: &Drawn,
+        drawn: &FrameAim,
         snapshot: &TrackSnapshot,
         now: HostTime,
         time: &LinkTime,
@@ -280,7 +280,7 @@ impl Scene<'_> {
     /// The region of a body from `now` on, and its distance from the projector; `None` if nothing of it can be told.
     fn region(
         &self,
-        drawn: &Drawn,
+        drawn: &FrameAim,
         body: usize,
         shape: &Shape,
         state: &TrackState,
@@ -328,7 +328,7 @@ impl Scene<'_> {
 
     /// The mirrors on which the light of a body can fall while the frame is lit, whatever its shift; `None` if there are
     /// none, or if the body reaches behind the projector.
-    fn area(&self, drawn: &Drawn, body: usize, shape: &Shape, clamp: u8) -> Option<Area> {
+    fn area(&self, drawn: &FrameAim, body: usize, shape: &Shape, clamp: u8) -> Option<Area> {
         let mut bounds: Option<(DVec2, DVec2)> = None;
         for pose in drawn.ends.map(|end| drawn.pose_at(body, end)) {
             for corner in &shape.corners {

@@ -33,7 +33,7 @@ pub(crate) fn keeps_step(rhythm: &SampleRhythm, slot_ns: i64) -> bool {
 
 /// A sample that a frame waits for.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(crate) struct Awaited {
+pub(crate) struct SampleWait {
     /// Its exposure, or a little before.
     pub captured_at: HostTime,
     /// Until when the frame can wait.
@@ -42,7 +42,7 @@ pub(crate) struct Awaited {
 
 /// When to read the poses of a frame that should be latched at `at`, and can be latched up to `late_ns` later, or a little
 /// later in any case: when the sample is ready that becomes so at about that time, with that sample; else at `at`.
-pub(crate) fn latch_at(rhythm: &SampleRhythm, at: HostTime, late_ns: i64) -> (HostTime, Option<Awaited>) {
+pub(crate) fn latch_at(rhythm: &SampleRhythm, at: HostTime, late_ns: i64) -> (HostTime, Option<SampleWait>) {
     let ready_at = rhythm.ready_at().plus_ns(MARGIN_NS);
     let period_ns = rhythm.period_ns.max(1);
     let until = at.plus_ns(late_ns.max(2 * MARGIN_NS));
@@ -53,7 +53,7 @@ pub(crate) fn latch_at(rhythm: &SampleRhythm, at: HostTime, late_ns: i64) -> (Ho
         return (at, None);
     }
     let captured_at = rhythm.captured_at.plus_ns(periods * period_ns - period_ns / 4);
-    (last, Some(Awaited { captured_at, until }))
+    (last, Some(SampleWait { captured_at, until }))
 }
 
 /// How far slots should be shifted, and from which on: later if positive, nanoseconds. `is_first`: no frame was sent yet.

@@ -14,7 +14,7 @@ use crate::order::Order;
 use crate::plan::frame::FramePlan;
 use crate::plan::link_time::LinkTime;
 use crate::telemetry::light_gauge::LightReport;
-use crate::telemetry::link_gauges::{Carried, LinkGauges};
+use crate::telemetry::link_gauges::{LinkGauges, LinkReport};
 use crate::telemetry::monitor::{ProjectorHealth, RunMonitor};
 use crate::telemetry::projector::ProjectorReport;
 use dpm_device::clock_map::ClockMap;
@@ -226,11 +226,11 @@ impl LinkKeeper {
     }
 
     /// What the link has carried so far.
-    fn carried(&self, link: &HostLink) -> Carried {
+    fn carried(&self, link: &HostLink) -> LinkReport {
         let c = link.counters();
         let by_tracks = link.status().and_then(|status| status.tracks).unwrap_or_default();
         let by_tracks = [by_tracks.planes_moved, by_tracks.planes_clamped, by_tracks.planes_stale];
-        Carried {
+        LinkReport {
             sessions: c.sessions,
             rearmed: self.rearmed,
             bytes_sent: c.bytes_sent,

@@ -1,11 +1,11 @@
 //! Decides which slot the next frame is for, when its poses are read, and when all frames of the run are planned.
 
 use super::facts::{CrewFacts, Facts};
-use super::genlock::{self, Awaited};
+use super::genlock::{self, SampleWait};
 use super::pace::{modelled_ns, Pace};
 use crate::frame::job::{Fate, FrameNote};
 use crate::frame::FrameTimeline;
-use crate::parameters::applied::Applied;
+use crate::parameters::applied::ParameterVersion;
 use crate::plan::eyes::HeadWatch;
 use crate::plan::frame::PlanInputs;
 use crate::plan::horizon::Horizon;
@@ -38,7 +38,7 @@ pub(crate) struct Latch {
     /// The same, but not before the slot was chosen. Reading the poses later than this is lateness of this thread.
     pub due_at: HostTime,
     /// The sample that it waits for a little, if it is late.
-    pub awaited: Option<Awaited>,
+    pub awaited: Option<SampleWait>,
     /// The lead: how long before the slot `at` is, nanoseconds.
     lead_ns: i64,
 }
@@ -50,7 +50,7 @@ pub(crate) struct PlanStage<P> {
     horizon: Horizon,
     heads: HeadWatch,
     /// What the operator may change while the run goes on.
-    parameters: Reader<Applied>,
+    parameters: Reader<ParameterVersion>,
     /// The newest version of them that was used; `None` before the first frame.
     used: Option<u64>,
     slot_ns: i64,

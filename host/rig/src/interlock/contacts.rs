@@ -1,7 +1,7 @@
 //! The contacts of `[safety.interlock]`: processes, control lines, files, held keys. A contact that cannot be read
 //! counts as open.
 
-use super::{Contact, Shared};
+use super::{Contact, InterlockState};
 use crate::config::InterlockConfig;
 use dpm_device::tty::{ControlLine, ControlSignal};
 use std::fs::OpenOptions;
@@ -19,7 +19,7 @@ const COMM_BYTES: usize = 15;
 const MOST_BYTES: u64 = 4096;
 
 /// The contact that a configuration names.
-pub(super) fn of(config: &InterlockConfig, shared: &Arc<Shared>) -> Box<dyn Contact> {
+pub(super) fn of(config: &InterlockConfig, shared: &Arc<InterlockState>) -> Box<dyn Contact> {
     match config {
         InterlockConfig::None(_) => Box::new(Nothing),
         InterlockConfig::Process(p) => match (&p.name, &p.pid_file) {
@@ -201,7 +201,7 @@ impl Contact for One {
 }
 
 /// The key that is passed to [`super::Interlock::key_pressed`].
-struct Key(Arc<Shared>);
+struct Key(Arc<InterlockState>);
 
 impl Contact for Key {
     fn is_closed(&mut self) -> bool {

@@ -21,7 +21,7 @@ use crate::telemetry::live::{LiveBody, LiveFrame};
 use crate::telemetry::miss_log::MissLog;
 use crate::telemetry::monitor::RunMonitor;
 use crate::telemetry::profile::{missed_by_cause, ordered_dark, Profiler};
-use crate::telemetry::report::{Latency, Report, Spread, StageTime};
+use crate::telemetry::report::{Latency, Percentiles, Report, StageTime};
 use crate::telemetry::signed::SignedHistogram;
 use crate::telemetry::slots::{SlotCounts, SlotLedger};
 use crate::telemetry::trace::TracedFrame;
@@ -557,7 +557,7 @@ impl Collector {
         let passes = PASSES.iter().map(|p| format!("gpu {p}")).zip(&self.passes);
         report.stages_ms = stages
             .chain(passes)
-            .filter_map(|(stage, h)| Spread::of_histogram(h, 1e6).map(|ms| StageTime { stage, ms }))
+            .filter_map(|(stage, h)| Percentiles::of_histogram(h, 1e6).map(|ms| StageTime { stage, ms }))
             .collect();
         report.mrays_per_s = (self.gpu_ns > 0).then(|| self.rays as f64 / self.gpu_ns as f64 * 1e3);
         report.clipped =

@@ -5,7 +5,7 @@ use crate::light::record::FrameRecord;
 use crate::light::registration::{PlaneLight, RegistrationMeter};
 use crate::plan::light_centre::{instants_of_planes, lights_of_frame};
 use crate::rig::Rig;
-use crate::telemetry::report::{Report, Spread};
+use crate::telemetry::report::{Percentiles, Report};
 use dpm_device::link::Moves;
 use dpm_device::projector::SlotMoves;
 use glam::DVec3;
@@ -153,7 +153,7 @@ impl RegistrationMeasures {
 
     /// Writes the measurements of the run into a report.
     pub(crate) fn fill(&self, report: &mut Report) {
-        let spread = |h: &Histogram<u64>| Spread::of_histogram(h, PER_PIXEL);
+        let spread = |h: &Histogram<u64>| Percentiles::of_histogram(h, PER_PIXEL);
         report.registration_error_px = spread(&self.at_centre);
         report.registration_error_in_time_px = spread(&self.in_time);
         [report.followed_offset_px, report.followed_smear_px] = self.followed.each_ref().map(spread);

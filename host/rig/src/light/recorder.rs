@@ -91,7 +91,7 @@ pub struct LightFrame {
 
 /// The planes on the mirrors as they were sent, kept until it is known what tracks made of them.
 #[derive(Default)]
-struct Sent {
+struct SentPlanes {
     /// The count of lit frames that they belong to.
     generation: Option<u64>,
     frame: Option<u32>,
@@ -112,7 +112,7 @@ pub(crate) struct LightRecorder {
     schedule: PlaneSchedule,
     /// Lit planes carry marks.
     is_marked: bool,
-    sent: Sent,
+    sent: SentPlanes,
     frames: VecDeque<LightFrame>,
     /// What tracks made of the last lit slots, and how many are kept.
     moves: VecDeque<SlotMoves>,
@@ -146,7 +146,7 @@ impl LightRecorder {
             hash,
             schedule,
             is_marked,
-            sent: Sent::default(),
+            sent: SentPlanes::default(),
             frames: VecDeque::with_capacity(keep + 1),
             moves: VecDeque::with_capacity(keep_moves),
             keep_moves,

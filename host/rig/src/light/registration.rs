@@ -15,7 +15,7 @@ const FOLLOWED_EVERY: usize = 8;
 
 /// Where the light of a frame's planes fell, as an eye sees it that follows a point of the body. Pixels.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub(crate) struct Followed {
+pub(crate) struct LightPath {
     /// Distance from the point to the mean of the light.
     pub offset_px: f64,
     /// Root mean square distance of the light from its mean.
@@ -110,7 +110,7 @@ impl RegistrationMeter {
         &'a self,
         body: usize,
         planes: &'a [PlaneLight],
-    ) -> impl Iterator<Item = Followed> + 'a {
+    ) -> impl Iterator<Item = LightPath> + 'a {
         let points = self.points.get(body).map_or(&[][..], Vec::as_slice);
         points.iter().step_by(FOLLOWED_EVERY).filter_map(move |p| {
             let at = |pose: &DAffine3| self.camera.project(pose.transform_point3(*p));
@@ -124,7 +124,7 @@ impl RegistrationMeter {
             }
             let mean = sum / weights;
             let smear_px = (squares / weights - mean.length_squared()).max(0.0).sqrt();
-            (weights > 0.0).then_some(Followed { offset_px: mean.length(), smear_px })
+            (weights > 0.0).then_some(LightPath { offset_px: mean.length(), smear_px })
         })
     }
 }

@@ -8,7 +8,7 @@ use glam::{DAffine3, DVec3};
 
 /// One version of the parameters.
 #[derive(Clone, Debug, PartialEq)]
-pub struct Applied {
+pub struct ParameterVersion {
     /// Its number; 0 is the rig file's.
     pub version: u64,
     /// By how much brighter than by the rig file light is; exactly 1 as long as the exposure is the rig file's.
@@ -25,7 +25,7 @@ pub struct Applied {
     pub mesh_to_body: Vec<DAffine3>,
 }
 
-impl Applied {
+impl ParameterVersion {
     /// `values` on `rig`. `middles` has the middle of every tracked body's mesh, in the mesh's space.
     pub fn new(version: u64, values: &Values, rig: &Rig, middles: &[DVec3]) -> Self {
         let mut camera = rig.camera;

@@ -1,6 +1,6 @@
 //! What an operator asks for, as one line: `set NAME=NUMBER,NUMBER`, `undo`, `save` and `list`.
 
-use super::Refused;
+use super::ChangeRefusal;
 
 /// Longest line, bytes.
 pub const MAX_LINE: usize = 512;
@@ -30,7 +30,7 @@ impl Command {
     ///
     /// # Errors
     /// `set` without a name, or with something that is no number.
-    pub fn parse(line: &str) -> Result<Option<Self>, Refused> {
+    pub fn parse(line: &str) -> Result<Option<Self>, ChangeRefusal> {
         let change = match line.trim() {
             "undo" => return Ok(Some(Self::Undo)),
             "save" => return Ok(Some(Self::Save)),
@@ -44,9 +44,9 @@ impl Command {
     ///
     /// # Errors
     /// There is no `=`, or something that is no number.
-    pub fn parse_change(text: &str) -> Result<Self, Refused> {
+    pub fn parse_change(text: &str) -> Result<Self, ChangeRefusal> {
         let Some((name, numbers)) = text.rsplit_once('=') else {
-            return Err(Refused::Syntax("write NAME=VALUE, for example exposure=1.5".into()));
+            return Err(ChangeRefusal::Syntax("write NAME=VALUE, for example exposure=1.5".into()));
         };
         let name = name.trim().to_owned();
         Ok(Self::Set { numbers: numbers_of(&name, numbers)?, name })
@@ -67,18 +67,20 @@ impl Command {
 }
 
 /// Numbers that commas separate; none in an empty text.
-fn numbers_of(name: &str, text: &str) -> Result<Vec<f64>, Refused> {
+fn numbers_of(name: &str, text: &str) -> Result<Vec<f64>, ChangeRefusal> {
     let (text, name) = (text.trim(), name.chars().take(80).collect::<String>());
     if text.is_empty() {
         return Ok(Vec::new());
     }
     let parts: Vec<&str> = text.split(',').take(MAX_NUMBERS + 1).collect();
     if parts.len() > MAX_NUMBERS {
-        return Err(Refused::Syntax(format!("{name}: more than {MAX_NUMBERS} numbers")));
+        return Err(ChangeRefusal::Syntax(format!("{name}: more than {MAX_NUMBERS} numbers")));
     }
     let number = |part: &&str| {
         let short: String = part.trim().chars().take(40).collect();
-        part.trim().parse::<f64>().map_err(|_| Refused::Syntax(format!("{name}: {short:?} is no number")))
+        part.trim()
+            .parse::<f64>()
+            .map_err(|_| ChangeRefusal::Syntax(format!("{name}: {short:?} is no number")))
     };
     parts.iter().map(number).collect()
 }

@@ -1,8 +1,8 @@
 //! The desk where parameters are changed, taken back and saved. It works beside the frame path: planning reads the
 //! newest version from a hand-off that neither locks nor waits.
 
-use super::applied::{middles, Applied};
-use super::{told_of, Parameter, Refused, Values};
+use super::applied::{middles, ParameterVersion};
+use super::{told_of, ChangeRefusal, Parameter, Values};
 use crate::config::GazeConfig;
 use crate::rig::Rig;
 use dpm_handoff::latest::{latest, Publisher, Reader};
@@ -57,7 +57,7 @@ struct State {
     before: VecDeque<Values>,
     /// What was changed last, and when.
     last: Option<(Parameter, u64)>,
-    to_planning: Publisher<Applied>,
+    to_planning: Publisher<ParameterVersion>,
 }
 
 /// Where parameters are changed. It exists from the beginning, and is of use from the first [`ParameterDesk::follow`].
@@ -82,7 +82,7 @@ impl fmt::Debug for ParameterDesk {
 
 /// A parameter with its numbers, for those who show it.
 #[derive(Clone, Debug, PartialEq, serde::Serialize)]
-pub struct Shown {
+pub struct ParameterView {
     /// Its name.
     pub name: String,
     /// What it does.
@@ -107,7 +107,7 @@ pub struct AllShown {
     /// The values differ from what the files say.
     pub is_unsaved: bool,
     /// Every parameter that has an effect.
-    pub all: Vec<Shown>,
+    pub all: Vec<ParameterView>,
 }
 
 impl ParameterDesk {
@@ -117,13 +117,13 @@ impl ParameterDesk {
     }
 
     /// The parameters of `rig` for a planning stage that begins. Values that were changed before stay.
-    pub(crate) fn follow(&self, rig: &Arc<Rig>) -> Reader<Applied> {
+    pub(crate) fn follow(&self, rig: &Arc<Rig>) -> Reader<ParameterVersion> {
         let mut place = self.state();
         let (middles, values, version) = match place.as_ref() {
             Some(s) => (s.middles.clone(), s.values.clone(), s.version),
             None => (middles(rig), Values::of(rig), 0),
         };
-        let (to_planning, reader) = latest(Applied::new(version, &values, rig, &middles));
+        let (to_planning, reader) = latest(ParameterVersion::new(version, &values, rig, &middles));
         match place.as_mut() {
             Some(state) => state.to_planning = to_planning,
             None => {
@@ -184,7 +184,7 @@ impl ParameterDesk {
         let state = self.open()?;
         let s = state.as_ref()?;
         let began = Values::of(&s.rig);
-        let one = |p: Parameter| Shown {
+        let one = |p: Parameter| ParameterView {
             name: p.name(&s.rig),
             told: p.told(),
             numbers: s.values.get(p),
@@ -204,7 +204,7 @@ impl ParameterDesk {
     pub fn projector(&self) -> Option<DAffine3> {
         let place = self.state();
         let s = place.as_ref()?;
-        Some(Applied::new(s.version, &s.values, &s.rig, &s.middles).camera.world_from_projector)
+        Some(ParameterVersion::new(s.version, &s.values, &s.rig, &s.middles).camera.world_from_projector)
     }
 
     /// The newest version, and whether it is in use, can be taken back and is saved: for those who look whether
@@ -221,9 +221,9 @@ impl ParameterDesk {
         name: &str,
         numbers: &[f64],
         now_ns: u64,
-    ) -> Result<(u64, String, bool), Refused> {
-        let mut state = self.open().ok_or(Refused::NoRun)?;
-        let s = state.as_mut().ok_or(Refused::NoRun)?;
+    ) -> Result<(u64, String, bool), ChangeRefusal> {
+        let mut state = self.open().ok_or(ChangeRefusal::NoRun)?;
+        let s = state.as_mut().ok_or(ChangeRefusal::NoRun)?;
         let parameter = Parameter::named(name, &s.rig)?;
         let mut values = s.values.clone();
         values.set(parameter, numbers, &s.rig)?;
@@ -245,10 +245,10 @@ impl ParameterDesk {
     }
 
     /// Takes the last step back.
-    pub(crate) fn undo(&self) -> Result<(u64, String), Refused> {
-        let mut state = self.open().ok_or(Refused::NoRun)?;
-        let s = state.as_mut().ok_or(Refused::NoRun)?;
-        let values = s.before.pop_back().ok_or(Refused::NothingToUndo)?;
+    pub(crate) fn undo(&self) -> Result<(u64, String), ChangeRefusal> {
+        let mut state = self.open().ok_or(ChangeRefusal::NoRun)?;
+        let s = state.as_mut().ok_or(ChangeRefusal::NoRun)?;
+        let values = s.before.pop_back().ok_or(ChangeRefusal::NothingToUndo)?;
         let told = values.changes_since(&s.values, &s.rig);
         s.last = None;
         s.take_over(values);
@@ -256,9 +256,9 @@ impl ParameterDesk {
     }
 
     /// What the files do not say yet.
-    pub(crate) fn to_keep(&self) -> Result<(Arc<Rig>, Values, ToKeep), Refused> {
-        let state = self.open().ok_or(Refused::NoRun)?;
-        let s = state.as_ref().ok_or(Refused::NoRun)?;
+    pub(crate) fn to_keep(&self) -> Result<(Arc<Rig>, Values, ToKeep), ChangeRefusal> {
+        let state = self.open().ok_or(ChangeRefusal::NoRun)?;
+        let s = state.as_ref().ok_or(ChangeRefusal::NoRun)?;
         let (now, saved) = (&s.values, &s.saved);
         let mut keep = ToKeep::default();
         if now.exposure != saved.exposure {
@@ -273,7 +273,7 @@ impl ParameterDesk {
         if now.gaze != saved.gaze {
             keep.keys.push((["observer", "gaze"], gaze(now.gaze, &s.rig)));
         }
-        let applied = Applied::new(s.version, now, &s.rig, &s.middles);
+        let applied = ParameterVersion::new(s.version, now, &s.rig, &s.middles);
         if now.projector != saved.projector {
             keep.projector = Some(applied.camera.world_from_projector);
         }
@@ -296,7 +296,7 @@ impl ParameterDesk {
 impl State {
     fn take_over(&mut self, values: Values) {
         self.version += 1;
-        self.to_planning.publish(Applied::new(self.version, &values, &self.rig, &self.middles));
+        self.to_planning.publish(ParameterVersion::new(self.version, &values, &self.rig, &self.middles));
         self.values = values;
     }
 }

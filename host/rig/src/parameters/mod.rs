@@ -2,7 +2,7 @@
 //! projector and of bodies.
 //!
 //! [`Values`] are the values as an operator thinks of them. [`desk::ParameterDesk`] checks changes, remembers the past
-//! for undo, and hands [`applied::Applied`] to planning, which uses it from one frame on. None of this can raise a limit
+//! for undo, and hands [`applied::ParameterVersion`] to planning, which uses it from one frame on. None of this can raise a limit
 //! on light: those are kept by the link and by the projector, from the planes that are sent.
 
 pub mod applied;
@@ -78,7 +78,7 @@ pub struct Values {
 
 /// Why a change was refused; nothing was changed.
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
-pub enum Refused {
+pub enum ChangeRefusal {
     /// The run draws no scene.
     #[error("this run has no parameters to change: they exist once a scene is drawn")]
     NoRun,
@@ -194,7 +194,7 @@ impl Parameter {
     ///
     /// # Errors
     /// There is none, or it would have no effect.
-    pub fn named(name: &str, rig: &Rig) -> Result<Self, Refused> {
+    pub fn named(name: &str, rig: &Rig) -> Result<Self, ChangeRefusal> {
         let fixed = [Self::Exposure, Self::Samples, Self::Budget, Self::Gaze, Self::Projector];
         let found = fixed
             .into_iter()
@@ -203,10 +203,10 @@ impl Parameter {
         let Some(parameter) = found else {
             let known: Vec<String> = Self::all_of(rig).into_iter().map(|p| p.name(rig)).collect();
             let name = name.chars().take(80).collect();
-            return Err(Refused::Unknown { name, known: known.join(", ") });
+            return Err(ChangeRefusal::Unknown { name, known: known.join(", ") });
         };
         match parameter.why_not(rig) {
-            Some(why) => Err(Refused::NoEffect { name: name.to_owned(), why }),
+            Some(why) => Err(ChangeRefusal::NoEffect { name: name.to_owned(), why }),
             None => Ok(parameter),
         }
     }
@@ -294,7 +294,7 @@ impl Values {
     ///
     /// # Errors
     /// The numbers are too few or too many, not numbers, or out of range. Then nothing is changed.
-    pub fn set(&mut self, parameter: Parameter, numbers: &[f64], rig: &Rig) -> Result<(), Refused> {
+    pub fn set(&mut self, parameter: Parameter, numbers: &[f64], rig: &Rig) -> Result<(), ChangeRefusal> {
         check(parameter, numbers, rig)?;
         match (parameter, numbers) {
             (Parameter::Exposure, [value]) => self.exposure = *value,
@@ -335,7 +335,7 @@ pub fn told_of(numbers: &[f64]) -> String {
     numbers.iter().map(f64::to_string).collect::<Vec<_>>().join(",")
 }
 
-fn check(parameter: Parameter, numbers: &[f64], rig: &Rig) -> Result<(), Refused> {
+fn check(parameter: Parameter, numbers: &[f64], rig: &Rig) -> Result<(), ChangeRefusal> {
     let name = parameter.name(rig);
     let fields = parameter.fields(rig);
     let is_none_meant = parameter == Parameter::Gaze && numbers.is_empty();
@@ -345,12 +345,12 @@ fn check(parameter: Parameter, numbers: &[f64], rig: &Rig) -> Result<(), Refused
             3 => "three numbers or none",
             _ => "six numbers",
         };
-        return Err(Refused::Count { name, wanted, given: numbers.len() });
+        return Err(ChangeRefusal::Count { name, wanted, given: numbers.len() });
     }
     for (field, value) in fields.iter().zip(numbers) {
         let full = format!("{name} {}", field.label).trim_end().to_owned();
         if !(field.low..=field.high).contains(value) {
-            return Err(Refused::Range {
+            return Err(ChangeRefusal::Range {
                 name: full,
                 value: value.to_string(),
                 low: field.low.to_string(),
@@ -359,7 +359,7 @@ fn check(parameter: Parameter, numbers: &[f64], rig: &Rig) -> Result<(), Refused
             });
         }
         if parameter == Parameter::Samples && value.fract() != 0.0 {
-            return Err(Refused::NotWhole { name: full, value: value.to_string() });
+            return Err(ChangeRefusal::NotWhole { name: full, value: value.to_string() });
         }
     }
     Ok(())

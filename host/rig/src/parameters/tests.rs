@@ -1,6 +1,6 @@
 use super::*;
 use crate::config::{Overrides, RigConfig};
-use applied::{middles, Applied};
+use applied::{middles, ParameterVersion};
 use dpm_device::planes::Raster;
 use proptest::prelude::*;
 use std::sync::Arc;
@@ -14,7 +14,7 @@ fn rig(flags: &[&str]) -> Arc<Rig> {
 #[test]
 fn without_a_change_planning_has_the_rigs_own_bits() {
     let rig = rig(&["render.exposure=0.37"]);
-    let first = Applied::new(0, &Values::of(&rig), &rig, &middles(&rig));
+    let first = ParameterVersion::new(0, &Values::of(&rig), &rig, &middles(&rig));
     assert_eq!(first.brighter.to_bits(), 1.0f32.to_bits());
     assert_eq!((first.camera, first.gaze), (rig.camera, None));
     for (body, place) in rig.bodies.iter().zip(&first.mesh_to_body) {
@@ -48,7 +48,7 @@ proptest! {
         if values.set(parameter, &numbers, rig).is_err() {
             prop_assert_eq!(&values, &before);
         }
-        let applied = Applied::new(1, &values, rig, &middles(rig));
+        let applied = ParameterVersion::new(1, &values, rig, &middles(rig));
         prop_assert!(applied.brighter.is_finite() && applied.brighter > 0.0);
         prop_assert!((1..=4096).contains(&applied.samples) && (1..=4_096_000).contains(&applied.most_milli));
         prop_assert!(applied.camera.world_from_projector.is_finite());

@@ -16,7 +16,7 @@ use decode::Decoder;
 use dpm_common::realtime::os::give_way;
 use dpm_scene::LivePictures;
 pub use source::look_at;
-use source::{Ended, Stream};
+use source::{Stream, StreamEnd};
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::Arc;
 use std::thread::{sleep, Builder, JoinHandle};
@@ -130,7 +130,7 @@ impl StreamReader {
     }
 
     /// Opens the source and shows what it sends, until it ends or is no sequence of pictures. Counts in `shown`.
-    fn read(&mut self, shown: &mut u64) -> Ended {
+    fn read(&mut self, shown: &mut u64) -> StreamEnd {
         let size = self.pictures.size();
         let mut stream = match Stream::open(&self.source, size) {
             Ok(stream) => stream,
@@ -141,7 +141,7 @@ impl StreamReader {
         let mut silent_since = Some(Instant::now());
         loop {
             if self.is_stopped() {
-                return Ended::Stopped;
+                return StreamEnd::Stopped;
             }
             // That it is black was told when the program before has ended.
             let is_told = *shown == 0 && (self.told.is_some() || self.waiting.is_some());
@@ -174,7 +174,7 @@ impl StreamReader {
                 self.note(format!("pictures of {width} x {height} have begun{fitted}"));
             }
             if let Err(wrong) = decoded {
-                return Ended::Wrong(wrong);
+                return StreamEnd::Wrong(wrong);
             }
         }
     }

@@ -22,7 +22,7 @@ const MOST_SAID: usize = 4096;
 
 /// Why no more pictures come.
 #[derive(Debug)]
-pub(super) enum Ended {
+pub(super) enum StreamEnd {
     /// The run is over.
     Stopped,
     /// The source cannot be opened.
@@ -37,7 +37,7 @@ pub(super) enum Ended {
     Failed(io::Error),
 }
 
-impl fmt::Display for Ended {
+impl fmt::Display for StreamEnd {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         match self {
             Self::Stopped => write!(f, "the run is over"),
@@ -63,11 +63,11 @@ impl Stream {
     ///
     /// # Errors
     /// Why it cannot be opened.
-    pub(super) fn open(source: &LiveSource, size: [u32; 2]) -> Result<Self, Ended> {
+    pub(super) fn open(source: &LiveSource, size: [u32; 2]) -> Result<Self, StreamEnd> {
         match source {
-            LiveSource::Pipe(path) => open_pipe(path).map_err(Ended::NotOpened),
+            LiveSource::Pipe(path) => open_pipe(path).map_err(StreamEnd::NotOpened),
             LiveSource::PipeWire(target) => {
-                start(gstreamer_at(Path::new(PROGRAM), target, size)).map_err(Ended::NotOpened)
+                start(gstreamer_at(Path::new(PROGRAM), target, size)).map_err(StreamEnd::NotOpened)
             }
         }
     }
@@ -84,13 +84,13 @@ impl Stream {
     ///
     /// # Errors
     /// Nothing more comes.
-    pub(super) fn read(&mut self, bytes: &mut [u8], limit: Duration) -> Result<usize, Ended> {
+    pub(super) fn read(&mut self, bytes: &mut [u8], limit: Duration) -> Result<usize, StreamEnd> {
         match self {
             Self::Pipe(file, has_come) => {
                 // Before a program has opened it, a pipe has nothing to wait for.
                 let is_ready = readable(&[file.as_raw_fd()], limit)?[0];
                 match if is_ready { file.read(bytes) } else { return Ok(0) } {
-                    Ok(0) if *has_come => Err(Ended::Closed),
+                    Ok(0) if *has_come => Err(StreamEnd::Closed),
                     Ok(0) => {
                         std::thread::sleep(limit);
                         Ok(0)
@@ -100,11 +100,11 @@ impl Stream {
                         Ok(count)
                     }
                     Err(e) if e.kind() == io::ErrorKind::WouldBlock => Ok(0),
-                    Err(e) => Err(Ended::Failed(e)),
+                    Err(e) => Err(StreamEnd::Failed(e)),
                 }
             }
             Self::Program(child, said) => {
-                let Some(out) = &mut child.stdout else { return Err(Ended::Program(String::new())) };
+                let Some(out) = &mut child.stdout else { return Err(StreamEnd::Program(String::new())) };
                 let both: Vec<RawFd> = [Some(out.as_raw_fd()), child.stderr.as_ref().map(AsRawFd::as_raw_fd)]
                     .into_iter()
                     .flatten()
@@ -124,10 +124,10 @@ impl Stream {
                         if let Some(err) = &mut child.stderr {
                             let _ = err.take(MOST_SAID as u64).read_to_end(said);
                         }
-                        Err(Ended::Program(told(said)))
+                        Err(StreamEnd::Program(told(said)))
                     }
                     Ok(count) => Ok(count),
-                    Err(e) => Err(Ended::Failed(e)),
+                    Err(e) => Err(StreamEnd::Failed(e)),
                 }
             }
         }
@@ -144,9 +144,9 @@ impl Drop for Stream {
     }
 }
 
-fn readable(descriptors: &[RawFd], limit: Duration) -> Result<Vec<bool>, Ended> {
+fn readable(descriptors: &[RawFd], limit: Duration) -> Result<Vec<bool>, StreamEnd> {
     let mut ready = Vec::with_capacity(descriptors.len());
-    wait_readable(descriptors, limit.as_millis() as i32, &mut ready).map_err(Ended::Failed)?;
+    wait_readable(descriptors, limit.as_millis() as i32, &mut ready).map_err(StreamEnd::Failed)?;
     Ok(ready)
 }
 

@@ -6,7 +6,7 @@
 //! cannot reach the light.
 
 use super::parts::CrewParts;
-use super::threads::{pack_thread, plan_thread, policy, tracking_thread, PackInbox, PlanInbox, Shared};
+use super::threads::{pack_thread, plan_thread, policy, tracking_thread, PackInbox, PlanInbox, RunState};
 use crate::engine::error::PipelineError;
 use crate::engine::facts::CrewFacts;
 use crate::engine::pack::PackStage;
@@ -83,7 +83,7 @@ impl CrewState {
     }
 
     /// True when the crew's threads should end.
-    pub(super) fn is_dismissed(&self, shared: &Shared) -> bool {
+    pub(super) fn is_dismissed(&self, shared: &RunState) -> bool {
         self.is_abandoned.load(Ordering::Relaxed) || shared.facts.monitor.stop_requested()
     }
 }
@@ -102,7 +102,7 @@ impl Crew {
     ///
     /// # Errors
     /// The system cannot start a thread.
-    pub(super) fn start(shared: &Arc<Shared>, parts: CrewParts) -> Result<(Self, Port), PipelineError> {
+    pub(super) fn start(shared: &Arc<RunState>, parts: CrewParts) -> Result<(Self, Port), PipelineError> {
         let CrewParts { tracking, renderer, packer, budget, memory, first, budget_milli } = parts;
         let rig = &shared.facts.rig;
         let policy = policy(rig);

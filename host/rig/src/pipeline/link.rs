@@ -3,7 +3,7 @@
 
 use super::crew::Port;
 use super::rights::Rights;
-use super::threads::{enter_frame_path, may_stall, pop_within, Shared, STEP_NS, WARM_UP_FRAMES};
+use super::threads::{enter_frame_path, may_stall, pop_within, RunState, STEP_NS, WARM_UP_FRAMES};
 use crate::engine::error::PipelineError;
 use crate::engine::link::{LinkStage, Offer};
 use crate::engine::options::StallIn;
@@ -37,7 +37,7 @@ pub(super) struct Line {
 /// Sends the frames of the current crew, then orders the projector to go dark: at once if a stop was requested, after
 /// the last frames' light if the run is complete. A panic in this thread also ends in the dark.
 pub(super) fn link_thread(
-    shared: &Shared,
+    shared: &RunState,
     mut line: Line,
     ports: Receiver<Port>,
     notes: NoteSender,
@@ -100,7 +100,7 @@ impl Desk {
     }
 
     /// The projector is dark. Counts frames that are still in flight as not sent. Waits briefly for the crew's end.
-    fn clear(&mut self, shared: &Shared) {
+    fn clear(&mut self, shared: &RunState) {
         let watch = Stopwatch::start();
         while !self.is_finished() && watch.elapsed_ns() < CLEARED_WITHIN_NS {
             shared.link_pulse.beat(shared.clock.now(), STEP_NS);
@@ -114,7 +114,7 @@ impl Desk {
 
 impl Line {
     /// Sends frames until no more will come or a stop is requested.
-    fn serve(&mut self, shared: &Shared, desk: &mut Desk) {
+    fn serve(&mut self, shared: &RunState, desk: &mut Desk) {
         while !shared.facts.monitor.stop_requested() {
             if let Some(port) = desk.ports.try_pop() {
                 // Frames of the former crew are dropped.
@@ -141,7 +141,7 @@ impl Line {
     }
 
     /// Sends one frame, or leaves it out.
-    fn take(&mut self, shared: &Shared, job: &mut FrameJob, is_newest: bool) {
+    fn take(&mut self, shared: &RunState, job: &mut FrameJob, is_newest: bool) {
         let FrameJob { note, memory } = job;
         let clock = &shared.clock;
         // Reopening a lost medium allocates, but the rig is dark then.
@@ -159,7 +159,7 @@ impl Line {
     }
 
     /// Waits for the last frames' light if the run is complete, then goes dark.
-    fn go_dark(&mut self, shared: &Shared) {
+    fn go_dark(&mut self, shared: &RunState) {
         let last = shared.clock.now();
         let mut now = last;
         while let Some(at) = self.stage.end(now, last, self.medium.as_mut()) {

@@ -9,7 +9,7 @@ use super::rights::Rights;
 use super::run::Ran;
 use super::settings::lead_estimator;
 use super::supervisor::{join_within, Maker, Supervisor, Workshop, Wreckage};
-use super::threads::{policy, Shared, STAGE_THREADS};
+use super::threads::{policy, RunState, STAGE_THREADS};
 use crate::engine::error::PipelineError;
 use crate::engine::facts::Facts;
 use crate::engine::keeper::LinkKeeper;
@@ -92,7 +92,7 @@ pub(super) fn run_at_real_pace(
         far.lights.map(|lights| (lights, rig.config.projector.light_delay_ns())),
     );
     let line = Line { stage: LinkStage::new(facts.clone(), link, keeper, lead), medium: far.medium };
-    let shared = Arc::new(Shared {
+    let shared = Arc::new(RunState {
         facts: facts.clone(),
         clock,
         time,
@@ -267,7 +267,7 @@ struct Threads {
 }
 
 /// What the threads returned.
-struct Ended {
+struct ThreadResults {
     /// `None` if the link's thread hangs.
     carried: Option<ProjectorReport>,
     /// What the tracker reports about bodies that were never seen.
@@ -276,7 +276,7 @@ struct Ended {
 
 impl Threads {
     fn start(
-        shared: &Arc<Shared>,
+        shared: &Arc<RunState>,
         parts: CrewParts,
         line: Line,
         maker: Maker,
@@ -308,15 +308,15 @@ impl Threads {
         Ok((Self { link, supervisor }, Inbox { notes, lights }))
     }
 
-    fn end(self) -> Ended {
+    fn end(self) -> ThreadResults {
         let unseen =
             join_within(self.supervisor, END_WITHIN.saturating_mul(2)).and_then(Result::ok).flatten();
-        Ended { carried: join_within(self.link, END_WITHIN).and_then(Result::ok), unseen }
+        ThreadResults { carried: join_within(self.link, END_WITHIN).and_then(Result::ok), unseen }
     }
 }
 
 /// Collects until the run is over, or until nothing can end it any more.
-fn collect(shared: &Shared, collector: &mut Collector, inbox: &mut Inbox) {
+fn collect(shared: &RunState, collector: &mut Collector, inbox: &mut Inbox) {
     let pulse = &shared.collector_pulse;
     pulse.begin(thread_id());
     let mut alive = || pulse.beat(shared.clock.now(), LOOK_NS);

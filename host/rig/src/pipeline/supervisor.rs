@@ -3,7 +3,7 @@
 
 use super::crew::{Crew, CrewState, Port};
 use super::parts::CrewParts;
-use super::threads::Shared;
+use super::threads::RunState;
 use crate::engine::error::PipelineError;
 use crate::engine::facts::Facts;
 use crate::engine::pulse::Pulse;
@@ -47,7 +47,7 @@ pub(super) type Maker = Arc<dyn Fn(Remake) -> Result<CrewParts, PipelineError> +
 
 /// The supervisor's state.
 pub(super) struct Supervisor {
-    pub(super) shared: Arc<Shared>,
+    pub(super) shared: Arc<RunState>,
     pub(super) mind: Supervision,
     /// Informs the link of a new crew.
     pub(super) ports: PortSender<Port>,

@@ -64,7 +64,7 @@ const POLL_REST: Duration = Duration::from_micros(200);
 const POLL_BEFORE_NS: i64 = 500_000;
 
 /// What all threads of a run share, whichever crew works.
-pub(super) struct Shared {
+pub(super) struct RunState {
     /// Facts that the parts of the engine share.
     pub(super) facts: Arc<Facts>,
     pub(super) clock: MonotonicClock,
@@ -111,13 +111,13 @@ pub(super) fn pop_within<T>(from: &mut Receiver<T>, limit_ns: i64) -> Option<T> 
 
 /// Reads the tracker until planning is over, for planning and, with `to_link`, for the link. Returns what is wrong with the tracker at the end.
 pub(super) fn tracking_thread(
-    shared: &Shared,
+    shared: &RunState,
     crew: &CrewState,
     mut stage: TrackingStage,
     mut latest: Publisher<TrackSnapshot>,
     mut to_link: Option<Publisher<TrackSnapshot>>,
 ) -> Option<String> {
-    let Shared { facts, clock, .. } = shared;
+    let RunState { facts, clock, .. } = shared;
     shared.rights.enter(0);
     let pulse = &crew.pulses[TRACKING];
     pulse.begin(thread_id());
@@ -194,13 +194,13 @@ pub(super) struct PlanInbox {
 
 /// Latches, plans and submits frames until all frames of the run are planned, or the crew is dismissed.
 pub(super) fn plan_thread(
-    shared: &Shared,
+    shared: &RunState,
     crew: &CrewState,
     mut renderer: Option<Renderer>,
     inbox: PlanInbox,
     to_pack: Sender<FrameJob>,
 ) {
-    let Shared { facts, clock, .. } = shared;
+    let RunState { facts, clock, .. } = shared;
     shared.rights.enter(1);
     let pulse = &crew.pulses[PLAN];
     pulse.begin(thread_id());
@@ -224,7 +224,7 @@ pub(super) fn plan_thread(
 
 /// The planning thread's state.
 struct PlanDesk<'a> {
-    shared: &'a Shared,
+    shared: &'a RunState,
     crew: &'a CrewState,
     stage: PlanStage<Real>,
     inbox: PlanInbox,
@@ -238,7 +238,12 @@ struct PlanDesk<'a> {
 }
 
 impl<'a> PlanDesk<'a> {
-    fn new(shared: &'a Shared, crew: &'a CrewState, mut inbox: PlanInbox, to_pack: Sender<FrameJob>) -> Self {
+    fn new(
+        shared: &'a RunState,
+        crew: &'a CrewState,
+        mut inbox: PlanInbox,
+        to_pack: Sender<FrameJob>,
+    ) -> Self {
         let time = inbox.time.latest().0;
         let stage = PlanStage::new(shared.facts.clone(), crew.facts.clone(), time, shared.clock.now());
         // All of it is there before the first frame.
@@ -353,14 +358,14 @@ pub(super) struct PackInbox {
 
 /// Waits for rendered frames and packs them into planes until no more come.
 pub(super) fn pack_thread(
-    shared: &Shared,
+    shared: &RunState,
     crew: &CrewState,
     mut stage: PackStage,
     mut packer: Packer,
     inbox: PackInbox,
     mut to_link: Sender<FrameJob>,
 ) {
-    let Shared { facts, clock, .. } = shared;
+    let RunState { facts, clock, .. } = shared;
     let PackInbox { mut jobs, gpu_waker } = inbox;
     shared.rights.enter(2);
     let pulse = &crew.pulses[PACK];

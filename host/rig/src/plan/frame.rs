@@ -5,7 +5,7 @@ use super::dark::DarkCause;
 use super::eyes::{GuardedEyes, HeadWatch};
 use super::light_centre::{light_centre_ns, planes_follow};
 use super::link_time::LinkTime;
-use crate::parameters::applied::Applied;
+use crate::parameters::applied::ParameterVersion;
 use crate::rig::{affine, Rig};
 use crate::tracks::TrackSnapshot;
 use dpm_device::time::{DeviceTicks, HostTime};
@@ -106,7 +106,7 @@ pub(crate) struct PlanInputs<'a> {
     /// Average samples per pixel, in thousandths.
     pub budget_milli: u64,
     /// What the operator may change while the run goes on.
-    pub applied: &'a Applied,
+    pub applied: &'a ParameterVersion,
     /// Now.
     pub now: HostTime,
 }
@@ -201,7 +201,7 @@ impl FramePlan {
     }
 
     /// Takes what the operator may change. Copies numbers, and allocates nothing.
-    fn take(&mut self, applied: &Applied) {
+    fn take(&mut self, applied: &ParameterVersion) {
         (self.parameters, self.most_milli) = (applied.version, applied.most_milli);
         (self.samples, self.brighter, self.camera) = (applied.samples, applied.brighter, applied.camera);
     }
@@ -276,7 +276,7 @@ impl FramePlan {
     }
 
     /// For every body: where it will be at the instants `swept_at`. Bodies whose poses are not predicted stand still.
-    fn sweep_bodies(&mut self, rig: &Rig, snapshot: &TrackSnapshot, applied: &Applied) {
+    fn sweep_bodies(&mut self, rig: &Rig, snapshot: &TrackSnapshot, applied: &ParameterVersion) {
         for (swept, scene) in self.swept_poses.iter_mut().zip(&mut self.swept_scene) {
             swept.clear();
             scene.clear();

@@ -48,7 +48,7 @@ const WRITTEN_WITHIN: Duration = Duration::from_secs(1);
 
 /// What is kept of a frame.
 #[derive(Clone, Copy, Debug)]
-pub(super) struct Flown {
+pub(super) struct FlightFrame {
     pub(super) id: FrameId,
     /// The slot that it was planned for.
     pub(super) slot: u64,
@@ -61,7 +61,7 @@ pub(super) struct Flown {
     pub(super) held_up_by: Option<MissCause>,
 }
 
-impl Flown {
+impl FlightFrame {
     /// What became of it.
     pub(super) fn fate_word(&self) -> String {
         match self.fate {
@@ -94,7 +94,7 @@ pub(super) struct Flight {
     /// The beginning of the first missed slot.
     pub(super) first_at: HostTime,
     pub(super) misses: u64,
-    pub(super) frames: Vec<Flown>,
+    pub(super) frames: Vec<FlightFrame>,
     pub(super) remarks: Vec<(HostTime, Remark)>,
     pub(super) standstills: Vec<Gap>,
 }
@@ -109,7 +109,7 @@ struct Open {
 
 /// The recorder. Everything but [`FlightRecorder::look`] copies into memory that is there already.
 pub(crate) struct FlightRecorder {
-    frames: VecDeque<Flown>,
+    frames: VecDeque<FlightFrame>,
     capacity: usize,
     remarks: VecDeque<(HostTime, Remark)>,
     open: Option<Open>,
@@ -158,7 +158,7 @@ impl FlightRecorder {
             self.frames.pop_front();
         }
         self.newest_at = self.newest_at.max(note.timeline.due_at);
-        self.frames.push_back(Flown {
+        self.frames.push_back(FlightFrame {
             id: note.plan.id,
             slot: note.plan.slot,
             latch_due_at: note.latch_due_at,

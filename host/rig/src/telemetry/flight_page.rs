@@ -1,6 +1,6 @@
 //! A flight as a page of text: what happened, and the frames around the first missed slot stage by stage.
 
-use super::flight::{Flight, Flown, Remark};
+use super::flight::{Flight, FlightFrame, Remark};
 use dpm_device::time::HostTime;
 use std::fmt::Write as _;
 
@@ -72,7 +72,7 @@ fn ms(at: HostTime, zero: HostTime) -> f64 {
     at.ns_since(zero) as f64 * 1e-6
 }
 
-fn row(text: &mut String, frame: &Flown, zero: HostTime, is_missed: bool) {
+fn row(text: &mut String, frame: &FlightFrame, zero: HostTime, is_missed: bool) {
     let t = &frame.timeline;
     // A stamp of zero: the frame never got there.
     let between = |from: HostTime, to: HostTime| match to {

@@ -34,7 +34,7 @@ impl Default for Time {
 
 /// What the link's thread tells.
 #[derive(Clone, Copy, Debug, Default)]
-pub(crate) struct Carried {
+pub(crate) struct LinkReport {
     /// Sessions opened.
     pub sessions: u64,
     /// Times that light came back by itself.
@@ -61,7 +61,7 @@ pub(crate) struct Carried {
 
 impl LinkGauges {
     /// Writes all figures.
-    pub(crate) fn tell(&self, c: &Carried) {
+    pub(crate) fn tell(&self, c: &LinkReport) {
         let counts = [c.sessions, c.rearmed, c.bytes_sent].into_iter().chain(c.planes);
         let counts = counts.chain([c.tracks_sent]).chain(c.planes_by_tracks).chain(c.not_sent);
         self.counts.iter().zip(counts).for_each(|(to, n)| to.store(n, Ordering::Relaxed));
@@ -156,7 +156,7 @@ mod tests {
             refused: 28,
             damaged_packets: 29,
         };
-        gauges.tell(&Carried {
+        gauges.tell(&LinkReport {
             sessions: 1,
             rearmed: 2,
             bytes_sent: 3_000_000,

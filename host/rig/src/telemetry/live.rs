@@ -95,7 +95,7 @@ pub struct LiveSnapshot {
 
 /// What a frame was drawn for.
 #[derive(Clone, Debug, Default, PartialEq)]
-pub struct Drawn {
+pub struct FrameSubject {
     /// Low 32 bits of its number.
     pub frame: u32,
     /// Per tracked body: world-from-mesh at the centre of its light.
@@ -124,7 +124,7 @@ pub struct Live {
     looked_until_ns: AtomicU64,
     told_at_ns: AtomicU64,
     snapshot: Lock<Option<Arc<LiveSnapshot>>>,
-    drawn: Lock<VecDeque<Drawn>>,
+    drawn: Lock<VecDeque<FrameSubject>>,
     light_wanted: AtomicBool,
     light: Lock<SeenLight>,
     follower: Lock<Option<SyncSender<SeenLight>>>,
@@ -193,7 +193,7 @@ impl Live {
     }
 
     /// What frame `frame` was drawn for; the newest frame if that one is not known.
-    pub fn drawn(&self, frame: Option<u32>) -> Option<Drawn> {
+    pub fn drawn(&self, frame: Option<u32>) -> Option<FrameSubject> {
         let drawn = held(&self.drawn);
         drawn.iter().rev().find(|d| Some(d.frame) == frame).or_else(|| drawn.back()).cloned()
     }

@@ -12,7 +12,7 @@ use crate::order::Order;
 use crate::parameters::ParameterDesk;
 use crate::plan::dark::DarkCause;
 use crate::tracks::gauges::{TrackerGauges, TrackerReport};
-use crate::tracks::Unseen;
+use crate::tracks::BlindBodies;
 use dpm_common::stopping;
 use dpm_device::link::{faults, LimitReached};
 use dpm_handoff::path::Lock;
@@ -180,7 +180,7 @@ pub struct RunMonitor {
     /// What is seen of the light: written by the link's thread and the supervisor.
     light: LightGauge,
     /// Written at most once.
-    tracker: OnceLock<Unseen>,
+    tracker: OnceLock<BlindBodies>,
     /// Why the run will never return; written at most once.
     gave_up: OnceLock<String>,
     /// Written at most once, before there is light.
@@ -485,7 +485,7 @@ impl RunMonitor {
 
     /// Reports, once per run, which bodies the tracker has not seen one second after its start, why, and what to do.
     /// Not for the frame path.
-    pub(crate) fn tell_of_tracker(&self, unseen: Unseen) {
+    pub(crate) fn tell_of_tracker(&self, unseen: BlindBodies) {
         let _ = self.tracker.set(unseen);
     }
 

@@ -14,7 +14,7 @@ use std::path::PathBuf;
 
 /// Percentiles of a quantity: the smallest value that at least that share of all values does not exceed.
 #[derive(Clone, Copy, Debug, PartialEq, serde::Serialize)]
-pub struct Spread {
+pub struct Percentiles {
     /// Median.
     pub p50: f64,
     /// 99 %.
@@ -25,7 +25,7 @@ pub struct Spread {
     pub max: f64,
 }
 
-impl Spread {
+impl Percentiles {
     /// Percentiles of what a histogram holds, divided by `unit`. `None` if it is empty.
     pub(crate) fn of_histogram(h: &Histogram<u64>, unit: f64) -> Option<Self> {
         (!h.is_empty()).then(|| Self {
@@ -68,7 +68,7 @@ pub const MODELLED: &str = "from real_time.stage_costs_us, not measured";
 pub struct Latency {
     /// Percentiles, milliseconds.
     #[serde(flatten)]
-    pub spread: Spread,
+    pub spread: Percentiles,
     /// Smallest, milliseconds.
     pub min: f64,
     /// True at virtual pace, where the costs of the stages are constants of the rig file.
@@ -83,7 +83,7 @@ impl Latency {
     pub(crate) fn of(histogram: &SignedHistogram, modelled: bool) -> Option<Self> {
         let ms = |ns: i64| ns as f64 * 1e-6;
         (!histogram.is_empty()).then(|| Self {
-            spread: Spread {
+            spread: Percentiles {
                 p50: ms(histogram.value_at_quantile(0.5)),
                 p99: ms(histogram.value_at_quantile(0.99)),
                 p999: ms(histogram.value_at_quantile(0.999)),
@@ -97,9 +97,9 @@ impl Latency {
 }
 
 impl std::ops::Deref for Latency {
-    type Target = Spread;
+    type Target = Percentiles;
 
-    fn deref(&self) -> &Spread {
+    fn deref(&self) -> &Percentiles {
         &self.spread
     }
 }
@@ -171,7 +171,7 @@ pub struct StageTime {
     /// Name of the stage.
     pub stage: String,
     /// Wall time of one frame in it, milliseconds.
-    pub ms: Spread,
+    pub ms: Percentiles,
 }
 
 /// The report of a run, as printed by `--json` and stored in `report.json`.
@@ -252,20 +252,20 @@ pub struct Report {
     pub calibration: Option<String>,
     /// Distance in projector pixels between where the light of a surface point was drawn and where that point was at that
     /// instant; null without ground truth. Tracks are not in it: see `followed_light`.
-    pub registration_error_px: Option<Spread>,
+    pub registration_error_px: Option<Percentiles>,
     /// The same with the newest sample in place of the prediction.
-    pub registration_error_unpredicted_px: Option<Spread>,
+    pub registration_error_unpredicted_px: Option<Percentiles>,
     /// The same for frames that were lit in their own slot, so that lateness does not contribute.
     #[serde(skip_serializing_if = "Option::is_none")]
-    pub registration_error_in_time_px: Option<Spread>,
+    pub registration_error_in_time_px: Option<Percentiles>,
     /// Distance from a surface point to the mean of the light that it should have had, plane by plane, each with its
     /// intensity and at its own instant: what an eye sees that follows the point. Of every 16th frame; null without
     /// ground truth.
     #[serde(skip_serializing_if = "Option::is_none")]
-    pub followed_offset_px: Option<Spread>,
+    pub followed_offset_px: Option<Percentiles>,
     /// Root mean square distance of that light from its mean: by how much the planes' motion smears it.
     #[serde(skip_serializing_if = "Option::is_none")]
-    pub followed_smear_px: Option<Spread>,
+    pub followed_smear_px: Option<Percentiles>,
     /// What that light is: "as lit", or "before tracks" if the projector moved it by tracks and only it knows by how much.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub followed_light: Option<&'static str>,
@@ -471,23 +471,23 @@ mod tests {
     #[test]
     fn percentiles_are_nearest_rank() {
         let mut values: Vec<f64> = (1..=1000).rev().map(f64::from).collect();
-        let spread = Spread::of(&mut values).unwrap();
-        assert_eq!(spread, Spread { p50: 500.0, p99: 990.0, p999: 999.0, max: 1000.0 });
+        let spread = Percentiles::of(&mut values).unwrap();
+        assert_eq!(spread, Percentiles { p50: 500.0, p99: 990.0, p999: 999.0, max: 1000.0 });
         let mut one = vec![f64::NAN, 7.0, f64::INFINITY];
-        assert_eq!(Spread::of(&mut one), Some(Spread { p50: 7.0, p99: 7.0, p999: 7.0, max: 7.0 }));
+        assert_eq!(Percentiles::of(&mut one), Some(Percentiles { p50: 7.0, p99: 7.0, p999: 7.0, max: 7.0 }));
         let mut two = vec![2.0, 1.0];
-        assert_eq!(Spread::of(&mut two), Some(Spread { p50: 1.0, p99: 2.0, p999: 2.0, max: 2.0 }));
-        assert_eq!(Spread::of(&mut vec![f64::NAN]), None);
+        assert_eq!(Percentiles::of(&mut two), Some(Percentiles { p50: 1.0, p99: 2.0, p999: 2.0, max: 2.0 }));
+        assert_eq!(Percentiles::of(&mut vec![f64::NAN]), None);
     }
 
     #[test]
     fn histograms_of_ns_become_ms() {
         let mut h = hdrhistogram::Histogram::<u64>::new(3).unwrap();
-        assert_eq!(Spread::ms_of_ns(&h), None);
+        assert_eq!(Percentiles::ms_of_ns(&h), None);
         for i in 1..=1000u64 {
             h.record(i * 1_000_000).unwrap();
         }
-        let spread = Spread::ms_of_ns(&h).unwrap();
+        let spread = Percentiles::ms_of_ns(&h).unwrap();
         for (got, want) in
             [(spread.p50, 500.0), (spread.p99, 990.0), (spread.p999, 999.0), (spread.max, 1000.0)]
         {
@@ -497,7 +497,7 @@ mod tests {
 
     #[test]
     fn json_has_the_agreed_keys_in_the_order_of_the_stages() {
-        let spread = Spread { p50: 1.0, p99: 2.0, p999: 3.0, max: f64::NAN };
+        let spread = Percentiles { p50: 1.0, p99: 2.0, p999: 3.0, max: f64::NAN };
         let latency = Latency { spread, min: -0.5, modelled: true, source: Some(MODELLED) };
         let stage = |name: &str| StageTime { stage: name.into(), ms: spread };
         let report = Report {

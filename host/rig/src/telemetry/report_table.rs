@@ -4,7 +4,7 @@ use super::report::{Report, MODELLED};
 use crate::plan::dark::DarkCause;
 use crate::telemetry::light_state::LightState;
 use crate::telemetry::projector::ProjectorReport;
-use crate::telemetry::report::Spread;
+use crate::telemetry::report::Percentiles;
 
 impl Report {
     /// The report as one sentence and a table of at most 100 columns.
@@ -274,6 +274,6 @@ impl Table {
     }
 }
 
-fn percentiles(s: Spread) -> String {
+fn percentiles(s: Percentiles) -> String {
     format!("p50 {:.3}  p99 {:.3}  p99.9 {:.3}  max {:.3}", s.p50, s.p99, s.p999, s.max)
 }

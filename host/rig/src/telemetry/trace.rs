@@ -104,7 +104,7 @@ pub(crate) struct TraceWriter<W: Write> {
 }
 
 /// A placed slice.
-struct Placed {
+struct TraceSlice {
     pid: u32,
     tid: u32,
     from: i64,
@@ -194,7 +194,7 @@ impl<W: Write> TraceWriter<W> {
         Ok(self.out)
     }
 
-    fn passes(&mut self, gpu: &Placed, passes: &[(&str, u64)]) -> Result<(), Error> {
+    fn passes(&mut self, gpu: &TraceSlice, passes: &[(&str, u64)]) -> Result<(), Error> {
         let mut from = gpu.from;
         for (name, ns) in passes {
             // Children must lie inside their parent; time stamps of another clock may exceed it a little.
@@ -221,13 +221,13 @@ impl<W: Write> TraceWriter<W> {
         from: HostTime,
         to: HostTime,
         frame: &FrameTrace<'_>,
-    ) -> Result<Placed, Error> {
+    ) -> Result<TraceSlice, Error> {
         let lanes = &mut self.lanes[track as usize];
         let lane = lanes.iter().position(|end| *end <= from.0).unwrap_or(LANES - 1);
         let from = from.0.max(lanes[lane]);
         let to = to.0.max(from);
         lanes[lane] = to;
-        let place = Placed { pid: TRACKS[track as usize].1, tid: tid(track, lane), from, to };
+        let place = TraceSlice { pid: TRACKS[track as usize].1, tid: tid(track, lane), from, to };
         self.event(format_args!(
             r#"{{"ph":"X","name":"{name}","cat":"frame","pid":{},"tid":{},"ts":{},"dur":{},"args":{{"frame":{},"slot":{}}}}}"#,
             place.pid,

@@ -68,9 +68,9 @@ impl TrackerKeys for ReplayConfig {
 const MOCK_S: i64 = 3;
 
 /// A file that is removed with this value.
-struct Removed(PathBuf);
+struct TemporaryFile(PathBuf);
 
-impl Drop for Removed {
+impl Drop for TemporaryFile {
     fn drop(&mut self) {
         // It lies in a folder for such files; nobody is left to hear of an error.
         let _ = std::fs::remove_file(&self.0);
@@ -85,7 +85,7 @@ fn mock(scene: &MockScene) -> io::Result<MockServer> {
     let recorder =
         Recorder::create(tracker.map_err(io::Error::other)?, &file, &bodies, scene.source.config().start);
     let mut recorder = recorder.map_err(io::Error::other)?;
-    let removed = Removed(file);
+    let removed = TemporaryFile(file);
     let end = scene.source.config().start.plus_ns(MOCK_S * 1_000_000_000);
     recorder.poll(end, &mut |_| ()).map_err(io::Error::other)?;
     recorder.finish().map_err(io::Error::other)?;

@@ -9,7 +9,7 @@ mod stage;
 mod tracker_frame;
 
 pub(crate) use phase::SampleRhythm;
-pub use seen::{SeenBodies, Unseen};
+pub use seen::{BlindBodies, SeenBodies};
 pub(crate) use source::NoTracker;
 pub use source::{open_for, open_for_names, open_in_world};
 pub use stage::{TrackSnapshot, TrackingStage};

@@ -28,7 +28,7 @@ impl SeenBodies {
 
 /// What the tracker says of bodies that it had not seen a second after its start.
 #[derive(Debug)]
-pub struct Unseen {
+pub struct BlindBodies {
     /// The message, which names them all.
     pub told: String,
     /// Their numbers.
@@ -36,7 +36,7 @@ pub struct Unseen {
     pub(super) seen: Arc<SeenBodies>,
 }
 
-impl Unseen {
+impl BlindBodies {
     /// The message still holds: none of them was seen since.
     pub fn holds(&self) -> bool {
         !self.bodies.iter().any(|body| self.seen.has(*body))

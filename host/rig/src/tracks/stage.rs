@@ -2,7 +2,7 @@
 
 use super::keys::KeyWatch;
 use super::phase::{SamplePhase, SampleRhythm};
-use super::seen::{SeenBodies, Unseen};
+use super::seen::{BlindBodies, SeenBodies};
 use super::tracker_frame::TrackerFrame;
 use crate::config::MAX_TRACKED;
 use crate::rig::Rig;
@@ -235,14 +235,14 @@ impl TrackingStage {
 
     /// Names the bodies that have not been seen yet and are therefore dark, the tracker's explanation, and what to
     /// do. `None` if all were seen.
-    pub(crate) fn not_seen_yet(&self, rig: &Rig) -> Option<Unseen> {
+    pub(crate) fn not_seen_yet(&self, rig: &Rig) -> Option<BlindBodies> {
         let told = self.unseen(
             rig,
             "has not seen",
             ["and no light falls there until it does", "and no light falls until it does"],
         )?;
         let bodies = (0..self.bodies).filter(|body| self.is_unseen(*body)).collect();
-        Some(Unseen { told, bodies, seen: self.seen.clone() })
+        Some(BlindBodies { told, bodies, seen: self.seen.clone() })
     }
 
     /// The same at the end of a run, with any other message of the tracker.

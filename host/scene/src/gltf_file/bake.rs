@@ -51,7 +51,7 @@ struct Made {
 }
 
 /// What takes the place of one material.
-struct Baked {
+struct BakedMaterial {
     /// Its number.
     material: u32,
     textures: Vec<Made>,
@@ -65,7 +65,7 @@ struct Baked {
 /// All of them.
 #[derive(Default)]
 pub(super) struct Bake {
-    baked: HashMap<u32, Baked>,
+    baked: HashMap<u32, BakedMaterial>,
     texels: usize,
     is_coarse: bool,
 }
@@ -85,7 +85,7 @@ impl Bake {
     ) -> Result<(u32, Vec<Vec2>), SceneError> {
         let source = &look.materials[material as usize];
         let sets = &look.sets[material as usize];
-        let baked = self.baked.entry(material).or_insert_with(|| Baked::new(source, sets, next));
+        let baked = self.baked.entry(material).or_insert_with(|| BakedMaterial::new(source, sets, next));
         if vertices.colour.is_some() {
             baked.add_coloured(source);
         }
@@ -150,9 +150,9 @@ impl Bake {
 
     /// The materials with their numbers; their textures are added to `textures`.
     pub(super) fn into_materials(self, look: &mut Look) -> Vec<(u32, Material)> {
-        let mut all: Vec<(u32, Baked)> = self.baked.into_iter().collect();
+        let mut all: Vec<(u32, BakedMaterial)> = self.baked.into_iter().collect();
         all.sort_unstable_by_key(|(_, baked)| baked.material);
-        let made = |(plain, baked): (u32, Baked)| {
+        let made = |(plain, baked): (u32, BakedMaterial)| {
             let mut material = look.materials[plain as usize].clone();
             let scale = Vec2::new(1.0 / ROW as f32, 1.0 / baked.rows as f32);
             for one in baked.textures {
@@ -178,7 +178,7 @@ impl Bake {
     }
 }
 
-impl Baked {
+impl BakedMaterial {
     fn new(source: &Material, sets: &[u32], material: u32) -> Self {
         let textures = source.textures().enumerate().filter_map(|(slot, reference)| {
             let set = sets.get(slot).copied().unwrap_or(0);

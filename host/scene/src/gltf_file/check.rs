@@ -59,7 +59,7 @@ pub(super) struct Counts {
 }
 
 /// Results for a document that passed.
-pub(crate) struct Checked {
+pub(crate) struct CheckResults {
     /// Content that is accepted but not reproduced.
     pub warnings: Vec<String>,
     /// The places of the meshes of instanced nodes.
@@ -67,7 +67,7 @@ pub(crate) struct Checked {
 }
 
 /// Checks the whole document except its buffers.
-pub(super) fn check(root: &Item, data: &Data, limits: &Limits) -> Result<Checked, SceneError> {
+pub(super) fn check(root: &Item, data: &Data, limits: &Limits) -> Result<CheckResults, SceneError> {
     let mut warnings = vec![];
     let list = |key, kind| root.list(key, kind, limits.objects);
     let (nodes, meshes) = (list("nodes", "node")?, list("meshes", "mesh")?);
@@ -101,7 +101,7 @@ pub(super) fn check(root: &Item, data: &Data, limits: &Limits) -> Result<Checked
     if !lost.is_empty() {
         warnings.push(format!("the file uses what is not reproduced: {}", lost.join(", ")));
     }
-    Ok(Checked { warnings, instances })
+    Ok(CheckResults { warnings, instances })
 }
 
 /// Checks the version and the required extensions. This comes first: a file that needs something

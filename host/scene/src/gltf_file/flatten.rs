@@ -11,7 +11,7 @@ use std::sync::Arc;
 use glam::{DAffine3, DMat3, DMat4, DVec3, Vec3};
 
 use super::super::limits::Cancel;
-use super::super::mesh::Dropped;
+use super::super::mesh::DropCounts;
 use super::super::part_motion::{Link, NodeMotion, PartMotion, Track};
 use super::super::{
     Body, DeformingMesh, Limits, LoadOptions, PunctualKind, PunctualLight, SceneError, TriangleMesh,
@@ -162,7 +162,7 @@ struct Gatherer<'a> {
     unskinned: Vec<(usize, Group)>,
     meshes: BTreeMap<Group, TriangleMesh>,
     lights: Vec<(Group, PunctualLight)>,
-    dropped: Dropped,
+    dropped: DropCounts,
     paint: Paint,
 }
 
@@ -182,7 +182,7 @@ impl<'a> Gatherer<'a> {
             unskinned: vec![],
             meshes: BTreeMap::new(),
             lights: vec![],
-            dropped: Dropped::default(),
+            dropped: DropCounts::default(),
             paint: Paint::new(source.look, limits),
         }
     }
@@ -368,7 +368,7 @@ impl<'a> Gatherer<'a> {
         &mut self,
         (mesh, node, number): (usize, usize, usize),
         pose: Option<Pose<'_>>,
-    ) -> Result<Option<(TriangleMesh, Dropped)>, SceneError> {
+    ) -> Result<Option<(TriangleMesh, DropCounts)>, SceneError> {
         self.cancel.check(self.limits)?;
         let Source { document, data, look, deformations, .. } = *self.source;
         let primitive = &document.as_json().meshes[mesh].primitives[number];

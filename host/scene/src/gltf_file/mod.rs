@@ -91,7 +91,7 @@ pub(super) fn read(
     // Of a document that was made from another file, that file counts.
     let limits = &limits.of_file(if limits.file_bytes > 0 { limits.file_bytes } else { all_bytes as u64 });
     let data = accessor::Data::new(&root, buffers, limits)?;
-    let check::Checked { mut warnings, instances } = check::check(&root, &data, limits)?;
+    let check::CheckResults { mut warnings, instances } = check::check(&root, &data, limits)?;
     warnings.extend(told);
     let nodes = root.list("nodes", "node", limits.objects)?;
     let animation = animation::read(&root, &data, &nodes, options, &mut warnings)?;

@@ -7,7 +7,7 @@ use gltf::json::mesh::{Mode, Primitive, Semantic};
 use gltf::json::validation::Checked;
 
 use super::super::limits::Cancel;
-use super::super::mesh::Dropped;
+use super::super::mesh::DropCounts;
 use super::super::{Limits, SceneError, TriangleMesh};
 use super::accessor::{Accessor, Data};
 use super::bake::Vertices;
@@ -24,7 +24,7 @@ pub(crate) fn read_primitive(
     deformation: &Deformation,
     paint: &mut Paint,
     stop: (&Cancel, &Limits),
-) -> Result<Option<(TriangleMesh, Dropped)>, SceneError> {
+) -> Result<Option<(TriangleMesh, DropCounts)>, SceneError> {
     let attribute = |semantic: Semantic| accessor_of(primitive, data, semantic);
     let Some(positions) = attribute(Semantic::Positions) else { return Ok(None) };
     let all = match deformation.faces() {

@@ -8,7 +8,7 @@ use std::sync::{Arc, Mutex};
 use dpm_device::planes::Raster;
 use dpm_device::time::HostTime;
 use dpm_display::dlpc900::behind;
-use dpm_display::fake::{display, FakeKms, Scanned};
+use dpm_display::fake::{display, FakeKms, ScanFrame};
 use dpm_display::kms::Kms;
 use dpm_display::mode::Timing;
 use dpm_display::transport::{on_card, DisplayTransport};
@@ -106,7 +106,7 @@ fn video_of(rig: &Rig) -> VideoPatterns {
 }
 
 /// Runs the rig, and returns what the graphics card sent, and how many frames were late by the report.
-fn sent(rig: &Arc<Rig>, gpu: &Arc<dpm_render::gpu::Gpu>) -> (Vec<Scanned>, u64) {
+fn sent(rig: &Arc<Rig>, gpu: &Arc<dpm_render::gpu::Gpu>) -> (Vec<ScanFrame>, u64) {
     let card = Arc::new(Lock::new(display(&[MODE])));
     let (shared, video) = (card.clone(), video_of(rig));
     let open: Box<OpenMedium> = Box::new(move |config, raster, surroundings| {
@@ -178,7 +178,7 @@ struct Seen {
 }
 
 /// What an eye sees that follows the card, in every new frame while the card moves steadily.
-fn seen(rig: &Rig, scanned: &[Scanned]) -> Vec<Seen> {
+fn seen(rig: &Rig, scanned: &[ScanFrame]) -> Vec<Seen> {
     let video = video_of(rig);
     let model = Arc::new(Mutex::new(Dlpc900Model::default()));
     Dlpc900::new(VirtualHid::new(model.clone())).unwrap().start_video_patterns(&video).unwrap();

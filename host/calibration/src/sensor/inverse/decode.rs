@@ -137,7 +137,7 @@ impl FrameLight<'_> {
 
 /// When the two frames of a pair began by the projector's report, nanoseconds after the first sample.
 #[derive(Clone, Copy)]
-struct Shown {
+struct PairStarts {
     pair: u64,
     begins_ns: [f64; 2],
 }
@@ -163,7 +163,7 @@ pub fn decode_pairs(
     let search = Search { code, record: &record, pairs: &pairs, frame_ns: timing.frame_ns, brightest };
     let (lag_ns, identity_percent) = search.lag()?;
     let ticks = ((timing.frame_ns / TICK_NS).round() as usize).clamp(2, TICKS);
-    let raw: Vec<(Shown, [Option<f64>; TICKS])> =
+    let raw: Vec<(PairStarts, [Option<f64>; TICKS])> =
         pairs.iter().map(|p| (*p, search.differences(p, lag_ns, ticks))).collect();
     let (levels, dropped) = levels(code, &record, &raw);
     let instants_ns = std::array::from_fn(|i| {
@@ -187,7 +187,7 @@ fn within_tick(tick: usize) -> [f64; 2] {
 }
 
 /// The pairs of which both frames were shown, with the first slot of each, and the share of the slots with a picture of its own.
-fn shown_pairs(timing: &Timing, record: &Record, shown: &dyn Fn(u64) -> u64) -> (Vec<Shown>, f64) {
+fn shown_pairs(timing: &Timing, record: &Record, shown: &dyn Fn(u64) -> u64) -> (Vec<PairStarts>, f64) {
     let begin = (record.base_ns.saturating_sub(timing.frame_zero_ns)) as f64;
     let slot = |ns: f64| ((begin + ns) / timing.frame_ns).max(0.0) as u64;
     let slots = slot(-LAGS_NS[1])..slot(record.length_ns() - LAGS_NS[0]);
@@ -203,7 +203,7 @@ fn shown_pairs(timing: &Timing, record: &Record, shown: &dyn Fn(u64) -> u64) -> 
     let pair = |w: &[(u64, u64)]| {
         let [(first, a), (second, b)] = [w[0], w[1]];
         (first % 2 == 0 && second == first + 1 && b - a <= 4)
-            .then(|| Shown { pair: first / 2, begins_ns: [of_slot(a), of_slot(b)] })
+            .then(|| PairStarts { pair: first / 2, begins_ns: [of_slot(a), of_slot(b)] })
     };
     let carried = fresh.len() as f64 / count.max(1) as f64;
     (fresh.windows(2).filter_map(pair).collect(), carried)
@@ -212,7 +212,7 @@ fn shown_pairs(timing: &Timing, record: &Record, shown: &dyn Fn(u64) -> u64) -> 
 struct Search<'a> {
     code: &'a InverseCode,
     record: &'a Record,
-    pairs: &'a [Shown],
+    pairs: &'a [PairStarts],
     frame_ns: f64,
     /// The part of a frame by which the lag is found.
     brightest: [f64; 2],
@@ -220,7 +220,7 @@ struct Search<'a> {
 
 impl Search<'_> {
     /// First frame less second one, with the sign of the identity: stripes less inverse.
-    fn difference(&self, pair: &Shown, from_ns: f64, until_ns: f64) -> Option<f64> {
+    fn difference(&self, pair: &PairStarts, from_ns: f64, until_ns: f64) -> Option<f64> {
         let [a, b] = pair.begins_ns.map(|begin| self.record.mean(begin + from_ns, begin + until_ns));
         let difference = a? - b?;
         Some(if self.code.is_inverse(2 * pair.pair) { -difference } else { difference })
@@ -281,7 +281,7 @@ impl Search<'_> {
     }
 
     /// Stripes less inverse at each instant of the frame.
-    fn differences(&self, pair: &Shown, lag_ns: f64, ticks: usize) -> [Option<f64>; TICKS] {
+    fn differences(&self, pair: &PairStarts, lag_ns: f64, ticks: usize) -> [Option<f64>; TICKS] {
         let tick = self.frame_ns / ticks as f64;
         std::array::from_fn(|i| {
             let [from, until] = within_tick(i).map(|t| lag_ns + t * tick);
@@ -292,9 +292,14 @@ impl Search<'_> {
 }
 
 /// Differences into levels: over the light of the instant within a frame, and over the contrast around the pair.
-fn levels(code: &InverseCode, record: &Record, raw: &[(Shown, [Option<f64>; TICKS])]) -> (Vec<Pair>, usize) {
+fn levels(
+    code: &InverseCode,
+    record: &Record,
+    raw: &[(PairStarts, [Option<f64>; TICKS])],
+) -> (Vec<Pair>, usize) {
     let is_wide = |pair: u64| code.is_wide(&code.stripe(code.index(pair)));
-    let wide: Vec<&(Shown, [Option<f64>; TICKS])> = raw.iter().filter(|(s, _)| is_wide(s.pair)).collect();
+    let wide: Vec<&(PairStarts, [Option<f64>; TICKS])> =
+        raw.iter().filter(|(s, _)| is_wide(s.pair)).collect();
     let size = |i: usize| {
         let all = wide.iter().filter_map(|(_, d)| d[i].map(f64::abs));
         percentile(all.collect(), 0.7)
@@ -312,7 +317,7 @@ fn levels(code: &InverseCode, record: &Record, raw: &[(Shown, [Option<f64>; TICK
     let contrasts = without_strays(&contrasts);
     let around = |pair: u64| between(&contrasts, pair, code.pairs() as u64);
     let usual = percentile(contrasts.iter().map(|(_, c)| *c).collect(), 0.5);
-    let pair = |(shown, d): &(Shown, [Option<f64>; TICKS])| {
+    let pair = |(shown, d): &(PairStarts, [Option<f64>; TICKS])| {
         let contrast = around(shown.pair)?;
         if contrast <= LEAST_CONTRAST * usual {
             return None;

@@ -12,7 +12,7 @@ use super::code::{InverseCode, Stripe};
 use super::decode::{DecodedPairs, Pair};
 use crate::least_squares::{huber, Equations};
 use crate::model::ProjectorModel;
-use crate::trajectory::{Stamped, Trajectory};
+use crate::trajectory::{TimedPose, Trajectory};
 use glam::DVec3;
 
 /// Fewest pairs: ten seconds at 60 frames a second.
@@ -32,7 +32,7 @@ const LATENCIES_S: [f64; 2] = [-0.05, 0.3];
 const MOST_LATENCY_SIGMA_US: f64 = 1000.0;
 
 /// A pair prepared for the fit.
-struct Paired {
+struct PairFix {
     stripe: Stripe,
     moment: Moment,
     /// Moments of the frame with the stripes and of that with the inverse, and the level of both.
@@ -40,7 +40,7 @@ struct Paired {
     contrast: f64,
 }
 
-impl Measured for Paired {
+impl Measured for PairFix {
     fn moment(&self) -> &Moment {
         &self.moment
     }
@@ -143,7 +143,7 @@ pub fn solve_latency_of_pairs(
 }
 
 /// How many places the wand was held still at for `hold_s` seconds: what a sweep lacks can be said while it goes on.
-pub fn places_rested(poses: &[Stamped], tip: DVec3, hold_s: f64) -> usize {
+pub fn places_rested(poses: &[TimedPose], tip: DVec3, hold_s: f64) -> usize {
     let mut found: Vec<DVec3> = Vec::new();
     let mut from = 0;
     for (i, pose) in poses.iter().enumerate() {
@@ -187,7 +187,7 @@ fn prepare(
     code: &InverseCode,
     decoded: &DecodedPairs,
     path: &Trajectory,
-) -> Result<Vec<Paired>, SensorError> {
+) -> Result<Vec<PairFix>, SensorError> {
     let few = |frames: usize| {
         let seconds = 2.0 * (2 * FEWEST - frames.min(FEWEST)) as f64 * 1e-9 * decoded.frame_ns;
         SensorError::TooFew { frames, need: FEWEST, seconds: seconds.max(1.0) }
@@ -210,9 +210,9 @@ fn prepare(
         let ticks: Vec<([Moment; 2], f64)> = pair.levels.iter().enumerate().filter_map(tick).collect();
         let moment = moment(path, middle_ns, 0.5 * (from as f64 + until as f64))?;
         let stripe = code.stripe(code.index(pair.number));
-        (!ticks.is_empty()).then_some(Paired { stripe, moment, ticks, contrast: pair.contrast })
+        (!ticks.is_empty()).then_some(PairFix { stripe, moment, ticks, contrast: pair.contrast })
     };
-    let seen: Vec<Paired> = decoded.pairs.iter().filter_map(seen).collect();
+    let seen: Vec<PairFix> = decoded.pairs.iter().filter_map(seen).collect();
     match seen.len() {
         n if n < FEWEST => Err(few(n)),
         _ => Ok(seen),
@@ -292,8 +292,8 @@ fn add_place(found: &mut Vec<DVec3>, at: DVec3) {
 }
 
 /// The latency at which wide stripes fit best: in motion it is worth a hundred pixels.
-fn with_latency(problem: &Problem, begun: State, seen: &[Paired]) -> State {
-    let few: Vec<&Paired> = thin(seen, 500).collect();
+fn with_latency(problem: &Problem, begun: State, seen: &[PairFix]) -> State {
+    let few: Vec<&PairFix> = thin(seen, 500).collect();
     let finest = f64::from(problem.raster.width()) / 16.0;
     let step = 0.004;
     let count = ((LATENCIES_S[1] - LATENCIES_S[0]) / step) as u32;

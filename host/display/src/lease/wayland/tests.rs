@@ -5,8 +5,8 @@ use std::os::unix::net::UnixStream;
 use std::thread::JoinHandle;
 use std::time::{Duration, Instant};
 
-use super::super::compositor::{Compositor, Manner, Request, Seen, FIRST};
-use super::super::socket::tests::Handed;
+use super::super::compositor::{Compositor, LeaseLog, Manner, Request, FIRST};
+use super::super::socket::tests::HandedSocket;
 use super::{lease_over, socket_of, Lease, Refusal};
 
 const OFFERS: [(&str, u32); 2] = [("DP-1", 33), ("HDMI-A-1", 44)];
@@ -16,11 +16,11 @@ fn compositor(
     manner: Manner,
     offers: &[(&'static str, u32)],
     given: Option<OwnedFd>,
-) -> (UnixStream, JoinHandle<Seen>) {
+) -> (UnixStream, JoinHandle<LeaseLog>) {
     let (client, stream) = UnixStream::pair().unwrap();
     // The card is none: what connectors are called, only the compositor can say then.
     let card = std::fs::File::open("/dev/null").unwrap().into();
-    let (mut given, offers, seen) = (given, offers.to_vec(), Seen::default());
+    let (mut given, offers, seen) = (given, offers.to_vec(), LeaseLog::default());
     let compositor = Compositor { stream, manner, offers, card, lend: Box::new(move || given.take()), seen };
     (client, std::thread::spawn(move || compositor.serve()))
 }
@@ -40,7 +40,7 @@ fn refused(manner: Manner, offers: &[(&'static str, u32)], connector: Option<&st
 
 #[test]
 fn the_connector_that_is_named_is_lent_and_given_back() {
-    let handed = Handed::new();
+    let handed = HandedSocket::new();
     let (stream, thread) = compositor(Manner::Lends, &OFFERS, Some(handed.given.try_clone().unwrap()));
     let lease = ask(stream, Some("HDMI-A-1"), Duration::from_secs(10)).expect("lent");
     assert!(!thread.is_finished(), "the connection stays as long as the lease does");
@@ -49,13 +49,13 @@ fn the_connector_that_is_named_is_lent_and_given_back() {
     assert_eq!(lender, "a fake");
     drop(back);
     let seen = thread.join().unwrap();
-    let expected = Seen { asked: Some(FIRST + 1), has_released_device: true, has_destroyed_lease: true };
+    let expected = LeaseLog { asked: Some(FIRST + 1), has_released_device: true, has_destroyed_lease: true };
     assert_eq!(seen, expected);
 }
 
 #[test]
 fn the_only_connector_needs_no_name_and_several_do() {
-    let handed = Handed::new();
+    let handed = HandedSocket::new();
     let (stream, thread) = compositor(Manner::Lends, &OFFERS[..1], Some(handed.given.try_clone().unwrap()));
     drop(ask(stream, None, Duration::from_secs(10)).expect("lent"));
     assert_eq!(thread.join().unwrap().asked, Some(FIRST));

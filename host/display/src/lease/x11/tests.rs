@@ -13,8 +13,8 @@ use x11rb::rust_connection::{DefaultStream, RustConnection};
 use x11rb::x11_utils::Serialize;
 
 use super::super::compositor::send;
-use super::super::socket::tests::Handed;
-use super::{lease_of, Bounded, Lease, Refusal};
+use super::super::socket::tests::HandedSocket;
+use super::{lease_of, BoundedStream, Lease, Refusal};
 
 /// Its number of the extension's requests.
 const RANDR: u8 = 140;
@@ -53,7 +53,7 @@ struct Manner {
 
 /// What the client did.
 #[derive(Debug, Default, PartialEq, Eq)]
-struct Seen {
+struct ClientLog {
     /// The output and the CRTC of the lease.
     lent: Option<(u32, u32)>,
     /// The lease was given back, and ended with it.
@@ -67,7 +67,7 @@ struct XServer {
     lid: u32,
     sequence: u16,
     is_silent: bool,
-    seen: Seen,
+    seen: ClientLog,
 }
 
 fn word(bytes: &[u8], at: usize) -> u32 {
@@ -144,7 +144,7 @@ impl XServer {
         Some(())
     }
 
-    fn serve(mut self) -> Seen {
+    fn serve(mut self) -> ClientLog {
         if self.greet().is_none() {
             return self.seen;
         }
@@ -289,10 +289,10 @@ fn desktop() -> Manner {
     }
 }
 
-fn start(manner: Manner, given: Option<OwnedFd>) -> (UnixStream, JoinHandle<Seen>) {
+fn start(manner: Manner, given: Option<OwnedFd>) -> (UnixStream, JoinHandle<ClientLog>) {
     let (client, stream) = UnixStream::pair().unwrap();
     let server =
-        XServer { stream, manner, given, lid: 0, sequence: 0, is_silent: false, seen: Seen::default() };
+        XServer { stream, manner, given, lid: 0, sequence: 0, is_silent: false, seen: ClientLog::default() };
     (client, std::thread::spawn(move || server.serve()))
 }
 
@@ -303,14 +303,14 @@ fn ask(
     patience: Duration,
 ) -> Result<Lease, Refusal> {
     let (stream, _) = DefaultStream::from_unix_stream(stream).unwrap();
-    let stream = Bounded::new(stream, Instant::now() + patience);
+    let stream = BoundedStream::new(stream, Instant::now() + patience);
     let server = RustConnection::connect_to_stream(stream, 0).expect("greeted");
     lease_of(server, 0, connector, kernel, "a fake".into())
 }
 
 /// What the server lends of `manner`, with the number of CRTC and output.
 fn lent(manner: Manner, connector: Option<&str>, kernel: &[(u32, String)]) -> Option<(u32, u32)> {
-    let handed = Handed::new();
+    let handed = HandedSocket::new();
     let (stream, thread) = start(manner, Some(handed.given.try_clone().unwrap()));
     let Lease { descriptor, back, .. } =
         ask(stream, connector, kernel, Duration::from_secs(10)).unwrap_or_else(|e| panic!("{e:?}"));
@@ -397,7 +397,7 @@ fn a_server_that_vanishes_or_says_nothing_is_told_in_time() {
 
 #[test]
 fn a_server_that_is_silent_at_the_end_holds_nobody_up() {
-    let handed = Handed::new();
+    let handed = HandedSocket::new();
     let manner = Manner { silent_at: Some(randr::FREE_LEASE_REQUEST), ..desktop() };
     let (stream, thread) = start(manner, Some(handed.given.try_clone().unwrap()));
     let lease = ask(stream, Some("HDMI-A-1"), &[], Duration::from_secs(10)).expect("lent");

@@ -43,7 +43,7 @@ struct Objects {
 
 /// What the client did after its lease.
 #[derive(Debug, Default, PartialEq, Eq)]
-pub(crate) struct Seen {
+pub(crate) struct LeaseLog {
     /// The connector that it asked for.
     pub(crate) asked: Option<u32>,
     /// It will ask for nothing else.
@@ -65,7 +65,7 @@ pub(crate) struct Compositor {
     /// Lends the first connector.
     pub(crate) lend: Box<dyn FnMut() -> Option<OwnedFd> + Send>,
     /// What the client did.
-    pub(crate) seen: Seen,
+    pub(crate) seen: LeaseLog,
 }
 
 /// The compositor's own numbers begin here.
@@ -122,7 +122,7 @@ impl Compositor {
     }
 
     /// Answers until the client goes away.
-    pub(crate) fn serve(mut self) -> Seen {
+    pub(crate) fn serve(mut self) -> LeaseLog {
         let mut objects = Objects::default();
         while let Some((object, opcode, arguments)) = self.read() {
             let last = arguments.last().copied().unwrap_or(0);

@@ -10,7 +10,7 @@ use dpm_calibrate::outline::Outlines;
 use dpm_calibrate::poses::Poses;
 use dpm_common::clock::MonotonicClock;
 use dpm_rig::failure::{Failure, FailureKind};
-use dpm_rig::results::{check_known, keep, Moved};
+use dpm_rig::results::{check_known, keep, NudgeTarget};
 use std::sync::Arc;
 
 /// Pixels across the dot: an eye finds its middle to half a pixel.
@@ -87,8 +87,8 @@ pub(super) fn check(args: &CheckArgs) -> Result<(), Failure> {
 pub(super) fn nudge(args: &NudgeArgs) -> Result<(), Failure> {
     let (config, mut results) = args.common.open()?;
     let moved = match (&args.body, args.projector) {
-        (Some(name), false) => Moved::Body(name.clone()),
-        _ => Moved::Projector,
+        (Some(name), false) => NudgeTarget::Body(name.clone()),
+        _ => NudgeTarget::Projector,
     };
     check_known(&results, &moved)?;
     let names: Vec<String> = args.body.iter().cloned().collect();

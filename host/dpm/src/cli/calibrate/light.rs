@@ -4,7 +4,7 @@ use super::{at_a_rate_that_is_carried, numbers, seconds, tip_and_sigma, Common, 
 use crate::cli::watch::print;
 use dpm_calibrate::light::{self, FlatSource, Ways};
 use dpm_calibrate::sensor;
-use dpm_calibration::projector::Known;
+use dpm_calibration::projector::PlaceHint;
 use dpm_calibration::sensor::Brightness;
 use dpm_rig::config::RigConfig;
 use dpm_rig::failure::{Failure, FailureKind};
@@ -27,7 +27,7 @@ struct SensorWand {
 impl SensorWand {
     /// How its sensor is recorded in coded light for so many seconds.
     fn setup(&self, config: &RigConfig, seconds: f64) -> sensor::Setup {
-        self.args.setup(&self.sensor, (&self.common, config), seconds, Known::default())
+        self.args.setup(&self.sensor, (&self.common, config), seconds, PlaceHint::default())
     }
 }
 

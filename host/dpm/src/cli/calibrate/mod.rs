@@ -10,10 +10,10 @@ use super::rig_args::RigArgs;
 use super::watch::{print, watch_quietly};
 use check::{check, nudge, CheckArgs, NudgeArgs};
 use dpm_calibrate::dialogue::Dialogue;
-use dpm_calibrate::pace::{slower, Paced};
+use dpm_calibrate::pace::{slower, PaceResult};
 use dpm_calibrate::recorder::Port;
 use dpm_calibrate::{body, sensor, wand};
-use dpm_calibration::projector::{Known, LensTerms};
+use dpm_calibration::projector::{LensTerms, PlaceHint};
 use dpm_calibration::rehearsal::{rehearse_with, Bias};
 use dpm_camera_files::{export, Form};
 use dpm_rig::config::{PlaneTiming, RigConfig};
@@ -121,7 +121,7 @@ impl SensorArgs {
         path: &str,
         (common, config): (&Common, &RigConfig),
         seconds: f64,
-        known: Known,
+        known: PlaceHint,
     ) -> sensor::Setup {
         sensor::Setup {
             port: self.port(path),
@@ -268,13 +268,13 @@ impl Common {
 /// That of `measure`, or no rate is low enough (exit code 3).
 fn at_a_rate_that_is_carried<T: Send + 'static>(
     config: &mut RigConfig,
-    measure: impl Fn(&RigConfig, &Arc<RunMonitor>) -> Result<Paced<T>, Failure> + Clone + Send + 'static,
+    measure: impl Fn(&RigConfig, &Arc<RunMonitor>) -> Result<PaceResult<T>, Failure> + Clone + Send + 'static,
 ) -> Result<T, Failure> {
     loop {
         let once = measure.clone();
         match watch_quietly(config.clone(), move |config, monitor| once(config, monitor))? {
-            Paced::Done(result) => return Ok(result),
-            Paced::TooFast { carried_hz } => {
+            PaceResult::Done(result) => return Ok(result),
+            PaceResult::TooFast { carried_hz } => {
                 let before = config.projector.frame_rate.hz();
                 *config = slower(config, carried_hz)?;
                 print(&format!(

@@ -8,7 +8,7 @@ use dpm_calibrate::poses::Poses;
 use dpm_calibrate::projector::{aim_by_hand, keep, solve_file, told_of, Points};
 use dpm_calibrate::shown::while_shown;
 use dpm_calibrate::{light, sensor};
-use dpm_calibration::projector::{Known, LensTerms, Options, Solved};
+use dpm_calibration::projector::{LensTerms, Options, PlaceHint, ProjectorFit};
 use dpm_common::clock::MonotonicClock;
 use dpm_rig::config::RigConfig;
 use dpm_rig::failure::Failure;
@@ -91,7 +91,7 @@ impl ProjectorArgs {
     pub(super) fn execute(&self) -> Result<(), Failure> {
         let (config, results) = self.common.open()?;
         let raster = config.projector.raster();
-        let known = Known { distance_m: self.distance, up: self.up };
+        let known = PlaceHint { distance_m: self.distance, up: self.up };
         let by_hand = Options::by_hand(raster);
         let options = Options { known, priors: by_hand.priors.with_lens(self.lens.terms()), ..by_hand };
         match (&self.sensor, &self.points) {
@@ -121,7 +121,7 @@ impl ProjectorArgs {
     fn by_sensor(
         &self,
         port: &str,
-        known: Known,
+        known: PlaceHint,
         config: &RigConfig,
         mut results: Results,
     ) -> Result<(), Failure> {
@@ -143,7 +143,7 @@ impl ProjectorArgs {
     }
 
     /// Writes a projector and says how good it is.
-    fn told(&self, mut results: Results, config: &RigConfig, solved: &Solved) -> Result<(), Failure> {
+    fn told(&self, mut results: Results, config: &RigConfig, solved: &ProjectorFit) -> Result<(), Failure> {
         keep(&mut results, config, solved, 1e-3 * self.bias);
         let told = format!("{}{}", told_of(solved), self.told_of_bias(&results));
         print(&format!("{told}\n{}\n", results.save(config)?));

@@ -1,6 +1,6 @@
 //! What `dpm doctor` says of the displays that can serve as projectors.
 
-use super::super::display::{look, Seen};
+use super::super::display::{look, CardView};
 use super::{Finding, State};
 use dpm_display::kms::Connector;
 
@@ -10,10 +10,10 @@ pub(super) fn findings() -> Vec<Finding> {
 }
 
 /// The displays that `projector.backend.kind = "display"` could drive.
-fn displays(all: &[Seen]) -> Vec<Finding> {
+fn displays(all: &[CardView]) -> Vec<Finding> {
     const UNTRIED: &str = "a display as projector has not been tried on real hardware yet (docs/DISPLAY.md)";
     let mut findings = Vec::new();
-    for Seen { path, is_in_use, connectors } in all {
+    for CardView { path, is_in_use, connectors } in all {
         let name = format!("displays of {}", path.display());
         let connectors = match connectors {
             Ok(connectors) => connectors,

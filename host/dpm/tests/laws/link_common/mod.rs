@@ -161,11 +161,11 @@ pub(crate) struct PtyProjector {
     pub path: PathBuf,
     device: Arc<Mutex<SerialProjector>>,
     start: Instant,
-    served: Mutex<Option<Served>>,
+    served: Mutex<Option<PluggedProjector>>,
 }
 
 /// A projector that is plugged in.
-struct Served {
+struct PluggedProjector {
     name: PortName,
     stop: Arc<AtomicBool>,
     thread: JoinHandle<()>,
@@ -191,7 +191,7 @@ impl PtyProjector {
 
     /// Pulls the plug. The projector keeps its power, and its light until the watchdog acts.
     pub(crate) fn unplug(&self) {
-        if let Some(Served { name, stop, thread }) = self.served.lock().unwrap().take() {
+        if let Some(PluggedProjector { name, stop, thread }) = self.served.lock().unwrap().take() {
             drop(name);
             stop.store(true, Ordering::Relaxed);
             thread.join().unwrap();
@@ -220,7 +220,7 @@ impl PtyProjector {
                 std::thread::sleep(Duration::from_micros(300));
             }
         });
-        *self.served.lock().unwrap() = Some(Served { name, stop, thread });
+        *self.served.lock().unwrap() = Some(PluggedProjector { name, stop, thread });
     }
 }
 

@@ -120,14 +120,14 @@ pub(crate) struct Peer {
 }
 
 /// A peer on a pseudo-terminal, until it is dropped.
-pub(crate) struct Served {
+pub(crate) struct PeerLine {
     pub path: String,
     stop: Arc<AtomicBool>,
     thread: Option<std::thread::JoinHandle<()>>,
     _other_end: File,
 }
 
-impl Served {
+impl PeerLine {
     /// `fault`: the rule to break; "" for none.
     pub(crate) fn new(fault: &str) -> Self {
         let (mut ours, theirs) = TTYPort::pair().expect("a pseudo-terminal");
@@ -171,7 +171,7 @@ impl Served {
     }
 }
 
-impl Drop for Served {
+impl Drop for PeerLine {
     fn drop(&mut self) {
         self.stop.store(true, Ordering::Relaxed);
         if let Some(thread) = self.thread.take() {

@@ -2,7 +2,7 @@
 //! device made to break a rule is reported for exactly that rule; and the mock projector keeps them all.
 
 use crate::cli_common::{code, dpm, err, out, own_folder};
-use crate::peer::Served;
+use crate::peer::PeerLine;
 use dpm_device::link::packet_bytes;
 use dpm_device::planes::Raster;
 use dpm_device::time::HostTime;
@@ -31,7 +31,7 @@ fn judged(path: &str, raster: Raster, only: &[String]) -> Judgement {
 }
 
 fn of_peer(fault: &str, only: &[String]) -> Judgement {
-    let served = Served::new(fault);
+    let served = PeerLine::new(fault);
     judged(&served.path, Raster::new(40, 30).unwrap(), only)
 }
 
@@ -133,7 +133,7 @@ fn every_rule_has_a_name_of_its_own_and_a_section_of_the_document() {
 fn the_program_prints_a_line_a_rule_and_its_exit_code_is_the_judgement() {
     let rig = concat!(env!("CARGO_MANIFEST_DIR"), "/../../rigs/demo.toml");
     for (fault, expected) in [("", 0), ("black", 1)] {
-        let served = Served::new(fault);
+        let served = PeerLine::new(fault);
         let backend = format!("projector.backend={{kind=\"serial\", port={:?}, baud=3000000}}", served.path);
         let mut args = vec!["link-test", rig, "--conformance", "--rule", "echo", "--rule", "black", "--json"];
         let sets = [

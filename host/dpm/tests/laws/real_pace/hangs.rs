@@ -14,11 +14,11 @@ const PREDICT_MS: u64 = 100;
 const SLOT_MS: u64 = 17;
 
 /// A thread of another process that is stopped as long as this lives.
-pub(super) struct Stopped {
+pub(super) struct HaltedThread {
     thread: i32,
 }
 
-impl Stopped {
+impl HaltedThread {
     /// Stops a thread immediately, as a debugger would.
     pub(super) fn new(thread: i32) -> Option<Self> {
         let none = std::ptr::null_mut::<libc::c_void>();
@@ -36,7 +36,7 @@ impl Stopped {
     }
 }
 
-impl Stopped {
+impl HaltedThread {
     /// Acknowledges the thread's end. Until the tracer does, the parent does not see the end of the process.
     fn reap(&self, process: u32) {
         // The process's own end is left to its parent.
@@ -47,7 +47,7 @@ impl Stopped {
     }
 }
 
-impl Drop for Stopped {
+impl Drop for HaltedThread {
     fn drop(&mut self) {
         let none = std::ptr::null_mut::<libc::c_void>();
         // SAFETY: as above; it does no harm if the thread is gone. Nobody sees the end of the process before the tracer has
@@ -107,7 +107,7 @@ fn whichever_thread_of_the_frames_way_hangs_light_ends_by_itself() {
         let run = lit_run(&path, &far);
         let all = threads(run.id());
         let Some((thread, _)) = all.iter().find(|(_, n)| n == name) else { panic!("{name}: {all:?}") };
-        let stopped = Stopped::new(*thread).expect("it may be traced");
+        let stopped = HaltedThread::new(*thread).expect("it may be traced");
         let dark = served_time(name, || !far.is_lit());
         // A frame that was already sent may still be lit for its own slot.
         let bound = Duration::from_millis(4 * SLOT_MS + PREDICT_MS + 20);
@@ -126,7 +126,7 @@ fn a_stage_that_hangs_is_replaced_and_does_nothing_when_it_wakes_up() {
         let mut run = lit_run(&path, &far);
         let id = run.id();
         let (thread, _) = threads(id).into_iter().find(|(_, n)| n == name).expect("it runs");
-        let stopped = Stopped::new(thread).expect("it may be traced");
+        let stopped = HaltedThread::new(thread).expect("it may be traced");
         let hung = Instant::now();
         far.until(LONG, "dark", &mut |s| !s.lit);
         let lit = far.status().frames_lit;
@@ -157,7 +157,7 @@ fn a_frozen_picture_goes_dark_when_a_stage_hangs() {
     std::thread::sleep(Duration::from_millis(4 * SLOT_MS + 2 * PREDICT_MS));
     assert!(far.is_lit(), "held");
     let (thread, _) = threads(run.id()).into_iter().find(|(_, n)| n == "dpm-plan").expect("it runs");
-    let stopped = Stopped::new(thread).expect("it may be traced");
+    let stopped = HaltedThread::new(thread).expect("it may be traced");
     let dark = served_time("dark", || !far.is_lit());
     // The stage's announcement, 0.1 s more, and the supervisor's confirmation that is missing.
     assert!(dark <= Duration::from_millis(500), "dark after {dark:?}");
@@ -198,7 +198,7 @@ fn fifty_recoveries_leave_nothing_behind_and_a_stop_during_one_writes_the_report
     std::thread::sleep(PEACE);
     let mut second = None;
     for k in 1..=RECOVERIES {
-        let stopped = Stopped::new(newest(crew[k % 3]).expect("it runs")).expect("it may be traced");
+        let stopped = HaltedThread::new(newest(crew[k % 3]).expect("it runs")).expect("it may be traced");
         let hung = Instant::now();
         run.wait_for_line(LONG, |line| line.contains("light again after"));
         std::thread::sleep(Duration::from_secs(1).saturating_sub(hung.elapsed()));
@@ -214,7 +214,7 @@ fn fifty_recoveries_leave_nothing_behind_and_a_stop_during_one_writes_the_report
             assert!(count <= first_count + 2, "{first_count}, then {count}: {:?}", threads(id));
         }
     }
-    let stopped = Stopped::new(newest("dpm-pack").expect("it runs")).expect("it may be traced");
+    let stopped = HaltedThread::new(newest("dpm-pack").expect("it runs")).expect("it may be traced");
     run.wait_for_line(LONG, |line| line.contains("are restarted"));
     run.signal("TERM");
     drop(stopped);

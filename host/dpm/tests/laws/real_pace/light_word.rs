@@ -1,7 +1,7 @@
 //! The word for the light is that of the light: on every cause of darkness, the state, the metrics and the report of a
 //! running rig agree with the mirrors of the projector.
 
-use super::hangs::{threads, Stopped};
+use super::hangs::{threads, HaltedThread};
 use crate::cli_common::{code, dpm, err, start, Folder, Running};
 use crate::cli_run::natnet;
 use crate::link_common::{raster, rig, start_with, Projector, PtyProjector};
@@ -96,12 +96,12 @@ fn a_limit_is_called_by_its_name() {
 }
 
 /// A running rig whose page is asked.
-struct Asked<'a> {
+struct PageWatch<'a> {
     address: SocketAddr,
     far: &'a PtyProjector,
 }
 
-impl Asked<'_> {
+impl PageWatch<'_> {
     fn get(&self, path: &str) -> Option<String> {
         let mut stream = TcpStream::connect(self.address).ok()?;
         stream.set_read_timeout(Some(LONG)).ok()?;
@@ -172,7 +172,7 @@ fn a_start_by_hand_a_lost_body_a_hung_stage_and_a_silent_tracker_are_called_by_t
         ),
     );
     let mut run = start(&["run", &rig]);
-    let asked = Asked { address, far: &far };
+    let asked = PageWatch { address, far: &far };
     // First the projector is connected, and then the start waits for a person.
     let begin = Instant::now();
     while !asked.agrees("NEVER ARMED")["now"]["light"]["told"].as_str().unwrap().contains("safety.start") {
@@ -192,7 +192,7 @@ fn a_start_by_hand_a_lost_body_a_hung_stage_and_a_silent_tracker_are_called_by_t
     let stopped = ["dpm-supervisor", "dpm-pack"].map(|wanted| {
         let (thread, _) =
             all.iter().find(|(_, name)| name == wanted).unwrap_or_else(|| panic!("{wanted}: {all:?}"));
-        Stopped::new(*thread).expect("it may be traced")
+        HaltedThread::new(*thread).expect("it may be traced")
     });
     asked.agrees("STALLED");
     drop(stopped);

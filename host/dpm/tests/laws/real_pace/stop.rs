@@ -18,11 +18,11 @@ const GONE: Duration = Duration::from_secs(2);
 const LOOKING: Duration = Duration::from_millis(20);
 
 /// A thread of another process that is stopped until this is dropped. Only the thread that made this can trace it.
-struct Stopped {
+struct FrozenThread {
     tid: i32,
 }
 
-impl Stopped {
+impl FrozenThread {
     fn thread(pid: u32, name: &str) -> Self {
         let tid = thread_of(pid, name);
         // SAFETY: requests without addresses to a thread of our own child; waitpid writes to a place that outlives it.
@@ -51,7 +51,7 @@ impl Stopped {
     }
 }
 
-impl Drop for Stopped {
+impl Drop for FrozenThread {
     fn drop(&mut self) {
         let none = std::ptr::null_mut::<libc::c_void>();
         // SAFETY: a request without addresses; it fails if the thread is gone, and a null status is allowed. Nobody sees the
@@ -80,7 +80,7 @@ fn thread_of(pid: u32, name: &str) -> i32 {
 }
 
 /// Waits for the end of `run` while `stopped` is traced; returns the time that counts.
-fn gone(run: &mut Running, stopped: &Stopped) -> Duration {
+fn gone(run: &mut Running, stopped: &FrozenThread) -> Duration {
     let pid = run.id();
     served_time("gone", || {
         stopped.reap(pid);
@@ -106,7 +106,7 @@ fn r2_whichever_thread_hangs_a_stop_is_dark_and_the_process_goes() {
         let (_folder, path, far) = rig(&format!("hang-{name}"));
         let mut run = start(&run_words(&path));
         far.until(LONG, "light", &mut |s| s.lit && s.frames_lit >= 3);
-        let stopped = Stopped::thread(run.id(), name);
+        let stopped = FrozenThread::thread(run.id(), name);
         run.signal(signal);
         let dark = served_time("dark", || !far.is_lit());
         // The link's own thread is the one that can send orders to the projector; without it the watchdog acts.
@@ -129,7 +129,7 @@ fn r9_black_and_safe_need_no_control_thread() {
     far.until(LONG, "light", &mut |s| s.lit && s.frames_lit >= 3);
     let pid = run.id().to_string();
     for (word, state) in [("black", DeviceState::Black), ("safe", DeviceState::Faulted)] {
-        let stopped = Stopped::thread(run.id(), "dpm-control");
+        let stopped = FrozenThread::thread(run.id(), "dpm-control");
         let told = dpm(&[word, "--pid", &pid], &[]);
         assert_eq!(code(&told), 0, "{}{}", out(&told), err(&told));
         assert!(out(&told).contains("by a signal") && out(&told).contains("rig.toml"), "{}", out(&told));
@@ -159,7 +159,7 @@ fn r4_an_order_is_obeyed_before_it_is_kept() {
     let run = start(&run_words(&path));
     far.until(LONG, "light", &mut |s| s.lit && s.frames_lit >= 3);
     let pid = run.id().to_string();
-    let stopped = Stopped::thread(run.id(), "dpm-orders");
+    let stopped = FrozenThread::thread(run.id(), "dpm-orders");
     let told = dpm(&["safe", "--pid", &pid], &[]);
     assert_eq!(far.status().state, DeviceState::Faulted);
     assert_eq!(code(&told), 3, "{}{}", out(&told), err(&told));

@@ -26,12 +26,12 @@ pub(crate) const PATIENCE: Duration = Duration::from_secs(30);
 
 /// The steps of a rig file that need not exist.
 #[derive(Debug)]
-pub(crate) struct Shown {
+pub(crate) struct NoSteps {
     pub(crate) rig: PathBuf,
     pub(crate) config: RigConfig,
 }
 
-impl Guide for Shown {
+impl Guide for NoSteps {
     fn steps(&self) -> Steps {
         let now = SystemTime::now();
         Steps::of(&About { rig: &self.rig, config: &self.config, file: None, now, running_since: None })
@@ -82,7 +82,7 @@ impl Running {
             address: "127.0.0.1:0".parse().unwrap(),
             hosts: vec!["rig.example.org".into()],
             token: Some(token.clone()),
-            guide: Arc::new(Shown { rig: dir.join("rig.toml"), config: config.clone() }),
+            guide: Arc::new(NoSteps { rig: dir.join("rig.toml"), config: config.clone() }),
         };
         let notes = Arc::new(Notes::default());
         let page = Page::serve(settings, monitor.clone(), orders.clone(), notes.clone()).unwrap();

@@ -21,7 +21,7 @@ const TOKEN: &str = "token/";
 
 /// What a message asks for.
 #[derive(Clone, Debug, PartialEq)]
-pub enum Heard {
+pub enum OscRequest {
     /// An order that takes light away or holds it: never ARM.
     Order(Order),
     /// A parameter by its name, with its numbers.
@@ -39,7 +39,7 @@ pub enum Heard {
 #[derive(Clone, PartialEq)]
 pub struct Said {
     /// What it asks for.
-    pub heard: Heard,
+    pub heard: OscRequest,
     /// The token, right or wrong.
     pub token: Option<String>,
 }
@@ -179,12 +179,12 @@ fn meaning(address: &str, numbers: Option<Vec<f64>>, token: Option<&str>) -> Res
     if let Some(order) = order {
         // A button sends 0 when it is released. An order with arguments that are no numbers is still an order.
         let is_released = numbers.is_some_and(|all| all.first() == Some(&0.0));
-        let heard = if is_released { Heard::Nothing } else { Heard::Order(order) };
+        let heard = if is_released { OscRequest::Nothing } else { OscRequest::Order(order) };
         return Ok(Said { heard, token });
     }
     let numbers = numbers.ok_or_else(|| Wrong::NoNumber(short(name)))?;
     // The address /dpm/body/hare is the parameter body.hare.
-    Ok(Said { heard: Heard::Set { name: name.replacen('/', ".", 1), numbers }, token })
+    Ok(Said { heard: OscRequest::Set { name: name.replacen('/', ".", 1), numbers }, token })
 }
 
 #[cfg(test)]
@@ -211,14 +211,14 @@ mod tests {
         bytes
     }
 
-    fn heard(bytes: &[u8]) -> (Vec<Result<Heard, Wrong>>, Result<(), Wrong>) {
+    fn heard(bytes: &[u8]) -> (Vec<Result<OscRequest, Wrong>>, Result<(), Wrong>) {
         let mut all = Vec::new();
         let end = decode(bytes, &mut |one| all.push(one.map(|said| said.heard)));
         (all, end)
     }
 
-    fn set(name: &str, numbers: &[f64]) -> Heard {
-        Heard::Set { name: name.into(), numbers: numbers.into() }
+    fn set(name: &str, numbers: &[f64]) -> OscRequest {
+        OscRequest::Set { name: name.into(), numbers: numbers.into() }
     }
 
     #[test]
@@ -230,14 +230,14 @@ mod tests {
         let gaze = sent("/dpm/body/my hare", ",idhTF", &mixed.concat());
         assert_eq!(heard(&gaze).0, [Ok(set("body.my hare", &[3.0, 2.5, 7.0, 1.0, 0.0]))]);
         for bytes in [padded("/dpm/black"), sent("/dpm/black", ",", &[]), sent("/dpm/black", ",T", &[])] {
-            assert_eq!(heard(&bytes), (vec![Ok(Heard::Order(Order::Black))], Ok(())));
+            assert_eq!(heard(&bytes), (vec![Ok(OscRequest::Order(Order::Black))], Ok(())));
         }
-        assert_eq!(heard(&sent("/dpm/black", ",s", &padded("now"))).0, [Ok(Heard::Order(Order::Black))]);
-        assert_eq!(heard(&sent("/dpm/safe", ",f", &0f32.to_be_bytes())).0, [Ok(Heard::Nothing)]);
+        assert_eq!(heard(&sent("/dpm/black", ",s", &padded("now"))).0, [Ok(OscRequest::Order(Order::Black))]);
+        assert_eq!(heard(&sent("/dpm/safe", ",f", &0f32.to_be_bytes())).0, [Ok(OscRequest::Nothing)]);
         let all = bundle(&[padded("/dpm/freeze"), bundle(std::slice::from_ref(&float)), padded("/dpm/safe")]);
         let told = heard(&all);
         assert_eq!(told.0.len(), 3, "{told:?}");
-        assert_eq!((told.0[2].clone(), told.1), (Ok(Heard::Order(Order::Safe)), Ok(())));
+        assert_eq!((told.0[2].clone(), told.1), (Ok(OscRequest::Order(Order::Safe)), Ok(())));
     }
 
     #[test]
@@ -259,7 +259,7 @@ mod tests {
         let body = token_of(&sent("/dpm/token/abc-012345-XYZ/body/hare", ",f", &number));
         assert_eq!(body, Ok((set("body.hare", &[1.5]), token.clone())));
         let freeze = token_of(&sent("/dpm/token/abc-012345-XYZ/freeze", ",", &[]));
-        assert_eq!(freeze, Ok((Heard::Order(Order::Freeze), token)));
+        assert_eq!(freeze, Ok((OscRequest::Order(Order::Freeze), token)));
         assert_eq!(token_of(&sent("/dpm/token/abc-012345-XYZ/arm", ",", &[])), Err(Wrong::Arm));
         assert_eq!(token_of(&sent("/dpm/exposure", ",f", &number)), Ok((set("exposure", &[1.5]), None)));
         // What is wrong is named without the token.
@@ -288,7 +288,7 @@ mod tests {
         let mut cut = bundle(&[padded("/dpm/black"), padded("/dpm/exposure")]);
         cut.truncate(cut.len() - 4);
         let told = heard(&cut);
-        assert_eq!(told.0, [Ok(Heard::Order(Order::Black))]);
+        assert_eq!(told.0, [Ok(OscRequest::Order(Order::Black))]);
         assert!(told.1.is_err());
         let deep = (0..6).fold(padded("/dpm/black"), |inner, _| bundle(&[inner]));
         assert!(heard(&deep).0.is_empty() && heard(&deep).1.is_err());
@@ -300,8 +300,8 @@ mod tests {
         fn any_bytes(bytes in prop::collection::vec(any::<u8>(), 0..200), address in "/dpm/[a-z/]{0,12}", tags in ",[ifhdTFsb]{0,20}") {
             for bytes in [bytes.clone(), sent(&address, &tags, &bytes), bundle(&[sent(&address, &tags, &bytes)])] {
                 for one in heard(&bytes).0 {
-                    prop_assert!(one != Ok(Heard::Order(Order::Arm)));
-                    if let Ok(Heard::Set { numbers, .. }) = one {
+                    prop_assert!(one != Ok(OscRequest::Order(Order::Arm)));
+                    if let Ok(OscRequest::Set { numbers, .. }) = one {
                         prop_assert!(numbers.len() <= MOST_NUMBERS);
                     }
                 }

@@ -13,7 +13,7 @@ use crate::order::Order;
 use crate::parameters::Command;
 use crate::standing::By;
 use crate::telemetry::monitor::RunMonitor;
-use decode::{decode, Heard, Said};
+use decode::{decode, OscRequest, Said};
 use dpm_common::realtime::os::give_way;
 use std::io;
 use std::net::{IpAddr, SocketAddr, UdpSocket};
@@ -161,12 +161,12 @@ impl Ear {
         let ip = from.ip().to_canonical();
         for heard in self.door.hear(bytes, ip) {
             let done = match heard {
-                Ok(Heard::Order(order)) => {
+                Ok(OscRequest::Order(order)) => {
                     self.order(order, from);
                     Ok(())
                 }
-                Ok(Heard::Nothing) => Ok(()),
-                Ok(Heard::Set { name, numbers }) => {
+                Ok(OscRequest::Nothing) => Ok(()),
+                Ok(OscRequest::Set { name, numbers }) => {
                     let command = Command::Set { name, numbers };
                     let given = parameters::give(&self.monitor, &command, &format!("osc {ip}"));
                     given.map(|_| ()).map_err(|e| format!("{ip}: {e}"))
@@ -200,7 +200,7 @@ impl Ear {
 
 impl Doorkeeper {
     /// What is to be done after a datagram from `ip`, and why the rest of it is refused.
-    pub fn hear(&self, bytes: &[u8], ip: IpAddr) -> Vec<Result<Heard, String>> {
+    pub fn hear(&self, bytes: &[u8], ip: IpAddr) -> Vec<Result<OscRequest, String>> {
         let may_send = if self.from.is_empty() { ip.is_loopback() } else { self.from.contains(&ip) };
         if !may_send {
             return vec![Err(format!("{ip} is not in osc.from"))];
@@ -211,11 +211,11 @@ impl Doorkeeper {
             let said = heard.map_err(|wrong| format!("{ip}: {wrong}"))?;
             match (self.permits(&said), said.heard) {
                 // The decoder knows no ARM; this holds it whatever becomes of the decoder.
-                (_, Heard::Order(Order::Arm)) => Err(format!("{ip}: OSC never arms")),
-                (permitted, Heard::Order(order)) if permitted.is_ok() || order.is_dark() => {
-                    Ok(Heard::Order(order))
+                (_, OscRequest::Order(Order::Arm)) => Err(format!("{ip}: OSC never arms")),
+                (permitted, OscRequest::Order(order)) if permitted.is_ok() || order.is_dark() => {
+                    Ok(OscRequest::Order(order))
                 }
-                (_, Heard::Nothing) => Ok(Heard::Nothing),
+                (_, OscRequest::Nothing) => Ok(OscRequest::Nothing),
                 (Ok(()), heard) => Ok(heard),
                 (Err(why), _) => Err(format!("{ip}: {why}")),
             }

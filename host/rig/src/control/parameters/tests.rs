@@ -1,6 +1,6 @@
 use super::*;
 use crate::config::{Overrides, RigConfig};
-use crate::parameters::applied::{middles, Applied};
+use crate::parameters::applied::{middles, ParameterVersion};
 use crate::parameters::desk::Setting;
 use crate::rig::Rig;
 use dpm_device::planes::Raster;
@@ -16,13 +16,13 @@ fn rig(flags: &[&str]) -> Arc<Rig> {
 }
 
 /// A run that draws `rig`, with the reader of its planning.
-fn run(rig: &Arc<Rig>) -> (Arc<RunMonitor>, Reader<Applied>) {
+fn run(rig: &Arc<Rig>) -> (Arc<RunMonitor>, Reader<ParameterVersion>) {
     let monitor = Arc::new(RunMonitor::default());
     let reader = monitor.parameters().follow(rig);
     (monitor, reader)
 }
 
-fn set(monitor: &Arc<RunMonitor>, text: &str) -> Result<Sent, Refused> {
+fn set(monitor: &Arc<RunMonitor>, text: &str) -> Result<ChangeResult, ChangeRefusal> {
     give(monitor, &Command::parse_change(text)?, "test")
 }
 
@@ -52,8 +52,8 @@ fn a_change_reaches_planning_whole_and_is_taken_back_whole() {
         assert_eq!(monitor.parameters().shown().unwrap().can_undo, left > 0);
     }
     let after = reader.latest().0.clone();
-    assert_eq!(Applied { version: before.version, ..after }, before);
-    assert_eq!(give(&monitor, &Command::Undo, "test").unwrap_err(), Refused::NothingToUndo);
+    assert_eq!(ParameterVersion { version: before.version, ..after }, before);
+    assert_eq!(give(&monitor, &Command::Undo, "test").unwrap_err(), ChangeRefusal::NothingToUndo);
 }
 
 #[test]
@@ -120,10 +120,10 @@ fn a_parameter_without_an_effect_is_refused_with_the_reason() {
         assert!(!shown.all.iter().any(|p| name.starts_with(p.name.as_str())), "{shown:?}");
     }
     let monitor = Arc::new(RunMonitor::default());
-    assert_eq!(set(&monitor, "exposure=1").unwrap_err(), Refused::NoRun);
+    assert_eq!(set(&monitor, "exposure=1").unwrap_err(), ChangeRefusal::NoRun);
     monitor.parameters().close();
     let _reader = monitor.parameters().follow(&rig(&[]));
-    assert_eq!(set(&monitor, "exposure=2").unwrap_err(), Refused::NoRun, "a pattern");
+    assert_eq!(set(&monitor, "exposure=2").unwrap_err(), ChangeRefusal::NoRun, "a pattern");
 }
 
 #[test]
@@ -171,7 +171,7 @@ fn saved(monitor: &Arc<RunMonitor>) -> String {
 fn only_what_the_files_do_not_say_is_saved_and_a_value_taken_back_is_saved_again() {
     let rig = rig(&["observer.gaze={kind=\"tracked\",target=\"venus\"}"]);
     let (monitor, _reader) = run(&rig);
-    assert!(matches!(give(&monitor, &Command::Save, "test"), Err(Refused::NotSaved(_))), "no file");
+    assert!(matches!(give(&monitor, &Command::Save, "test"), Err(ChangeRefusal::NotSaved(_))), "no file");
     let all: Arc<Mutex<Vec<ToKeep>>> = Arc::default();
     let written = all.clone();
     monitor.parameters().set_saver(Box::new(move |_, kept| {

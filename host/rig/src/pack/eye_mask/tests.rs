@@ -180,7 +180,7 @@ fn tracks_move_no_light_into_the_guard() {
 }
 
 /// A tracker that gives a head's label to the other one, and loses heads, as a plan of draws says.
-struct Muddled {
+struct LabelMuddle {
     inner: MockTracker,
     draws: Draws,
 }
@@ -188,7 +188,7 @@ struct Muddled {
 /// Length of a stretch in which labels and losses stay as they are, nanoseconds.
 const STRETCH_NS: i64 = 700_000_000;
 
-impl Muddled {
+impl LabelMuddle {
     /// In one stretch of six the labels are exchanged; in one of eight a head is lost, sometimes both.
     fn mood(&self, at: HostTime) -> (bool, [bool; 2]) {
         let stretch = (at.0 / STRETCH_NS) as u64;
@@ -197,7 +197,7 @@ impl Muddled {
     }
 }
 
-impl Tracker for Muddled {
+impl Tracker for LabelMuddle {
     fn poll(&mut self, now: HostTime, sink: &mut dyn FnMut(&TrackerSample)) -> Result<usize, TrackerError> {
         let mut samples = Vec::new();
         self.inner.poll(now, &mut |sample| samples.push(*sample))?;
@@ -253,7 +253,7 @@ fn no_light_meets_a_head(frames: i64, seed: u64) -> [f64; 2] {
         ..Default::default()
     };
     let motions = rig.tracked().filter_map(|b| b.motion.clone()).collect();
-    let muddled = Muddled { inner: MockTracker::new(tracker, motions).unwrap(), draws: Draws::new(seed) };
+    let muddled = LabelMuddle { inner: MockTracker::new(tracker, motions).unwrap(), draws: Draws::new(seed) };
     let mut stage = TrackingStage::new(&rig, Box::new(muddled));
     let (mut publisher, mut reader) = latest(TrackSnapshot::empty(rig.tracked_count()));
     let mut watch = HeadWatch::new(&rig);

@@ -1,7 +1,7 @@
 //! Tracking, plan and pack, and the GPU between them.
 
 use super::line::Line;
-use super::{Machine, Part, Rendered, Takes, NEVER};
+use super::{GpuWork, Machine, Part, Takes, NEVER};
 use crate::engine::error::PipelineError;
 use crate::engine::facts::{CrewFacts, Facts};
 use crate::engine::pace::Real;
@@ -310,9 +310,9 @@ impl Crew {
                 self.plan.submitted(&mut job.note, now);
                 let begin = self.gpu_free_at.max(now);
                 let (done_at, lost) = match machine.renders(job.note.plan.id.0, begin) {
-                    Rendered::After(ns) => (begin.plus_ns(ns), None),
-                    Rendered::Never => (NEVER, None),
-                    Rendered::Lost(ns, error) => (begin.plus_ns(ns), Some(error)),
+                    GpuWork::After(ns) => (begin.plus_ns(ns), None),
+                    GpuWork::Never => (NEVER, None),
+                    GpuWork::Lost(ns, error) => (begin.plus_ns(ns), Some(error)),
                 };
                 self.gpu_free_at = done_at;
                 self.gpu.push_back(OnGpu { job, done_at, lost });

@@ -80,7 +80,7 @@ pub enum Takes {
 
 /// What the GPU does with a frame.
 #[derive(Debug)]
-pub enum Rendered {
+pub enum GpuWork {
     /// It finishes the frame after this many nanoseconds of its own time.
     After(i64),
     /// It never finishes.
@@ -126,7 +126,7 @@ pub trait Machine {
     fn takes(&mut self, part: Part, frame: u64, now: HostTime) -> Takes;
 
     /// What the GPU does with `frame`, which it begins at `now`.
-    fn renders(&mut self, frame: u64, now: HostTime) -> Rendered;
+    fn renders(&mut self, frame: u64, now: HostTime) -> GpuWork;
 
     /// Opens the GPU (`with_gpu`) and prepares a crew's first frame: how long that takes, and the undisturbed time of
     /// a frame, both in nanoseconds.

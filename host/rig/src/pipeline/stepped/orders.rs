@@ -1,7 +1,7 @@
 //! Orders that are written down without a thread: whoever steps them says how long the disk takes.
 
 use crate::config::Restart;
-use crate::control::orders::{Desk, Given, Kept, Ticket};
+use crate::control::orders::{Desk, KeepResult, OrderOnItsWay, Ticket};
 use crate::order::Order;
 use crate::standing::{standing_in_folder, By, Identity, OrderFile, Stands, StateFolder};
 use crate::telemetry::monitor::RunMonitor;
@@ -24,7 +24,7 @@ pub struct SteppedOrders {
     desk: Desk,
     file: OrderFile,
     keeps: bool,
-    writes: Option<(HostTime, Given)>,
+    writes: Option<(HostTime, OrderOnItsWay)>,
 }
 
 impl SteppedOrders {
@@ -57,9 +57,9 @@ impl SteppedOrders {
     /// What became of the order; `None` while it is not settled.
     pub fn outcome(&self, ticket: Ticket) -> Option<StoredOrder> {
         Some(match self.desk.outcome(ticket)? {
-            Kept::In(_) | Kept::Nowhere => StoredOrder::Kept,
-            Kept::Forgotten => StoredOrder::Forgotten,
-            Kept::Not(_) => StoredOrder::Refused,
+            KeepResult::In(_) | KeepResult::Nowhere => StoredOrder::Kept,
+            KeepResult::Forgotten => StoredOrder::Forgotten,
+            KeepResult::Not(_) => StoredOrder::Refused,
         })
     }
 

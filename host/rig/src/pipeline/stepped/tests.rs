@@ -82,7 +82,7 @@ const STRUCK_NS: i64 = 200 * MS;
 
 /// A frame as the link sent it.
 #[derive(Clone, Copy, Debug)]
-struct Sent {
+struct LinkFrame {
     sent_at: HostTime,
     due_at: HostTime,
     captured_at: Option<HostTime>,
@@ -91,7 +91,7 @@ struct Sent {
 
 /// A machine whose stages are slower the more frames are under way, as where the frames do not fit the caches: with four
 /// of them pack and link each take nearly a slot, so a queue that stands keeps itself standing.
-struct Cached {
+struct CacheMachine {
     rig: Arc<Rig>,
     strikes: Strikes,
     has_struck: bool,
@@ -102,12 +102,12 @@ struct Cached {
     /// When the newest frames were planned, by number.
     planned: [HostTime; 64],
     alone_ns: i64,
-    sent: Vec<Sent>,
+    sent: Vec<LinkFrame>,
     /// The collector takes so long for a pass.
     collector_ns: i64,
 }
 
-impl Cached {
+impl CacheMachine {
     fn stage_ns(&mut self, now: HostTime) -> i64 {
         self.steps += 1;
         let under_way = self.newest[0].saturating_sub(self.newest[1]) as i64;
@@ -118,7 +118,7 @@ impl Cached {
     }
 }
 
-impl Machine for Cached {
+impl Machine for CacheMachine {
     fn takes(&mut self, part: Part, frame: u64, now: HostTime) -> Takes {
         // A link that waits for a frame is woken by it.
         let works = part != Part::Link || frame > 0;
@@ -144,8 +144,8 @@ impl Machine for Cached {
         })
     }
 
-    fn renders(&mut self, _: u64, _: HostTime) -> Rendered {
-        Rendered::After(0)
+    fn renders(&mut self, _: u64, _: HostTime) -> GpuWork {
+        GpuWork::After(0)
     }
 
     fn makes_crew(&mut self, _: bool, _: HostTime) -> (i64, Result<i64, GpuError>) {
@@ -164,12 +164,12 @@ impl Machine for Cached {
     fn sent(&mut self, frame: &SentFrame<'_>) {
         let (sent_at, due_at, captured_at) = (frame.sent_at, frame.due_at, frame.captured_at);
         let planned_at = self.planned[frame.frame as usize % 64];
-        self.sent.push(Sent { sent_at, due_at, captured_at, planned_at });
+        self.sent.push(LinkFrame { sent_at, due_at, captured_at, planned_at });
     }
 }
 
 /// What was sent in a run of `ms` milliseconds with these keys.
-fn run(keys: &[&str], strikes: Strikes, collector_ns: i64, shifts_slots: bool, ms: i64) -> Vec<Sent> {
+fn run(keys: &[&str], strikes: Strikes, collector_ns: i64, shifts_slots: bool, ms: i64) -> Vec<LinkFrame> {
     run_of(keys, strikes, collector_ns, shifts_slots, ms, ALONE_NS)
 }
 
@@ -181,7 +181,7 @@ fn run_of(
     shifts_slots: bool,
     ms: i64,
     alone_ns: i64,
-) -> Vec<Sent> {
+) -> Vec<LinkFrame> {
     let flags = keys.iter().map(|key| (*key).to_owned()).chain(["real_time.pace=\"real\"".to_owned()]);
     let overrides = Overrides { variables: vec![], flags: flags.collect() };
     let config = RigConfig::demo(&overrides).unwrap_or_else(|e| panic!("{e}"));
@@ -200,7 +200,7 @@ fn run_of(
         }
         _ => Box::new(inner),
     };
-    let machine = Cached {
+    let machine = CacheMachine {
         rig: rig.clone(),
         strikes,
         has_struck: false,
@@ -223,13 +223,13 @@ fn run_of(
 }
 
 /// Frames that were sent in time for their slots between two instants, and slots in that time.
-fn in_time(sent: &[Sent], slot_ns: i64, from: HostTime, to: HostTime) -> [i64; 2] {
+fn in_time(sent: &[LinkFrame], slot_ns: i64, from: HostTime, to: HostTime) -> [i64; 2] {
     let all = sent.iter().filter(|s| s.due_at >= from && s.due_at < to && s.sent_at <= s.due_at);
     [all.count() as i64, to.ns_since(from) / slot_ns]
 }
 
 /// The mean age of light between two instants, from the tracker's exposure to the slot, nanoseconds.
-fn mean_age_ns(sent: &[Sent], from: HostTime, to: HostTime) -> i64 {
+fn mean_age_ns(sent: &[LinkFrame], from: HostTime, to: HostTime) -> i64 {
     let ages = sent.iter().filter(|s| s.due_at >= from && s.due_at < to);
     let ages: Vec<i64> = ages.filter_map(|s| Some(s.due_at.ns_since(s.captured_at?))).collect();
     ages.iter().sum::<i64>() / ages.len().max(1) as i64
@@ -330,7 +330,7 @@ fn the_lead_of_few_frames_is_no_longer_than_they_need() {
         let rate = format!("projector.frame_rate=\"{rate}\"");
         let sent = run_of(&[&rate], Strikes::Nothing, 100_000, false, 6_000, 700_000);
         let settled = sent.iter().filter(|s| s.due_at > HostTime(3_000 * MS));
-        let median = |of: fn(&Sent) -> i64| {
+        let median = |of: fn(&LinkFrame) -> i64| {
             let mut all: Vec<i64> = settled.clone().map(of).collect();
             all.sort_unstable();
             all[all.len() / 2]

@@ -8,7 +8,7 @@ use gltf::json::mesh::Semantic;
 use gltf::json::validation::Checked;
 
 use super::super::super::deforming::{MorphTarget, Place, Skeleton, SkeletonNode};
-use super::super::super::mesh::Dropped;
+use super::super::super::mesh::DropCounts;
 use super::super::super::part_motion::Track;
 use super::super::super::{DeformingMesh, SceneError, TriangleMesh};
 use super::super::deform::{Pose, Skin};
@@ -24,7 +24,7 @@ const MOST_NODES: usize = 1024;
 /// Why a mesh does not deform.
 type Reason = &'static str;
 /// Primitives by their numbers, with what was left out of them.
-type Pieces = Vec<(usize, (TriangleMesh, Dropped))>;
+type Pieces = Vec<(usize, (TriangleMesh, DropCounts))>;
 
 impl Gatherer<'_> {
     /// The meshes without skins that deform.

@@ -94,10 +94,10 @@ pub(super) fn decode(
     check_meaning(item, &file)?;
     let content = Content { item, file: &file, size };
     let mut stored = match (header.format, file.descriptor.model) {
-        (None, Some(ColorModel::ETC1S)) => Stored::of_bytes(basis::etc1s(&content)?),
-        (None, Some(ColorModel::UASTC)) => Stored::of_bytes(basis::uastc(&content)?),
+        (None, Some(ColorModel::ETC1S)) => StoredTexels::of_bytes(basis::etc1s(&content)?),
+        (None, Some(ColorModel::UASTC)) => StoredTexels::of_bytes(basis::uastc(&content)?),
         (None, model) => return Err(content.unsupported(&format!("of the colour model {model:?}"))),
-        (Some(format), _) => Stored::of(&content, format)?,
+        (Some(format), _) => StoredTexels::of(&content, format)?,
     };
     let order = file.note("KTXswizzle");
     if let Some(order) = order.as_deref().filter(|order| *order != "rgba") {
@@ -119,7 +119,7 @@ pub(super) fn decode(
 }
 
 /// What an image stores, as texels.
-struct Stored {
+struct StoredTexels {
     texels: Vec<[u8; 4]>,
     /// Channels, 1 to 4, beginning with red.
     channels: usize,
@@ -127,7 +127,7 @@ struct Stored {
     cut_off: bool,
 }
 
-impl Stored {
+impl StoredTexels {
     /// Texels of three or four channels that are bytes already.
     fn of_bytes(texels: Vec<[u8; 4]>) -> Self {
         Self { texels, channels: 4, cut_off: false }
