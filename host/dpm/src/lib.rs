@@ -1,7 +1,7 @@
 //! The program `dpm`: the rig controller and its tools on the command line.
 
-// What only a satellite calls is dead in a program without it.
-#![cfg_attr(not(feature = "satellites"), allow(dead_code))]
+// What only a satellite or the bar of a terminal calls is dead in a program without it.
+#![cfg_attr(not(all(feature = "satellites", feature = "terminal")), allow(dead_code))]
 
 pub mod cli;
 #[cfg(feature = "dlpc900")]

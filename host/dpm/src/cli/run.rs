@@ -2,7 +2,9 @@
 
 use super::own_runs;
 use super::rig_args::RigArgs;
-use super::watch::{check_file, check_out, print, run_and_report, watch, write_text};
+#[cfg(feature = "lab")]
+use super::watch::check_file;
+use super::watch::{check_out, print, run_and_report, watch, write_text};
 use crate::keep_parameters;
 #[cfg(feature = "lab")]
 use dpm_lab::film::{film, FilmRequest};
