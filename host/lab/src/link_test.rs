@@ -418,9 +418,9 @@ mod tests {
     use super::*;
     use dpm_device::link::DeviceState;
     use dpm_device::transport::inproc::Direct;
+    use dpm_mock::projector::MockProjector;
     use dpm_rig::config::Overrides;
     use dpm_rig::order::Order;
-    use hil_mock::projector::MockProjector;
 
     fn measured(frames_per_s: f64, link_busy: u64, no_credit: u64) -> LinkMeasurement {
         LinkMeasurement {
