@@ -457,7 +457,7 @@ mod tests {
         let mut asked = |held: u64| {
             let stands = |serial: u64| {
                 let told = "since yesterday".to_owned();
-                (serial == held).then(|| Stands { order: Order::Black, told, is_on_disk: true })
+                (serial == held).then_some(Stands { order: Order::Black, told, is_on_disk: true })
             };
             let mut at = 0;
             let mut now = || {
