@@ -26,7 +26,7 @@ impl LightError {
 }
 
 /// `start` after a motion along and about its own axes: `centre`, a point of the frame it starts from, moves by `by_m`
-/// metres, and the frame turns about it by the rotation vector `turn_rad`. [`Nudges::offset`] tells such a motion.
+/// metres, and the frame turns about it by the rotation vector `turn_rad`. The nudges of a calibration are such motions.
 pub fn moved(start: &DAffine3, centre: DVec3, by_m: DVec3, turn_rad: DVec3) -> DAffine3 {
     let rotation = so3_exp(turn_rad);
     *start * DAffine3::from_rotation_translation(rotation, centre + by_m - rotation * centre)

@@ -48,7 +48,7 @@ function roomView(canvas) {
   const middle = scaled(add(low, high), 0.5), reach = Math.max(Math.hypot(...add(high, low, -1)) / 2, 0.2);
   const back = [Math.sin(room.yaw) * Math.cos(room.pitch), Math.sin(room.pitch), Math.cos(room.yaw) * Math.cos(room.pitch)];
   const right = unit(cross([0, 1, 0], back)), up = cross(back, right);
-  const from = add(middle, back, 2.7 * reach / room.zoom), focal = 1.25 * Math.min(canvas.width, canvas.height * 1.4);
+  const from = add(middle, back, 3 * reach / room.zoom), focal = 1.25 * Math.min(canvas.width, canvas.height * 1.4);
   const seen = p => {
     const d = add(p, from, -1), far = -dot(d, back);
     return far > 0.01 * reach ? [canvas.width / 2 + focal * dot(d, right) / far, canvas.height / 2 - focal * dot(d, up) / far, far] : null;
