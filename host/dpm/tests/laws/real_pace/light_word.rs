@@ -148,31 +148,59 @@ fn order(word: &str, run: &Running) {
     assert_eq!(code(&output), 0, "{}", err(&output));
 }
 
-/// Found in use, O1: a rig without a tracker was green, up and lit, and so was one whose stages hung for 92 s.
-#[test]
-fn a_start_by_hand_a_lost_body_a_hung_stage_and_a_silent_tracker_are_called_by_their_name() {
-    let folder = Folder::new("word");
-    let far = PtyProjector::new("word", MockConfig::new(raster()));
-    // It serves the bunny alone.
-    let server = natnet(&MotionSpec::Still {}, [0.0, 0.1, 0.0]);
+/// Starts a rig of two bodies, of which the server at `port` serves the bunny alone. `safety`: what else its file says of `[safety]`.
+fn start_asked<'a>(
+    folder: &Folder,
+    far: &'a PtyProjector,
+    port: u16,
+    safety: &str,
+) -> (Running, PageWatch<'a>) {
     // Free for a moment at least, and nobody else in this test asks for one.
     let address = TcpListener::bind("127.0.0.1:0").unwrap().local_addr().unwrap();
     let rig = folder.write(
         "rig.toml",
         &format!(
             "[projector]\nwidth = {}\nheight = {}\nframe_rate = 30\nplanes = 8\nbackend = {}\n[render]\nspp = 1\n\
-             method = \"full\"\n[safety]\nstart = \"by hand\"\npredict_ms = 100\n[output]\ndir = {:?}\nlog_every_s = 0.5\n\
+             method = \"full\"\n[safety]\npredict_ms = 100\n{safety}\n[output]\ndir = {:?}\nlog_every_s = 0.5\n\
              [tracker]\nkind = \"natnet\"\nserver = \"127.0.0.1\"\nlocal = \"127.0.0.1\"\ncommand_port = {}\n\
              [[scene.bodies]]\nname = \"bunny\"\n[[scene.bodies]]\nname = \"venus\"\n[page]\nlisten = \"{address}\"\n",
             raster().width(),
             raster().height(),
             far.backend(""),
             folder.text(),
-            server.address().port(),
+            port,
         ),
     );
-    let mut run = start(&["run", &rig]);
-    let asked = PageWatch { address, far: &far };
+    (start(&["run", &rig]), PageWatch { address, far })
+}
+
+/// The page of a rig whose light rests again and again says so, and why.
+#[test]
+fn a_limit_is_called_by_its_name_on_the_page() {
+    let folder = Folder::new("word-rests");
+    let far = PtyProjector::new("word-rests", MockConfig::new(raster()));
+    let server = natnet(&MotionSpec::Still {}, [0.0, 0.1, 0.0]);
+    let limits = "flashes_per_second = 0\nlimits = { mean_level = 0.002, mean_window_s = 3.0 }";
+    let (run, asked) = start_asked(&folder, &far, server.address().port(), limits);
+    let begin = Instant::now();
+    while !asked.agrees("DARK")["now"]["light"]["told"].as_str().unwrap().contains("safety.limits.mean_level")
+    {
+        assert!(begin.elapsed() < LONG, "it never rests");
+    }
+    asked.agrees("PARTLY LIT");
+    run.signal("TERM");
+}
+
+/// Found in use, O1: a rig without a tracker was green, up and lit, and so was one whose stages hung for 92 s.
+#[test]
+fn a_start_by_hand_an_interlock_a_lost_body_a_hung_stage_and_a_silent_tracker_are_called_by_their_name() {
+    let folder = Folder::new("word");
+    let far = PtyProjector::new("word", MockConfig::new(raster()));
+    // It serves the bunny alone.
+    let server = natnet(&MotionSpec::Still {}, [0.0, 0.1, 0.0]);
+    let contact = folder.write("contact", "1");
+    let by_hand = format!("start = \"by hand\"\ninterlock = {{ kind = \"line\", file = {contact:?} }}");
+    let (mut run, asked) = start_asked(&folder, &far, server.address().port(), &by_hand);
     // First the projector is connected, and then the start waits for a person.
     let begin = Instant::now();
     while !asked.agrees("NEVER ARMED")["now"]["light"]["told"].as_str().unwrap().contains("safety.start") {
@@ -186,6 +214,12 @@ fn a_start_by_hand_a_lost_body_a_hung_stage_and_a_silent_tracker_are_called_by_t
     order("black", &run);
     asked.agrees("DARK BY ORDER");
     order("arm", &run);
+    asked.agrees("PARTLY LIT");
+    folder.write("contact", "0");
+    let state = asked.agrees("DARK");
+    let told = state["now"]["light"]["told"].as_str().unwrap();
+    assert!(told.contains("safety.interlock"), "{told}");
+    folder.write("contact", "1");
     asked.agrees("PARTLY LIT");
     // A stage hangs, and so does the supervisor, which would replace it before the light had been gone for a second.
     let all = threads(run.id());
@@ -204,7 +238,6 @@ fn a_start_by_hand_a_lost_body_a_hung_stage_and_a_silent_tracker_are_called_by_t
     assert!(told.contains("bunny: the tracker has not reported it") && told.contains("venus: "), "{told}");
     let metrics = asked.get("/metrics").unwrap();
     assert!(metrics.contains("dpm_body_lit{body=\"bunny\"} 0\n"), "{metrics}");
+    run.wait_for_line(LONG, |line| line.contains("\"light\":\"dark\""));
     run.signal("TERM");
-    let rest = run.rest_of_lines(LONG);
-    assert!(rest.iter().any(|line| line.contains("\"light\":\"dark\"")), "{rest:?}");
 }
