@@ -6,6 +6,7 @@ use std::io::{BufRead, BufReader, Read};
 use std::path::PathBuf;
 use std::process::{Child, Command, ExitStatus, Output, Stdio};
 use std::sync::mpsc::{channel, Receiver};
+use std::sync::Once;
 use std::time::{Duration, Instant};
 
 /// No Vulkan driver, whatever the machine has.
@@ -14,7 +15,11 @@ pub(crate) const NO_DRIVER: [(&str, &str); 2] =
 
 /// A folder of this test program for locks, sockets and standing orders of the programs that it starts.
 pub(crate) fn own_folder(name: &str) -> PathBuf {
-    PathBuf::from(env!("CARGO_TARGET_TMPDIR")).join(format!("dpm-{}", std::process::id())).join(name)
+    static CLEARED: Once = Once::new();
+    let own = PathBuf::from(env!("CARGO_TARGET_TMPDIR")).join(format!("dpm-{}", std::process::id()));
+    // An earlier test had the same number, and what it ordered would stand.
+    CLEARED.call_once(|| drop(std::fs::remove_dir_all(&own)));
+    own.join(name)
 }
 
 /// The program with arguments, in an environment without our settings. It does not see what this machine's own rigs
