@@ -338,6 +338,11 @@ impl Laws {
         self.hidden_until = self.hidden_until.max(t);
     }
 
+    /// The program may still have to find a fault at `t`, and end by it.
+    pub fn is_hidden(&self, t: i64) -> bool {
+        t <= self.hidden_until
+    }
+
     /// Until then the disk may still be busy with an order.
     pub fn slow_disk_until(&mut self, t: i64) {
         self.slow_disk_until = self.slow_disk_until.max(t);

@@ -291,7 +291,11 @@ impl World {
     /// Frames queue between the stages, or the cable is too slow for them.
     fn strike_flow(&mut self, kind: Kind, dice: &mut Dice) {
         let slot_ns = S / i64::from(self.setup.rate_hz);
-        let begins = self.is_alone() && self.laws.is_lit_well(self.t) && !self.laws.is_slow(self.t);
+        // A program that ends by an earlier fault, as by a collector that never returns, is dark until it has begun again.
+        let begins = self.is_alone()
+            && self.laws.is_lit_well(self.t)
+            && !self.laws.is_slow(self.t)
+            && !self.laws.is_hidden(self.t);
         let (lasts_ns, spell) = if kind == Kind::X17 {
             // The stages keep up again after so long.
             let slow_ns = dice.between(50, 200) * MS + 4 * slot_ns;

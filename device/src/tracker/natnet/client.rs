@@ -137,6 +137,10 @@ pub struct NatNetClient {
     version_changes: u64,
     is_filtered: bool,
     polled_at: Option<HostTime>,
+    /// Nobody read for a while, and the sockets have not been empty since.
+    has_backlog: bool,
+    /// From the wall clock, which the kernel stamps by, to the host's clock, when the sockets were last empty.
+    wall_offset_ns: Option<i64>,
     /// The arrival of the datagram that is being read is known.
     is_arrival_known: bool,
     /// Bit stream that was requested and is not confirmed yet.
@@ -244,6 +248,8 @@ impl NatNetClient {
             asked: None,
             is_filtered: false,
             polled_at: None,
+            has_backlog: false,
+            wall_offset_ns: None,
             is_arrival_known: true,
             refused: None,
         }
@@ -521,6 +527,10 @@ impl NatNetClient {
     }
 
     fn on_echo(&mut self, payload: &[u8], at: HostTime) -> Verdict {
+        if !self.is_arrival_known {
+            // How long it was on its way is not known, so it says nothing of the server's clock.
+            return Verdict::Used(0);
+        }
         match msg::decode_echo_response(payload) {
             Ok((stamp, ticks)) if self.server_clock.on_echo(stamp, ticks, at) => Verdict::Used(0),
             Ok(_) => Verdict::Unsupported,
@@ -608,6 +618,12 @@ impl NatNetClient {
                 }
                 continue;
             };
+            if !self.is_arrival_known && self.config.kernel_stamps {
+                // It may have waited for seconds, and meanwhile the server's clock, or this machine's, may have been set
+                // or stopped: no map dates it. The next frame is a few milliseconds away.
+                self.gate.count_unknown_age();
+                continue;
+            }
             let sample = TrackerSample {
                 body: self.lookup[found].1,
                 pose: Pose {
@@ -637,41 +653,48 @@ enum Verdict {
 
 impl Tracker for NatNetClient {
     fn poll(&mut self, now: HostTime, sink: &mut dyn FnMut(&TrackerSample)) -> Result<usize, TrackerError> {
-        // What arrived while nobody read has an unknown arrival, unless the kernel stamped it.
+        // What arrived while nobody read has an unknown arrival, unless the kernel stamped it. It may be more than one poll reads.
         let was_away = self.polled_at.is_some_and(|at| now.ns_since(at) > AWAY_NS);
         self.polled_at = Some(now);
+        self.has_backlog |= was_away;
         self.housekeeping(now, was_away);
         let foreign = |c: &TrackerCounters| (c.packets.foreign_source, c.packets.foreign_port);
         let before = foreign(self.gate.counters());
         let (mut delivered, mut budget, mut offset) = (0, Self::MAX_DATAGRAMS_PER_POLL, None);
-        let mut is_crowded = false;
+        let (mut is_crowded, mut is_all_read) = (false, true);
         // Commands first: names and clock before the frames that need them. They are few; frames get the rest of the budget.
         for is_data in [false, true] {
             let alone = is_data || self.data.is_none();
             let mut share = if alone { budget } else { Self::MAX_DATAGRAMS_PER_POLL / 2 };
+            let mut is_empty = false;
             while share > 0 && budget > 0 {
                 let port = if is_data { self.data.as_deref() } else { Some(&*self.command) };
+                is_empty = true;
                 let Some(port) = port else { break };
                 let arrival = port.receive(&mut self.buffer).map_err(|source| TrackerError::Io {
                     context: "NatNet: receiving failed; is the network interface still up?".into(),
                     source,
                 })?;
                 let Some(arrival) = arrival else { break };
+                is_empty = false;
                 share -= 1;
                 is_crowded |= share == 0;
                 budget -= 1;
                 let here = self.clock.now();
-                self.is_arrival_known = !was_away;
+                self.is_arrival_known = !self.has_backlog;
                 let at = match arrival.kernel_ns.filter(|_| self.config.kernel_stamps) {
                     Some(stamp) => {
-                        self.is_arrival_known = true;
-                        let offset = *offset.get_or_insert_with(|| port.realtime_offset_ns(&*self.clock));
-                        let stamped = HostTime(stamp.saturating_add(offset)).min(here);
-                        // A very old stamp comes from a stepped wall clock, not from the arrival.
-                        if here.ns_since(stamped) > 10_000 * MS {
-                            here
+                        let now = *offset.get_or_insert_with(|| port.realtime_offset_ns(&*self.clock));
+                        // Set while nobody read, the wall clock stamped what waits by two measures.
+                        let is_steady = self.wall_offset_ns.is_none_or(|was| now.abs_diff(was) <= MS as u64);
+                        let stamped = HostTime(stamp.saturating_add(now));
+                        let is_plausible = (-MS..=10_000 * MS).contains(&here.ns_since(stamped));
+                        self.is_arrival_known |= is_plausible && is_steady;
+                        // A very old stamp, or one of the future, comes from a stepped wall clock, not from the arrival.
+                        if is_plausible {
+                            stamped.min(here)
                         } else {
-                            stamped
+                            here
                         }
                     }
                     None => here,
@@ -683,6 +706,11 @@ impl Tracker for NatNetClient {
                     self.data = None;
                 }
             }
+            is_all_read &= is_empty;
+        }
+        self.has_backlog &= !is_all_read;
+        if !self.has_backlog {
+            self.wall_offset_ns = offset.or(self.wall_offset_ns);
         }
         if is_crowded && before != foreign(self.gate.counters()) && !self.is_filtered {
             // Other senders fill the queue: let the kernel drop their datagrams from now on, uncounted.
@@ -753,3 +781,7 @@ impl NatNetClient {
         }
     }
 }
+
+#[cfg(test)]
+#[path = "client_tests.rs"]
+mod tests;

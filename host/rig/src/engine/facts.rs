@@ -41,6 +41,8 @@ pub(crate) struct Facts {
     pub travel_ns: AtomicI64,
     /// When all stages were last found alive.
     pub alive_at_ns: AtomicI64,
+    /// A crew was replaced, and the link has not seen it: however soon the next one works, a frozen picture is not held.
+    pub crew_lost: AtomicBool,
     /// Number of the next frame.
     pub next_frame: AtomicU64,
     /// The slot after the last one to be planned; 0 while it is not known.
@@ -103,6 +105,7 @@ impl Facts {
             typical_ns: AtomicI64::new(lead.typical_ns()),
             travel_ns: AtomicI64::new(RECEIPT_NS),
             alive_at_ns: AtomicI64::new(now.0),
+            crew_lost: AtomicBool::new(false),
             next_frame: AtomicU64::new(0),
             end_slot: AtomicU64::new(0),
             slots_a_frame: AtomicU64::new(1),

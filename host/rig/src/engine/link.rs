@@ -172,7 +172,9 @@ impl<P: Pace> LinkStage<P> {
     /// Polls the link and does what is due between frames.
     pub(crate) fn poll(&mut self, now: HostTime, transport: &mut dyn Transport) {
         let Self { facts, link, keeper, follower, slack, seen, slot_ns, medium_queue, stands, .. } = self;
-        let alive = now.ns_since(HostTime(facts.alive_at_ns.load(Ordering::Relaxed))) <= ALIVE_WITHIN_NS;
+        let lost = facts.crew_lost.swap(false, Ordering::Relaxed);
+        let alive =
+            !lost && now.ns_since(HostTime(facts.alive_at_ns.load(Ordering::Relaxed))) <= ALIVE_WITHIN_NS;
         let result = keeper.poll(now, link, transport, !P::FOLLOWS_CLOCK, alive, &facts.monitor);
         let now_seen = [link.counters().sessions, keeper.clock_steps()];
         if std::mem::replace(seen, now_seen) != now_seen {

@@ -298,6 +298,7 @@ impl Supervision {
     pub(crate) fn judge(&mut self, trouble: Trouble, now: HostTime) -> Verdict {
         let facts = self.facts.clone();
         facts.gpu_since_ns.store(i64::MAX, Ordering::Relaxed);
+        facts.crew_lost.store(true, Ordering::Relaxed);
         if let Trouble::Panicked(_) = trouble {
             facts.fail(trouble.into_error());
             return Verdict::End;

@@ -397,6 +397,24 @@ fn no_frame_is_frozen_where_heads_are_guarded() {
     }
 }
 
+/// A picture that is held when a crew is lost ends, however soon the next crew works.
+#[test]
+fn a_frozen_picture_ends_with_the_crew_that_drew_it() {
+    let mut bench = bench(&[], RunOptions::default());
+    let mut stage = bench.link::<Real>();
+    bench.facts.monitor.give_order(Order::Freeze);
+    for ms in 0..40 {
+        let now = bench.now.plus_ns(ms * MS);
+        bench.facts.alive_at_ns.store(now.0, Ordering::Relaxed);
+        bench.facts.crew_lost.fetch_or(ms == 20, Ordering::Relaxed);
+        stage.poll(now, &mut bench.cable);
+        if ms == 19 {
+            assert_eq!(bench.cable.device_mut().projector().status().state, DeviceState::Frozen);
+        }
+    }
+    assert_eq!(bench.cable.device_mut().projector().status().state, DeviceState::Black);
+}
+
 /// How long after the last frame the projector is told to be dark, nanoseconds; `None`: never.
 fn told_after<P: Pace>(stopped: bool) -> Option<i64> {
     let mut bench = bench(&[], RunOptions::default());
