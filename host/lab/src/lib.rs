@@ -29,6 +29,7 @@ pub mod plan_savings;
 pub mod reference;
 pub mod report;
 pub mod room;
+pub mod rounding;
 pub mod scene_plan;
 pub mod sequence;
 pub mod snapshot;

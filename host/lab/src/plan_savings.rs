@@ -1,6 +1,7 @@
 //! One part of a rig's plan, in and out, into what it costs: time and rays of a frame, and whether a pixel changes.
 
 use super::median::{median, quartiles};
+use super::rounding::Rounding;
 use super::sequence::{draw, poses_at};
 use dpm_common::clock::Stopwatch;
 use dpm_render::gpu::Gpu;
@@ -30,6 +31,8 @@ pub struct Saving {
     pub with_rays: f64,
     /// Every code value and every bit of radiance is the same.
     pub pixels_identical: bool,
+    /// How the pictures differ.
+    pub rounding: Rounding,
     /// RMS difference of the last frame's radiance by its mean.
     pub difference: f64,
     /// The part is there for the picture: with it another one is drawn. Else it is code that nothing calls for, and no pixel may change.
@@ -48,10 +51,20 @@ impl Saving {
         low > 0.0 || high < 0.0
     }
 
-    /// A pixel changed that must not.
-    pub fn is_wrong(&self) -> bool {
-        !self.changes_pictures && !self.pixels_identical
+    /// A pixel changed that must not, on a device that keeps bits, or by more than rounding on one that does not.
+    pub fn is_wrong(&self, keeps_bits: bool) -> bool {
+        !self.changes_pictures && !self.pixels_identical && (keeps_bits || !self.rounding.is_rounding())
     }
+}
+
+/// Whether the device's compiler keeps the bits of a computation from one program to the next: all parts but at most one
+/// keep them, and these are three at least. Then the one that does not is wrong, and is no matter of rounding.
+pub(super) fn keeps_bits<'a>(savings: impl Iterator<Item = &'a Saving>) -> bool {
+    let (mut same, mut differing) = (0, 0);
+    for saving in savings.filter(|s| !s.changes_pictures) {
+        *if saving.pixels_identical { &mut same } else { &mut differing } += 1;
+    }
+    differing <= 1 && same >= 3
 }
 
 /// Frames timed of each renderer, in turns so that both meet the same disturbances; the first two of each are not counted.
@@ -206,7 +219,7 @@ pub(crate) fn compare(
     let mut renderers = [open(without)?, open(with)?];
     let mut slots: [FrameSlot; 2] = [renderers[0].create_slot(true)?, renderers[1].create_slot(true)?];
     let (mut times, mut rays) = ([Vec::new(), Vec::new()], [0.0f64; 2]);
-    let (mut pixels_identical, mut difference) = (true, 0.0);
+    let (mut rounding, mut difference) = (Rounding::default(), 0.0);
     let spp = rig.config.render.spp;
     for k in 0..FRAMES {
         let poses = poses_at(rig, u64::from(k));
@@ -219,8 +232,7 @@ pub(crate) fn compare(
             rays[i] += f64::from(counters.rays) / f64::from(FRAMES);
         }
         let [a, b] = [0, 1].map(|i: usize| slots[i].radiance().unwrap_or(&[]));
-        let same = |(a, b): (&[f32; 4], &[f32; 4])| a.map(f32::to_bits) == b.map(f32::to_bits);
-        pixels_identical &= slots[0].codes() == slots[1].codes() && a.iter().zip(b).all(same);
+        rounding.add([a, b], [slots[0].codes(), slots[1].codes()]);
         difference = relative_rms(a, b);
     }
     let times = times.map(|t| t.into_iter().skip(SETTLE).map(|ns| ns as f64 * 1e-6).collect::<Vec<f64>>());
@@ -236,7 +248,8 @@ pub(crate) fn compare(
         saved_middle_half_ms: quartiles(differences),
         without_rays,
         with_rays,
-        pixels_identical,
+        pixels_identical: rounding.keeps_bits(),
+        rounding,
         difference,
         changes_pictures: false,
     })

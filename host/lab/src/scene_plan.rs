@@ -1,6 +1,6 @@
 //! `dpm plan`: a rig into what its scene and method need of the renderer, what is left out of it and how, and what that saves.
 
-use super::plan_savings::{changed, compare, flipped, keeping, Saving, Side};
+use super::plan_savings::{changed, compare, flipped, keeping, keeps_bits, Saving, Side};
 use super::temporal_light::TemporalLight;
 use dpm_common::clock::Stopwatch;
 use dpm_device::planes::Channel;
@@ -434,10 +434,11 @@ pub fn scene_plan(config: &RigConfig, measure: bool) -> Result<PlanReport, Failu
         body_list: false,
     };
     report.together = Some(pair(mine, Side { keep: all, ..mine })?);
+    let keeps_bits = keeps_bits(report.entries.iter().filter_map(|e| e.saving.as_ref()));
     let changed: Vec<&str> = (report.entries.iter())
-        .filter(|e| e.saving.as_ref().is_some_and(Saving::is_wrong))
+        .filter(|e| e.saving.as_ref().is_some_and(|s| s.is_wrong(keeps_bits)))
         .map(|e| e.feature)
-        .chain(report.together.iter().filter(|s| s.is_wrong()).map(|_| "all together"))
+        .chain(report.together.iter().filter(|s| s.is_wrong(keeps_bits)).map(|_| "all together"))
         .collect();
     if changed.is_empty() {
         return Ok(report);

@@ -43,7 +43,14 @@ fn saved(s: &Saving) -> String {
             100.0 * s.difference
         );
     }
-    let same = if s.pixels_identical { "same pixels" } else { "PIXELS DIFFER" };
+    let (r, moved) = (&s.rounding, 100.0 * s.rounding.moved_share());
+    let by = format!("{} of {} lit pixels, {moved:.2} % show other samples", r.differing, r.lit);
+    let by = format!("{by}, the mean is {:+.1e} of itself off", r.mean_difference());
+    let same = match (s.pixels_identical, r.is_rounding()) {
+        (true, _) => "same pixels".to_owned(),
+        (false, true) => format!("same up to rounding ({by})"),
+        (false, false) => format!("PIXELS DIFFER ({by})"),
+    };
     format!("{:.2} ms instead of {:.2} ms: {cost}; {same}", s.without_ms, s.with_ms)
 }
 
