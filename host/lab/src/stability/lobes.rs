@@ -422,13 +422,15 @@ fn closed_forms() -> Vec<ClosedForm> {
             let lit = even(3.0 * (1.0 - c * f) + c * f);
             all.push(ClosedForm::new(name("a lamp"), lamp, mu, lit, 2e-2));
         }
-        all.push(ClosedForm::new(
-            format!("rough coat over white at {mu}"),
-            with(white(), |l| l.coat = coat(1.0, 0.6)),
-            mu,
-            even(1.0),
-            6e-3,
-        ));
+        for factor in [1.0, 0.4] {
+            all.push(ClosedForm::new(
+                format!("rough coat of {factor} over white at {mu}"),
+                with(white(), |l| l.coat = coat(factor, 0.6)),
+                mu,
+                even(1.0),
+                6e-3,
+            ));
+        }
         let color = Vec3::new(4.0, 0.5, 0.0);
         let tinted = Specular { factor: 0.6, color, ..Specular::default() };
         let rise = (f - 0.04) / 0.96;
