@@ -100,7 +100,7 @@ mod tests {
 
     const PIXELS: usize = 64 * 48;
 
-    /// Numbers from 0 to 1 [Steele14].
+    /// Numbers from 0 to 1, by SplitMix64.
     struct Random(u64);
 
     impl Random {
