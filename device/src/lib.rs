@@ -72,6 +72,7 @@ pub mod rng;
 pub mod sensor;
 #[cfg(feature = "std")]
 mod stream;
+pub mod tag36h11;
 pub mod time;
 #[cfg(feature = "std")]
 pub mod tracker;

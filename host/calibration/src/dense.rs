@@ -57,7 +57,7 @@ pub(crate) fn svd(mut columns: Columns) -> Svd {
 }
 
 /// Solves `A x = b` for a symmetric positive definite matrix in rows; `None` if it is not positive definite.
-pub(crate) fn solve_spd(a: &[Vec<f64>], b: &[f64]) -> Option<Vec<f64>> {
+pub fn solve_spd(a: &[Vec<f64>], b: &[f64]) -> Option<Vec<f64>> {
     let l = cholesky(a)?;
     let n = b.len();
     let mut x = b.to_vec();
@@ -84,7 +84,7 @@ pub(crate) fn inverse_diagonal(a: &[Vec<f64>]) -> Option<Vec<f64>> {
 }
 
 /// Inverse of a symmetric positive definite matrix in rows; `None` if it is not positive definite.
-pub(crate) fn inverse_spd(a: &[Vec<f64>]) -> Option<Vec<Vec<f64>>> {
+pub fn inverse_spd(a: &[Vec<f64>]) -> Option<Vec<Vec<f64>>> {
     let n = a.len();
     (0..n)
         .map(|i| {

@@ -5,7 +5,7 @@ use crate::dense::solve_spd;
 
 /// Half the weighted sum of squares around a state, to second order: `cost - slope . d + d . hessian . d / 2`.
 #[derive(Clone, Debug)]
-pub(crate) struct Equations {
+pub struct Equations {
     parameters: usize,
     /// Lower triangle of J^T W J, in rows of full length.
     hessian: Vec<f64>,
@@ -17,7 +17,7 @@ pub(crate) struct Equations {
 
 /// The weight of a residual under Huber's loss, and half its loss. Residuals up to `knee` count by their square, larger
 /// ones by their size.
-pub(crate) fn huber(size: f64, knee: f64) -> (f64, f64) {
+pub fn huber(size: f64, knee: f64) -> (f64, f64) {
     if size <= knee {
         (1.0, 0.5 * size * size)
     } else {
@@ -26,7 +26,8 @@ pub(crate) fn huber(size: f64, knee: f64) -> (f64, f64) {
 }
 
 impl Equations {
-    pub(crate) fn new(parameters: usize) -> Self {
+    /// No residual yet, of so many parameters.
+    pub fn new(parameters: usize) -> Self {
         Self {
             parameters,
             hessian: vec![0.0; parameters * parameters],
@@ -36,7 +37,7 @@ impl Equations {
     }
 
     /// Adds a residual with its derivatives. The caller adds the cost, since the loss need not be the square.
-    pub(crate) fn add(&mut self, row: &[f64], residual: f64, weight: f64) {
+    pub fn add(&mut self, row: &[f64], residual: f64, weight: f64) {
         let n = self.parameters;
         for (a, value) in row.iter().enumerate() {
             let scaled = value * weight;
@@ -52,7 +53,7 @@ impl Equations {
 
     /// Adds what is known of a parameter beforehand: it deviates from the expectation by `deviation`, give or take
     /// `sigma`. A sigma that is infinite says nothing.
-    pub(crate) fn expect(&mut self, parameter: usize, deviation: f64, sigma: f64) {
+    pub fn expect(&mut self, parameter: usize, deviation: f64, sigma: f64) {
         let weight = 1.0 / (sigma * sigma);
         self.slope[parameter] -= weight * deviation;
         self.hessian[parameter * self.parameters + parameter] += weight;
@@ -60,24 +61,27 @@ impl Equations {
     }
 
     /// The symmetric matrix in rows.
-    pub(crate) fn matrix(&self) -> Vec<Vec<f64>> {
+    pub fn matrix(&self) -> Vec<Vec<f64>> {
         let n = self.parameters;
         (0..n).map(|i| (0..n).map(|j| self.hessian[i.max(j) * n + i.min(j)]).collect()).collect()
     }
 }
 
 /// Where a descent ended.
-pub(crate) struct Descent<S> {
+pub struct Descent<S> {
+    /// The last state.
     pub state: S,
     /// The equations at `state`.
     pub equations: Equations,
+    /// Whether nothing is left to gain.
     pub converged: bool,
+    /// Steps made.
     pub steps: usize,
 }
 
 /// Goes down from `start`. `equations` gives the equations of a state, `cost` only their cost (infinite where the state
 /// is impossible), and `step` a neighbour. `None` if the start is impossible.
-pub(crate) fn descend<S: Clone>(
+pub fn descend<S: Clone>(
     start: S,
     most_steps: usize,
     equations: impl Fn(&S) -> Option<Equations>,

@@ -9,8 +9,8 @@
 
 pub mod body;
 pub mod check;
-mod dense;
-mod least_squares;
+pub mod dense;
+pub mod least_squares;
 pub mod light;
 pub mod nudge;
 pub mod outline;

@@ -31,6 +31,7 @@
 //! # }
 //! ```
 
+pub mod camera;
 pub mod faults;
 pub mod hand;
 pub mod line_port;
