@@ -21,3 +21,47 @@ impl Pose {
             && (norm2 - 1.0).abs() <= 2.0 * tolerance + tolerance * tolerance
     }
 }
+
+/// Covariance of a pose: of the position, m, and of a rotation vector on the left, rad, in the axes of the position.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct PoseCovariance {
+    /// The lower triangle by rows: 1 entry, then 2, up to 6. Position first.
+    pub lower: [f32; 21],
+}
+
+impl PoseCovariance {
+    /// Of a symmetric matrix, whose lower triangle is read.
+    pub fn of(matrix: &[[f64; 6]; 6]) -> Self {
+        let mut lower = [0.0; 21];
+        let mut at = 0;
+        for (i, row) in matrix.iter().enumerate() {
+            for value in &row[..=i] {
+                lower[at] = *value as f32;
+                at += 1;
+            }
+        }
+        Self { lower }
+    }
+
+    /// The whole matrix.
+    pub fn matrix(&self) -> [[f64; 6]; 6] {
+        let mut out = [[0.0; 6]; 6];
+        let mut at = 0;
+        for i in 0..6 {
+            for j in 0..=i {
+                out[i][j] = f64::from(self.lower[at]);
+                out[j][i] = out[i][j];
+                at += 1;
+            }
+        }
+        out
+    }
+
+    /// The variances of the position along each axis, m^2, and of the rotation about each, rad^2; `None` if one of them is
+    /// not finite or not above 0, which no measurement has.
+    pub fn variances(&self) -> Option<[[f64; 3]; 2]> {
+        let diagonal = [0, 2, 5, 9, 14, 20].map(|i| f64::from(self.lower[i]));
+        let possible = diagonal.iter().all(|v| v.is_finite() && *v > 0.0);
+        possible.then(|| [[diagonal[0], diagonal[1], diagonal[2]], [diagonal[3], diagonal[4], diagonal[5]]])
+    }
+}

@@ -363,6 +363,7 @@ mod tests {
             pose: Pose { position_m: [k as f64 * 1e-3, 0.0, 0.0], ..Pose::IDENTITY },
             tracked: true,
             mean_error_m: 0.0,
+            covariance: None,
             sequence: k as u32,
             captured_at: HostTime(k * 2_000_000),
             received_at: HostTime(k * 2_000_000 + 1_000_000),

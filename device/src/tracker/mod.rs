@@ -10,7 +10,7 @@ pub mod vrpn;
 
 pub use gate::{BodyCounters, PacketCounters, SampleCounters, SampleGate, TrackerCounters};
 
-use crate::pose::Pose;
+use crate::pose::{Pose, PoseCovariance};
 pub use crate::stream::{Opener, Stream};
 use crate::time::HostTime;
 use std::time::Duration;
@@ -39,6 +39,8 @@ pub struct TrackerSample {
     pub tracked: bool,
     /// The tracker's mean marker error, metres; 0 when it gives none.
     pub mean_error_m: f32,
+    /// By the tracker's own account, in the world's axes; `None` from a tracker that gives none.
+    pub covariance: Option<PoseCovariance>,
     /// The tracker's frame number (wraps as the protocol does).
     pub sequence: u32,
     /// Mid-exposure, mapped to the host's clock.

@@ -308,6 +308,7 @@ fn get_sample(bytes: &[u8; SAMPLE_BYTES]) -> TrackerSample {
         captured_at: HostTime(i64::from_le_bytes(at(bytes, 8))),
         received_at: HostTime(i64::from_le_bytes(at(bytes, 16))),
         mean_error_m: f32::from_le_bytes(at(bytes, 24)),
+        covariance: None,
         pose: Pose {
             position_m: [number(0), number(1), number(2)],
             rotation_xyzw: [number(3), number(4), number(5), number(6)],

@@ -27,6 +27,7 @@ fn sample(k: u32, body: u16, now: HostTime) -> TrackerSample {
         pose: Pose { position_m: [x, -x / 3.0, f64::from(body)], rotation_xyzw: [0.6, 0.0, 0.0, 0.8] },
         tracked: !k.is_multiple_of(7),
         mean_error_m: 1.25e-4,
+        covariance: None,
         sequence: (u32::MAX - 3).wrapping_add(k),
         captured_at: now.plus_ns(-1_234_567),
         received_at: now,

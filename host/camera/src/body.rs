@@ -3,7 +3,7 @@
 use crate::constellation;
 use crate::planar::poses_of_square;
 use crate::pose::{Observation, PoseFit, Problem, Velocity};
-use crate::{SpotSighting, TagSighting};
+use crate::sightings::{Expectation, Sightings};
 use dpm_common::so3::so3_between;
 use dpm_scene::geometry::projector::ProjectorCamera;
 use glam::{DAffine3, DVec3};
@@ -38,35 +38,9 @@ pub struct Markings {
     pub markers: Vec<DVec3>,
 }
 
-/// What one camera saw in one picture.
-#[derive(Clone, Copy, Debug)]
-pub struct Sightings<'a> {
-    /// Tags.
-    pub tags: &'a [TagSighting],
-    /// Spots.
-    pub spots: &'a [SpotSighting],
-    /// By how much later each row is exposed than the one above it, seconds; 0 for a global shutter.
-    pub row_s: f64,
-    /// The row that was exposed at the pose's instant.
-    pub row: f64,
-}
-
-/// Where a body is expected to be.
-#[derive(Clone, Copy, Debug, PartialEq)]
-pub struct Expectation {
-    /// From the body to the cameras' space.
-    pub pose: DAffine3,
-    /// Its motion, for a rolling shutter.
-    pub velocity: Velocity,
-    /// By how much it may have turned otherwise, rad, one standard deviation.
-    pub turn: f64,
-    /// By how much it may have moved otherwise, metres, one standard deviation.
-    pub shift: f64,
-}
-
 /// A body in the cameras' space.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub struct Located {
+pub struct BodyPose {
     /// Its pose. The covariance reaches to the other pose that may be the true one.
     pub fit: PoseFit,
     /// The odds that another pose is the true one, 0 to 0.5.
@@ -77,7 +51,7 @@ pub struct Located {
     pub points: usize,
 }
 
-impl Located {
+impl BodyPose {
     /// Whether the pose may be used: no pose that is as good is turned away from it by more than a filter bears.
     pub fn is_certain(&self) -> bool {
         self.doubt < MOST_DOUBT || self.apart < SMALL_TURN
@@ -104,7 +78,7 @@ impl Markings {
         cameras: &[ProjectorCamera],
         sightings: &[Sightings<'_>],
         expected: Option<&Expectation>,
-    ) -> Option<Located> {
+    ) -> Option<BodyPose> {
         let (observations, starts) = self.tag_observations(cameras, sightings);
         let velocity = expected.map_or(Velocity::default(), |e| e.velocity);
         if observations.len() >= 4 {
@@ -151,7 +125,7 @@ impl Markings {
 }
 
 /// The best pose that the solver reaches from the starts, and what speaks for the next best.
-fn choose(problem: &Problem<'_>, starts: &[DAffine3], expected: Option<&Expectation>) -> Option<Located> {
+fn choose(problem: &Problem<'_>, starts: &[DAffine3], expected: Option<&Expectation>) -> Option<BodyPose> {
     let mut found: Vec<(PoseFit, f64)> = Vec::new();
     for start in expected.map(|e| e.pose).iter().chain(starts) {
         let Some(fit) = problem.refine(start) else { continue };
@@ -178,14 +152,5 @@ fn choose(problem: &Problem<'_>, starts: &[DAffine3], expected: Option<&Expectat
             (doubt, apart) = (odds, turn);
         }
     }
-    Some(Located { fit, doubt, apart, points: problem.observations.len() })
-}
-
-impl Expectation {
-    /// What speaks against a pose: half its squared distance in standard deviations.
-    fn against(&self, fit: &PoseFit) -> f64 {
-        let turn = so3_between(glam::DQuat::from_mat3(&glam::DMat3::from(self.pose.matrix3)), fit.rotation);
-        let shift = fit.position - self.pose.translation;
-        0.5 * (turn.length() / self.turn).powi(2) + 0.5 * (shift.length() / self.shift).powi(2)
-    }
+    Some(BodyPose { fit, doubt, apart, points: problem.observations.len() })
 }

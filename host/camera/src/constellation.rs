@@ -4,9 +4,9 @@
 //! choice of three spots for three markers gives two poses by scaled orthography (\[Alter94\]), which the solver refines, and
 //! the pose that explains most spots wins. Two poses that are equally good are refused.
 
-use crate::body::{Expectation, Sightings};
+use crate::blobs::SpotSighting;
 use crate::pose::{Observation, PoseFit, Problem, Velocity};
-use crate::SpotSighting;
+use crate::sightings::{Expectation, Sightings};
 use dpm_scene::geometry::projector::ProjectorCamera;
 use glam::{DAffine3, DMat3, DVec2, DVec3};
 

@@ -37,10 +37,12 @@ mod image;
 mod outline;
 mod planar;
 mod pose;
+mod sightings;
 mod threshold;
 
 pub use blobs::{SpotDetector, SpotSighting};
-pub use body::{Expectation, Located, Markings, Sightings, TagPlace};
+pub use body::{BodyPose, Markings, TagPlace};
 pub use detect::{TagDetector, TagSighting, TAGS};
 pub use image::{GreyImage, LEAST_SIDE, MOST_SIDE};
 pub use pose::{Covariance, Observation, PoseFit, Velocity};
+pub use sightings::{Expectation, Sightings};

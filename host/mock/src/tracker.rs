@@ -222,6 +222,7 @@ impl SampleSource {
             pose,
             tracked: !strikes(FaultKind::Invalid),
             mean_error_m: self.config.position_noise_m as f32,
+            covariance: None,
             sequence: k.saturating_sub(first_since_reset) as u32,
             captured_at: self.at(t),
             received_at: self.at(t),

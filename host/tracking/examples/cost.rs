@@ -60,6 +60,7 @@ fn sample(body: u16, k: i64, hz: i64, still: bool) -> TrackerSample {
         },
         tracked: true,
         mean_error_m: 0.0,
+        covariance: None,
         sequence: k as u32,
         captured_at,
         received_at: captured_at.plus_ns(2_000_000),

@@ -185,6 +185,7 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
                 pose: Pose { position_m: p.to_array(), rotation_xyzw: q.to_array() },
                 tracked: true,
                 mean_error_m: 0.0,
+                covariance: None,
                 sequence: i as u32,
                 captured_at: HostTime(*at),
                 received_at: HostTime(*at),

@@ -566,9 +566,9 @@ pub struct Imm<C: Chart> {
 }
 
 impl<C: Chart> Imm<C> {
-    /// Starts at a measured point of variance `r` with unknown velocity.
-    pub fn new(config: &ImmConfig, z: C::Point, r: f64) -> Self {
-        Self { base: z, axes: [AxisBank::new(config, r); 3] }
+    /// Starts at a measured point of variance `r` along each axis with unknown velocity.
+    pub fn new(config: &ImmConfig, z: C::Point, r: DVec3) -> Self {
+        Self { base: z, axes: r.to_array().map(|r| AxisBank::new(config, r)) }
     }
 
     /// Weight of each model on each axis; each row sums to 1.
@@ -636,11 +636,11 @@ impl<C: Chart> Imm<C> {
         self.rebase();
     }
 
-    /// Squared Mahalanobis distance of a measurement of variance `r` (after [`Imm::advance`]): each axis by its most
+    /// Squared Mahalanobis distance of a measurement of variance `r` along each axis (after [`Imm::advance`]): each axis by its most
     /// tolerant mode, with `slack` metres or rad of standard deviation added for motion that no mode expects.
-    pub(crate) fn distance_squared(&self, z: C::Point, r: f64, slack: f64) -> f64 {
+    pub(crate) fn distance_squared(&self, z: C::Point, r: DVec3, slack: f64) -> f64 {
         let z = C::between(self.base, z).to_array();
-        let axis = |(bank, z): (&AxisBank, f64)| {
+        let axis = |((bank, z), r): ((&AxisBank, f64), f64)| {
             let distance = |m: &AxisMode| {
                 let d = z - m.offset;
                 d * d / (m.covariance.pp + r + slack * slack).max(f64::MIN_POSITIVE)
@@ -648,15 +648,15 @@ impl<C: Chart> Imm<C> {
             let possible = bank.modes.iter().zip(bank.probability).filter(|(_, p)| *p > 0.0);
             possible.map(|(m, _)| distance(m)).fold(f64::INFINITY, f64::min)
         };
-        self.axes.iter().zip(z).map(axis).sum()
+        self.axes.iter().zip(z).zip(r.to_array()).map(axis).sum()
     }
 
-    /// Updates with a measurement of variance `r` >= 0 per axis at the instant that [`Imm::advance`] propagated to.
+    /// Updates with a measurement of variance `r` >= 0 along each axis at the instant that [`Imm::advance`] propagated to.
     /// Returns the normalised innovation squared of the mixture (3 degrees of freedom).
-    pub fn update(&mut self, z: C::Point, r: f64) -> f64 {
+    pub fn update(&mut self, z: C::Point, r: DVec3) -> f64 {
         let z = C::between(self.base, z).to_array();
         let mut nis = 0.0;
-        for (axis, z) in self.axes.iter_mut().zip(z) {
+        for ((axis, z), r) in self.axes.iter_mut().zip(z).zip(r.to_array()) {
             let before = AxisBank::mixture(&axis.modes, &axis.probability);
             let d = z - before.offset;
             nis += d * d / (before.covariance.pp + r).max(f64::MIN_POSITIVE);

@@ -100,13 +100,18 @@ pub(crate) struct Learner<C: Chart> {
     next: usize,
 }
 
+/// The variance of an axis that is like all three: the rungs do not tell axes apart.
+fn mean(r: DVec3) -> f64 {
+    r.element_sum() / 3.0
+}
+
 impl<C: Chart> Learner<C> {
-    /// Starts at a measured point of variance `r` with unknown velocity. The body is expected to accelerate by
+    /// Starts at a measured point of variance `r` along each axis with unknown velocity. The body is expected to accelerate by
     /// `acceleration` doubled `level` times, and to repeat itself after `recall_after_s` ([`ImmConfig`]).
-    pub(crate) fn new(acceleration: f64, recall_after_s: f64, level: i32, z: C::Point, r: f64) -> Self {
+    pub(crate) fn new(acceleration: f64, recall_after_s: f64, level: i32, z: C::Point, r: DVec3) -> Self {
         let config = models_for(acceleration * f64::from(level).exp2());
         let covariance = Covariance {
-            pp: r,
+            pp: mean(r),
             vv: config.initial_velocity.powi(2),
             aa: config.onset_acceleration.powi(2),
             ..Covariance::default()
@@ -195,10 +200,11 @@ impl<C: Chart> Learner<C> {
         }
     }
 
-    /// Updates all filters with a measurement of variance `r` at `at_ns`, to which they were advanced. Returns the
+    /// Updates all filters with a measurement of variance `r` along each axis at `at_ns`, to which they were advanced. Returns the
     /// normalised innovation squared of the bank.
-    pub(crate) fn update(&mut self, at_ns: i64, z: C::Point, r: f64) -> f64 {
+    pub(crate) fn update(&mut self, at_ns: i64, z: C::Point, r: DVec3) -> f64 {
         let nis = self.now.bank.update(z, r);
+        let r = mean(r);
         let measured = C::between(self.base, z);
         for rung in &mut self.now.rungs {
             let (covariance, [kp, kv, ka]) = rung.covariance.updated(r);
@@ -275,10 +281,10 @@ mod tests {
     fn after_swing(amplitude: f64, w: f64) -> Learner<Translations> {
         let mut gauss = Gauss::new(3);
         let at = |i: i64| DVec3::X * amplitude * (w * i as f64 * 2e-3).sin();
-        let mut learner = Learner::new(5.0, f64::INFINITY, 0, at(0), NOISE * NOISE);
+        let mut learner = Learner::new(5.0, f64::INFINITY, 0, at(0), DVec3::splat(NOISE * NOISE));
         for i in 1..2000 {
             learner.advance(2e-3, None);
-            learner.update(i * 2_000_000, at(i) + gauss.vector(NOISE), NOISE * NOISE);
+            learner.update(i * 2_000_000, at(i) + gauss.vector(NOISE), DVec3::splat(NOISE * NOISE));
         }
         learner
     }
@@ -305,10 +311,15 @@ mod tests {
         let learned = |begin: DQuat| {
             let mut gauss = Gauss::new(3);
             let turn = |i: i64| so3_exp(DVec3::Y * (0.5 * (8.0 * i as f64 * 2e-3).sin()));
-            let mut learner = Learner::<Rotations>::new(20.0, f64::INFINITY, 0, turn(0) * begin, 1e-6);
+            let mut learner =
+                Learner::<Rotations>::new(20.0, f64::INFINITY, 0, turn(0) * begin, DVec3::splat(1e-6));
             for i in 1..2000 {
                 learner.advance(2e-3, None);
-                learner.update(i * 2_000_000, so3_exp(gauss.vector(1e-3)) * turn(i) * begin, 1e-6);
+                learner.update(
+                    i * 2_000_000,
+                    so3_exp(gauss.vector(1e-3)) * turn(i) * begin,
+                    DVec3::splat(1e-6),
+                );
             }
             (learner.level(), learner.combined().mean.velocity)
         };
@@ -321,11 +332,11 @@ mod tests {
     /// Before enough forecasts were judged, and where nothing can be compared, the bank alone predicts.
     #[test]
     fn the_bank_predicts_until_there_is_a_choice() {
-        let mut learner = Learner::<Translations>::new(5.0, f64::INFINITY, 0, DVec3::ONE, 0.0);
+        let mut learner = Learner::<Translations>::new(5.0, f64::INFINITY, 0, DVec3::ONE, DVec3::ZERO);
         for i in 1..i64::from(SETTLES) {
             assert_eq!(learner.combined(), learner.bank().combined());
             learner.advance(2e-3, None);
-            learner.update(i * 2_000_000, DVec3::ONE, 0.0);
+            learner.update(i * 2_000_000, DVec3::ONE, DVec3::ZERO);
         }
         assert_eq!(Errors { count: 1000, ..Errors::default() }.share_of_rung(0), 0.0, "0 / 0");
     }

@@ -22,6 +22,7 @@
 //!         pose: Pose { position_m: [x, 0.0, 0.0], ..Pose::IDENTITY },
 //!         tracked: true,
 //!         mean_error_m: 0.0,
+//!         covariance: None,
 //!         sequence: i as u32,
 //!         captured_at,
 //!         received_at: captured_at,

@@ -202,6 +202,8 @@ struct PoseReading {
     at: HostTime,
     position: DVec3,
     rotation: DQuat,
+    /// Variances along and about the axes by the tracker's own account, m^2 and rad^2.
+    stated: Option<[DVec3; 2]>,
 }
 
 #[derive(Clone, Debug)]
@@ -336,8 +338,8 @@ impl PoseFilter {
         let (position, rotation) = match self.config.prediction {
             Prediction::On => (track.position.combined(), track.rotation.combined()),
             Prediction::Off => (
-                Kinematics::held(track.newest.position, self.position_noise.variance()),
-                Kinematics::held(track.newest.rotation, self.rotation_noise.variance()),
+                Kinematics::held(track.newest.position, deviation(self.variances(&track.newest).0).powi(2)),
+                Kinematics::held(track.newest.rotation, deviation(self.variances(&track.newest).1).powi(2)),
             ),
         };
         Some(TrackState {
@@ -365,17 +367,22 @@ impl PoseFilter {
         self.track.as_ref().map_or([0.0; 2], |track| [track.position.excess(), track.rotation.excess()])
     }
 
-    fn variances(&self) -> (f64, f64) {
-        if self.config.measure_noise {
+    /// The variances of a sample along each axis: the tracker's own, which knows from where it looks, or those measured of all.
+    fn variances(&self, z: &PoseReading) -> (DVec3, DVec3) {
+        if let Some([position, rotation]) = z.stated {
+            return (position, rotation);
+        }
+        let (position, rotation) = if self.config.measure_noise {
             (self.position_noise.variance(), self.rotation_noise.variance())
         } else {
             let c = &self.config;
             (c.position_noise_m * c.position_noise_m, c.rotation_noise_rad * c.rotation_noise_rad)
-        }
+        };
+        (DVec3::splat(position), DVec3::splat(rotation))
     }
 
     fn take(&mut self, z: PoseReading) -> Verdict {
-        let (rp, rr) = self.variances();
+        let (rp, rr) = self.variances(&z);
         let c = self.config;
         let carried_for_ns = self.carried_for_ns();
         if let Some(track) = &mut self.track {
@@ -410,8 +417,8 @@ impl PoseFilter {
                     self.position_noise.push(z.at.0, z.position);
                     self.rotation_noise.push(z.at.0, z.rotation);
                     let (p, r) = (position.bank().mean(), rotation.bank().mean());
-                    self.position_recall.push(to_ns, z.position, p.point, p.velocity, rp.sqrt());
-                    self.rotation_recall.push(to_ns, z.rotation, r.point, r.velocity, rr.sqrt());
+                    self.position_recall.push(to_ns, z.position, p.point, p.velocity, deviation(rp));
+                    self.rotation_recall.push(to_ns, z.rotation, r.point, r.velocity, deviation(rr));
                     return track.accept(z, c.stuck_after);
                 }
                 position.back_to(before.0);
@@ -422,7 +429,7 @@ impl PoseFilter {
     }
 
     /// Collects samples that agree; the third in a row starts a new track.
-    fn acquire(&mut self, z: PoseReading, rp: f64, rr: f64) -> Verdict {
+    fn acquire(&mut self, z: PoseReading, rp: DVec3, rr: DVec3) -> Verdict {
         let c = self.config;
         if let [.., Some(last)] = self.candidates {
             let gap_ns = z.at.ns_since(last.at);
@@ -467,14 +474,14 @@ impl PoseFilter {
 
     /// Whether `z` continues the candidates: no faster than the fastest plausible motion, and no sharper turn than the
     /// strongest plausible one.
-    fn agrees(&self, z: PoseReading, rp: f64) -> bool {
+    fn agrees(&self, z: PoseReading, rp: DVec3) -> bool {
         let c = &self.config;
         let [.., previous, Some(last)] = self.candidates else {
             return true;
         };
         let h = z.at.ns_since(last.at) as f64 * 1e-9;
         let step = z.position - last.position;
-        let noise = c.gate_sigmas * rp.sqrt();
+        let noise = c.gate_sigmas * deviation(rp);
         if step.length() > c.max_speed_m_s * h + 2.0 * noise {
             return false;
         }
@@ -527,7 +534,19 @@ fn check(sample: &TrackerSample) -> Result<PoseReading, Verdict> {
         at: sample.captured_at,
         position: DVec3::from_array(sample.pose.position_m),
         rotation: DQuat::from_array(sample.pose.rotation_xyzw).normalize(),
+        stated: sample
+            .covariance
+            .and_then(|c| c.variances())
+            .map(|v| v.map(|v| DVec3::from_array(v).max(LEAST_VARIANCE))),
     })
+}
+
+/// No sample is better than a micrometre and a microradian, whatever its tracker says.
+const LEAST_VARIANCE: DVec3 = DVec3::splat(1e-12);
+
+/// The standard deviation of an axis that is like all three.
+fn deviation(variances: DVec3) -> f64 {
+    (variances.element_sum() / 3.0).sqrt()
 }
 
 #[cfg(test)]

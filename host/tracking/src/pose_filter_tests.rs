@@ -19,6 +19,7 @@ fn sample(at_ns: i64, p: DVec3, q: DQuat) -> TrackerSample {
         pose: Pose { position_m: p.to_array(), rotation_xyzw: q.to_array() },
         tracked: true,
         mean_error_m: 0.0,
+        covariance: None,
         sequence: (at_ns / (2 * MS)) as u32,
         captured_at: HostTime(at_ns),
         received_at: HostTime(at_ns + MS),
@@ -316,11 +317,11 @@ fn covariances_stay_positive_for_stiff_numbers() {
         let mut models = models_for(5.0);
         models.initial_velocity = velocity;
         models.models.iter_mut().for_each(|m| m.noise *= process);
-        let mut bank = Imm::<Translations>::new(&models, DVec3::ZERO, r);
+        let mut bank = Imm::<Translations>::new(&models, DVec3::ZERO, DVec3::splat(r));
         let mut gauss = Gauss::new(9);
         for _ in 0..20_000 {
             bank.advance(&models, 2e-3, None);
-            bank.update(gauss.vector(1e-4), r);
+            bank.update(gauss.vector(1e-4), DVec3::splat(r));
             assert!(bank.combined().mean.point.is_finite());
             for c in bank.covariances().into_iter().flatten() {
                 assert!(least_eigenvalue(&c) >= -1e-12 * c.trace(), "{c:?}");
@@ -624,4 +625,39 @@ fn an_acceleration_does_not_outlive_a_gap() {
             assert!(off.abs() < bound, "{gap_ms} ms at {hz} Hz, sample {k}: {off} m off");
         }
     }
+}
+
+/// A camera sees sideways ten times as well as it sees depth, and says so: the filter weighs each axis by that, and is no worse for
+/// a sample that is said to be bad.
+#[test]
+fn what_a_tracker_says_of_its_own_noise_is_believed() {
+    let stated = |depth: f64, seed: u64, said: bool| {
+        let mut gauss = Gauss::new(seed);
+        let mut filter =
+            PoseFilter::new(PoseFilterConfig { lost_after_ns: 60 * MS, ..PoseFilterConfig::default() });
+        let mut squares = 0.0;
+        for i in 0..400i64 {
+            let (at, t) = (i * 16 * MS, i as f64 * 0.016);
+            let truth = DVec3::new(0.1 * (1.5 * t).sin(), 0.0, -1.0);
+            // Every fifth picture is blurred.
+            let sigma = if i % 5 == 0 { 10.0 } else { 1.0 } * DVec3::new(1e-4, 1e-4, depth);
+            let mut s = sample(at, truth + gauss.vector(1.0) * sigma, DQuat::IDENTITY);
+            let mut matrix = [[0.0; 6]; 6];
+            (0..3).for_each(|k| matrix[k][k] = sigma[k] * sigma[k]);
+            (3..6).for_each(|k| matrix[k][k] = 1e-6);
+            s.covariance = said.then(|| dpm_device::pose::PoseCovariance::of(&matrix));
+            filter.update(&s);
+            if i > 100 {
+                let there = filter.predict(HostTime(at)).unwrap().pose.position_m;
+                squares += (DVec3::from_array(there) - truth).length_squared();
+            }
+        }
+        squares.sqrt()
+    };
+    let (mut with, mut without) = (0.0, 0.0);
+    for seed in 0..8 {
+        with += stated(1e-3, seed, true);
+        without += stated(1e-3, seed, false);
+    }
+    assert!(with < 0.75 * without, "{with} with, {without} without");
 }

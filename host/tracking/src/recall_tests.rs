@@ -236,6 +236,7 @@ fn with_and_without(path: &[f64]) -> [f64; 2] {
                 pose: Pose { position_m: p.to_array(), rotation_xyzw: [0.0, 0.0, 0.0, 1.0] },
                 tracked: true,
                 mean_error_m: 0.0,
+                covariance: None,
                 sequence: i as u32,
                 captured_at: at,
                 received_at: at,

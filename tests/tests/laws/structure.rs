@@ -15,6 +15,7 @@ const CRATES: [&str; 19] = [
     "host/mock",
     "host/calibrate",
     "host/calibration",
+    "host/camera",
     "host/camera-files",
     "host/calibration-file",
     "host/display",

@@ -632,6 +632,7 @@ impl NatNetClient {
                 },
                 tracked: body.is_tracked(),
                 mean_error_m: body.mean_error,
+                covariance: None,
                 sequence: info.number as u32,
                 captured_at,
                 received_at: at,

@@ -223,6 +223,7 @@ impl SerialTracker {
                             },
                             tracked,
                             mean_error_m: mean_error,
+                            covariance: None,
                             sequence,
                             captured_at,
                             received_at: at,

@@ -362,6 +362,7 @@ impl VrpnClient {
                             pose,
                             tracked: true,
                             mean_error_m: 0.0,
+                            covariance: None,
                             // VRPN does not number the samples of a sensor.
                             sequence: 0,
                             captured_at,

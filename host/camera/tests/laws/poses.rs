@@ -2,7 +2,7 @@
 
 use crate::stage::{any_rotation, camera, facing, optics, quantile, two_tags, within};
 use dpm_camera::{
-    Covariance, Expectation, Located, Markings, Sightings, SpotSighting, TagPlace, TagSighting, Velocity,
+    BodyPose, Covariance, Expectation, Markings, Sightings, SpotSighting, TagPlace, TagSighting, Velocity,
 };
 use dpm_common::so3::so3_between;
 use dpm_device::rng::Draws;
@@ -56,12 +56,12 @@ fn locate(
     tags: &[TagSighting],
     spots: &[SpotSighting],
     expected: Option<&Expectation>,
-) -> Option<Located> {
+) -> Option<BodyPose> {
     markings.locate(&[*camera], &[Sightings { tags, spots, row_s: 0.0, row: 400.0 }], expected)
 }
 
 /// The error of a pose: of the place, m, and of the turn, rad.
-fn error(found: &Located, truth: &DAffine3) -> [f64; 6] {
+fn error(found: &BodyPose, truth: &DAffine3) -> [f64; 6] {
     let d = found.fit.position - truth.translation;
     let w = so3_between(DQuat::from_mat3(&truth.matrix3), found.fit.rotation);
     [d.x, d.y, d.z, w.x, w.y, w.z]

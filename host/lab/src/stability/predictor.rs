@@ -130,6 +130,7 @@ fn sample(at_ns: i64, position: DVec3, q: DQuat) -> TrackerSample {
         pose: Pose { position_m: position.to_array(), rotation_xyzw: q.to_array() },
         tracked: true,
         mean_error_m: 0.0,
+        covariance: None,
         sequence: (at_ns / STEP_NS) as u32,
         captured_at: HostTime(at_ns),
         received_at: HostTime(at_ns.saturating_add(1_000_000)),

@@ -220,6 +220,7 @@ mod tests {
                     pose: Pose { position_m: [k as f64 * 1e-3, 0.0, 0.0], ..Pose::IDENTITY },
                     tracked: true,
                     mean_error_m: 0.0,
+                    covariance: None,
                     sequence: k as u32,
                     captured_at: at,
                     received_at: at,

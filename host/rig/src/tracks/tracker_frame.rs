@@ -2,7 +2,7 @@
 
 use crate::rig::pose_of;
 use crate::trackers::TrackerConfig;
-use dpm_device::pose::Pose;
+use dpm_device::pose::{Pose, PoseCovariance};
 use dpm_device::tracker::TrackerSample;
 use glam::{DAffine3, DMat3, DQuat, DVec3};
 
@@ -49,7 +49,27 @@ impl TrackerFrame {
         let world = pose_of(&(self.world_from_axes * in_axes));
         // The filter's gate judges the length of the quaternion, which therefore stays.
         sample.pose = Pose { rotation_xyzw: world.rotation_xyzw.map(|c| c * length), ..world };
+        sample.covariance = sample.covariance.map(|c| self.covariance(&c));
         sample
+    }
+
+    /// A covariance in the world's axes. A rotation vector turns as a place does, and the other way in a mirror.
+    fn covariance(&self, covariance: &PoseCovariance) -> PoseCovariance {
+        let turn = DMat3::from(self.world_from_axes.matrix3) * self.axes;
+        let (shifts, turns) = (turn * self.scale, turn * self.axes.determinant());
+        let map = |i: usize, k: usize| match (i / 3, k / 3) {
+            (0, 0) => shifts.col(k)[i],
+            (1, 1) => turns.col(k - 3)[i - 3],
+            _ => 0.0,
+        };
+        let from = covariance.matrix();
+        let entry = |i: usize, j: usize| -> f64 {
+            (0..6)
+                .flat_map(|k| (0..6).map(move |l| (k, l)))
+                .map(|(k, l)| map(i, k) * from[k][l] * map(j, l))
+                .sum()
+        };
+        PoseCovariance::of(&std::array::from_fn(|i| std::array::from_fn(|j| entry(i, j))))
     }
 
     /// `A R A^T` for the exchange of axes A. A mirror turns the other way.
@@ -82,6 +102,7 @@ mod tests {
             pose: Pose { position_m, rotation_xyzw: rotation.to_array() },
             tracked: true,
             mean_error_m: 0.0,
+            covariance: None,
             sequence: 0,
             captured_at: HostTime(5_000_000),
             received_at: HostTime(7_000_000),
@@ -115,6 +136,25 @@ mod tests {
             let here = crate::rig::affine(&out.pose).transform_point3(exchanged);
             assert!((here - there).length() < 1e-12, "{here} {there}");
         }
+    }
+
+    /// Depth of the tracker becomes height of the world, and noise of depth noise of height.
+    #[test]
+    fn a_covariance_turns_with_the_space() {
+        let f = frame(&["tracker.transform.axes=\"x z -y\"", "tracker.transform.scale=0.001"]).unwrap();
+        let mut matrix = [[0.0; 6]; 6];
+        (0..6).for_each(|i| matrix[i][i] = 1.0 + i as f64);
+        (matrix[2][3], matrix[3][2]) = (0.5, 0.5);
+        let mut given = sample([0.0; 3], DQuat::IDENTITY);
+        given.covariance = Some(PoseCovariance::of(&matrix));
+        let got = f.apply(&given).covariance.unwrap().matrix();
+        let near = |a: f64, b: f64| (a - b).abs() < 1e-6 * b.abs();
+        // World y is the tracker's z; world z is minus its y.
+        assert!(near(got[0][0], 1e-6) && near(got[1][1], 3e-6) && near(got[2][2], 2e-6), "{got:?}");
+        assert!(
+            near(got[3][3], 4.0) && near(got[4][4], 6.0) && near(got[5][5], 5.0) && near(got[1][3], 5e-4),
+            "{got:?}"
+        );
     }
 
     #[test]

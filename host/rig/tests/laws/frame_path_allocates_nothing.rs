@@ -65,6 +65,7 @@ fn a_hundred_thousand_frames_allocate_nothing() {
                     pose: Pose { position_m: [x, 0.0, 0.0], ..Pose::IDENTITY },
                     tracked: frame % 5_000 > 40,
                     mean_error_m: 0.0,
+                    covariance: None,
                     sequence: frame as u32,
                     captured_at,
                     received_at: captured_at.plus_ns(2_000_000),

@@ -107,6 +107,7 @@ fn sample(line: &[u8], bodies: &[BodyKey], received_at: HostTime) -> Option<Trac
         },
         tracked: true,
         mean_error_m: 0.0,
+        covariance: None,
         sequence: 0,
         captured_at: HostTime(microseconds.checked_mul(1000)?),
         received_at,
