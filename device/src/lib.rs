@@ -61,6 +61,7 @@ pub mod light;
 mod line;
 pub mod link;
 mod packet;
+pub mod picture_stream;
 pub mod planes;
 pub mod pose;
 #[cfg(feature = "alloc")]

@@ -45,16 +45,9 @@ impl PoseCovariance {
 
     /// The whole matrix.
     pub fn matrix(&self) -> [[f64; 6]; 6] {
-        let mut out = [[0.0; 6]; 6];
-        let mut at = 0;
-        for i in 0..6 {
-            for j in 0..=i {
-                out[i][j] = f64::from(self.lower[at]);
-                out[j][i] = out[i][j];
-                at += 1;
-            }
-        }
-        out
+        // Row i begins after i (i + 1) / 2 entries.
+        let entry = |i: usize, j: usize| f64::from(self.lower[i * (i + 1) / 2 + j]);
+        core::array::from_fn(|i| core::array::from_fn(|j| entry(i.max(j), i.min(j))))
     }
 
     /// The variances of the position along each axis, m^2, and of the rotation about each, rad^2; `None` if one of them is

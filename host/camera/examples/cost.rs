@@ -74,7 +74,7 @@ fn main() {
         let painted = 1e3 * painted / PICTURES as f64;
         println!("{name}: {median:.2} ms, {worst:.2} at most ({found} found; painted in {painted:.1} ms)");
         if let Some(folder) = &folder {
-            let path = format!("{folder}/{}.pgm", name.replace(' ', "-").replace('/', "-"));
+            let path = format!("{folder}/{}.pgm", name.replace([' ', '/'], "-"));
             std::fs::write(path, [b"P5 1280 800 255\n", &pixels[..]].concat()).expect("written");
         }
     }

@@ -94,7 +94,7 @@ impl SpotDetector {
         let (long, short) =
             ((high.0 - low.0).max(high.1 - low.1) + 1, (high.0 - low.0).min(high.1 - low.1) + 1);
         let inside = low.0 >= RIM && low.1 >= RIM && high.0 + RIM < w && high.1 + RIM < h;
-        if !inside || count > LARGEST || count < 2 || long > 4 * short + 4 || 4 * count < long * short {
+        if !inside || !(2..=LARGEST).contains(&count) || long > 4 * short + 4 || 4 * count < long * short {
             return None;
         }
         weigh(image, (low.0 - RIM, low.1 - RIM), (high.0 + RIM, high.1 + RIM))

@@ -38,7 +38,10 @@ mod outline;
 mod planar;
 mod pose;
 mod sightings;
+mod source;
+mod stream;
 mod threshold;
+mod tracker;
 
 pub use blobs::{SpotDetector, SpotSighting};
 pub use body::{BodyPose, Markings, TagPlace};
@@ -46,3 +49,6 @@ pub use detect::{TagDetector, TagSighting, TAGS};
 pub use image::{GreyImage, LEAST_SIDE, MOST_SIDE};
 pub use pose::{Covariance, Observation, PoseFit, Velocity};
 pub use sightings::{Expectation, Sightings};
+pub use source::{Picture, PictureSource};
+pub use stream::StreamSource;
+pub use tracker::{CameraTracker, CameraTrackerSetup};

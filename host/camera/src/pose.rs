@@ -8,7 +8,7 @@ use dpm_calibration::dense::inverse_spd;
 use dpm_calibration::least_squares::{descend, huber, Equations};
 use dpm_common::so3::{so3_between, so3_exp};
 use dpm_scene::geometry::projector::ProjectorCamera;
-use glam::{DAffine3, DMat3, DQuat, DVec2, DVec3};
+use glam::{DAffine3, DQuat, DVec2, DVec3};
 
 /// Residuals up to this many standard deviations count by their square, larger ones by their size.
 const KNEE: f64 = 3.5;
@@ -159,7 +159,7 @@ impl<'a> Problem<'a> {
 
     /// The nearest pose that explains the observations best; `None` if the start is impossible or they determine no pose.
     pub(crate) fn refine(&self, start: &DAffine3) -> Option<PoseFit> {
-        let rotation = DQuat::from_mat3(&DMat3::from(start.matrix3)).normalize();
+        let rotation = DQuat::from_mat3(&start.matrix3).normalize();
         let start = State { rotation, middle: start.transform_point3(self.middle) };
         let step = |s: &State, d: &[f64]| State {
             rotation: (so3_exp(DVec3::from_slice(&d[..3])) * s.rotation).normalize(),
@@ -199,10 +199,8 @@ fn about_origin(inverse: &[Vec<f64>], lever: DVec3) -> Covariance {
     for i in 0..3 {
         map[i][3 + i] = 1.0;
         map[3 + i][i] = 1.0;
-        for j in 0..3 {
-            // hat(lever) * turn = lever x turn = -(turn x lever).
-            map[i][j] = cross.col(j)[i];
-        }
+        // hat(lever) * turn = lever x turn = -(turn x lever).
+        map[i][..3].copy_from_slice(&cross.row(i).to_array());
     }
     let mut out = [[0.0; 6]; 6];
     for i in 0..6 {

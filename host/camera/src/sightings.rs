@@ -4,7 +4,7 @@ use crate::blobs::SpotSighting;
 use crate::detect::TagSighting;
 use crate::pose::{PoseFit, Velocity};
 use dpm_common::so3::so3_between;
-use glam::{DAffine3, DMat3, DQuat};
+use glam::{DAffine3, DQuat};
 
 /// What one camera saw in one picture.
 #[derive(Clone, Copy, Debug)]
@@ -35,7 +35,7 @@ pub struct Expectation {
 impl Expectation {
     /// What speaks against a pose: half its squared distance in standard deviations.
     pub(crate) fn against(&self, fit: &PoseFit) -> f64 {
-        let turn = so3_between(DQuat::from_mat3(&DMat3::from(self.pose.matrix3)), fit.rotation);
+        let turn = so3_between(DQuat::from_mat3(&self.pose.matrix3), fit.rotation);
         let shift = fit.position - self.pose.translation;
         0.5 * (turn.length() / self.turn).powi(2) + 0.5 * (shift.length() / self.shift).powi(2)
     }

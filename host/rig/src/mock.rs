@@ -6,6 +6,10 @@ use dpm_mock::projector::FaultyProjector;
 use dpm_mock::tracker::TRACKER_FAULTS;
 use std::net::{Ipv4Addr, SocketAddrV4};
 
+#[cfg(feature = "camera")]
+pub(crate) use dpm_mock::camera::{
+    BrightMarker, CameraHost, CameraOptics, MarkedBody, MockCamera, MockCameraConfig, PrintedTag,
+};
 pub(crate) use dpm_mock::faults::{FaultError, FaultPlan};
 pub(crate) use dpm_mock::motion::{Motion, MotionError, MotionSpec};
 pub(crate) use dpm_mock::natnet_host::{free_port, NatNetHost};

@@ -5,9 +5,11 @@
 //! pure function of the seed and its number; the optics share no code with what they judge.
 
 mod clutter;
+mod host;
 mod optics;
 mod paint;
 
+pub use host::CameraHost;
 pub use optics::CameraOptics;
 
 use crate::faults::{FaultError, FaultKind, FaultPlan};

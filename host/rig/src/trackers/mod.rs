@@ -5,6 +5,8 @@
 //! (`tests/tests/laws/tracker_kinds.rs`) runs over all rows.
 
 mod axes;
+#[cfg(feature = "camera")]
+mod camera;
 mod keys;
 mod kind;
 mod mock;
@@ -15,6 +17,8 @@ mod transform;
 mod vrpn;
 
 pub use axes::Axes;
+#[cfg(feature = "camera")]
+pub use camera::{CameraTrackerConfig, MarkerConfig, TagConfig};
 pub use keys::{SourceError, TrackerConfig, TrackerKeys, TrackerPlace};
 pub use kind::{Decoder, MockScene, MockServer, PoseOrigin, TrackerKind};
 pub use mock::simulated;
@@ -23,8 +27,15 @@ pub use transform::{PoseConfig, TrackerTransformConfig};
 use dpm_common::keys::rows::Registry;
 
 /// One row a kind, in the order of the manual. The first plays a rig file that names none, and `--simulate`.
-static KINDS: Registry<TrackerKind> =
-    Registry::new(&[&mock::KIND, &natnet::KIND, &vrpn::KIND, &serial::KIND, &replay::KIND]);
+static KINDS: Registry<TrackerKind> = Registry::new(&[
+    &mock::KIND,
+    &natnet::KIND,
+    &vrpn::KIND,
+    &serial::KIND,
+    #[cfg(feature = "camera")]
+    &camera::KIND,
+    &replay::KIND,
+]);
 
 /// All kinds.
 pub fn kinds() -> Vec<&'static TrackerKind> {

@@ -1,0 +1,62 @@
+//! The keys of a camera.
+
+use crate::trackers::transform::TrackerTransformConfig;
+use dpm_common::keys::read::{Any, NotEmpty, Within};
+use dpm_common::section;
+use std::path::PathBuf;
+
+section! {
+    /// A printed tag on a body.
+    pub struct TagConfig {
+        /// Name of the body: one of `scene.bodies[].name`, or what a person wears.
+        body: String = String::new(), "", NotEmpty;
+        /// Its number in the family AprilTag 36h11.
+        id: u16 = 0, "", Within(0, 586);
+        /// Length of a side of its black border, without the white margin. Measure the print.
+        side_m: f64 = 0.08, "m", Within(0.005, 2.0);
+        /// Where its middle lies in the body.
+        position: [f64; 3] = [0.0; 3], "m", Within(-100.0, 100.0);
+        /// Rotations about x, then y, then z, from the body's axes to the tag's: x to the right and y up as printed, z towards
+        /// who reads it.
+        rotation_deg: [f64; 3] = [0.0; 3], "deg", Within(-360.0, 360.0);
+        /// The rotation as a quaternion x, y, z, w instead; its length does not matter.
+        rotation: Option<[f64; 4]> = None, "", Within(-1e6, 1e6);
+    }
+}
+
+section! {
+    /// A marker of retro-reflective tape on a body.
+    pub struct MarkerConfig {
+        /// Name of the body: one of `scene.bodies[].name`, or what a person wears.
+        body: String = String::new(), "", NotEmpty;
+        /// Where its middle lies in the body.
+        position: [f64; 3] = [0.0; 3], "m", Within(-100.0, 100.0);
+    }
+}
+
+section! {
+    /// A camera.
+    pub struct CameraTrackerConfig {
+        /// `tcp:HOST:PORT` of `hil-mock serve camera`.
+        device: String = "tcp:127.0.0.1:8951".into(), "", NotEmpty;
+        /// Columns and rows of its pictures.
+        size: [u32; 2] = [1280, 800], "px", Within(16, 8192);
+        /// Pictures per second.
+        rate_hz: u32 = 60, "Hz", Within(1, 1_000);
+        /// A calibration file of its lens, as OpenCV and others write it (docs/CALIBRATION.md); its pose is not used.
+        calibration: Option<PathBuf> = None, "", NotEmpty;
+        /// Horizontal angle of view of a camera without a calibration file, whose lens then bends nothing.
+        view_deg: f64 = 60.0, "deg", Within(5.0, 170.0);
+        /// Tags on the bodies.
+        tags: Vec<TagConfig> = Vec::new(), "", Any;
+        /// Markers on the bodies: at least 4 on a body that has any.
+        markers: Vec<MarkerConfig> = Vec::new(), "", Any;
+        /// Grey level that markers reach and nothing else does.
+        marker_level: u8 = 100, "", Within(1, 255);
+        /// From the camera's coordinates to the world's; the camera looks along -Z, and +Y is up. It is the camera's pose.
+        transform: TrackerTransformConfig = TrackerTransformConfig::default(), "", Any;
+        /// Time by which a sample is older than its time stamp says. `dpm calibrate latency` measures it. Negative if
+        /// stamps are too old.
+        latency_us: i64 = 0, "us", Within(-200_000, 200_000);
+    }
+}
