@@ -4,8 +4,8 @@
 //! Reading order: [`usb_model`] is a USB device, [`usb_plug`] its cable, [`usbip`] the cable to another kernel.
 
 pub use dpm_mock::{
-    faults, hand, line_port, monotonic, motion, natnet_host, natnet_server, report_queue, serial_server,
-    tracker, vrpn_host, vrpn_server,
+    camera, faults, hand, line_port, monotonic, motion, natnet_host, natnet_server, report_queue,
+    serial_server, tracker, vrpn_host, vrpn_server,
 };
 
 pub mod dlpc900;

@@ -31,7 +31,7 @@ use std::path::Path;
 pub type Entry = fn(&[u8]);
 
 /// Every entry with the name of its fuzz target, which is also the name of its folder of seeds.
-pub const ALL: [(&str, Entry); 39] = [
+pub const ALL: [(&str, Entry); 40] = [
     ("link_stream", link_stream),
     ("link_rle", link_rle),
     ("link_tracks", link_tracks),
@@ -41,6 +41,7 @@ pub const ALL: [(&str, Entry); 39] = [
     ("natnet_datagram", natnet_datagram),
     ("vrpn_stream", vrpn_stream),
     ("serial_pose", serial_pose),
+    ("picture_header", picture_header),
     ("sensor_packet", sensor_packet),
     ("texts", texts),
     ("recording", recording),
@@ -214,6 +215,11 @@ pub fn natnet_datagram(bytes: &[u8]) {
 /// A VRPN stream.
 pub fn vrpn_stream(bytes: &[u8]) {
     tracker("vrpn_stream", bytes);
+}
+
+/// The header of a camera's picture.
+pub fn picture_header(bytes: &[u8]) {
+    tracker("picture_header", bytes);
 }
 
 /// A packet of the serial pose stream.

@@ -73,7 +73,7 @@ pub(super) fn clock_from_now() -> Arc<dyn HostClock> {
     Arc::new(move || HostTime(i64::try_from(epoch.elapsed().as_nanos()).unwrap_or(i64::MAX)))
 }
 
-fn parse_body(text: &str) -> Result<(String, Motion), String> {
+pub(super) fn parse_body(text: &str) -> Result<(String, Motion), String> {
     let wrong = |why: String| format!("--body `{text}`: {why}");
     let (place, motion) = text.split_once('=').unwrap_or((text, "still"));
     let (name, position) = match place.split_once('@') {
@@ -91,7 +91,7 @@ fn parse_body(text: &str) -> Result<(String, Motion), String> {
     Ok((name.to_owned(), Motion::new(&spec, rest).map_err(|e| wrong(e.to_string()))?))
 }
 
-fn parse_rate(text: &str) -> Result<FrameRate, String> {
+pub(super) fn parse_rate(text: &str) -> Result<FrameRate, String> {
     let (num, den) = text.split_once('/').unwrap_or((text, "1"));
     let rate = num.trim().parse().ok().zip(den.trim().parse().ok());
     rate.and_then(|(num, den)| FrameRate::new(num, den))

@@ -1,6 +1,7 @@
 //! The devices that `hil-mock serve` offers: one module each.
 
 mod bodies;
+mod camera;
 mod dlpc900;
 mod natnet;
 mod orders;
@@ -18,6 +19,8 @@ use std::io::Write;
 /// A mock device.
 #[derive(Subcommand)]
 pub(crate) enum Device {
+    /// Camera before bodies with printed tags: pictures over TCP
+    Camera(camera::CameraArguments),
     /// DLPC900 projector controller (LightCrafter 6500 / 9000): a USB HID device over USB/IP
     Dlpc900(dlpc900::Dlpc900Arguments),
     /// OptiTrack NatNet server: poses over UDP
@@ -71,6 +74,7 @@ fn cannot_open(path: &str, e: &serialport::Error) -> String {
 /// Runs `device` until it is stopped or fails.
 pub(crate) fn run(device: Device) -> Result<(), Box<dyn Error>> {
     match device {
+        Device::Camera(arguments) => camera::run(&arguments),
         Device::Dlpc900(arguments) => dlpc900::run(&arguments),
         Device::Natnet(arguments) => natnet::run(&arguments),
         Device::Projector(arguments) => projector::run(&arguments),

@@ -8,7 +8,7 @@ use std::net::{Ipv4Addr, SocketAddrV4};
 
 #[cfg(feature = "camera")]
 pub(crate) use dpm_mock::camera::{
-    BrightMarker, CameraHost, CameraOptics, MarkedBody, MockCamera, MockCameraConfig, PrintedTag,
+    two_tags, CameraHost, CameraOptics, MarkedBody, MockCamera, MockCameraConfig,
 };
 pub(crate) use dpm_mock::faults::{FaultError, FaultPlan};
 pub(crate) use dpm_mock::motion::{Motion, MotionError, MotionSpec};

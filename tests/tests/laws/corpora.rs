@@ -9,6 +9,7 @@ use dpm_device::cobs::{encode, encoded_bytes};
 use dpm_device::link::{
     rle_encode, Area, Commit, Header, HostMessage, MessageType, Packet, Region, Tracks, MAX_CONTROL_BYTES,
 };
+use dpm_device::picture_stream::PictureHeader;
 use dpm_device::planes::Raster;
 use dpm_device::sensor::wire::{BlockHead, LevelBits, Levels, SensorMessage, MAX_FRAME};
 use dpm_device::time::DeviceTicks;
@@ -40,6 +41,15 @@ fn made() -> Vec<(&'static str, &'static str, Vec<u8>)> {
     }
     let plane = Header { led_code: 7, frame: 1, ..Header::control(MessageType::Plane, 42, 0) };
     stream.extend(Packet::new(plane, &[0xf0, 0x0f, 0x80]).to_vec());
+    let picture = PictureHeader {
+        width: 64,
+        height: 48,
+        number: 7,
+        begin_ns: 1_000_000_000,
+        exposure_ns: 2_000_000,
+        row_ns: 10_000,
+    };
+    seeds.push(("picture_header", "header", picture.encode().to_vec()));
     seeds.push(("link_stream", "messages", stream.clone()));
     let mut coded = vec![0; 256];
     let mut bits = [0u8; 64];

@@ -342,10 +342,10 @@ fn negative_part(imm: &Imm<Translations>, worst: f64) -> f64 {
 /// A prior of variance `first`, and measurements of variance `r`, at steps of 1 ns to 10 s.
 fn covariance_between(first: f64, r: f64, s: &mut Sampler) -> f64 {
     let config = models_for(5.0);
-    let mut imm = Imm::<Translations>::new(&config, DVec3::ZERO, first);
+    let mut imm = Imm::<Translations>::new(&config, DVec3::ZERO, DVec3::splat(first));
     (0..300).fold(0.0, |worst, i| {
         imm.advance(&config, [0.002, 0.0, 1e-9, 10.0][i % 4], None);
-        imm.update(DVec3::splat(1e-3 * s.uniform()), r);
+        imm.update(DVec3::splat(1e-3 * s.uniform()), DVec3::splat(r));
         negative_part(&imm, worst)
     })
 }
@@ -362,10 +362,10 @@ fn covariance(seed: u64) -> f64 {
     for (first, r) in [(1e12, 1e-12), (1e12, 1e-24), (1e-12, 1e12), (1e24, 1e-24), (1e12, 0.0), (0.0, 0.0)] {
         worst = worst.max(covariance_between(first, r, &mut s));
     }
-    let mut imm = Imm::<Translations>::new(&config, DVec3::ZERO, 1e-8);
+    let mut imm = Imm::<Translations>::new(&config, DVec3::ZERO, DVec3::splat(1e-8));
     for i in 0..100_000 {
         imm.advance(&config, 0.002, None);
-        imm.update(DVec3::splat(1e-4 * s.uniform()), 1e-8);
+        imm.update(DVec3::splat(1e-4 * s.uniform()), DVec3::splat(1e-8));
         if i % 100 == 0 {
             worst = negative_part(&imm, worst);
         }

@@ -29,6 +29,25 @@ pub struct PrintedTag {
     pub place: Pose,
 }
 
+/// Two tags of 80 mm on the front of body number `n`, turned out by 25 degrees: numbers 2 n and 2 n + 1.
+pub fn two_tags(n: usize) -> [PrintedTag; 2] {
+    [-1.0, 1.0].map(|side: f64| {
+        let half = 0.5 * (side * 25.0).to_radians();
+        let rotation_xyzw = [0.0, libm::sin(half), 0.0, libm::cos(half)];
+        let place = Pose { position_m: [side * 0.055, 0.0, 0.0], rotation_xyzw };
+        PrintedTag { id: (2 * n + usize::from(side > 0.0)) as u16, side_m: 0.08, place }
+    })
+}
+
+impl PrintedTag {
+    /// The tag as an entry of `tracker.tags` of a rig file.
+    pub fn as_toml(&self, body: &str) -> String {
+        let (id, side, at) = (self.id, self.side_m, &self.place);
+        let place = format!("position = {:?}, rotation = {:?}", at.position_m, at.rotation_xyzw);
+        format!("{{ body = {body:?}, id = {id}, side_m = {side:?}, {place} }}")
+    }
+}
+
 /// A ball of retro-reflective tape on a body.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct BrightMarker {

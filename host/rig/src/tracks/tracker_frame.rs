@@ -55,7 +55,7 @@ impl TrackerFrame {
 
     /// A covariance in the world's axes. A rotation vector turns as a place does, and the other way in a mirror.
     fn covariance(&self, covariance: &PoseCovariance) -> PoseCovariance {
-        let turn = DMat3::from(self.world_from_axes.matrix3) * self.axes;
+        let turn = self.world_from_axes.matrix3 * self.axes;
         let (shifts, turns) = (turn * self.scale, turn * self.axes.determinant());
         let map = |i: usize, k: usize| match (i / 3, k / 3) {
             (0, 0) => shifts.col(k)[i],

@@ -9,8 +9,10 @@ use std::path::Path;
 
 /// The camera of the calibration file, or a pinhole.
 pub(super) fn camera(keys: &CameraTrackerConfig) -> Result<ProjectorCamera, SourceError> {
-    let raster = Raster::new(keys.size[0], keys.size[1])
-        .map_err(|e| SourceError::of_key("tracker.size", e.to_string()))?;
+    let [w, h] = keys.size;
+    let raster = Raster::new(w, h);
+    let raster =
+        raster.ok_or_else(|| SourceError::of_key("tracker.size", format!("{w} x {h} is no raster")))?;
     match &keys.calibration {
         Some(path) => stored(path, raster).map_err(|e| SourceError::of_key("tracker.calibration", e)),
         None => {

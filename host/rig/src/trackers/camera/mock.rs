@@ -1,8 +1,6 @@
 //! A camera made of software before the bodies of a mock's scene.
 
-use crate::mock::{
-    BrightMarker, CameraHost, CameraOptics, MarkedBody, MockCamera, MockCameraConfig, PrintedTag, ANY_PORT,
-};
+use crate::mock::{two_tags, CameraHost, CameraOptics, MarkedBody, MockCamera, MockCameraConfig, ANY_PORT};
 use crate::trackers::{MockScene, MockServer};
 use dpm_device::pose::Pose;
 use std::io;
@@ -12,11 +10,6 @@ const SIZE: [u32; 2] = [640, 400];
 const VIEW_DEG: f64 = 60.0;
 /// From the middle of the bodies, m.
 const AWAY_M: f64 = 1.2;
-/// A tag's side, how far from the body's middle its own lies, and by how much it is turned out.
-const SIDE_M: f64 = 0.08;
-const APART_M: f64 = 0.055;
-const TURN_DEG: f64 = 25.0;
-
 /// Two tags on the front of each body, and a camera before all of them.
 pub(super) fn mock(scene: &MockScene) -> io::Result<MockServer> {
     let rests: Vec<[f64; 3]> = scene.motions.iter().map(|m| m.rest().position_m).collect();
@@ -25,22 +18,9 @@ pub(super) fn mock(scene: &MockScene) -> io::Result<MockServer> {
     let mut tags = Vec::new();
     let mut bodies = Vec::new();
     for (n, (name, motion)) in scene.names.iter().zip(&scene.motions).enumerate() {
-        let own = [-1.0, 1.0].map(|side: f64| {
-            let half = 0.5 * (side * TURN_DEG).to_radians();
-            let place = Pose {
-                position_m: [side * APART_M, 0.0, 0.0],
-                rotation_xyzw: [0.0, half.sin(), 0.0, half.cos()],
-            };
-            PrintedTag { id: (2 * n + usize::from(side > 0.0)) as u16, side_m: SIDE_M, place }
-        });
-        tags.extend(own.map(|tag| {
-            format!(
-                "{{ body = {name:?}, id = {}, side_m = {SIDE_M}, position = {:?}, rotation = {:?} }}",
-                tag.id, tag.place.position_m, tag.place.rotation_xyzw
-            )
-        }));
-        let markers: Vec<BrightMarker> = Vec::new();
-        bodies.push(MarkedBody { motion: motion.clone(), tags: own.to_vec(), markers });
+        let own = two_tags(n);
+        tags.extend(own.map(|tag| tag.as_toml(name)));
+        bodies.push(MarkedBody { motion: motion.clone(), tags: own.to_vec(), markers: vec![] });
     }
     let config = MockCameraConfig {
         optics: CameraOptics::pinhole(SIZE, VIEW_DEG),

@@ -160,3 +160,65 @@ fn any_header(bytes: &[u8]) {
         assert!(header.pixel_bytes() <= 8192 * 8192);
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use crate::config::{Overrides, RigConfig};
+    use crate::mock::{Motion, MotionSpec, SampleSource};
+    use crate::trackers::{MockScene, TrackerPlace};
+    use dpm_device::pose::Pose;
+    use dpm_device::time::{HostClock, HostTime};
+    use dpm_device::tracker::{BodyKey, Tracker};
+    use std::path::Path;
+    use std::sync::Arc;
+    use std::time::{Duration, Instant};
+
+    fn clock() -> Arc<dyn HostClock> {
+        let epoch = Instant::now();
+        Arc::new(move || HostTime(epoch.elapsed().as_nanos() as i64))
+    }
+
+    /// From the mock's picture over a socket to samples with a covariance that are where the body was.
+    #[test]
+    fn the_mocks_pictures_become_poses_with_their_covariance() {
+        let rest = Pose { position_m: [0.1, 0.2, 0.3], ..Pose::IDENTITY };
+        let motion = Motion::new(&MotionSpec::paper_translation(), rest).unwrap();
+        let source = SampleSource::new(Default::default(), vec![motion.clone()]).unwrap();
+        let clock = clock();
+        let names = vec!["hare".to_owned()];
+        let scene = MockScene { source, motions: vec![motion.clone()], names, clock: clock.clone() };
+        let server = super::mock::mock(&scene).unwrap();
+        let mut text = "[real_time]\npace = \"real\"\n[tracker]\nkind = \"camera\"\n".to_owned();
+        server.keys.iter().for_each(|(key, value)| text += &format!("{key} = {value}\n"));
+        let config = RigConfig::parse("rig.toml", &text, Path::new(""), &Overrides::default());
+        let config = config.unwrap_or_else(|e| panic!("{e}\n{text}")).tracker;
+        let bodies = vec![BodyKey { name: "hare".into(), id: None }];
+        let place = TrackerPlace { bodies, motions: vec![], clock: clock.clone(), start: HostTime(0) };
+        let mut tracker = config.open(place).unwrap();
+        let (transform, _) = config.frame().unwrap();
+        let world = transform.pose().unwrap();
+        let mut errors = Vec::new();
+        let begin = Instant::now();
+        while errors.len() < 20 {
+            assert!(
+                begin.elapsed() < Duration::from_secs(30),
+                "{} samples, {}",
+                errors.len(),
+                tracker.status()
+            );
+            let mut sink = |s: &dpm_device::tracker::TrackerSample| {
+                let at = world.transform_point3(glam::DVec3::from_array(s.pose.position_m));
+                let truth = motion.pose_at(s.captured_at.0).position_m;
+                if s.tracked {
+                    assert!(s.covariance.is_some_and(|c| c.variances().is_some()));
+                    errors.push((at - glam::DVec3::from_array(truth)).length());
+                }
+            };
+            tracker.poll(clock.now(), &mut sink).unwrap();
+            std::thread::sleep(Duration::from_millis(2));
+        }
+        errors.sort_by(f64::total_cmp);
+        assert!(errors[10] < 0.01, "{errors:?}");
+        assert!(tracker.gate().unwrap().counters().is_conserved());
+    }
+}

@@ -1,0 +1,115 @@
+//! `hil-mock serve camera`: a camera before bodies with printed tags.
+
+use super::bodies::{clock_from_now, parse_body, parse_rate};
+use super::say;
+use clap::Args;
+use dpm_device::pose::Pose;
+use hil_mock::camera::{two_tags, CameraHost, CameraOptics, MarkedBody, MockCamera, MockCameraConfig};
+use hil_mock::faults::FaultPlan;
+use std::error::Error;
+use std::net::{Ipv4Addr, SocketAddrV4};
+use std::time::{Duration, Instant};
+
+/// Arguments of `hil-mock serve camera`.
+#[derive(Args)]
+pub(crate) struct CameraArguments {
+    /// Address to serve on
+    #[arg(long, default_value = "127.0.0.1")]
+    bind: Ipv4Addr,
+    /// TCP port
+    #[arg(long, default_value_t = 8951)]
+    port: u16,
+    /// Body as NAME[@X,Y,Z][=MOTION], metres, with two tags of 80 mm; as of the other trackers. May be repeated
+    #[arg(long = "body", value_name = "BODY", default_values = ["Hare@0,0,0=translate", "Bust@0.3,0,0=rotate"])]
+    bodies: Vec<String>,
+    /// Place of the camera, which looks along -Z: X,Y,Z in metres
+    #[arg(long, default_value = "0.15,0,1.2")]
+    place: String,
+    /// Columns and rows, as 1280x800
+    #[arg(long, default_value = "1280x800")]
+    size: String,
+    /// Horizontal angle of view, degrees
+    #[arg(long, default_value_t = 60.0)]
+    view_deg: f64,
+    /// Pictures per second, as a number or fraction
+    #[arg(long, default_value = "60")]
+    rate: String,
+    /// Exposure of each row, milliseconds
+    #[arg(long, default_value_t = 2.0)]
+    exposure_ms: f64,
+    /// By how much later each row is exposed than the one above it, microseconds; 0 is a global shutter
+    #[arg(long, default_value_t = 0.0)]
+    row_us: f64,
+    /// From the end of the exposure to the arrival, milliseconds
+    #[arg(long, default_value_t = 4.0)]
+    latency_ms: f64,
+    /// Noise of reading, grey levels
+    #[arg(long, default_value_t = 1.5)]
+    noise: f64,
+    /// Shapes in the background, some of which look like tags
+    #[arg(long, default_value_t = 40)]
+    clutter: u32,
+    /// What goes wrong: loss, dropout, stuck, slow and stall, for example `loss=0.01,dropout@5s+20ms/10s`
+    #[arg(long, default_value = "")]
+    faults: FaultPlan,
+    /// Seed of noise, clutter and faults
+    #[arg(long, default_value_t = 1)]
+    seed: u64,
+    /// Stop after this many seconds
+    #[arg(long, value_parser = super::seconds)]
+    seconds: Option<f64>,
+}
+
+/// Numbers with a mark between them.
+fn numbers<T: std::str::FromStr, const N: usize>(
+    text: &str,
+    mark: char,
+    what: &str,
+) -> Result<[T; N], String> {
+    let all: Vec<T> = text.split(mark).filter_map(|n| n.trim().parse().ok()).collect();
+    all.try_into().map_err(|_| format!("`{text}` is not {what}"))
+}
+
+/// Serves until the time is over or the socket fails.
+pub(super) fn run(arguments: &CameraArguments) -> Result<(), Box<dyn Error>> {
+    let size = numbers(&arguments.size, 'x', "columns and rows such as 1280x800")?;
+    let place: [f64; 3] = numbers(&arguments.place, ',', "three numbers X,Y,Z in metres")?;
+    let (mut bodies, mut tags) = (Vec::new(), Vec::new());
+    for (n, text) in arguments.bodies.iter().enumerate() {
+        let (name, motion) = parse_body(text)?;
+        let own = two_tags(n);
+        tags.extend(own.map(|tag| tag.as_toml(&name)));
+        bodies.push(MarkedBody { motion, tags: own.to_vec(), markers: vec![] });
+    }
+    let config = MockCameraConfig {
+        optics: CameraOptics::pinhole(size, arguments.view_deg),
+        pose: Pose { position_m: place, ..Pose::IDENTITY },
+        rate: parse_rate(&arguments.rate)?,
+        exposure_ns: (arguments.exposure_ms * 1e6) as i64,
+        row_ns: (arguments.row_us * 1e3) as i64,
+        latency_ns: (arguments.latency_ms * 1e6) as i64,
+        read_noise: arguments.noise,
+        clutter: arguments.clutter,
+        seed: arguments.seed,
+        faults: arguments.faults.clone(),
+        ..MockCameraConfig::default()
+    };
+    let address = SocketAddrV4::new(arguments.bind, arguments.port);
+    let host = CameraHost::start(MockCamera::new(config, bodies)?, address, clock_from_now())
+        .map_err(|e| super::cannot_serve("a camera", address, &e, "--port"))?;
+    say(format_args!("camera on {}; in the rig file:", host.address()));
+    say(format_args!("[tracker]\nkind = \"camera\"\ndevice = \"tcp:{}\"", host.address()));
+    say(format_args!(
+        "size = {size:?}\nview_deg = {:?}\ntransform = {{ position = {place:?} }}",
+        arguments.view_deg
+    ));
+    say(format_args!("tags = [\n  {},\n]", tags.join(",\n  ")));
+    let started = Instant::now();
+    while host.is_running() {
+        if arguments.seconds.is_some_and(|s| started.elapsed().as_secs_f64() >= s) {
+            return Ok(());
+        }
+        std::thread::sleep(Duration::from_millis(50));
+    }
+    Err("the network socket failed".into())
+}
