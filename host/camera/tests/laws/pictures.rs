@@ -78,7 +78,7 @@ fn config() -> MockCameraConfig {
 
 #[test]
 fn tags_at_rest_are_seen_to_hundredths_of_a_pixel() {
-    let mut errors = look(&two_tags(), 40, 0.5, &MotionSpec::Still {}, &config());
+    let mut errors = look(&two_tags(), 12, 0.5, &MotionSpec::Still {}, &config());
     let [corner, place, turn] = errors.p99();
     let median = quantile(&mut errors.corners_px, 0.5);
     println!("{median:.3} px, p99 {corner:.3} px, {place:.3} mm, {turn:.3} deg, {} missed", errors.missed);
@@ -92,7 +92,7 @@ fn blur_leans_to_no_side() {
     let moving =
         MotionSpec::Sinusoid { direction: [1.0, 0.4, 0.3], peak_speed_m_s: 0.5, peak_acceleration_m_s2: 5.0 };
     let config = MockCameraConfig { exposure_ns: 4_000_000, instants: 16, ..config() };
-    let mut errors = look(&two_tags(), 40, 0.5, &moving, &config);
+    let mut errors = look(&two_tags(), 12, 0.5, &moving, &config);
     let [corner, place, turn] = errors.p99();
     println!("p99 {corner:.3} px, {place:.3} mm, {turn:.3} deg, {} missed", errors.missed);
     assert!(
@@ -108,7 +108,7 @@ fn markers_are_seen_to_half_a_millimetre() {
         [[0.0, 0.0, 0.0], [0.1, 0.0, 0.02], [0.0, 0.08, 0.0], [-0.07, -0.05, 0.03], [0.05, -0.06, -0.03]];
     let markings = Markings { tags: vec![], markers: markers.map(DVec3::from_array).to_vec() };
     let dark = MockCameraConfig { white: 40.0, ..config() };
-    let mut errors = look(&markings, 60, 0.8, &MotionSpec::Still {}, &dark);
+    let mut errors = look(&markings, 20, 0.8, &MotionSpec::Still {}, &dark);
     let [spot, place, turn] = errors.p99();
     println!("p99 {spot:.3} px, {place:.3} mm, {turn:.3} deg, {} missed", errors.missed);
     assert!(errors.missed <= 3, "{} missed", errors.missed);

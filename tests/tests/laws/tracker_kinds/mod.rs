@@ -10,6 +10,7 @@ use dpm_rig::config::{Overrides, RigConfig};
 use dpm_rig::trackers::{
     add, kinds, simulated, MockScene, PoseOrigin, TrackerConfig, TrackerKind, TrackerPlace,
 };
+use glam::DAffine3;
 use hil_mock::motion::{Motion, MotionSpec};
 use hil_mock::tracker::{MockTrackerConfig, SampleSource};
 use proptest::test_runner::{Config, TestRunner};
@@ -117,14 +118,17 @@ fn brings_the_truth(kind: &TrackerKind) {
     }
     let gate = tracker.gate().expect("every tracker ends in a gate");
     assert!(gate.counters().is_conserved(), "{}", gate.counters());
+    // What measures from a place of its own says where that is.
+    let world_from_tracker =
+        config.frame().and_then(|(transform, _)| transform.pose()).unwrap_or(DAffine3::IDENTITY);
     for (body, of_body) in samples.iter().enumerate() {
         assert!(of_body.windows(2).all(|w| w[0].captured_at < w[1].captured_at), "in order of capture");
         let mut errors: Vec<f64> = of_body
             .iter()
             .map(|s| {
                 let truth = source.true_pose(BodyIndex(body as u16), s.captured_at.0).unwrap();
-                let apart = |i: usize| (truth.position_m[i] - s.pose.position_m[i]).powi(2);
-                (0..3).map(apart).sum::<f64>().sqrt()
+                let seen = world_from_tracker.transform_point3(s.pose.position_m.into());
+                seen.distance(truth.position_m.into())
             })
             .collect();
         errors.sort_by(f64::total_cmp);
