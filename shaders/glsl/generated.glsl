@@ -471,6 +471,8 @@ struct Barycentric {
 
 struct Counters {
     uint rays;
+    uint camera_rays;
+    uint proven_rays;
     uint samples;
     uint invalid_samples;
     uint lit_pixels;

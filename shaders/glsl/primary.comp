@@ -105,4 +105,5 @@ void main() {
     set_surface(at, surface);
     set_barycentric(at, Barycentric(hit.barycentric));
     COUNT(rays, closest + shadow)
+    COUNT(camera_rays, closest + shadow)
 }

@@ -136,7 +136,8 @@ void trace_slots(uint base) {
             state = follows ? BEGINS | FOLLOWS : BEGINS;
         }
     }
-    COUNT(rays, rays)
+    COUNT(rays, rays_of(rays))
+    COUNT(proven_rays, proven_rays_of(rays))
 }
 
 // Adds the light of the slots, pixel by pixel, and writes the pixels whose last sample is among them.

@@ -16,7 +16,7 @@ void main() {
     Sampler rng = begin_sampler(at, spp);
     bool dpm = (frame.flags & FRAME_DPM) != 0u;
     Sums sums = NO_SAMPLES;
-    uint traced = 0u, invalid = 0u, rays = 0u;
+    uint traced = 0u, invalid = 0u, all_rays = 0u, proven = 0u;
     // A lane whose path ends begins its next sample at once, while the paths of its neighbours continue.
     Path path;
     bool begins = true;
@@ -24,8 +24,11 @@ void main() {
         if (begins) path = begin_path(first, rng, met.id);
         Branches branches;
         Hit hit;
+        uint rays = 0u;
         begins = !branch(path, rng, rays, branches) || !follow(path, branches, hit)
               || !arrive(path, branches, hit, shading_point(hit, -normalize(branches.next.direction)));
+        all_rays += rays_of(rays);
+        proven += proven_rays_of(rays);
         if (begins) {
             if (!add_sample(sums, path.radiance, dpm && path.exact != 0u)) invalid++;
             rng.index++;
@@ -33,7 +36,8 @@ void main() {
         }
     } while (traced < spp && !sums.exact);
     write_sums(at, sums);
-    COUNT(rays, rays)
+    COUNT(rays, all_rays)
+    COUNT(proven_rays, proven)
     COUNT(samples, traced)
     COUNT_RARE(invalid_samples, invalid)
 }

@@ -543,8 +543,12 @@ gpu_structs! {
 
     /// What one frame counted. Zeroed by the host before the frame.
     struct Counters {
-        /// Rays, whether they ask for the nearest hit or for any.
+        /// Rays, whether they ask for the nearest hit or for any, and whether they are walked or proven to meet nothing.
         rays: u32,
+        /// Those of them from the projector and from there to the eye. All of these are walked.
+        camera_rays: u32,
+        /// Those of them that a horizon proves to meet nothing. They are not walked.
+        proven_rays: u32,
         /// Paths.
         samples: u32,
         /// Samples dropped because they were not finite.
@@ -784,6 +788,13 @@ pub struct Part {
     pub before: usize,
     /// Bytes of a pixel in all parts.
     pub all: usize,
+}
+
+impl Counters {
+    /// Rays that were walked through the scene: all that no horizon proves to meet nothing.
+    pub fn walked_rays(&self) -> u32 {
+        self.rays.saturating_sub(self.proven_rays)
+    }
 }
 
 impl Part {

@@ -15,6 +15,7 @@
 pub mod clock;
 pub mod commit;
 pub mod files;
+pub mod fnv;
 pub mod folder;
 pub mod guardian;
 pub mod keys;

@@ -22,6 +22,7 @@ pub mod handoff_cost;
 pub mod lanes;
 pub mod link_test;
 mod median;
+pub mod method_choice;
 mod metrics;
 pub mod offline;
 pub mod paint;
@@ -31,6 +32,7 @@ pub mod report;
 pub mod room;
 pub mod rounding;
 pub mod scene_plan;
+pub mod seed_frames;
 pub mod sequence;
 pub mod snapshot;
 #[cfg(test)]

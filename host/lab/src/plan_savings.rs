@@ -29,6 +29,10 @@ pub struct Saving {
     pub without_rays: f64,
     /// The same with it.
     pub with_rays: f64,
+    /// Those of the rays without the part that were walked; the others were proven to meet nothing.
+    pub without_walked_rays: f64,
+    /// The same with it.
+    pub with_walked_rays: f64,
     /// Every code value and every bit of radiance is the same.
     pub pixels_identical: bool,
     /// How the pictures differ.
@@ -218,7 +222,7 @@ pub(crate) fn compare(
     let open = |side: Side<'_>| Renderer::keeping(gpu, side.scene, side.settings.clone(), side.keep);
     let mut renderers = [open(without)?, open(with)?];
     let mut slots: [FrameSlot; 2] = [renderers[0].create_slot(true)?, renderers[1].create_slot(true)?];
-    let (mut times, mut rays) = ([Vec::new(), Vec::new()], [0.0f64; 2]);
+    let (mut times, mut rays, mut walked) = ([Vec::new(), Vec::new()], [0.0f64; 2], [0.0f64; 2]);
     let (mut rounding, mut difference) = (Rounding::default(), 0.0);
     let spp = rig.config.render.spp;
     for k in 0..FRAMES {
@@ -230,6 +234,7 @@ pub(crate) fn compare(
             times[i].push(if gpu_ns > 0 { gpu_ns } else { watch.elapsed_ns() });
             let counters = cost.counters();
             rays[i] += f64::from(counters.rays) / f64::from(FRAMES);
+            walked[i] += f64::from(counters.walked_rays()) / f64::from(FRAMES);
         }
         let [a, b] = [0, 1].map(|i: usize| slots[i].radiance().unwrap_or(&[]));
         rounding.add([a, b], [slots[0].codes(), slots[1].codes()]);
@@ -248,6 +253,8 @@ pub(crate) fn compare(
         saved_middle_half_ms: quartiles(differences),
         without_rays,
         with_rays,
+        without_walked_rays: walked[0],
+        with_walked_rays: walked[1],
         pixels_identical: rounding.keeps_bits(),
         rounding,
         difference,

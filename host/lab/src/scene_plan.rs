@@ -1,15 +1,18 @@
 //! `dpm plan`: a rig into what its scene and method need of the renderer, what is left out of it and how, and what that saves.
 
+use super::method_choice::choose;
 use super::plan_savings::{changed, compare, flipped, keeping, keeps_bits, Saving, Side};
 use super::temporal_light::TemporalLight;
 use dpm_common::clock::Stopwatch;
-use dpm_device::planes::Channel;
+use dpm_device::planes::{Channel, Raster};
+use dpm_render::gpu::Gpu;
 use dpm_render::method::{Method, SamplerKind};
 use dpm_render::scene_data::{SceneData, SceneNeeds};
 use dpm_render::warp::LEAST_MOTION_PX;
 use dpm_render::{traffic, Keep, Output, RenderError, RendererSettings, Traffic};
 use dpm_rig::config::{EffectsConfig, PlanePoses, RenderConfig, RenderMethod, RigConfig};
 use dpm_rig::failure::{Failure, FailureKind};
+use dpm_rig::method_choice::{self, MethodChoice};
 use dpm_rig::pipeline::{renderer_settings, PipelineError};
 use dpm_rig::rig::Rig;
 use dpm_rig::run_rig::{open_gpu, traced_raster};
@@ -17,6 +20,7 @@ use dpm_scene::bvh::{BodyBvh, Refit};
 use dpm_scene::{Body, Deformed, Environment, Material, Scene, TextureRef};
 use glam::Vec3;
 use serde::Serialize;
+use std::sync::Arc;
 
 /// One part that not every rig needs.
 #[derive(Clone, Debug, Serialize)]
@@ -52,6 +56,8 @@ pub struct PlanReport {
     pub temporal_light: Option<TemporalLight>,
     /// What differs from a run on the rig.
     pub warnings: Vec<String>,
+    /// What method "auto" was measured to be; `None` of another method, or without measurement.
+    pub method_choice: Option<MethodChoice>,
 }
 
 const BY_CONSTANT: &str = "specialization constant";
@@ -304,7 +310,7 @@ fn rig_entries(rig: &Rig) -> Vec<PlanEntry> {
         },
         entry(
             "pixels out of the light",
-            (config.render.method != RenderMethod::Dpm)
+            (!config.render.method.takes_a_budget())
                 .then(|| format!("method {} does not look back", config.render.method.word())),
             "no light fell there in the last frame, nor within two pixels",
             "no ray in three frames of four while nothing jumps, decided per pixel",
@@ -370,6 +376,30 @@ fn planes_that_follow(rig: &Rig) -> PlanEntry {
     }
 }
 
+/// Measures what method "auto" is for this rig on this device, and keeps it for its runs.
+fn measured_method(
+    config: &RigConfig,
+    raster: Option<Raster>,
+    gpu: &Arc<Gpu>,
+    warnings: &mut Vec<String>,
+) -> Result<MethodChoice, Failure> {
+    let cache = std::env::temp_dir().join(format!("dpm-methods-{}", std::process::id()));
+    let chosen = choose(&|| Rig::build(config, raster), gpu, &cache, &mut |_| ());
+    // What cannot be removed lies in a folder for temporary files.
+    let _ = std::fs::remove_dir_all(&cache);
+    let choice = chosen.map_err(|e| Failure::new(FailureKind::BadInput, e))?;
+    let kept = match method_choice::folder() {
+        Some(folder) => choice.write(&folder).map_err(|e| e.to_string()),
+        None => Err("there is no home directory; set DPM_STATE_DIR".into()),
+    };
+    match kept {
+        Ok(path) => warnings.push(format!("method auto: kept in {}, which runs read", path.display())),
+        Err(why) => warnings
+            .push(format!("method auto: runs will use dpm, because the choice could not be kept: {why}")),
+    }
+    Ok(choice)
+}
+
 fn gpu_failure(error: impl Into<RenderError>) -> Failure {
     PipelineError::Render(error.into()).into()
 }
@@ -396,9 +426,19 @@ pub fn scene_plan(config: &RigConfig, measure: bool) -> Result<PlanReport, Failu
     let packs = RendererSettings { output: Output::Planes(rig.schedule), ..renderer_settings(&rig) };
     let traffic = traffic(&packs, Keep::default());
     let temporal_light = TemporalLight::of(&config.projector);
-    let mut report =
-        PlanReport { method: word.to_owned(), entries, together: None, traffic, temporal_light, warnings };
+    let mut report = PlanReport {
+        method: word.to_owned(),
+        entries,
+        together: None,
+        traffic,
+        temporal_light,
+        warnings,
+        method_choice: None,
+    };
     let Some(gpu) = gpu else { return Ok(report) };
+    if config.render.method == RenderMethod::Auto {
+        report.method_choice = Some(measured_method(config, raster, &gpu, &mut report.warnings)?);
+    }
     let (own, lean) = (renderer_settings(&rig), Keep::default());
     let mine = Side { scene: &rig.scene, settings: &own, keep: lean };
     let pair = |without: Side<'_>, with: Side<'_>| compare(&rig, &gpu, without, with).map_err(gpu_failure);

@@ -47,6 +47,8 @@ pub struct Seen {
     pub frames: Vec<Vec<Vec3>>,
     /// Closest-hit and shadow rays of the kept frames, primary rays included.
     pub rays: u64,
+    /// Those of them that were walked through the scene; the others were proven to meet nothing.
+    pub walked_rays: u64,
     /// Samples of the kept frames.
     pub samples: u64,
     /// Cost of every kept frame.
@@ -169,7 +171,7 @@ impl Theatre {
         };
         let mut renderer = Renderer::new(&self.gpu, &rig.scene, settings)?;
         let mut slot = renderer.create_slot(true)?;
-        let mut seen = Seen { frames: Vec::new(), rays: 0, samples: 0, costs: Vec::new() };
+        let mut seen = Seen { frames: Vec::new(), rays: 0, walked_rays: 0, samples: 0, costs: Vec::new() };
         let total = self.span.warm_up + self.span.kept;
         for k in 0..total {
             let poses = self.poses(k, total);
@@ -178,6 +180,7 @@ impl Theatre {
             if k >= self.span.warm_up {
                 let c = cost.counters();
                 seen.rays += u64::from(c.rays);
+                seen.walked_rays += u64::from(c.walked_rays());
                 seen.samples += u64::from(c.samples);
                 seen.costs.push(cost);
                 seen.frames.push(self.look(
@@ -188,6 +191,12 @@ impl Theatre {
             }
         }
         Ok(seen)
+    }
+
+    /// The same with so many frames before those that are kept.
+    pub(crate) fn with_warm_up(&self, warm_up: u32) -> Self {
+        let (rig, gpu, probes) = (self.rig.clone(), self.gpu.clone(), self.probes.clone());
+        Self { rig, gpu, span: Span { warm_up, ..self.span }, probes, frozen: self.frozen }
     }
 
     /// Poses of frame `k` of `total`, the last of which is that of the span.

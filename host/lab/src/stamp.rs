@@ -1,42 +1,12 @@
 //! A rig and a device into the words under which a measurement can be found again.
 
+use dpm_common::fnv::Fnv;
 use dpm_device::regular_file;
 use dpm_render::gpu::DeviceSummary;
 use dpm_rig::rig::Rig;
 use serde::{Deserialize, Serialize};
 use std::fmt::Write;
 use std::path::Path;
-
-/// 64 bits of FNV-1a [Fowler, Noll, Vo]: names files by what they were made from. Not for enemies.
-#[derive(Clone, Copy, Debug)]
-pub(crate) struct Fnv(u64);
-
-impl Default for Fnv {
-    fn default() -> Self {
-        Self(0xcbf2_9ce4_8422_2325)
-    }
-}
-
-impl Fnv {
-    /// Takes bytes in.
-    pub(crate) fn add(&mut self, bytes: &[u8]) {
-        for &b in bytes {
-            self.0 = (self.0 ^ u64::from(b)).wrapping_mul(0x0100_0000_01b3);
-        }
-    }
-
-    /// The hash as 16 hexadecimal digits.
-    pub(crate) fn text(&self) -> String {
-        format!("{:016x}", self.0)
-    }
-}
-
-impl Write for Fnv {
-    fn write_str(&mut self, s: &str) -> std::fmt::Result {
-        self.add(s.as_bytes());
-        Ok(())
-    }
-}
 
 /// What a measurement was made with.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
@@ -128,21 +98,4 @@ const MAX_INPUT_BYTES: u64 = 2 << 30;
 /// The file's bytes. One that cannot be read any more counts as empty: the rig was built from it a moment ago.
 fn add_file(hash: &mut Fnv, path: &Path) {
     hash.add(&regular_file::read(path, MAX_INPUT_BYTES).unwrap_or_default());
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn the_hash_is_fnv_1a() {
-        // Published test values of the 64-bit variant.
-        for (text, wanted) in
-            [("", "cbf29ce484222325"), ("a", "af63dc4c8601ec8c"), ("foobar", "85944171f73967e8")]
-        {
-            let mut hash = Fnv::default();
-            hash.add(text.as_bytes());
-            assert_eq!(hash.text(), wanted);
-        }
-    }
 }

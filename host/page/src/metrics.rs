@@ -48,7 +48,8 @@ families! {
     PREDICT = "dpm_prediction_seconds", "gauge", "The longest time for which prediction may extend a track";
     BUDGET = "dpm_samples_per_pixel", "gauge", "Average samples per pixel that the newest frame was given";
     SAMPLES = "dpm_samples_total", "counter", "Samples taken";
-    RAYS = "dpm_rays_total", "counter", "Rays traced";
+    RAYS = "dpm_rays_total", "counter", "Rays, with those that were proven to meet nothing";
+    WALKED_RAYS = "dpm_walked_rays_total", "counter", "Rays that were walked through the scene";
     REGISTRATION = "dpm_registration_error_pixels", "gauge", "Distance of light from its place in projector pixels; only with a mock tracker";
     PICTURES = "dpm_live_pictures_total", "counter", "Pictures of another program that the body was given (scene.bodies[].texture)";
     TRACKER = "dpm_tracker_samples_total", "counter", "Samples of the tracker by what became of them; lost ones never came";
@@ -193,6 +194,7 @@ fn run(out: &mut Out, state: &State, figures: &LiveSnapshot) {
     out.family(BUDGET).value(&[], figures.frame.budget_spp);
     out.family(SAMPLES).value(&[], figures.samples as f64);
     out.family(RAYS).value(&[], figures.rays as f64);
+    out.family(WALKED_RAYS).value(&[], figures.walked_rays as f64);
     out.family(REGISTRATION);
     if let Some(spread) = r.registration_error_px {
         for (quantile, px) in

@@ -165,6 +165,7 @@ impl State {
             "misses": misses,
             "flights": f.flights,
             "rays": f.rays,
+            "walked_rays": f.walked_rays,
             "samples": f.samples,
         })
     }

@@ -19,6 +19,7 @@ use self::v2log::write_v2_log;
 use dpm_common::files::write_atomically;
 use dpm_rig::config::RigConfig;
 use dpm_rig::failure::{Ended, Failure};
+use dpm_rig::method_choice;
 use dpm_rig::pipeline::{self, RunOptions, RunOutcome};
 use dpm_rig::presence;
 use dpm_rig::rig::Rig;
@@ -72,7 +73,9 @@ pub fn profile_rig(
         presence::look(config)?;
         let gpu = open_gpu(config)?;
         let mut notes = Vec::new();
-        let rig = Arc::new(Rig::build(config, traced_raster(config, &gpu, &mut notes))?);
+        let mut rig = Rig::build(config, traced_raster(config, &gpu, &mut notes))?;
+        method_choice::decide(&mut rig, &gpu);
+        let rig = Arc::new(rig);
         (pipeline::run(rig.clone(), &gpu, options, monitor)?, notes, rig)
     };
     let mut profile = summary(&outcome, &rig, prepared);

@@ -64,6 +64,11 @@ impl RendererPlan {
         Ok(Self { data, settings, keep, tracked })
     }
 
+    /// The same scene to be drawn with other settings. What was worked out of it is shared.
+    pub fn with_settings(&self, settings: RendererSettings) -> Self {
+        Self { settings, ..self.clone() }
+    }
+
     /// How the shaders read tables and find what a ray meets on this device. Software Vulkan should read texel buffers.
     ///
     /// # Errors

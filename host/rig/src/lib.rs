@@ -39,6 +39,7 @@ pub mod failure;
 pub mod frame;
 pub mod interlock;
 pub mod light;
+pub mod method_choice;
 mod mock;
 pub mod order;
 pub mod pack;

@@ -212,6 +212,8 @@ pub struct Rig {
     pub latency_ns: Option<i64>,
     /// What is used of the calibration file, one sentence; `None` without such a file.
     pub calibration: Option<String>,
+    /// How method "auto" was decided, one sentence; `None` where the rig file names the method, or before it is decided.
+    pub method_choice: Option<String>,
 }
 
 /// A rigid transform from a pose.
@@ -317,6 +319,7 @@ impl Rig {
             drive,
             latency_ns,
             calibration,
+            method_choice: None,
         };
         // Those of a rig that was built before with the same scene may hold no more.
         rig.scene.warnings.retain(|told| !told.starts_with(plausible::MARK));
@@ -353,6 +356,7 @@ impl Rig {
             drive: Drive::default(),
             latency_ns: measured.latency.as_ref().map(|l| (l.latency_us * 1e3).round() as i64),
             calibration: None,
+            method_choice: None,
             config,
         })
     }

@@ -4,6 +4,7 @@ use super::pictures::{pictures, to_srgb};
 use crate::config::RigConfig;
 use crate::engine::connect::ConnectError;
 use crate::failure::{Ended, Failure, FailureKind};
+use crate::method_choice;
 use crate::pipeline::{self, PipelineError, RunOptions, RunOutcome};
 use crate::presence;
 use crate::rig::{Rig, RigError};
@@ -35,7 +36,9 @@ pub fn run_rig(config: &RigConfig, monitor: &Arc<RunMonitor>) -> Result<Ended<Re
     let gpu = open_gpu(config)?;
     let mut notes = Vec::new();
     let raster = traced_raster(config, &gpu, &mut notes);
-    let rig = Arc::new(Rig::build(config, raster)?);
+    let mut rig = Rig::build(config, raster)?;
+    method_choice::decide(&mut rig, &gpu);
+    let rig = Arc::new(rig);
     let output = &config.output;
     // The pictures show the light itself, which only the mock observes.
     let has_light = config.projector.backend.is_mock();

@@ -12,6 +12,7 @@ use dpm_rig::rig::Rig;
 use dpm_scene::lobes::*;
 use dpm_scene::shapes::*;
 use dpm_scene::{Material, PunctualKind, PunctualLight, Scene};
+use dpm_shaders::structs::Counters;
 use dpm_tests::compare::{assert_same_picture, bits};
 use dpm_tests::gpu::with_gpu;
 use glam::{DVec3, Vec3};
@@ -175,6 +176,38 @@ fn leaving_out_changes_no_bit_of(scenes: impl IntoIterator<Item = (&'static str,
             assert_eq!(bits(&lean.radiance), bits(&stored.radiance), "{name}: tables in storage");
             assert_eq!(lean.codes, stored.codes, "{name}: tables in storage");
         }
+    });
+}
+
+/// A ball alone is convex: nothing that leaves it meets it again, so a GPU walks none of its paths' rays. From within nothing leaves it.
+/// Software Vulkan has no horizons, and walks all. The rays are the same.
+#[test]
+fn rays_that_are_proven_to_miss_are_counted_apart() {
+    with_gpu(|gpu| {
+        let counted = |scene: &Scene, eye: f64, storage_tables: bool| {
+            let shot = Shot {
+                spp: 4,
+                depth: 4,
+                ..Shot::new(scene, camera(40, 30, DVec3::new(0.0, 0.0, eye), DVec3::ZERO))
+            };
+            let counters = shot.draw_keeping(gpu, Keep { storage_tables, ..Keep::default() }).counters;
+            let sum = |of: &dyn Fn(&Counters) -> u32| counters.iter().map(|c| u64::from(of(c))).sum::<u64>();
+            assert_eq!(sum(&|c| c.rays), sum(&|c| c.walked_rays() + c.proven_rays));
+            [sum(&|c| c.rays), sum(&|c| c.camera_rays), sum(&|c| c.proven_rays)]
+        };
+        let ball = |outward: bool| {
+            let mut scene = scene_of(sphere(Vec3::ZERO, 0.5, 2, outward), diffuse(Vec3::splat(0.7)));
+            scene.environment = sky(0.8);
+            scene
+        };
+        let [rays, camera, proven] = counted(&ball(true), 2.0, true);
+        assert!(camera > 1000 && rays - camera > 1000, "{rays}, {camera}");
+        assert_eq!(proven, rays - camera, "every ray of a path leaves a convex body");
+        if gpu.summary().software {
+            assert_eq!(counted(&ball(true), 2.0, false), [rays, camera, 0], "walked as they are");
+        }
+        let [rays, camera, proven] = counted(&ball(false), 0.3, true);
+        assert!(rays - camera > 1000 && proven == 0, "{rays}, {camera}, {proven}");
     });
 }
 

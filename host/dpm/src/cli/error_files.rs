@@ -235,6 +235,7 @@ mod tests {
             budget,
             spp: 1.0,
             rays: 1.0,
+            walked_rays: 1.0,
             rays_to_paper: 1.0,
             samples: 1.0,
             gpu_ms: 1.0,

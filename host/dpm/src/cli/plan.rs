@@ -35,11 +35,13 @@ fn saved(s: &Saving) -> String {
     );
     if s.changes_pictures {
         return format!(
-            "{:.2} ms and {:.0} rays without, {:.2} ms and {:.0} rays with: {cost}; pixels differ by {:.1} % RMS",
+            "{:.2} ms and {:.0} rays ({:.0} walked) without, {:.2} ms and {:.0} rays ({:.0} walked) with: {cost}; pixels differ by {:.1} % RMS",
             s.without_ms,
             s.without_rays,
+            s.without_walked_rays,
             s.with_ms,
             s.with_rays,
+            s.with_walked_rays,
             100.0 * s.difference
         );
     }
@@ -102,6 +104,7 @@ pub(super) fn execute(args: &PlanArgs) -> Result<(), Failure> {
     if let Some(s) = &report.together {
         text += &format!("all that is left out and can be put back, together: {}\n", saved(s));
     }
+    text += &report.method_choice.as_ref().map_or(String::new(), |c| format!("method auto: {}\n", c.told()));
     text += &moved(&report.traffic);
     text += &report.temporal_light.as_ref().map_or(String::new(), |light| seen(light, args));
     print(&text);

@@ -122,6 +122,17 @@ impl RigArgs {
         self.rig_for(path, Purpose { at_rest: true, ..Purpose::default() })
     }
 
+    /// The same of a rig file that is part of the program. The files that it names are relative to the working folder.
+    ///
+    /// # Errors
+    /// As [`RigArgs::rig`].
+    #[cfg(feature = "lab")]
+    pub(super) fn rig_of_text(&self, name: &str, text: &str) -> Result<RigConfig, Failure> {
+        let overrides = Overrides::from_environment(self.flags()?);
+        let purpose = Purpose { at_rest: true, simulate: self.simulate, ..Purpose::default() };
+        Ok(RigConfig::parse_for(name, text, Path::new(""), &overrides, purpose)?)
+    }
+
     /// The same with other `keys`, as `--set` takes them; `None` if the rig file refuses them.
     pub(super) fn with_keys(&self, path: Option<&Path>, keys: &[&str]) -> Option<RigConfig> {
         let mut other = self.clone();

@@ -21,6 +21,7 @@ use dpm_render::pack::{pack, BitPlaneFrame, Kernel};
 use dpm_render::{RenderError, Renderer};
 use dpm_rig::config::RigConfig;
 use dpm_rig::failure::{Failure, FailureKind};
+use dpm_rig::method_choice;
 use dpm_rig::order::Order;
 use dpm_rig::pipeline::{renderer_settings, PipelineError};
 use dpm_rig::presence;
@@ -250,7 +251,7 @@ fn load(
     monitor: &RunMonitor,
 ) -> Result<(PatternSequence, usize), Failure> {
     presence::GPU.look(config)?;
-    let rig = Rig::build(config, None)?;
+    let mut rig = Rig::build(config, None)?;
     let schedule = config.projector.schedule();
     let most = frames_held(dmd, schedule.len());
     let frames = if config.tracker.is_mock() {
@@ -267,10 +268,12 @@ fn load(
         1
     };
     let gpu = open_gpu(config)?;
+    method_choice::decide(&mut rig, &gpu);
+    warnings.extend(rig.method_choice.iter().map(|told| format!("render.method = \"auto\": {told}")));
     let mut renderer =
         Renderer::new(&gpu, &rig.scene, renderer_settings(&rig)).map_err(PipelineError::from)?;
     let mut slot = renderer.create_slot(false).map_err(RenderError::from).map_err(PipelineError::from)?;
-    let spp = config.render.spp;
+    let spp = rig.config.render.spp;
     let mut packed = Vec::new();
     for k in 0..frames {
         if monitor.stop_requested() {

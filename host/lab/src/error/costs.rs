@@ -7,7 +7,7 @@
 use serde::Deserialize;
 
 /// Reports of cards, as `dpm bench --report FILE` writes them.
-const REPORTS: [&str; 1] = [include_str!("../../cards/h100.json")];
+const REPORTS: [&str; 2] = [include_str!("../../cards/h100.json"), include_str!("../../cards/h200.json")];
 
 /// The pass whose time goes with the rays.
 const BY_RAYS: &str = "trace";
@@ -16,7 +16,34 @@ const BY_RAYS: &str = "trace";
 #[derive(Clone, Debug, Deserialize)]
 pub struct CardCosts {
     stamp: CardStamp,
+    #[serde(default)]
     methods: Vec<MethodReport>,
+    #[serde(default)]
+    frames: Vec<CardFrame>,
+}
+
+/// A frame that was measured on a card at 1024 x 768 and depth 3, as a row of docs/lab/H100.md has it.
+#[derive(Clone, Debug, Deserialize)]
+pub struct CardFrame {
+    /// "demo", or "bunny-venus" with the diffuse bodies.
+    pub scene: String,
+    /// The method.
+    pub method: String,
+    /// Samples that were asked for.
+    pub samples: String,
+    /// Rays that surely meet nothing were not walked.
+    pub horizons: bool,
+    /// The pass `trace`, ms.
+    pub trace_ms: f64,
+    /// Distance of frames in line, ms.
+    pub in_line_ms: Option<f64>,
+    /// Rays of `trace`, and paths: of that frame where they were noted, else of the same frame on software Vulkan. The model is held to
+    /// frames that have them.
+    pub path_rays: Option<f64>,
+    /// See `path_rays`.
+    pub paths: Option<f64>,
+    /// Share of `path_rays` that horizons proved to miss, of the same frame on software Vulkan by the shaders of a GPU; 0 without horizons.
+    pub proven_share: Option<f64>,
 }
 
 #[derive(Clone, Debug, Deserialize)]
@@ -68,6 +95,7 @@ impl CardCosts {
         let card: Self = serde_json::from_str(report).map_err(|e| e.to_string())?;
         let is_sound = |m: &MethodReport| m.rays_per_frame > 0.0 && m.lit_pixels > 0.0;
         match card.methods.iter().find(|m| !is_sound(m)) {
+            None if card.methods.is_empty() && card.frames.is_empty() => Err("it has no methods".into()),
             Some(m) => Err(format!("{} has no rays or no lit pixels", m.method)),
             None => Ok(card),
         }
@@ -81,6 +109,11 @@ impl CardCosts {
     /// The card.
     pub fn name(&self) -> &str {
         &self.stamp.device
+    }
+
+    /// Frames that were measured one by one.
+    pub fn frames(&self) -> &[CardFrame] {
+        &self.frames
     }
 
     /// Those of a method; `None` if it was not measured, or by no pass.
@@ -102,7 +135,9 @@ mod tests {
     #[test]
     fn committed_reports_have_the_costs_of_the_methods() {
         assert_eq!(CardCosts::all().len(), REPORTS.len());
-        for card in CardCosts::all() {
+        // Of the H200 single frames were measured, and no method by all its passes.
+        for card in CardCosts::all().into_iter().filter(|card| !card.methods.is_empty()) {
+            assert_eq!(card.name(), "NVIDIA H100");
             for method in ["full", "sequence", "miyamoto", "paper", "dpm"] {
                 let (costs, report) =
                     (card.of(method).unwrap(), card.methods.iter().find(|m| m.method == method).unwrap());

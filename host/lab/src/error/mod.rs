@@ -1,7 +1,7 @@
 //! Error against rays and time of every method: runs, references, tables, plots.
 
 pub mod costs;
-mod equal;
+pub(crate) mod equal;
 pub mod export;
 pub mod figure3;
 pub mod groups;

@@ -39,14 +39,9 @@ pub(crate) fn switched_method_of(render: &RenderConfig, which: RenderMethod) -> 
     own.to_method()
 }
 
-/// What the row of the frame's own samples is called, shown without history or filter.
+/// What the row of the frame's own samples is called, shown without history or filter: what a history or a filter makes worse than this is
+/// better left out.
 pub const OWN: &str = "own";
-
-/// The frame's own samples of the sequences that method dpm's surface points carry, as many in every pixel, shown without history or filter.
-/// It has no bias: what a history or a filter makes worse than this is better left out.
-pub(crate) fn own_method(dpm: &Method) -> Method {
-    Method { rate_map: false, temporal: false, spatial: false, history_cap: 0.0, ..dpm.clone() }
-}
 
 /// The five methods, and what lies under dpm ([`OWN`]); with `ablation`, dpm with each part off in turn too. `paper` comes first: its rays
 /// are everybody's budget.
@@ -57,7 +52,7 @@ pub fn contenders(render: &RenderConfig, ablation: bool) -> Vec<Contender> {
         of(RenderMethod::Paper),
         of(RenderMethod::Full),
         of(RenderMethod::Sequence),
-        Contender { name: OWN, method: own_method(&dpm) },
+        of(RenderMethod::Own),
         of(RenderMethod::Miyamoto),
         of(RenderMethod::Dpm),
     ];

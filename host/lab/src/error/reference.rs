@@ -2,8 +2,8 @@
 
 use super::runs::{ErrorRunError, EYE_FRAMES};
 use crate::sequence::{eye_mean, rmse, Theatre};
-use crate::stamp::Fnv;
 use dpm_common::files::write_atomically;
+use dpm_common::fnv::Fnv;
 use dpm_device::regular_file;
 use dpm_render::method::{Method, SamplerKind};
 use glam::Vec3;

@@ -13,7 +13,7 @@ fn optional(v: Option<f64>) -> String {
 /// All rows as CSV with a head line. Columns are the fields of [`ErrorRow`], preceded by device and configuration hash.
 pub fn csv(groups: &[GroupResult]) -> String {
     let mut text = String::from(
-        "device,driver,commit,config,seed,motion,budget,method,spp,rays,rays_to_paper,samples,gpu_ms,wall_ms,single_rmse,single_rel_mse,\
+        "device,driver,commit,config,seed,motion,budget,method,spp,rays,walked_rays,rays_to_paper,samples,gpu_ms,wall_ms,single_rmse,single_rel_mse,\
          perceived_rmse,perceived_rmse_raw,perceived_fovea,perceived_periphery,bias,bias_floor,noise,mean_shift,flip,flicker,\
          flicker_periphery,ratio_to_paper,reference_error,ms_low,ms_high,run_a_raw,run_b_raw,equal_time_spp,equal_time_to_dpm,\
          equal_time_rmse_raw,equal_time_rmse\n",
@@ -23,13 +23,14 @@ pub fn csv(groups: &[GroupResult]) -> String {
             // Writing into a string cannot fail.
             let _ = writeln!(
                 text,
-                "{},{},{},\"{}\",{:.4},{:.1},{:.5},{:.1},{:.6},{:.6},{:.6e},{:.6e},{:.6e},{:.6e},{},{},{:.6e},{:.6e},{:.6e},{:.6e},{:.6e},{:.6e},{},{:.5},{:.6e},{:.6},{:.6},{:.6e},{:.6e},{}",
+                "{},{},{},\"{}\",{:.4},{:.1},{:.1},{:.5},{:.1},{:.6},{:.6},{:.6e},{:.6e},{:.6e},{:.6e},{},{},{:.6e},{:.6e},{:.6e},{:.6e},{:.6e},{:.6e},{},{:.5},{:.6e},{:.6},{:.6},{:.6e},{:.6e},{}",
                 g.stamp.csv(),
                 if r.moving { "moving" } else { "still" },
                 r.budget,
                 r.method,
                 r.spp,
                 r.rays,
+                r.walked_rays,
                 r.rays_to_paper,
                 r.samples,
                 r.gpu_ms,
@@ -92,8 +93,8 @@ pub fn markdown(groups: &[GroupResult]) -> String {
 /// All rows as Markdown tables, with the stamps above, and dpm beside the best of the others below.
 pub(super) fn tables(groups: &[(Setting, &GroupResult)]) -> String {
     let mut text = stamps(groups.iter().map(|(_, g)| &g.stamp));
-    text += "| group | method | rays/frame | rays / paper | ms a frame (middle half) | single RMSE | perceived RMSE as measured | two runs | less the reference's own | bias | of chance | noise | mean | FLIP | flicker | perceived / paper | perceived / best other | flicker / least other |\n";
-    text += "|---|---|---:|---:|---|---:|---:|---|---:|---:|---:|---:|---:|---:|---:|---:|---:|---:|\n";
+    text += "| group | method | rays/frame | of them walked | rays / paper | ms a frame (middle half) | single RMSE | perceived RMSE as measured | two runs | less the reference's own | bias | of chance | noise | mean | FLIP | flicker | perceived / paper | perceived / best other | flicker / least other |\n";
+    text += "|---|---|---:|---:|---:|---|---:|---:|---|---:|---:|---:|---:|---:|---:|---:|---:|---:|---:|\n";
     for &(setting, g) in groups {
         let best = best_other(g).map_or(f64::NAN, |r| r.perceived_rmse);
         let least = least_flicker(g, |r| flicker(setting, r));
@@ -131,10 +132,11 @@ pub(super) fn tables(groups: &[(Setting, &GroupResult)]) -> String {
 /// One row of the first table; `best` and `least` are the least error and flicker of the other methods.
 fn row(setting: Setting, r: &ErrorRow, best: f64, least: f64) -> String {
     format!(
-        "| {} | {} | {:.0} | {:.3} | {} | {:.4} | {:.5} | {} | {:.5} | {:.5} | {:.5} | {:.5} | {:+.2} % | {:.4} | {:.5} | {:.2} | {:.2} | {:.2} |\n",
+        "| {} | {} | {:.0} | {:.0} | {:.3} | {} | {:.4} | {:.5} | {} | {:.5} | {:.5} | {:.5} | {:.5} | {:+.2} % | {:.4} | {:.5} | {:.2} | {:.2} | {:.2} |\n",
         setting.name(),
         r.method,
         r.rays,
+        r.walked_rays,
         r.rays_to_paper,
         time_text(r),
         r.single_rmse,

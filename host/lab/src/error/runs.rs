@@ -7,7 +7,8 @@
 //! Equal rays are not equal time, so the other methods are drawn once more with as many samples as fill the time of a frame of dpm.
 
 use super::costs::CardCosts;
-use super::equal::{corrected, least_spp, nearest, off_equal, where_equal, with_samples, Trial};
+pub use super::equal::RACES;
+use super::equal::{corrected, least_spp, most_spp, samples_at_equal_time, with_samples, Trial};
 use super::parts::Part;
 use super::plan::{contenders, looks, paper_at, Contender, Setting, Window};
 use super::reference::{mean_of, Reference};
@@ -16,7 +17,8 @@ use crate::metrics::flicker::TileSeries;
 use crate::metrics::flip::{mean_flip, DEFAULT_PIXELS_PER_DEGREE};
 use crate::metrics::{luminance, white_of, MetricError, Picture};
 use crate::sequence::{eye_mean, rmse, FrameTime, Seen, Span, Theatre};
-use crate::stamp::{Fnv, Stamp};
+use crate::stamp::Stamp;
+use dpm_common::fnv::Fnv;
 use dpm_device::planes::Raster;
 use dpm_render::gpu::Gpu;
 use dpm_render::method::Method;
@@ -61,14 +63,6 @@ pub(crate) const LAST_SLOT: u64 = 383;
 pub const EYE_FRAMES: usize = 31;
 /// Rays count as equal within this share.
 const EQUAL_RAYS: f64 = 0.01;
-/// At equal time no method is asked for more than so many times its samples at equal rays, nor for more than [`MOST_SPP`].
-const MOST_SAMPLES_MORE: f32 = 16.0;
-/// As many as a rig file may ask for.
-const MOST_SPP: f32 = 4096.0;
-/// Times count as equal within this share ...
-const EQUAL_TIME: f64 = 0.05;
-/// ... for which so many races are run at most, beside the first at equal rays.
-pub const RACES: usize = 4;
 /// Fewer probes in the periphery than this share of all do not tell its flicker.
 const LEAST_PERIPHERY: f64 = 0.01;
 
@@ -107,8 +101,11 @@ pub struct ErrorRow {
     pub budget: f64,
     /// Samples a lit pixel and frame asked of this method; at least 1 where nothing is kept.
     pub spp: f64,
-    /// Rays of a frame.
+    /// Rays of a frame, with those that were proven to meet nothing. Methods get equal numbers of these.
     pub rays: f64,
+    /// Those of them that were walked through the scene.
+    #[serde(default)]
+    pub walked_rays: f64,
     /// Rays by those of the group's budget: those of `paper`, or less below 1. Above 1 for a method that cannot take so few.
     pub rays_to_paper: f64,
     /// Samples of a frame.
@@ -351,9 +348,6 @@ impl ErrorRuns {
     }
 
     /// Draws every method but dpm and its parts with as many samples as fill the time of a frame of dpm.
-    ///
-    /// Times are compared within a race only, where all meet the same disturbances. Races with more and fewer samples tell what a sample
-    /// takes beside what a frame takes without any, until the times are equal or [`RACES`] have been run; of all trials the nearest counts.
     #[allow(clippy::too_many_arguments)]
     fn at_equal_time(
         &self,
@@ -366,37 +360,15 @@ impl ErrorRuns {
     ) -> Result<(), ErrorRunError> {
         let Some(dpm) = contenders.iter().position(|c| c.name == DPM) else { return Ok(()) };
         let others: Vec<usize> = (0..rows.len()).filter(|&i| is_other(contenders[i].name)).collect();
-        let seed = self.stamp.seed as u32;
+        let methods: Vec<&Method> = others.iter().map(|&i| &contenders[i].method).collect();
         // Samples that were tried, and the time of a frame by that of dpm, which ran along with its own.
-        let mut trials: Vec<Vec<Trial>> =
-            others.iter().map(|&i| vec![(rows[i].spp, times[i].ms() / times[dpm].ms())]).collect();
-        for _ in 0..RACES {
-            if trials.iter().all(|t| off_equal(nearest(t)) <= EQUAL_TIME) {
-                break;
-            }
-            let next: Vec<f32> = others
-                .iter()
-                .zip(&trials)
-                .map(|(&i, tried)| {
-                    let (own, least) = (rows[i].spp as f32, least_spp(&contenders[i].method));
-                    (where_equal(tried) as f32).clamp(least, (MOST_SAMPLES_MORE * own).clamp(least, MOST_SPP))
-                })
-                .collect();
-            each("times");
-            let runners: Vec<(Method, f32)> = others
-                .iter()
-                .zip(&next)
-                .map(|(&i, &spp)| (with_samples(&contenders[i].method, spp), spp))
-                .chain([(contenders[dpm].method.clone(), rows[dpm].spp as f32)])
-                .collect();
-            let raced = theatre.race(&runners, seed)?;
-            let of_dpm = raced.last().map_or(f64::NAN, FrameTime::ms);
-            for ((tried, &spp), time) in trials.iter_mut().zip(&next).zip(&raced) {
-                tried.push((f64::from(spp), time.ms() / of_dpm));
-            }
-        }
-        for (&i, tried) in others.iter().zip(&trials) {
-            rows[i].equal_time = Some(self.seen_with(&contenders[i], nearest(tried), reference, each)?);
+        let first: Vec<Trial> =
+            others.iter().map(|&i| (rows[i].spp, times[i].ms() / times[dpm].ms())).collect();
+        let beside = (contenders[dpm].method.clone(), rows[dpm].spp as f32);
+        let seed = self.stamp.seed as u32;
+        let equal = samples_at_equal_time(theatre, &methods, &first, &beside, seed, &mut || each("times"))?;
+        for (&i, trial) in others.iter().zip(equal) {
+            rows[i].equal_time = Some(self.seen_with(&contenders[i], trial, reference, each)?);
         }
         Ok(())
     }
@@ -441,7 +413,7 @@ impl ErrorRuns {
             for (contender, row) in contenders.iter().zip(&mut *rows).filter(|(c, _)| is_other(c.name)) {
                 let Some(costs) = card.of(contender.name) else { continue };
                 let least = least_spp(&contender.method);
-                let most = (MOST_SAMPLES_MORE * row.spp as f32).clamp(least, MOST_SPP);
+                let most = most_spp(row.spp as f32, least);
                 // A method whose samples go by the visual angle keeps its table's shape, and its rays grow with it.
                 let rays = |spp: f32| self.rays_at(&with_samples(&contender.method, spp), spp);
                 let (few, many) = (row.spp as f32, 2.0 * row.spp as f32);
@@ -548,6 +520,7 @@ impl ErrorRuns {
             budget: self.setting.budget,
             spp: f64::from(spp),
             rays: both(&|s| s.rays),
+            walked_rays: both(&|s| s.walked_rays),
             rays_to_paper: 1.0,
             samples: both(&|s| s.samples),
             gpu_ms: 0.0,

@@ -19,6 +19,7 @@ use dpm_render::{FrameSlot, Keep, RenderError, Renderer, RendererSettings};
 use dpm_rig::config::{BodyConfig, MotionValue, RenderConfig, RigConfig};
 use dpm_rig::failure::{Failure, FailureKind};
 use dpm_rig::light::recorder::LightFrame;
+use dpm_rig::method_choice;
 use dpm_rig::picture_stream::PictureStreams;
 use dpm_rig::pictures::{pictures, FallenLight};
 use dpm_rig::pipeline::{renderer_settings, PipelineError};
@@ -155,6 +156,7 @@ pub fn snapshot(
     let mut warnings = Vec::new();
     let raster = traced_raster(config, &gpu, &mut warnings);
     let mut rig = Rig::build(config, raster)?;
+    method_choice::decide(&mut rig, &gpu);
     warnings.extend(keep_live(&mut rig));
     let (rig, view) = stage(rig, request, &gpu)?;
     warnings.extend(rig.scene.warnings.iter().cloned());

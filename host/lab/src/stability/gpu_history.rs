@@ -5,7 +5,6 @@ use super::gpu_exact::{chance_comes_in, noise_free};
 use super::gpu_paper::{gaze_aside, ALPHAS};
 use super::gpu_shot::Shot;
 use super::gpu_tracer::still_life;
-use crate::bench::METHODS;
 use crate::error::plan::method_of;
 use crate::twins::rate_map::{decide, PixelGuide, RateConstants};
 use dpm_render::gpu::Gpu;
@@ -113,7 +112,7 @@ pub(crate) const CASES: &[GpuCase] = &[
 
 /// Every method with its authors' constants.
 pub(super) fn methods() -> Vec<Method> {
-    METHODS.into_iter().map(|which| method_of(&RenderConfig::default(), which)).collect()
+    RenderMethod::DRAWN.into_iter().map(|which| method_of(&RenderConfig::default(), which)).collect()
 }
 
 /// Method dpm with its own constants.

@@ -3,14 +3,25 @@
 use super::{PaperConfig, RenderConfig, RenderMethod};
 use dpm_render::method::{Method, PaperConstants, SamplerKind, HISTORY_CAP};
 
+impl RenderMethod {
+    /// All that a frame can be drawn by, in the order of the reports.
+    pub const DRAWN: [Self; 6] =
+        [Self::Full, Self::Sequence, Self::Own, Self::Miyamoto, Self::Paper, Self::Dpm];
+
+    /// Whether its frames take any number of samples, which a budget may change from frame to frame: `dpm` and what is made of it.
+    pub fn takes_a_budget(self) -> bool {
+        matches!(self, Self::Dpm | Self::Own | Self::Auto)
+    }
+}
+
 impl RenderConfig {
-    /// The method that the rig file asks for, with all its switches resolved.
+    /// The method that the rig file asks for, with all its switches resolved. "auto" that nobody has decided is `dpm`.
     pub fn to_method(&self) -> Method {
         let effects = self.effects_on();
-        let dpm = self.method == RenderMethod::Dpm;
+        let dpm = self.method.takes_a_budget();
         let sampler = match (effects.blue_noise, self.method) {
             (false, _) => SamplerKind::Independent,
-            (true, RenderMethod::Dpm) => SamplerKind::Continued,
+            (true, _) if dpm => SamplerKind::Continued,
             (true, RenderMethod::Sequence) => SamplerKind::PixelSequence,
             (true, _) => SamplerKind::BlueNoise,
         };

@@ -108,6 +108,7 @@ pub(crate) struct Collector {
     stages: Vec<Histogram<u64>>,
     passes: Vec<Histogram<u64>>,
     pub(super) rays: u64,
+    pub(super) walked_rays: u64,
     pub(super) samples: u64,
     gpu_ns: u64,
     lit_values: u64,
@@ -178,6 +179,7 @@ impl Collector {
             stages: STAGES.iter().map(|_| histogram()).collect(),
             passes: PASSES.iter().map(|_| histogram()).collect(),
             rays: 0,
+            walked_rays: 0,
             samples: 0,
             gpu_ns: 0,
             lit_values: 0,
@@ -359,6 +361,7 @@ impl Collector {
         let cost = job.cost.unwrap_or_default();
         let c = cost.counters();
         self.rays += u64::from(c.rays);
+        self.walked_rays += u64::from(c.walked_rays());
         self.samples += u64::from(c.samples);
         self.gpu_ns += cost.pass_ns.iter().sum::<u64>();
         self.lit_values += 3 * u64::from(c.lit_pixels);
@@ -559,7 +562,8 @@ impl Collector {
             .chain(passes)
             .filter_map(|(stage, h)| Percentiles::of_histogram(h, 1e6).map(|ms| StageTime { stage, ms }))
             .collect();
-        report.mrays_per_s = (self.gpu_ns > 0).then(|| self.rays as f64 / self.gpu_ns as f64 * 1e3);
+        let rate = |rays: u64| (self.gpu_ns > 0).then(|| rays as f64 / self.gpu_ns as f64 * 1e3);
+        (report.mrays_per_s, report.walked_mrays_per_s) = (rate(self.rays), rate(self.walked_rays));
         report.clipped =
             if self.lit_values > 0 { self.clipped_values as f64 / self.lit_values as f64 } else { 0.0 };
         report.nan_pixels = self.nan_values;

@@ -69,6 +69,7 @@ impl Collector {
             frame: self.newest_live.0,
             planned: monitor.counts().frames_planned,
             rays: self.rays,
+            walked_rays: self.walked_rays,
             samples: self.samples,
             misses: self.misses.newest(),
             flights: self.flights.as_ref().map(FlightRecorder::flights),

@@ -12,7 +12,6 @@ pub mod desk;
 pub use command::Command;
 pub use desk::{ParameterDesk, Saver};
 
-use crate::config::RenderMethod;
 use crate::rig::Rig;
 use std::fmt::Write as _;
 
@@ -214,13 +213,13 @@ impl Parameter {
     /// Why it has no effect on `rig`; `None` if it has one.
     fn why_not(self, rig: &Rig) -> Option<&'static str> {
         let render = &rig.config.render;
-        let is_dpm = render.method == RenderMethod::Dpm;
+        let takes_a_budget = render.method.takes_a_budget();
         match self {
-            Self::Samples if !is_dpm && render.effects_on().spp_by_angle => {
+            Self::Samples if !takes_a_budget && render.effects_on().spp_by_angle => {
                 Some("the method takes its samples by the angle from the gaze (render.paper.zone_spp)")
             }
-            Self::Budget if !is_dpm => {
-                Some("only method dpm shares a budget out; samples is the one to change")
+            Self::Budget if !takes_a_budget => {
+                Some("only methods dpm and own share a budget out; samples is the one to change")
             }
             _ => None,
         }

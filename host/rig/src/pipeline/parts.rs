@@ -2,7 +2,6 @@
 //! cable.
 
 use super::settings::{budget_controller, output, renderer_settings};
-use crate::config::RenderMethod;
 use crate::engine::connect::{connect, ENDED_WITH_THE_LAST_RUN};
 use crate::engine::error::PipelineError;
 use crate::engine::options::RunOptions;
@@ -205,7 +204,7 @@ impl CrewParts {
         origin: &Origin,
         wakes: bool,
     ) -> Result<Self, PipelineError> {
-        if rig.config.render.method == RenderMethod::Dpm && self.renderer.is_some() {
+        if rig.config.render.method.takes_a_budget() && self.renderer.is_some() {
             self.budget = budget_controller(rig);
         }
         self.draw_unseen(rig)?;

@@ -100,6 +100,9 @@ fn run_from(
     if let Some(used) = &rig.calibration {
         monitor.note(format!("calibration: {used}"));
     }
+    if let Some(choice) = &rig.method_choice {
+        monitor.note(format!("render.method = \"auto\": {choice}"));
+    }
     let heads: Vec<String> = rig.config.heads().iter().map(|head| format!("{head:?}")).collect();
     if !heads.is_empty() {
         monitor.note(format!(
@@ -151,6 +154,7 @@ impl Ran {
                 Origin::Pattern(..) => "pattern",
             },
             prediction: config.prediction.on,
+            method_choice: rig.method_choice.clone(),
             calibration: rig.calibration.clone(),
             light_hash: recorder.as_ref().and_then(LightRecorder::hash).unwrap_or_default(),
             projector: Some(carried),

@@ -83,8 +83,10 @@ pub struct LiveSnapshot {
     pub frame: LiveFrame,
     /// Frames planned.
     pub planned: u64,
-    /// Rays traced.
+    /// Rays, with those that were proven to meet nothing.
     pub rays: u64,
+    /// Those of them that were walked through the scene.
+    pub walked_rays: u64,
     /// Samples taken.
     pub samples: u64,
     /// The last missed slots, newest first.

@@ -247,6 +247,9 @@ pub struct Report {
     pub method: &'static str,
     /// Whether poses were predicted to the time of light.
     pub prediction: bool,
+    /// How method "auto" was decided, one sentence; absent where the rig file names the method.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub method_choice: Option<String>,
     /// What was used of the calibration file, one sentence; absent without such a file.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub calibration: Option<String>,
@@ -295,8 +298,11 @@ pub struct Report {
     pub stages_ms: Vec<StageTime>,
     /// Frames lit per second of wall time.
     pub frames_per_wall_second: f64,
-    /// Camera rays and all rays traced, in millions per second of render time; null if nothing was rendered.
+    /// All rays, in millions per second of render time, with those that were proven to meet nothing and were not
+    /// walked; null if nothing was rendered.
     pub mrays_per_s: Option<f64>,
+    /// Those of them that were walked through the scene.
+    pub walked_mrays_per_s: Option<f64>,
     /// Share of lit channel values that exceeded the projector's power, 0 to 1.
     pub clipped: f64,
     /// Pixels that were not a number and were made black.
@@ -360,6 +366,7 @@ impl Default for Report {
             software_gpu: false,
             method: "full",
             prediction: false,
+            method_choice: None,
             calibration: None,
             registration_error_px: None,
             registration_error_unpredicted_px: None,
@@ -378,6 +385,7 @@ impl Default for Report {
             stages_ms: Vec::new(),
             frames_per_wall_second: 0.0,
             mrays_per_s: None,
+            walked_mrays_per_s: None,
             clipped: 0.0,
             nan_pixels: 0,
             light_hash: String::new(),

@@ -138,6 +138,9 @@ impl Report {
         let software = if self.software_gpu { " (software)" } else { "" };
         table.row("GPU", format!("{}{software}", self.gpu));
         table.row("method", self.method.to_string());
+        if let Some(choice) = &self.method_choice {
+            table.row("method auto", choice.clone());
+        }
         if let Some(used) = &self.calibration {
             table.row("calibration", used.clone());
         }
@@ -190,8 +193,9 @@ impl Report {
     }
 
     fn light_rows(&self, table: &mut Table) {
-        if let Some(rays) = self.mrays_per_s {
-            table.row("rays", format!("{rays:.2} million/s"));
+        if let (Some(rays), Some(walked)) = (self.mrays_per_s, self.walked_mrays_per_s) {
+            let proven = rays - walked;
+            table.row("rays", format!("{walked:.2} million/s walked, {proven:.2} million/s proven to miss"));
         }
         if self.clipped > 0.0 {
             let advice = "raise projector.max_intensity or lower render.exposure";

@@ -3,5 +3,6 @@
 mod equal_work;
 mod every_case;
 mod large_rasters;
+mod method_choice;
 mod subgroup_widths;
 mod turns;

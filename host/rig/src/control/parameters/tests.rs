@@ -108,9 +108,9 @@ fn what_is_out_of_range_or_unknown_is_refused_and_changes_nothing() {
 #[test]
 fn a_parameter_without_an_effect_is_refused_with_the_reason() {
     for (method, name, word) in [
-        ("full", "budget=1", "only method dpm"),
+        ("full", "budget=1", "only methods dpm"),
         ("paper", "samples=3", "zone_spp"),
-        ("paper", "budget=1", "only method dpm"),
+        ("paper", "budget=1", "only methods dpm"),
     ] {
         let rig = rig(&[&format!("render.method={method}")]);
         let (monitor, _reader) = run(&rig);
