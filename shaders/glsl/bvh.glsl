@@ -3,7 +3,7 @@
 //
 // Nodes and triangles are read through NODE and TRI: from texel buffers on software Vulkan, where that is twice as fast, and from storage buffers
 // on GPUs. The two also differ in how they keep what waits, see `walk_software.glsl` and `walk_gpu.glsl`. With RAY_QUERY the device traces rays by its
-// own trees, see `walk_query.glsl`.
+// own trees, see `walk_query.glsl`. With WALK_APART the host walks.
 #ifdef TEXEL_TABLES
 layout(set = 0, binding = B_NODES, rgba32ui) uniform readonly uimageBuffer node_texels;
 layout(set = 0, binding = B_TRIANGLES, rgba32f) uniform readonly imageBuffer triangle_texels;
@@ -192,7 +192,9 @@ bool enters_any(vec3 origin, vec3 direction, uint left, float t_max) {
     return next_body(0u, origin, inverse, 0u, left, t_max) < frame.instance_count;
 }
 
-#ifdef TEXEL_TABLES
+#if defined(WALK_APART)
+#include "walk_apart.glsl"
+#elif defined(TEXEL_TABLES)
 #include "walk_software.glsl"
 #elif defined(RAY_QUERY)
 #include "walk_query.glsl"

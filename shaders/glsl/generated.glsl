@@ -60,6 +60,9 @@
 #define TRACE_GROUP_SAMPLES 180u
 #define TRACE_PIXEL_SAMPLES 128u
 #define TRACE_SLOTS 320u
+#define RAY_NONE 0u
+#define RAY_CLOSEST 1u
+#define RAY_ANY 2u
 #define SAMPLER_INDEPENDENT 0u
 #define SAMPLER_BLUE_NOISE 1u
 #define SAMPLER_CONTINUED 2u
@@ -100,6 +103,8 @@
 #define B_MOTION 33u
 #define B_MOVERS 34u
 #define B_PLANE_GROUPS 35u
+#define B_QUEUE 37u
+#define B_QUEUE_ROWS 38u
 #define B_BODY_TREE 36u
 // Index of a pixel's element in a part of a buffer.
 #define SURFACES_HIT_AT(i) (((i) >> 6u) * 128u + 0u + ((i) & 63u))

@@ -235,6 +235,7 @@ void aim_coverage(Branches b, uint ray) {
     if (HAS_ALPHA_BLEND) begin_coverage(Sampler(b.coverage.x, b.coverage.y, b.pixel), ray);
 }
 
+#ifndef WALK_APART
 // Traces the rays that `branch` left, and adds their light. False: the path has ended, and its radiance is complete. True: it goes on at `hit`.
 bool follow(inout Path path, Branches b, out Hit hit) {
     bool met = false;
@@ -267,6 +268,7 @@ bool follow(inout Path path, Branches b, out Hit hit) {
     if (HAS_ALPHA_BLEND && coverage.chance != 0u) path.exact = 0u;
     return onward && met;
 }
+#endif
 
 // The path's next vertex, at which the ray of `b` arrives. False: the path ends there, and its radiance is complete.
 bool arrive(inout Path path, Branches b, Hit hit, Point s) {

@@ -147,8 +147,8 @@ float average_albedo(uint table, float alpha) {
 // Whether a ray that starts on the outside of a triangle surely does not meet the triangle's body again: it is above the horizon that `horizons` of the
 // host found. `row` is the first of the triangle's rows, and `normal` is of unit length.
 bool leaves_body(uint body, uint row, vec3 normal, vec3 direction) {
-#ifdef TEXEL_TABLES
-    // Horizons are not worked out for software Vulkan.
+#if defined(TEXEL_TABLES) && !defined(WALK_APART)
+    // Horizons are not worked out for software Vulkan, unless the host walks.
     return false;
 #else
     vec3 d = transform_vector(instance_at(body).object_from_world, direction), a = abs(d);

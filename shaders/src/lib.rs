@@ -89,7 +89,10 @@ macro_rules! table_shaders {
             query: [$(Some(spirv!($query)),)? None][0],
         };)*
         /// Every shader in the crate.
-        pub const ALL: &[Shader] = &[$($konst.texel, $konst.storage, $(spirv!($query),)?)* PACK];
+        pub const ALL: &[Shader] = &[
+            $($konst.texel, $konst.storage, $(spirv!($query),)?)*
+            TRACE_BEGIN, TRACE_HITS, TRACE_ENDS, TRACE_MISSES, TRACE_SUMS, PACK,
+        ];
     };
 }
 
@@ -124,7 +127,23 @@ table_shaders! {
     MOTION = "motion";
     /// Planes taken from the pixels whose surfaces are at their mirrors at their instants.
     WARP = "warp";
+    /// The walk alone, for measurements.
+    WALK = "walk";
 }
 
 /// Code values into bit planes.
 pub const PACK: Shader = spirv!("pack");
+
+/// Work items into paths and the rays from their first vertices.
+pub const TRACE_BEGIN: Shader = spirv!("trace_begin.texel");
+/// Paths that have met a surface to their next vertices.
+pub const TRACE_HITS: Shader = spirv!("trace_hits.texel");
+/// The same where that is their last vertex.
+pub const TRACE_ENDS: Shader = spirv!("trace_ends.texel");
+/// Paths that have met none to their ends.
+pub const TRACE_MISSES: Shader = spirv!("trace_misses.texel");
+/// The light of the paths of each work item into radiance.
+pub const TRACE_SUMS: Shader = spirv!("trace_sums.texel");
+
+/// The parts of the pass `trace` where the host walks its rays (software Vulkan).
+pub const TRACE_APART: [Shader; 5] = [TRACE_BEGIN, TRACE_HITS, TRACE_ENDS, TRACE_MISSES, TRACE_SUMS];

@@ -624,11 +624,20 @@ pub const CONSTANTS: &[(&str, u32)] = &[
     ("TRACE_GROUP_SAMPLES", TRACE_GROUP_SAMPLES),
     ("TRACE_PIXEL_SAMPLES", TRACE_PIXEL_SAMPLES),
     ("TRACE_SLOTS", TRACE_SLOTS),
+    ("RAY_NONE", RAY_NONE),
+    ("RAY_CLOSEST", RAY_CLOSEST),
+    ("RAY_ANY", RAY_ANY),
     ("SAMPLER_INDEPENDENT", SAMPLER_INDEPENDENT),
     ("SAMPLER_BLUE_NOISE", SAMPLER_BLUE_NOISE),
     ("SAMPLER_CONTINUED", SAMPLER_CONTINUED),
     ("SAMPLER_PIXEL_SEQUENCE", SAMPLER_PIXEL_SEQUENCE),
 ];
+/// Kind of a ray that the host walks: there is none.
+pub const RAY_NONE: u32 = 0;
+/// The nearest surface is wanted.
+pub const RAY_CLOSEST: u32 = 1;
+/// Any surface is.
+pub const RAY_ANY: u32 = 2;
 /// A pixel that met nothing.
 pub const NO_HIT: u32 = u32::MAX;
 /// No texture.
@@ -929,7 +938,7 @@ macro_rules! tables {
         }
 
         /// Bindings that are texel buffers in the shaders that read tables so.
-        pub const TEXEL_BINDINGS: &[&str] = &["B_NODES", "B_TRIANGLES", $($texel),*];
+        pub const TEXEL_BINDINGS: &[&str] = &["B_NODES", "B_TRIANGLES", "B_QUEUE_ROWS", $($texel),*];
     };
 }
 
@@ -997,7 +1006,14 @@ pub const BINDINGS: &[(&str, u32)] = &[
     ("B_MOTION", 33),
     ("B_MOVERS", 34),
     ("B_PLANE_GROUPS", 35),
+    ("B_QUEUE", 37),
+    ("B_QUEUE_ROWS", 38),
 ];
+
+/// Whether a binding is bound on software Vulkan only: the second bindings of buffers, as texels, and the rays that the host walks.
+pub fn is_of_software(binding: &str) -> bool {
+    binding.ends_with("_ROWS") || binding == "B_QUEUE"
+}
 
 /// The binding after them, of the shaders that ask the device for hits: no buffer, but the tree over the bodies of the frame.
 pub const TREE_BINDING: (&str, u32) = ("B_BODY_TREE", 36);

@@ -13,6 +13,7 @@
 //! ```
 
 pub mod bench;
+pub mod bench_walk;
 pub mod blue_noise;
 pub mod conformance;
 pub mod error;

@@ -56,7 +56,7 @@ impl DeformedTables {
             })
         };
         let bodies = data.deforming.iter().map(of_body).collect::<Result<_, GpuError>>()?;
-        Ok(Some(Self { geometry: Geometry::new(gpu, data, reading)?, bodies }))
+        Ok(Some(Self { geometry: Geometry::new(gpu, data, reading, false)?, bodies }))
     }
 
     /// Deforms the bodies as at `t_ns`, and changes their bounds in `bounds`, one entry for each body of the scene. It

@@ -1,5 +1,6 @@
 //! The memory of one frame in flight, on the GPU and on the host, and the buffer of each binding of the shaders.
 
+use super::apart::{self, ApartFrame};
 use super::body_tree::BodyTree;
 use super::deformed::DeformedTables;
 use super::fill::fill;
@@ -43,7 +44,12 @@ pub(super) struct FrameBuffers {
     pub plane_bytes: usize,
     pub guides: Buffer,
     pub schedule: Buffer,
-    pub work: Buffer,
+    /// `None`: it belongs to `apart`.
+    pub work: Option<Buffer>,
+    /// What the frame shares with the threads that walk its rays; `None`: the shaders walk.
+    pub apart: Option<Arc<ApartFrame>>,
+    /// Bound where no host walks.
+    no_queue: Option<Buffer>,
     /// The history's picture. In method dpm the pass `reproject` leaves shifts here, which the pass `accumulate` reads before it writes the picture.
     pub filtered: Buffer,
     /// The picture after the spatial filter. By method dpm only a host that reads everything gets it.
@@ -97,7 +103,7 @@ impl FrameBuffers {
     pub(super) fn new(
         gpu: &Arc<Gpu>,
         settings: &RendererSettings,
-        (data, reading): (&SceneData, Reading),
+        (data, reading, apart): (&SceneData, Reading, Option<apart::Layout>),
         tiles: usize,
         body_tree: BodyTree,
         live: Option<&LiveTextures>,
@@ -121,6 +127,12 @@ impl FrameBuffers {
             Output::Planes(_) => None,
             Output::Codes | Output::Both(_) => Some(size("code values", pixels * each.codes, Readback)?),
         };
+        let nodes = body_tree.most_nodes();
+        let apart = apart.map(|layout| ApartFrame::new(gpu, layout, bodies, nodes, pixels)).transpose()?;
+        let own_work = apart.is_none().then(|| size("work list", pixels * each.work, Device)).transpose()?;
+        let needs_none = reading == Reading::Texels && apart.is_none();
+        let no_queue =
+            needs_none.then(|| Buffer::new_texels(gpu, "no rays", 1, false, Device)).transpose()?;
         Ok(Self {
             frame: latched("frame uniforms", size_of::<Frame>())?,
             instances: latched("instances", size_of::<Instance>() * bodies.max(1))?,
@@ -142,7 +154,9 @@ impl FrameBuffers {
             plane_bytes,
             guides: with("guides", each.guides)?,
             schedule: size("schedule", size_of::<Schedule>(), Device)?,
-            work: size("work list", pixels * each.work, Device)?,
+            work: own_work,
+            apart: apart.map(Arc::new),
+            no_queue,
             filtered: with("filtered radiance", each.filtered)?,
             filtered_shown: with("shown radiance", if debug { SHOWN_BYTES } else { each.shown })?,
             motion: with("motion of surfaces", each.motion)?,
@@ -225,7 +239,7 @@ impl FrameBuffers {
             ("radiance", &self.radiance),
             ("guides", &self.guides),
             ("schedule", &self.schedule),
-            ("work list", &self.work),
+            ("work list", self.work()),
             ("filtered radiance", &self.filtered),
             ("shown radiance", &self.filtered_shown),
             ("code values", &self.codes),
@@ -238,6 +252,12 @@ impl FrameBuffers {
         ];
         let of_host = of_host.into_iter().filter_map(|(name, buffer)| Some((name, buffer?)));
         of_shaders.into_iter().chain(of_host).map(|(name, buffer)| (name, buffer.place())).collect()
+    }
+
+    /// The work list.
+    pub(super) fn work(&self) -> &Buffer {
+        let of_apart = || self.apart.as_ref().map(|apart| &apart.work);
+        self.work.as_ref().or_else(of_apart).expect("one of the two")
     }
 
     /// The scene's geometry, or that of this frame.
@@ -277,7 +297,11 @@ impl FrameBuffers {
             "B_FORMER" => &shared.history[1 - parity],
             "B_RATES" => &shared.rates,
             "B_SCHEDULE" => &self.schedule,
-            "B_WORK" => &self.work,
+            "B_WORK" => self.work(),
+            "B_QUEUE" | "B_QUEUE_ROWS" => self.apart.as_ref().map_or_else(
+                || self.no_queue.as_ref().expect("bound for software Vulkan only"),
+                |apart| &apart.queue,
+            ),
             "B_NOISE" => &shared.noise,
             "B_OPTICS" => &shared.optics,
             "B_FILTERED" | "B_FILTERED_ROWS" => &self.filtered,

@@ -17,6 +17,7 @@
 //! ```
 
 pub mod albedo_map;
+mod apart;
 pub mod blue_noise;
 mod body_tree;
 mod deformed;
@@ -44,6 +45,8 @@ mod scene_needs;
 mod settings;
 mod slot;
 pub mod tiles;
+mod walk_alone;
+pub mod walker;
 pub mod warp;
 
 pub use memory::least_memory_bytes;

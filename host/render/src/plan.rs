@@ -1,5 +1,6 @@
 //! What a renderer is made from, without a device, and the pipelines that this becomes on one.
 
+use super::apart::{self, ApartPipelines};
 use super::optics::OpticsLayout;
 use super::passes::TABLE;
 use super::scene_data::{Keep, SceneData, SceneDataError};
@@ -40,6 +41,8 @@ pub(super) struct Pipelines {
     pub table: Arc<BindingTable>,
     /// One for each row of [`TABLE`]; `None`: the method does not need the pass.
     pub each: Vec<Option<ComputePipeline>>,
+    /// The parts of passes between which the host walks rays, and where everything lies; `None`: it does not.
+    pub apart: Option<(ApartPipelines, apart::Layout)>,
 }
 
 /// Workgroups of the pass `trace` for each multiprocessor or compute unit, so that the device is busy to the end: about three times what it holds at
@@ -139,7 +142,53 @@ impl RendererPlan {
         let wanted = self.wanted(reading, trace_groups(gpu.summary()));
         let each = wanted.map(|program| program.map(compiled).transpose());
         let each = each.collect::<Result<_, _>>()?;
-        Ok(Pipelines { table, each })
+        let apart = match self.layout_apart(gpu, reading) {
+            Ok(layout) => {
+                let optics = OpticsLayout::new(&self.settings);
+                let constants = self.constants(&optics, trace_groups(gpu.summary()));
+                Some((ApartPipelines::new(&table, &constants)?, layout))
+            }
+            Err(reason) => {
+                if self.settings.tracing == Tracing::Host && gpu.summary().software {
+                    tracing::warn!("the shaders walk the rays, and not the host: {reason}");
+                }
+                None
+            }
+        };
+        Ok(Pipelines { table, each, apart })
+    }
+
+    /// The walk alone, on this device.
+    ///
+    /// # Errors
+    /// The GPU's own.
+    pub(super) fn walk(
+        &self,
+        gpu: &Arc<Gpu>,
+        table: &Arc<BindingTable>,
+        reading: Reading,
+    ) -> Result<ComputePipeline, GpuError> {
+        let constants = self.constants(&OpticsLayout::new(&self.settings), trace_groups(gpu.summary()));
+        ComputePipeline::new(table, dpm_shaders::WALK.reading(reading), &constants)
+    }
+
+    /// Where everything lies if the host walks the rays; else why it does not.
+    pub(super) fn layout_apart(&self, gpu: &Gpu, reading: Reading) -> Result<apart::Layout, &'static str> {
+        let needs = self.needs();
+        if let Some(reason) = apart::refusal(gpu, reading, &self.settings, &self.data, &needs) {
+            return Err(reason);
+        }
+        let most = gpu.max_buffer_bytes();
+        apart::Layout::new(&self.settings, needs.absorption, needs.emissive, most)
+            .ok_or("paths have no rays, or more than there is room for")
+    }
+
+    /// Why the host of software Vulkan does not walk the rays of this plan on this device; `None`: it does, or the device is no software.
+    ///
+    /// # Errors
+    /// Ray queries are asked for, and the device has none.
+    pub fn walks_in_shaders(&self, gpu: &Gpu) -> Result<Option<&'static str>, GpuError> {
+        Ok(self.layout_apart(gpu, self.reading(gpu.summary())?).err())
     }
 
     /// The programs that a GPU whose driver does not say how large it is would be given for this plan, in the order in which they run. None of them

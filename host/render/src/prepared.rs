@@ -24,7 +24,8 @@ impl PreparedScene {
     /// The scene is too large for this device, or the GPU's own.
     pub(super) fn new(gpu: &Arc<Gpu>, plan: &RendererPlan) -> Result<Self, GpuError> {
         let reading = plan.reading(gpu.summary())?;
-        let scene = Arc::new(SceneGpu::new(gpu, &plan.data, reading)?);
+        let scene =
+            Arc::new(SceneGpu::new(gpu, &plan.data, reading, plan.layout_apart(gpu, reading).is_ok())?);
         let pipelines = Arc::new(plan.pipelines(gpu, reading)?);
         Ok(Self { gpu: gpu.clone(), plan: plan.clone(), reading, pipelines, scene })
     }
@@ -38,7 +39,12 @@ impl PreparedScene {
         if self.plan.data.live.is_empty() {
             return Ok(self.clone());
         }
-        let scene = Arc::new(SceneGpu::new(&self.gpu, &self.plan.data, self.reading)?);
+        let scene = Arc::new(SceneGpu::new(
+            &self.gpu,
+            &self.plan.data,
+            self.reading,
+            self.pipelines.apart.is_some(),
+        )?);
         Ok(Self { scene, ..self.clone() })
     }
 

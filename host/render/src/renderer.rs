@@ -1,5 +1,6 @@
 //! One frame on the GPU, from surfaces over radiance to code values. `Renderer::create_slot` records the passes in their order.
 
+use super::apart::{ApartLists, Crew, Side};
 use super::body_tree::BodyTree;
 use super::fill;
 use super::frame_buffers::FrameBuffers;
@@ -18,12 +19,14 @@ use super::slot::FrameSlot;
 use super::tiles::TileList;
 use super::warp::Movers;
 use crate::gpu::{
-    submit_frame, BindingSet, CommandList, FrameFence, Gpu, GpuError, Orders, Overlap, Recorder,
+    submit_frame, BindingSet, CommandList, FrameFence, Gpu, GpuError, Order, Orders, Overlap, Recorder, Relay,
 };
 use crate::pack;
 use bytemuck::Zeroable;
 use dpm_scene::Scene;
-use dpm_shaders::structs::{self as gpu_structs, in_blocks, Counters, Frame, Instance, Mover, Schedule};
+use dpm_shaders::structs::{
+    self as gpu_structs, in_blocks, BodyNode, Counters, Frame, Instance, Mover, Schedule,
+};
 use dpm_shaders::Reading;
 use glam::{DAffine3, Vec3};
 use std::ops::Range;
@@ -34,6 +37,15 @@ use std::sync::Arc;
 const PER_TILE_QUARTER: u64 = 0;
 const PER_TILE_RATES: u64 = 16;
 const PER_MOVING_QUARTER: u64 = 32;
+/// Where the pass `trace` stands, which has parts where the host walks rays.
+const TRACE: usize = {
+    let mut i = 0;
+    while !matches!(TABLE[i].grid, Grid::Work) {
+        i += 1;
+    }
+    i
+};
+
 /// After this pass the history is what it is before the frame's samples.
 const REPROJECT: &str = "reproject";
 
@@ -65,6 +77,8 @@ pub struct Renderer {
     reading: Reading,
     /// The order of frames that overlap.
     orders: Orders,
+    /// The next question that a frame may ask of the threads that walk.
+    next_question: u64,
     optics: OpticsLayout,
     prepared: PreparedScene,
     pub(super) gpu: Arc<Gpu>,
@@ -141,8 +155,13 @@ impl Renderer {
         let rated = vec![false; tile_list.len()];
         let movers = Movers::new(data.bodies.len(), &settings.plane_groups, !settings.shows_halftones());
         let live = LiveTextures::new(&data.live, settings.most_live_texels);
+        let walks_tree = plan.walks_body_tree(reading);
+        let nodes = BodyTree::new(if walks_tree { data.bodies.len() } else { 0 }).most_nodes();
+        let walks = prepared.pipelines.apart.is_some() && overlap.is_none();
+        let crew = walks.then(|| Crew::new(gpu, &data, nodes)).transpose()?;
         Ok(Self {
             resources: Arc::new(Resources {
+                crew: crew.filter(|crew| !crew.is_empty()),
                 pipelines: prepared.pipelines.clone(),
                 shared,
                 scene: prepared.scene().clone(),
@@ -160,8 +179,9 @@ impl Renderer {
             tile_list,
             movers,
             live,
-            walks_tree: plan.walks_body_tree(reading),
+            walks_tree,
             orders: Orders::default(),
+            next_question: 1,
             optics,
             gpu: gpu.clone(),
             prepared,
@@ -176,6 +196,21 @@ impl Renderer {
     /// Whether the device finds itself what a ray meets (ray query), or the shaders do.
     pub fn asks_device(&self) -> bool {
         self.resources.scene.geometry.trees.is_some()
+    }
+
+    /// What the scene has become.
+    pub(super) fn scene_data(&self) -> &SceneData {
+        &self.data
+    }
+
+    /// How shaders read tables and find what a ray meets.
+    pub(super) fn reading(&self) -> Reading {
+        self.reading
+    }
+
+    /// Whether shaders read tables through texel buffers.
+    pub(super) fn is_software(&self) -> bool {
+        self.reading == Reading::Texels
     }
 
     /// Interpolated normal of a surface, in its body's space and without the normal map.
@@ -211,7 +246,8 @@ impl Renderer {
         let (gpu, resources, settings) = (&self.gpu, &self.resources, &self.settings);
         let tile_list = self.tile_list.clone();
         let body_tree = BodyTree::new(if self.walks_tree { self.data.bodies.len() } else { 0 });
-        let scene = (&*self.data, self.reading);
+        let apart = resources.crew.as_ref().and(resources.pipelines.apart.as_ref());
+        let scene = (&*self.data, self.reading, apart.map(|(_, layout)| *layout));
         let live = self.live.as_ref();
         let buffers = FrameBuffers::new(gpu, settings, scene, tile_list.len(), body_tree, live, debug)?;
         buffers.clear(gpu, settings)?;
@@ -240,9 +276,14 @@ impl Renderer {
             ])
         };
         let lists = [lists(0)?, lists(1)?];
+        let apart =
+            apart.map(|_| Ok([0, 1].map(|parity| self.record_apart(&sets[parity], &buffers, parity))));
+        let apart = apart.transpose()?.map(|[a, b]| Ok([a?, b?])).transpose()?;
         Ok(FrameSlot {
             fence: FrameFence::new(gpu)?,
             lists,
+            apart,
+            was_apart: false,
             _sets: sets,
             buffers,
             tile_list,
@@ -272,6 +313,26 @@ impl Renderer {
         }
         r.barrier();
         r.stamp();
+    }
+
+    /// Records the first lists of frames whose rays the host walks.
+    fn record_apart(
+        &self,
+        set: &BindingSet,
+        b: &FrameBuffers,
+        parity: usize,
+    ) -> Result<ApartLists, GpuError> {
+        let frame = b.apart.as_ref().expect("made with the frame");
+        let (pipelines, _) = self.resources.pipelines.apart.as_ref().expect("compiled for it");
+        let around = |r: &mut Recorder<'_>, what: Side| match what {
+            Side::Before => {
+                self.record_latch(r, b);
+                self.record_passes(r, 0..TRACE, set, b, parity);
+            }
+            Side::After => self.record_passes(r, TRACE + 1..FIRST_PASSES, set, b, parity),
+        };
+        let stamps = [1 + TRACE, FIRST_PASSES - TRACE - 1].map(|n| n as u32);
+        ApartLists::record(&self.gpu, (frame, pipelines, set), (&b.schedule, &b.counters), stamps, &around)
     }
 
     /// Records `rows` of [`TABLE`] in their order, with a barrier after each. Of a pass that the method does not need only the time stamp is recorded.
@@ -331,7 +392,7 @@ impl Renderer {
             r.copy(&b.radiance, &d.traced, pixels * b.each.radiance);
             r.copy(&shared.rates, &d.rates, tiles * 4);
             r.copy(&b.schedule, &d.schedule, size_of::<Schedule>());
-            r.copy(&b.work, &d.work, pixels * b.each.work);
+            r.copy(b.work(), &d.work, pixels * b.each.work);
             if let Some(to) = &d.motion {
                 r.copy(&b.motion, to, pixels * b.each.motion);
             }
@@ -390,11 +451,11 @@ impl Renderer {
         let frame = Frame { body_nodes, flags: constants.flags | shows_all, ..constants };
         slot.buffers.frame.host.write(&[frame]);
         slot.parity = 1 - self.last.parity;
-        let [first, second] = &slot.lists[slot.parity];
         let order = self.orders.next(slot.parity);
-        let overlap = self.resources.overlap.as_ref().map(|overlap| (overlap, order));
-        let piece = slot.buffers.piece.as_ref().filter(|_| has_piece).map(Piece::list);
-        let submitted = submit_frame(piece, [first, second], overlap, &mut slot.fence);
+        let samples = (inputs.budget_spp, inputs.spp, u64::from(tile_count) * 256);
+        let submitted = self.submit_lists(slot, (has_piece, order), samples, body_nodes);
+        // Numbers of questions are not used again, also if this has failed.
+        self.next_question += Relay::QUESTIONS as u64;
         if submitted.is_err() {
             self.live.iter_mut().for_each(LiveTextures::take_back);
         }
@@ -406,6 +467,35 @@ impl Renderer {
         let lost = (0..inputs.poses.len()).map(|i| is_lost(&self.tracked, i, inputs.lost));
         self.last.becomes(inputs, slot.parity, lost);
         Ok(())
+    }
+
+    /// Starts the lists of a slot that has all of its inputs: those between which the host walks rays if it can and all samples surely have room.
+    /// `samples`: the budget, the samples of a pixel, and the pixels that are listed. `body_nodes`: as [`Self::write_bodies`] returns.
+    fn submit_lists(
+        &self,
+        slot: &mut FrameSlot,
+        (has_piece, order): (bool, Order),
+        (budget_spp, spp, pixels): (f32, u32, u64),
+        body_nodes: u32,
+    ) -> Result<(), GpuError> {
+        let [first, second] = &slot.lists[slot.parity];
+        let piece = slot.buffers.piece.as_ref().filter(|_| has_piece).map(Piece::list);
+        let overlap = self.resources.overlap.as_ref().map(|overlap| (overlap, order));
+        let apart = (slot.buffers.apart.as_ref(), slot.apart.as_ref(), self.resources.crew.as_ref());
+        slot.was_apart = false;
+        let (Some(frame), Some(lists), Some(crew)) = apart else {
+            return submit_frame(piece, [first, second], overlap, &mut slot.fence);
+        };
+        if !frame.layout.serves(&self.settings.method, budget_spp, spp, pixels) {
+            return submit_frame(piece, [first, second], overlap, &mut slot.fence);
+        }
+        slot.was_apart = true;
+        let question = self.next_question;
+        let bodies = slot.buffers.instances.host.read(self.data.bodies.len() * size_of::<Instance>() / 4);
+        let nodes = body_nodes as usize * 8 * size_of::<BodyNode>() / 4;
+        frame.begin(question, bodies, slot.buffers.body_nodes.host.read(nodes));
+        crew.hand(question, frame);
+        crew.relay().submit(piece, &lists[slot.parity].0, second, question, &mut slot.fence)
     }
 
     /// Writes where the bodies are: for the shaders, and for whatever tree rays find them in. Returns how many nodes of the tree over bodies an octant

@@ -1,5 +1,6 @@
 //! What submissions read.
 
+use super::apart::Crew;
 use super::memory::SharedBuffers;
 use super::plan::Pipelines;
 use super::scene_gpu::SceneGpu;
@@ -9,6 +10,8 @@ use std::sync::Arc;
 /// What submissions read. The renderer and every slot hold it, so it is freed after the last submission has ended, in whatever order they are
 /// dropped.
 pub(super) struct Resources {
+    /// Walks the rays of frames, if the host does that.
+    pub(super) crew: Option<Crew>,
     // Dropped before the buffers that they use.
     pub(super) pipelines: Arc<Pipelines>,
     pub(super) shared: SharedBuffers,

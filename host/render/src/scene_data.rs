@@ -8,6 +8,7 @@ use super::deforming_body::DeformingBody;
 use super::live_textures::{LiveTexture, PLACES};
 pub use super::scene_needs::SceneNeeds;
 use crate::gpu::BodyTriangles;
+use crate::walker::WideTree;
 use bytemuck::Zeroable;
 use dpm_scene::albedo_table::{tabulated, AlbedoTable, ALBEDO_NODES};
 use dpm_scene::bvh::BodyBvh;
@@ -114,6 +115,8 @@ pub struct SceneData {
     pub triangles: Vec<[u32; 4]>,
     /// The horizons of the triangles, once they were asked for.
     horizons: OnceLock<Vec<Horizon>>,
+    /// The trees of the bodies as the host walks them, once they were asked for.
+    wide_trees: OnceLock<Vec<WideTree>>,
     /// Indices and material per triangle in BVH order.
     pub refs: Vec<TriangleRef>,
     /// All vertices.
@@ -513,6 +516,23 @@ impl SceneData {
 }
 
 impl SceneData {
+    /// The tree of each body for rays that the host walks; unpacked when they are first asked for.
+    pub(crate) fn wide_trees(&self) -> &[WideTree] {
+        self.wide_trees.get_or_init(|| {
+            let ends =
+                self.bodies.iter().skip(1).map(|b| 5 * b.node_offset as usize).chain([self.nodes.len()]);
+            let of_body = |(body, end): (&BodyData, usize)| {
+                let row = |at: usize| {
+                    let [x, y, z, _] = self.triangles[3 * body.triangle_offset as usize + at];
+                    [x, y, z].map(f32::from_bits)
+                };
+                let corners = |at: usize| [row(3 * at), row(3 * at + 1), row(3 * at + 2)];
+                WideTree::new(&self.nodes[5 * body.node_offset as usize..end], corners)
+            };
+            self.bodies.iter().zip(ends).map(of_body).collect()
+        })
+    }
+
     /// [`Self::triangles`] with their horizons, which take a fiftieth of a millisecond of a core for each triangle when they are first asked for.
     pub fn triangles_with_horizons(&self) -> Vec<[u32; 4]> {
         let corner = |row: &[u32; 4]| Vec3::from_array([row[0], row[1], row[2]].map(f32::from_bits));

@@ -49,14 +49,22 @@ impl Geometry {
     ///
     /// # Errors
     /// Out of memory or beyond the device's limits.
-    pub(super) fn new(gpu: &Arc<Gpu>, data: &SceneData, reading: Reading) -> Result<Self, GpuError> {
+    pub(super) fn new(
+        gpu: &Arc<Gpu>,
+        data: &SceneData,
+        reading: Reading,
+        host_walks: bool,
+    ) -> Result<Self, GpuError> {
         let (texel, query) = (reading == Reading::Texels, reading == Reading::Query);
         // Buffers cannot be empty; one element of padding is never read.
         let empty = [[0u32; 4]; 5];
         let nodes = if data.nodes.is_empty() || query { &empty[..] } else { &data.nodes };
-        // On software Vulkan a run is too short, and its rays too few, to be worth the time that horizons take.
-        let triangles =
-            if texel { Cow::from(&data.triangles) } else { Cow::from(data.triangles_with_horizons()) };
+        // Where the shaders of software Vulkan walk, a run is too short, and its rays too few, to be worth the time that horizons take.
+        let triangles = if texel && !host_walks {
+            Cow::from(&data.triangles)
+        } else {
+            Cow::from(data.triangles_with_horizons())
+        };
         let triangles = if triangles.is_empty() { &empty[..] } else { &triangles };
         let rows = |what, words: &[[u32; 4]], float| rows(gpu, reading, what, words, float);
         let (triangles, trees) = if query {
@@ -76,14 +84,20 @@ impl Geometry {
 }
 
 impl SceneGpu {
-    /// Uploads `data` for shaders that read it in this way, and has the device build its trees if they ask it for hits.
+    /// Uploads `data` for shaders that read it in this way, and has the device build its trees if they ask it for hits. `host_walks`: the host of
+    /// software Vulkan walks the rays, and horizons save it some.
     ///
     /// # Errors
     /// Out of memory or beyond the device's limits.
-    pub(crate) fn new(gpu: &Arc<Gpu>, data: &SceneData, reading: Reading) -> Result<Self, GpuError> {
+    pub(crate) fn new(
+        gpu: &Arc<Gpu>,
+        data: &SceneData,
+        reading: Reading,
+        host_walks: bool,
+    ) -> Result<Self, GpuError> {
         let rows = |what, words: &[[u32; 4]], float| rows(gpu, reading, what, words, float);
         Ok(Self {
-            geometry: Geometry::new(gpu, data, reading)?,
+            geometry: Geometry::new(gpu, data, reading, host_walks)?,
             refs: rows("triangle indices", cast_slice(&data.refs), false)?,
             materials: rows("materials", cast_slice(&data.materials), false)?,
             textures: Buffer::from_slice(gpu, "texture table", &data.textures)?,

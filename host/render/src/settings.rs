@@ -56,6 +56,8 @@ pub enum Tracing {
     Walk,
     /// The device, software or not (ray query). One that cannot is refused.
     RayQuery,
+    /// On software Vulkan threads of the host, where they can ([`crate::RendererPlan::walks_in_shaders`] says why not); elsewhere as `Auto`.
+    Host,
 }
 
 impl Tracing {
@@ -63,7 +65,7 @@ impl Tracing {
     /// queries, so it does so only if it is asked to.
     pub fn asks_device(self, device: &DeviceSummary) -> bool {
         match self {
-            Self::Auto => device.ray_query && !device.software,
+            Self::Auto | Self::Host => device.ray_query && !device.software,
             Self::Walk => false,
             Self::RayQuery => device.ray_query,
         }

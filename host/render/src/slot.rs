@@ -1,13 +1,15 @@
 //! One frame in flight: its memory on the GPU and on the host, what it cost, and what can be read back.
 
+use super::apart::ApartLists;
 use super::frame_buffers::FrameBuffers;
 use super::passes::{FIRST_PASSES, PASSES};
 use super::read_back::{elements, Guide, History, Surface};
 use super::resources::Resources;
 use super::tiles::{TileList, TILE};
 use crate::gpu::{BindingSet, CommandList, FrameFence, GpuError, Place};
+use crate::walker::Ray;
 use dpm_device::planes::Raster;
-use dpm_shaders::structs::{part, Counters, HistoryLight, Moved, Schedule, WorkItem};
+use dpm_shaders::structs::{part, BodyNode, Counters, HistoryLight, Instance, Moved, Schedule, WorkItem};
 use std::sync::Arc;
 
 /// What a frame cost.
@@ -47,6 +49,10 @@ pub struct FrameSlot {
     pub(super) fence: FrameFence,
     /// Two for each of the two history buffers that a frame may write: the passes that the next frame waits for, and the others.
     pub(super) lists: [[CommandList; 2]; 2],
+    /// Those that take the place of the first ones where the host walks rays, for each of the two history buffers.
+    pub(super) apart: Option<[ApartLists; 2]>,
+    /// The frame that ran last did so.
+    pub(super) was_apart: bool,
     pub(super) _sets: [BindingSet; 2],
     pub(super) buffers: FrameBuffers,
     pub(super) tile_list: TileList,
@@ -86,7 +92,13 @@ impl FrameSlot {
         cost.overlaps = self.resources.overlap.is_some();
         let [first, second] = &self.lists[self.parity];
         let (of_first, of_second) = self.stamps.split_at_mut(FIRST_PASSES + 1);
-        if first.stamps_ns(of_first) == of_first.len() && second.stamps_ns(of_second) == of_second.len() {
+        let has_first = match self.apart.as_ref().filter(|_| self.was_apart) {
+            None => first.stamps_ns(of_first),
+            Some(lists) => {
+                (lists[self.parity].0.iter()).fold(0, |n, list| n + list.own_stamps_ns(&mut of_first[n..]))
+            }
+        };
+        if has_first == of_first.len() && second.stamps_ns(of_second) == of_second.len() {
             let ends = of_first.windows(2).chain(of_second.windows(2));
             for (pass, ends) in cost.pass_ns.iter_mut().zip(ends) {
                 *pass = ends[1].saturating_sub(ends[0]);
@@ -165,6 +177,19 @@ impl FrameSlot {
         let listed = debug.schedule.read::<Schedule>(1)[0].listed;
         let items = (listed as u32) as usize;
         Some((debug.work.read(items.min(self.raster.pixel_count())), (listed >> 32) as u32))
+    }
+
+    /// The rays that each path of the frame has asked for last, in the order of the samples, with the bodies and the tree over them; `None` unless the
+    /// host has walked them. Valid after [`FrameSlot::wait`].
+    pub fn last_rays(&self) -> Option<(Vec<Ray>, Vec<Instance>, Vec<BodyNode>)> {
+        self.buffers.apart.as_ref().filter(|_| self.was_apart).map(|apart| apart.last_rays())
+    }
+
+    /// Rays of the frame's paths, those included that surely meet nothing, and those that were walked; `cost` is the frame's. `None` unless the host has
+    /// walked them.
+    pub fn path_rays(&self, cost: &FrameCost) -> Option<(u32, u32)> {
+        let apart = self.buffers.apart.as_ref().filter(|_| self.was_apart)?;
+        Some(apart.ray_counts(cost.counters().rays))
     }
 
     /// Workgroups of the pass `trace` that the pass `schedule` asked for. Only with `debug` at creation.

@@ -22,10 +22,20 @@ const WITH_TABLES: &[&str] = &[
     "halftone",
     "motion",
     "warp",
+    "walk",
 ];
 
 /// Those of them whose rays walk through the scene: each is built a third time, for devices that trace rays themselves.
 const WITH_QUERIES: &[&str] = &["primary", "trace"];
+
+/// Parts of the pass `trace` for software Vulkan, where the host walks the rays: output, source, and a define beside that of texels.
+const APART: &[(&str, &str, &str)] = &[
+    ("trace_begin", "trace_begin", ""),
+    ("trace_hits", "trace_hits", ""),
+    ("trace_ends", "trace_hits", "-DENDS"),
+    ("trace_misses", "trace_misses", ""),
+    ("trace_sums", "trace_sums", ""),
+];
 
 /// Version of Vulkan for all shaders but those with ray queries.
 const VULKAN: &str = "--target-env=vulkan1.1";
@@ -33,20 +43,25 @@ const VULKAN: &str = "--target-env=vulkan1.1";
 const VULKAN_OF_QUERIES: &str = "--target-env=vulkan1.2";
 
 /// Output stem, source, extra defines, version of Vulkan.
-fn variants() -> Vec<(String, String, Option<&'static str>, &'static str)> {
+fn variants() -> Vec<(String, String, Vec<&'static str>, &'static str)> {
     let source = |name: &str| format!("{name}.comp");
     let mut all: Vec<_> = WITH_TABLES
         .iter()
         .flat_map(|name| {
             [
-                (format!("{name}.texel"), source(name), Some("-DTEXEL_TABLES"), VULKAN),
-                (format!("{name}.storage"), source(name), None, VULKAN),
+                (format!("{name}.texel"), source(name), vec!["-DTEXEL_TABLES"], VULKAN),
+                (format!("{name}.storage"), source(name), vec![], VULKAN),
             ]
         })
         .collect();
-    let query = |name: &&str| (format!("{name}.query"), source(name), Some("-DRAY_QUERY"), VULKAN_OF_QUERIES);
+    let query = |name: &&str| (format!("{name}.query"), source(name), vec!["-DRAY_QUERY"], VULKAN_OF_QUERIES);
     all.extend(WITH_QUERIES.iter().map(query));
-    all.push(("pack".to_owned(), source("pack"), None, VULKAN));
+    let apart = |(output, name, define): &(&str, &str, &'static str)| {
+        let defines = ["-DTEXEL_TABLES", define].into_iter().filter(|d| !d.is_empty()).collect();
+        (format!("{output}.texel"), source(name), defines, VULKAN)
+    };
+    all.extend(APART.iter().map(apart));
+    all.push(("pack".to_owned(), source("pack"), vec![], VULKAN));
     all
 }
 
@@ -59,12 +74,12 @@ fn main() -> ExitCode {
     std::fs::write(glsl.join("tables.glsl"), dpm_shaders::generate::tables_glsl())
         .expect("write tables.glsl");
     std::fs::create_dir_all(&spv).expect("create spv");
-    for (stem, source, define, vulkan) in variants() {
+    for (stem, source, defines, vulkan) in variants() {
         let output = spv.join(format!("{stem}.spv"));
         let status = Command::new("glslc")
             .args([vulkan, "-O", "-Werror", "-I"])
             .arg(&glsl)
-            .args(define)
+            .args(defines)
             .arg(glsl.join(&source))
             .arg("-o")
             .arg(&output)

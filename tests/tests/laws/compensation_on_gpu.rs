@@ -14,8 +14,8 @@ use dpm_render::scene_data::SceneNeeds;
 use dpm_render::Surface;
 use dpm_shaders::specialization as ids;
 use dpm_shaders::structs::{
-    Counters, Frame, Instance, Rows, TriangleRef, Vertex, BINDINGS, LENS_BROWN, LENS_NONE, NO_ALBEDO_MAP,
-    NO_HIT,
+    is_of_software, Counters, Frame, Instance, Rows, TriangleRef, Vertex, BINDINGS, LENS_BROWN, LENS_NONE,
+    NO_ALBEDO_MAP, NO_HIT,
 };
 use dpm_shaders::Reading;
 use dpm_tests::gpu::with_gpu;
@@ -112,7 +112,7 @@ fn on_gpu_through(gpu: &Arc<Gpu>, input: &Input, texel: bool) -> (Vec<u32>, Coun
     let counters = device("counters", size_of::<Counters>());
     let codes_host = host("codes", PIXELS * 4);
     let counters_host = host("counters", size_of::<Counters>());
-    let bound = || BINDINGS.iter().filter(|(name, _)| texel || !name.ends_with("_ROWS"));
+    let bound = || BINDINGS.iter().filter(|(name, _)| texel || !is_of_software(name));
     let reading = if texel { Reading::Texels } else { Reading::Storage };
     let table = BindingTable::new(gpu, &shared_bindings(reading)).unwrap();
     let mut constants = SceneNeeds::default().everything().constants();

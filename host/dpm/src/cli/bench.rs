@@ -3,8 +3,10 @@
 use super::rig_args::RigArgs;
 use super::watch::{check_file, check_out, print, write_json, write_out};
 use dpm_lab::bench::{bench, BenchOptions, MethodCost};
+use dpm_lab::bench_walk::{bench_walk, WalkReport};
 use dpm_lab::gpu_model;
 use dpm_lab::seed_frames::{seed_frames, SeedScene};
+use dpm_render::gpu::Gpu;
 use dpm_rig::config::RenderMethod;
 use dpm_rig::failure::Failure;
 use dpm_rig::pipeline::{renderer_settings, PipelineError};
@@ -12,6 +14,7 @@ use dpm_rig::rig::Rig;
 use dpm_rig::run_rig::open_gpu;
 use dpm_rig::telemetry::report::to_json;
 use std::path::PathBuf;
+use std::sync::Arc;
 
 /// The rig of the experiment of \[paper\] with scans of a hare and a bust, which are not part of the program.
 const BUNNY_VENUS: &str = include_str!("../../../../rigs/bunny-venus.toml");
@@ -50,6 +53,10 @@ pub(crate) struct BenchArgs {
     /// with such files bench-*.json, and sets them beside the model
     #[arg(long, value_name = "FILE")]
     report: Option<PathBuf>,
+    /// Record the rays of a frame once and walk them by this processor's kernels and by the device's, and measure nothing else. Software Vulkan
+    /// records them
+    #[arg(long, conflicts_with_all = ["method", "model", "report"])]
+    walk: bool,
     /// Print one JSON object
     #[arg(long)]
     json: bool,
@@ -58,6 +65,32 @@ pub(crate) struct BenchArgs {
 /// Rays that were proven to meet nothing cost no walk, so rates are of those that were walked.
 const HEAD: &str = "          walked                walked/     proven/     samples/ samples/\n\
                     method      Mrays/s Msamples/s      frame       frame       frame lit pixel     GPU ms    wall ms    in line\n";
+
+/// The lines of `dpm bench --walk`.
+fn walk_lines(report: &WalkReport) -> String {
+    let share = 100.0 * f64::from(report.proven_misses) / f64::from(report.path_rays.max(1));
+    let mut text = format!(
+        "{} rays of paths in the frame: {} proven to miss ({share:.1} %), {} walked\n",
+        report.path_rays, report.proven_misses, report.walked
+    );
+    text += "kernel                   kind          rays   Mrays/s    hit %    differ\n";
+    for r in &report.rates {
+        let (rate, hit) = (r.rays_per_s * 1e-6, 100.0 * r.hit);
+        text +=
+            &format!("{:<24} {:<8} {:>9} {rate:>9.2} {hit:>8.2} {:>9}\n", r.kernel, r.kind, r.rays, r.differ);
+    }
+    text + "Kernels of the processor by the time of one thread, the device's by its own clock. \"differ\": rays of which the first kernel says \
+            something else.\n"
+}
+
+fn measure_walk(args: &BenchArgs, rig: &Rig, gpu: &Arc<Gpu>) -> Result<(), Failure> {
+    let Some(report) = bench_walk(rig, gpu).map_err(PipelineError::from)? else {
+        print("The host cannot walk the rays of this scene; the warning above says why.\n");
+        return Ok(());
+    };
+    print(&if args.json { to_json(&report) + "\n" } else { walk_lines(&report) });
+    write_out(args.flags.out.as_deref(), "bench-walk.json", &report)
+}
 
 fn lines(c: &MethodCost) -> String {
     let gpu = c.gpu_ms.map_or("-".into(), |ms| format!("{ms:.3}"));
@@ -136,6 +169,9 @@ pub(super) fn execute(args: &BenchArgs) -> Result<(), Failure> {
     check_files(args)?;
     let gpu = open_gpu(&config)?;
     let rig = Rig::build(&config, None)?;
+    if args.walk {
+        return measure_walk(args, &rig, &gpu);
+    }
     if !args.json {
         let (device, raster) = (gpu.summary(), rig.camera.raster);
         print(&format!(

@@ -5,6 +5,7 @@ use super::error::{GpuError, MemoryPool};
 use ash::vk;
 use bytemuck::Pod;
 use std::ptr::NonNull;
+use std::sync::atomic::AtomicU32;
 use std::sync::Arc;
 
 /// Largest buffer of [`MemoryKind::Upload`] that goes to the GPU's own memory, bytes.
@@ -22,6 +23,9 @@ pub enum MemoryKind {
     Upload,
     /// Written by shaders and read by the host. Mapped, and cached if possible.
     Readback,
+    /// Written and read by shaders and by threads of the host, in turns. Mapped, and cached if possible. What nobody has written is undefined, and takes
+    /// no memory on software Vulkan.
+    Shared,
 }
 
 /// Where a buffer's memory lies.
@@ -237,7 +241,9 @@ impl Buffer {
                     .map_memory(memory, 0, vk::WHOLE_SIZE, vk::MemoryMapFlags::empty())
                     .on(gpu, "mapping a buffer")?;
                 buffer.mapped = NonNull::new(pointer.cast());
-                buffer.bytes_mut().fill(0);
+                if kind != MemoryKind::Shared {
+                    buffer.bytes_mut().fill(0);
+                }
             }
             Ok(buffer)
         }
@@ -259,7 +265,7 @@ impl Buffer {
             // GPU reads across the bus: that part of the GPU's memory may be small, too.
             MemoryKind::Upload if needs.size <= MOST_UPLOAD_ON_DEVICE => &[on_device, coherent],
             MemoryKind::Upload => &[coherent],
-            MemoryKind::Readback => &[
+            MemoryKind::Readback | MemoryKind::Shared => &[
                 P::from_raw(P::HOST_VISIBLE.as_raw() | P::HOST_COHERENT.as_raw() | P::HOST_CACHED.as_raw()),
                 coherent,
             ],
@@ -328,6 +334,17 @@ impl Buffer {
         let pointer = self.mapped.expect("a mapped kind of buffer");
         // SAFETY: as above, and &mut self excludes other access by the host.
         unsafe { std::slice::from_raw_parts_mut(pointer.as_ptr(), self.len_bytes) }
+    }
+
+    /// The mapped words, for threads that share them: who may write which, and when, they agree on by other means.
+    ///
+    /// # Panics
+    /// For [`MemoryKind::Device`] buffers.
+    pub(crate) fn words(&self) -> &[AtomicU32] {
+        let pointer = self.mapped.expect("a mapped kind of buffer");
+        // SAFETY: mapped for `len_bytes` for the life of the buffer, and memory is mapped at whole pages. Words that are read while the device writes
+        // them may be any; nobody relies on those.
+        unsafe { std::slice::from_raw_parts(pointer.as_ptr().cast::<AtomicU32>(), self.len_bytes / 4) }
     }
 
     /// The first `count` elements.

@@ -79,21 +79,35 @@ impl CommandList {
     /// Fills in the time stamps of the last finished run, in nanoseconds since the first of them, and returns their number.
     /// Allocates nothing.
     pub(crate) fn stamps_ns(&self, out: &mut [u64]) -> usize {
+        let n = self.ticks(out);
+        let first = out.first().copied().unwrap_or(0);
+        out[..n].iter_mut().for_each(|stamp| *stamp = self.ns(stamp.wrapping_sub(first)));
+        n
+    }
+
+    /// The same since a time of the device's own.
+    pub(crate) fn own_stamps_ns(&self, out: &mut [u64]) -> usize {
+        let n = self.ticks(out);
+        out[..n].iter_mut().for_each(|stamp| *stamp = self.ns(*stamp));
+        n
+    }
+
+    fn ns(&self, ticks: u64) -> u64 {
+        (ticks as f64 * f64::from(self.gpu.summary().timestamp_period_ns)) as u64
+    }
+
+    fn ticks(&self, out: &mut [u64]) -> usize {
         let Some(queries) = self.queries.filter(|_| !self.gpu.is_lost()) else { return 0 };
         let n = (self.stamps as usize).min(out.len());
         // SAFETY: the queries were written by the last submission, whose fence the caller waited for.
         let ok = within(Place::Vulkan, || unsafe {
             self.gpu.device.get_query_pool_results(queries, 0, &mut out[..n], vk::QueryResultFlags::TYPE_64)
         });
-        if ok.is_err() || n == 0 {
-            return 0;
+        if ok.is_err() {
+            0
+        } else {
+            n
         }
-        let first = out[0];
-        let period = f64::from(self.gpu.summary().timestamp_period_ns);
-        for stamp in &mut out[..n] {
-            *stamp = (stamp.wrapping_sub(first) as f64 * period) as u64;
-        }
-        n
     }
 
     /// Runs the list. `fence` is signalled when it is done. A device that is lost or was given up is not used.
@@ -206,6 +220,15 @@ impl Recorder<'_> {
         self.pipeline_barrier(S::COMPUTE_SHADER | S::TRANSFER, S::HOST, barrier);
     }
 
+    /// Makes what the host has written meanwhile visible to what follows.
+    pub(crate) fn barrier_from_host(&mut self) {
+        use vk::{AccessFlags as A, PipelineStageFlags as S};
+        let barrier = vk::MemoryBarrier::default()
+            .src_access_mask(A::HOST_WRITE)
+            .dst_access_mask(A::SHADER_READ | A::TRANSFER_READ | A::INDIRECT_COMMAND_READ);
+        self.pipeline_barrier(S::HOST, S::COMPUTE_SHADER | S::TRANSFER | S::DRAW_INDIRECT, barrier);
+    }
+
     pub(super) fn pipeline_barrier(
         &mut self,
         from: vk::PipelineStageFlags,
@@ -233,7 +256,17 @@ impl Recorder<'_> {
 
     /// Copies the first `bytes` of one buffer to another, from the byte `at` there on.
     pub(crate) fn copy_to(&mut self, from: &Buffer, to: &Buffer, bytes: usize, at: usize) {
-        let region = [vk::BufferCopy { src_offset: 0, dst_offset: at as u64, size: bytes as u64 }];
+        self.copy_part((from, 0), (to, at), bytes);
+    }
+
+    /// Copies `bytes` of one buffer, from a byte on, to another, from a byte there on.
+    pub(crate) fn copy_part(
+        &mut self,
+        (from, src): (&Buffer, usize),
+        (to, dst): (&Buffer, usize),
+        bytes: usize,
+    ) {
+        let region = [vk::BufferCopy { src_offset: src as u64, dst_offset: dst as u64, size: bytes as u64 }];
         // SAFETY: recording; both buffers have transfer usage and are kept alive by the owner.
         unsafe { self.list.gpu.device.cmd_copy_buffer(self.list.buffer, from.handle, to.handle, &region) }
     }

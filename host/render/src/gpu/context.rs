@@ -46,6 +46,8 @@ pub struct Gpu {
     /// Where frames begin and where they end. The same queue twice where the device has one.
     queues: [vk::Queue; 2],
     goes_first: bool,
+    /// It has semaphores that count.
+    has_timelines: bool,
     /// Whose turn it is to submit.
     turn: Turn,
     pub(super) queue_family: u32,
@@ -122,6 +124,8 @@ struct NewDevice {
     queues: [vk::Queue; 2],
     /// Frames go before the work of other programs.
     goes_first: bool,
+    /// It has semaphores that count.
+    has_timelines: bool,
     /// Most that buffers may take of the address space.
     most_bytes: Option<u64>,
 }
@@ -161,7 +165,7 @@ fn create(
     };
     // SAFETY: the device was created with so many queues of this family.
     let queues = [0, queue_count - 1].map(|i| unsafe { device.get_device_queue(queue_family, i) });
-    Ok(NewDevice { device, queue_family, queues, goes_first, most_bytes })
+    Ok(NewDevice { device, queue_family, queues, goes_first, has_timelines, most_bytes })
 }
 
 /// The device with the features that the shaders need, and with semaphores that count and ray queries where it has them. `first`: the extension by
@@ -283,7 +287,7 @@ impl Gpu {
         let mut first_error = None;
         for Candidate { physical, summary, id } in usable {
             let name: Arc<str> = summary.name.as_str().into();
-            let NewDevice { device, queue_family, queues, goes_first, most_bytes } =
+            let NewDevice { device, queue_family, queues, goes_first, has_timelines, most_bytes } =
                 match create(&instance, physical, &summary, options) {
                     Ok(created) => created,
                     Err(error) => {
@@ -311,6 +315,7 @@ impl Gpu {
                 device,
                 queues,
                 goes_first,
+                has_timelines,
                 turn: Turn::default(),
                 queue_family,
                 memory,
@@ -452,6 +457,11 @@ impl Gpu {
     /// Whether frames go before the work of other programs, because the driver offers that and the system lets this program.
     pub fn goes_first(&self) -> bool {
         self.goes_first
+    }
+
+    /// Whether device and host can take turns within a frame ([`super::Relay`]).
+    pub(crate) fn has_timelines(&self) -> bool {
+        self.has_timelines
     }
 
     /// Whether a frame can begin on one queue while the one before ends on another.

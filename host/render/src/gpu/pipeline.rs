@@ -33,13 +33,14 @@ impl BindingKind {
     }
 }
 
-/// The bindings that all shaders share, with their kinds. The second bindings of a buffer, as texels, are bound only for shaders that read tables so,
+/// The bindings that all shaders share, with their kinds. The second bindings of a buffer, as texels, and the rays that the host walks are bound only
+/// for shaders that read tables so,
 /// because devices bind a limited number; and the tree over the bodies only for those that ask the device for hits.
 pub fn shared_bindings(reading: Reading) -> Vec<(u32, BindingKind)> {
     let texel = reading == Reading::Texels;
     let tree = (reading == Reading::Query).then_some((structs::TREE_BINDING.1, BindingKind::BodyTree));
     (structs::BINDINGS.iter())
-        .filter(|(name, _)| texel || !name.ends_with("_ROWS"))
+        .filter(|(name, _)| texel || !structs::is_of_software(name))
         .map(|&(name, binding)| {
             let rows = texel && structs::TEXEL_BINDINGS.contains(&name);
             (binding, if rows { BindingKind::Texel } else { BindingKind::Storage })

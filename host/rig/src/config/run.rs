@@ -155,6 +155,9 @@ words! {
         Walk = "walk",
         /// The device by ray queries, software or not. A device without them is refused. Where meshes deform, the shaders walk.
         Query = "query",
+        /// On software Vulkan threads of the host, between the shaders' dispatches; for scenes without holes, veils and meshes that deform. It takes
+        /// some seconds more to start. Elsewhere as "auto".
+        Host = "host",
     }
 }
 

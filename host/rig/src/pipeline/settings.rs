@@ -68,6 +68,7 @@ pub fn renderer_settings(rig: &Rig) -> RendererSettings {
             config::Tracing::Auto => Tracing::Auto,
             config::Tracing::Walk => Tracing::Walk,
             config::Tracing::Query => Tracing::RayQuery,
+            config::Tracing::Host => Tracing::Host,
         },
         most_live_texels: most_live_texels(rig),
     }
