@@ -7,7 +7,7 @@
 
 use serde::Serialize;
 
-/// Of the lit pixels, so many may show other samples: an H100 changed up to 9 % ([`docs/lab/H100.md`]).
+/// Of the lit pixels, so many may show other samples: an H100 changed up to 9 % (`docs/lab/H100.md`).
 pub const MOST_MOVED: f64 = 0.10;
 /// A pixel whose radiance changes by more than this share of itself shows other samples.
 const MOVED: f64 = 1e-3;

@@ -130,9 +130,8 @@ impl FrameBuffers {
         let nodes = body_tree.most_nodes();
         let apart = apart.map(|layout| ApartFrame::new(gpu, layout, bodies, nodes, pixels)).transpose()?;
         let own_work = apart.is_none().then(|| size("work list", pixels * each.work, Device)).transpose()?;
-        let needs_none = reading == Reading::Texels && apart.is_none();
         let no_queue =
-            needs_none.then(|| Buffer::new_texels(gpu, "no rays", 1, false, Device)).transpose()?;
+            apart.is_none().then(|| Buffer::new_texels(gpu, "no rays", 1, false, Device)).transpose()?;
         Ok(Self {
             frame: latched("frame uniforms", size_of::<Frame>())?,
             instances: latched("instances", size_of::<Instance>() * bodies.max(1))?,
@@ -299,7 +298,7 @@ impl FrameBuffers {
             "B_SCHEDULE" => &self.schedule,
             "B_WORK" => self.work(),
             "B_QUEUE" | "B_QUEUE_ROWS" => self.apart.as_ref().map_or_else(
-                || self.no_queue.as_ref().expect("bound for software Vulkan only"),
+                || self.no_queue.as_ref().expect("made where no host walks"),
                 |apart| &apart.queue,
             ),
             "B_NOISE" => &shared.noise,

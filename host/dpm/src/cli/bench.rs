@@ -22,7 +22,7 @@ const BUNNY_VENUS: &str = include_str!("../../../../rigs/bunny-venus.toml");
 /// What `--preset` measures.
 #[derive(clap::ValueEnum, Clone, Copy, Debug)]
 enum BenchPreset {
-    /// The frames of \[paper\]'s headline.
+    /// The frames of the paper's headline.
     Seed,
 }
 
@@ -44,8 +44,8 @@ pub(crate) struct BenchArgs {
     /// estimated rates, term by term
     #[arg(long)]
     model: bool,
-    /// Measure the two frames of [paper]'s headline instead: its method with 18/18/2 samples and its predecessor with 14, on the demo,
-    /// which has textures, and on the bodies of rigs/bunny-venus.toml, whose file --scene names; beside them what [paper] says,
+    /// Measure the two frames of the paper's headline instead: its method with 18/18/2 samples and its predecessor with 14, on the demo,
+    /// which has textures, and on the bodies of rigs/bunny-venus.toml, whose file --scene names; beside them what the paper says,
     /// what was measured on other cards, and what the model computes
     #[arg(long, value_enum, conflicts_with_all = ["rig", "method", "model"])]
     preset: Option<BenchPreset>,
