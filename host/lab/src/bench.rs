@@ -4,7 +4,7 @@ use super::median::{median, median_ms};
 use super::sequence::{draw, poses_at, submit, FRAME_WAIT_NS};
 use super::stamp::Stamp;
 use crate::error::plan::switched_method_of;
-use crate::gpu_model::{modelled, FrameWork, Modelled};
+use crate::gpu_model::{modelled, CountedFrame, FrameWork, Modelled};
 use crate::lanes::{Lanes, WIDTHS};
 use dpm_render::gpu::Gpu;
 use dpm_render::method::Method;
@@ -73,6 +73,13 @@ pub struct MethodCost {
     pub passes: Vec<PassTime>,
 }
 
+impl MethodCost {
+    /// What the model of GPUs asks for.
+    pub(crate) fn counted(&self) -> CountedFrame<'_> {
+        (self.method, self.rays_per_frame, &self.work)
+    }
+}
+
 /// What `dpm bench` tells.
 #[derive(Clone, Debug, Serialize)]
 pub struct BenchReport {
@@ -122,7 +129,8 @@ pub fn bench(
         each(&cost);
         methods.push(cost);
     }
-    let modelled_not_measured = if wants_model { modelled(&methods) } else { Vec::new() };
+    let modelled_not_measured =
+        if wants_model { modelled(methods.iter().map(MethodCost::counted)) } else { Vec::new() };
     let (stamp, spp) = (Stamp::new(rig, gpu.summary()), rig.config.render.spp);
     let ray_query = renderer_settings(rig).tracing.asks_device(gpu.summary());
     Ok(BenchReport { stamp, spp, ray_query, methods, modelled_not_measured })

@@ -12,7 +12,6 @@
 //!
 //! [docs/lab/GPU-MODEL.md](../../../docs/lab/GPU-MODEL.md) has both, and where the fit is wrong.
 
-use crate::bench::MethodCost;
 use crate::lanes::Lanes;
 use serde::Serialize;
 
@@ -156,21 +155,23 @@ pub struct Modelled {
     /// Frames per second that this allows.
     pub frames_per_s: [f64; 2],
     /// The same by rates that were assumed and that failed where a card was measured.
-    pub failed_assumption: Assumed,
+    pub failed_assumption: RateAssumption,
 }
 
 /// A frame by the assumptions that stood here before a card was measured, milliseconds, least and most.
 #[derive(Clone, Debug, PartialEq, Serialize)]
-pub struct Assumed {
+pub struct RateAssumption {
     /// All rays over rate and busy lanes.
     pub trace_ms: [f64; 2],
     /// The whole frame.
     pub frame_ms: [f64; 2],
 }
 
+/// A method, its rays of a frame, and the frame's counts.
+pub(crate) type CountedFrame<'a> = (&'static str, f64, &'a FrameWork);
+
 /// The model for every card and every method that was measured.
-pub fn modelled(methods: &[MethodCost]) -> Vec<Modelled> {
-    let each = methods.iter().map(|m| (m.method, m.rays_per_frame, &m.work));
+pub(crate) fn modelled<'a>(each: impl Iterator<Item = CountedFrame<'a>> + Clone) -> Vec<Modelled> {
     CARDS.iter().flat_map(|card| each.clone().filter_map(|method| on(card, method))).collect()
 }
 
@@ -208,7 +209,7 @@ impl Card {
 }
 
 /// `None` for a method that traced nothing.
-fn on(card: &Card, (method, rays, work): (&'static str, f64, &FrameWork)) -> Option<Modelled> {
+fn on(card: &Card, (method, rays, work): CountedFrame<'_>) -> Option<Modelled> {
     let lanes = work.lanes.iter().find(|lanes| lanes.width == card.width)?;
     let rays_of_paths = work.path_rays as f64;
     let walked = 1.0 - work.proven_rays as f64 / rays_of_paths.max(1.0);
@@ -226,7 +227,8 @@ fn on(card: &Card, (method, rays, work): (&'static str, f64, &FrameWork)) -> Opt
     let [least, most] = card.assumed_rays_per_s;
     let assumed = [most, least].map(|rate| 1e3 * rays / (rate * lanes.busy));
     let others = screen_by(ASSUMED_BANDWIDTH_SHARE) + barriers_ms + readback_by(ASSUMED_BUS_BYTES_PER_S);
-    let failed_assumption = Assumed { trace_ms: assumed, frame_ms: assumed.map(|trace| trace + others) };
+    let failed_assumption =
+        RateAssumption { trace_ms: assumed, frame_ms: assumed.map(|trace| trace + others) };
     let gpu = card.name;
     Some(Modelled {
         gpu,

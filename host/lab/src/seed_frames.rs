@@ -106,7 +106,7 @@ pub fn seed_frames(
                     .map(|card| on_card(card, name, samples, &here, is_papers))
                     .collect(),
                 modelled_not_measured: if is_papers {
-                    modelled(std::slice::from_ref(&here))
+                    modelled(std::iter::once(here.counted()))
                 } else {
                     Vec::new()
                 },
