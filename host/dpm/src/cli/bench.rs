@@ -70,7 +70,7 @@ const HEAD: &str = "          walked                walked/     proven/     samp
 fn walk_lines(report: &WalkReport) -> String {
     let share = 100.0 * f64::from(report.proven_misses) / f64::from(report.path_rays.max(1));
     let mut text = format!(
-        "{} rays of paths in the frame: {} proven to miss ({share:.1} %), {} walked\n",
+        "{} rays of paths in the frame: {} proven to miss ({share:.1} %), {} walked; below are those of the last round\n",
         report.path_rays, report.proven_misses, report.walked
     );
     text += "kernel                   kind          rays   Mrays/s    hit %    differ\n";
