@@ -5,8 +5,13 @@ use crate::link::{faults, mean_luminance, Config, SlotClock, Underrun, REST_US};
 use crate::time::{DeviceTicks, HostTime};
 
 use super::config::Shown;
-use super::frames::Held;
+use super::frames::{FrameStore, Held, Pending};
 use super::{Core, Mode};
+
+/// The planes of the frame in a buffer.
+fn planes_of<'a>(store: &'a FrameStore, config: &Config, buffer: usize) -> &'a [u8] {
+    &store.bytes(buffer)[..config.raster.plane_bytes() * config.schedule.len()]
+}
 
 impl Core {
     /// Begins one slot.
@@ -18,16 +23,7 @@ impl Core {
         if self.panel_busy && self.untaken.is_some() && self.lit_now {
             return self.lit_a_slot_later(slots, slot, start);
         }
-        // What a busy panel cannot take waits for the next slot.
-        let mut due = if self.panel_busy { None } else { self.store.take_due(slot) };
-        if let Some((_, superseded)) =
-            due.filter(|(frame, _)| self.mode == Mode::Normal && frame.dark_from <= start)
-        {
-            // The frame was allowed to be late, but its own light is over.
-            self.status.frames_superseded = self.status.frames_superseded.wrapping_add(superseded);
-            self.status.frames_late = self.status.frames_late.wrapping_add(1);
-            due = None;
-        }
+        let due = self.take_due(slot, start);
         if due.is_none() && self.dark_from().is_some_and(|dark| dark <= start) {
             self.end_light();
         }
@@ -39,8 +35,7 @@ impl Core {
         });
         let too_much = match (self.mode, due) {
             (Mode::Normal, Some((frame, _))) => {
-                let bytes = config.raster.plane_bytes() * config.schedule.len();
-                let planes = &self.store.bytes(frame.buffer)[..bytes];
+                let planes = planes_of(&self.store, config, frame.buffer);
                 self.guard.new_frame(config.raster, &config.schedule, planes)
             }
             _ if again => self.guard.same_frame(),
@@ -61,18 +56,7 @@ impl Core {
         let kind = match (self.mode, due) {
             (Mode::Normal, Some((frame, superseded))) => {
                 self.status.frames_superseded = self.status.frames_superseded.wrapping_add(superseded);
-                self.status.frames_lit = self.status.frames_lit.wrapping_add(1);
-                self.status.last_lit_frame = frame.frame;
-                self.status.last_lit_at = start;
-                self.following.lit(frame.slot);
-                self.store.lit =
-                    Some(Held { frame: frame.frame, dark_from: frame.dark_from, buffer: frame.buffer });
-                self.generation += 1;
-                if self.flash.is_some() {
-                    let bytes = config.raster.plane_bytes() * config.schedule.len();
-                    let planes = &self.store.bytes(frame.buffer)[..bytes];
-                    self.luminance = mean_luminance(config.raster, &config.schedule, planes);
-                }
+                self.show(config, &frame, start);
                 LightKind::Lit
             }
             (_, due) => {
@@ -97,6 +81,34 @@ impl Core {
         if self.flash.as_mut().is_some_and(|f| f.observe(slot, luminance)) {
             self.rest(start, u64::from(REST_US));
             self.latch(faults::FLASH_LIMIT);
+        }
+    }
+
+    /// The frame for `slot`, and the number of older ones that it replaces. What a busy panel cannot take waits for the
+    /// next slot.
+    fn take_due(&mut self, slot: u64, start: DeviceTicks) -> Option<(Pending, u32)> {
+        let due = if self.panel_busy { None } else { self.store.take_due(slot) };
+        let (frame, superseded) = due?;
+        if self.mode == Mode::Normal && frame.dark_from <= start {
+            // The frame was allowed to be late, but its own light is over.
+            self.status.frames_superseded = self.status.frames_superseded.wrapping_add(superseded);
+            self.status.frames_late = self.status.frames_late.wrapping_add(1);
+            return None;
+        }
+        due
+    }
+
+    /// Puts a frame onto the mirrors at `start`.
+    fn show(&mut self, config: &Config, frame: &Pending, start: DeviceTicks) {
+        self.status.frames_lit = self.status.frames_lit.wrapping_add(1);
+        self.status.last_lit_frame = frame.frame;
+        self.status.last_lit_at = start;
+        self.following.lit(frame.slot);
+        self.store.lit = Some(Held { frame: frame.frame, dark_from: frame.dark_from, buffer: frame.buffer });
+        self.generation += 1;
+        if self.flash.is_some() {
+            let planes = planes_of(&self.store, config, frame.buffer);
+            self.luminance = mean_luminance(config.raster, &config.schedule, planes);
         }
     }
 

@@ -81,6 +81,36 @@ fn material(scene: &Scene, calls: impl Fn(&Material) -> bool) -> Option<String> 
     found.find(|m| calls(m)).map(|m| format!("material \"{}\"", m.name))
 }
 
+/// A part of the shaders that materials call for.
+struct MaterialPart {
+    feature: &'static str,
+    /// What the renderer decided.
+    need: fn(&SceneNeeds) -> bool,
+    /// The materials that are named as the reason.
+    calls: fn(&Material) -> bool,
+    /// Why the part is left out.
+    or: &'static str,
+}
+
+#[rustfmt::skip] // a table
+const MATERIAL_PARTS: [MaterialPart; 15] = [
+    MaterialPart { feature: "normal maps", need: |n| n.normal_maps, calls: |m| m.normal_texture.is_some(), or: "no normal map" },
+    MaterialPart { feature: "alpha mask", need: |n| n.alpha_mask, calls: |m| m.alpha_cutoff.is_some() || m.alpha_blend, or: "no material is cut out" },
+    MaterialPart { feature: "alpha blend", need: |n| n.alpha_blend, calls: |m| m.alpha_blend, or: "all is there or not" },
+    MaterialPart { feature: "transmission", need: |n| n.transmission, calls: |m| m.transmission > 0.0, or: "light passes nothing" },
+    MaterialPart { feature: "specular", need: |n| n.specular, calls: |m| m.metallic > 0.0 || m.ior != 1.0, or: "every index is 1 and nothing is metal" },
+    MaterialPart { feature: "diffuse", need: |n| n.diffuse, calls: |m| m.metallic < 1.0 || m.metallic_roughness_texture.is_some(), or: "every material is metal" },
+    MaterialPart { feature: "clear coat", need: |n| n.clearcoat, calls: |m| m.lobes.coat.factor > 0.0, or: "no material has KHR_materials_clearcoat" },
+    MaterialPart { feature: "specular colour", need: |n| n.specular_color, calls: |m| !m.lobes.specular.is_plain(), or: "no material has KHR_materials_specular" },
+    MaterialPart { feature: "anisotropy", need: |n| n.anisotropy, calls: |m| m.lobes.anisotropy.strength > 0.0, or: "no material has KHR_materials_anisotropy" },
+    MaterialPart { feature: "sheen", need: |n| n.sheen, calls: |m| m.lobes.sheen.color != Vec3::ZERO, or: "no material has KHR_materials_sheen" },
+    MaterialPart { feature: "absorption", need: |n| n.absorption, calls: |m| m.lobes.absorption != Vec3::ZERO, or: "no solid absorbs (KHR_materials_volume)" },
+    MaterialPart { feature: "thin film", need: |n| n.iridescence, calls: |m| m.lobes.film.factor > 0.0, or: "no material has KHR_materials_iridescence" },
+    MaterialPart { feature: "diffuse transmission", need: |n| n.diffuse_transmission, calls: |m| m.lobes.diffuse_transmission.factor > 0.0, or: "no material has KHR_materials_diffuse_transmission" },
+    MaterialPart { feature: "dispersion", need: |n| n.dispersion, calls: |m| m.lobes.dispersion > 0.0, or: "no solid has KHR_materials_dispersion" },
+    MaterialPart { feature: "emissive", need: |n| n.emissive, calls: |m| m.emissive.max_element() > 0.0, or: "nothing emits" },
+];
+
 /// Parts that depend on the scene alone. `needs` is what the renderer decided; the scene only says why.
 pub(crate) fn scene_entries(scene: &Scene, needs: &SceneNeeds, clamp: f64) -> Vec<PlanEntry> {
     let part = |feature, need: bool, reason: Option<String>, or| {
@@ -94,99 +124,16 @@ pub(crate) fn scene_entries(scene: &Scene, needs: &SceneNeeds, clamp: f64) -> Ve
     let is_of_file = |t: &TextureRef| !scene.textures.get(t.texture as usize).is_some_and(|t| t.of_vertices);
     let of_file = material(scene, |m| m.textures().flatten().any(|t| is_of_file(&t)));
     let painted = material(scene, |m| m.textures().any(|t| t.is_some()));
-    vec![
-        match (of_file, painted) {
-            (None, Some(name)) => {
-                let reason = format!("{name}; they become a texture");
-                part("colours of vertices", needs.textures, Some(reason), "no texture on any triangle")
-            }
-            (of_file, _) => part("textures", needs.textures, of_file, "no texture on any triangle"),
-        },
-        part(
-            "normal maps",
-            needs.normal_maps,
-            material(scene, |m| m.normal_texture.is_some()),
-            "no normal map",
-        ),
-        part(
-            "alpha mask",
-            needs.alpha_mask,
-            material(scene, |m| m.alpha_cutoff.is_some() || m.alpha_blend),
-            "no material is cut out",
-        ),
-        part("alpha blend", needs.alpha_blend, material(scene, |m| m.alpha_blend), "all is there or not"),
-        part(
-            "transmission",
-            needs.transmission,
-            material(scene, |m| m.transmission > 0.0),
-            "light passes nothing",
-        ),
-        part(
-            "specular",
-            needs.specular,
-            material(scene, |m| m.metallic > 0.0 || m.ior != 1.0),
-            "every index is 1 and nothing is metal",
-        ),
-        part(
-            "diffuse",
-            needs.diffuse,
-            material(scene, |m| m.metallic < 1.0 || m.metallic_roughness_texture.is_some()),
-            "every material is metal",
-        ),
-        part(
-            "clear coat",
-            needs.clearcoat,
-            material(scene, |m| m.lobes.coat.factor > 0.0),
-            "no material has KHR_materials_clearcoat",
-        ),
-        part(
-            "specular colour",
-            needs.specular_color,
-            material(scene, |m| !m.lobes.specular.is_plain()),
-            "no material has KHR_materials_specular",
-        ),
-        part(
-            "anisotropy",
-            needs.anisotropy,
-            material(scene, |m| m.lobes.anisotropy.strength > 0.0),
-            "no material has KHR_materials_anisotropy",
-        ),
-        part(
-            "sheen",
-            needs.sheen,
-            material(scene, |m| m.lobes.sheen.color != Vec3::ZERO),
-            "no material has KHR_materials_sheen",
-        ),
-        part(
-            "absorption",
-            needs.absorption,
-            material(scene, |m| m.lobes.absorption != Vec3::ZERO),
-            "no solid absorbs (KHR_materials_volume)",
-        ),
-        part(
-            "thin film",
-            needs.iridescence,
-            material(scene, |m| m.lobes.film.factor > 0.0),
-            "no material has KHR_materials_iridescence",
-        ),
-        part(
-            "diffuse transmission",
-            needs.diffuse_transmission,
-            material(scene, |m| m.lobes.diffuse_transmission.factor > 0.0),
-            "no material has KHR_materials_diffuse_transmission",
-        ),
-        part(
-            "dispersion",
-            needs.dispersion,
-            material(scene, |m| m.lobes.dispersion > 0.0),
-            "no solid has KHR_materials_dispersion",
-        ),
-        part(
-            "emissive",
-            needs.emissive,
-            material(scene, |m| m.emissive.max_element() > 0.0),
-            "nothing emits",
-        ),
+    let textures = match (of_file, painted) {
+        (None, Some(name)) => {
+            let reason = format!("{name}; they become a texture");
+            part("colours of vertices", needs.textures, Some(reason), "no texture on any triangle")
+        }
+        (of_file, _) => part("textures", needs.textures, of_file, "no texture on any triangle"),
+    };
+    let of_materials =
+        MATERIAL_PARTS.map(|p| part(p.feature, (p.need)(needs), material(scene, p.calls), p.or));
+    let of_the_rest = [
         part(
             "punctual lights",
             needs.punctual,
@@ -218,7 +165,8 @@ pub(crate) fn scene_entries(scene: &Scene, needs: &SceneNeeds, clamp: f64) -> Ve
             "no animation deforms a mesh",
             "frames in flight share the scene's tables",
         ),
-    ]
+    ];
+    std::iter::once(textures).chain(of_materials).chain(of_the_rest).collect()
 }
 
 /// Frames whose shapes are worked out to measure how long one takes.
@@ -404,6 +352,47 @@ fn gpu_failure(error: impl Into<RenderError>) -> Failure {
     PipelineError::Render(error.into()).into()
 }
 
+/// Times frames of `rig` with and without each part of the report that can be put back or taken out.
+fn measure_savings(report: &mut PlanReport, rig: &Rig, gpu: &Arc<Gpu>) -> Result<(), Failure> {
+    let method = rig.config.render.to_method();
+    let (own, lean) = (renderer_settings(&rig), Keep::default());
+    let mine = Side { scene: &rig.scene, settings: &own, keep: lean };
+    let pair = |without: Side<'_>, with: Side<'_>| compare(rig, gpu, without, with).map_err(gpu_failure);
+    for e in &mut report.entries {
+        let with_code = if e.left_out { keeping(e.feature, &method) } else { None };
+        // What no scene of this kind can be drawn without has another scene beside it: of what it needs one without, else one with.
+        let scene = changed(e.feature, &rig.scene).filter(|_| e.needed || e.feature == "environment image");
+        e.saving = match (with_code, flipped(e.feature, &own), scene) {
+            (Some(keep), ..) => {
+                let saving = pair(mine, Side { keep, ..mine })?;
+                Some(if keep.every_pixel { saving.of_pictures() } else { saving })
+            }
+            (None, Some(other), _) => {
+                let other = Side { settings: &other, ..mine };
+                let (without, with) = if e.left_out { (mine, other) } else { (other, mine) };
+                Some(pair(without, with)?.of_pictures())
+            }
+            (None, None, Some(other)) => {
+                let other = Side { scene: &other, ..mine };
+                let (without, with) = if e.left_out { (mine, other) } else { (other, mine) };
+                Some(pair(without, with)?.of_pictures())
+            }
+            (None, None, None) => None,
+        };
+    }
+    let all = Keep {
+        needs: SceneNeeds::default().everything(),
+        rate_map: method.needs_history() && !method.needs_rates(),
+        every_tile: true,
+        // A pixel that only another body's motion uncovers may be lit three frames later.
+        every_pixel: false,
+        storage_tables: false,
+        body_list: false,
+    };
+    report.together = Some(pair(mine, Side { keep: all, ..mine })?);
+    Ok(())
+}
+
 /// Plans the rig; `measure` opens the GPU and times frames with and without each part that can be put back or taken out.
 ///
 /// # Errors
@@ -439,41 +428,7 @@ pub fn scene_plan(config: &RigConfig, measure: bool) -> Result<PlanReport, Failu
     if config.render.method == RenderMethod::Auto {
         report.method_choice = Some(measured_method(config, raster, &gpu, &mut report.warnings)?);
     }
-    let (own, lean) = (renderer_settings(&rig), Keep::default());
-    let mine = Side { scene: &rig.scene, settings: &own, keep: lean };
-    let pair = |without: Side<'_>, with: Side<'_>| compare(&rig, &gpu, without, with).map_err(gpu_failure);
-    for e in &mut report.entries {
-        let with_code = if e.left_out { keeping(e.feature, &method) } else { None };
-        // What no scene of this kind can be drawn without has another scene beside it: of what it needs one without, else one with.
-        let scene = changed(e.feature, &rig.scene).filter(|_| e.needed || e.feature == "environment image");
-        e.saving = match (with_code, flipped(e.feature, &own), scene) {
-            (Some(keep), ..) => {
-                let saving = pair(mine, Side { keep, ..mine })?;
-                Some(if keep.every_pixel { saving.of_pictures() } else { saving })
-            }
-            (None, Some(other), _) => {
-                let other = Side { settings: &other, ..mine };
-                let (without, with) = if e.left_out { (mine, other) } else { (other, mine) };
-                Some(pair(without, with)?.of_pictures())
-            }
-            (None, None, Some(other)) => {
-                let other = Side { scene: &other, ..mine };
-                let (without, with) = if e.left_out { (mine, other) } else { (other, mine) };
-                Some(pair(without, with)?.of_pictures())
-            }
-            (None, None, None) => None,
-        };
-    }
-    let all = Keep {
-        needs: SceneNeeds::default().everything(),
-        rate_map: method.needs_history() && !method.needs_rates(),
-        every_tile: true,
-        // A pixel that only another body's motion uncovers may be lit three frames later.
-        every_pixel: false,
-        storage_tables: false,
-        body_list: false,
-    };
-    report.together = Some(pair(mine, Side { keep: all, ..mine })?);
+    measure_savings(&mut report, &rig, &gpu)?;
     let keeps_bits = keeps_bits(report.entries.iter().filter_map(|e| e.saving.as_ref()));
     let changed: Vec<&str> = (report.entries.iter())
         .filter(|e| e.saving.as_ref().is_some_and(|s| s.is_wrong(keeps_bits)))

@@ -1,6 +1,7 @@
 //! A scene into the flat arrays that the shaders read: BVHs, vertices, materials, texels, lights and the environment.
 
 mod lights;
+mod materials;
 mod relight;
 
 use super::body_tree::FEWEST_BODIES;
@@ -10,23 +11,16 @@ pub use super::scene_needs::SceneNeeds;
 use crate::gpu::BodyTriangles;
 use crate::walker::WideTree;
 use bytemuck::Zeroable;
-use dpm_scene::albedo_table::{tabulated, AlbedoTable, ALBEDO_NODES};
 use dpm_scene::bvh::BodyBvh;
 use dpm_scene::horizon::{horizons, Horizon, CLOSED};
-use dpm_scene::lobes::{Coat, Lobes, LEAST_COVERAGE, THICKEST_FILM_NM};
 use dpm_scene::mesh::MAX_COORDINATE_M;
-use dpm_scene::{picture_at, LinearTexel, Scene, TextureRef, ToLinear, TriangleMesh, Wrap};
-use dpm_shaders::structs::{
-    self as gpu, AlbedoCell, Light, Material, TextureInfo, TextureUse, TriangleRef, Vertex,
-};
+use dpm_scene::{picture_at, LinearTexel, Scene, ToLinear, TriangleMesh, Wrap};
+use dpm_shaders::structs::{self as gpu, AlbedoCell, Light, Material, TextureInfo, TriangleRef, Vertex};
 use glam::{DAffine3, Vec3};
 use std::sync::OnceLock;
 
 /// Most bodies that a scene may have, those that never move included. The number of a body has 8 bits of a word that it shares with the triangle.
 pub const MAX_BODIES: usize = 256;
-
-/// A solid with a smaller index of refraction is drawn as a thin wall, because the peak of its refraction is too narrow for f32.
-const STRAIGHT_BELOW_IOR: f32 = 1.001;
 
 /// Where the data of one body are, and its bounds in body space.
 #[derive(Clone, Debug)]
@@ -43,18 +37,6 @@ pub struct BodyData {
     pub flags: u32,
     /// Largest magnitude among coordinates.
     pub extent: f32,
-}
-
-/// The cells of an albedo table as the shader reads them: those between nodes, row after row, then those between two averages.
-fn albedo_cells(table: &AlbedoTable) -> Vec<AlbedoCell> {
-    let n = ALBEDO_NODES;
-    let mut cells = Vec::with_capacity((n - 1) * n);
-    for rows in table.directional.windows(2 * n).step_by(n) {
-        let (low, high) = rows.split_at(n);
-        cells.extend((1..n).map(|i| AlbedoCell { corners: [low[i - 1], low[i], high[i - 1], high[i]] }));
-    }
-    cells.extend(table.average.windows(2).map(|e| AlbedoCell { corners: [e[0], e[1], 0.0, 0.0] }));
-    cells
 }
 
 /// The rows of an affine map for the shaders.
@@ -198,19 +180,6 @@ pub enum SceneDataError {
     TooFar(String, f32),
 }
 
-fn texture_use(t: Option<TextureRef>) -> TextureUse {
-    let Some(t) = t else {
-        return TextureUse { texture: gpu::NO_TEXTURE, row_u: [1.0, 0.0, 0.0], row_v: [0.0, 1.0, 0.0] };
-    };
-    // KHR_texture_transform: uv' = translation * rotation * scale * uv. The rotation is counter-clockwise, with v down.
-    let (s, c) = t.rotation.sin_cos();
-    TextureUse {
-        texture: t.texture,
-        row_u: [c * t.scale.x, s * t.scale.y, t.offset.x],
-        row_v: [-s * t.scale.x, c * t.scale.y, t.offset.y],
-    }
-}
-
 /// Largest radiance or intensity that is uploaded. Its square times any number of samples is far below the largest f32, and it is far above what
 /// any projector can show.
 const BRIGHTEST: f32 = 1e12;
@@ -282,113 +251,6 @@ impl SceneData {
             self.live.push(LiveTexture { texture: index, places, len, pictures: live.pictures.clone() });
             // What is shown first is in the texture's own place.
             self.texels.resize(end + (PLACES - 1) * len, [0; 2]);
-        }
-    }
-
-    fn add_materials(&mut self, scene: &Scene) {
-        let used = scene.used_materials();
-        let ior_of = |m: &dpm_scene::Material| if m.ior.is_finite() { m.ior.max(1.0) } else { 1.0 };
-        let iors: Vec<f32> = scene.materials.iter().map(ior_of).collect();
-        let (tables, table_of) = tabulated(&iors);
-        self.albedo.extend(tables.iter().flat_map(|&ior| albedo_cells(&AlbedoTable::new(ior))));
-        let lobes = || scene.materials.iter().zip(&used).filter(|(_, used)| **used).map(|(m, _)| &m.lobes);
-        let mut made = tables.len() as u32;
-        let mut extra = |wanted: bool, make: &dyn Fn() -> Vec<AlbedoTable>| {
-            let tables = if wanted { make() } else { vec![] };
-            self.albedo.extend(tables.iter().flat_map(albedo_cells));
-            made += tables.len() as u32;
-            made - tables.len() as u32
-        };
-        let coat_table = extra(lobes().any(|l| l.coat.factor > 0.0), &|| vec![AlbedoTable::new(Coat::IOR)]);
-        let facets = |l: &Lobes| !l.specular.is_plain() || l.film.factor > 0.0;
-        let white_table = extra(lobes().any(facets), &|| vec![AlbedoTable::white()]);
-        let sheen_table =
-            extra(lobes().any(|l| l.sheen.color != Vec3::ZERO), &|| AlbedoTable::sheen().to_vec());
-        for (((m, &used), &ior), table) in scene.materials.iter().zip(&used).zip(&iors).zip(table_of) {
-            let (transmissive, lobes) = (m.transmission > 0.0, &m.lobes);
-            let metal_everywhere = m.metallic >= 1.0 && m.metallic_roughness_texture.is_none();
-            if used {
-                let needs = &mut self.needs;
-                needs.textures |= m.textures().any(|t| t.is_some());
-                needs.normal_maps |= m.normal_texture.is_some();
-                needs.alpha_mask |= m.alpha_cutoff.is_some() || m.alpha_blend;
-                needs.transmission |= transmissive;
-                needs.specular |= m.metallic > 0.0 || ior != 1.0;
-                needs.diffuse |= !metal_everywhere;
-                needs.clearcoat |= lobes.coat.factor > 0.0;
-                needs.specular_color |= !lobes.specular.is_plain() && !metal_everywhere && ior != 1.0;
-                needs.anisotropy |= lobes.anisotropy.strength > 0.0;
-                needs.sheen |= lobes.sheen.color != Vec3::ZERO;
-                needs.absorption |= lobes.absorption != Vec3::ZERO;
-                needs.alpha_blend |= m.alpha_blend;
-                needs.iridescence |= lobes.film.factor > 0.0;
-                needs.diffuse_transmission |= lobes.diffuse_transmission.factor > 0.0 && !metal_everywhere;
-                needs.dispersion |= lobes.dispersion > 0.0 && transmissive && !m.thin_walled;
-            }
-            let mut flags = 0;
-            if m.double_sided {
-                flags |= gpu::MATERIAL_DOUBLE_SIDED;
-            }
-            if m.thin_walled || ior < STRAIGHT_BELOW_IOR {
-                flags |= gpu::MATERIAL_THIN;
-            }
-            if m.shines_through() {
-                flags |= gpu::MATERIAL_TRANSMISSIVE;
-            }
-            if m.alpha_blend {
-                flags |= gpu::MATERIAL_BLEND;
-            }
-            let Lobes { coat, specular, anisotropy, sheen, film, diffuse_transmission, .. } = *lobes;
-            self.materials.push(Material {
-                base_color: m.base_color.into(),
-                alpha: m.alpha,
-                emissive: bounded(m.emissive).into(),
-                alpha_cutoff: m.alpha_cutoff.unwrap_or(if m.alpha_blend { LEAST_COVERAGE } else { -1.0 }),
-                metallic: m.metallic,
-                roughness: m.roughness,
-                ior,
-                transmission: m.transmission,
-                normal_scale: m.normal_scale,
-                flags,
-                albedo_table: table as u32,
-                base_color_texture: texture_use(m.base_color_texture),
-                metallic_roughness_texture: texture_use(m.metallic_roughness_texture),
-                normal_texture: texture_use(m.normal_texture),
-                emissive_texture: texture_use(m.emissive_texture),
-                transmission_texture: texture_use(m.transmission_texture),
-                coat: coat.factor,
-                coat_roughness: coat.roughness,
-                coat_normal_scale: coat.normal_scale,
-                coat_table,
-                white_table,
-                sheen_table,
-                specular: specular.factor,
-                specular_color: specular.color.into(),
-                anisotropy: anisotropy.strength,
-                anisotropy_direction: anisotropy.direction().into(),
-                sheen_color: sheen.color.into(),
-                sheen_roughness: sheen.roughness,
-                film: film.factor,
-                film_ior: film.ior,
-                film_thickness: film.thickness_nm.map(|nm| nm.min(THICKEST_FILM_NM)),
-                absorption: if m.thin_walled { [0.0; 3] } else { lobes.absorption.into() },
-                shine: diffuse_transmission.factor,
-                shine_color: diffuse_transmission.color.into(),
-                dispersion: if m.thin_walled { 0.0 } else { lobes.dispersion },
-                coat_texture: texture_use(coat.texture),
-                coat_roughness_texture: texture_use(coat.roughness_texture),
-                coat_normal_texture: texture_use(coat.normal_texture),
-                specular_texture: texture_use(specular.texture),
-                specular_color_texture: texture_use(specular.color_texture),
-                anisotropy_texture: texture_use(anisotropy.texture),
-                sheen_color_texture: texture_use(sheen.color_texture),
-                sheen_roughness_texture: texture_use(sheen.roughness_texture),
-                film_texture: texture_use(film.texture),
-                film_thickness_texture: texture_use(film.thickness_texture),
-                shine_texture: texture_use(diffuse_transmission.texture),
-                shine_color_texture: texture_use(diffuse_transmission.color_texture),
-                reserved: 0,
-            });
         }
     }
 

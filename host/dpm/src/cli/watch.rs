@@ -32,6 +32,7 @@ use dpm_rig::telemetry::report::{to_json, Report};
 use std::io::Write;
 use std::path::Path;
 use std::sync::Arc;
+use std::thread::JoinHandle;
 use std::time::{Duration, Instant};
 
 /// How often to check keys, signals and the projector's state.
@@ -134,6 +135,33 @@ fn not_begun<T>(_: &RigConfig) -> Result<T, Failure> {
     Err(Failure::new(FailureKind::Device, "stopped before anything was lit"))
 }
 
+/// How a run ends that had results.
+const PANICKED: &str = "the run was stopped by a panic in one of its threads (see above)";
+
+/// Starts the run on a thread of its own, which sends its result when it ends.
+fn start_worker<T: Send + 'static>(
+    rig: RigConfig,
+    monitor: Arc<RunMonitor>,
+    run: impl FnOnce(&RigConfig, &Arc<RunMonitor>) -> Result<T, Failure> + Send + 'static,
+) -> Result<(JoinHandle<()>, Receiver<Result<T, Failure>>), Failure> {
+    let (done, finished) = unbounded();
+    let work = move || {
+        // Only the instance that has the projector's lock starts it. A panic ends without a message to the guard, like
+        // a SIGKILL.
+        let guard = rig.projector.backend.guardian().map(|words| Guard::start(&words));
+        let result = run(&rig, &monitor);
+        if let Some(guard) = guard {
+            guard.dismiss();
+        }
+        // The watcher is gone only if it panicked; then the result is not needed.
+        let _ = done.send(result);
+    };
+    let worker = std::thread::Builder::new().name("dpm-run".into()).spawn(work);
+    let worker =
+        worker.map_err(|e| Failure::new(FailureKind::Device, format!("cannot start a thread: {e}")))?;
+    Ok((worker, finished))
+}
+
 /// `stopped`: the result of a run that is abandoned because a signal came while it set up.
 fn watch_with<T: Send + 'static>(
     rig: RigConfig,
@@ -154,24 +182,7 @@ fn watch_with<T: Send + 'static>(
     // Before the run begins, so that it comes up dark if an order stands.
     let orders = Arc::new(stand_by(&rig, &monitor, &teller)?);
     let shown = rig.clone();
-    let (done, finished) = unbounded();
-    let worker = {
-        let monitor = Arc::clone(&monitor);
-        std::thread::Builder::new()
-            .name("dpm-run".into())
-            .spawn(move || {
-                // Only the instance that has the projector's lock starts it. A panic ends without a message to the guard,
-                // like a SIGKILL.
-                let guard = rig.projector.backend.guardian().map(|words| Guard::start(&words));
-                let result = run(&rig, &monitor);
-                if let Some(guard) = guard {
-                    guard.dismiss();
-                }
-                // The watcher is gone only if it panicked; then the result is not needed.
-                let _ = done.send(result);
-            })
-            .map_err(|e| Failure::new(FailureKind::Device, format!("cannot start a thread: {e}")))?
-    };
+    let (worker, finished) = start_worker(rig, Arc::clone(&monitor), run)?;
     if let Some(interlock) = monitor.interlock() {
         let now = if interlock.is_closed() { "closed" } else { "open" };
         teller.note(&format!("safety.interlock: light only while {}; it is {now}", interlock.what()));
@@ -202,12 +213,9 @@ fn watch_with<T: Send + 'static>(
             stopped(&shown)
         }
     };
-    let result = match result {
-        Ok(_) if stopping::has_panicked() => Err(Failure::new(
-            FailureKind::Device,
-            "the run was stopped by a panic in one of its threads (see above)",
-        )),
-        result => result,
+    let result = match stopping::has_panicked() {
+        true => result.and(Err(Failure::new(FailureKind::Device, PANICKED))),
+        false => result,
     };
     let Watcher { mut teller, mut status, .. } = watcher;
     if let Some(status) = &mut status {

@@ -32,7 +32,48 @@ fn along(point: &SurfacePoint, direction: DVec3) -> DVec3 {
     }
 }
 
+/// Leaves a path one channel, chosen by the light that it carries, with all of that light on average. `u`: even over 0 to 1. The channel, 0 to 2.
+fn take_channel(throughput: &mut DVec3, u: f64) -> usize {
+    let total = throughput.element_sum();
+    let mut u = u * total;
+    let chosen = (0..3).find(|&c| {
+        let here = u < throughput[c];
+        u -= throughput[c];
+        here
+    });
+    let channel = chosen.unwrap_or(0);
+    *throughput = DVec3::AXES[channel] * total;
+    channel
+}
+
 impl Reference<'_> {
+    /// What a ray meets that looks through the surface at `x1`, and the share of light that is left on the way; `None`: the sky.
+    fn behind(&self, x1: &SurfacePoint, on: DVec3, sampler: &mut Sampler) -> Option<(SurfacePoint, DVec3)> {
+        let key = self.ray_key(sampler);
+        let origin = offset(x1.position, x1.geometric, on, x1.scale);
+        let hit = self.bvh.closest(origin, on, f64::INFINITY, |hit| self.is_met(hit, key))?;
+        let met = self.resolve(&hit);
+        let left = if met.geometric.dot(on) > 0.0 {
+            left_by(met.look.lobes.absorption, met.position.distance(x1.position))
+        } else {
+            DVec3::ONE
+        };
+        Some((met, left))
+    }
+
+    /// What the surface at `point` emits toward `v`, weighted against the sampling of lights. `pdf`: of the direction that led here.
+    fn emitted(&self, point: &SurfacePoint, v: DVec3, pdf: Option<f64>) -> DVec3 {
+        let facing = point.geometric.dot(v);
+        if point.look.emission == DVec3::ZERO || (facing <= 0.0 && !point.look.emits_behind) {
+            return DVec3::ZERO;
+        }
+        let weight = pdf.map_or(1.0, |pdf| {
+            let by_light = self.lights.triangle_pdf(point.bvh_triangle) * point.distance * point.distance;
+            balance(pdf, by_light / facing.abs())
+        });
+        point.look.emission * point.look.lobes.over_emission(facing) * weight
+    }
+
     /// One sample of the radiance that leaves `x1` toward `toward_viewer` (unit), with at most `depth` closest hits counting `x1`.
     pub(crate) fn radiance(
         &self,
@@ -48,45 +89,18 @@ impl Reference<'_> {
         // Density of the direction that led here; None at x1 and behind a delta lobe, where light sampling has no part.
         let mut pdf: Option<f64> = None;
         if point.look.lobes.coverage < 1.0 && sampler.uniform() >= point.look.lobes.coverage {
-            // The sample looks through the first surface.
-            let (on, key) = (-toward_viewer, self.ray_key(sampler));
-            let origin = offset(point.position, point.geometric, on, point.scale);
-            match self.bvh.closest(origin, on, f64::INFINITY, |hit| self.is_met(hit, key)) {
-                Some(hit) => {
-                    let met = self.resolve(&hit);
-                    if met.geometric.dot(on) > 0.0 {
-                        let way = met.position.distance(point.position);
-                        throughput *= left_by(met.look.lobes.absorption, way);
-                    }
-                    point = met;
-                }
-                None => return self.lights.sky_radiance(on),
+            match self.behind(x1, -toward_viewer, sampler) {
+                Some((met, left)) => (point, throughput) = (met, left),
+                None => return self.lights.sky_radiance(-toward_viewer),
             }
         }
         for vertex in 1..=depth {
-            let facing = point.geometric.dot(v);
-            if point.look.emission != DVec3::ZERO && (facing > 0.0 || point.look.emits_behind) {
-                let weight = pdf.map_or(1.0, |pdf| {
-                    let by_light =
-                        self.lights.triangle_pdf(point.bvh_triangle) * point.distance * point.distance;
-                    balance(pdf, by_light / facing.abs())
-                });
-                sum += throughput * point.look.emission * point.look.lobes.over_emission(facing) * weight;
-            }
+            sum += throughput * self.emitted(&point, v, pdf);
             if vertex == depth {
                 break;
             }
             if point.look.lobes.dispersion > 0.0 && !point.look.thin {
-                // The path goes on with one channel, chosen by the light that it carries.
-                let total = throughput.element_sum();
-                let mut u = sampler.uniform() * total;
-                let chosen = (0..3).find(|&c| {
-                    let here = u < throughput[c];
-                    u -= throughput[c];
-                    here
-                });
-                let channel = chosen.unwrap_or(0);
-                throughput = DVec3::AXES[channel] * total;
+                let channel = take_channel(&mut throughput, sampler.uniform());
                 point.look.ior = point.look.lobes.index_of_channel(point.look.ior, channel);
             }
             let table = self.table(point.look.material);

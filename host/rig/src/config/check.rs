@@ -103,6 +103,12 @@ fn bodies(rig: &RigConfig, reader: &mut Reader) {
         refuse(reader, &["scene.bodies"], problem, "bodies that move as one can be one body".into());
     }
     worn(rig, &ids, reader);
+    observer(rig, reader);
+}
+
+/// What the observer and the scene's key name exists, and is given once.
+fn observer(rig: &RigConfig, reader: &mut Reader) {
+    let bodies = &rig.scene.bodies;
     let mut must_exist = |key: &str, name: &str, worn: &[&WearableConfig]| {
         let mut known = bodies.iter().map(|b| &b.name).chain(worn.iter().map(|w| &w.name));
         if !known.any(|known| known == name) {

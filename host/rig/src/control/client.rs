@@ -1,6 +1,6 @@
 //! The operator's end: gives an order to running rigs, and reports whether it was obeyed.
 
-use super::status_file::StatusFile;
+use super::status_file::{Said, StatusFile};
 use super::{is_obeyed, runtime_path, socket_name, HEARD};
 use crate::order::Order;
 use crate::standing::state_folder;
@@ -327,6 +327,15 @@ fn check_listener(listener: Peer, place: &Place) -> io::Result<()> {
     Err(io::Error::new(io::ErrorKind::PermissionDenied, told))
 }
 
+/// The signal that gives an order to a rig whose control thread does not answer.
+fn signal_of(order: Order) -> Option<i32> {
+    match order {
+        Order::Black => Some(libc::SIGUSR1),
+        Order::Safe => Some(libc::SIGUSR2),
+        Order::Freeze | Order::Arm => None,
+    }
+}
+
 /// The answer of one rig; `None` if there is no rig.
 fn ask(place: &Place, order: Order) -> Option<Answer> {
     let answer = |rig: String, text: String, done: bool| {
@@ -344,11 +353,7 @@ fn ask(place: &Place, order: Order) -> Option<Answer> {
     };
     let mut text = String::new();
     let mut open = say(&mut stream, order).is_ok();
-    let signal = match order {
-        Order::Black => Some(libc::SIGUSR1),
-        Order::Safe => Some(libc::SIGUSR2),
-        Order::Freeze | Order::Arm => None,
-    };
+    let signal = signal_of(order);
     let mut signalled: Option<io::Result<()>> = None;
     let mut seen = None;
     let rig = |text: &str| match text.lines().next().and_then(|l| l.strip_prefix(HEARD)) {
@@ -381,35 +386,48 @@ fn ask(place: &Place, order: Order) -> Option<Answer> {
         if signalled.is_some() || is_heard && !open {
             let said = StatusFile::read(&place.folder, place.pid).ok();
             if let Some(said) = said.filter(|s| s.at_ns > begin_ns && is_obeyed(order, s.health)) {
-                let how = match signalled {
-                    Some(_) => "by a signal, because its control thread does not answer",
-                    None => "according to its state file",
-                };
-                let kept = said.standing.filter(|standing| standing.strength() >= order.strength());
-                if let (Some(kept), true) = (kept, order.is_dark()) {
-                    let text = format!("ok: projector {} ({how}); {} is kept", said.health, kept.word());
-                    return answer(said.rig, text, true);
+                match obeyed(&said, order, signalled.is_some()) {
+                    Ok(text) => return answer(said.rig, text, true),
+                    Err(text) => seen = Some(text),
                 }
-                if !order.is_dark() {
-                    return answer(said.rig, format!("ok: projector {} ({how})", said.health), true);
-                }
-                seen = Some(format!("projector {} ({how}), but NOT kept over a restart", said.health));
             }
         }
     }
     if let Some(seen) = seen {
         return answer(rig(&text), seen, false);
     }
-    let what = match (&signalled, text.starts_with(HEARD)) {
-        (Some(Ok(())), _) => "delivered by a signal, NOT confirmed",
-        (_, true) => "delivered, NOT confirmed",
-        (Some(Err(_)), _) | (None, _) => "perhaps not delivered, NOT confirmed",
+    let what = unconfirmed(signalled.as_ref(), text.starts_with(HEARD));
+    answer(rig(&text), format!("{what}; {}", by_hand(order, place.pid)), false)
+}
+
+/// What a state file says of an order that the projector obeys; an error if the order would be gone after a restart.
+fn obeyed(said: &Said, order: Order, by_signal: bool) -> Result<String, String> {
+    let how = if by_signal {
+        "by a signal, because its control thread does not answer"
+    } else {
+        "according to its state file"
     };
-    let why = match signalled {
-        Some(Err(e)) => format!(" (no signal could be sent: {e})"),
-        _ => String::new(),
+    let kept = said.standing.filter(|standing| standing.strength() >= order.strength());
+    match kept {
+        Some(kept) if order.is_dark() => {
+            Ok(format!("ok: projector {} ({how}); {} is kept", said.health, kept.word()))
+        }
+        _ if !order.is_dark() => Ok(format!("ok: projector {} ({how})", said.health)),
+        _ => Err(format!("projector {} ({how}), but NOT kept over a restart", said.health)),
+    }
+}
+
+/// How far an order came that nobody confirmed. `is_heard`: the rig said that it has it.
+fn unconfirmed(signalled: Option<&io::Result<()>>, is_heard: bool) -> String {
+    let what = match signalled {
+        Some(Ok(())) => "delivered by a signal, NOT confirmed",
+        _ if is_heard => "delivered, NOT confirmed",
+        _ => "perhaps not delivered, NOT confirmed",
     };
-    answer(rig(&text), format!("{what}{why}; {}", by_hand(order, place.pid)), false)
+    match signalled {
+        Some(Err(e)) => format!("{what} (no signal could be sent: {e})"),
+        _ => what.to_owned(),
+    }
 }
 
 fn say(stream: &mut UnixStream, order: Order) -> io::Result<()> {

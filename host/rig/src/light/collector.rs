@@ -123,6 +123,27 @@ pub(crate) struct Collector {
 /// much more.
 const MAX_TRACED: usize = 30_000;
 
+/// What is kept of a frame until its light is seen.
+fn record_of(job: &FrameNote) -> FrameRecord {
+    FrameRecord {
+        id: job.plan.id,
+        slot: job.plan.slot,
+        timeline: job.timeline,
+        drawn_for: job.plan.centre_at,
+        tracked_poses: job.plan.tracked_poses.clone(),
+        swept_poses: job.plan.swept_poses.clone(),
+        sampled_poses: job.plan.sampled_poses.clone(),
+        dark: job.plan.dark.clone(),
+        cut_mirrors: job.cut_mirrors,
+        guard_radius_m: job.plan.eyes.spheres.iter().fold(0.0, |most, s| s.radius_m.max(most)),
+        head_lost: job.plan.eyes.lost,
+        eye: job.plan.eye,
+        parameters: job.plan.parameters,
+        code_hash: job.code_hash,
+        pass_ns: job.cost.unwrap_or_default().pass_ns,
+    }
+}
+
 impl Collector {
     /// Keeps the last `keep` lit frames. `verify`: compares hashes of code values and light.
     pub(crate) fn new(rig: Arc<Rig>, keep: usize, verify: bool) -> Self {
@@ -358,6 +379,34 @@ impl Collector {
         if let Some(flights) = &mut self.flights {
             flights.frame(job);
         }
+        self.add_costs(job);
+        self.placement.observe(
+            &self.rig.camera,
+            &job.plan.sampled_poses,
+            &job.plan.seen,
+            self.registration.points(),
+            job.timeline.due_at,
+        );
+        let names = self.rig.bodies.iter().map(|b| b.name.as_str());
+        self.placement.news(names, |told| monitor.note(told));
+        let sent = job.is_sent();
+        let refused = !sent && !matches!(job.fate, Fate::Overtaken | Fate::Stopped);
+        self.slots.planned(job.plan.slot, &job.timeline, refused, job.held_up_by);
+        self.last_planned = self.last_planned.max(Some(job.plan.slot));
+        while self.repeats.front().is_some_and(|&slot| slot < job.plan.slot) {
+            self.repeats.pop_front();
+            self.repeated += 1;
+        }
+        if sent {
+            self.pending.push_back(record_of(job));
+        } else {
+            self.too_old += u64::from(job.fate == Fate::TooOld);
+            self.count_unlit(&job.timeline, monitor);
+        }
+    }
+
+    /// Adds the rays, samples and times of a frame.
+    fn add_costs(&mut self, job: &FrameNote) {
         let cost = job.cost.unwrap_or_default();
         let c = cost.counters();
         self.rays += u64::from(c.rays);
@@ -381,45 +430,6 @@ impl Collector {
             if ns > 0 {
                 self.stages[stage as usize].saturating_record(ns);
             }
-        }
-        self.placement.observe(
-            &self.rig.camera,
-            &job.plan.sampled_poses,
-            &job.plan.seen,
-            self.registration.points(),
-            job.timeline.due_at,
-        );
-        let names = self.rig.bodies.iter().map(|b| b.name.as_str());
-        self.placement.news(names, |told| monitor.note(told));
-        let sent = job.is_sent();
-        let refused = !sent && !matches!(job.fate, Fate::Overtaken | Fate::Stopped);
-        self.slots.planned(job.plan.slot, &job.timeline, refused, job.held_up_by);
-        self.last_planned = self.last_planned.max(Some(job.plan.slot));
-        while self.repeats.front().is_some_and(|&slot| slot < job.plan.slot) {
-            self.repeats.pop_front();
-            self.repeated += 1;
-        }
-        if sent {
-            self.pending.push_back(FrameRecord {
-                id: job.plan.id,
-                slot: job.plan.slot,
-                timeline: job.timeline,
-                drawn_for: job.plan.centre_at,
-                tracked_poses: job.plan.tracked_poses.clone(),
-                swept_poses: job.plan.swept_poses.clone(),
-                sampled_poses: job.plan.sampled_poses.clone(),
-                dark: job.plan.dark.clone(),
-                cut_mirrors: job.cut_mirrors,
-                guard_radius_m: job.plan.eyes.spheres.iter().fold(0.0, |most, s| s.radius_m.max(most)),
-                head_lost: job.plan.eyes.lost,
-                eye: job.plan.eye,
-                parameters: job.plan.parameters,
-                code_hash: job.code_hash,
-                pass_ns: cost.pass_ns,
-            });
-        } else {
-            self.too_old += u64::from(job.fate == Fate::TooOld);
-            self.count_unlit(&job.timeline, monitor);
         }
     }
 
@@ -446,73 +456,82 @@ impl Collector {
                 }
             }
             LightKind::Blank => self.slots.nothing_new(slot, begin, 0),
-            LightKind::Lit => {
-                let Some(frame) = note.event.frame else { return };
-                self.torn += u64::from(note.torn);
-                self.reordered += u64::from(self.last_lit.is_some_and(|last| !frame_newer(frame, last)));
-                self.last_lit = Some(frame);
-                let Some(at) = self.pending.iter().position(|r| r.id.0 as u32 == frame) else {
-                    if self.is_unrecorded(frame) {
-                        // It is in no other count, but its slot showed a frame.
-                        return self.slots.own(slot, begin, note.unseen);
-                    }
-                    // The frame was counted as dropped long ago, so this slot does not count as its own.
-                    self.slots.nothing_new(slot, begin, note.unseen);
-                    return;
-                };
-                // Earlier frames were lit without a report of their own, or were overtaken and will never be lit.
-                for k in 0..at {
-                    if k >= note.unseen as usize {
-                        self.drop_oldest(monitor);
-                    } else if let Some(unseen) = self.pending.pop_front() {
-                        self.count_lit(&unseen, unseen.timeline.due_at, false, monitor);
-                    }
-                }
-                let Some(mut record) = self.pending.pop_front() else { return };
-                let last_photon_at = note.event.last_photon_at;
-                let exposure_ns = last_photon_at.ns_since(begin);
-                let centre_at = begin.plus_ns(light_centre_ns(&self.rig, exposure_ns));
-                record.timeline.lit_at = Some(begin);
-                record.timeline.centre_at = Some(centre_at);
-                record.timeline.last_photon_at = Some(last_photon_at);
-                let late = slot > record.slot;
-                if late {
-                    self.slots.nothing_new(slot, begin, note.unseen);
-                } else {
-                    self.slots.own(slot, begin, note.unseen);
-                }
-                if let Some(flights) = &mut self.flights {
-                    flights.lit(record.id, begin, last_photon_at);
-                }
-                self.count_lit(&record, begin, late, monitor);
-                if self.verify && note.hash != record.code_hash {
-                    self.light_mismatches += 1;
-                }
-                self.registration.lit(&record, late, self.prepared);
-                self.measure_clock(note, &record);
-                // If no light fell on any body, there is no interval from motion to light.
-                let is_dark = self.is_dark(&record);
-                let stamps = if is_dark { record.timeline.without_sample() } else { record.timeline };
-                self.profiler.lit(&stamps, slot, late);
-                if self.trace_frames > 0 {
-                    if self.traced.len() >= self.trace_frames {
-                        self.traced.pop_front();
-                    }
-                    self.traced.push_back(TracedFrame {
-                        id: record.id,
-                        slot,
-                        timeline: record.timeline,
-                        last_photon_at,
-                        pass_ns: record.pass_ns,
-                    });
-                }
-                if self.keep > 0 {
-                    if self.recent.len() >= self.keep {
-                        self.recent.pop_front();
-                    }
-                    self.recent.push_back(record);
-                }
+            LightKind::Lit => self.lit(note, monitor),
+        }
+    }
+
+    /// A slot showed a frame for the first time.
+    fn lit(&mut self, note: &LightNote, monitor: &RunMonitor) {
+        let (slot, begin) = (note.event.slot, note.event.first_photon_at);
+        let Some(frame) = note.event.frame else { return };
+        self.torn += u64::from(note.torn);
+        self.reordered += u64::from(self.last_lit.is_some_and(|last| !frame_newer(frame, last)));
+        self.last_lit = Some(frame);
+        let Some(at) = self.pending.iter().position(|r| r.id.0 as u32 == frame) else {
+            if self.is_unrecorded(frame) {
+                // It is in no other count, but its slot showed a frame.
+                return self.slots.own(slot, begin, note.unseen);
             }
+            // The frame was counted as dropped long ago, so this slot does not count as its own.
+            self.slots.nothing_new(slot, begin, note.unseen);
+            return;
+        };
+        // Earlier frames were lit without a report of their own, or were overtaken and will never be lit.
+        for k in 0..at {
+            if k >= note.unseen as usize {
+                self.drop_oldest(monitor);
+            } else if let Some(unseen) = self.pending.pop_front() {
+                self.count_lit(&unseen, unseen.timeline.due_at, false, monitor);
+            }
+        }
+        let Some(mut record) = self.pending.pop_front() else { return };
+        let last_photon_at = note.event.last_photon_at;
+        let exposure_ns = last_photon_at.ns_since(begin);
+        let centre_at = begin.plus_ns(light_centre_ns(&self.rig, exposure_ns));
+        record.timeline.lit_at = Some(begin);
+        record.timeline.centre_at = Some(centre_at);
+        record.timeline.last_photon_at = Some(last_photon_at);
+        let late = slot > record.slot;
+        if late {
+            self.slots.nothing_new(slot, begin, note.unseen);
+        } else {
+            self.slots.own(slot, begin, note.unseen);
+        }
+        if let Some(flights) = &mut self.flights {
+            flights.lit(record.id, begin, last_photon_at);
+        }
+        self.count_lit(&record, begin, late, monitor);
+        if self.verify && note.hash != record.code_hash {
+            self.light_mismatches += 1;
+        }
+        self.registration.lit(&record, late, self.prepared);
+        self.measure_clock(note, &record);
+        // If no light fell on any body, there is no interval from motion to light.
+        let is_dark = self.is_dark(&record);
+        let stamps = if is_dark { record.timeline.without_sample() } else { record.timeline };
+        self.profiler.lit(&stamps, slot, late);
+        self.keep(record, slot, last_photon_at);
+    }
+
+    /// Keeps what the trace and the report show of single frames.
+    fn keep(&mut self, record: FrameRecord, slot: u64, last_photon_at: HostTime) {
+        if self.trace_frames > 0 {
+            if self.traced.len() >= self.trace_frames {
+                self.traced.pop_front();
+            }
+            self.traced.push_back(TracedFrame {
+                id: record.id,
+                slot,
+                timeline: record.timeline,
+                last_photon_at,
+                pass_ns: record.pass_ns,
+            });
+        }
+        if self.keep > 0 {
+            if self.recent.len() >= self.keep {
+                self.recent.pop_front();
+            }
+            self.recent.push_back(record);
         }
     }
 

@@ -6,7 +6,8 @@ use super::{Finding, State};
 use dpm_common::clock::{Clock, MonotonicClock};
 use dpm_device::link::{faults, DeviceHello, HostLink, LinkState};
 use dpm_device::pose::Pose;
-use dpm_device::tracker::BodyKey;
+use dpm_device::time::HostTime;
+use dpm_device::tracker::{BodyKey, Tracker};
 use dpm_device::transport::Transport;
 use dpm_rig::config::RigConfig;
 use dpm_rig::pipeline::connect;
@@ -81,37 +82,18 @@ pub(super) fn tracker(config: &RigConfig, rig: Option<&Rig>) -> (Finding, Option
             return (finding, None);
         }
     };
-    let mut seen = vec![0u32; bodies.len()];
-    let mut last: Vec<Option<Pose>> = vec![None; bodies.len()];
-    let mut exchanges = Exchanges::default();
-    let failed = loop {
-        let now = clock.now();
-        if now.ns_since(start) > LISTEN_NS {
-            break None;
-        }
-        let polled = tracker.poll(now, &mut |sample| {
-            let body = usize::from(sample.body.0);
-            if let Some(count) = seen.get_mut(body).filter(|_| sample.tracked) {
-                *count += 1;
-                last[body] = Some(sample.pose);
-                exchanges.observe(body, DVec3::from_array(sample.pose.position_m));
-            }
-        });
-        if let Err(e) = polled {
-            break Some(e.to_string());
-        }
-        clock.wait_until(now.plus_ns(POLL_EVERY_NS));
-    };
+    let (heard, failed, exchanges) = listen(tracker.as_mut(), bodies, &clock, start);
     let seconds = 1e-9 * LISTEN_NS as f64;
-    let told = bodies.iter().zip(&seen).map(|(body, count)| match count {
+    let told = heard.iter().map(|body| match body.count {
         0 => format!("\"{}\" is not seen", body.name),
-        _ => format!("\"{}\" {:.0} times a second", body.name, f64::from(*count) / seconds),
+        count => format!("\"{}\" {:.0} times a second", body.name, f64::from(count) / seconds),
     });
     let found = told.collect::<Vec<_>>().join(", ");
     let finding = match failed {
         Some(why) => Finding::new(name, State::Missing, format!("{found}; {why}"), page),
-        None if seen.contains(&0) => {
-            let state = if seen.iter().all(|count| *count == 0) { State::Missing } else { State::Warning };
+        None if heard.iter().any(|body| body.count == 0) => {
+            let state =
+                if heard.iter().all(|body| body.count == 0) { State::Missing } else { State::Warning };
             let remedy = format!("{}; a body that is not seen stays dark", tracker.status());
             Finding::new(name, state, found, remedy)
         }
@@ -120,23 +102,54 @@ pub(super) fn tracker(config: &RigConfig, rig: Option<&Rig>) -> (Finding, Option
             None => Finding::new(name, State::Ok, found, ""),
         },
     };
+    (with_exchanges(finding, &exchanges, &heard), Some(heard))
+}
+
+/// Listens for [`LISTEN_NS`] from `start`. What was heard of each body, why the tracker failed, and which bodies changed places.
+fn listen(
+    tracker: &mut dyn Tracker,
+    bodies: Vec<BodyKey>,
+    clock: &MonotonicClock,
+    start: HostTime,
+) -> (Heard, Option<String>, Exchanges) {
+    let named = bodies.into_iter().map(|body| HeardBody { name: body.name, count: 0, last: None });
+    let mut heard: Heard = named.collect();
+    let mut exchanges = Exchanges::default();
+    loop {
+        let now = clock.now();
+        if now.ns_since(start) > LISTEN_NS {
+            return (heard, None, exchanges);
+        }
+        let polled = tracker.poll(now, &mut |sample| {
+            let index = usize::from(sample.body.0);
+            if let Some(body) = heard.get_mut(index).filter(|_| sample.tracked) {
+                body.count += 1;
+                body.last = Some(sample.pose);
+                exchanges.observe(index, DVec3::from_array(sample.pose.position_m));
+            }
+        });
+        if let Err(e) = polled {
+            return (heard, Some(e.to_string()), exchanges);
+        }
+        clock.wait_until(now.plus_ns(POLL_EVERY_NS));
+    }
+}
+
+/// A finding about the tracker, with the bodies that changed places.
+fn with_exchanges(finding: Finding, exchanges: &Exchanges, heard: &Heard) -> Finding {
     let swaps = exchanges.pairs.iter().map(|([a, b], count)| {
         let times = if *count == 1 { "once".into() } else { format!("{count} times") };
-        format!("\"{}\" and \"{}\" changed places {times}", bodies[*a].name, bodies[*b].name)
+        format!("\"{}\" and \"{}\" changed places {times}", heard[*a].name, heard[*b].name)
     });
     let swaps: Vec<String> = swaps.collect();
-    let finding = if swaps.is_empty() {
-        finding
-    } else {
-        let state = if finding.state == State::Ok { State::Warning } else { finding.state };
-        let remedy = "their markers are too alike: give each body an arrangement of its own";
-        let remedy =
-            if finding.remedy.is_empty() { remedy.into() } else { format!("{}; {remedy}", finding.remedy) };
-        Finding { state, found: format!("{}; {}", finding.found, swaps.join(", ")), remedy, ..finding }
-    };
-    let heard = bodies.into_iter().zip(seen).zip(last);
-    let heard = heard.map(|((body, count), last)| HeardBody { name: body.name, count, last });
-    (finding, Some(heard.collect()))
+    if swaps.is_empty() {
+        return finding;
+    }
+    let state = if finding.state == State::Ok { State::Warning } else { finding.state };
+    let remedy = "their markers are too alike: give each body an arrangement of its own";
+    let remedy =
+        if finding.remedy.is_empty() { remedy.into() } else { format!("{}; {remedy}", finding.remedy) };
+    Finding { state, found: format!("{}; {}", finding.found, swaps.join(", ")), remedy, ..finding }
 }
 
 /// Whether the slots can follow the tracker: its rate in the rig file beside that of frames. If it was `heard` at another
