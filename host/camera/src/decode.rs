@@ -1,8 +1,9 @@
 //! The inside of a quadrilateral into the number of a tag, or into nothing.
 //!
 //! A tag is never guessed: the border must be dark and the margin around it bright everywhere, by light that changes
-//! evenly over the tag, and the cells must be those of one of the family's codes but for at most two. Two
-//! codes differ in eleven cells, so what is corrected cannot be another tag's.
+//! evenly over the tag, and the cells must be those of one of the family's codes but for at most two that are neither
+//! black nor white. Two codes differ in eleven cells, so what is corrected cannot be another tag's; and a square with cells
+//! that are as clear as a print's is no tag, even where a code differs from it in one cell only.
 
 use crate::image::GreyImage;
 use crate::outline::Quad;
@@ -11,6 +12,8 @@ use glam::{DMat3, DVec2, DVec3};
 
 /// Cells that may be read wrong and are corrected.
 const MOST_WRONG: u32 = 2;
+/// They lie away from the middle between black and white by less than this share of half their difference.
+const MOST_WRONG_CLEARNESS: f64 = 0.4;
 /// Of the 36 cells of the margin, how many need not be bright: a finger, a shadow, a neighbour.
 const MARGIN_MISSED: usize = 3;
 /// Grey levels between white and black that a tag needs.
@@ -54,11 +57,11 @@ impl Family {
     /// How many tags it has.
     pub(crate) const LEN: usize = CODES.len();
 
-    /// The tag whose cells these are, up to [`MOST_WRONG`] of them.
-    fn find(&self, bits: u64) -> Option<(u16, usize, u32)> {
+    /// The tag whose cells these are, up to [`MOST_WRONG`] of them: its number and turn, and those that are wrong.
+    fn find(&self, bits: u64) -> Option<(u16, usize, u64)> {
         let (known, id, turn) = self.turned.iter().min_by_key(|(known, ..)| (known ^ bits).count_ones())?;
-        let wrong = (known ^ bits).count_ones();
-        (wrong <= MOST_WRONG).then_some((*id, usize::from(*turn), wrong))
+        let wrong = known ^ bits;
+        (wrong.count_ones() <= MOST_WRONG).then_some((*id, usize::from(*turn), wrong))
     }
 }
 
@@ -156,12 +159,13 @@ pub(crate) fn read(image: &GreyImage<'_>, quad: &Quad, family: &Family) -> Optio
     if contrasts.iter().any(|c| *c < LEAST_CONTRAST) {
         return None;
     }
-    let (mut bits, mut clear) = (0u64, 0.0);
+    let (mut bits, mut unclear, mut clear) = (0u64, 0u64, 0.0);
     for y in 1..n - 1 {
         for x in 1..n - 1 {
             let p = place(x, y);
             let level = (value(p)? - middle(p)) / (0.5 * (white.at(p) - black.at(p)));
             bits = bits << 1 | u64::from(level > 0.0);
+            unclear = unclear << 1 | u64::from(level.abs() < MOST_WRONG_CLEARNESS);
             clear += level.abs().min(1.0);
         }
     }
@@ -169,7 +173,10 @@ pub(crate) fn read(image: &GreyImage<'_>, quad: &Quad, family: &Family) -> Optio
         return None;
     }
     let (id, turn, wrong) = family.find(bits)?;
-    Some(Reading { id, turn, wrong, contrast: 0.25 * contrasts.iter().sum::<f64>() })
+    if wrong & !unclear != 0 {
+        return None;
+    }
+    Some(Reading { id, turn, wrong: wrong.count_ones(), contrast: 0.25 * contrasts.iter().sum::<f64>() })
 }
 
 #[cfg(test)]
@@ -184,7 +191,7 @@ mod tests {
             assert_eq!(family.find(quarter), Some((id as u16, 1, 0)));
             assert_eq!(clockwise(clockwise(clockwise(quarter))), *code);
             // Two wrong cells are corrected, three are refused.
-            assert_eq!(family.find(code ^ 0x8_0000_0001), Some((id as u16, 0, 2)));
+            assert_eq!(family.find(code ^ 0x8_0000_0001), Some((id as u16, 0, 0x8_0000_0001)));
             assert_eq!(family.find(code ^ 0x8_0010_0001), None);
         }
     }

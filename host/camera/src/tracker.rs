@@ -157,7 +157,9 @@ struct Watch {
     sequence: u32,
     pictures: u64,
     busy: Duration,
+    /// Samples that found no room, and pictures all of whose samples did.
     lost: u64,
+    unread: u32,
 }
 
 impl Watch {
@@ -175,6 +177,7 @@ impl Watch {
             pictures: 0,
             busy: Duration::ZERO,
             lost: 0,
+            unread: 0,
         }
     }
 
@@ -230,10 +233,15 @@ impl Watch {
             .collect();
         self.pictures += 1;
         self.busy += begin.elapsed();
-        self.sequence = picture.number;
+        // While nobody reads, as before the rig's first frame, what finds no room is not lost on the camera's way.
+        self.sequence = picture.number.wrapping_sub(self.unread);
+        let before = self.lost;
         for (body, found) in found.into_iter().enumerate() {
             self.report(body, at, found);
         }
+        let is_marked = |b: &&Markings| !b.tags.is_empty() || !b.markers.is_empty();
+        let marked = self.setup.bodies.iter().filter(is_marked).count() as u64;
+        self.unread = self.unread.wrapping_add(u32::from(marked > 0 && self.lost == before + marked));
         let ms = 1e3 * self.busy.as_secs_f64() / self.pictures as f64;
         self.hand_on(Message::Work(self.pictures, ms, self.lost));
         Ok(())
