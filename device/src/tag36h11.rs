@@ -23,6 +23,47 @@ pub fn printed_cell(id: u16, x: usize, y: usize) -> Option<bool> {
     })
 }
 
+/// Tags side by side on a flat sheet, from which a camera is calibrated: a white sheet without gaps, because the margins of
+/// neighbours touch. The first tag is the upper left one, and numbers count along the rows.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct TagBoard {
+    /// Tags in a row.
+    pub columns: u16,
+    /// Rows of tags.
+    pub rows: u16,
+    /// Length of a side of a tag's black border, metres.
+    pub side_m: f64,
+    /// Number of the first tag.
+    pub first: u16,
+}
+
+impl TagBoard {
+    /// The board for a sheet of A4 or US letter: 7 x 5 tags of 28 mm, of the last numbers of the family.
+    pub const SMALL: Self = Self { columns: 7, rows: 5, side_m: 0.028, first: 552 };
+    /// The same for a sheet of A3: tags of 40 mm.
+    pub const LARGE: Self = Self { side_m: 0.04, ..Self::SMALL };
+
+    /// From tag to tag, metres.
+    pub fn pitch_m(&self) -> f64 {
+        self.side_m * PRINTED as f64 / CELLS as f64
+    }
+
+    /// Width and height of all tags with their margins, metres.
+    pub fn size_m(&self) -> [f64; 2] {
+        [f64::from(self.columns) * self.pitch_m(), f64::from(self.rows) * self.pitch_m()]
+    }
+
+    /// The number of each tag and its middle from the board's middle, metres: x to the right and y up as printed.
+    pub fn tags(&self) -> impl Iterator<Item = (u16, [f64; 2])> {
+        let board = *self;
+        let [w, h] = board.size_m();
+        (0..board.columns * board.rows).map(move |n| {
+            let (x, y) = (f64::from(n % board.columns) + 0.5, f64::from(n / board.columns) + 0.5);
+            (board.first + n, [x * board.pitch_m() - 0.5 * w, 0.5 * h - y * board.pitch_m()])
+        })
+    }
+}
+
 /// The code of each tag.
 pub const CODES: [u64; 587] = [
     0xd5d628584,

@@ -4,11 +4,19 @@ use super::bodies::{clock_from_now, parse_body, parse_rate};
 use super::say;
 use clap::Args;
 use dpm_device::pose::Pose;
-use hil_mock::camera::{two_tags, CameraHost, CameraOptics, MarkedBody, MockCamera, MockCameraConfig};
+use hil_mock::camera::{
+    two_tags, BoardHold, CameraHost, CameraOptics, MarkedBody, MockCamera, MockCameraConfig,
+};
 use hil_mock::faults::FaultPlan;
 use std::error::Error;
 use std::net::{Ipv4Addr, SocketAddrV4};
 use std::time::{Duration, Instant};
+
+/// The bodies of the scene that a rig file without one has, moved so that their tags stay in view.
+const HELD: [&str; 2] = [
+    r#"bunny@0,0,0={"kind":"translate","speed_m_s":0.3,"amplitude_m":0.1,"acceleration_m_s2":3}"#,
+    r#"venus@0.3,0,0={"kind":"sway","axis":[0,1,0],"peak_rate_rad_s":1,"peak_acceleration_rad_s2":4}"#,
+];
 
 /// Arguments of `hil-mock serve camera`.
 #[derive(Args)]
@@ -20,7 +28,7 @@ pub(crate) struct CameraArguments {
     #[arg(long, default_value_t = 8951)]
     port: u16,
     /// Body as NAME[@X,Y,Z][=MOTION], metres, with two tags of 80 mm; as of the other trackers. May be repeated
-    #[arg(long = "body", value_name = "BODY", default_values = ["Hare@0,0,0=translate", "Bust@0.3,0,0=rotate"])]
+    #[arg(long = "body", value_name = "BODY", default_values = HELD)]
     bodies: Vec<String>,
     /// Place of the camera, which looks along -Z: X,Y,Z in metres
     #[arg(long, default_value = "0.15,0,1.2")]
@@ -46,6 +54,18 @@ pub(crate) struct CameraArguments {
     /// Noise of reading, grey levels
     #[arg(long, default_value_t = 1.5)]
     noise: f64,
+    /// In place of bodies: hold the printed board of `dpm calibrate camera`, at one drawn place after another
+    #[arg(long, conflicts_with = "bodies")]
+    board: bool,
+    /// By how far the ends of the board lie before its middle, millimetres
+    #[arg(long, default_value_t = 0.0, allow_hyphen_values = true)]
+    bend_mm: f64,
+    /// The largest tilt of the board, degrees
+    #[arg(long, default_value_t = 40.0)]
+    tilt_deg: f64,
+    /// Draw focal lengths, centre and lens by this seed, and print them, in place of --view-deg
+    #[arg(long, value_name = "SEED")]
+    drawn_lens: Option<u64>,
     /// Shapes in the background, some of which look like tags
     #[arg(long, default_value_t = 40)]
     clutter: u32,
@@ -61,7 +81,7 @@ pub(crate) struct CameraArguments {
 }
 
 /// Numbers with a mark between them.
-fn numbers<T: std::str::FromStr, const N: usize>(
+pub(super) fn numbers<T: std::str::FromStr, const N: usize>(
     text: &str,
     mark: char,
     what: &str,
@@ -74,15 +94,12 @@ fn numbers<T: std::str::FromStr, const N: usize>(
 pub(super) fn run(arguments: &CameraArguments) -> Result<(), Box<dyn Error>> {
     let size = numbers(&arguments.size, 'x', "columns and rows such as 1280x800")?;
     let place: [f64; 3] = numbers(&arguments.place, ',', "three numbers X,Y,Z in metres")?;
-    let (mut bodies, mut tags) = (Vec::new(), Vec::new());
-    for (n, text) in arguments.bodies.iter().enumerate() {
-        let (name, motion) = parse_body(text)?;
-        let own = two_tags(n);
-        tags.extend(own.map(|tag| tag.as_toml(&name)));
-        bodies.push(MarkedBody { motion, tags: own.to_vec(), markers: vec![] });
-    }
+    let optics = match arguments.drawn_lens {
+        Some(seed) => CameraOptics::drawn(size, seed),
+        None => CameraOptics::pinhole(size, arguments.view_deg),
+    };
     let config = MockCameraConfig {
-        optics: CameraOptics::pinhole(size, arguments.view_deg),
+        optics,
         pose: Pose { position_m: place, ..Pose::IDENTITY },
         rate: parse_rate(&arguments.rate)?,
         exposure_ns: (arguments.exposure_ms * 1e6) as i64,
@@ -94,16 +111,40 @@ pub(super) fn run(arguments: &CameraArguments) -> Result<(), Box<dyn Error>> {
         faults: arguments.faults.clone(),
         ..MockCameraConfig::default()
     };
+    let (mut bodies, mut tags) = (Vec::new(), Vec::new());
+    if arguments.board {
+        let hold = BoardHold {
+            bend_m: 1e-3 * arguments.bend_mm,
+            tilt: arguments.tilt_deg.to_radians(),
+            seed: arguments.seed,
+            ..BoardHold::default()
+        };
+        bodies.push(hold.body(&config)?);
+    } else {
+        for (n, text) in arguments.bodies.iter().enumerate() {
+            let (name, motion) = parse_body(text)?;
+            let own = two_tags(n);
+            tags.extend(own.map(|tag| tag.as_toml(&name)));
+            bodies.push(MarkedBody { motion, tags: own.to_vec(), markers: vec![] });
+        }
+    }
+    let true_lens = arguments.drawn_lens.map(|_| config.optics.clone());
     let address = SocketAddrV4::new(arguments.bind, arguments.port);
     let host = CameraHost::start(MockCamera::new(config, bodies)?, address, clock_from_now())
         .map_err(|e| super::cannot_serve("a camera", address, &e, "--port"))?;
     say(format_args!("camera on {}; in the rig file:", host.address()));
     say(format_args!("[tracker]\nkind = \"camera\"\ndevice = \"tcp:{}\"", host.address()));
-    say(format_args!(
-        "size = {size:?}\nview_deg = {:?}\ntransform = {{ position = {place:?} }}",
-        arguments.view_deg
-    ));
-    say(format_args!("tags = [\n  {},\n]", tags.join(",\n  ")));
+    say(format_args!("size = {size:?}\ntransform = {{ position = {place:?} }}"));
+    match true_lens {
+        // A comment: a calibration is to find it.
+        Some(o) => {
+            say(format_args!("# truth: focal {:?}, centre {:?}, lens {:?}", o.focal, o.centre, o.lens))
+        }
+        None => say(format_args!("view_deg = {:?}", arguments.view_deg)),
+    }
+    if !tags.is_empty() {
+        say(format_args!("tags = [\n  {},\n]", tags.join(",\n  ")));
+    }
     let started = Instant::now();
     while host.is_running() {
         if arguments.seconds.is_some_and(|s| started.elapsed().as_secs_f64() >= s) {

@@ -3,6 +3,7 @@
 mod bodies;
 mod camera;
 mod dlpc900;
+mod lit_camera;
 mod natnet;
 mod orders;
 mod projector;
@@ -23,6 +24,8 @@ pub(crate) enum Device {
     Camera(camera::CameraArguments),
     /// DLPC900 projector controller (LightCrafter 6500 / 9000): a USB HID device over USB/IP
     Dlpc900(dlpc900::Dlpc900Arguments),
+    /// Bit-plane projector, what it lights, and a camera that sees that
+    LitCamera(Box<lit_camera::LitCameraArguments>),
     /// OptiTrack NatNet server: poses over UDP
     Natnet(natnet::NatNetArguments),
     /// Bit-plane projector: a USB device over USB/IP, or on a serial port or pseudo-terminal
@@ -76,6 +79,7 @@ pub(crate) fn run(device: Device) -> Result<(), Box<dyn Error>> {
     match device {
         Device::Camera(arguments) => camera::run(&arguments),
         Device::Dlpc900(arguments) => dlpc900::run(&arguments),
+        Device::LitCamera(arguments) => lit_camera::run(&arguments),
         Device::Natnet(arguments) => natnet::run(&arguments),
         Device::Projector(arguments) => projector::run(&arguments),
         Device::SensorWand(arguments) => sensor_wand::run(&arguments),

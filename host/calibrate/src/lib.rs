@@ -3,6 +3,7 @@
 
 pub mod aim;
 pub mod body;
+pub mod camera;
 pub mod check;
 mod codes;
 pub mod dialogue;
@@ -19,4 +20,5 @@ pub mod recorder;
 pub mod sensor;
 pub mod showing;
 pub mod shown;
+pub mod view;
 pub mod wand;

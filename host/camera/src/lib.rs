@@ -28,7 +28,9 @@
 //! ```
 
 mod blobs;
+mod board;
 mod body;
+mod coded;
 mod constellation;
 mod decode;
 mod detect;
@@ -39,16 +41,19 @@ mod planar;
 mod pose;
 mod sightings;
 mod source;
+mod sources;
 mod stream;
 mod threshold;
 mod tracker;
 
 pub use blobs::{SpotDetector, SpotSighting};
+pub use board::{board_pdf, board_view};
 pub use body::{BodyPose, Markings, TagPlace};
+pub use coded::{board_markings, coded_view};
 pub use detect::{TagDetector, TagSighting, TAGS};
 pub use image::{GreyImage, LEAST_SIDE, MOST_SIDE};
 pub use pose::{Covariance, Observation, PoseFit, Velocity};
 pub use sightings::{Expectation, Sightings};
-pub use source::{Picture, PictureSource};
-pub use stream::StreamSource;
+pub use source::{Picture, PictureSource, SourceKind, SourceOpener};
+pub use sources::open_source;
 pub use tracker::{CameraTracker, CameraTrackerSetup};

@@ -1,6 +1,7 @@
 //! Where pictures come from: one trait for a camera of the machine and for a mock.
 
-use dpm_device::time::HostTime;
+use dpm_device::time::{HostClock, HostTime};
+use std::sync::Arc;
 use std::time::Duration;
 
 /// A grey picture and when it was exposed.
@@ -33,4 +34,17 @@ pub trait PictureSource: Send {
 
     /// What and where it is, for messages.
     fn name(&self) -> &str;
+}
+
+/// Opens a source by what follows its prefix. The stamps of its pictures go onto the clock.
+pub type SourceOpener = fn(&str, &Arc<dyn HostClock>) -> Result<Box<dyn PictureSource>, String>;
+
+/// A kind of sources: a row of the table in `sources.rs`.
+pub struct SourceKind {
+    /// What its devices begin with.
+    pub prefix: &'static str,
+    /// What a device looks like, for messages.
+    pub form: &'static str,
+    /// Opens one.
+    pub open: SourceOpener,
 }

@@ -1,18 +1,28 @@
 //! Pictures from a socket of this machine: the mock's.
 
-use crate::source::{Picture, PictureSource};
+use crate::source::{Picture, PictureSource, SourceKind};
 use dpm_device::picture_stream::{PictureHeader, HEADER_BYTES, MAGIC};
 use dpm_device::time::{HostClock, HostTime};
 use std::io::{ErrorKind, Read};
-use std::net::{SocketAddr, TcpStream};
+use std::net::{SocketAddr, TcpStream, ToSocketAddrs};
 use std::sync::Arc;
 use std::time::{Duration, Instant};
+
+/// A server on a socket.
+pub(crate) static KIND: SourceKind =
+    SourceKind { prefix: "tcp:", form: "\"tcp:HOST:PORT\" of `hil-mock serve camera`", open };
+
+fn open(place: &str, clock: &Arc<dyn HostClock>) -> Result<Box<dyn PictureSource>, String> {
+    let found = place.to_socket_addrs().ok().and_then(|mut all| all.next());
+    let address = found.ok_or_else(|| format!("{place:?} is no HOST:PORT"))?;
+    Ok(Box::new(StreamSource::new(address, clock)))
+}
 
 /// How long a connection may take.
 const CONNECT: Duration = Duration::from_millis(500);
 
 /// A client of [`dpm_device::picture_stream`]. It connects when it is asked for a picture, and again after every loss.
-pub struct StreamSource {
+pub(crate) struct StreamSource {
     address: SocketAddr,
     name: String,
     /// The host's clock less CLOCK_MONOTONIC, ns.
@@ -24,7 +34,7 @@ pub struct StreamSource {
 
 impl StreamSource {
     /// A client of the server at `address`, whose stamps go onto `clock`.
-    pub fn new(address: SocketAddr, clock: &Arc<dyn HostClock>) -> Self {
+    fn new(address: SocketAddr, clock: &Arc<dyn HostClock>) -> Self {
         let offset_ns = clock.now().0 - dpm_common::unix::monotonic_ns() as i64;
         Self { address, name: format!("tcp:{address}"), offset_ns, stream: None, bytes: Vec::new() }
     }

@@ -16,7 +16,7 @@ pub use fit::{LensTerms, Priors};
 pub use refusal::Refusal;
 pub(crate) use solve::{check_result, check_terms, look_for_motion, moved_px};
 pub use solve::{relocate, solve, ProjectorFit};
-pub(crate) use uncertainty::{percentile, variance};
+pub(crate) use uncertainty::{percentile, predict_share, variance};
 pub use uncertainty::{predict, Volume};
 
 use crate::model::ProjectorModel;

@@ -42,12 +42,25 @@ impl Volume {
     }
 }
 
+/// The share of calibrations whose error [`predict`] bounds.
+const BOUND: f64 = 0.99;
 /// Calibrations that are drawn from the covariance.
 const DRAWS: u64 = 400;
 
 /// The error over `points` of a projector whose numbers have the given covariance, and whose points in the
 /// world are known to `point_m` along each axis (0 where they are exact).
 pub fn predict(model: &ProjectorModel, covariance: &[Vec<f64>], points: &[DVec3]) -> LightError {
+    predict_share(model, covariance, points, BOUND)
+}
+
+/// The same, with the 99th percentile over the points that a share of all projectors so uncertain stays below: 0.99 is a bound,
+/// 0.5 what is to be expected.
+pub(crate) fn predict_share(
+    model: &ProjectorModel,
+    covariance: &[Vec<f64>],
+    points: &[DVec3],
+    share: f64,
+) -> LightError {
     let n = PARAMETERS;
     let slopes: Vec<_> =
         points.iter().filter_map(|p| model.derive(*p).map(|d| (*p, d.by_parameters))).collect();
@@ -77,7 +90,7 @@ pub fn predict(model: &ProjectorModel, covariance: &[Vec<f64>], points: &[DVec3]
         })
         .collect();
     bounds.sort_by(f64::total_cmp);
-    let p99_px = bounds[(0.99 * (bounds.len() - 1) as f64).round() as usize];
+    let p99_px = bounds[(share * (bounds.len() - 1) as f64).round() as usize];
     LightError { typical_px, p99_px, worst, worst_px }
 }
 

@@ -3,4 +3,5 @@
 mod identity;
 mod pictures;
 mod poses;
+mod projector;
 mod stage;

@@ -1,6 +1,6 @@
 //! The mock camera on a real socket: one thread that paints each picture and sends it when it is due.
 
-use super::MockCamera;
+use super::{Exposure, MockCamera, MockCameraConfig};
 use crate::monotonic;
 use dpm_device::picture_stream::PictureHeader;
 use dpm_device::time::HostClock;
@@ -10,6 +10,33 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::Arc;
 use std::thread::JoinHandle;
 use std::time::Duration;
+
+/// What makes the pictures that a [`CameraHost`] sends.
+pub trait PictureMaker: Send {
+    /// Raster, rate, exposure and faults.
+    fn config(&self) -> &MockCameraConfig;
+
+    /// Picture `number`; `None` if it is lost on the way.
+    fn exposure(&self, number: u64) -> Option<Exposure>;
+
+    /// Makes a picture, rows from above. It may wait by the clock until the exposure is over.
+    fn make(&mut self, exposure: &Exposure, clock: &dyn HostClock, pixels: &mut Vec<u8>);
+}
+
+impl PictureMaker for MockCamera {
+    fn config(&self) -> &MockCameraConfig {
+        self.config()
+    }
+
+    fn exposure(&self, number: u64) -> Option<Exposure> {
+        self.exposure(number)
+    }
+
+    /// The mock knows what it will see, and paints ahead of the exposure.
+    fn make(&mut self, exposure: &Exposure, _: &dyn HostClock, pixels: &mut Vec<u8>) {
+        self.paint(exposure, pixels);
+    }
+}
 
 /// A camera that sends its pictures until it is dropped ([`dpm_device::picture_stream`]).
 pub struct CameraHost {
@@ -28,7 +55,11 @@ impl CameraHost {
     ///
     /// # Errors
     /// The system refuses the socket or the thread.
-    pub fn start(camera: MockCamera, address: SocketAddrV4, clock: Arc<dyn HostClock>) -> io::Result<Self> {
+    pub fn start(
+        camera: impl PictureMaker + 'static,
+        address: SocketAddrV4,
+        clock: Arc<dyn HostClock>,
+    ) -> io::Result<Self> {
         let listener = TcpListener::bind(address)?;
         listener.set_nonblocking(true)?;
         let bound = listener.local_addr()?;
@@ -61,7 +92,7 @@ impl Drop for CameraHost {
 }
 
 fn serve(
-    mut camera: MockCamera,
+    mut camera: impl PictureMaker,
     listener: &TcpListener,
     clock: &dyn HostClock,
     over: &AtomicBool,
@@ -92,8 +123,7 @@ fn serve(
             rest_until(clock, exposure.arrives_ns, over);
             continue;
         }
-        // The mock knows what it will see, and paints ahead of the exposure.
-        camera.paint(&exposure, &mut pixels);
+        camera.make(&exposure, clock, &mut pixels);
         rest_until(clock, exposure.arrives_ns, over);
         clients.retain_mut(|client| {
             client.write_all(&header.encode()).and_then(|()| client.write_all(&pixels)).is_ok()

@@ -4,12 +4,18 @@
 //! blur by motion, rolling shutter, shading, noise of photons and of reading, and a background with clutter. A picture is a
 //! pure function of the seed and its number; the optics share no code with what they judge.
 
+mod board;
 mod clutter;
 mod host;
+mod lit;
+mod lit_camera;
 mod optics;
 mod paint;
 
-pub use host::CameraHost;
+pub use board::BoardHold;
+pub use host::{CameraHost, PictureMaker};
+pub use lit::{LitStage, LitThing, LitView};
+pub use lit_camera::{LitCamera, ShownLight};
 pub use optics::CameraOptics;
 
 use crate::faults::{FaultError, FaultKind, FaultPlan};

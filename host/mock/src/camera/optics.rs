@@ -1,5 +1,7 @@
 //! The optics of the mock camera: pixels into rays. They share no code with what they judge.
 
+use dpm_device::rng::Draws;
+
 /// A pinhole with the lens of Brown.
 #[derive(Clone, Debug, PartialEq)]
 pub struct CameraOptics {
@@ -19,6 +21,21 @@ impl CameraOptics {
         let half = [0.5 * f64::from(size[0]), 0.5 * f64::from(size[1])];
         let focal = half[0] / libm::tan(0.5 * view_deg.to_radians());
         Self { size, focal: [focal; 2], centre: half, lens: [0.0; 5] }
+    }
+
+    /// A camera as they come: a drawn angle of view of 45 to 75 degrees, pixels that are nearly square, an axis near the middle,
+    /// and a lens that bends the corners by up to some tens of pixels.
+    pub fn drawn(size: [u32; 2], seed: u64) -> Self {
+        let draws = Draws::new(seed).stream(0x6f70_7469);
+        let pinhole = Self::pinhole(size, 45.0 + 30.0 * draws.unit(0));
+        let aside = |i: u64| 2.0 * draws.unit(i) - 1.0;
+        let off = 0.02 * f64::from(size[0]);
+        Self {
+            focal: [pinhole.focal[0], pinhole.focal[1] * (1.0 + 0.005 * aside(1))],
+            centre: [pinhole.centre[0] + off * aside(2), pinhole.centre[1] + off * aside(3)],
+            lens: [0.15 * aside(4), 0.05 * aside(5), 1e-3 * aside(6), 1e-3 * aside(7), 0.0],
+            ..pinhole
+        }
     }
 
     /// The bent ray of a straight one, both `[x / z, y / z]` with y down.
@@ -42,7 +59,7 @@ impl CameraOptics {
     }
 
     /// The straight ray of a pixel, by iteration from the bent one; the lens must not fold inside the picture.
-    fn straight(&self, pixel: [f64; 2]) -> [f64; 2] {
+    pub(super) fn straight(&self, pixel: [f64; 2]) -> [f64; 2] {
         let bent: [f64; 2] = std::array::from_fn(|i| (pixel[i] - self.centre[i]) / self.focal[i]);
         let mut ray = bent;
         if self.lens != [0.0; 5] {

@@ -7,6 +7,8 @@ use dpm_common::keys::read::Reader;
 use dpm_common::keys::rows::{KeyValues, OfKind};
 use dpm_device::time::{HostClock, HostTime};
 use dpm_device::tracker::{BodyKey, Tracker, TrackerError};
+#[cfg(feature = "camera")]
+use dpm_scene::geometry::projector::ProjectorCamera;
 use std::error::Error;
 use std::path::PathBuf;
 use std::sync::Arc;
@@ -71,6 +73,18 @@ pub trait TrackerKeys: KeyValues {
 
     /// The same keys with each input file placed by `place`, which gets the file and its key; `None` without files.
     fn placed(&self, _place: &mut dyn FnMut(&mut PathBuf, &str)) -> Option<Arc<dyn TrackerKeys>> {
+        None
+    }
+
+    /// Opens the pictures of a tracker that looks by a camera; `None` for all others.
+    #[cfg(feature = "camera")]
+    fn view(&self, _clock: &Arc<dyn HostClock>) -> Option<Result<super::CameraView, SourceError>> {
+        None
+    }
+
+    /// Lens and place in the world of such a camera.
+    #[cfg(feature = "camera")]
+    fn eye(&self) -> Option<Result<ProjectorCamera, SourceError>> {
         None
     }
 

@@ -1,5 +1,6 @@
 //! `dpm calibrate ...`: measures what a rig needs to know, and writes it into the calibration file.
 
+mod camera;
 mod check;
 mod light;
 #[cfg(feature = "page")]
@@ -8,6 +9,7 @@ mod projector;
 
 use super::rig_args::RigArgs;
 use super::watch::{print, watch_quietly};
+use camera::CameraArgs;
 use check::{check, nudge, CheckArgs, NudgeArgs};
 use dpm_calibrate::dialogue::Dialogue;
 use dpm_calibrate::pace::{slower, PaceResult};
@@ -43,6 +45,8 @@ enum What {
     Wand(WandArgs),
     /// Find lens and pose of the projector: hold the tip of the wand into one cross after another
     Projector(ProjectorArgs),
+    /// Print a board, and find focal length, centre and lens of the camera that looks at it
+    Camera(CameraArgs),
     /// Find where a mesh is in its tracked body: touch known points of it, then wander over its surface
     Body(BodyArgs),
     /// Measure how far light is from where it belongs on a tracked body, and say what to measure again
@@ -320,6 +324,7 @@ pub(super) fn execute(args: &CalibrateArgs) -> Result<(), Failure> {
             Ok(())
         }
         What::Projector(args) => args.execute(),
+        What::Camera(args) => args.execute(),
         What::Body(args) => {
             let (config, mut results) = args.common.open()?;
             let scene = Rig::build(&config, None)?.scene;

@@ -1,5 +1,6 @@
 //! `dpm calibrate projector`: by hand, from a file of points, or by the wand's light sensor.
 
+use super::camera::Paper;
 use super::{at_a_rate_that_is_carried, seconds, tip_and_sigma, tip_of, Common, SensorArgs};
 use crate::cli::watch::{print, watch_quietly};
 use dpm_calibrate::aim::Aim;
@@ -7,11 +8,11 @@ use dpm_calibrate::dialogue::Dialogue;
 use dpm_calibrate::poses::Poses;
 use dpm_calibrate::projector::{aim_by_hand, keep, solve_file, told_of, Points};
 use dpm_calibrate::shown::while_shown;
-use dpm_calibrate::{light, sensor};
+use dpm_calibrate::{light, sensor, view};
 use dpm_calibration::projector::{LensTerms, Options, PlaceHint, ProjectorFit};
 use dpm_common::clock::MonotonicClock;
 use dpm_rig::config::RigConfig;
-use dpm_rig::failure::Failure;
+use dpm_rig::failure::{Failure, FailureKind};
 use dpm_rig::pack::source::PatternSource;
 use dpm_rig::pattern::run_pattern;
 use dpm_rig::results::Results;
@@ -19,6 +20,7 @@ use dpm_rig::telemetry::monitor::RunMonitor;
 use glam::DVec3;
 use std::path::PathBuf;
 use std::sync::Arc;
+use std::time::Duration;
 
 #[derive(clap::Args, Clone, Debug)]
 pub(super) struct ProjectorArgs {
@@ -45,6 +47,15 @@ pub(super) struct ProjectorArgs {
     /// Seconds of motion with the sensor; default: 30, or 75 where frames and their inverse are shown
     #[arg(long, value_name = "S", value_parser = seconds, requires = "sensor")]
     seconds: Option<f64>,
+    /// Let the rig's camera look at coded pictures on whatever is there, with a body that carries tags or the printed board in view
+    #[arg(long, conflicts_with_all = ["sensor", "points"])]
+    camera: bool,
+    /// The paper of the printed board that may be in view
+    #[arg(long, value_enum, default_value = "a4", requires = "camera")]
+    paper: Paper,
+    /// How long a picture stands before the camera's picture of it counts, seconds
+    #[arg(long, value_name = "S", default_value_t = 0.3, value_parser = seconds, requires = "camera")]
+    settle: f64,
     /// Show nothing and ask for nothing: solve the points of a file, "x y z column row" a line, metres and pixels
     #[arg(long, value_name = "FILE")]
     points: Option<PathBuf>,
@@ -94,6 +105,9 @@ impl ProjectorArgs {
         let known = PlaceHint { distance_m: self.distance, up: self.up };
         let by_hand = Options::by_hand(raster);
         let options = Options { known, priors: by_hand.priors.with_lens(self.lens.terms()), ..by_hand };
+        if self.camera {
+            return self.by_camera(&config, results);
+        }
         match (&self.sensor, &self.points) {
             (Some(port), _) => self.by_sensor(port, known, &config, results),
             (None, Some(path)) => self.told(results, &config, &solve_file(path, raster, options)?),
@@ -115,6 +129,24 @@ impl ProjectorArgs {
         self.told(results, config, &solved)?;
         // Not before the result is written: until then the points are all there is.
         points.forget();
+        Ok(())
+    }
+
+    fn by_camera(&self, config: &RigConfig, mut results: Results) -> Result<(), Failure> {
+        let clock = view::clock();
+        let bad = |told: String| Failure::new(FailureKind::BadInput, told);
+        let none = || bad("the rig's tracker has no pictures; write tracker.kind = \"camera\"".into());
+        let mut eyes = config.tracker.view(&clock).ok_or_else(none)?.map_err(|e| bad(e.to_string()))?;
+        let eye = config.tracker.eye().ok_or_else(none)?.map_err(|e| bad(e.to_string()))?;
+        let settle = Duration::from_secs_f64(self.settle);
+        let task = view::Task { clock, board: Some(self.paper.board().0), settle };
+        let fit = watch_quietly(config.clone(), move |config, monitor| {
+            view::calibrate(config, (&mut eyes, &eye), &task, monitor, &mut |text| {
+                print(&format!("{text}\n"))
+            })
+        })?;
+        view::keep(&mut results, config, &fit);
+        print(&format!("{}\n{}\n", view::told_of(&fit), results.save(config)?));
         Ok(())
     }
 

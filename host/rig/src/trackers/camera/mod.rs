@@ -9,12 +9,14 @@ pub use keys::{CameraTrackerConfig, MarkerConfig, TagConfig};
 use super::keys::{SourceError, TrackerKeys, TrackerPlace};
 use super::kind::{PoseOrigin, TrackerKind};
 use super::transform::{PoseConfig, TrackerTransformConfig};
-use dpm_camera::{CameraTracker, CameraTrackerSetup, Markings, PictureSource, StreamSource, TagPlace, TAGS};
+use dpm_camera::{open_source, CameraTracker, CameraTrackerSetup, Markings, PictureSource, TagPlace, TAGS};
 use dpm_common::keys::read::{refuse, Reader};
 use dpm_device::picture_stream::{PictureHeader, HEADER_BYTES};
-use dpm_device::tracker::{BodyKey, Tracker};
+use dpm_device::planes::Raster;
+use dpm_device::time::HostClock;
+use dpm_device::tracker::Tracker;
+use dpm_scene::geometry::projector::ProjectorCamera;
 use glam::DVec3;
-use std::net::ToSocketAddrs;
 use std::path::PathBuf;
 use std::sync::Arc;
 
@@ -27,8 +29,17 @@ pub(super) static KIND: TrackerKind = TrackerKind::of::<CameraTrackerConfig>(
     mock::mock,
 );
 
-/// What begins the address of a camera on a socket.
-const SOCKET: &str = "tcp:";
+/// The camera of a tracker, for whoever calibrates by it.
+pub struct CameraView {
+    /// Its pictures.
+    pub source: Box<dyn PictureSource>,
+    /// Their columns and rows.
+    pub raster: Raster,
+    /// The file of its lens, if the rig file names one.
+    pub calibration: Option<PathBuf>,
+    /// What it can see of each body that carries tags.
+    pub markings: Vec<Markings>,
+}
 
 impl TrackerKeys for CameraTrackerConfig {
     fn rate_hz(&self) -> Option<u32> {
@@ -98,6 +109,28 @@ impl TrackerKeys for CameraTrackerConfig {
         Some(Arc::new(keys))
     }
 
+    fn view(&self, clock: &Arc<dyn HostClock>) -> Option<Result<CameraView, SourceError>> {
+        let view = || {
+            let [w, h] = self.size;
+            let no_raster = || SourceError::of_key("tracker.size", format!("{w} x {h} is no raster"));
+            Ok(CameraView {
+                source: self.source(clock)?,
+                raster: Raster::new(w, h).ok_or_else(no_raster)?,
+                calibration: self.calibration.clone(),
+                markings: self.bodies().into_iter().map(|name| self.markings(name)).collect(),
+            })
+        };
+        Some(view())
+    }
+
+    fn eye(&self) -> Option<Result<ProjectorCamera, SourceError>> {
+        let placed = |camera: ProjectorCamera| {
+            let wrong = || SourceError::of_key("tracker.transform", "its rotation is zero");
+            Ok(ProjectorCamera { world_from_projector: self.transform.pose().ok_or_else(wrong)?, ..camera })
+        };
+        Some(lens::camera(self).and_then(placed))
+    }
+
     fn open(&self, place: TrackerPlace) -> Result<Box<dyn Tracker>, SourceError> {
         for body in self.bodies() {
             if !place.bodies.iter().any(|b| b.name == body) {
@@ -111,45 +144,38 @@ impl TrackerKeys for CameraTrackerConfig {
         }
         let setup = CameraTrackerSetup {
             camera: lens::camera(self)?,
-            bodies: place.bodies.iter().map(|b| self.markings(b)).collect(),
+            bodies: place.bodies.iter().map(|b| self.markings(&b.name)).collect(),
             marker_level: self.marker_level,
         };
-        let Some(address) = self.device.strip_prefix(SOCKET) else {
-            return Err(SourceError::of_key("tracker.device", no_device(&self.device)));
-        };
-        let found = address.to_socket_addrs().ok().and_then(|mut all| all.next());
-        let address = found
-            .ok_or_else(|| SourceError::of_key("tracker.device", format!("{address:?} is no HOST:PORT")))?;
-        let source: Box<dyn PictureSource> = Box::new(StreamSource::new(address, &place.clock));
+        let source = self.source(&place.clock)?;
         Ok(Box::new(CameraTracker::start(setup, source, place.clock)?))
     }
 }
 
 impl CameraTrackerConfig {
+    fn source(&self, clock: &Arc<dyn HostClock>) -> Result<Box<dyn PictureSource>, SourceError> {
+        open_source(&self.device, clock).map_err(|e| SourceError::of_key("tracker.device", e))
+    }
+
     /// The names of the bodies that have tags or markers.
     fn bodies(&self) -> std::collections::BTreeSet<&str> {
         self.tags.iter().map(|t| &*t.body).chain(self.markers.iter().map(|m| &*m.body)).collect()
     }
 
     /// What the camera can see of a body.
-    fn markings(&self, body: &BodyKey) -> Markings {
-        let tags = self.tags.iter().filter(|t| t.body == body.name).map(|t| TagPlace {
+    fn markings(&self, body: &str) -> Markings {
+        let tags = self.tags.iter().filter(|t| t.body == body).map(|t| TagPlace {
             id: t.id,
             side: t.side_m,
             body_from_tag: pose(t).to_affine().unwrap_or_default(),
         });
-        let markers = self.markers.iter().filter(|m| m.body == body.name);
+        let markers = self.markers.iter().filter(|m| m.body == body);
         Markings { tags: tags.collect(), markers: markers.map(|m| DVec3::from_array(m.position)).collect() }
     }
 }
 
 fn pose(tag: &TagConfig) -> PoseConfig {
     PoseConfig { position: tag.position, rotation_deg: tag.rotation_deg, rotation: tag.rotation }
-}
-
-/// What is wrong with a device that this build cannot open.
-fn no_device(device: &str) -> String {
-    format!("{device:?} cannot be opened by this build; write \"tcp:HOST:PORT\" of `hil-mock serve camera`")
 }
 
 /// A header: what is read is written as the same bytes.
