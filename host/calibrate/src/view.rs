@@ -33,6 +33,9 @@ pub struct Task {
 
 /// A camera that is silent, or a projector that is dark, for so long has failed.
 const SILENCE: Duration = Duration::from_secs(10);
+/// By how much the light of a picture may differ from that of the one before: grey levels, and a share.
+const STEADY_LEVELS: f64 = 0.3;
+const STEADY_SHARE: f64 = 0.01;
 /// How long a picture is waited for.
 const PATIENCE: Duration = Duration::from_millis(200);
 
@@ -107,12 +110,19 @@ fn take(
     Ok(seen)
 }
 
-/// The first picture whose exposure began so long after now.
+/// Whether the same light fell in two pictures: a frame that came late leaves a gap in it.
+fn is_steady(a: &[u8], b: &[u8]) -> bool {
+    let light = |p: &[u8]| p.iter().map(|v| f64::from(*v)).sum::<f64>() / p.len().max(1) as f64;
+    (light(a) - light(b)).abs() < STEADY_LEVELS + STEADY_SHARE * light(a)
+}
+
+/// The first picture whose exposure began so long after now, and in which as much light fell as in the one before.
 fn picture_after(view: &mut CameraView, task: &Task, monitor: &RunMonitor) -> Result<Vec<u8>, Failure> {
     let told = Instant::now();
     let from = task.clock.now().plus_ns(task.settle.as_nanos() as i64);
     let (w, h) = (view.raster.width() as usize, view.raster.height() as usize);
     let mut picture = Picture::default();
+    let mut before: Option<Vec<u8>> = None;
     loop {
         if monitor.stop_requested() {
             return Err(Failure::new(
@@ -131,7 +141,13 @@ fn picture_after(view: &mut CameraView, task: &Task, monitor: &RunMonitor) -> Re
                     format!("pictures have {} x {} pixels: set tracker.size", picture.width, picture.height);
                 return Err(Failure::new(FailureKind::BadInput, told));
             }
-            Ok(true) if picture.begin >= from => return Ok(std::mem::take(&mut picture.pixels)),
+            Ok(true) if picture.begin >= from => {
+                let pixels = std::mem::take(&mut picture.pixels);
+                if before.is_some_and(|b| is_steady(&b, &pixels)) {
+                    return Ok(pixels);
+                }
+                before = Some(pixels);
+            }
             Ok(_) => {}
             Err(_) => std::thread::sleep(PATIENCE),
         }
