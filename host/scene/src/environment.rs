@@ -13,7 +13,7 @@ use glam::{DVec3, Vec3};
 use image::{ImageFormat, ImageReader};
 
 use super::gltf_file::read_file;
-use super::limits::{largest_piece, Limits};
+use super::limits::{largest_piece, of_header, of_picture, Limits};
 use super::load::contained;
 use super::primaries::Primaries;
 use super::srgb::to_linear;
@@ -543,17 +543,15 @@ fn decode_bounded(
 ) -> Result<image::DynamicImage, SceneError> {
     let reader = || ImageReader::with_format(std::io::Cursor::new(bytes), format);
     let failed = |e: image::ImageError| SceneError::broken("image", format!("cannot be decoded: {e}"));
-    let decoder = reader().into_decoder().map_err(failed)?;
+    let mut header = reader();
+    header.limits(of_header());
+    let decoder = header.into_decoder().map_err(failed)?;
     let (width, height) = image::ImageDecoder::dimensions(&decoder);
-    let texels = check_size(width, height)?;
+    check_size(width, height)?;
     check_piece(1, image::ImageDecoder::total_bytes(&decoder), bytes.len())?;
     let mut bounded = reader();
-    let mut memory = image::Limits::default();
-    memory.max_image_width = Some(width);
-    memory.max_image_height = Some(height);
-    memory.max_alloc =
-        Some((texels as u64 * texel_bytes + (16 << 20)).min(2 * largest_piece(bytes.len() as u64)));
-    bounded.limits(memory);
+    let allowed = largest_piece(bytes.len() as u64);
+    bounded.limits(of_picture(format, [width, height], texel_bytes, allowed));
     bounded.decode().map_err(failed)
 }
 

@@ -59,6 +59,32 @@ pub(crate) const fn largest_piece(bytes: u64) -> u64 {
     64_000_000 + 16 * bytes
 }
 
+/// What a decoder of pictures may take before the size of its picture is known: a profile of colours or a text of a PNG may
+/// claim any length.
+pub(crate) fn of_header() -> image::Limits {
+    let mut memory = image::Limits::default();
+    memory.max_alloc = Some(16 << 20);
+    memory
+}
+
+/// What a decoder may take for a picture of these sides, of which a texel takes at most `texel_bytes`, and `allowed` bytes are
+/// the largest piece. The rest is room for tables.
+pub(crate) fn of_picture(
+    format: image::ImageFormat,
+    [width, height]: [u32; 2],
+    texel_bytes: u64,
+    allowed: u64,
+) -> image::Limits {
+    // A TIFF is unpacked by strips, of which one may be the whole; what a PNG takes beside its texels is for profiles.
+    let pieces = if format == image::ImageFormat::Png { 1 } else { 2 };
+    let mut memory = image::Limits::default();
+    memory.max_image_width = Some(width);
+    memory.max_image_height = Some(height);
+    let texels = u64::from(width) * u64::from(height);
+    memory.max_alloc = Some((texels * texel_bytes).min(pieces * allowed) + (16 << 20));
+    memory
+}
+
 impl Limits {
     /// The limits for a file of `bytes` bytes in all. Triangles cost time, and a short file may request any number of
     /// them by instances of a mesh: a million are free, and more need bytes in the file.

@@ -1,6 +1,7 @@
 //! Pictures whose values are light as measured, without the curve of sRGB: flat fields.
 
 use crate::environment::{check_piece, check_size, collect, read_pfm};
+use crate::limits::of_header;
 use crate::SceneError;
 use glam::Vec3;
 use image::{ImageFormat, ImageReader, Limits};
@@ -51,7 +52,9 @@ pub fn load_linear_picture(bytes: &[u8]) -> Result<LinearPicture, SceneError> {
 fn read_png(bytes: &[u8]) -> Result<LinearPicture, SceneError> {
     let broken = |e: image::ImageError| SceneError::broken("image", e.to_string());
     let reader = || ImageReader::with_format(Cursor::new(bytes), ImageFormat::Png);
-    let (width, height) = reader().into_dimensions().map_err(broken)?;
+    let mut header = reader();
+    header.limits(of_header());
+    let (width, height) = header.into_dimensions().map_err(broken)?;
     let texels = check_size(width, height)?;
     check_piece(texels, 8, bytes.len())?;
     let mut limits = Limits::default();

@@ -2,12 +2,15 @@
 """Compares what dpm reads of mesh files and skies with what other programs read of them.
 
     cargo build -p dpm-scene --features exr --example load_all
-    tests/peers/files/run.py [--work DIR] [--out docs/lab/FILES.md] [--more DIR]
+    tests/peers/files/run.py [--work DIR] [--out docs/lab/FILES.md] [--more DIR] [--only-more] [--damage N [--seed N]]
 
 Packages alone are fetched: trimesh, numpy-stl, OpenEXR and OpenCV from PyPI, three from npm. They contain hardly any files, so
 the corpus is what they write: shapes with colours of vertices, of faces and without, in every form that they have, and each of
 these again as other systems and other programs would leave it (line ends, byte-order marks, trailing bytes, far coordinates,
-wrong endings). `--more` adds the files of a folder. Exit code 1: a file that both peers open is not opened, or read otherwise.
+wrong endings). `--more` adds the files of a folder: meshes, skies, pictures, which Pillow reads as well, and calibrations.
+`--damage` has dpm alone read so many of all files with bits turned, parts cut off, doubled, overwritten and taken from others.
+Exit code 1: a file that all peers open is not opened, or read otherwise; a reader panics, needs more than 30 s, or asks for
+more memory at once than 64 MB and sixteen times the file's bytes.
 """
 
 import argparse
@@ -23,6 +26,9 @@ HERE = pathlib.Path(__file__).resolve().parent
 PACKAGES = ["trimesh", "numpy", "numpy-stl", "OpenEXR", "opencv-python-headless", "scipy", "pillow"]
 MESHES = {".obj", ".ply", ".stl", ".glb", ".gltf"}
 SKIES = {".exr", ".hdr"}
+PICTURES = {".png", ".jpg", ".jpeg", ".tga", ".tif", ".tiff", ".webp", ".bmp"}
+# What dpm alone reads here; `calibrations.py` compares such files with OpenCV.
+OTHERS = {".ktx2", ".yml", ".yaml", ".xml", ".json", ".gz", ".zip", ".mpcdi", ".npz"}
 LARGEST = 20 << 20
 
 
@@ -147,6 +153,8 @@ def trimesh_reads(path):
         if all(m.visual.kind in ("vertex", "face") for m in meshes):
             colours = [view_colour(meshes, view) for view in range(8)]
         count = int(sum(len(m.faces) for m in meshes))
+        if not np.isfinite(high - low).all():
+            return {"refused": "coordinates that are no numbers"}
         return {"triangles": count, "sides": (high - low).tolist(), "colours": colours}
     except Exception as e:  # any refusal of another program is one
         return {"refused": f"{type(e).__name__}: {e}"[:200]}
@@ -181,19 +189,56 @@ def sky_reads(path):
     import numpy as np
 
     try:
-        if path.suffix == ".exr":
-            import OpenEXR
-
-            channels = OpenEXR.File(str(path), separate_channels=True).channels()
-            pick = lambda c: next((channels[k].pixels for k in channels if k == c or k.endswith("." + c)), None)
-            rgb = [pick(c) for c in "RGB"]
-            rgb = [pick("Y")] * 3 if rgb[0] is None else rgb
-            rgb = np.stack([np.asarray(c, dtype=np.float64) for c in rgb], axis=-1)
+        if path.suffix.lower() == ".exr":
+            rgb = exr_light(path)
         else:
             import cv2
 
             rgb = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)[:, :, ::-1].astype(np.float64)
+        # What is no light: SCENES.md says what dpm makes of it.
+        rgb = np.clip(np.nan_to_num(rgb, nan=0.0, posinf=65504.0, neginf=0.0), 0.0, None)
         return {"width": rgb.shape[1], "height": rgb.shape[0], "mean": rgb.mean(axis=(0, 1)).tolist()}
+    except Exception as e:
+        return {"refused": f"{type(e).__name__}: {e}"[:200]}
+
+
+def exr_light(path):
+    """Red, green and blue of the layer with light, in the display window; black where nothing is stored."""
+    import numpy as np
+    import OpenEXR
+
+    with OpenEXR.File(str(path), separate_channels=True) as file:
+        for part in file.parts:
+            header, channels = part.header, part.channels
+            layers = sorted({name.rpartition(".")[0] for name in channels if name.rpartition(".")[2] in "RY"})
+            if layers:
+                break
+        prefix = layers[0] + "." if layers[0] else ""
+        if prefix + "RY" in channels or "chromaticities" in header:
+            raise ValueError("chroma and other primaries are not converted here")
+        rgb = [channels.get(prefix + c, channels.get(prefix + "Y")) for c in "RGB"]
+        rgb = np.stack([np.asarray(c.pixels, dtype=np.float64) for c in rgb], axis=-1)
+        (left, top), (right, bottom) = header["displayWindow"]
+        (x0, y0), (x1, y1) = header["dataWindow"]
+        out = np.zeros((bottom - top + 1, right - left + 1, 3))
+        l, t, r, b = max(left, x0), max(top, y0), min(right, x1) + 1, min(bottom, y1) + 1
+        if l < r and t < b:
+            out[t - top : b - top, l - left : r - left] = rgb[t - y0 : b - y0, l - x0 : r - x0]
+        return out
+
+
+def picture_reads(path):
+    import numpy as np
+    from PIL import Image
+
+    try:
+        with Image.open(path) as picture:
+            if picture.mode.startswith("I;16") or picture.mode == "I":
+                # Pillow cuts these off at 255.
+                rgb = np.repeat(np.asarray(picture, dtype=np.float64)[:, :, None] / 257, 3, axis=2)
+            else:
+                rgb = np.asarray(picture.convert("RGB"), dtype=np.float64)
+        return {"width": rgb.shape[1], "height": rgb.shape[0], "mean": rgb.mean(axis=(0, 1)).tolist(), "is_codes": True}
     except Exception as e:
         return {"refused": f"{type(e).__name__}: {e}"[:200]}
 
@@ -208,16 +253,83 @@ def three_reads(work, paths):
 
 
 def ours_reads(program, paths):
+    """What dpm reads of each file, with what the reading costs."""
     out = {}
     for i in range(0, len(paths), 64):
-        some = [str(p) for p in paths[i : i + 64]]
-        done = subprocess.run([program, "--json", *some], capture_output=True, text=True, check=False)
-        for line in done.stdout.splitlines():
-            one = json.loads(line)
-            out[one["file"]] = one["read"]
-        for path in some:
-            out.setdefault(path, {"refused": f"the program ended with {done.returncode}"})
+        waiting = [str(p) for p in paths[i : i + 64]]
+        while waiting:
+            done = subprocess.run([program, "--json", *waiting], capture_output=True, text=True, check=False)
+            read = [json.loads(line) for line in done.stdout.splitlines()]
+            out.update((one["file"], one) for one in read)
+            waiting = waiting[len(read) :]
+            if waiting:
+                told = {"refused": f"the program ended with {done.returncode}: {done.stderr[-300:]}"}
+                out[waiting[0]] = {"ms": 0, "piece": 0, "at_most": 0, "read": told, "crashed": True}
+                waiting = waiting[1:]
     return out
+
+
+def faults(ours, path):
+    """What no file may do to a reader."""
+    told = ours["read"].get("refused", "")
+    # A program that ends, a panic that was caught, and a load that was given up.
+    if ours.get("crashed") or "a defect of this program" in told or "took longer than" in told or ours["ms"] > 30_000:
+        yield f"{path}: {told or ours['ms']}"
+    allowed = 64_000_000 + 16 * sum(p.stat().st_size for p in belonging(path))
+    if ours["piece"] > allowed:
+        yield f"{path}: {ours['piece']} bytes at once, {allowed} are allowed"
+
+
+def belonging(path):
+    """The file, and those of its folders that it may name."""
+    if path.suffix.lower() not in (".gltf", ".obj"):
+        return [path]
+    return [path, *(p for p in path.parent.rglob("*") if p.is_file() and p.suffix.lower() not in (".gltf", ".obj", ".glb"))]
+
+
+def damage(args, paths):
+    """Reads files after seeded damage; the fault of each that does what none may."""
+    import random
+
+    chance = random.Random(args.seed)
+    of_ending = {}
+    for path in paths:
+        of_ending.setdefault(path.suffix.lower(), []).append(path)
+    made = []
+    for number in range(args.damage):
+        # As many of each ending.
+        path = chance.choice(of_ending[chance.choice(sorted(of_ending))])
+        whole = bytearray(path.read_bytes())
+        for _ in range(chance.choice((1, 1, 2, 8))):
+            kind, at = chance.randrange(6), chance.randrange(max(1, min(len(whole), chance.choice((200, 4096, 1 << 30)))))
+            if kind == 0 and whole:
+                whole[at] ^= 1 << chance.randrange(8)
+            elif kind == 1 and whole:
+                whole[at : at + 4] = chance.choice((b"\xff\xff\xff\xff", b"\xff\xff\xff\x7f", b"\0\0\0\0", b"9999"))
+            elif kind == 2:
+                del whole[chance.randrange(at, len(whole) + 1) :]
+            elif kind == 3:
+                del whole[at : at + chance.randrange(1, 200)]
+            elif kind == 4:
+                whole[at:at] = whole[at : at + chance.randrange(1, 200)] * chance.randrange(1, 5)
+            else:
+                other = chance.choice(paths).read_bytes()
+                begin = chance.randrange(max(1, len(other)))
+                whole[at : at + 4096] = other[begin : begin + chance.randrange(1, 4096)]
+        # Beside its original, since it may name the files there.
+        made.append(path.with_name(f"damaged-{number}{path.suffix}"))
+        made[-1].write_bytes(whole)
+    ours = ours_reads(args.program, made)
+    found = [told for path in made for told in faults(ours[str(path)], path)]
+    opened = sum("refused" not in one["read"] for one in ours.values())
+    print(f"{len(made)} damaged files: {opened} opened, {len(found)} faults; at most {max(o['ms'] for o in ours.values())} ms, "
+          f"{max(o['piece'] for o in ours.values()) >> 20} MiB at once and {max(o['at_most'] for o in ours.values()) >> 20} MiB in all")
+    print("\n".join(found))
+    keep = {told.split(": ")[0] for told in found}
+    for path in made:
+        if str(path) not in keep:
+            path.unlink()
+    return found
 
 
 def differs(ours, peers):
@@ -226,10 +338,11 @@ def differs(ours, peers):
         return f"refused: {ours['refused']}"
     told = ""
     for peer in peers:
-        near = lambda a, b, tolerance: all(abs(x - y) <= tolerance * max(1e-9, abs(x), abs(y)) for x, y in zip(a, b))
         if "mean" in peer:
             same = (ours["width"], ours["height"]) == (peer["width"], peer["height"])
-            if same and near(ours["mean"], peer["mean"], 2e-3):
+            # Codes of eight bits are rounded, and chroma of JPEG is spread in several ways.
+            codes = 1.0 if "is_codes" in peer else 0.0
+            if same and all(abs(x - y) <= codes + 2e-3 * max(abs(x), abs(y)) for x, y in zip(ours["mean"], peer["mean"])):
                 return ""
             told = f"{ours['width']} x {ours['height']} of {ours['mean']}, not {peer['width']} x {peer['height']} of {peer['mean']}"
             continue
@@ -247,55 +360,85 @@ def differs(ours, peers):
     return told
 
 
-def compare(args):
-    work = args.work
-    corpus = work / "corpus"
-    if not corpus.exists():
-        write_meshes(corpus)
-        vary(corpus)
-        write_skies(corpus)
-    roots = [corpus, work / "venv/lib", work / "node_modules", *args.more]
-    paths, seen = [], set()
-    for root in roots:
+def corpus_files(args):
+    """The files to read, each content once, and the group of each."""
+    own = args.work / "corpus"
+    if not own.exists() and not args.only_more:
+        write_meshes(own)
+        vary(own)
+        write_skies(own)
+    packages = [own, args.work / "venv/lib", args.work / "node_modules"]
+    paths, seen = {}, set()
+    for root in [] if args.only_more else packages:
         for path in sorted(p for p in root.rglob("*") if p.suffix.lower() in MESHES | SKIES and p.is_file()):
-            digest = hashlib.sha256(path.read_bytes()).hexdigest()
-            if path.stat().st_size <= LARGEST and digest not in seen:
-                seen.add(digest)
-                paths.append(path.resolve())
+            note(paths, seen, path, path.parent.name)
+    for root in args.more:
+        endings = MESHES | SKIES | PICTURES | OTHERS
+        for path in sorted(p for p in root.rglob("*") if p.suffix.lower() in endings and p.is_file()):
+            note(paths, seen, path, "others")
+    return paths
+
+
+def note(paths, seen, path, group):
+    digest = hashlib.sha256(path.read_bytes()).hexdigest()
+    if path.stat().st_size <= LARGEST and digest not in seen:
+        seen.add(digest)
+        paths[path.resolve()] = group
+
+
+def compare(args):
+    paths = corpus_files(args)
+    if args.damage:
+        sys.exit(1 if damage(args, list(paths)) else 0)
+    ours = ours_reads(args.program, list(paths))
     meshes = [p for p in paths if p.suffix.lower() in MESHES]
-    ours = ours_reads(args.program, paths)
-    three = three_reads(work, meshes)
+    three = three_reads(args.work, meshes)
     groups, wrong = {}, []
-    for path in paths:
-        if path.suffix.lower() in MESHES:
+    for path, name in paths.items():
+        ending = path.suffix.lower()
+        if ending in MESHES:
             peers = [trimesh_reads(path), three.get(str(path), {"refused": "three.js gave no answer"})]
+        elif ending in OTHERS:
+            peers = [{"refused": "nobody was asked"}]
         else:
-            peers = [sky_reads(path)]
+            peers = [sky_reads(path) if ending in SKIES else picture_reads(path)]
         opened = [p for p in peers if "refused" not in p]
-        group = groups.setdefault((path.parent.name, path.suffix.lower()), [0, 0, 0, 0])
-        group[0] += 1
-        group[1] += len(opened) == len(peers)
-        group[2] += "refused" not in ours[str(path)]
-        told = differs(ours[str(path)], opened) if opened else ""
-        if told and len(opened) == len(peers):
-            group[3] += 1
-            wrong.append(f"{path}: {told}")
-    rows = sorted(groups.items(), key=lambda g: (-(g[1][3] / g[1][0]), g[0]))
-    table = ["| written by | ending | files | opened by all peers | opened by dpm | of these wrong or refused |",
-             "|---|---|---:|---:|---:|---:|"]
-    table += [f"| {name} | `{ending}` | {n} | {both} | {own} | {bad} |" for (name, ending), (n, both, own, bad) in rows]
-    total = [sum(g[i] for g in groups.values()) for i in range(4)]
-    table.append(f"| all | | {total[0]} | {total[1]} | {total[2]} | {total[3]} |")
-    text = "\n".join(table) + "\n"
-    print(text)
+        one = ours[str(path)]
+        group = groups.setdefault((name, ending), [0] * 7)
+        told = differs(one["read"], opened) if opened else ""
+        is_both = len(opened) == len(peers)
+        wrong += [f"{path}: {told}"] if told and is_both else []
+        found = list(faults(one, path))
+        wrong += found
+        refused = "refused" in one["read"]
+        for i, add in enumerate((1, is_both, not refused, is_both and refused, is_both and told != "", len(found) > 0)):
+            group[i] += add
+        group[6] = max(group[6], one["piece"])
+    table = report(groups)
+    print(table)
     print("\n".join(wrong))
     if args.out:
-        old = args.out.read_text() if args.out.exists() else ""
-        begin, end = "<!-- table -->\n", "<!-- end -->\n"
-        if begin in old and end in old:
-            text = old[: old.index(begin) + len(begin)] + text + old[old.index(end) :]
-        args.out.write_text(text)
+        write_out(args.out, table)
     sys.exit(1 if wrong else 0)
+
+
+def report(groups):
+    rows = sorted(groups.items(), key=lambda g: (-(g[1][4] / g[1][0]), g[0]))
+    total = [sum(g[i] for g in groups.values()) for i in range(6)] + [max(g[6] for g in groups.values())]
+    cells = [(name, f"`{ending}`", row) for (name, ending), row in rows] + [("all", "", total)]
+    table = ["| written by | ending | files | opened by all peers | opened by dpm | refused alone | of these refused or other | faults "
+             "| at once, MiB |", "|---|---|---:|---:|---:|---:|---:|---:|---:|"]
+    table += [f"| {name} | {ending} | {' | '.join(map(str, row[:6]))} | {row[6] / (1 << 20):.1f} |" for name, ending, row in cells]
+    return "\n".join(table) + "\n"
+
+
+def write_out(out, text):
+    """Puts the table where the former one stands."""
+    old = out.read_text() if out.exists() else ""
+    begin, end = "<!-- table -->\n", "<!-- end -->\n"
+    if begin in old and end in old:
+        text = old[: old.index(begin) + len(begin)] + text + old[old.index(end) :]
+    out.write_text(text)
 
 
 def main():
@@ -304,6 +447,9 @@ def main():
     parser.add_argument("--program", type=pathlib.Path, default=ROOT / "target/debug/examples/load_all")
     parser.add_argument("--out", type=pathlib.Path)
     parser.add_argument("--more", type=pathlib.Path, action="append", default=[])
+    parser.add_argument("--only-more", action="store_true", help="leave out what the packages write and have")
+    parser.add_argument("--damage", type=int, default=0, help="read so many damaged files")
+    parser.add_argument("--seed", type=int, default=53)
     parser.add_argument("--inside", action="store_true", help=argparse.SUPPRESS)
     args = parser.parse_args()
     args.work.mkdir(parents=True, exist_ok=True)

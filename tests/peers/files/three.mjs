@@ -1,15 +1,23 @@
 // Reads mesh files with the loaders of three.js, one path a line on standard input; prints an object a line: triangles and
-// sides, or why it cannot. Textures need a browser and are left out.
+// sides, or why it cannot. Files beside a glTF are read from the disk. Textures and Draco need a browser and are left out.
 import { readFileSync } from 'node:fs';
+import { dirname } from 'node:path';
 import { createInterface } from 'node:readline';
 import { Box3, Vector3 } from 'three';
 import { GLTFLoader } from 'three/examples/jsm/loaders/GLTFLoader.js';
 import { OBJLoader } from 'three/examples/jsm/loaders/OBJLoader.js';
 import { PLYLoader } from 'three/examples/jsm/loaders/PLYLoader.js';
+import { MeshoptDecoder } from 'three/examples/jsm/libs/meshopt_decoder.module.js';
 import { STLLoader } from 'three/examples/jsm/loaders/STLLoader.js';
 
 globalThis.self = globalThis;
 globalThis.ProgressEvent ??= class {};
+const DISK = 'http://disk';
+const fetched = globalThis.fetch;
+globalThis.fetch = async (request) => {
+  const url = request.url ?? request;
+  return url.startsWith(DISK) ? new Response(readFileSync(decodeURIComponent(url.slice(DISK.length)))) : fetched(request);
+};
 
 const count = (geometry) => (geometry.index ?? geometry.getAttribute('position')).count / 3;
 
@@ -33,7 +41,9 @@ async function read(path) {
   if (ending === 'stl') return ofGeometry(new STLLoader().parse(buffer));
   if (ending === 'ply') return ofGeometry(new PLYLoader().parse(buffer));
   if (ending === 'obj') return ofObject(new OBJLoader().parse(bytes.toString('utf8')));
-  return ofObject((await new GLTFLoader().parseAsync(ending === 'glb' ? buffer : bytes.toString('utf8'), '')).scene);
+  const loader = new GLTFLoader().setMeshoptDecoder(MeshoptDecoder);
+  const beside = DISK + encodeURI(dirname(path)) + '/';
+  return ofObject((await loader.parseAsync(ending === 'glb' ? buffer : bytes.toString('utf8'), beside)).scene);
 }
 
 for await (const path of createInterface({ input: process.stdin })) {
@@ -41,6 +51,7 @@ for await (const path of createInterface({ input: process.stdin })) {
   try {
     told = await read(path);
     if (!(told.triangles > 0)) told = { refused: 'no triangles' };
+    else if (!told.sides.every(Number.isFinite)) told = { refused: 'coordinates that are no numbers' };
   } catch (e) {
     told = { refused: String(e.message ?? e).slice(0, 200) };
   }

@@ -5,6 +5,7 @@ use std::io::Cursor;
 use image::codecs::png::PngDecoder;
 use image::{AnimationDecoder, ImageDecoder, ImageError};
 
+use super::super::limits::of_header;
 use super::super::{Limits, SceneError, Texture};
 use super::json::Item;
 use super::picture::{check_decoded, check_size, Size};
@@ -28,7 +29,7 @@ pub(super) fn decode(
     if !bytes.starts_with(b"\x89PNG") {
         return Ok(None);
     }
-    let Ok(mut decoder) = PngDecoder::new(Cursor::new(bytes)) else { return Ok(None) };
+    let Ok(mut decoder) = PngDecoder::with_limits(Cursor::new(bytes), of_header()) else { return Ok(None) };
     if !decoder.is_apng().map_err(failed)? {
         return Ok(None);
     }

@@ -283,15 +283,16 @@ fn base64(text: &[u8]) -> Result<Vec<u8>, SceneError> {
     Ok(out)
 }
 
-/// Loads every buffer of the document, each cut to its declared length; together at most `limits.bytes`.
+/// Loads every buffer of the document, each cut to its declared length; together at most `limits.bytes`. Also gives the bytes
+/// of those that lie in other files.
 pub(crate) fn load_buffers(
     root: &Item,
     binary: Option<Vec<u8>>,
     folder: Option<&Folder>,
     limits: &Limits,
-) -> Result<Vec<Vec<u8>>, SceneError> {
+) -> Result<(Vec<Vec<u8>>, u64), SceneError> {
     let mut binary = binary;
-    let mut total = 0u64;
+    let (mut total, mut of_others) = (0u64, 0);
     let mut out = vec![];
     for (i, buffer) in root.list("buffers", "buffer", limits.objects)?.iter().enumerate() {
         if is_placeholder(buffer)? {
@@ -307,7 +308,11 @@ pub(crate) fn load_buffers(
             "simplify the scene",
         )?;
         let mut bytes = match buffer.text("uri")? {
-            Some(uri) => fetch(uri, folder, limits.bytes).map_err(|e| buffer.error(e.to_string()))?,
+            Some(uri) => {
+                let fetched = fetch(uri, folder, limits.bytes).map_err(|e| buffer.error(e.to_string()))?;
+                of_others += if uri.starts_with("data:") { 0 } else { fetched.len() as u64 };
+                fetched
+            }
             None if i == 0 && binary.is_some() => binary.take().unwrap_or_default(),
             None => return Err(buffer.error("has neither a 'uri' nor a binary chunk in this file")),
         };
@@ -320,7 +325,7 @@ pub(crate) fn load_buffers(
         bytes.truncate(promised as usize);
         out.push(bytes);
     }
-    Ok(out)
+    Ok((out, of_others))
 }
 
 #[cfg(test)]

@@ -11,7 +11,7 @@ use std::sync::Arc;
 use glam::{DAffine3, DMat3, DMat4, DVec3, Vec3};
 
 use super::super::limits::Cancel;
-use super::super::mesh::DropCounts;
+use super::super::mesh::{DropCounts, MAX_COORDINATE_M};
 use super::super::part_motion::{Link, NodeMotion, PartMotion, Track};
 use super::super::{
     Body, DeformingMesh, Limits, LoadOptions, PunctualKind, PunctualLight, SceneError, TriangleMesh,
@@ -199,6 +199,15 @@ impl<'a> Gatherer<'a> {
         let document = self.source.document;
         self.at_rest = AtRest::of(self.source, &claim_of);
         let world = self.source.world;
+        let away = self.far_offset(&claim_of);
+        if away != DVec3::ZERO {
+            warnings.push(format!(
+                "its bodies lie {:.0} km from the origin: all are moved by as much, which puts body '{}' there",
+                1e-3 * away.length(),
+                claims.bodies[0].name
+            ));
+        }
+        let world = DAffine3::from_translation(-away) * world;
         let group = Group { claim: None, is_virtual: false, part: None, deforming: None };
         let mut walk: Vec<Step> = roots(document)
             .into_iter()
@@ -278,6 +287,32 @@ impl<'a> Gatherer<'a> {
             Group { claim: Some(c), .. } => self.rest[c].inverse() * *world,
             Group { claim: None, .. } => *world,
         }
+    }
+
+    /// Where the first body's node lies, if no room reaches as far: a place on the globe. Zero for a scene with skins, whose joints
+    /// may stand anywhere.
+    fn far_offset(&self, claim_of: &HashMap<usize, usize>) -> DVec3 {
+        let document = self.source.document;
+        let has_skin = |node: gltf::Node| {
+            node.mesh()
+                .is_some_and(|mesh| self.source.deformations.skin(node.index(), mesh.index()).is_some())
+        };
+        if document.nodes().any(has_skin) {
+            return DVec3::ZERO;
+        }
+        let mut walk: Vec<(usize, DAffine3)> =
+            roots(document).into_iter().map(|node| (node, self.source.world)).collect();
+        while let Some((index, world)) = walk.pop() {
+            let Some(node) = document.nodes().nth(index) else { continue };
+            let world = world * local_transform(&node, self.source.animation.nodes.get(&index));
+            if claim_of.get(&index) == Some(&0) {
+                let at = world.translation;
+                let is_far = at.is_finite() && at.abs().max_element() >= f64::from(MAX_COORDINATE_M);
+                return if is_far { at } else { DVec3::ZERO };
+            }
+            walk.extend(node.children().map(|child| (child.index(), world)));
+        }
+        DVec3::ZERO
     }
 
     /// World-from-body at rest of claim `c`, whose node is at `world`.
@@ -547,9 +582,7 @@ fn rigid_part(map: &DAffine3) -> Option<DAffine3> {
     let y = (map.matrix3.y_axis - x * x.dot(map.matrix3.y_axis)).normalize();
     let rotation = DMat3::from_cols(x, y, x.cross(y));
     let rigid = DAffine3 { matrix3: rotation, translation: map.translation };
-    (rigid.is_finite()
-        && map.translation.abs().max_element() < f64::from(super::super::mesh::MAX_COORDINATE_M))
-    .then_some(rigid)
+    (rigid.is_finite() && map.translation.abs().max_element() < f64::from(MAX_COORDINATE_M)).then_some(rigid)
 }
 
 /// A light in the space of its body; `None` if its position is not finite.

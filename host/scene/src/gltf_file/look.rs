@@ -259,6 +259,12 @@ impl Reader<'_> {
                     self.image_items[image].name
                 ));
             }
+            if let Some((kept, stored)) = decoded.as_ref().and_then(|d| Some((d.size, d.stored?))) {
+                warnings.push(format!(
+                    "{}: it is read with {} x {} of its {} x {} texels, as many as so short a file may take",
+                    self.image_items[image].name, kept.width, kept.height, stored.width, stored.height
+                ));
+            }
             self.images.insert(image, decoded);
         }
         Ok(image)

@@ -83,13 +83,17 @@ pub(super) fn read(
     let container::Container { root: mut tree, binary, told } = container::split(bytes, limits)?;
     let root = Item::new(&tree, "document".into())?;
     check::check_asset(&root)?;
-    let mut buffers = container::load_buffers(&root, binary, folder.as_ref(), limits)?;
+    let (mut buffers, of_others) = container::load_buffers(&root, binary, folder.as_ref(), limits)?;
     compressed::decompress(&mut tree, &mut buffers, limits, cancel)?;
     ktx2_image::make_plain(&mut tree, limits)?;
     let root = Item::new(&tree, "document".into())?;
     let all_bytes = bytes.len() + buffers.iter().map(Vec::len).sum::<usize>();
     // Of a document that was made from another file, that file counts.
-    let limits = &limits.of_file(if limits.file_bytes > 0 { limits.file_bytes } else { all_bytes as u64 });
+    let limits = &match limits.file_bytes {
+        // What is unpacked allows triangles, but no picture.
+        0 => Limits { file_bytes: bytes.len() as u64 + of_others, ..limits.of_file(all_bytes as u64) },
+        of_source => limits.of_file(of_source),
+    };
     let data = accessor::Data::new(&root, buffers, limits)?;
     let check::CheckResults { mut warnings, instances } = check::check(&root, &data, limits)?;
     warnings.extend(told);

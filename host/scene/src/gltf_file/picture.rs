@@ -5,7 +5,7 @@ use std::io::Cursor;
 
 use image::{ImageFormat, ImageReader};
 
-use super::super::limits::largest_piece;
+use super::super::limits::{largest_piece, of_header, of_picture};
 use super::super::{Limits, SceneError};
 use super::json::Item;
 use super::ktx2_image;
@@ -38,6 +38,8 @@ pub(super) struct Picture {
     pub red_green_only: bool,
     /// Some of its numbers lay outside of 0 to 1 and were cut off there.
     pub cut_off: bool,
+    /// The sides in the file, of which means are read, because all texels would take more than so short a file may.
+    pub stored: Option<Size>,
 }
 
 impl Picture {
@@ -68,24 +70,78 @@ pub(super) fn decode(
         return ktx2_image::decode(item, bytes, texels_so_far, limits);
     }
     let format = format_of(item, bytes, name)?;
-    let reader = || ImageReader::with_format(Cursor::new(bytes), format);
+    if format == ImageFormat::Tiff && is_tiled_in_planes(bytes) {
+        return Err(item.error("is a TIFF with tiles in planes of colours: save it with strips, or as PNG"));
+    }
+    let mut reader = ImageReader::with_format(Cursor::new(bytes), format);
+    reader.limits(of_header());
     let failed = |e: image::ImageError| item.error(format!("cannot be decoded: {e}"));
-    let decoder = reader().into_decoder().map_err(failed)?;
+    let decoder = reader.into_decoder().map_err(failed)?;
     let (width, height) = image::ImageDecoder::dimensions(&decoder);
     let size = Size { width, height };
     check_size(item, size, texels_so_far, limits)?;
-    let decoded = image::ImageDecoder::total_bytes(&decoder).max(4 * size.texels() as u64);
-    check_decoded(item, bytes, decoded, limits)?;
-    let mut bounded = reader();
-    let mut memory = image::Limits::default();
-    memory.max_image_width = Some(width);
-    memory.max_image_height = Some(height);
-    // 16-bit RGBA is the widest decoded format; the rest is room for the decoder's own tables.
-    memory.max_alloc = Some(u64::from(width) * u64::from(height) * 8 + (16 << 20));
-    bounded.limits(memory);
-    let rgba = bounded.decode().map_err(failed)?.into_rgba8();
-    let texels = rgba.as_raw().chunks_exact(4).map(|c| [c[0], c[1], c[2], c[3]]).collect();
-    Ok(Picture { size, texels, srgb: None, red_green_only: false, cut_off: false })
+    check_decoded(item, bytes, image::ImageDecoder::total_bytes(&decoder), limits)?;
+    let mut bounded = ImageReader::with_format(Cursor::new(bytes), format);
+    // 16-bit RGBA is the widest decoded format.
+    bounded.limits(of_picture(format, [width, height], 8, allowed(bytes, limits)));
+    // A decoder that panics leaves its picture out, and not the scene.
+    let decode = std::panic::AssertUnwindSafe(|| bounded.decode());
+    let decoded = std::panic::catch_unwind(decode)
+        .map_err(|_| item.error("cannot be decoded: its decoder failed; save it as PNG"))?
+        .map_err(failed)?;
+    let (kept, texels) = as_rgba(decoded, allowed(bytes, limits));
+    let stored = (kept.texels() < size.texels()).then_some(size);
+    Ok(Picture { size: kept, texels, srgb: None, red_green_only: false, cut_off: false, stored })
+}
+
+/// The texels of a decoded picture, or the means of squares of them, of which all fit into `allowed` bytes.
+fn as_rgba(decoded: image::DynamicImage, allowed: u64) -> (Size, Vec<[u8; 4]>) {
+    use image::GenericImageView;
+    let (width, height) = decoded.dimensions();
+    let bytes = |step: u32| 4 * u64::from(width.div_ceil(step)) * u64::from(height.div_ceil(step));
+    let step = (1..).find(|step| bytes(*step) <= allowed).unwrap_or(1);
+    if step == 1 {
+        let rgba = decoded.into_rgba8();
+        let texels = rgba.as_raw().chunks_exact(4).map(|c| [c[0], c[1], c[2], c[3]]).collect();
+        return (Size { width, height }, texels);
+    }
+    let size = Size { width: width.div_ceil(step), height: height.div_ceil(step) };
+    let mut texels = Vec::with_capacity(size.texels());
+    for (top, left) in (0..height)
+        .step_by(step as usize)
+        .flat_map(|y| (0..width).step_by(step as usize).map(move |x| (y, x)))
+    {
+        let (down, across) = (top..height.min(top + step), left..width.min(left + step));
+        let count = (down.len() * across.len()) as u32;
+        let mut sum = [0; 4];
+        for (y, x) in down.flat_map(|y| across.clone().map(move |x| (y, x))) {
+            let of = decoded.get_pixel(x, y).0;
+            sum.iter_mut().zip(of).for_each(|(sum, code)| *sum += u32::from(code));
+        }
+        texels.push(sum.map(|sum| ((sum + count / 2) / count) as u8));
+    }
+    (size, texels)
+}
+
+/// Whether a TIFF stores tiles of one colour each, which the decoder does not survive.
+fn is_tiled_in_planes(bytes: &[u8]) -> bool {
+    let is_big = bytes.starts_with(b"MM");
+    let number = |at: usize, length: usize| {
+        let of = bytes.get(at..at + length)?.iter();
+        let add = |sum: usize, byte: &u8| sum << 8 | usize::from(*byte);
+        Some(if is_big { of.fold(0, add) } else { of.rev().fold(0, add) })
+    };
+    let entries = || {
+        let begin = number(4, 4)?;
+        let count = number(begin, 2)?;
+        Some((0..count).map(move |i| begin + 2 + 12 * i))
+    };
+    let value = |wanted: usize| {
+        let at = entries()?.find(|at| number(*at, 2) == Some(wanted))?;
+        number(at + 8, 2)
+    };
+    // PlanarConfiguration, TileWidth.
+    value(284) == Some(2) && value(322).is_some()
 }
 
 /// The format of an image by its first bytes. TGA has none of its own: its header, its last bytes or its name show it.
@@ -118,9 +174,16 @@ pub(super) fn check(item: &Item, bytes: &[u8], name: &str, limits: &Limits) -> R
         return Ok(());
     }
     let format = format_of(item, bytes, name)?;
-    let sides = ImageReader::with_format(Cursor::new(bytes), format).into_dimensions();
-    let (width, height) = sides.map_err(|e| item.error(format!("cannot be decoded: {e}")))?;
+    let mut reader = ImageReader::with_format(Cursor::new(bytes), format);
+    reader.limits(of_header());
+    let (width, height) =
+        reader.into_dimensions().map_err(|e| item.error(format!("cannot be decoded: {e}")))?;
     check_size(item, Size { width, height }, 0, limits)
+}
+
+/// Bytes that one piece of memory may have for a picture of `bytes`, or for the scene that it is of.
+fn allowed(bytes: &[u8], limits: &Limits) -> u64 {
+    largest_piece(limits.file_bytes.max(bytes.len() as u64))
 }
 
 /// Refuses a picture that takes more bytes than the length of its file allows.
@@ -133,7 +196,7 @@ pub(super) fn check_decoded(
     SceneError::check_limit(
         &format!("the bytes of {} in so short a file", item.name),
         decoded,
-        largest_piece(limits.file_bytes.max(bytes.len() as u64)),
+        allowed(bytes, limits),
         "use a smaller texture",
     )
 }

@@ -2,6 +2,7 @@
 //! format.
 
 use serde_json::{json, Value};
+use std::collections::BTreeMap;
 
 /// Triangles of one material.
 #[derive(Clone, Debug, Default, PartialEq)]
@@ -87,6 +88,26 @@ impl Document {
             }
         }
         (low[0] <= high[0]).then_some((low, high))
+    }
+
+    /// Makes one object of all, and one part of all triangles of a material.
+    pub(super) fn join(&mut self, name: String) {
+        self.warnings.push(format!("the file has {} objects; all are read as one", self.objects.len()));
+        let mut joined: BTreeMap<(Option<usize>, [bool; 3]), Part> = BTreeMap::new();
+        for part in self.objects.drain(..).flat_map(|object| object.parts) {
+            // What a part lacks has no value that would stand for it.
+            let has =
+                [part.normals.is_empty(), part.uvs.is_empty(), part.colours.is_empty()].map(|empty| !empty);
+            let to = joined.entry((part.material, has)).or_default();
+            let first = to.positions.len() as u32;
+            to.material = part.material;
+            to.triangles.extend(part.triangles.iter().map(|corners| corners.map(|corner| first + corner)));
+            to.positions.extend(part.positions);
+            to.normals.extend(part.normals);
+            to.uvs.extend(part.uvs);
+            to.colours.extend(part.colours);
+        }
+        self.objects = vec![Object { name, parts: joined.into_values().collect() }];
     }
 
     /// Scanners write the same colours twice, as a texture and at vertices, and no format but glTF says that one multiplies the other:

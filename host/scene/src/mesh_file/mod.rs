@@ -23,8 +23,8 @@ use super::srgb::to_linear;
 use super::{LoadOptions, Scene, SceneError};
 use document::Document;
 
-/// Most objects that stay apart: beyond, all are one.
-const MAX_OBJECTS: usize = 10_000;
+/// Most parts of objects, one for each material, that stay apart: beyond, all objects are one.
+const MAX_PARTS: usize = 10_000;
 
 /// A format of meshes.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -98,11 +98,8 @@ pub(super) fn read(
         MeshFormat::Ply => ply::read(bytes, &name, beside, limits, cancel)?,
         MeshFormat::Stl => stl::read(bytes, &name, limits, cancel)?,
     };
-    if document.objects.len() > MAX_OBJECTS {
-        let told = format!("the file has {} objects; all are read as one", document.objects.len());
-        document.warnings.push(told);
-        let parts = document.objects.drain(..).flat_map(|object| object.parts).collect();
-        document.objects = vec![document::Object { name, parts }];
+    if document.objects.iter().map(|object| object.parts.len()).sum::<usize>() > MAX_PARTS {
+        document.join(name);
     }
     document.drop_colours_beside_textures();
     let (axes, told) = units::axes(&document, format, options);

@@ -5,11 +5,13 @@ use crate::gltf_file;
 use crate::limits::Limits;
 use crate::SceneError;
 use serde_json::{json, Value};
-use std::collections::{BTreeMap, BTreeSet};
+use std::collections::{BTreeMap, BTreeSet, HashMap};
 use std::path::Path;
 
 /// Names that a message shows.
 const SHOWN: usize = 8;
+/// Files of materials, and pictures, that are looked for: each name costs a look into a folder.
+const MOST_FILES: usize = 4096;
 
 /// A matt material of full albedo on both sides.
 pub(super) fn plain(name: &str) -> Value {
@@ -91,6 +93,10 @@ impl Look {
 pub(super) struct Library {
     looks: Vec<Look>,
     numbers: BTreeMap<String, usize>,
+    /// Names without capitals, with the only name that has these letters; `None` if there are several.
+    alike: HashMap<String, Option<String>>,
+    /// Names of files that were looked for.
+    files: BTreeSet<String>,
     /// URIs of pictures with their numbers; `None` for those that cannot be read.
     pictures: BTreeMap<String, Option<usize>>,
     /// URIs in the order of their numbers.
@@ -115,12 +121,28 @@ impl Library {
         limits: &Limits,
     ) -> Result<(), SceneError> {
         let fetch = |name: &str| gltf_file::fetch_beside(&uri_of(name), beside, limits.json_bytes);
+        if !self.is_new(names)? {
+            return Ok(());
+        }
         let several: Vec<&str> = names.split_ascii_whitespace().collect();
         let whole = fetch(names);
         if several.len() < 2 || whole.is_ok() {
             return self.add_file(names, whole, beside, limits);
         }
-        several.into_iter().take(64).try_for_each(|name| self.add_file(name, fetch(name), beside, limits))
+        for name in several.into_iter().take(64) {
+            if self.is_new(name)? {
+                self.add_file(name, fetch(name), beside, limits)?;
+            }
+        }
+        Ok(())
+    }
+
+    /// Whether a file of materials was not looked for before.
+    fn is_new(&mut self, name: &str) -> Result<bool, SceneError> {
+        let is_new = self.files.insert(name.to_owned());
+        let (count, most) = (self.files.len() as u64, MOST_FILES as u64);
+        SceneError::check_limit("the number of files of materials", count, most, "name one file")?;
+        Ok(is_new)
     }
 
     fn add_file(
@@ -148,9 +170,8 @@ impl Library {
         if let Some(&number) = self.numbers.get(name) {
             return number;
         }
-        let mut near = self.numbers.iter().filter(|(known, _)| known.to_lowercase() == name.to_lowercase());
-        if let (Some((_, &number)), None) = (near.next(), near.next()) {
-            return number;
+        if let Some(Some(near)) = self.alike.get(&name.to_lowercase()) {
+            return self.numbers[near];
         }
         self.undeclared.insert(name.to_owned());
         self.declare(name)
@@ -165,6 +186,10 @@ impl Library {
         self.looks.push(Look::new(name));
         let number = self.looks.len() - 1;
         self.numbers.insert(name.to_owned(), number);
+        let only = self.alike.entry(name.to_lowercase()).or_insert_with(|| Some(name.to_owned()));
+        if only.as_deref() != Some(name) {
+            *only = None;
+        }
         number
     }
 
@@ -259,6 +284,9 @@ impl Library {
         };
         let uri = uri_of(name);
         if !self.pictures.contains_key(&uri) {
+            if self.pictures.len() == MOST_FILES {
+                return *self.ignored.entry("maps beyond the 4096th").or_default() += 1;
+            }
             let made = match picture(&uri, beside, limits) {
                 Ok(()) => {
                     self.uris.push(uri.clone());
@@ -276,9 +304,9 @@ impl Library {
         *[&mut look.map, &mut look.emissive_map, &mut look.normal_map][slot] = picture;
     }
 
-    /// The materials as JSON of glTF.
-    pub(super) fn materials(&self) -> Vec<Value> {
-        self.looks.iter().map(Look::to_gltf).collect()
+    /// The materials of these numbers as JSON of glTF.
+    pub(super) fn materials(&self, numbers: &BTreeSet<usize>) -> Vec<Value> {
+        numbers.iter().map(|number| self.looks[*number].to_gltf()).collect()
     }
 
     /// What is not reproduced, each kind once.

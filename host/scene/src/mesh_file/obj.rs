@@ -6,11 +6,13 @@ use super::ply::add_fan;
 use super::{far, linear, lines, numbers};
 use crate::limits::{Cancel, Limits};
 use crate::SceneError;
-use std::collections::{BTreeMap, HashMap};
+use std::collections::{BTreeMap, BTreeSet, HashMap};
 use std::path::Path;
 
 /// Number of a list's member that a corner does not name.
 const NONE: u32 = u32::MAX;
+/// Materials that faces may use: each costs some kilobytes.
+const MOST_MATERIALS: u64 = 10_000;
 
 /// A corner of a face: numbers of its position, texture coordinates and normal, or [`NONE`].
 type Corner = [u32; 3];
@@ -278,7 +280,7 @@ impl Reader<'_> {
             Object { name, parts: parts.collect() }
         });
         let has_triangles = |object: &Object| object.parts.iter().any(|part| !part.triangles.is_empty());
-        let objects: Vec<Object> = objects.filter(has_triangles).collect();
+        let mut objects: Vec<Object> = objects.filter(has_triangles).collect();
         for (count, what) in [
             (lost.faces, "faces name vertices that are not there"),
             (lost.uvs, "corners name texture coordinates that are not there"),
@@ -304,9 +306,27 @@ impl Reader<'_> {
                 self.ignored.iter().map(|(what, times)| format!("{what} ({times} times)")).collect();
             warnings.push(format!("the file has what reflects no light: {}", all.join(", ")));
         }
-        let materials = self.library.materials();
+        let materials = self.library.materials(&keep_used(&mut objects)?);
         Ok(Document { objects, materials, textures: self.library.uris, offset, warnings })
     }
+}
+
+/// The materials that parts use, by their numbers in the library; the parts name them by their places among these then.
+fn keep_used(objects: &mut [Object]) -> Result<BTreeSet<usize>, SceneError> {
+    let parts = || objects.iter().flat_map(|object| &object.parts);
+    let used: BTreeSet<usize> = parts().filter_map(|part| part.material).collect();
+    SceneError::check_limit(
+        "the number of materials that faces use",
+        used.len() as u64,
+        MOST_MATERIALS,
+        "merge materials",
+    )?;
+    let places: BTreeMap<usize, usize> =
+        used.iter().enumerate().map(|(place, number)| (*number, place)).collect();
+    for part in objects.iter_mut().flat_map(|object| &mut object.parts) {
+        part.material = part.material.map(|number| places[&number]);
+    }
+    Ok(used)
 }
 
 /// `1`, `1/2`, `1//3` or `1/2/3`; numbers below zero count from the end of their list. `None` if it is none of these. What it

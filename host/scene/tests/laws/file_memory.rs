@@ -60,6 +60,30 @@ fn radiance(width: usize, height: usize) -> Vec<u8> {
     out
 }
 
+/// A PNG of one texel whose profile of colours unpacks to 200 MB.
+fn png_with_long_profile() -> Vec<u8> {
+    let mut packed = ZlibEncoder::new(vec![], Compression::best());
+    packed.write_all(&vec![0; 200_000_000]).unwrap();
+    let content = [b"iCCPa\0\0".to_vec(), packed.finish().unwrap()].concat();
+    let mut crc = flate2::Crc::new();
+    crc.update(&content);
+    let chunk = [&(content.len() as u32 - 4).to_be_bytes()[..], &content, &crc.sum().to_be_bytes()].concat();
+    let whole = png(1, 1, false);
+    // Behind the signature and the header.
+    [&whole[..33], &chunk, &whole[33..]].concat()
+}
+
+/// A black and white BMP, of which a texel is a bit.
+fn bmp_of_bits(side: u32) -> Vec<u8> {
+    let rows = vec![0; (side.div_ceil(32) * 4 * side) as usize];
+    let mut out = b"BM".to_vec();
+    for number in [62 + rows.len() as u32, 0, 62, 40, side, side, 1 | 1 << 16, 0, 0, 1, 1, 2, 0, 0, u32::MAX]
+    {
+        out.extend(number.to_le_bytes());
+    }
+    [out, rows].concat()
+}
+
 /// Files that promise much in few bytes.
 fn bombs() -> Vec<(&'static str, Vec<u8>)> {
     let text = |text: String| text.into_bytes();
@@ -111,7 +135,35 @@ fn bombs() -> Vec<(&'static str, Vec<u8>)> {
         ),
         ("YAML of rows", text(format!("%YAML:1.0\nK: [{}0]\n", "0,".repeat(400_000)))),
         ("glTF with a picture of 8192 x 4096", with_image(&png(8192, 4096, false)).bytes()),
+        ("PNG with a long profile", png_with_long_profile()),
+        ("glTF with a long profile", with_image(&png_with_long_profile()).bytes()),
+        ("glTF with a BMP of bits", with_image(&bmp_of_bits(7000)).bytes()),
+        ("STL of solids", STL_SOLID.repeat(20_000)),
     ]
+}
+
+const STL_SOLID: &[u8] =
+    b"solid a\nfacet normal 0 0 1\nouter loop\nvertex 0 0 0\nvertex 1 0 0\nvertex 0 1 0\nendloop\nendfacet\nendsolid\n";
+
+/// Names cost a look into those before, parts an accessor and a node: none of it may grow with their square.
+#[test]
+fn a_hundred_thousand_names_and_parts_are_read_in_a_moment_or_refused() {
+    let corners = "v 0 0 0\nv 1 0 0\nv 0 1 0\n".to_owned();
+    let many = |line: &dyn Fn(usize) -> String| (0..100_000).map(line).collect::<String>();
+    let materials = corners.clone() + &many(&|i| format!("usemtl M{i}\nf 1 2 3\n"));
+    let objects = corners.clone() + &many(&|i| format!("o b{i}\nf 1 2 3\n"));
+    let libraries = corners + "f 1 2 3\n" + &many(&|i| format!("mtllib c{i}.mtl\n"));
+    let begin = std::time::Instant::now();
+    let load = |text: String| load_mesh_here(text.as_bytes(), MeshFormat::Obj, &LoadOptions::default());
+    let told = load(materials).unwrap_err().to_string();
+    assert!(told.contains("materials that faces use comes to 100000"), "{told}");
+    let told = load(libraries).unwrap_err().to_string();
+    assert!(told.contains("files of materials"), "{told}");
+    let scene = load(objects).unwrap();
+    let triangles: usize = scene.bodies.iter().map(|b| b.mesh.triangles.len()).sum();
+    assert!(triangles == 100_000 && scene.warnings.join("").contains("100000 objects"), "{triangles}");
+    // Some three seconds without optimisation; with their square it was half a minute with it.
+    assert!(begin.elapsed().as_secs() < 60, "{:?}", begin.elapsed());
 }
 
 #[test]

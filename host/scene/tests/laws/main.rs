@@ -11,4 +11,5 @@ mod gltf_scenes;
 mod ktx2_formats;
 mod ktx2_textures;
 mod mutated_gltf;
+mod odd_gltf;
 mod opencv_lens;

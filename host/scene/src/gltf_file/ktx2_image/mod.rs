@@ -115,6 +115,7 @@ pub(super) fn decode(
         srgb,
         red_green_only: stored.channels == 2 && as_stored,
         cut_off: stored.cut_off,
+        stored: None,
     })
 }
 
