@@ -73,12 +73,28 @@ fn every_dialect_gives_the_same_projector() {
         let rvec = "rvec:\n- - -2.9181157\n- - 0.0\n- - 0.0\n";
         format!("{mtx}{}{rvec}{}", by_line("dist", lens), by_line("tvec", T))
     };
+    // Its keys are sorted, so that the numbers stand before the rows: line by line, or in brackets.
+    let sorted = |name: &str, rows: usize, cols: usize, data: &str| {
+        let numbers = match cols {
+            1 => format!("data: [{data}]"),
+            _ => "data:\n".to_owned() + &data.split(", ").map(|v| format!("  - {v}\n")).collect::<String>(),
+        };
+        format!("{name}:\n  cols: {cols}\n  {}\n  rows: {rows}\n", numbers.trim_end())
+    };
+    let ros_by_pyyaml = format!(
+        "{}{}distortion_model: plumb_bob\nimage_height: 768\nimage_width: 1024\n{}{}",
+        sorted("camera_matrix", 3, 3, K),
+        sorted("distortion_coefficients", 1, 5, lens),
+        sorted("R", 3, 3, R),
+        sorted("T", 3, 1, T),
+    );
     let map = |text: &str| text.replace("POSE", POSE);
     let files: Vec<(&str, String)> = vec![
         ("OpenCV flat", format!("%YAML:1.0\n{k}{}{r}{t}", matrix("D", (1, 5), lens))),
         ("nested JSON", map(nested)),
         ("camera_info", ros2),
         ("PyYAML", pyyaml),
+        ("camera_info by PyYAML", ros_by_pyyaml),
         (
             "kalibr",
             "cam0:\n  camera_model: pinhole\n  intrinsics: [1500.0, 1500.0, 512.0, 700.0]\n  distortion_model: radtan\n  \

@@ -62,6 +62,15 @@ impl Entries {
         }
     }
 
+    /// The numbers of a matrix that stands alone in its section, which are no entry any more.
+    pub(super) fn take_matrix(&mut self, section: &str, name: &str) -> Option<Vec<f64>> {
+        let inside = self.sections.get(section)?;
+        let (1, Some(Entry::Matrix(matrix))) = (inside.len(), inside.get(name)) else { return None };
+        let data = matrix.data.clone();
+        self.sections.remove(section);
+        Some(data)
+    }
+
     /// A list of lists of numbers; rows of different lengths are no matrix.
     pub(super) fn list(rows: Vec<Vec<f64>>) -> Entry {
         let columns = rows.first().map_or(0, Vec::len);

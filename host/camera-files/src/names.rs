@@ -198,7 +198,7 @@ fn role(plain: &str) -> Option<Role> {
         "imageheight" | "height" | "imagesizeheight" | "imgheight" | "screenheight" | "screenresy"
         | "resolutiony" | "resy" | "yres" | "yresolution" | "rasterheight" | "h" => Role::Height,
         "resolution" | "imagesize" | "size" | "imgsize" | "rastersize" | "screenresolution"
-        | "screensize" | "imageresolution" | "res" => Role::Size,
+        | "screensize" | "imageresolution" | "res" | "raster" | "dimensions" => Role::Size,
         "shape" | "imageshape" | "imgshape" => Role::Shape,
         "fisheyemodel" | "distortionmodel" | "cameramodel" | "lensmodel" | "cameratype" => Role::LensModel,
         "e"

@@ -235,8 +235,13 @@ fn close<'a>(open: &mut Vec<Open<'a>>, found: &mut Entries) -> Result<(), Storag
         found.add(&section, name, sequence.entry());
         return Ok(());
     }
-    // A section that counts rows and columns without being a matrix.
     let inside = inner(&section, name)?;
+    // PyYAML sorts the keys, so that the numbers stand before the rows.
+    if let (Some(_), Some(_), Some(data)) = (parts.rows, parts.columns, found.take_matrix(&inside, "data")) {
+        found.add(&section, name, Entry::Matrix(parts.matrix_of(name, data)?));
+        return Ok(());
+    }
+    // A section that counts rows and columns without being a matrix.
     for (key, word) in [("rows", parts.rows), ("cols", parts.columns), ("dt", parts.kind)] {
         if let Some(word) = word {
             found.add(&inside, key, Entries::word(word));

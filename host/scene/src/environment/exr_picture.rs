@@ -37,9 +37,41 @@ fn failed(e: exr::error::Error) -> SceneError {
     SceneError::broken("image", format!("cannot be decoded: {e}"))
 }
 
+/// The file without an attribute `type` that contradicts the bits of its version, which alone count in a file of one part.
+/// `None`: there is none, or the header cannot be followed, which the reader says.
+fn without_false_kind(bytes: &[u8]) -> Option<Vec<u8>> {
+    const TILED: u8 = 2;
+    const DEEP_OR_PARTS: u8 = 0x18;
+    let bits = *bytes.get(5)?;
+    let kind: &[u8] = if bits & TILED != 0 { b"tiledimage" } else { b"scanlineimage" };
+    let mut at = 8usize;
+    while bits & DEEP_OR_PARTS == 0 {
+        let text = |at: usize| bytes.get(at..)?.iter().take(256).position(|b| *b == 0);
+        let name = at..at + text(at)?;
+        if name.is_empty() {
+            return None;
+        }
+        let size_at = name.end + 1 + text(name.end + 1)? + 1;
+        let size = u32::from_le_bytes(bytes.get(size_at..size_at + 4)?.try_into().ok()?) as usize;
+        at = (size_at + 4).checked_add(size)?;
+        if &bytes[name.clone()] == b"type" {
+            let is_true =
+                bytes.get(size_at + 4..at)?.strip_suffix(b"\0").unwrap_or(&bytes[size_at + 4..at]) == kind;
+            return (!is_true).then(|| {
+                let mut mended = bytes.to_vec();
+                mended[name].copy_from_slice(b"told");
+                mended
+            });
+        }
+    }
+    None
+}
+
 /// Reads a picture; its sides are checked before its texels are.
 pub(super) fn read_exr(bytes: &[u8]) -> Result<Read, SceneError> {
     let file_bytes = bytes.len();
+    let mended = without_false_kind(bytes);
+    let bytes = mended.as_deref().unwrap_or(bytes);
     let coarse = subsampled::without_subsampling(bytes);
     let bytes = coarse.as_ref().map_or(bytes, |(whole, _)| whole);
     let meta = exr::meta::MetaData::read_from_buffered(Cursor::new(bytes), false).map_err(failed)?;
@@ -288,6 +320,23 @@ mod tests {
             [[4.0, 2.0, 0.5], [70_000.0, 3.0, 1.0], [0.25, 0.0, 0.0], [10.0, 9.0, 8.0]].map(Vec3::from_array);
         assert_eq!((width, height, texels.as_slice()), (2, 2, &expected[..]));
         decode_environment(&small(), 0.0, 1.0).unwrap();
+    }
+
+    #[test]
+    fn a_kind_that_contradicts_the_version_does_not_count() {
+        let plain = small();
+        // Two rows of six numbers, with eight bytes in front of each; their offsets stand before them.
+        let table = plain.len() - 2 * (8 + 24) - 16;
+        for kind in ["scanlineimage", "tiledimage", "deepscanline", "deeptile"] {
+            let told = [b"type\0string\0", &(kind.len() as u32).to_le_bytes()[..], kind.as_bytes()].concat();
+            let mut bytes = [&plain[..8], &told, &plain[8..]].concat();
+            for offset in bytes[table + told.len()..][..16].chunks_exact_mut(8) {
+                let moved = u64::from_le_bytes(offset.try_into().unwrap()) + told.len() as u64;
+                offset.copy_from_slice(&moved.to_le_bytes());
+            }
+            let read = read_exr(&bytes).unwrap();
+            assert_eq!(read.texels, read_exr(&plain).unwrap().texels, "{kind}");
+        }
     }
 
     #[test]
