@@ -209,6 +209,8 @@ layout(constant_id = 40) const bool HAS_IRIDESCENCE = true;
 layout(constant_id = 41) const bool HAS_DIFFUSE_TRANSMISSION = true;
 // A solid of the scene refracts colours differently.
 layout(constant_id = 42) const bool HAS_DISPERSION = true;
+// Bits below the parts of a halftone, which are shown once. Above 0, the pass `warp` cuts code values into levels.
+layout(constant_id = 43) const uint HALFTONE_LOW = 0u;
 
 struct Frame {
     vec3 projector_position;

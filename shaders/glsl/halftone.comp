@@ -6,19 +6,16 @@
 #extension GL_GOOGLE_include_directive : require
 #extension GL_EXT_scalar_block_layout : require
 #include "scene.glsl"
+#include "halftone.glsl"
 
 layout(local_size_x = 8, local_size_y = 8) in;
 
 layout(set = 0, binding = B_CODES, scalar) buffer Codes { uint codes[]; };
-layout(set = 0, binding = B_NOISE, scalar) readonly buffer Noise { uint noise_bytes[]; };
 layout(set = 0, binding = B_TILES, scalar) readonly buffer Tiles { uint tiles[]; };
 layout(set = 0, binding = B_MOVERS, scalar) readonly buffer Movers { Mover movers[]; };
 
 shared uint keys[64];
 shared uint rests;
-
-// What the parts of a channel add up to at full light.
-const uint MOST = HALFTONE_PARTS * ((1u << HALFTONE_DEPTH) - 1u);
 
 // A pixel's place on the blue noise. It is fixed to the body that the pixel shows, where that moves: so the values of a surface point are those
 // that follow one another in time.
@@ -28,44 +25,6 @@ uvec2 place_of(uvec2 pixel, uint index) {
     uint mover = id == NO_HIT ? 0u : instance_at(id >> 24u).mover;
     // The size of the noise is a power of two, so that places left of it and above it wrap around, too.
     return mover == 0u ? pixel : uvec2(ivec2(pixel) - movers[mover - 1u].centre);
-}
-
-// The blue noise of a place for a channel's remainders.
-uint noise_of(uvec2 place, uint channel) {
-    // The mask has two channels; the third of a frame is the first, half a mask aside.
-    uint x = (place.x + (channel >> 1u) * (NOISE_SIZE / 2u)) % NOISE_SIZE;
-    uint texel = ((frame.drawn % NOISE_FRAMES) * NOISE_SIZE + place.y % NOISE_SIZE) * NOISE_SIZE + x;
-    return (noise_bytes[texel >> 1u] >> ((texel & 1u) * 16u + (channel & 1u) * 8u)) & 255u;
-}
-
-// The part at which the order of parts begins at a place: the same in each cell of 4 x 4 mirrors. Of four neighbouring cells each begins in another
-// quarter of the parts, of 16 each in another sixteenth, and so on.
-uint phase_of(uvec2 place) {
-    uvec2 cell = place % NOISE_SIZE / 4u;
-    uint rank = 0u;
-    for (uint level = 0u; level < 4u; level++) {
-        uint quarter = (((cell.x ^ cell.y) & 1u) << 1u) | (cell.y & 1u);
-        cell >>= 1u;
-        rank = (rank << 2u) | (quarter ^ (hash_u32((level << 16u) | (rank << 8u) | (cell.y << 4u) | cell.x) & 3u));
-    }
-    return (rank * HALFTONE_PARTS / 256u + 5u * (frame.drawn % HALFTONE_PARTS)) % HALFTONE_PARTS;
-}
-
-// Parts that add up to `sum`: all the same number, or one more in some, the first of the order that begins at part `phase`.
-uint spread(uint sum, uint phase) {
-    uint each = sum / HALFTONE_PARTS;
-    uint more = sum % HALFTONE_PARTS;
-    uint word = 0u;
-    for (uint p = 0u; p < HALFTONE_PARTS; p++) word |= each << (p * HALFTONE_DEPTH);
-    // The order of the parts: by the bits of their numbers in reverse.
-    int bits = findMSB(HALFTONE_PARTS - 1u) + 1;
-    for (uint i = 0u; i < 1u << bits; i++) {
-        uint p = bitfieldReverse(i) >> (32 - bits);
-        if (p >= HALFTONE_PARTS || more == 0u) continue;
-        word += 1u << ((p + phase) % HALFTONE_PARTS * HALFTONE_DEPTH);
-        more--;
-    }
-    return word;
 }
 
 // The bits of a channel with the code value `code`. All invocations of the workgroup call it; outside the raster `code` is 0.

@@ -1,9 +1,11 @@
 // Planes that follow the bodies: each group of bits is taken from the pixel whose surface is at this mirror at the group's instant. Equals the CPU's
-// `Drawn::word` bit for bit.
+// `Drawn::word` bit for bit. Where the highest bit is split, what is taken is a code value, which is cut into a level by the place of the body that is
+// there.
 #version 460
 #extension GL_GOOGLE_include_directive : require
 #extension GL_EXT_scalar_block_layout : require
 #include "scene.glsl"
+#include "halftone.glsl"
 
 layout(local_size_x = 8, local_size_y = 8) in;
 
@@ -74,6 +76,27 @@ bool has_whole_codes(uint mask) {
     return all(equal(bits * (255u - bits), uvec3(0u)));
 }
 
+// The bits of a channel with the code value `sum / weights` at a place of a body: the level below, or the one above if the noise of the place's cell is
+// less than what is left. The noise is that of the cell, so that groups which take places beside one another show bits of one level.
+uint bits_of(uint sum, uint weights, ivec2 place, uint channel) {
+    uint noise = 2u * noise_of(uvec2(place >> 2), channel) + 1u;
+    uint level = (sum * MOST + ((noise * weights * 255u) >> 9u)) / (255u * weights);
+    return spread(level, phase_of(uvec2(place)));
+}
+
+// What is shown at a place where the code values are `sums / weights`. `from` is the centre of the body.
+uint cut(uvec3 sums, uint weights, ivec2 at, ivec2 from) {
+    ivec2 place = nearest_pixel(at) - from;
+    if (HALFTONE_WHITE) return bits_of(sums.g, weights, place, 0u);
+    return bits_of(sums.r, weights, place, 0u) | (bits_of(sums.g, weights, place, 1u) << 8u) | (bits_of(sums.b, weights, place, 2u) << 16u);
+}
+
+// What is shown of a pixel's word at a place.
+uint shown(uint word, ivec2 at, ivec2 from) {
+    if (HALFTONE_LOW == 0u) return word;
+    return cut(uvec3(word & 255u, (word >> 8u) & 255u, (word >> 16u) & 255u), 1u, at, from);
+}
+
 // The word of the pixel that this frame takes for a place between pixels. Frames take each of those around it as often as it is near: in turn, or
 // because the instants for which the body is drawn spread the places over a pixel.
 uint word_of_one(uint m, ivec2 at, uint g) {
@@ -83,7 +106,7 @@ uint word_of_one(uint m, ivec2 at, uint g) {
     return owner_of(there) == OWNER_STILL + 1u + m ? there.word : motions[index_of(nearest_pixel(at))].word;
 }
 
-// The word of mover `m` at a place, for group `g`. Halftones are taken whole. Code values are between those of the pixels around the place that
+// The word of mover `m` at a place, for group `g`. Halftones of equal planes are taken whole. Code values are between those of the pixels around the place that
 // show the body. Where these are rough, bits of different groups would be those of codes that the picture does not have, and their sum would be
 // far off: there each frame takes the code of one pixel.
 uint word_of(uint m, ivec2 at, uint g) {
@@ -101,8 +124,9 @@ uint word_of(uint m, ivec2 at, uint g) {
         all_words |= weight > 0u ? there.word : 0u;
         sums += weight * uvec3(there.word & 255u, (there.word >> 8u) & 255u, (there.word >> 16u) & 255u);
     }
-    if ((all_words & WORD_ROUGH) != 0u && !has_whole_codes(groups[g].mask)) return word_of_one(m, at, g);
+    if ((all_words & WORD_ROUGH) != 0u && !has_whole_codes(groups[g].mask)) return shown(word_of_one(m, at, g), at, movers[m].centre);
     // The nearest of the four shows the body, so the weights are positive.
+    if (HALFTONE_LOW > 0u) return cut(sums, max(weights, 1u), at, movers[m].centre);
     uvec3 code = (sums + weights / 2u) / max(weights, 1u);
     return code.r | (code.g << 8u) | (code.b << 16u);
 }
@@ -123,17 +147,26 @@ uint word_at(ivec2 pixel, uint g, Moved own) {
         }
     }
     if (mover != NO_MOVER) return word_of(mover, place, g);
-    if (owner <= OWNER_STILL) return owner == OWNER_STILL ? own.word : 0u;
+    if (owner <= OWNER_STILL) return owner == OWNER_STILL ? shown(own.word, pixel << 6, ivec2(0)) : 0u;
     // A body has left this mirror and uncovers what was hidden. What is seen behind its edge goes on here.
     uint left = owner - OWNER_STILL - 1u;
-    Moved behind = moved_at(left, nearest_pixel(source(left, pixel, motion_of(own), instant)));
-    return owner_of(behind) == OWNER_NONE ? 0u : behind.word;
+    ivec2 at = source(left, pixel, motion_of(own), instant);
+    Moved behind = moved_at(left, nearest_pixel(at));
+    return owner_of(behind) == OWNER_NONE ? 0u : shown(behind.word, at, ivec2(0));
+}
+
+bool is_near_mover(ivec2 pixel) {
+    bool near = false;
+    for (uint m = 0u; m < frame.mover_count; m++) near = near || within(m, pixel);
+    return near;
 }
 
 void main() {
     uvec2 at;
     if (!tile_pixel(tiles[gl_WorkGroupID.x >> 2u], at)) return;
     ivec2 pixel = ivec2(at);
+    // What no mover can reach stays as the halftone has it.
+    if (HALFTONE_LOW > 0u && !is_near_mover(pixel)) return;
     uint index = index_of(pixel);
     Moved own = Moved(motions[index].word, motions[index].motion, motions[index].owner_and_depth);
     uint word = WARP_WHOLE_WORDS ? own.word : own.word & ~WORD_ROUGH;

@@ -138,4 +138,6 @@ specialization_constants! {
     HAS_DIFFUSE_TRANSMISSION: bool = true;
     /// A solid of the scene refracts colours differently.
     HAS_DISPERSION: bool = true;
+    /// Bits below the parts of a halftone, which are shown once. Above 0, the pass `warp` cuts code values into levels.
+    HALFTONE_LOW: uint = 0;
 }

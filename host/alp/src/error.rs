@@ -113,7 +113,7 @@ pub enum AlpError {
         needed: usize,
     },
     /// The queue is too short.
-    #[error("{device} queues {places} sequences, and two frames of {parts} sequences need {needed}: use weights = \"equal\"")]
+    #[error("{device} queues {places} sequences, and two frames of {parts} sequences need {needed}: use plane_times = \"equal\"")]
     Queue {
         /// The device.
         device: String,

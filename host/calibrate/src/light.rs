@@ -314,7 +314,9 @@ pub fn keep(results: &mut Results, config: &RigConfig, channels: Channels, sourc
     let data = format!("full-field levels on a light sensor at rest; {told}");
     let provenance =
         results.provenance(config, "", data, "levels between references of full white, by frame");
-    results.file.light = Some(LightSection::new(&LightModel { channels, flat }, provenance));
+    let weights = Some(config.projector.weights.word().to_owned());
+    let section = LightSection::new(&LightModel { channels, flat }, provenance);
+    results.file.light = Some(LightSection { weights, ..section });
     format!("{light}\n{told}")
 }
 

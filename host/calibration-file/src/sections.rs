@@ -271,6 +271,9 @@ impl LatencySection {
 pub struct LightSection {
     /// Columns and rows of the raster that the flat field refers to.
     pub size: [u32; 2],
+    /// The rig file's `projector.weights` with which it was measured; older files do not name them.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub weights: Option<String>,
     /// For each channel, light over that at full code, at codes in equal steps from 0 to full: 0 first, 1 last.
     pub curves: Vec<Vec<f64>>,
     /// Light of each channel at full code over that of all; they add up to 1.
@@ -293,6 +296,7 @@ impl LightSection {
         let (channels, flat) = (&light.channels, &light.flat);
         Self {
             size: [flat.raster.width(), flat.raster.height()],
+            weights: None,
             curves: channels.curves.clone(),
             intensity: channels.intensity.clone(),
             black: channels.black,

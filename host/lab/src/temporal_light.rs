@@ -23,8 +23,9 @@ pub const JUDGED: [Field; 2] = [
 const TABLE: [[f64; 3]; 3] = [[0.0, 10.0, 20.0], [1.0, 5.0, 10.0], [20.0, 100.0, 300.0]];
 /// The darkest grey that is judged: an eighth of full light. Darker ones are modulated more, and seen less.
 const DARKEST: u8 = 32;
-/// Every so many greys are judged where each takes a halftone of its own.
-const STEP_OF_HALFTONES: usize = 16;
+/// Every so many greys are judged where each takes a halftone of its own. The number is odd, because planes may show the low
+/// bits of a grey as they are.
+const STEP_OF_HALFTONES: usize = 7;
 
 /// What is noticed of the light of a grey, each in units of its threshold.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize)]
@@ -181,7 +182,7 @@ pub struct Mend {
 /// What could mend a light, the cheapest first.
 const MENDS: [&[&str]; 14] = [
     &["projector.weights=\"equal\""],
-    &["projector.backend.weights=\"equal\"", "projector.weights=\"equal\""],
+    &["projector.backend.plane_times=\"equal\"", "projector.weights=\"equal\""],
     &["projector.backend.encoding=\"binary24\""],
     &["projector.backend.encoding=\"mono1x24\""],
     &["projector.planes=8"],
@@ -191,7 +192,11 @@ const MENDS: [&[&str]; 14] = [
     &["projector.frame_rate=\"240\""],
     &["projector.frame_rate=\"480\""],
     &["projector.frame_rate=\"947\""],
-    &["projector.frame_rate=\"240\"", "projector.backend.weights=\"equal\"", "projector.weights=\"equal\""],
+    &[
+        "projector.frame_rate=\"240\"",
+        "projector.backend.plane_times=\"equal\"",
+        "projector.weights=\"equal\"",
+    ],
     &["projector.frame_rate=\"240\"", "projector.weights=\"equal\""],
     &["projector.frame_rate=\"947\"", "projector.weights=\"equal\""],
 ];
@@ -234,4 +239,31 @@ pub fn mend(light: &TemporalLight, read: impl Fn(&[&str]) -> Option<RigConfig>) 
 /// Sensitivity to flicker in a field; for those who compare it with other programs.
 pub fn sensitivity(field: Field, hz: f64) -> f64 {
     flicker_sensitivity(field, hz)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use dpm_rig::config::Overrides;
+
+    /// Mean and 90th percentile of the modulation at 947 frames/s over greys, and the light of white.
+    fn of(weights: &str) -> ([f64; 2], f64) {
+        let flags = vec![format!("projector.weights={weights:?}"), "real_time.pace=\"real\"".to_owned()];
+        let rig = RigConfig::demo(&Overrides { variables: vec![], flags }).unwrap_or_else(|e| panic!("{e}"));
+        let [mean, p90, _] = TemporalLight::of(&rig.projector).unwrap().at_frame_rate.unwrap();
+        let white = LightCourse::of(&rig.projector, [u8::MAX; 3]).unwrap();
+        let light = white.flashes.iter().map(|f| f.light[1] * (f.span_ns[1] - f.span_ns[0])).sum::<f64>();
+        let peak = white.flashes.iter().map(|f| f.light[1]).fold(0.0, f64::max);
+        (([mean, p90]), light / white.period_ns / peak)
+    }
+
+    /// Three planes of the highest bit leave half of the modulation of one, and twice the light at the same peak.
+    #[test]
+    fn a_split_highest_bit_modulates_less_and_lights_more() {
+        let [(split, white), (binary, of_binary)] = ["split", "binary"].map(of);
+        println!("split {split:.3?}, binary {binary:.3?}: white {:.3} times at the same peak", white / of_binary);
+        assert!(split[0] <= 0.85 && split[1] <= 1.65, "{split:?}");
+        assert!(binary[0] > 1.4 && binary[1] > split[1], "{binary:?}");
+        assert!(white >= 1.9 * of_binary, "{white} {of_binary}");
+    }
 }

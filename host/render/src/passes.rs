@@ -67,7 +67,7 @@ pub(super) enum Grid {
 }
 
 /// Every pass, in the order in which they run. Between two of them lies a barrier.
-pub(super) const TABLE: [Pass; 12] = [
+pub(super) const TABLE: [Pass; 13] = [
     Pass {
         name: "primary",
         code: Code::ByMethod {
@@ -285,7 +285,7 @@ pub(super) const TABLE: [Pass; 12] = [
             writes: &["B_CODES"],
             seldom: &[],
         }),
-        when: |s, _| s.halftone.is_some(),
+        when: |s, _| s.halftone.is_some_and(|halftone| !halftone.is_cut()),
         grid: Grid::Tiles,
         walks: false,
         overlaps: true,
@@ -300,6 +300,20 @@ pub(super) const TABLE: [Pass; 12] = [
         }),
         when: |s, _| !s.plane_groups.is_empty(),
         grid: Grid::Moving,
+        walks: false,
+        overlaps: true,
+    },
+    Pass {
+        // The pass `halftone` for planes whose highest bit is split, of which the pass `motion` keeps the code values.
+        name: "cut",
+        code: Code::OfAll(Kernel {
+            shader: |reading| shaders::HALFTONE.reading(reading),
+            reads: &["B_SURFACES.hit", "B_CODES"],
+            writes: &["B_CODES"],
+            seldom: &[],
+        }),
+        when: |s, _| s.halftone.is_some_and(pack::Halftone::is_cut),
+        grid: Grid::Tiles,
         walks: false,
         overlaps: true,
     },

@@ -106,9 +106,9 @@ impl Output {
 }
 
 impl RendererSettings {
-    /// The words of pixels are halftones, of which nothing lies between two pixels, and not code values.
+    /// The words that planes follow by are halftones, of which nothing lies between two pixels, and not code values.
     pub(crate) fn shows_halftones(&self) -> bool {
-        self.halftone.is_some_and(|halftone| !halftone.is_exact())
+        self.halftone.is_some_and(|halftone| !halftone.is_exact() && !halftone.is_cut())
     }
 }
 

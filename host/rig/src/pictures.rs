@@ -148,7 +148,7 @@ pub fn pictures(
         });
     };
     let projector = rig.camera.position();
-    let intensity = Vec3::from_array(rig.config.projector.max_intensity.0.map(|v| v as f32));
+    let intensity = Vec3::from_array(rig.config.projector.intensity_at_255().map(|v| v as f32));
     // The viewer's camera has no lens.
     if !rig.camera.lens.is_pinhole() {
         renderer = Renderer::new(gpu, &rig.scene, settings(None))?;

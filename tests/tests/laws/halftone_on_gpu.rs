@@ -88,14 +88,15 @@ fn on_gpu(
     bytemuck::pod_collect_to_vec(&through(Reading::Storage))
 }
 
-/// Planes of equal light, and parts of more bits.
+/// Planes of equal light, parts of more bits, and planes whose highest bit is split.
 fn schedules() -> Vec<PlaneSchedule> {
     let parts =
         [(3, 8, true), (4, 6, true), (6, 4, true), (8, 3, true), (12, 2, true), (2, 4, false), (4, 2, false)];
     let of_parts = parts
         .map(|(count, depth, white)| PlaneSchedule::of_parts(Parts { count, depth, low: 0, white }).unwrap());
     let equal = [PlaneSchedule::equal_rgb24(), PlaneSchedule::equal_mono8(), PlaneSchedule::equal24()];
-    [&equal[..], &of_parts].concat()
+    let split = [PlaneSchedule::split_rgb24(), PlaneSchedule::split_mono8()];
+    [&equal[..], &of_parts, &split].concat()
 }
 
 #[test]
@@ -194,6 +195,38 @@ mod breadth {
             assert!(lit > 1_000, "{lit} blocks are lit");
             // A projector's brightness that is not exactly twice another's may round single code values otherwise.
             assert!(worst <= 0.40, "{worst} levels");
+        });
+    }
+
+    /// Split planes give the picture of binary ones: a block's mean is that of binary planes to what a code value is rounded by
+    /// where the same light has half the code, and to what its halftone rounds. White would have twice the light.
+    #[test]
+    fn light_of_split_planes_is_that_of_binary_ones() {
+        with_gpu(|gpu| {
+            let light = |flags: &[&str]| {
+                let still = [0, 1].map(|i| format!("scene.bodies.{i}.motion={{kind=\"still\"}}"));
+                let flags = [&still.each_ref().map(String::as_str)[..], flags].concat();
+                let rig = demo_rig(128, 96, &flags);
+                let (outcome, _) = run(gpu, &rig, 24, 24);
+                assert_eq!((outcome.light_mismatches, outcome.report.frames_lit), (0, 24));
+                let sums = |frame: &LightFrame| block_sums(rig.camera.raster, &frame.codes);
+                outcome.light.iter().map(sums).collect::<Vec<_>>()
+            };
+            let [binary, split] =
+                ["binary", "split"].map(|weights| light(&[&format!("projector.weights={weights:?}")]));
+            let (mut worst, mut off, mut lit) = (0.0f64, 0.0, 0);
+            for (a, b) in binary.iter().flatten().zip(split.iter().flatten()) {
+                for c in (0..3).filter(|c| a[*c] > 0) {
+                    let [a, b] = [f64::from(a[c]), f64::from(b[c]) * 508.0 / 255.0].map(|sum| sum / 64.0);
+                    worst = worst.max((a - b).abs());
+                    off += a - b;
+                    lit += 1;
+                }
+            }
+            assert!(lit > 1_000, "{lit} blocks are lit");
+            let off = off / f64::from(lit);
+            println!("blocks of split planes differ by {off:.3} levels on average, by {worst:.2} at most");
+            assert!(worst <= 1.9 && off.abs() <= 0.1, "{worst} levels, {off} on average");
         });
     }
 }

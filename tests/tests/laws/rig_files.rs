@@ -53,7 +53,7 @@ fn a_rig_file_moves_from_projector_to_projector() {
         at(1024, 768, "947", 24, "{kind=\"usb\"}"),
         at(1024, 768, "60", 24, "{kind=\"window\"}"),
         at(1920, 1080, "60", 24, "{kind=\"display\"}"),
-        at(1024, 768, "80", 8, "{kind=\"alp\",weights=\"binary\"}"),
+        at(1024, 768, "80", 8, "{kind=\"alp\",plane_times=\"binary\"}"),
         at(1920, 1080, "60", 24, "{kind=\"dlpc900\"}"),
         behind("rgb8"),
         behind("planes24"),

@@ -111,7 +111,7 @@ enum ErrorCommand {
     },
     /// What an eye sees of a moving texture, plane by plane: motion times what the planes are drawn for
     Planes {
-        /// How far the planes of each bit follow, 0 to 1, like projector.plane_follow; those of binary24 always follow wholly
+        /// How far the planes of each bit follow, 0 to 1, like projector.plane_follow; those of split and binary24 always follow wholly
         #[arg(long, value_name = "SHARE", default_value_t = FOLLOW_SHARE, value_parser = share)]
         follow: f64,
         /// Print one JSON object
@@ -200,7 +200,7 @@ fn planes(follow: f64, json: bool) -> Result<(), Failure> {
     let gpu = open_gpu(&config)?;
     let orders = [BitOrder::default().0].into_iter().chain(OTHER_ORDERS);
     let panels = orders.map(|order| Panel::of_bits(order).following(follow));
-    let panels: Vec<Panel> = panels.chain([Panel::of_binary24()]).collect();
+    let panels: Vec<Panel> = panels.chain([Panel::of_split(), Panel::of_binary24()]).collect();
     let mut rows = Vec::new();
     for pattern in [Pattern::Noise, Pattern::Patches] {
         let card = Card::new(&gpu, pattern).map_err(failed)?;

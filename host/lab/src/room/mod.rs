@@ -243,7 +243,7 @@ impl RoomPicture {
 
 /// Radiance of each point in the projector's light.
 pub(crate) fn lit(rig: &Rig, points: &[Option<SeenPoint>], window: &[FallenLight]) -> Vec<Vec3> {
-    let intensity = Vec3::from_array(rig.config.projector.max_intensity.0.map(|v| v as f32));
+    let intensity = Vec3::from_array(rig.config.projector.intensity_at_255().map(|v| v as f32));
     let lit = |point: &Option<SeenPoint>| {
         let Some(point) = point.as_ref().filter(|p| !p.is_hidden) else { return Vec3::ZERO };
         let sum: Vec3 = window.iter().map(|slot| slot.on(rig, point.body, point.in_mesh)).sum();

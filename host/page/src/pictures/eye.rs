@@ -95,7 +95,7 @@ impl Eye {
             return None;
         }
         let projector = self.rig.camera.at_raster(self.raster);
-        let intensity = Vec3::from_array(self.rig.config.projector.max_intensity.0.map(|v| v as f32));
+        let intensity = Vec3::from_array(self.rig.config.projector.intensity_at_255().map(|v| v as f32));
         let ambient = Vec3::from_array(self.rig.config.scene.ambient.map(|v| v as f32));
         let (eye, _) = self.rig.observer.eye_and_gaze(poses);
         self.rig.scene_poses(poses, t_ns, &mut self.poses);

@@ -24,9 +24,11 @@
 //!
 //! Where the highest bit of a code value is split into equal planes (`PlaneSchedule::split_rgb24`), each of these is a part of
 //! one bit, and the bits below are shown once, as they are. What a sum has of whole parts goes to the equal planes by the same
-//! order. Only two of the planes begin an order, and none at another one in the next frame: the planes of a level would
-//! follow one another at a fraction of the frame rate, which eyes see sooner. The shader does not do this yet, and no rig file
-//! asks for it.
+//! order, which begins at the second of them in every cell and in every frame. Orders that differ from cell to cell would put the
+//! light of one level at different instants, which an eye that rests sees as noise of a passing picture; orders that differ from
+//! frame to frame would follow one another at a fraction of the frame rate, which eyes see sooner. Planes that follow a body are not taken from the
+//! words of mirrors then, whose low bits would not add up with those of a mirror beside it: each takes the code value of the
+//! body's place, and [`Halftone::cut`] gives it a level by noise that a whole cell of the body shares.
 //!
 //! Everything is integer arithmetic, so `shaders/glsl/halftone.comp` gives the same words.
 
@@ -72,11 +74,17 @@ impl Halftone {
         self.depth == 8
     }
 
+    /// The highest bit is split. Planes that follow take code values then, and cut each into a level where the body is.
+    pub fn is_cut(self) -> bool {
+        self.low > 0
+    }
+
     /// Specialization constants of the pass.
-    pub fn constants(self) -> [(u32, u32); 3] {
+    pub fn constants(self) -> [(u32, u32); 4] {
         [
             (ids::HALFTONE_PARTS, self.parts),
             (ids::HALFTONE_DEPTH, self.depth),
+            (ids::HALFTONE_LOW, self.low),
             (ids::HALFTONE_WHITE, self.white.into()),
         ]
     }
@@ -87,6 +95,23 @@ impl Halftone {
             &[(0, 8)]
         } else {
             &[(0, 0), (8, 8), (16, 16)]
+        }
+    }
+
+    /// The word of a mirror that shows a place of a body where red, green and blue have the code values `sums / weights`. The place
+    /// is counted from the body's centre, in pixels. A channel's level is the one below its code value, or the one above where the
+    /// noise of the place's cell in frame `frame` is less than what is left; so the levels of 256 frames or cells have the mean of
+    /// the code value, to a 500th of a level. `weights` is 1 to 4096.
+    pub(crate) fn cut(self, sums: [u32; 3], weights: u32, place: [i32; 2], frame: u32) -> u32 {
+        let cell = place.map(|c| c >> 2);
+        let bits = |sum: u32, channel: usize| {
+            let noise = 2 * noise(cell, frame, channel) + 1;
+            let level = (sum * self.most() + ((noise * weights * 255) >> 9)) / (255 * weights);
+            spread(level, self, phase(place, frame, self))
+        };
+        match self.white {
+            true => bits(sums[1], 0),
+            false => (0..3).fold(0, |word, c| word | bits(sums[c], c) << (8 * c)),
         }
     }
 
@@ -114,17 +139,17 @@ fn noise([x, y]: [i32; 2], frame: u32, channel: usize) -> u32 {
 
 /// The part at which the order of parts begins at a place: the same in each cell. Of four neighbouring cells each begins in
 /// another quarter of the parts, of 16 each in another sixteenth, and so on up to the 256 cells of 64 x 64 places. Which of the
-/// four has which quarter is drawn, so that no pattern repeats along a line.
+/// four has which quarter is drawn, so that no pattern repeats along a line. Where the highest bit is split, the order is one.
 fn phase([x, y]: [i32; 2], frame: u32, how: Halftone) -> u32 {
+    if how.is_cut() {
+        return 1;
+    }
     let [mut x, mut y] = [x, y].map(|c| c.rem_euclid(blue_noise::SIZE as i32) as u32 / CELL);
     let mut rank = 0;
     for level in 0..4 {
         let quarter = ((x ^ y) & 1) << 1 | y & 1;
         (x, y) = (x >> 1, y >> 1);
         rank = rank << 2 | quarter ^ hash_u32(level << 16 | rank << 8 | y << 4 | x) & 3;
-    }
-    if how.low > 0 {
-        return rank / 128;
     }
     // Five has no divisor in common with any number of parts that there is.
     (rank * how.parts / 256 + 5 * (frame % how.parts)) % how.parts

@@ -1,5 +1,6 @@
 //! The CPU twin of `shaders/glsl/warp.comp`.
 
+use crate::pack::Halftone;
 use dpm_device::planes::Raster;
 use dpm_shaders::structs::{Moved, Mover, PlaneGroup, OWNER_NONE, OWNER_STILL, ROUGH_STEP, WORD_ROUGH};
 
@@ -14,6 +15,8 @@ pub struct Drawn<'a> {
     pub movers: &'a [Mover],
     /// The words are code values, and what lies between pixels is interpolated. Words of halftones are taken whole.
     pub are_codes: bool,
+    /// How code values are cut into the levels of planes whose highest bit is split; else `None`.
+    pub cut: Option<Halftone>,
     /// Frames that were drawn before: where code values are rough, each takes the pixels between which a place lies in turn.
     pub before: u32,
 }
@@ -52,6 +55,12 @@ fn source(mover: &Mover, pixel: [i32; 2], motion: [i32; 2], instant: i32) -> [i3
 /// The pixel in which a place is.
 fn nearest(at: [i32; 2]) -> [i32; 2] {
     at.map(|c| (c + 32) >> 6)
+}
+
+/// The pixel of a place, counted from a centre.
+fn from_centre(at: [i32; 2], centre: [i32; 2]) -> [i32; 2] {
+    let pixel = nearest(at);
+    [0, 1].map(|c| pixel[c] - centre[c])
 }
 
 /// True if the code values `here` are by more than half of [`ROUGH_STEP`] off the middle between those to the left and right, or
@@ -134,7 +143,7 @@ impl Drawn<'_> {
     /// that show the same body.
     fn word_at(&self, Place { at, owner }: Place, group: &PlaneGroup, number: u32) -> u32 {
         if !self.are_codes || owner <= OWNER_STILL {
-            return self.at(nearest(at)).word;
+            return self.shown(self.at(nearest(at)).word, at, [0, 0]);
         }
         let mover = self.mover_of(owner);
         let shows = |pixel| self.moved_at(mover, pixel).filter(|m| owner_of(m) == owner);
@@ -154,11 +163,20 @@ impl Drawn<'_> {
             let turn = turn_of(self.before, number);
             let step = [0, 1].map(|c| if mover.in_turn[c] == 1 { turn[c] } else { 32 });
             let there = shows([0, 1].map(|c| (at[c] + step[c]) >> 6));
-            return there.unwrap_or(self.at(nearest(at))).word;
+            return self.shown(there.unwrap_or(self.at(nearest(at))).word, at, mover.centre);
         }
         // The nearest of the four shows the body, so the weights are positive.
+        if let Some(halftone) = self.cut {
+            return halftone.cut(sums, weights, from_centre(at, mover.centre), self.before);
+        }
         let code = |c: usize| ((sums[c] + weights / 2) / weights) << (8 * c);
         code(0) | code(1) | code(2)
+    }
+
+    /// What is shown of a pixel's word at a place of a body with this centre.
+    fn shown(&self, word: u32, at: [i32; 2], centre: [i32; 2]) -> u32 {
+        let codes = [0, 8, 16].map(|shift| word >> shift & 0xff);
+        self.cut.map_or(word, |halftone| halftone.cut(codes, 1, from_centre(at, centre), self.before))
     }
 
     /// A word without the mark of what is rough.
@@ -265,7 +283,8 @@ mod tests {
                 codes.map(|[r, g, b]| moved(r | g << 8 | b << 16, motion, BODY, 0)).collect();
             for (drawn_at, apart) in [(0, 16000), (19000, -9000)] {
                 let movers = [mover_of_all(raster, motion, drawn_at)];
-                let drawn = Drawn { raster, pixels: &pixels, movers: &movers, are_codes: true, before: 0 };
+                let drawn =
+                    Drawn { raster, pixels: &pixels, movers: &movers, are_codes: true, cut: None, before: 0 };
                 let groups: Vec<PlaneGroup> = (0..8)
                     .map(|bit| PlaneGroup { mask: 0x01_0101 << bit, instant: (bit - 4) * apart })
                     .collect();
@@ -296,7 +315,8 @@ mod tests {
         let word = |[x, y]: [i32; 2]| ((16 * y + x + 1) as u32).wrapping_mul(2_654_435_761);
         let pixels: Vec<Moved> = places(raster).map(|at| moved(word(at), motion, BODY, 0)).collect();
         let movers = [mover_of_all(raster, motion, 0)];
-        let drawn = Drawn { raster, pixels: &pixels, movers: &movers, are_codes: false, before: 0 };
+        let drawn =
+            Drawn { raster, pixels: &pixels, movers: &movers, are_codes: false, cut: None, before: 0 };
         let groups = [PlaneGroup { mask: 0xff_ffff, instant: 65535 }];
         // The place is 1.5 pixels to the left, which is nearest to the right one of two, and 0.6 pixels below.
         let from = word([8 - 1, 4 + 1]);
@@ -324,7 +344,8 @@ mod tests {
             };
             let pixels: Vec<Moved> = places(raster).map(of).collect();
             let movers = [[0, 0], fast].map(|start| mover_of_all(raster, start, 0));
-            let drawn = Drawn { raster, pixels: &pixels, movers: &movers, are_codes: true, before: 0 };
+            let drawn =
+                Drawn { raster, pixels: &pixels, movers: &movers, are_codes: true, cut: None, before: 0 };
             let shows = |at: [i32; 2]| is_in(at) && (is_fast(at) || behind != OWNER_NONE);
             // By a 32nd of the exposure the body has moved by one or two pixels.
             for instant in (-16..=16).map(|step| 2048 * step) {

@@ -84,6 +84,7 @@ pub(crate) fn measured_file() -> CalibrationFile {
         Some(LatencySection { latency_us: 2500.0, sigma_us: 5.0, provenance: Provenance::default() });
     file.light = Some(LightSection {
         size: [1024, 768],
+        weights: None,
         curves: vec![vec![0.0, 0.25, 1.0]; 3],
         intensity: vec![0.25, 0.5, 0.25],
         black: 0.01,

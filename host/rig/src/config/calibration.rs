@@ -12,7 +12,8 @@ section! {
     pub struct CalibrationConfig {
         /// The file that `dpm calibrate` writes. Its parts take the place of `projector.position`, `look_at`, `up`,
         /// `horizontal_fov_deg` and `calibration`; of `scene.bodies[].mesh_to_body`; of `tracker.latency_us`; of
-        /// `projector.response` and `projector.flat_field`, and of the channels' shares of `projector.max_intensity`.
+        /// `projector.response` and `projector.flat_field`, and of the channels' shares of `projector.max_intensity`. Its light
+        /// is refused with planes of other `projector.weights` than those that were measured.
         file: Option<PathBuf> = None, "", NotEmpty;
     }
 }
@@ -27,6 +28,20 @@ pub(super) fn check(rig: &RigConfig, reader: &mut Reader) {
             return refuse(reader, &["calibration.file"], e.to_string(), remedy);
         }
     };
+    let weights = &rig.projector.weights;
+    let told = measured.light.as_ref().map(|light| light.weights.as_deref());
+    // A file that names no planes was measured with those of its rig, before there were planes that exceed full light.
+    let of_file = |told: Option<&str>| told.unwrap_or(rig.projector.weights_measured(None).word()).to_owned();
+    if let Some(of_file) = told.map(of_file).filter(|of_file| *of_file != weights.word()) {
+        let problem = format!(
+            "its light was measured with projector.weights = {of_file:?}, and the rig has {:?}, of which it is not known what a \
+             code value gives",
+            weights.word()
+        );
+        let remedy =
+            format!("set projector.weights = {of_file:?}, or measure again with `dpm calibrate light`");
+        refuse(reader, &["calibration.file", "projector.weights"], problem, remedy);
+    }
     for key in taken(rig, &measured).into_iter().filter(|key| reader.is_written(key)).collect::<Vec<_>>() {
         let problem = "is given twice: here and by `calibration.file`".to_owned();
         refuse(reader, &[&key], problem, "remove it; the calibration file has the measured value".into());

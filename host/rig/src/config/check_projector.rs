@@ -1,7 +1,7 @@
 //! Contradictions between the keys of `[projector]`.
 
 use super::check::{contradict, refuse, shown};
-use super::{ProjectorConfig, RigConfig};
+use super::{PlaneWeights, ProjectorConfig, ResponseConfig, RigConfig};
 use dpm_common::keys::read::Reader;
 
 pub(super) fn projector(rig: &RigConfig, reader: &mut Reader) {
@@ -59,7 +59,50 @@ pub(super) fn projector(rig: &RigConfig, reader: &mut Reader) {
             );
         }
     }
+    measured_light(p, reader);
     p.backend.check(&p.frame_keys(), reader);
+    let is_dimmed = !p.backend.is_lit_fully() && !p.backend.kind().is_loaded();
+    if p.weights == PlaneWeights::Split && !is_dimmed {
+        contradict(
+            reader,
+            &[
+                ("projector.weights", shown(p.weights)),
+                ("projector.backend.kind", format!("{:?}", p.backend.kind().word.word)),
+            ],
+            &format!("a {} does not dim its light from plane to plane", p.backend.kind().name),
+            "leave `projector.weights` out, or give it the value that the page on this kind of projectors names".into(),
+        );
+    }
+}
+
+/// Response and flat field are of the planes with which they were measured.
+fn measured_light(p: &ProjectorConfig, reader: &mut Reader) {
+    let of_response = (p.response != ResponseConfig::default()).then_some("projector.response");
+    let keys: Vec<&str> =
+        of_response.into_iter().chain(p.flat_field.as_ref().map(|_| "projector.flat_field")).collect();
+    let [first, ..] = keys[..] else {
+        if p.measured_with.is_some() {
+            let problem = "says how response and flat field were measured, but there are none".to_owned();
+            refuse(reader, &["projector.measured_with"], problem, "remove it".into());
+        }
+        return;
+    };
+    let measured = p.weights_measured(p.measured_with);
+    if measured != p.weights {
+        contradict(
+            reader,
+            &[
+                ("projector.weights", shown(p.weights)),
+                ("projector.measured_with", shown(measured)),
+                (first, "as measured".into()),
+            ],
+            "the light of other planes was measured, and what a code value gives is not known of these",
+            format!(
+                "set projector.weights = {}, or measure again with these planes and name them in projector.measured_with",
+                shown(measured)
+            ),
+        );
+    }
 }
 
 /// The keys that say how to read the calibration file.

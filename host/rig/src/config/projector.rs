@@ -28,12 +28,15 @@ section! {
         /// How much light the planes of a channel give: "binary" halves it from plane to plane, so that their bits are the
         /// code value; "equal" gives every plane the same, and shows grey as a halftone of mirrors and planes. Change it
         /// if the projector lights all planes alike: a DLPC900 that shows the bits of a video signal, or an ALP. On a
-        /// bit-plane projector equal planes together give 128 / 255 of full white.
+        /// bit-plane projector equal planes together give 128 / 255 of full white. "split" shows the highest bit three
+        /// times, apart from one another, in place of the two lowest: twice the light at the same peak, less modulated,
+        /// and half the levels, of which the rest comes back over two frames. It is for bit-plane projectors that offer
+        /// planes that exceed full light (docs/PROTOCOL.md, section 17).
         weights: PlaneWeights = PlaneWeights::Binary, "", Any;
         /// The order in which a frame shows the bits of a code value, from its first plane on; red, green and blue in
         /// turn for each bit. By default the highest bits are lit together, which smears a moving picture least. The
         /// light of "7 6 5 4 3 2 1 0" is over soonest: its centre comes 0.12 ms earlier at 947 frames/s, and so needs
-        /// less prediction. Has no effect on planes of equal weights.
+        /// less prediction. Has no effect on planes of equal weights, or on split ones, whose order is fixed.
         plane_order: BitOrder = BitOrder::default(), "", Any;
         /// The instant for which each bit plane shows the bodies. "own": the planes of each bit (each plane, if all
         /// give equal light) are shown where the bodies are while these planes are lit, so that a moving picture is not
@@ -43,7 +46,7 @@ section! {
         /// `plane_poses = "own"`: 1 shows each where the bodies are while it is lit, 0 shows all where they are at the
         /// centre. 1 is sharpest for an eye that follows a body; less is less noisy for one that rests. At 947 frames/s
         /// and above the value is a fraction of the way; at lower rates the planes stop the same time short of it.
-        /// Planes of equal weights, and those that show a whole code value, always go to their own instant.
+        /// Planes of equal and split weights, and those that show a whole code value, always go to their own instant.
         plane_follow: f64 = FOLLOW_SHARE, "", Within(0.0, 1.0);
         /// Whether the projector gets the places of the bodies between frames, so that it moves their light while the
         /// planes are lit. "auto": if it offers that (the link's TRACKS), and not on a serial line. Change it to "auto"
@@ -86,6 +89,9 @@ section! {
         /// PFM, of any size). Pixels that are darker than the brightest one are driven harder; `max_intensity` is that
         /// of the brightest.
         flat_field: Option<PathBuf> = None, "", NotEmpty;
+        /// The `weights` with which `response` and `flat_field` were measured; the rig's own if left out, but never "split". A
+        /// rig whose planes are others than these is refused: what a code value gives is not known of them.
+        measured_with: Option<PlaneWeights> = None, "", Any;
         /// Time by which light falls later than the projector reports. Set it if a check shows that light trails the
         /// motion whatever the tracker.
         latency_us: u32 = 0, "us", Within(0, 200_000);
@@ -133,9 +139,17 @@ impl ProjectorConfig {
     }
 
     /// Light of a mirror that is on in all planes, as a code value of which 255 is full light. It is less where planes of
-    /// equal light are lit by LEDs that are dimmed for the bits of a code value.
+    /// equal light are lit by LEDs that are dimmed for the bits of a code value, and more where planes exceed full light.
     pub fn full_light(&self) -> u32 {
         self.schedule().full_light()
+    }
+
+    /// Radiant intensity of each channel of a mirror whose light is 255, in scene units: what recorders and mocks count light in.
+    /// It is `max_intensity`, and more where planes exceed full light.
+    pub fn intensity_at_255(&self) -> [f64; 3] {
+        let schedule = self.schedule();
+        let times = f64::from(schedule.white_weight()) / f64::from(schedule.limit_weight());
+        self.max_intensity.0.map(|intensity| intensity * times)
     }
 
     /// `schedule` as this projector lights it: a light source that is not dimmed from plane to plane gives full white where
@@ -156,7 +170,7 @@ impl ProjectorConfig {
 
     /// The planes of a frame in the order in which they are shown.
     pub fn schedule(&self) -> PlaneSchedule {
-        self.backend.schedule().unwrap_or_else(|| self.lit_by(self.schedule_of_keys()))
+        self.backend.schedule().unwrap_or_else(|| self.lit_by(self.schedule_of(self.weights)))
     }
 
     /// What the kind of projector has to know of frames to judge its keys.
@@ -165,16 +179,31 @@ impl ProjectorConfig {
         FrameKeys { size, rate: self.frame_rate, planes: self.planes, weights: self.weights }
     }
 
-    /// The planes that `planes`, `weights` and `plane_order` describe.
-    fn schedule_of_keys(&self) -> PlaneSchedule {
+    /// White of planes of these weights as a share of the full white that limits on light count in.
+    pub fn white_of(&self, weights: PlaneWeights) -> f64 {
+        let of_keys = || f64::from(self.lit_by(self.schedule_of(weights)).full_light()) / 255.0;
+        self.backend.schedule().map_or_else(of_keys, |_| 1.0)
+    }
+
+    /// The weights of the planes with which light is taken to have been measured, by what a rig file or a calibration file says of
+    /// it. What says nothing is older than planes that exceed full light.
+    pub(super) fn weights_measured(&self, told: Option<PlaneWeights>) -> PlaneWeights {
+        let own = Some(self.weights).filter(|weights| *weights != PlaneWeights::Split);
+        told.or(own).unwrap_or(PlaneWeights::Binary)
+    }
+
+    /// The planes that `planes`, `plane_order` and these weights describe.
+    fn schedule_of(&self, weights: PlaneWeights) -> PlaneSchedule {
         let BitOrder(bits) = self.plane_order;
         let binary = match self.planes {
             8 => PlaneSchedule::mono8_in(bits),
             _ => PlaneSchedule::rgb24_in(bits),
         };
-        match (self.planes, self.weights) {
+        match (self.planes, weights) {
             (8, PlaneWeights::Equal) => PlaneSchedule::equal_mono8(),
             (_, PlaneWeights::Equal) => PlaneSchedule::equal_rgb24(),
+            (8, PlaneWeights::Split) => PlaneSchedule::split_mono8(),
+            (_, PlaneWeights::Split) => PlaneSchedule::split_rgb24(),
             (_, PlaneWeights::Binary) => {
                 binary.expect("the order was checked when the configuration was read")
             }

@@ -1,7 +1,7 @@
 //! `[safety]` with its limits and interlock: what happens when something fails, how much light is permitted, and what else
 //! must permit it.
 
-use super::{Origin, RigConfig, Wearable};
+use super::{Origin, PlaneWeights, ProjectorConfig, RigConfig, Wearable};
 use dpm_common::keys::read::{Any, NotEmpty, Reader, Within};
 use dpm_common::{kinds, section, words};
 use dpm_device::link::{LightLimits, MAX_LIMIT_MS, MIN_LIMIT_MS};
@@ -66,14 +66,24 @@ section! {
         /// Longest time of full white (a level of 0.95 or more, including pauses below a tenth of a second), 0.5 to
         /// 3600; 0 is off. Afterwards the light goes off for the same time.
         full_white_s: f64 = 0.0, "s", Within(0.0, LONGEST_S);
+        /// The `projector.weights` whose full white `mean_level` is a share of: those with which it was measured. Limits count
+        /// the light of binary planes, whatever planes are lit, so a level of planes that give less is made smaller. Planes
+        /// that give more are refused here.
+        measured_with: PlaneWeights = PlaneWeights::Binary, "", Any;
     }
 }
 
 impl LimitsConfig {
+    /// True if nothing is limited.
+    pub fn is_off(&self) -> bool {
+        self.mean_level <= 0.0 && self.full_white_s <= 0.0
+    }
+
     /// The limits in the units of host and projector. Each value is in its range once the configuration is accepted.
-    pub fn limits(&self) -> LightLimits {
-        // Rounded towards less light.
-        let mean_permille = (self.mean_level * 1000.0 + 1e-9).floor() as u16;
+    pub fn limits(&self, projector: &ProjectorConfig) -> LightLimits {
+        // Rounded towards less light. No planes make a limit wider.
+        let white = projector.white_of(self.measured_with).min(1.0);
+        let mean_permille = (self.mean_level * white * 1000.0 + 1e-9).floor() as u16;
         LightLimits {
             mean_permille,
             window_ms: if mean_permille > 0 { (self.mean_window_s * 1000.0).round() as u32 } else { 0 },
@@ -202,14 +212,26 @@ pub(super) fn check(rig: &RigConfig, reader: &mut Reader) {
         reader.refuse(&origin, key, problem.to_owned(), remedy.to_owned());
     };
     let limits = &rig.safety.limits;
-    if limits.mean_level > 0.0 && limits.mean_level < 0.001 {
+    let white = rig.projector.white_of(limits.measured_with);
+    if limits.mean_level > 0.0 && limits.mean_level * white < 0.001 {
         refuse("safety.limits.mean_level", "is below a thousandth of full white", "write 0 to switch it off");
+    }
+    let measured_with = "safety.limits.measured_with";
+    if white > 1.0 {
+        let problem = format!("names planes whose white is {white:.2} times the full white that limits count in, so every limit would be that much wider");
+        let remedy = "remove the key, and write mean_level as a share of the full white of binary planes";
+        refuse(measured_with, &problem, remedy);
+    } else if white < 1.0 && limits.full_white_s > 0.0 {
+        let problem = format!("names planes whose white is a level of {white:.2}, and full_white_s counts levels of 0.95 and more");
+        refuse(measured_with, &problem, "limit the light of such planes by mean_level alone");
+    } else if limits.is_off() && limits.measured_with != PlaneWeights::Binary {
+        refuse(measured_with, "says how limits were measured, but there are none", "remove it");
     }
     if limits.full_white_s > 0.0 && limits.full_white_s < SHORTEST_S {
         let remedy = "at least 0.5 s, or 0 to switch it off";
         refuse("safety.limits.full_white_s", "is too short to be distinguished from a flash", remedy);
     }
-    if !limits.limits().is_off() && rig.projector.backend.kind().is_loaded() {
+    if !limits.is_off() && rig.projector.backend.kind().is_loaded() {
         let key =
             if limits.mean_level > 0.0 { "safety.limits.mean_level" } else { "safety.limits.full_white_s" };
         refuse(

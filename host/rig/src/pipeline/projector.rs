@@ -90,6 +90,6 @@ pub fn link_settings(config: &RigConfig, raster: Raster) -> LinkSettings {
         },
         codecs: codecs(&config.projector.backend),
         flash_limit: flash_limit(config),
-        limits: config.safety.limits.limits(),
+        limits: config.safety.limits.limits(&config.projector),
     }
 }

@@ -14,7 +14,8 @@ use dpm_render::pack::{halftone, source_bits, Halftone};
 pub struct Flash {
     /// Its begin and its end, nanoseconds from the first photon of the first frame on; the end is not before the begin.
     pub span_ns: [f64; 2],
-    /// Brightness of red, green and blue, in units of full white: the mean over a period is the code value's share of it.
+    /// Brightness of red, green and blue, in units of full white: the mean over a period is the code value's share of it, or of the
+    /// light of all planes where these do not reach it or exceed it.
     pub light: [f64; 3],
 }
 
@@ -49,7 +50,7 @@ impl LightCourse {
         }
         let halftone = Halftone::of(&schedule);
         let frames = halftone.map_or(1, |_| FRAMES);
-        let white = f64::from(schedule.white_weight());
+        let white = f64::from(schedule.limit_weight());
         let mut flashes = Vec::new();
         for frame in 0..frames {
             let of_planes = match halftone {
@@ -131,17 +132,18 @@ mod tests {
     #[test]
     fn the_mean_light_is_the_code_value() {
         let equal = ["projector.weights=equal"];
+        let split = ["projector.weights=split"];
         let alp = [
             "projector.frame_rate=80",
             "projector.planes=8",
             "projector.backend.kind=alp",
-            "projector.backend.weights=binary",
+            "projector.backend.plane_times=binary",
         ];
         let loaded =
             [&CONTROLLER[..3], &["projector.backend.kind=dlpc900", "projector.backend.panel=dlp6500"]]
                 .concat();
         let window = ["projector.frame_rate=60", "projector.backend.kind=window"];
-        for keys in [&[][..], &equal, &alp, &loaded, &window, &CONTROLLER] {
+        for keys in [&[][..], &equal, &split, &alp, &loaded, &window, &CONTROLLER] {
             let projector = projector(keys);
             let is_white = projector.schedule().planes().iter().all(|p| p.channel == Channel::White);
             let full = f64::from(projector.full_light()) / 255.0;

@@ -18,9 +18,9 @@ section! {
         library: Option<PathBuf> = None, "", NotEmpty;
         /// Serial number of the device; 0 is the first one that is found.
         device_number: u32 = 0, "", Within(0, 2_147_483_647);
-        /// How long the planes of a frame are lit. With "equal" write `projector.weights` = "equal", so that grey is
+        /// How long the planes of a frame are lit: all equally long, or each as its bit weighs. With "equal" write `projector.weights` = "equal", so that grey is
         /// made of equal planes, or dim the light source from plane to plane.
-        weights: AlpWeights = AlpWeights::Equal, "", Any;
+        plane_times: AlpWeights = AlpWeights::Equal, "", Any;
         /// Slots for which a frame is lit if the host is late with the next one. It is also the longest time of light
         /// after the host has died.
         slots_per_sequence: u32 = 1, "slots", Within(1, 3);
@@ -71,16 +71,16 @@ impl ProjectorKeys for AlpConfig {
     /// An ALP has one picture time for each sequence, so binary weights take a sequence for each plane. What the panel, its
     /// memory and its cable hold is known when it is opened.
     fn check(&self, frames: &FrameKeys, reader: &mut Reader) {
-        if self.weights != AlpWeights::Binary {
+        if self.plane_times != AlpWeights::Binary {
             return;
         }
-        let weights = ("projector.backend.weights", shown(self.weights));
+        let weights = ("projector.backend.plane_times", shown(self.plane_times));
         if frames.weights == PlaneWeights::Equal {
             contradict(
                 reader,
                 &[weights, frames.weights_key()],
                 "halftones need planes of equal light",
-                "set projector.backend.weights = \"equal\", or leave projector.weights out".into(),
+                "set projector.backend.plane_times = \"equal\", or leave projector.weights out".into(),
             );
             return;
         }
@@ -89,21 +89,21 @@ impl ProjectorKeys for AlpConfig {
                 reader,
                 &[weights, ("projector.planes", shown(frames.planes))],
                 "binary weights are for the eight planes of one channel",
-                "set projector.planes = 8, or projector.backend.weights = \"equal\"".into(),
+                "set projector.planes = 8, or projector.backend.plane_times = \"equal\"".into(),
             );
         } else if self.slots_per_sequence > 1 {
             contradict(
                 reader,
                 &[("projector.backend.slots_per_sequence", shown(self.slots_per_sequence)), weights],
                 "a frame of binary weights is several sequences, which the device does not repeat as one",
-                "set projector.backend.slots_per_sequence = 1, or projector.backend.weights = \"equal\""
+                "set projector.backend.slots_per_sequence = 1, or projector.backend.plane_times = \"equal\""
                     .into(),
             );
         }
     }
 
     fn plane_timing(&self) -> PlaneTiming {
-        match self.weights {
+        match self.plane_times {
             AlpWeights::Binary => PlaneTiming::ByWeight,
             AlpWeights::Equal => PlaneTiming::Equal,
         }
@@ -112,7 +112,7 @@ impl ProjectorKeys for AlpConfig {
     /// A dark picture ends every frame: as long as a plane, or as the shortest.
     fn lit_time(&self, frames: &FrameKeys) -> LitTime {
         let whole = LitTime::all_of(frames.rate);
-        let dark_ns = match self.weights {
+        let dark_ns = match self.plane_times {
             AlpWeights::Equal => whole.frame_ns / (i64::from(frames.planes) + 1),
             AlpWeights::Binary => SHORTEST_NS.min(whole.frame_ns / 2),
         };
@@ -149,7 +149,7 @@ impl ProjectorKeys for AlpConfig {
             raster: panel.raster,
             showing: Showing {
                 schedule: panel.schedule,
-                weights: self.weights.weights(),
+                weights: self.plane_times.weights(),
                 rate: panel.rate,
                 frames: self.frames_in_flight as usize,
                 runs: self.slots_per_sequence,
@@ -165,9 +165,9 @@ impl ProjectorKeys for AlpConfig {
             why: e.to_string(),
         })?;
         let mut warnings: Vec<String> = transport.welcome().map(ToString::to_string).into_iter().collect();
-        if self.weights == AlpWeights::Equal && Halftone::of(&panel.schedule).is_none() {
+        if self.plane_times == AlpWeights::Equal && Halftone::of(&panel.schedule).is_none() {
             warnings.push(format!(
-                "projector.backend.weights = \"equal\": the {} planes are lit equally long, so levels are right only if the light source is dimmed from \
+                "projector.backend.plane_times = \"equal\": the {} planes are lit equally long, so levels are right only if the light source is dimmed from \
                  plane to plane; `projector.weights` = \"equal\" shows grey without that (docs/ALP.md)",
                 panel.schedule.len()
             ));

@@ -8,7 +8,7 @@ use dpm_device::time::FrameRate;
 pub enum PlaneTiming {
     /// Every plane is lit equally long, with the light of its bit.
     Equal,
-    /// Every plane is lit for as long as its bit weighs, always with the same light: an ALP with `weights = "binary"`.
+    /// Every plane is lit for as long as its bit weighs, always with the same light: an ALP with `plane_times = "binary"`.
     ByWeight,
     /// So many planes are lit together, as a number of as many bits, and the next ones after them: the patterns of a DLPC900.
     Together {
@@ -49,5 +49,7 @@ words! {
         Binary = "binary",
         /// All the same.
         Equal = "equal",
+        /// Half as much from plane to plane, but for the highest bit, which three planes of equal light show.
+        Split = "split",
     }
 }

@@ -18,7 +18,7 @@ const BINARY: [&str; 6] = [
     "--set",
     "projector.weights=\"binary\"",
     "--set",
-    "projector.backend.weights=\"binary\"",
+    "projector.backend.plane_times=\"binary\"",
     "--set",
     "projector.frame_rate=80",
 ];
@@ -196,14 +196,14 @@ fn what_cannot_be_is_refused_with_figures_and_doctor_says_so() {
         }
     };
     refused(&["projector.frame_rate=120"], &["at least 44 us", "at most 88.8 frames/s"], 3);
-    let equal = "projector.backend.weights=\"equal\"";
+    let equal = "projector.backend.plane_times=\"equal\"";
     refused(&[equal, "projector.frame_rate=900"], &["MB/s over its cable", "at most"], 3);
     refused(
         &["projector.width=800", "projector.height=600"],
         &["1024 x 768 mirrors", "projector.width = 1024"],
         3,
     );
-    refused(&["projector.planes=24"], &["`projector.planes` = 24", "weights = \"equal\""], 2);
+    refused(&["projector.planes=24"], &["`projector.planes` = 24", "plane_times = \"equal\""], 2);
     refused(&["projector.backend.slots_per_sequence=2"], &["slots_per_sequence = 1"], 2);
     refused(&["projector.backend.device_number=77"], &["ALP_NOT_ONLINE (1001)", "device_number"], 3);
     let output =

@@ -39,7 +39,8 @@ fn the_light_of_a_display_is_later_than_its_slots() {
     assert_eq!(alp.projector.plane_timing(), PlaneTiming::Equal);
     let LitTime { whole_ns, frame_ns, .. } = alp.projector.lit_time();
     assert_eq!(whole_ns, frame_ns - frame_ns / 9);
-    let binary = ["projector.weights=binary", "projector.backend.weights=binary", "projector.frame_rate=80"];
+    let binary =
+        ["projector.weights=binary", "projector.backend.plane_times=binary", "projector.frame_rate=80"];
     let alp = template("alp.toml", &binary).unwrap_or_else(|e| panic!("{e}"));
     assert_eq!(alp.projector.plane_timing(), PlaneTiming::ByWeight);
     let window = template("window.toml", &[]).unwrap_or_else(|e| panic!("{e}"));
@@ -131,4 +132,87 @@ fn a_controller_behind_a_display_shows_frames_that_have_arrived() {
         let told = parsed(keys).expect_err("refused").to_string();
         assert!(told.contains(names), "{keys:?}: {told}");
     }
+}
+
+/// Planes whose highest bit is split are for projectors that dim their light from plane to plane, and nothing else asks a device
+/// for planes that exceed full light.
+#[test]
+fn only_projectors_that_dim_their_planes_split_the_highest_bit() {
+    let split = "projector.weights=\"split\"";
+    for name in ["usb-natnet.toml", "demo.toml"] {
+        let schedule = |keys: &[&str]| {
+            template(name, keys).unwrap_or_else(|e| panic!("{name}, {keys:?}: {e}")).projector.schedule()
+        };
+        assert!(!schedule(&[]).exceeds() && !schedule(&["projector.weights=\"equal\""]).exceeds(), "{name}");
+        assert_eq!(schedule(&[split]), PlaneSchedule::split_rgb24(), "{name}");
+        assert_eq!(schedule(&[split, "projector.planes=8"]), PlaneSchedule::split_mono8(), "{name}");
+    }
+    for name in ["display.toml", "window.toml", "alp.toml", "dlpc900-live.toml", "dlpc900.toml"] {
+        let told = template(name, &[split]).expect_err(name).to_string();
+        assert!(told.contains("does not dim its light from plane to plane"), "{name}: {told}");
+    }
+}
+
+/// Limits count the light of binary planes whatever planes are lit, so no schedule makes a limit wider: not the rig's own, and
+/// not the one that a limit says it was measured with.
+#[test]
+fn no_schedule_widens_a_limit() {
+    let permille = |keys: &[&str]| {
+        let all = [&["safety.limits.mean_level=0.3"][..], keys].concat();
+        let rig = template("usb-natnet.toml", &all).unwrap_or_else(|e| panic!("{keys:?}: {e}"));
+        rig.safety.limits.limits(&rig.projector).mean_permille
+    };
+    let [split, equal] = ["split", "equal"].map(|w| format!("projector.weights={w:?}"));
+    let named = |w: &str| format!("safety.limits.measured_with={w:?}");
+    for keys in [&[][..], &[&split], &[&equal], &[&named("binary")], &[&split, &named("binary")]] {
+        assert_eq!(permille(keys), 300, "{keys:?}");
+    }
+    // White of equal planes is 128 of 255.
+    assert_eq!(permille(&[&named("equal")]), 150);
+    assert_eq!(permille(&[&split, &named("equal")]), 150);
+    // An ALP lights all planes fully, so its white is the same.
+    let alp = template("alp.toml", &["safety.limits.mean_level=0.3", &named("equal")]).unwrap();
+    assert_eq!(alp.safety.limits.limits(&alp.projector).mean_permille, 300);
+    let mean = "safety.limits.mean_level=0.3";
+    for (keys, names) in [
+        (&[mean, &named("split")][..], "would be that much wider"),
+        (&[mean, &named("split"), &split], "would be that much wider"),
+        (&["safety.limits.full_white_s=2", &named("equal")], "counts levels of 0.95"),
+        (&["safety.limits.mean_level=0.0015", &named("equal")], "below a thousandth"),
+        (&[&named("equal")], "there are none"),
+    ] {
+        let told = template("usb-natnet.toml", keys).expect_err("refused").to_string();
+        assert!(told.contains(names), "{keys:?}: {told}");
+    }
+}
+
+/// What a code value gives is measured with some planes, and a rig with others is refused. What says nothing was not measured
+/// with planes that exceed full light.
+#[test]
+fn measured_light_is_that_of_the_planes_it_was_measured_with() {
+    let gamma = "projector.response={kind=\"gamma\"}";
+    let flat = "projector.flat_field=\"white.png\"";
+    let [split, equal] = ["split", "equal"].map(|w| format!("projector.weights={w:?}"));
+    let named = |w: &str| format!("projector.measured_with={w:?}");
+    for keys in [
+        &[gamma][..],
+        &[gamma, &equal],
+        &[flat, &named("binary")],
+        &[gamma, &split, &named("split")],
+        &[&split],
+    ] {
+        template("usb-natnet.toml", keys).unwrap_or_else(|e| panic!("{keys:?}: {e}"));
+    }
+    for keys in [
+        &[gamma, &split][..],
+        &[flat, &split],
+        &[gamma, &split, &named("binary")],
+        &[gamma, &named("split")],
+        &[flat, &equal, &named("binary")],
+    ] {
+        let told = template("usb-natnet.toml", keys).expect_err("refused").to_string();
+        assert!(told.contains("the light of other planes was measured"), "{keys:?}: {told}");
+    }
+    let told = template("usb-natnet.toml", &[&named("equal")]).expect_err("refused").to_string();
+    assert!(told.contains("there are none"), "{told}");
 }
