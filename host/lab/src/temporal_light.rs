@@ -261,7 +261,10 @@ mod tests {
     #[test]
     fn a_split_highest_bit_modulates_less_and_lights_more() {
         let [(split, white), (binary, of_binary)] = ["split", "binary"].map(of);
-        println!("split {split:.3?}, binary {binary:.3?}: white {:.3} times at the same peak", white / of_binary);
+        println!(
+            "split {split:.3?}, binary {binary:.3?}: white {:.3} times at the same peak",
+            white / of_binary
+        );
         assert!(split[0] <= 0.85 && split[1] <= 1.65, "{split:?}");
         assert!(binary[0] > 1.4 && binary[1] > split[1], "{binary:?}");
         assert!(white >= 1.9 * of_binary, "{white} {of_binary}");

@@ -168,8 +168,8 @@ fn planes_of_gpu_and_cpu_are_the_same_bits() {
             for fast in [1.0, 8.0, 60.0] {
                 let [now, first, last] = poses_of_frame(&twists(fast), centre_of(&schedule));
                 let mut renderer = renderer_of(cut, gpu, &scene, &camera, &groups);
+                let mut at_rest = renderer_of(cut, gpu, &scene, &camera, &[]);
                 let frames = [0, 1].map(|before| {
-                    let mut at_rest = renderer_of(cut, gpu, &scene, &camera, &[]);
                     let still = draw_frame(before, &mut at_rest, &camera, &now, None);
                     let shown = draw_frame(before, &mut renderer, &camera, &now, Some((&first, &last)));
                     assert_eq!((shown.movers.len(), still.movers.len()), (2, 0), "{name}");
@@ -377,7 +377,9 @@ mod breadth {
     #[test]
     fn planes_whose_highest_bit_is_split_add_up_where_bodies_move() {
         with_gpu(|gpu| {
-            for (pattern, follows, rests) in [(Pattern::Noise, 0.0085, 0.011), (Pattern::Patches, 0.0085, 0.011)] {
+            for (pattern, follows, rests) in
+                [(Pattern::Noise, 0.0085, 0.011), (Pattern::Patches, 0.0085, 0.011)]
+            {
                 let card = Card::new(gpu, pattern).unwrap();
                 let [rest, moves] = ["at rest", "1 m/s"].map(|name| {
                     let row = card.measure(motion_named(name), &Panel::of_split()).unwrap();

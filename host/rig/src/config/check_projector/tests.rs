@@ -164,7 +164,9 @@ fn no_schedule_widens_a_limit() {
     };
     let [split, equal] = ["split", "equal"].map(|w| format!("projector.weights={w:?}"));
     let named = |w: &str| format!("safety.limits.measured_with={w:?}");
-    for keys in [&[][..], &[&split], &[&equal], &[&named("binary")], &[&split, &named("binary")]] {
+    let [binary_named, equal_named, split_named] = ["binary", "equal", "split"].map(named);
+    let plain: [&[&str]; 5] = [&[], &[&split], &[&equal], &[&binary_named], &[&split, &binary_named]];
+    for keys in plain {
         assert_eq!(permille(keys), 300, "{keys:?}");
     }
     // White of equal planes is 128 of 255.
@@ -174,13 +176,14 @@ fn no_schedule_widens_a_limit() {
     let alp = template("alp.toml", &["safety.limits.mean_level=0.3", &named("equal")]).unwrap();
     assert_eq!(alp.safety.limits.limits(&alp.projector).mean_permille, 300);
     let mean = "safety.limits.mean_level=0.3";
-    for (keys, names) in [
-        (&[mean, &named("split")][..], "would be that much wider"),
-        (&[mean, &named("split"), &split], "would be that much wider"),
-        (&["safety.limits.full_white_s=2", &named("equal")], "counts levels of 0.95"),
-        (&["safety.limits.mean_level=0.0015", &named("equal")], "below a thousandth"),
-        (&[&named("equal")], "there are none"),
-    ] {
+    let refused: [(&[&str], &str); 5] = [
+        (&[mean, &split_named], "would be that much wider"),
+        (&[mean, &split_named, &split], "would be that much wider"),
+        (&["safety.limits.full_white_s=2", &equal_named], "counts levels of 0.95"),
+        (&["safety.limits.mean_level=0.0015", &equal_named], "below a thousandth"),
+        (&[&equal_named], "there are none"),
+    ];
+    for (keys, names) in refused {
         let told = template("usb-natnet.toml", keys).expect_err("refused").to_string();
         assert!(told.contains(names), "{keys:?}: {told}");
     }
@@ -191,25 +194,23 @@ fn no_schedule_widens_a_limit() {
 #[test]
 fn measured_light_is_that_of_the_planes_it_was_measured_with() {
     let gamma = "projector.response={kind=\"gamma\"}";
-    let flat = "projector.flat_field=\"white.png\"";
+    let flat = concat!("projector.flat_field=\"", env!("CARGO_MANIFEST_DIR"), "/Cargo.toml\"");
     let [split, equal] = ["split", "equal"].map(|w| format!("projector.weights={w:?}"));
     let named = |w: &str| format!("projector.measured_with={w:?}");
-    for keys in [
-        &[gamma][..],
-        &[gamma, &equal],
-        &[flat, &named("binary")],
-        &[gamma, &split, &named("split")],
-        &[&split],
-    ] {
+    let [of_binary, of_split] = ["binary", "split"].map(named);
+    let good: [&[&str]; 5] =
+        [&[gamma], &[gamma, &equal], &[flat, &of_binary], &[gamma, &split, &of_split], &[&split]];
+    for keys in good {
         template("usb-natnet.toml", keys).unwrap_or_else(|e| panic!("{keys:?}: {e}"));
     }
-    for keys in [
-        &[gamma, &split][..],
+    let bad: [&[&str]; 5] = [
+        &[gamma, &split],
         &[flat, &split],
-        &[gamma, &split, &named("binary")],
-        &[gamma, &named("split")],
-        &[flat, &equal, &named("binary")],
-    ] {
+        &[gamma, &split, &of_binary],
+        &[gamma, &of_split],
+        &[flat, &equal, &of_binary],
+    ];
+    for keys in bad {
         let told = template("usb-natnet.toml", keys).expect_err("refused").to_string();
         assert!(told.contains("the light of other planes was measured"), "{keys:?}: {told}");
     }
