@@ -23,9 +23,9 @@ pub const JUDGED: [Field; 2] = [
 const TABLE: [[f64; 3]; 3] = [[0.0, 10.0, 20.0], [1.0, 5.0, 10.0], [20.0, 100.0, 300.0]];
 /// The darkest grey that is judged: an eighth of full light. Darker ones are modulated more, and seen less.
 const DARKEST: u8 = 32;
-/// Every so many greys are judged where each takes a halftone of its own. The number is odd, because planes may show the low
-/// bits of a grey as they are.
-const STEP_OF_HALFTONES: usize = 7;
+/// Every so many greys are judged where each takes a halftone of its own; and where planes show the low bits of a grey as they
+/// are, an odd number, so that all of these are met.
+const STEP_OF_HALFTONES: [usize; 2] = [16, 7];
 
 /// What is noticed of the light of a grey, each in units of its threshold.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize)]
@@ -91,8 +91,8 @@ pub struct TemporalLight {
 impl TemporalLight {
     /// The light of `projector`; `None` if another program decides it.
     pub fn of(projector: &ProjectorConfig) -> Option<Self> {
-        let has_halftones = projector.schedule().parts().is_some();
-        let step = if has_halftones { STEP_OF_HALFTONES } else { 1 };
+        let [of_parts, of_split] = STEP_OF_HALFTONES;
+        let step = projector.schedule().parts().map_or(1, |p| if p.low > 0 { of_split } else { of_parts });
         let greys: Vec<LightCourse> = (DARKEST..=u8::MAX)
             .rev()
             .step_by(step)
@@ -254,7 +254,7 @@ mod tests {
         let white = LightCourse::of(&rig.projector, [u8::MAX; 3]).unwrap();
         let light = white.flashes.iter().map(|f| f.light[1] * (f.span_ns[1] - f.span_ns[0])).sum::<f64>();
         let peak = white.flashes.iter().map(|f| f.light[1]).fold(0.0, f64::max);
-        (([mean, p90]), light / white.period_ns / peak)
+        ([mean, p90], light / white.period_ns / peak)
     }
 
     /// Three planes of the highest bit leave half of the modulation of one, and twice the light at the same peak.

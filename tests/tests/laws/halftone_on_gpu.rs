@@ -197,36 +197,4 @@ mod breadth {
             assert!(worst <= 0.40, "{worst} levels");
         });
     }
-
-    /// Split planes give the picture of binary ones: a block's mean is that of binary planes to what a code value is rounded by
-    /// where the same light has half the code, and to what its halftone rounds. White would have twice the light.
-    #[test]
-    fn light_of_split_planes_is_that_of_binary_ones() {
-        with_gpu(|gpu| {
-            let light = |flags: &[&str]| {
-                let still = [0, 1].map(|i| format!("scene.bodies.{i}.motion={{kind=\"still\"}}"));
-                let flags = [&still.each_ref().map(String::as_str)[..], flags].concat();
-                let rig = demo_rig(128, 96, &flags);
-                let (outcome, _) = run(gpu, &rig, 24, 24);
-                assert_eq!((outcome.light_mismatches, outcome.report.frames_lit), (0, 24));
-                let sums = |frame: &LightFrame| block_sums(rig.camera.raster, &frame.codes);
-                outcome.light.iter().map(sums).collect::<Vec<_>>()
-            };
-            let [binary, split] =
-                ["binary", "split"].map(|weights| light(&[&format!("projector.weights={weights:?}")]));
-            let (mut worst, mut off, mut lit) = (0.0f64, 0.0, 0);
-            for (a, b) in binary.iter().flatten().zip(split.iter().flatten()) {
-                for c in (0..3).filter(|c| a[*c] > 0) {
-                    let [a, b] = [f64::from(a[c]), f64::from(b[c]) * 508.0 / 255.0].map(|sum| sum / 64.0);
-                    worst = worst.max((a - b).abs());
-                    off += a - b;
-                    lit += 1;
-                }
-            }
-            assert!(lit > 1_000, "{lit} blocks are lit");
-            let off = off / f64::from(lit);
-            println!("blocks of split planes differ by {off:.3} levels on average, by {worst:.2} at most");
-            assert!(worst <= 1.9 && off.abs() <= 0.1, "{worst} levels, {off} on average");
-        });
-    }
 }
