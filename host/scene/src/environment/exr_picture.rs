@@ -45,7 +45,10 @@ fn without_false_kind(bytes: &[u8]) -> Option<Vec<u8>> {
     let bits = *bytes.get(5)?;
     let kind: &[u8] = if bits & TILED != 0 { b"tiledimage" } else { b"scanlineimage" };
     let mut at = 8usize;
-    while bits & DEEP_OR_PARTS == 0 {
+    if bits & DEEP_OR_PARTS != 0 {
+        return None;
+    }
+    loop {
         let text = |at: usize| bytes.get(at..)?.iter().take(256).position(|b| *b == 0);
         let name = at..at + text(at)?;
         if name.is_empty() {
@@ -64,7 +67,6 @@ fn without_false_kind(bytes: &[u8]) -> Option<Vec<u8>> {
             });
         }
     }
-    None
 }
 
 /// Reads a picture; its sides are checked before its texels are.
