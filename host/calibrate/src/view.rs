@@ -165,7 +165,7 @@ pub fn told_of(fit: &ViewFit) -> String {
     let (p, m, [used, all]) = (&fit.predicted, &fit.model, fit.rays);
     let at = m.position();
     format!(
-        "predicted error {:.2} px (what is to be expected of the 99th percentile over what was lit, and no bound);\n\
+        "predicted error {:.2} px (what is to be expected of the 99th percentile over the raster, and no bound);\n\
          focal lengths {:.1} and {:.1} px, at ({:.3}, {:.3}, {:.3}) m; residual {:.3} px rms of {used} of {all} rays",
         p.p99_px, m.focal.x, m.focal.y, at.x, at.y, at.z, fit.rms_px
     )

@@ -23,6 +23,7 @@ use crate::model::{ProjectorModel, PARAMETERS};
 use crate::projector::{percentile, predict_share, Priors};
 use dpm_calibration_file::LightError;
 use dpm_device::planes::Raster;
+use dpm_scene::geometry::projector::ProjectorCamera;
 use fit::State;
 use glam::{DAffine3, DVec2, DVec3};
 
@@ -77,7 +78,7 @@ pub struct ViewFit {
     pub model: ProjectorModel,
     /// Covariance of its numbers.
     pub covariance: Vec<Vec<f64>>,
-    /// The error that the light has on what was seen: a typical draw, not a bound.
+    /// The error that the light has all over the raster, at the distances of what was seen: a typical draw, not a bound.
     pub predicted: LightError,
     /// Root mean square residual of the rays along one axis, pixels.
     pub rms_px: f64,
@@ -100,6 +101,8 @@ const THINNEST: f64 = 0.006;
 const MOST_UNCERTAIN_PX: f64 = 10.0;
 /// Residuals beyond which nothing that stood still explains the rays, pixels.
 const MOST_RMS_PX: f64 = 2.0;
+/// Columns and rows of the pixels over which the error is predicted.
+const GRID: [u32; 2] = [16, 12];
 /// The draw of the errors that is reported as the error: the middle one.
 const TYPICAL: f64 = 0.5;
 
@@ -128,19 +131,28 @@ pub fn solve(raster: Raster, view: &CodedView) -> Result<ViewFit, ViewRefusal> {
 fn judge(raster: Raster, view: &CodedView, found: fit::Fit) -> Result<ViewFit, ViewRefusal> {
     let State { model, .. } = &found.state;
     let points: Vec<DVec3> = view.rays.iter().filter_map(|r| found.state.end(view, r)).collect();
-    if model.camera(raster).is_err() {
-        return Err(ViewRefusal::LensFolds);
-    }
-    let step = (points.len() / 600).max(1);
-    let some: Vec<DVec3> = points.iter().copied().step_by(step).collect();
+    let Ok(camera) = model.camera(raster) else { return Err(ViewRefusal::LensFolds) };
     let covariance: Vec<Vec<f64>> =
         found.covariance.iter().take(PARAMETERS).map(|row| row[..PARAMETERS].to_vec()).collect();
-    let predicted = predict_share(model, &covariance, &some, TYPICAL);
+    let predicted = predict_share(model, &covariance, &over_raster(raster, &camera, &points), TYPICAL);
     if predicted.p99_px.is_nan() || predicted.p99_px > MOST_UNCERTAIN_PX {
         return Err(ViewRefusal::Uncertain { p99_px: predicted.p99_px, most_px: MOST_UNCERTAIN_PX });
     }
     let rays = [points.len(), view.rays.len()];
     Ok(ViewFit { model: *model, covariance, predicted, rms_px: found.rms_px, rays, points })
+}
+
+/// Points that pixels all over the raster light, at the distances at which something was seen.
+fn over_raster(raster: Raster, camera: &ProjectorCamera, seen: &[DVec3]) -> Vec<DVec3> {
+    let distances: Vec<f64> = seen.iter().map(|p| p.distance(camera.position())).collect();
+    let distances = [0.1, 0.5, 0.9].map(|share| percentile(distances.clone(), share));
+    let size = DVec2::new(f64::from(raster.width()), f64::from(raster.height()));
+    let [across, down] = GRID;
+    let pixels = (0..across * down).map(|k| DVec2::new(f64::from(k % across), f64::from(k / across)));
+    let places = pixels.map(|at| at / DVec2::new(f64::from(across - 1), f64::from(down - 1)) * size);
+    let rays: Vec<_> =
+        places.map(|pixel| camera.ray(pixel)).filter(|ray| ray.direction.is_finite()).collect();
+    distances.into_iter().flat_map(|far| rays.iter().map(move |r| r.origin + far * r.direction)).collect()
 }
 
 fn check(raster: Raster, view: &CodedView) -> Result<(), ViewRefusal> {

@@ -9,7 +9,6 @@ struct Scene {
     raster: Raster,
     truth: ProjectorModel,
     view: CodedView,
-    ends: Vec<DVec3>,
 }
 
 #[derive(Clone, Copy)]
@@ -72,7 +71,7 @@ fn drawn(draws: Draws, setup: Setup) -> Scene {
     );
     let covariance =
         std::array::from_fn(|i| std::array::from_fn(|j| if i == j { sigmas[i].powi(2) } else { 0.0 }));
-    let (mut rays, mut ends) = (Vec::new(), Vec::new());
+    let mut rays = Vec::new();
     // All over the wall, then all over the board.
     let all = (0..2500u32)
         .map(|k| DVec3::new(f64::from(k % 50) / 49.0 * 1.8 - 0.9, f64::from(k / 50) / 49.0 * 1.4 - 0.7, 0.0));
@@ -107,18 +106,25 @@ fn drawn(draws: Draws, setup: Setup) -> Scene {
         let noise = setup.noise_px * DVec2::new(draws.normal(i), draws.normal(i + 2));
         let plane = plane.filter(|_| setup.tags);
         rays.push(CodedRay { ray, pixel: pixel + noise, sigma_px: 0.1, plane });
-        ends.push(end);
     }
     let bodies = vec![KnownBody { world_from_body: seen, covariance }];
     let planes = vec![KnownPlane { body: 0, body_from_plane: DAffine3::IDENTITY }];
-    Scene { raster, truth, view: CodedView { eye, rays, bodies, planes }, ends }
+    Scene { raster, truth, view: CodedView { eye, rays, bodies, planes } }
 }
 
 impl Scene {
-    /// The error of the light on what was seen: 99th percentile, pixels.
+    /// The error of the light all over the raster, 1.4 to 2.2 m away: 99th percentile, pixels.
     fn error_px(&self, fit: &ViewFit) -> f64 {
-        let off = |p: &DVec3| Some((fit.model.project(*p)? - self.truth.project(*p)?).length());
-        percentile(self.ends.iter().map(|p| off(p).unwrap_or(f64::INFINITY)).collect(), 0.99)
+        let truth = self.truth.camera(self.raster).unwrap();
+        let off = |pixel: DVec2, far: f64| {
+            let ray = truth.ray(pixel);
+            Some((fit.model.project(ray.origin + far * ray.direction)? - pixel).length())
+        };
+        let size = DVec2::new(f64::from(self.raster.width()), f64::from(self.raster.height()));
+        let pixels =
+            (0..20 * 15u32).map(|k| DVec2::new(f64::from(k % 20) / 19.0, f64::from(k / 20) / 14.0) * size);
+        let errors = pixels.flat_map(|p| [1.4, 1.8, 2.2].map(|far| off(p, far).unwrap_or(f64::INFINITY)));
+        percentile(errors.collect(), 0.99)
     }
 }
 
@@ -146,23 +152,23 @@ fn within_two(shares: &[f64]) -> usize {
 
 #[test]
 fn the_error_of_drawn_projectors_is_small_and_predicted() {
-    let (errors, shares) = judged(5);
-    assert!(errors.len() == 5 && percentile(errors.clone(), 1.0) < 2.5, "{errors:?}");
-    assert!(within_two(&shares) >= 3, "{shares:?}");
+    let (errors, shares) = judged(12);
+    assert!(errors.len() == 12 && percentile(errors.clone(), 0.5) < 1.0, "{errors:?}");
+    assert!((0.5..2.0).contains(&percentile(shares.clone(), 0.5)), "{shares:?}");
 }
 
 mod breadth {
     use super::*;
 
-    /// The error of one view is that of two or three numbers that it determines worst, so it scatters about its prediction: 72 of 100
-    /// lie within a factor of two, and half of them on either side.
+    /// The error of one view is that of two or three numbers that it determines worst, so it scatters about its prediction: two in three
+    /// lie within a factor of two, and half of all on either side.
     #[test]
     fn the_predicted_error_is_the_true_one_over_drawn_projectors() {
         let (errors, shares) = judged(100);
         let (within, solved) = (within_two(&shares), shares.len());
         let usual = percentile(shares, 0.5);
         println!("{within} of {solved} within a factor of two; predicted over true {usual:.2}");
-        assert!(solved >= 95 && within * 100 >= 65 * solved, "{within} of {solved}");
+        assert!(solved >= 95 && within * 100 >= 60 * solved, "{within} of {solved}");
         assert!((0.7..1.4).contains(&usual) && percentile(errors, 0.5) < 0.6);
     }
 }
