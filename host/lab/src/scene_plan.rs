@@ -355,7 +355,7 @@ fn gpu_failure(error: impl Into<RenderError>) -> Failure {
 /// Times frames of `rig` with and without each part of the report that can be put back or taken out.
 fn measure_savings(report: &mut PlanReport, rig: &Rig, gpu: &Arc<Gpu>) -> Result<(), Failure> {
     let method = rig.config.render.to_method();
-    let (own, lean) = (renderer_settings(&rig), Keep::default());
+    let (own, lean) = (renderer_settings(rig), Keep::default());
     let mine = Side { scene: &rig.scene, settings: &own, keep: lean };
     let pair = |without: Side<'_>, with: Side<'_>| compare(rig, gpu, without, with).map_err(gpu_failure);
     for e in &mut report.entries {

@@ -138,12 +138,15 @@ fn not_begun<T>(_: &RigConfig) -> Result<T, Failure> {
 /// How a run ends that had results.
 const PANICKED: &str = "the run was stopped by a panic in one of its threads (see above)";
 
+/// The thread of a run, and what it sends when it ends.
+type Worker<T> = (JoinHandle<()>, Receiver<Result<T, Failure>>);
+
 /// Starts the run on a thread of its own, which sends its result when it ends.
 fn start_worker<T: Send + 'static>(
     rig: RigConfig,
     monitor: Arc<RunMonitor>,
     run: impl FnOnce(&RigConfig, &Arc<RunMonitor>) -> Result<T, Failure> + Send + 'static,
-) -> Result<(JoinHandle<()>, Receiver<Result<T, Failure>>), Failure> {
+) -> Result<Worker<T>, Failure> {
     let (done, finished) = unbounded();
     let work = move || {
         // Only the instance that has the projector's lock starts it. A panic ends without a message to the guard, like
