@@ -41,6 +41,7 @@ pub(crate) fn read_look(
         limits,
         cancel,
         images: HashMap::new(),
+        holders: HashMap::new(),
         known: HashMap::new(),
         textures: vec![],
         texels: 0,
@@ -91,6 +92,8 @@ struct Reader<'a> {
     cancel: &'a Cancel,
     /// Decoded images; `None`: one that cannot be read, which is told.
     images: HashMap<usize, Option<Picture>>,
+    /// Image to index in `textures`: the first texture of an image takes its texels, so that no picture is held twice.
+    holders: HashMap<usize, usize>,
     /// (image, sampler, sRGB, with heights) to index in `textures`: textures of a file may differ in their names alone.
     known: HashMap<(usize, Option<usize>, bool, bool), u32>,
     textures: Vec<Texture>,
@@ -278,7 +281,7 @@ impl Reader<'_> {
         heights: bool,
         warnings: &mut Vec<String>,
     ) -> Result<Texture, SceneError> {
-        let Some(Some(picture)) = self.images.get(&image) else {
+        let Some(Some(picture)) = self.images.get_mut(&image) else {
             return Err(SceneError::Internal(format!("image {image} was not decoded")));
         };
         let (Size { width, height }, srgb) = (picture.size, picture.srgb);
@@ -297,6 +300,16 @@ impl Reader<'_> {
             self.limits.texels,
             "use smaller textures",
         )?;
+        let texels = match self.holders.get(&image) {
+            _ if heights => picture.with_heights(),
+            // Another texture may need its heights.
+            _ if picture.red_green_only => picture.texels.clone(),
+            Some(&holder) => self.textures[holder].texels.clone(),
+            None => {
+                self.holders.insert(image, self.textures.len());
+                std::mem::take(&mut picture.texels)
+            }
+        };
         let texture = self.document.textures().nth(u.texture);
         let sampler = texture.as_ref().map(|t| t.sampler());
         let wrap = |mode: gltf::texture::WrappingMode| match mode {
@@ -307,7 +320,7 @@ impl Reader<'_> {
         Ok(Texture {
             width,
             height,
-            texels: if heights { picture.with_heights() } else { picture.texels.clone() },
+            texels,
             srgb: u.srgb,
             wrap_u: sampler.as_ref().map_or(Wrap::Repeat, |s| wrap(s.wrap_s())),
             wrap_v: sampler.as_ref().map_or(Wrap::Repeat, |s| wrap(s.wrap_t())),

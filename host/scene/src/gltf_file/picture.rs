@@ -101,8 +101,10 @@ fn as_rgba(decoded: image::DynamicImage, allowed: u64) -> (Size, Vec<[u8; 4]>) {
     let bytes = |step: u32| 4 * u64::from(width.div_ceil(step)) * u64::from(height.div_ceil(step));
     let step = (1..).find(|step| bytes(*step) <= allowed).unwrap_or(1);
     if step == 1 {
-        let rgba = decoded.into_rgba8();
-        let texels = rgba.as_raw().chunks_exact(4).map(|c| [c[0], c[1], c[2], c[3]]).collect();
+        // A decoder may leave room for a part of a texel, which only a copy gets rid of.
+        let copy = |raw: Vec<u8>| raw.chunks_exact(4).map(|c| [c[0], c[1], c[2], c[3]]).collect();
+        let texels =
+            bytemuck::try_cast_vec(decoded.into_rgba8().into_raw()).unwrap_or_else(|(_, raw)| copy(raw));
         return (Size { width, height }, texels);
     }
     let size = Size { width: width.div_ceil(step), height: height.div_ceil(step) };
