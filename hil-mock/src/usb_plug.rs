@@ -7,6 +7,7 @@
 //! the disconnect signalled.
 
 use std::collections::{BTreeMap, VecDeque};
+use std::ops::Range;
 use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
 use std::time::{Duration, Instant};
 
@@ -443,34 +444,19 @@ impl PlugState {
         let mut moved = 0;
         loop {
             let now = (self.clock)();
-            let mut refused = refuse_until.is_some_and(|t| now < t);
             let skip = matches!(fault, Some(Fault::Unplug(_))) && limit == 0;
-            let (seen, step) = {
+            let (seen, refused) = {
                 let s = lock(&self.state);
-                let seen = s.moves;
-                refused |= s.held_until.is_some_and(|t| now < t);
                 let cancelled = s.queues.get(&endpoint).is_some_and(|q| q.cancel_running);
                 if cancelled || s.pulled {
                     return (if cancelled { Status::Cancelled } else { Status::Gone }, moved);
                 }
-                let step = if refused || skip {
-                    Progress { bytes: 0, then: if skip { Then::Complete } else { Then::Nak } }
-                } else if let Some(setup) = r.setup {
-                    drop(s);
-                    self.control(&setup, &mut r.buffer)
-                } else {
-                    drop(s);
-                    let mut model = lock(&self.model);
-                    // Read the clock again: the model may have been busy with another endpoint's transfer, and its
-                    // stamps must not be older.
-                    let now = (self.clock)();
-                    if is_in {
-                        model.transfer_in(now, endpoint, &mut r.buffer[moved..])
-                    } else {
-                        model.transfer_out(now, endpoint, &r.buffer[moved..limit])
-                    }
-                };
-                (seen, step)
+                (s.moves, refuse_until.max(s.held_until).is_some_and(|t| now < t))
+            };
+            let step = match (skip, refused) {
+                (true, _) => Progress { bytes: 0, then: Then::Complete },
+                (_, true) => Progress { bytes: 0, then: Then::Nak },
+                _ => self.transfer(endpoint, is_in, r, moved..limit),
             };
             // If a model claims more than it was given, the claim is limited: the host never sees unwritten bytes.
             moved = (moved + step.bytes).min(r.buffer.len());
@@ -505,6 +491,22 @@ impl PlugState {
                 Some(Fault::Short(n)) if is_in => (status, moved.min(n)),
                 _ => (status, moved),
             };
+        }
+    }
+
+    /// Has the model take what is sent of `part` of a request's bytes, or fill them.
+    fn transfer(&self, endpoint: u8, is_in: bool, r: &mut Request, part: Range<usize>) -> Progress {
+        if let Some(setup) = r.setup {
+            return self.control(&setup, &mut r.buffer);
+        }
+        let mut model = lock(&self.model);
+        // The clock is read behind the lock: the model may have been busy with another endpoint's transfer, and its stamps
+        // must not be older.
+        let now = (self.clock)();
+        if is_in {
+            model.transfer_in(now, endpoint, &mut r.buffer[part.start..])
+        } else {
+            model.transfer_out(now, endpoint, &r.buffer[part])
         }
     }
 

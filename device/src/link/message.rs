@@ -383,6 +383,46 @@ impl HostMessage {
     }
 }
 
+/// Reads the payload of STATUS.
+fn status(p: &[u8]) -> Result<Status, PayloadError> {
+    let kind = MessageType::Status;
+    // No two combinations of parts are equally long.
+    let more = p.len().saturating_sub(STATUS_BYTES);
+    let follows = more == TRACKS_BYTES || more == TRACKS_BYTES + TIMING_BYTES;
+    let times = more == TIMING_BYTES || more == TRACKS_BYTES + TIMING_BYTES;
+    let tracks_end = STATUS_BYTES + if follows { TRACKS_BYTES } else { 0 };
+    expect_len(kind, p, tracks_end + if times { TIMING_BYTES } else { 0 })?;
+    Ok(Status {
+        state: DeviceState::from_code(p[0]).ok_or(PayloadError::Field { kind, field: "state" })?,
+        lit: p[1] & 1 != 0,
+        last_plane: p[2],
+        buffers_free: p[3],
+        faults: u32_at(p, 4),
+        frame_limit: u32_at(p, 8),
+        frames_accounted: u32_at(p, 12),
+        last_whole_frame: u32_at(p, 16),
+        last_lit_frame: u32_at(p, 20),
+        last_lit_at: DeviceTicks(u64_at(p, 24)),
+        now: DeviceTicks(u64_at(p, 32)),
+        slots: u32_at(p, 40),
+        frames_seen: u32_at(p, 44),
+        frames_lit: u32_at(p, 48),
+        slots_repeated: u32_at(p, 52),
+        slots_blank: u32_at(p, 56),
+        frames_incomplete: u32_at(p, 60),
+        frames_late: u32_at(p, 64),
+        frames_superseded: u32_at(p, 68),
+        frames_refused: u32_at(p, 72),
+        packets: u32_at(p, 76),
+        header_errors: u32_at(p, 80),
+        payload_errors: u32_at(p, 84),
+        packets_ignored: u32_at(p, 88),
+        bytes_skipped: u32_at(p, 92),
+        tracks: follows.then(|| TrackCounts::parse(&p[STATUS_BYTES..])),
+        timing: times.then(|| FrameTiming::parse(&p[tracks_end..])),
+    })
+}
+
 impl DeviceMessage {
     /// Reads a payload that a host received.
     pub fn parse(kind: MessageType, p: &[u8]) -> Result<Self, PayloadError> {
@@ -407,43 +447,7 @@ impl DeviceMessage {
                     now: DeviceTicks(u64_at(p, 32)),
                 })
             }
-            MessageType::Status => {
-                // No two combinations of parts are equally long.
-                let more = p.len().saturating_sub(STATUS_BYTES);
-                let follows = more == TRACKS_BYTES || more == TRACKS_BYTES + TIMING_BYTES;
-                let times = more == TIMING_BYTES || more == TRACKS_BYTES + TIMING_BYTES;
-                let tracks_end = STATUS_BYTES + if follows { TRACKS_BYTES } else { 0 };
-                expect_len(kind, p, tracks_end + if times { TIMING_BYTES } else { 0 })?;
-                Self::Status(Status {
-                    state: DeviceState::from_code(p[0]).ok_or(field("state"))?,
-                    lit: p[1] & 1 != 0,
-                    last_plane: p[2],
-                    buffers_free: p[3],
-                    faults: u32_at(p, 4),
-                    frame_limit: u32_at(p, 8),
-                    frames_accounted: u32_at(p, 12),
-                    last_whole_frame: u32_at(p, 16),
-                    last_lit_frame: u32_at(p, 20),
-                    last_lit_at: DeviceTicks(u64_at(p, 24)),
-                    now: DeviceTicks(u64_at(p, 32)),
-                    slots: u32_at(p, 40),
-                    frames_seen: u32_at(p, 44),
-                    frames_lit: u32_at(p, 48),
-                    slots_repeated: u32_at(p, 52),
-                    slots_blank: u32_at(p, 56),
-                    frames_incomplete: u32_at(p, 60),
-                    frames_late: u32_at(p, 64),
-                    frames_superseded: u32_at(p, 68),
-                    frames_refused: u32_at(p, 72),
-                    packets: u32_at(p, 76),
-                    header_errors: u32_at(p, 80),
-                    payload_errors: u32_at(p, 84),
-                    packets_ignored: u32_at(p, 88),
-                    bytes_skipped: u32_at(p, 92),
-                    tracks: follows.then(|| TrackCounts::parse(&p[STATUS_BYTES..])),
-                    timing: times.then(|| FrameTiming::parse(&p[tracks_end..])),
-                })
-            }
+            MessageType::Status => Self::Status(status(p)?),
             MessageType::Echo => Self::Echo(echo(p)?),
             MessageType::Fault => {
                 expect_len(kind, p, 16)?;

@@ -277,23 +277,7 @@ impl Core {
                 self.ignore();
                 return;
             }
-            HostMessage::Hello(hello) => {
-                let version = self.setup.version;
-                if session == 0 {
-                    self.ignore();
-                } else if !(hello.version_min..=hello.version_max).contains(&version) {
-                    self.hello_due = Some(session);
-                    self.version_refused_due = Some(session);
-                } else {
-                    if session != self.session {
-                        self.open_session(session);
-                    }
-                    self.last_heard = self.ticks();
-                    self.hello_due = Some(session);
-                    self.status_due = true;
-                }
-                return;
-            }
+            HostMessage::Hello(hello) => return self.greeted(session, hello.version_min..=hello.version_max),
             HostMessage::Stop => return self.disarm(),
             HostMessage::Safe => return self.latch(crate::link::faults::HOST_SAFE),
             HostMessage::Black if self.mode != Mode::Disarmed => {
@@ -329,6 +313,23 @@ impl Core {
             }
             HostMessage::Commit(commit) => self.commit(header, &commit),
             _ => {}
+        }
+    }
+
+    /// A host speaks these versions and opens `session`, or is refused.
+    fn greeted(&mut self, session: u32, versions: core::ops::RangeInclusive<u16>) {
+        if session == 0 {
+            self.ignore();
+        } else if !versions.contains(&self.setup.version) {
+            self.hello_due = Some(session);
+            self.version_refused_due = Some(session);
+        } else {
+            if session != self.session {
+                self.open_session(session);
+            }
+            self.last_heard = self.ticks();
+            self.hello_due = Some(session);
+            self.status_due = true;
         }
     }
 

@@ -259,43 +259,9 @@ impl SampleGate {
         }
         if let Some(last) = state.last {
             if sample.captured_at <= last.captured_at {
-                if sample.sequence == last.sequence && sample.captured_at == last.captured_at {
-                    counters.samples.duplicate += 1;
-                    state.counters.duplicate += 1;
-                    return None;
-                }
-                if state.late_run > 0 && sample.captured_at > state.late_newest {
-                    state.late_run = state.late_run.saturating_add(1);
-                } else {
-                    (state.late_run, state.late_first) = (1, (sample.captured_at, sample.received_at));
-                }
-                state.late_newest = sample.captured_at;
-                let quiet_ns = sample.received_at.ns_since(last.received_at);
-                let captured_ns = sample.captured_at.ns_since(state.late_first.0);
-                let arrived_ns = sample.received_at.ns_since(state.late_first.1);
-                let is_burst = arrived_ns < captured_ns / 2;
-                if state.late_run >= Self::RESTART_RUN && is_burst {
-                    // Restart the measurement of the pace here: samples after a burst must not be measured against its
-                    // beginning.
-                    (state.late_run, state.late_first) = (1, (sample.captured_at, sample.received_at));
-                }
-                if state.late_run < Self::RESTART_RUN || quiet_ns < Self::RESTART_QUIET_NS {
-                    counters.samples.late += 1;
-                    state.counters.late += 1;
-                    return None;
-                }
-                counters.restarts += 1;
+                admit_late(state, &last, &sample, counters)?;
             } else {
-                match sample.sequence.wrapping_sub(last.sequence) {
-                    // Equal numbers with a newer capture: a source without sequence numbers (VRPN), or one that
-                    // restarted at the same number.
-                    0 | 1 => {}
-                    gap if gap - 1 <= Self::MAX_GAP => {
-                        counters.lost += u64::from(gap - 1);
-                        state.counters.lost += u64::from(gap - 1);
-                    }
-                    _ => counters.restarts += 1,
-                }
+                note_gap(state, &last, &sample, counters);
             }
             note_stuck(state, &last, &sample, counters);
         }
@@ -306,6 +272,62 @@ impl SampleGate {
         state.counters.used += 1;
         counters.untracked += u64::from(!sample.tracked);
         Some(sample)
+    }
+}
+
+/// A sample that was captured no later than the last one: `Some` if it is the newest of a clock that was set back, else it is
+/// counted.
+fn admit_late(
+    state: &mut BodyState,
+    last: &TrackerSample,
+    sample: &TrackerSample,
+    counters: &mut TrackerCounters,
+) -> Option<()> {
+    if sample.sequence == last.sequence && sample.captured_at == last.captured_at {
+        counters.samples.duplicate += 1;
+        state.counters.duplicate += 1;
+        return None;
+    }
+    if state.late_run > 0 && sample.captured_at > state.late_newest {
+        state.late_run = state.late_run.saturating_add(1);
+    } else {
+        (state.late_run, state.late_first) = (1, (sample.captured_at, sample.received_at));
+    }
+    state.late_newest = sample.captured_at;
+    let quiet_ns = sample.received_at.ns_since(last.received_at);
+    let captured_ns = sample.captured_at.ns_since(state.late_first.0);
+    let arrived_ns = sample.received_at.ns_since(state.late_first.1);
+    let is_burst = arrived_ns < captured_ns / 2;
+    if state.late_run >= SampleGate::RESTART_RUN && is_burst {
+        // Restart the measurement of the pace here: samples after a burst must not be measured against its
+        // beginning.
+        (state.late_run, state.late_first) = (1, (sample.captured_at, sample.received_at));
+    }
+    if state.late_run < SampleGate::RESTART_RUN || quiet_ns < SampleGate::RESTART_QUIET_NS {
+        counters.samples.late += 1;
+        state.counters.late += 1;
+        return None;
+    }
+    counters.restarts += 1;
+    Some(())
+}
+
+/// Counts what was lost between two samples.
+fn note_gap(
+    state: &mut BodyState,
+    last: &TrackerSample,
+    sample: &TrackerSample,
+    counters: &mut TrackerCounters,
+) {
+    match sample.sequence.wrapping_sub(last.sequence) {
+        // Equal numbers with a newer capture: a source without sequence numbers (VRPN), or one that
+        // restarted at the same number.
+        0 | 1 => {}
+        gap if gap - 1 <= SampleGate::MAX_GAP => {
+            counters.lost += u64::from(gap - 1);
+            state.counters.lost += u64::from(gap - 1);
+        }
+        _ => counters.restarts += 1,
     }
 }
 

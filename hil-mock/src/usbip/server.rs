@@ -251,25 +251,8 @@ impl<L: Link> Session<L> {
                     if cable.submit(request).is_err() {
                         return Ok(());
                     }
-                    let packet = || {
-                        let d = cable.descriptors();
-                        let known = endpoints(&d[18.min(d.len())..]).into_iter().find(|e| e.0 == endpoint);
-                        known.map_or(0, |e| usize::from(e.2))
-                    };
                     if flags & ZERO_PACKET != 0 && !is_in && !control && bytes > 0 {
-                        let packet = packet();
-                        if packet > 0 && bytes.is_multiple_of(packet) {
-                            let id = ZERO_PACKET_IDS | self.id(seqnum);
-                            let zero = Request {
-                                id,
-                                endpoint,
-                                setup: None,
-                                buffer: Vec::new(),
-                                done: Box::new(|_| ()),
-                            };
-                            // Refused only if the device is gone, which the next read reports.
-                            let _ = cable.submit(zero);
-                        }
+                        self.end_by_a_zero_packet(cable, seqnum, endpoint, bytes);
                     }
                 }
                 Urb::Unlink { seqnum, victim, .. } => {
@@ -288,6 +271,19 @@ impl<L: Link> Session<L> {
                     return Err(io::Error::new(io::ErrorKind::InvalidData, format!("{other:?} from a host")))
                 }
             }
+        }
+    }
+
+    /// Sends a packet of no bytes behind `bytes` that end with a whole packet.
+    fn end_by_a_zero_packet(&self, cable: &Arc<dyn UsbCable>, seqnum: u32, endpoint: u8, bytes: usize) {
+        let d = cable.descriptors();
+        let known = endpoints(&d[18.min(d.len())..]).into_iter().find(|e| e.0 == endpoint);
+        let packet = known.map_or(0, |e| usize::from(e.2));
+        if packet > 0 && bytes.is_multiple_of(packet) {
+            let id = ZERO_PACKET_IDS | self.id(seqnum);
+            let zero = Request { id, endpoint, setup: None, buffer: Vec::new(), done: Box::new(|_| ()) };
+            // Refused only if the device is gone, which the next read reports.
+            let _ = cable.submit(zero);
         }
     }
 

@@ -154,13 +154,7 @@ fn touch(
     let mut skipped = 0;
     loop {
         let suggested = named.get(count + skipped).copied();
-        let question = match suggested {
-            Some((words, DVec3 { x, y, z })) => {
-                format!("point {}: {words}, at ({x:.4}, {y:.4}, {z:.4}) m:", count + 1)
-            }
-            None => format!("point {}: x y z of a point of your own, or d:", count + 1),
-        };
-        let answer = dialogue.ask(&question)?;
+        let answer = dialogue.ask(&question(count + 1, suggested.as_ref()))?;
         let numbers: Vec<f64> = answer.split_whitespace().filter_map(|w| w.parse().ok()).collect();
         let mesh = match (answer.as_str(), &numbers[..]) {
             ("s" | "S", _) => {
@@ -195,6 +189,16 @@ fn touch(
             }
             Err(why) => dialogue.tell(&why.to_string()),
         }
+    }
+}
+
+/// What is asked for point `number`: a named one, or one of the operator's own.
+fn question(number: usize, suggested: Option<&(&str, DVec3)>) -> String {
+    match suggested {
+        Some((words, DVec3 { x, y, z })) => {
+            format!("point {number}: {words}, at ({x:.4}, {y:.4}, {z:.4}) m:")
+        }
+        None => format!("point {number}: x y z of a point of your own, or d:"),
     }
 }
 

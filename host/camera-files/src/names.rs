@@ -135,128 +135,76 @@ fn owner(plain: &str) -> Option<(Owner, &str)> {
     (is_numbered && !is_pose).then(|| (Owner::Other(plain[rest.len()..].into()), rest))
 }
 
-/// What a name without its device's means: lower case, letters and digits alone.
+/// Names without their devices', in lower case and of letters and digits alone, by what they mean.
+const ROLES: &[(Role, &str)] = &[
+    (
+        Role::Intrinsics,
+        "cameramatrix k mtx m intrinsicmatrix intrinsics intrinsic int matrix intrinsicsmatrix kmatrix \
+         intrinsicparameters cammatrix",
+    ),
+    (Role::Intrinsic(0), "fx focalx focallengthx"),
+    (Role::Intrinsic(1), "fy focaly focallengthy"),
+    (Role::Intrinsic(2), "cx ppx principalpointx"),
+    (Role::Intrinsic(3), "cy ppy principalpointy"),
+    (
+        Role::Distortion,
+        "distortioncoefficients distcoeffs distortioncoeffs distcoeff distortion dist d distcoefs \
+         distcoef lensdistortion distortioncoef kc coeffs distortionparameters distortionvector",
+    ),
+    (Role::Coefficient(0), "k1"),
+    (Role::Coefficient(1), "k2"),
+    (Role::Coefficient(2), "p1"),
+    (Role::Coefficient(3), "p2"),
+    (Role::Coefficient(4), "k3"),
+    (Role::Coefficient(5), "k4"),
+    (Role::Coefficient(6), "k5"),
+    (Role::Coefficient(7), "k6"),
+    (Role::Rotation, "r rotation rotationmatrix rotationvector rvec rot rmat rotmat rmatrix rotvec"),
+    (Role::Translation, "t translation translationvector tvec trans transvec"),
+    (
+        Role::Pose,
+        "extrinsics extrinsic extrinsicmatrix rt worldtocamera worldtocam w2c worldtoprojector \
+         worldtoproj tcamimu tcamworld tcw tprojworld tprojectorworld tcameraworld camerafromworld \
+         projectorfromworld",
+    ),
+    (
+        Role::Placement,
+        "cameratoworld camtoworld c2w twc tworldcam tworldproj tworldprojector tworldcamera \
+         projectortoworld projtoworld timucam worldfromcamera worldfromprojector",
+    ),
+    (Role::EitherPose, "pose posematrix transform transformmatrix transformation transformationmatrix"),
+    (
+        Role::Width,
+        "imagewidth width imagesizewidth imgwidth screenwidth screenresx resolutionx resx xres \
+         xresolution rasterwidth w",
+    ),
+    (
+        Role::Height,
+        "imageheight height imagesizeheight imgheight screenheight screenresy resolutiony resy yres \
+         yresolution rasterheight h",
+    ),
+    (
+        Role::Size,
+        "resolution imagesize size imgsize rastersize screenresolution screensize imageresolution res \
+         raster dimensions",
+    ),
+    (Role::Shape, "shape imageshape imgshape"),
+    (Role::LensModel, "fisheyemodel distortionmodel cameramodel lensmodel cameratype"),
+    (
+        Role::ByProduct,
+        "e f essentialmatrix fundamentalmatrix rotationaxis euler fov rotationangleradians \
+         rotationangledegrees focallength principalpoint perviewreprojectionerrors perviewerrors \
+         imagepoints gridpoints objectpoints projectionmatrix p calibrationtime boardwidth boardheight \
+         squaresize markersize nframes nrofframes numberofframes flags flagvalue fixaspectratio \
+         aspectratio avgreprojectionerror avgreprojerr maxreprojerr reprojectionerror rms rmserror \
+         stereorms error camerror projerror stereoerror caliberror cameraname name camoverlaps rostopic \
+         timeshiftcamimu calibrationdate fixprincipalpoint assumezerotangentialdistortion fixk1 fixk2 \
+         fixk3 calibrationpattern fisheyecalibration typeid",
+    ),
+];
+
+/// What a name of [`ROLES`] means.
 fn role(plain: &str) -> Option<Role> {
-    Some(match plain {
-        "cameramatrix"
-        | "k"
-        | "mtx"
-        | "m"
-        | "intrinsicmatrix"
-        | "intrinsics"
-        | "intrinsic"
-        | "int"
-        | "matrix"
-        | "intrinsicsmatrix"
-        | "kmatrix"
-        | "intrinsicparameters"
-        | "cammatrix" => Role::Intrinsics,
-        "fx" | "focalx" | "focallengthx" => Role::Intrinsic(0),
-        "fy" | "focaly" | "focallengthy" => Role::Intrinsic(1),
-        "cx" | "ppx" | "principalpointx" => Role::Intrinsic(2),
-        "cy" | "ppy" | "principalpointy" => Role::Intrinsic(3),
-        "distortioncoefficients"
-        | "distcoeffs"
-        | "distortioncoeffs"
-        | "distcoeff"
-        | "distortion"
-        | "dist"
-        | "d"
-        | "distcoefs"
-        | "distcoef"
-        | "lensdistortion"
-        | "distortioncoef"
-        | "kc"
-        | "coeffs"
-        | "distortionparameters"
-        | "distortionvector" => Role::Distortion,
-        "k1" => Role::Coefficient(0),
-        "k2" => Role::Coefficient(1),
-        "p1" => Role::Coefficient(2),
-        "p2" => Role::Coefficient(3),
-        "k3" => Role::Coefficient(4),
-        "k4" => Role::Coefficient(5),
-        "k5" => Role::Coefficient(6),
-        "k6" => Role::Coefficient(7),
-        "r" | "rotation" | "rotationmatrix" | "rotationvector" | "rvec" | "rot" | "rmat" | "rotmat"
-        | "rmatrix" | "rotvec" => Role::Rotation,
-        "t" | "translation" | "translationvector" | "tvec" | "trans" | "transvec" => Role::Translation,
-        "extrinsics" | "extrinsic" | "extrinsicmatrix" | "rt" | "worldtocamera" | "worldtocam" | "w2c"
-        | "worldtoprojector" | "worldtoproj" | "tcamimu" | "tcamworld" | "tcw" | "tprojworld"
-        | "tprojectorworld" | "tcameraworld" | "camerafromworld" | "projectorfromworld" => Role::Pose,
-        "cameratoworld" | "camtoworld" | "c2w" | "twc" | "tworldcam" | "tworldproj" | "tworldprojector"
-        | "tworldcamera" | "projectortoworld" | "projtoworld" | "timucam" | "worldfromcamera"
-        | "worldfromprojector" => Role::Placement,
-        "pose"
-        | "posematrix"
-        | "transform"
-        | "transformmatrix"
-        | "transformation"
-        | "transformationmatrix" => Role::EitherPose,
-        "imagewidth" | "width" | "imagesizewidth" | "imgwidth" | "screenwidth" | "screenresx"
-        | "resolutionx" | "resx" | "xres" | "xresolution" | "rasterwidth" | "w" => Role::Width,
-        "imageheight" | "height" | "imagesizeheight" | "imgheight" | "screenheight" | "screenresy"
-        | "resolutiony" | "resy" | "yres" | "yresolution" | "rasterheight" | "h" => Role::Height,
-        "resolution" | "imagesize" | "size" | "imgsize" | "rastersize" | "screenresolution"
-        | "screensize" | "imageresolution" | "res" | "raster" | "dimensions" => Role::Size,
-        "shape" | "imageshape" | "imgshape" => Role::Shape,
-        "fisheyemodel" | "distortionmodel" | "cameramodel" | "lensmodel" | "cameratype" => Role::LensModel,
-        "e"
-        | "f"
-        | "essentialmatrix"
-        | "fundamentalmatrix"
-        | "rotationaxis"
-        | "euler"
-        | "fov"
-        | "rotationangleradians"
-        | "rotationangledegrees"
-        | "focallength"
-        | "principalpoint"
-        | "perviewreprojectionerrors"
-        | "perviewerrors"
-        | "imagepoints"
-        | "gridpoints"
-        | "objectpoints"
-        | "projectionmatrix"
-        | "p"
-        | "calibrationtime"
-        | "boardwidth"
-        | "boardheight"
-        | "squaresize"
-        | "markersize"
-        | "nframes"
-        | "nrofframes"
-        | "numberofframes"
-        | "flags"
-        | "flagvalue"
-        | "fixaspectratio"
-        | "aspectratio"
-        | "avgreprojectionerror"
-        | "avgreprojerr"
-        | "maxreprojerr"
-        | "reprojectionerror"
-        | "rms"
-        | "rmserror"
-        | "stereorms"
-        | "error"
-        | "camerror"
-        | "projerror"
-        | "stereoerror"
-        | "caliberror"
-        | "cameraname"
-        | "name"
-        | "camoverlaps"
-        | "rostopic"
-        | "timeshiftcamimu"
-        | "calibrationdate"
-        | "fixprincipalpoint"
-        | "assumezerotangentialdistortion"
-        | "fixk1"
-        | "fixk2"
-        | "fixk3"
-        | "calibrationpattern"
-        | "fisheyecalibration"
-        | "typeid" => Role::ByProduct,
-        _ => return None,
-    })
+    let row = ROLES.iter().find(|(_, names)| names.split_ascii_whitespace().any(|name| name == plain))?;
+    Some(row.0)
 }

@@ -150,73 +150,105 @@ pub(super) fn entries(text: &str) -> Result<Entries, StorageError> {
         // Where the value begins, also behind the end of the line.
         let value_at = start + line.rfind(item.value).unwrap_or(0);
         let value_at = if item.value.is_empty() { line_end } else { value_at };
-        let Some(key) = item.key else {
-            let Some(o) = open.last_mut() else { continue };
-            if item.value.starts_with('[') {
-                let length = list_length(&text[value_at..])
-                    .ok_or_else(|| StorageError::matrix(o.name, "the list does not end with ]"))?;
-                match rows(&text[value_at..value_at + length]) {
-                    Some(rows) => o.sequence.rows.extend(rows),
-                    None => o.sequence.other = true,
+        let rest = &text[value_at..];
+        let taken = match (item.key, open.last_mut()) {
+            (None, None) => 0,
+            (None, Some(o)) => o.take_member(&item, rest)?,
+            (Some(key), around) => {
+                match around.map_or(Ok(None), |o| o.take_part(key, &item, rest, &mut found))? {
+                    Some(taken) => taken,
+                    None => take_named(key, &item, (text, start, value_at), &mut open, &mut found)?,
                 }
-                at = at.max(value_at + length);
-            } else {
-                o.sequence.take(item.value, item.indent, item.dashes);
             }
-            continue;
         };
-        if let Some(o) = open.last_mut() {
-            let is_matrix = o.tagged || o.parts.rows.is_some();
-            match key {
-                "rows" => o.parts.rows = Some(item.value),
-                "cols" => o.parts.columns = Some(item.value),
-                "dt" => o.parts.kind = Some(item.value),
-                // Numbers line by line follow as a sequence, which has a name of its own.
-                "data" if is_matrix && !text[value_at..].trim_start().starts_with("- ") => {
-                    let error = |what: &str| StorageError::matrix(o.name, what);
-                    // The list may start on the next line.
-                    let list = text[value_at..].trim_start();
-                    let list = list.strip_prefix('[').ok_or_else(|| error("data does not start with ["))?;
-                    let end = list.find(']').ok_or_else(|| error("data does not end with ]"))?;
-                    let matrix = o.parts.matrix(o.name, &list[..end])?;
-                    found.add(&o.section, o.name, Entry::Matrix(matrix));
-                    (o.tagged, o.parts) = (false, Parts::default());
-                    at = at.max(text.len() - list.len() + end + 1);
-                    continue;
-                }
-                _ => {}
-            }
-            if matches!(key, "rows" | "cols" | "dt") {
-                continue;
-            }
-        }
-        let section = open.last().map_or(Ok(String::new()), |o| inner(&o.section, o.name))?;
-        if item.value.is_empty() || item.value.starts_with("!!opencv-matrix") {
-            if open.len() == DEEPEST {
-                let what = format!("sections are nested more than {DEEPEST} deep");
-                let line = text[..start].matches('\n').count() + 1;
-                return Err(StorageError::Syntax { form: "YAML", line, what });
-            }
-            let tagged = !item.value.is_empty();
-            let (parts, sequence) = (Parts::default(), Sequence::default());
-            open.push(Open { indent: item.inner, name: key, section, tagged, parts, sequence });
-        } else if item.value.starts_with('[') {
-            let length = list_length(&text[value_at..])
-                .ok_or_else(|| StorageError::matrix(key, "the list does not end with ]"))?;
-            let list = rows(&text[value_at..value_at + length]);
-            found.add(&section, key, list.map_or(Entry::Other, Entries::list));
-            at = at.max(value_at + length);
-        } else if item.value.starts_with('{') {
-            at = at.max(value_at + json::add_map(&mut found, &section, key, &text[value_at..])?);
-        } else {
-            let word = item.value.split(" #").next().unwrap_or("").trim_end();
-            found.add(&section, key, Entries::word(word));
-        }
+        at = at.max(value_at + taken);
     }
     while !open.is_empty() {
         close(&mut open, &mut found)?;
     }
     Ok(found)
+}
+
+impl<'a> Open<'a> {
+    /// Takes a member of a sequence, whose value `rest` begins with. Returns the bytes that it takes of it, 0 if it ends with its
+    /// line.
+    fn take_member(&mut self, item: &Item<'a>, rest: &str) -> Result<usize, StorageError> {
+        if !item.value.starts_with('[') {
+            self.sequence.take(item.value, item.indent, item.dashes);
+            return Ok(0);
+        }
+        let length = list_length(rest)
+            .ok_or_else(|| StorageError::matrix(self.name, "the list does not end with ]"))?;
+        match rows(&rest[..length]) {
+            Some(rows) => self.sequence.rows.extend(rows),
+            None => self.sequence.other = true,
+        }
+        Ok(length)
+    }
+
+    /// Takes what `key` is of a matrix, with the bytes that it takes of `rest`; `None` if it is no part of one.
+    fn take_part(
+        &mut self,
+        key: &str,
+        item: &Item<'a>,
+        rest: &'a str,
+        found: &mut Entries,
+    ) -> Result<Option<usize>, StorageError> {
+        let is_matrix = self.tagged || self.parts.rows.is_some();
+        match key {
+            "rows" => self.parts.rows = Some(item.value),
+            "cols" => self.parts.columns = Some(item.value),
+            "dt" => self.parts.kind = Some(item.value),
+            // Numbers line by line follow as a sequence, which has a name of its own.
+            "data" if is_matrix && !rest.trim_start().starts_with("- ") => {
+                let error = |what: &str| StorageError::matrix(self.name, what);
+                // The list may start on the next line.
+                let list = rest.trim_start();
+                let list = list.strip_prefix('[').ok_or_else(|| error("data does not start with ["))?;
+                let end = list.find(']').ok_or_else(|| error("data does not end with ]"))?;
+                let matrix = self.parts.matrix(self.name, &list[..end])?;
+                found.add(&self.section, self.name, Entry::Matrix(matrix));
+                (self.tagged, self.parts) = (false, Parts::default());
+                return Ok(Some(rest.len() - list.len() + end + 1));
+            }
+            _ => return Ok(None),
+        }
+        Ok(Some(0))
+    }
+}
+
+/// Takes a name with a value of its own, or opens one whose value follows. Returns the bytes that it takes from `value_at` on, 0 if
+/// it ends with its line, which begins at `start`.
+fn take_named<'a>(
+    key: &'a str,
+    item: &Item<'a>,
+    (text, start, value_at): (&'a str, usize, usize),
+    open: &mut Vec<Open<'a>>,
+    found: &mut Entries,
+) -> Result<usize, StorageError> {
+    let rest = &text[value_at..];
+    let section = open.last().map_or(Ok(String::new()), |o| inner(&o.section, o.name))?;
+    if item.value.is_empty() || item.value.starts_with("!!opencv-matrix") {
+        if open.len() == DEEPEST {
+            let what = format!("sections are nested more than {DEEPEST} deep");
+            let line = text[..start].matches('\n').count() + 1;
+            return Err(StorageError::Syntax { form: "YAML", line, what });
+        }
+        let tagged = !item.value.is_empty();
+        let (parts, sequence) = (Parts::default(), Sequence::default());
+        open.push(Open { indent: item.inner, name: key, section, tagged, parts, sequence });
+    } else if item.value.starts_with('[') {
+        let length =
+            list_length(rest).ok_or_else(|| StorageError::matrix(key, "the list does not end with ]"))?;
+        found.add(&section, key, rows(&rest[..length]).map_or(Entry::Other, Entries::list));
+        return Ok(length);
+    } else if item.value.starts_with('{') {
+        return json::add_map(found, &section, key, rest);
+    } else {
+        let word = item.value.split(" #").next().unwrap_or("").trim_end();
+        found.add(&section, key, Entries::word(word));
+    }
+    Ok(0)
 }
 
 /// Ends the innermost name: a matrix must have had its numbers, and the members of a sequence are its value.

@@ -211,10 +211,7 @@ pub(crate) fn measure(
     let total = median_ms(costs.iter().map(|c| c.pass_ns.iter().sum()));
     let gpu_ms = (total > 0.0).then_some(total);
     let seconds = gpu_ms.unwrap_or(wall_ms) * 1e-3;
-    let passes = PASSES
-        .iter()
-        .enumerate()
-        .map(|(i, &pass)| PassTime { pass, ms: median_ms(costs.iter().map(|c| c.pass_ns[i])) });
+    let time = |(i, &pass)| PassTime { pass, ms: median_ms(costs.iter().map(|c| c.pass_ns[i])) };
     Ok(MethodCost {
         method: which.word,
         frames: costs.len(),
@@ -230,7 +227,7 @@ pub(crate) fn measure(
         rays_per_s: rays_per_frame / seconds,
         walked_rays_per_s: walked_rays_per_frame / seconds,
         samples_per_s: samples_per_frame / seconds,
-        passes: if gpu_ms.is_some() { passes.collect() } else { Vec::new() },
+        passes: gpu_ms.map_or_else(Vec::new, |_| PASSES.iter().enumerate().map(time).collect()),
     })
 }
 

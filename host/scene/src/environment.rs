@@ -6,6 +6,7 @@
 
 #[cfg(feature = "exr")]
 mod exr_picture;
+mod radiance;
 
 use std::path::Path;
 
@@ -20,6 +21,7 @@ use super::srgb::to_linear;
 use super::{Environment, SceneError};
 #[cfg(feature = "exr")]
 use exr_picture::read_exr;
+use radiance::read_rgbe;
 
 /// The formats that this program reads.
 const FORMATS: &str = if cfg!(feature = "exr") {
@@ -364,166 +366,6 @@ pub(crate) fn read_pfm(bytes: &[u8]) -> Result<Pixels, SceneError> {
         }
     };
     Ok((width, height, (0..texels).map(texel).collect()))
-}
-
-/// Radiance pictures \[Ward91\]: in any order of rows and columns, plain or with each component run-length coded, as RGBE or
-/// XYZE.
-fn read_rgbe(bytes: &[u8]) -> Result<Read, SceneError> {
-    let mut rest = bytes;
-    let mut exposure = 1.0f32;
-    let mut correction = Vec3::ONE;
-    let mut primaries: Option<Primaries> = None;
-    let mut warnings = vec![];
-    let mut is_xyz = false;
-    line(&mut rest)?;
-    let mut lines = 0;
-    loop {
-        let text = line(&mut rest)?;
-        lines += 1;
-        if text.is_empty() {
-            break;
-        }
-        if lines > 1000 {
-            return Err(header("has more than 1000 lines"));
-        }
-        let Some((name, value)) = text.split_once('=') else { continue };
-        let numbers: Vec<f32> = value.split_ascii_whitespace().map_while(|w| w.parse().ok()).collect();
-        match (name.trim(), &numbers[..]) {
-            ("FORMAT", _) => match value.trim() {
-                "32-bit_rle_rgbe" => {}
-                "32-bit_rle_xyze" => is_xyz = true,
-                other => {
-                    return Err(SceneError::unsupported(
-                        format!("the pixel format {other}"),
-                        "save it as RGBE",
-                    ))
-                }
-            },
-            ("EXPOSURE", [value, ..]) => exposure *= value,
-            ("EXPOSURE", []) => return Err(header("has an EXPOSURE that is not a number")),
-            ("COLORCORR", [r, g, b, ..]) => correction *= Vec3::new(*r, *g, *b),
-            ("PRIMARIES", [rx, ry, gx, gy, bx, by, wx, wy, ..]) => {
-                let at = |x: &f32, y: &f32| glam::DVec2::new(f64::from(*x), f64::from(*y));
-                primaries = Some(Primaries { rgb: [at(rx, ry), at(gx, gy), at(bx, by)], white: at(wx, wy) });
-            }
-            ("COLORCORR" | "PRIMARIES", _) => {
-                warnings.push(format!("its {} has too few numbers: it is left out", name.trim()))
-            }
-            ("VIEW", _) if value.contains("-vt") && !value.contains("-vta") => {
-                warnings.push(format!("its VIEW is {}: it is read as latitude and longitude", value.trim()));
-            }
-            _ => {}
-        }
-    }
-    let gain = correction * exposure;
-    if !(gain.is_finite() && gain.min_element() > 0.0) {
-        return Err(header("has an EXPOSURE or COLORCORR that is not above zero"));
-    }
-    let size = line(&mut rest)?;
-    let words: Vec<&str> = size.split_ascii_whitespace().collect();
-    let wrong = || {
-        header("must give the size as '-Y height +X width' or in one of the seven other orders of rows and columns")
-    };
-    let [first, outer, second, inner] = words[..] else { return Err(wrong()) };
-    let side = |s: &str| s.parse::<u32>().map_err(|_| header("gives a size that is not a number"));
-    let (outer, inner) = (side(outer)?, side(inner)?);
-    let axis = |word: &str| Some((word.strip_prefix(['+', '-'])?.to_owned(), word.starts_with('+')));
-    let ((outer_axis, outer_rises), (inner_axis, inner_rises)) =
-        axis(first).zip(axis(second)).ok_or_else(wrong)?;
-    let by_rows = match (outer_axis.as_str(), inner_axis.as_str()) {
-        ("Y", "X") => true,
-        ("X", "Y") => false,
-        _ => return Err(wrong()),
-    };
-    let (width, height) = if by_rows { (inner, outer) } else { (outer, inner) };
-    let count = check_size(width, height)?;
-    check_piece(count, 4, bytes.len())?;
-    // No encoding of a scan line is shorter than one texel.
-    if (rest.len() as u64) < 4 * u64::from(outer) / 2 {
-        return Err(SceneError::broken("image", "has fewer bytes than its size needs: it is cut off"));
-    }
-    let mut stored = vec![[0u8; 4]; count];
-    for (y, row) in stored.chunks_exact_mut(inner as usize).enumerate() {
-        if read_rgbe_row(&mut rest, row).is_none() {
-            // Light that is missing at the end is told; a picture that is mostly missing is none.
-            if y <= outer as usize / 2 {
-                return Err(SceneError::broken(format!("row {y}"), "is cut off or damaged"));
-            }
-            warnings.push(format!(
-                "it is cut off or damaged from scan line {y} of {outer} on: the rest is black"
-            ));
-            row.fill([0; 4]);
-            break;
-        }
-    }
-    // Up is +Y and right is +X: the upper left texel comes first here.
-    let (x_rises, y_rises) = if by_rows { (inner_rises, outer_rises) } else { (outer_rises, inner_rises) };
-    let at = |x: u32, y: u32| {
-        let x = if x_rises { x } else { width - 1 - x };
-        let y = if y_rises { height - 1 - y } else { y };
-        let (outer_at, inner_at) = if by_rows { (y, x) } else { (x, y) };
-        let [r, g, b, e] = stored[outer_at as usize * inner as usize + inner_at as usize];
-        let unit = if e == 0 { 0.0 } else { (f64::from(e) - 136.0).exp2() };
-        let scaled = |x: u8, gain: f32| (f64::from(x) * unit / f64::from(gain)) as f32;
-        Vec3::new(scaled(r, gain.x), scaled(g, gain.y), scaled(b, gain.z))
-    };
-    let ((width, height, texels), told) = collect([width, height], bytes.len(), at);
-    warnings.extend(told);
-    if is_xyz {
-        let white = primaries.map_or(Primaries::XYZ.white, |p| p.white);
-        primaries = Some(Primaries { white, ..Primaries::XYZ });
-    }
-    Ok(Read { width, height, texels, primaries, warnings })
-}
-
-/// Reads one row in any of the three encodings.
-fn read_rgbe_row(rest: &mut &[u8], row: &mut [[u8; 4]]) -> Option<()> {
-    let take = |rest: &mut &[u8], n: usize| -> Option<Vec<u8>> {
-        let (head, tail) = rest.split_at_checked(n)?;
-        *rest = tail;
-        Some(head.to_vec())
-    };
-    let width = row.len();
-    let by_component = (8..32768).contains(&width)
-        && matches!(**rest, [2, 2, high, low, ..] if usize::from(high) << 8 | usize::from(low) == width);
-    if by_component {
-        *rest = &rest[4..];
-        for component in [0, 1, 2, 3] {
-            let mut x = 0;
-            while x < width {
-                let code = usize::from(take(rest, 1)?[0]);
-                let run = code > 128;
-                let n = if run { code - 128 } else { code };
-                if n == 0 || x + n > width {
-                    return None;
-                }
-                let values = take(rest, if run { 1 } else { n })?;
-                for k in 0..n {
-                    row[x + k][component] = values[if run { 0 } else { k }];
-                }
-                x += n;
-            }
-        }
-        return Some(());
-    }
-    // Plain texels; (1, 1, 1, n) repeats the previous texel n times; each such code that directly follows another
-    // counts eight bits higher.
-    let (mut x, mut shift) = (0, 0);
-    while x < width {
-        let texel: [u8; 4] = take(rest, 4)?.try_into().ok()?;
-        if texel[..3] == [1, 1, 1] {
-            let n = usize::from(texel[3]).checked_shl(shift).filter(|_| shift <= 16)?;
-            let before = row[x.checked_sub(1)?];
-            row.get_mut(x..x.checked_add(n)?)?.fill(before);
-            x += n;
-            shift += 8;
-        } else {
-            row[x] = texel;
-            x += 1;
-            shift = 0;
-        }
-    }
-    Some(())
 }
 
 /// Refuses OpenEXR in a program that was built without it.

@@ -21,74 +21,108 @@ pub(crate) struct Surface {
 pub(crate) fn surface_nets(field: &dyn Fn(Vec3) -> f32, min: Vec3, max: Vec3, cell: f32) -> Surface {
     let samples = ((max - min) / cell).ceil().as_uvec3() + UVec3::ONE;
     let [nx, ny, nz] = samples.to_array();
-    let at = |x: u32, y: u32, z: u32| (x + nx * (y + ny * z)) as usize;
     let value = sample_near_surface(field, min, samples, cell);
-    // Central differences along the diagonals of a cube: four evaluations instead of six.
-    let gradient = |p: Vec3| {
-        let step = 0.15 * cell;
-        let corners =
-            [Vec3::ONE, Vec3::new(1.0, -1.0, -1.0), Vec3::new(-1.0, 1.0, -1.0), Vec3::new(-1.0, -1.0, 1.0)];
-        corners.iter().map(|&k| k * field(p + step * k)).sum::<Vec3>() / (4.0 * step)
-    };
-
+    let grid = Grid { min, cell, samples: [nx, ny, nz], value };
     let mut surface = Surface { positions: vec![], normals: vec![], triangles: vec![] };
-    let mut vertex_of_cell = vec![u32::MAX; value.len()];
+    let mut vertex_of_cell = vec![u32::MAX; grid.value.len()];
     for z in 0..nz - 1 {
         for y in 0..ny - 1 {
             for x in 0..nx - 1 {
-                // Nearly all cells lie on one side, and all eight corners say so at once.
-                let row = at(x, y, z);
-                let corners =
-                    [0, 1].map(|dz| [0, 1].map(|dy| &value[row + (nx * (dy + ny * dz)) as usize..][..2]));
-                let inside =
-                    corners.as_flattened().iter().flat_map(|pair| *pair).filter(|v| **v < 0.0).count();
-                if inside == 0 || inside == 8 {
-                    continue;
-                }
-                let Some(start) = mean_crossing(|dx, dy, dz| value[at(x + dx, y + dy, z + dz)]) else {
-                    continue;
-                };
-                let corner = min + cell * UVec3::new(x, y, z).as_vec3();
-                let mut p = corner + cell * start;
-                let g = gradient(p);
-                for _ in 0..2 {
-                    p -= (field(p) * g / g.length_squared().max(0.1)).clamp_length_max(0.5 * cell);
-                }
-                p = p.clamp(corner, corner + cell);
-                vertex_of_cell[at(x, y, z)] = surface.positions.len() as u32;
-                surface.positions.push(p);
-                surface.normals.push(gradient(p).normalize_or(Vec3::Y));
+                let Some((position, normal)) = grid.vertex(field, x, y, z) else { continue };
+                vertex_of_cell[grid.at(x, y, z)] = surface.positions.len() as u32;
+                surface.positions.push(position);
+                surface.normals.push(normal);
             }
         }
     }
     for z in 1..nz - 1 {
         for y in 1..ny - 1 {
             for x in 1..nx - 1 {
-                let inside = value[at(x, y, z)] < 0.0;
-                for axis in 0..3 {
-                    // The four cells around the grid edge that leaves this sample along `axis`, counter-clockwise when
-                    // seen against it.
-                    let (u, v) = ((axis + 1) % 3, (axis + 2) % 3);
-                    let mut ahead = [x, y, z];
-                    ahead[axis] += 1;
-                    if (value[at(ahead[0], ahead[1], ahead[2])] < 0.0) == inside {
-                        continue;
-                    }
-                    let mut ring = [[x, y, z]; 4];
-                    for (k, (du, dv)) in [(1, 1), (0, 1), (0, 0), (1, 0)].into_iter().enumerate() {
-                        ring[k][u] -= du;
-                        ring[k][v] -= dv;
-                    }
-                    let mut quad = ring.map(|[x, y, z]| vertex_of_cell[at(x, y, z)]);
-                    if !inside {
-                        quad.reverse();
-                    }
+                for quad in grid.quads(&vertex_of_cell, x, y, z) {
                     push_quad(&mut surface, quad);
                 }
             }
         }
     }
     surface
+}
+
+/// Samples of a field, x fastest.
+struct Grid {
+    min: Vec3,
+    cell: f32,
+    samples: [u32; 3],
+    value: Vec<f32>,
+}
+
+impl Grid {
+    fn at(&self, x: u32, y: u32, z: u32) -> usize {
+        let [nx, ny, _] = self.samples;
+        (x + nx * (y + ny * z)) as usize
+    }
+
+    /// The point of the surface in a cell, and the direction away from it; `None` where the surface does not pass.
+    fn vertex(&self, field: &dyn Fn(Vec3) -> f32, x: u32, y: u32, z: u32) -> Option<(Vec3, Vec3)> {
+        let ([nx, ny, _], cell, value) = (self.samples, self.cell, &self.value);
+        // Nearly all cells lie on one side, and all eight corners say so at once.
+        let row = self.at(x, y, z);
+        let corners = [0, 1].map(|dz| [0, 1].map(|dy| &value[row + (nx * (dy + ny * dz)) as usize..][..2]));
+        let inside = corners.as_flattened().iter().flat_map(|pair| *pair).filter(|v| **v < 0.0).count();
+        if inside == 0 || inside == 8 {
+            return None;
+        }
+        // Central differences along the diagonals of a cube: four evaluations instead of six.
+        let gradient = |p: Vec3| {
+            let step = 0.15 * cell;
+            let corners = [
+                Vec3::ONE,
+                Vec3::new(1.0, -1.0, -1.0),
+                Vec3::new(-1.0, 1.0, -1.0),
+                Vec3::new(-1.0, -1.0, 1.0),
+            ];
+            corners.iter().map(|&k| k * field(p + step * k)).sum::<Vec3>() / (4.0 * step)
+        };
+        let start = mean_crossing(|dx, dy, dz| value[self.at(x + dx, y + dy, z + dz)])?;
+        let corner = self.min + cell * UVec3::new(x, y, z).as_vec3();
+        let mut p = corner + cell * start;
+        let g = gradient(p);
+        for _ in 0..2 {
+            p -= (field(p) * g / g.length_squared().max(0.1)).clamp_length_max(0.5 * cell);
+        }
+        p = p.clamp(corner, corner + cell);
+        Some((p, gradient(p).normalize_or(Vec3::Y)))
+    }
+
+    /// The quads across those grid edges which leave a sample upwards and which the surface cuts.
+    fn quads<'a>(
+        &'a self,
+        vertex_of_cell: &'a [u32],
+        x: u32,
+        y: u32,
+        z: u32,
+    ) -> impl Iterator<Item = [u32; 4]> + 'a {
+        let inside = self.value[self.at(x, y, z)] < 0.0;
+        (0..3).filter_map(move |axis| {
+            // The four cells around the grid edge that leaves this sample along `axis`, counter-clockwise when seen
+            // against it.
+            let (u, v) = ((axis + 1) % 3, (axis + 2) % 3);
+            let mut ahead = [x, y, z];
+            ahead[axis] += 1;
+            if (self.value[self.at(ahead[0], ahead[1], ahead[2])] < 0.0) == inside {
+                return None;
+            }
+            let mut ring = [[x, y, z]; 4];
+            for (k, (du, dv)) in [(1, 1), (0, 1), (0, 0), (1, 0)].into_iter().enumerate() {
+                ring[k][u] -= du;
+                ring[k][v] -= dv;
+            }
+            let mut quad = ring.map(|[x, y, z]| vertex_of_cell[self.at(x, y, z)]);
+            if !inside {
+                quad.reverse();
+            }
+            Some(quad)
+        })
+    }
 }
 
 /// Samples on a grid, x fastest. Blocks of samples that are far from the surface according to the field get one value

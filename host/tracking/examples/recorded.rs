@@ -151,91 +151,111 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
     let mut logs = [0.0; 3];
     let files: Vec<String> = std::env::args().skip(1).collect();
     for path in &files {
-        let recording = Recording::read(path)?;
-        let mut noise = Sampler::new(7, 0);
-        let mut normal = || {
-            let (a, b) = (
-                (noise.next_u64() >> 11) as f64 / (1u64 << 53) as f64,
-                (noise.next_u64() >> 11) as f64 / (1u64 << 53) as f64,
-            );
-            (-2.0 * (1.0 - a).ln()).sqrt() * (std::f64::consts::TAU * b).cos()
-        };
-        let n = ((recording.len_s() - 0.1) * 1e9) as i64 / PERIOD_NS;
-        let samples: Vec<(i64, DVec3, DQuat)> = (25..n)
-            .map(|i| {
-                let at = i * PERIOD_NS;
-                let (p, q) = recording.at(at as f64 * 1e-9);
-                let shaken = DQuat::from_scaled_axis(DVec3::new(normal(), normal(), normal()) * NOISE[1]) * q;
-                (at, p + DVec3::new(normal(), normal(), normal()) * NOISE[0], shaken)
-            })
-            .collect();
-        let truth: Vec<[(DVec3, DQuat); 3]> = samples
-            .iter()
-            .map(|(at, ..)| HORIZONS_NS.map(|ahead| recording.at((at + ahead) as f64 * 1e-9)))
-            .collect();
-        let (mut errors, mut turns): ([Vec<f64>; 3], [Vec<f64>; 3]) = Default::default();
-        let mut filter = PoseFilter::new(PoseFilterConfig::default());
-        let forgetful = PoseFilterConfig { recall_after_s: f64::INFINITY, ..PoseFilterConfig::default() };
-        let (mut forgetful, mut unrecalled) = (PoseFilter::new(forgetful), Vec::new());
-        let mut spent = Duration::ZERO;
-        let mut levels = [[i32::MAX, i32::MIN]; 2];
-        for (i, (at, p, q)) in samples.iter().enumerate() {
-            let sample = TrackerSample {
-                body: BodyIndex(0),
-                pose: Pose { position_m: p.to_array(), rotation_xyzw: q.to_array() },
-                tracked: true,
-                mean_error_m: 0.0,
-                covariance: None,
-                sequence: i as u32,
-                captured_at: HostTime(*at),
-                received_at: HostTime(*at),
-            };
-            let begin = Instant::now();
-            filter.update(&sample);
-            spent += begin.elapsed();
-            forgetful.update(&sample);
-            if i < SETTLE {
-                continue;
-            }
-            for (range, level) in levels.iter_mut().zip(filter.levels()) {
-                *range = [range[0].min(level), range[1].max(level)];
-            }
-            if let Some(predicted) = forgetful.predict(HostTime(at + HORIZONS_NS[1])) {
-                unrecalled.push((DVec3::from_array(predicted.pose.position_m) - truth[i][1].0).length());
-            }
-            for k in 0..3 {
-                let Some(predicted) = filter.predict(HostTime(at + HORIZONS_NS[k])) else { continue };
-                errors[k].push((DVec3::from_array(predicted.pose.position_m) - truth[i][k].0).length());
-                turns[k].push(DQuat::from_array(predicted.pose.rotation_xyzw).angle_between(truth[i][k].1));
-            }
+        let ratios = of_recording(path)?;
+        for (log, ratio) in logs.iter_mut().zip(ratios) {
+            *log += ratio.ln() / files.len() as f64;
         }
-        let mut tuned = [f64::INFINITY; 3];
-        for exponent in 0..40 {
-            let q = 10f64.powf(-2.0 + 0.25 * f64::from(exponent));
-            let mut constant = Constant::new(q, samples[0].1);
-            let mut of: [Vec<f64>; 3] = Default::default();
-            for (i, (_, p, _)) in samples.iter().enumerate().skip(1) {
-                constant.update(PERIOD_NS as f64 * 1e-9, *p, NOISE[0] * NOISE[0]);
-                if i >= SETTLE {
-                    for k in 0..3 {
-                        of[k].push((constant.ahead(HORIZONS_NS[k] as f64 * 1e-9) - truth[i][k].0).length());
-                    }
-                }
-            }
-            for (best, of) in tuned.iter_mut().zip(of) {
-                *best = best.min(p99(of));
-            }
-        }
-        let name = path.rsplit('/').next().unwrap_or(path);
-        print!("{name:24}");
-        for k in 0..3 {
-            let (own, turn) = (p99(std::mem::take(&mut errors[k])), p99(std::mem::take(&mut turns[k])));
-            logs[k] += (own / tuned[k]).ln() / files.len() as f64;
-            print!("  {:6.3} {:5.3} {:6.2}", 1e3 * own, own / tuned[k], 1e3 * turn);
-        }
-        print!("  without recall {:.3}", p99(unrecalled) / tuned[1]);
-        println!("  {levels:?}  {:.2} us", spent.as_secs_f64() * 1e6 / samples.len() as f64);
     }
     println!("geometric mean            {:?}", logs.map(|log| (1e3 * log.exp()).round() / 1e3));
     Ok(())
+}
+
+/// Noisy samples of a recording: instant, position and rotation.
+fn samples_of(recording: &Recording) -> Vec<(i64, DVec3, DQuat)> {
+    let mut noise = Sampler::new(7, 0);
+    let mut normal = || {
+        let (a, b) = (
+            (noise.next_u64() >> 11) as f64 / (1u64 << 53) as f64,
+            (noise.next_u64() >> 11) as f64 / (1u64 << 53) as f64,
+        );
+        (-2.0 * (1.0 - a).ln()).sqrt() * (std::f64::consts::TAU * b).cos()
+    };
+    let n = ((recording.len_s() - 0.1) * 1e9) as i64 / PERIOD_NS;
+    (25..n)
+        .map(|i| {
+            let at = i * PERIOD_NS;
+            let (p, q) = recording.at(at as f64 * 1e-9);
+            let shaken = DQuat::from_scaled_axis(DVec3::new(normal(), normal(), normal()) * NOISE[1]) * q;
+            (at, p + DVec3::new(normal(), normal(), normal()) * NOISE[0], shaken)
+        })
+        .collect()
+}
+
+/// Prints the row of a recording. Returns the ratios of the 99th percentiles to those of the tuned filter, by horizon.
+fn of_recording(path: &str) -> Result<[f64; 3], Box<dyn std::error::Error>> {
+    let recording = Recording::read(path)?;
+    let samples = samples_of(&recording);
+    let truth: Vec<[(DVec3, DQuat); 3]> = samples
+        .iter()
+        .map(|(at, ..)| HORIZONS_NS.map(|ahead| recording.at((at + ahead) as f64 * 1e-9)))
+        .collect();
+    let (mut errors, mut turns): ([Vec<f64>; 3], [Vec<f64>; 3]) = Default::default();
+    let mut filter = PoseFilter::new(PoseFilterConfig::default());
+    let forgetful = PoseFilterConfig { recall_after_s: f64::INFINITY, ..PoseFilterConfig::default() };
+    let (mut forgetful, mut unrecalled) = (PoseFilter::new(forgetful), Vec::new());
+    let mut spent = Duration::ZERO;
+    let mut levels = [[i32::MAX, i32::MIN]; 2];
+    for (i, (at, p, q)) in samples.iter().enumerate() {
+        let sample = TrackerSample {
+            body: BodyIndex(0),
+            pose: Pose { position_m: p.to_array(), rotation_xyzw: q.to_array() },
+            tracked: true,
+            mean_error_m: 0.0,
+            covariance: None,
+            sequence: i as u32,
+            captured_at: HostTime(*at),
+            received_at: HostTime(*at),
+        };
+        let begin = Instant::now();
+        filter.update(&sample);
+        spent += begin.elapsed();
+        forgetful.update(&sample);
+        if i < SETTLE {
+            continue;
+        }
+        for (range, level) in levels.iter_mut().zip(filter.levels()) {
+            *range = [range[0].min(level), range[1].max(level)];
+        }
+        if let Some(predicted) = forgetful.predict(HostTime(at + HORIZONS_NS[1])) {
+            unrecalled.push((DVec3::from_array(predicted.pose.position_m) - truth[i][1].0).length());
+        }
+        for k in 0..3 {
+            let Some(predicted) = filter.predict(HostTime(at + HORIZONS_NS[k])) else { continue };
+            errors[k].push((DVec3::from_array(predicted.pose.position_m) - truth[i][k].0).length());
+            turns[k].push(DQuat::from_array(predicted.pose.rotation_xyzw).angle_between(truth[i][k].1));
+        }
+    }
+    let tuned = tuned(&samples, &truth);
+    print!("{:24}", path.rsplit('/').next().unwrap_or(path));
+    let mut ratios = [0.0; 3];
+    for k in 0..3 {
+        let (own, turn) = (p99(std::mem::take(&mut errors[k])), p99(std::mem::take(&mut turns[k])));
+        ratios[k] = own / tuned[k];
+        print!("  {:6.3} {:5.3} {:6.2}", 1e3 * own, ratios[k], 1e3 * turn);
+    }
+    print!("  without recall {:.3}", p99(unrecalled) / tuned[1]);
+    println!("  {levels:?}  {:.2} us", spent.as_secs_f64() * 1e6 / samples.len() as f64);
+    Ok(ratios)
+}
+
+/// The 99th percentiles of the constant-acceleration filter whose noise is tuned to the recording, by horizon.
+fn tuned(samples: &[(i64, DVec3, DQuat)], truth: &[[(DVec3, DQuat); 3]]) -> [f64; 3] {
+    let mut tuned = [f64::INFINITY; 3];
+    for exponent in 0..40 {
+        let q = 10f64.powf(-2.0 + 0.25 * f64::from(exponent));
+        let mut constant = Constant::new(q, samples[0].1);
+        let mut of: [Vec<f64>; 3] = Default::default();
+        for (i, (_, p, _)) in samples.iter().enumerate().skip(1) {
+            constant.update(PERIOD_NS as f64 * 1e-9, *p, NOISE[0] * NOISE[0]);
+            if i >= SETTLE {
+                for k in 0..3 {
+                    of[k].push((constant.ahead(HORIZONS_NS[k] as f64 * 1e-9) - truth[i][k].0).length());
+                }
+            }
+        }
+        for (best, of) in tuned.iter_mut().zip(of) {
+            *best = best.min(p99(of));
+        }
+    }
+    tuned
 }

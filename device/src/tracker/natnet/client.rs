@@ -652,6 +652,45 @@ enum Verdict {
     Unsupported,
 }
 
+impl NatNetClient {
+    /// When a datagram came that the kernel stamped with a time of the wall clock, of which `stamp` also has the difference to the
+    /// host's clock; `None`: the kernel gave no stamp, and it counts as come now. Sets `is_arrival_known`.
+    fn arrived_at(&mut self, stamp: Option<(i64, i64)>) -> HostTime {
+        let here = self.clock.now();
+        self.is_arrival_known = !self.has_backlog;
+        let Some((stamp, now)) = stamp else { return here };
+        // Set while nobody read, the wall clock stamped what waits by two measures.
+        let is_steady = self.wall_offset_ns.is_none_or(|was| now.abs_diff(was) <= MS as u64);
+        let stamped = HostTime(stamp.saturating_add(now));
+        let is_plausible = (-MS..=10_000 * MS).contains(&here.ns_since(stamped));
+        self.is_arrival_known |= is_plausible && is_steady;
+        // A very old stamp, or one of the future, comes from a stepped wall clock, not from the arrival.
+        if is_plausible {
+            stamped.min(here)
+        } else {
+            here
+        }
+    }
+
+    /// Has the kernel drop the datagrams of others. `of_other_addresses`: none of those that crowd the queue came from the
+    /// server's address.
+    fn filter(&mut self, of_other_addresses: bool) {
+        // Other senders fill the queue: let the kernel drop their datagrams from now on, uncounted.
+        self.is_filtered = true;
+        let announced = self.server.as_ref().map_or(0, |s| s.data_port);
+        let learned = self.learned_port.map_or(0, |(port, _)| port);
+        let mut ports = [self.config.command_port, self.config.data_port, announced, learned];
+        if of_other_addresses {
+            // All of them have other addresses; this server's port for frames may still have to be learned.
+            ports = [0; 4];
+        }
+        let count = ports.iter().take_while(|p| **p != 0).count();
+        for port in [&self.command].into_iter().chain(&self.data) {
+            let _ = port.keep_only(self.config.server, &ports[..count]);
+        }
+    }
+}
+
 impl Tracker for NatNetClient {
     fn poll(&mut self, now: HostTime, sink: &mut dyn FnMut(&TrackerSample)) -> Result<usize, TrackerError> {
         // What arrived while nobody read has an unknown arrival, unless the kernel stamped it. It may be more than one poll reads.
@@ -681,25 +720,12 @@ impl Tracker for NatNetClient {
                 share -= 1;
                 is_crowded |= share == 0;
                 budget -= 1;
-                let here = self.clock.now();
-                self.is_arrival_known = !self.has_backlog;
-                let at = match arrival.kernel_ns.filter(|_| self.config.kernel_stamps) {
-                    Some(stamp) => {
-                        let now = *offset.get_or_insert_with(|| port.realtime_offset_ns(&*self.clock));
-                        // Set while nobody read, the wall clock stamped what waits by two measures.
-                        let is_steady = self.wall_offset_ns.is_none_or(|was| now.abs_diff(was) <= MS as u64);
-                        let stamped = HostTime(stamp.saturating_add(now));
-                        let is_plausible = (-MS..=10_000 * MS).contains(&here.ns_since(stamped));
-                        self.is_arrival_known |= is_plausible && is_steady;
-                        // A very old stamp, or one of the future, comes from a stepped wall clock, not from the arrival.
-                        if is_plausible {
-                            stamped.min(here)
-                        } else {
-                            here
-                        }
-                    }
-                    None => here,
+                let offset_of = |offset: &mut Option<i64>| {
+                    *offset.get_or_insert_with(|| port.realtime_offset_ns(&*self.clock))
                 };
+                let stamp = arrival.kernel_ns.filter(|_| self.config.kernel_stamps);
+                let stamp = stamp.map(|stamp| (stamp, offset_of(&mut offset)));
+                let at = self.arrived_at(stamp);
                 let frames = self.frames;
                 delivered += self.take_in(arrival, at, sink);
                 if !is_data && self.frames > frames {
@@ -714,19 +740,7 @@ impl Tracker for NatNetClient {
             self.wall_offset_ns = offset.or(self.wall_offset_ns);
         }
         if is_crowded && before != foreign(self.gate.counters()) && !self.is_filtered {
-            // Other senders fill the queue: let the kernel drop their datagrams from now on, uncounted.
-            self.is_filtered = true;
-            let announced = self.server.as_ref().map_or(0, |s| s.data_port);
-            let learned = self.learned_port.map_or(0, |(port, _)| port);
-            let mut ports = [self.config.command_port, self.config.data_port, announced, learned];
-            if before.1 == self.gate.counters().packets.foreign_port {
-                // All of them have other addresses; this server's port for frames may still have to be learned.
-                ports = [0; 4];
-            }
-            let count = ports.iter().take_while(|p| **p != 0).count();
-            for port in [&self.command].into_iter().chain(&self.data) {
-                let _ = port.keep_only(self.config.server, &ports[..count]);
-            }
+            self.filter(before.1 == self.gate.counters().packets.foreign_port);
         }
         Ok(delivered)
     }

@@ -204,37 +204,19 @@ impl SerialTracker {
                 mean_error,
             }) => {
                 let captured_at = self.captured_at(captured, at);
-                let place = |(i, b): (usize, &BodyKey)| b.id.unwrap_or(i as i64) == i64::from(body);
-                let delivered = match self.config.bodies.iter().enumerate().position(place) {
-                    None => {
-                        self.gate.count_unknown();
-                        0
-                    }
-                    Some(_) if !self.is_settled => {
-                        self.gate.count_unknown_age();
-                        0
-                    }
-                    Some(i) => {
-                        let sample = TrackerSample {
-                            body: BodyIndex(i as u16),
-                            pose: Pose {
-                                position_m: position.map(f64::from),
-                                rotation_xyzw: rotation_xyzw.map(f64::from),
-                            },
-                            tracked,
-                            mean_error_m: mean_error,
-                            covariance: None,
-                            sequence,
-                            captured_at,
-                            received_at: at,
-                        };
-                        self.gate.admit(&sample).map_or(0, |sample| {
-                            sink(&sample);
-                            1
-                        })
-                    }
+                let pose =
+                    Pose { position_m: position.map(f64::from), rotation_xyzw: rotation_xyzw.map(f64::from) };
+                let sample = |body| TrackerSample {
+                    body,
+                    pose,
+                    tracked,
+                    mean_error_m: mean_error,
+                    covariance: None,
+                    sequence,
+                    captured_at,
+                    received_at: at,
                 };
-                (Ok(()), delivered)
+                (Ok(()), self.admit(i64::from(body), sample, sink))
             }
             Ok(SerialMessage::Hello { version: VERSION, ticks_per_second, .. }) => {
                 if ticks_per_second != self.ticks_per_second || self.map.is_none() {
@@ -258,6 +240,27 @@ impl SerialTracker {
             Err(false) => packets.unsupported += 1,
         }
         delivered
+    }
+
+    /// Passes the sample of the body with number `id` on. Returns how many were delivered.
+    fn admit(
+        &mut self,
+        id: i64,
+        sample: impl FnOnce(BodyIndex) -> TrackerSample,
+        sink: &mut dyn FnMut(&TrackerSample),
+    ) -> usize {
+        let place = |(i, b): (usize, &BodyKey)| b.id.unwrap_or(i as i64) == id;
+        match self.config.bodies.iter().enumerate().position(place) {
+            None => self.gate.count_unknown(),
+            Some(_) if !self.is_settled => self.gate.count_unknown_age(),
+            Some(i) => {
+                if let Some(sample) = self.gate.admit(&sample(BodyIndex(i as u16))) {
+                    sink(&sample);
+                    return 1;
+                }
+            }
+        }
+        0
     }
 
     fn on_echo(&mut self, token: u64, ticks: u64, at: HostTime) -> Result<(), bool> {

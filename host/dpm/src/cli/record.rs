@@ -102,14 +102,7 @@ pub(super) fn execute(args: &RecordArgs) -> Result<(), Failure> {
     if written == 0 {
         return Err(Failure::new(FailureKind::Device, format!("the tracker delivered no sample: {status}")));
     }
-    let there = seen.iter().filter(|seen| **seen).count();
-    let of = if there == bodies.len() { format!("{there}") } else { format!("{there} of {}", bodies.len()) };
-    print(&format!("{written} samples of {of} bodies in {}\n", args.out.display()));
-    if there < bodies.len() {
-        let missing = bodies.iter().zip(&seen).filter(|(_, seen)| !**seen);
-        let missing: Vec<String> = missing.map(|(body, _)| format!("{:?}", body.name)).collect();
-        print(&format!("warning: no sample of {}: {status}\n", missing.join(", ")));
-    }
+    say_written(written, &args.out, (&bodies, &seen), &status);
     if unrecorded > 0 {
         print(&format!(
             "warning: {unrecorded} samples came faster than they could be written, and are not in it\n"
@@ -119,4 +112,16 @@ pub(super) fn execute(args: &RecordArgs) -> Result<(), Failure> {
         print(&format!("warning: {warning}\n"));
     }
     Ok(())
+}
+
+/// Says how many samples of how many of `bodies` were written, and which of them were never `seen`.
+fn say_written(written: u64, out: &std::path::Path, (bodies, seen): (&[BodyKey], &[bool]), status: &str) {
+    let there = seen.iter().filter(|seen| **seen).count();
+    let of = if there == bodies.len() { format!("{there}") } else { format!("{there} of {}", bodies.len()) };
+    print(&format!("{written} samples of {of} bodies in {}\n", out.display()));
+    if there < bodies.len() {
+        let missing = bodies.iter().zip(seen).filter(|(_, seen)| !**seen);
+        let missing: Vec<String> = missing.map(|(body, _)| format!("{:?}", body.name)).collect();
+        print(&format!("warning: no sample of {}: {status}\n", missing.join(", ")));
+    }
 }

@@ -321,25 +321,16 @@ fn video(config: &RigConfig, backend: &Dlpc900Config, dmd: Dmd) -> VideoPatterns
     }
 }
 
-/// Sets up the controller, obeys orders, supervises it for `seconds` (forever if `None`), and puts it to rest.
-///
-/// # Errors
-/// The controller refuses or fails. It is no error if it is unplugged: the run searches for it and sets it up again.
-pub(crate) fn present<P: HidPort>(
-    open: &mut dyn FnMut() -> Result<Dlpc900<P>, Dlpc900Error>,
-    show: &Show,
-    seconds: Option<f64>,
-    monitor: &RunMonitor,
-) -> Result<Dlpc900Report, Failure> {
-    let mut d = open()?;
+/// The report of a show that has not begun.
+fn report_of(dmd: Dmd, show: &Show) -> Dlpc900Report {
     let step_us: u64 = show.entries().iter().map(|e| u64::from(e.exposure_us) + u64::from(e.dark_us)).sum();
     let frames = match show {
         Show::Preloaded(s) => s.images().len(),
         Show::Video(_) => 1,
     };
-    let mut report = Dlpc900Report {
+    Dlpc900Report {
         version: env!("CARGO_PKG_VERSION"),
-        dmd: d.dmd().name(),
+        dmd: dmd.name(),
         mode: if matches!(show, Show::Preloaded(_)) { "preloaded" } else { "video" },
         frames_loaded: None,
         frame_rate_hz: frames as f64 * 1e6 / step_us.max(1) as f64,
@@ -352,7 +343,21 @@ pub(crate) fn present<P: HidPort>(
         came_back: 0,
         shown_s: 0.0,
         warnings: Vec::new(),
-    };
+    }
+}
+
+/// Sets up the controller, obeys orders, supervises it for `seconds` (forever if `None`), and puts it to rest.
+///
+/// # Errors
+/// The controller refuses or fails. It is no error if it is unplugged: the run searches for it and sets it up again.
+pub(crate) fn present<P: HidPort>(
+    open: &mut dyn FnMut() -> Result<Dlpc900<P>, Dlpc900Error>,
+    show: &Show,
+    seconds: Option<f64>,
+    monitor: &RunMonitor,
+) -> Result<Dlpc900Report, Failure> {
+    let mut d = open()?;
+    let mut report = report_of(d.dmd(), show);
     let word = Word::default();
     if let Some(order) = monitor.take_order() {
         // An order that stood before the run, or came while it rendered: the controller is set up dark.

@@ -106,9 +106,16 @@ impl<'t> Bsdf<'t> {
             choose: Choices::default(),
         };
         this.coat = this.dielectric_albedo(v);
-        // Lobes are chosen by about the light each returns under even lighting.
+        this.choose = this.choices(this.under_layer(v_world));
+        Some(this)
+    }
+
+    /// The shares by which lobes are chosen: about the light that each returns under even lighting. `under_layer` is left of it
+    /// under the coat.
+    fn choices(&self, under_layer: f64) -> Choices {
+        let (look, lobes, inside, v) = (self.look, &self.look.lobes, self.inside, self.v);
         let (m, t, b) = (look.metallic, look.transmission, look.base.max_element());
-        let reflected = if inside { this.facet(v.z).2 } else { this.coat };
+        let reflected = if inside { self.facet(v.z).2 } else { self.coat };
         let passed = (1.0 - m) * t * (1.0 - reflected) * b;
         let mut facet = m * fresnel_schlick(look.base, v.z).max_element() + (1.0 - m) * reflected;
         if !look.thin {
@@ -117,8 +124,8 @@ impl<'t> Bsdf<'t> {
         if look.ior > 1.0 || m > 0.0 {
             facet = facet.max(1e-3);
         }
-        let spread = if inside { 0.0 } else { (1.0 - m) * (1.0 - t) * (1.0 - this.coat) };
-        let (layer, sheen) = (1.0 - this.under_layer(v_world), lobes.sheen_albedo(v.z));
+        let spread = if inside { 0.0 } else { (1.0 - m) * (1.0 - t) * (1.0 - self.coat) };
+        let (layer, sheen) = (1.0 - under_layer, lobes.sheen_albedo(v.z));
         let sheen = if inside { 0.0 } else { sheen };
         let under = (1.0 - layer) * (1.0 - sheen);
         let weights = Choices {
@@ -132,15 +139,14 @@ impl<'t> Bsdf<'t> {
         let w = &weights;
         let sum = w.facet + w.diffuse + w.straight + w.layer + w.sheen + w.shine;
         let share = |x: f64| if sum > 0.0 { x / sum } else { 0.0 };
-        this.choose = Choices {
+        Choices {
             facet: share(w.facet),
             diffuse: share(w.diffuse),
             straight: share(w.straight),
             layer: share(w.layer),
             sheen: share(w.sheen),
             shine: share(w.shine),
-        };
-        Some(this)
+        }
     }
 
     fn mirror_is_delta(&self) -> bool {

@@ -32,6 +32,15 @@ fn along(point: &SurfacePoint, direction: DVec3) -> DVec3 {
     }
 }
 
+/// What a ray absorbed of each channel, per metre, that came through `medium` along `l` and met a surface: the back of a solid is met
+/// from within it, wherever the ray comes from.
+fn crossed(met: &SurfacePoint, l: DVec3, medium: DVec3) -> DVec3 {
+    let of_solid = met.look.lobes.absorption;
+    let behind = met.geometric.dot(l) > 0.0;
+    let pick = |c: usize| if behind && of_solid[c] > 0.0 { of_solid[c] } else { medium[c] };
+    DVec3::new(pick(0), pick(1), pick(2))
+}
+
 /// Leaves a path one channel, chosen by the light that it carries, with all of that light on average. `u`: even over 0 to 1. The channel, 0 to 2.
 fn take_channel(throughput: &mut DVec3, u: f64) -> usize {
     let total = throughput.element_sum();
@@ -128,12 +137,8 @@ impl Reference<'_> {
             match self.bvh.closest(origin, next.l, f64::INFINITY, |hit| self.is_met(hit, key)) {
                 Some(hit) => {
                     let met = self.resolve(&hit);
-                    // The back of a solid is met from within it, wherever the ray comes from.
-                    let of_solid = met.look.lobes.absorption;
-                    let behind = met.geometric.dot(next.l) > 0.0;
-                    let pick = |c: usize| if behind && of_solid[c] > 0.0 { of_solid[c] } else { medium[c] };
-                    let absorption = DVec3::new(pick(0), pick(1), pick(2));
-                    throughput *= left_by(absorption, met.position.distance(point.position));
+                    throughput *=
+                        left_by(crossed(&met, next.l, medium), met.position.distance(point.position));
                     point = met;
                 }
                 None => {

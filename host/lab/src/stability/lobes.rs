@@ -444,34 +444,7 @@ fn closed_forms() -> Vec<ClosedForm> {
             let expected = film_reflectance(base_color.as_dvec3(), f64::from(1.4f32), f64::from(nm), mu);
             all.push(ClosedForm::new(format!("film of {nm} nm at {mu}"), m, mu, expected, 1e-3));
         }
-        for roughness in [0.3, 0.7, 1.0] {
-            let color = Vec3::new(0.9, 0.5, 0.2);
-            let cloth = Sheen { color, roughness, ..Sheen::default() };
-            let e = albedo_of_sheen(mu, f64::from(roughness * roughness));
-            let over_black = with(black(), |l| l.sheen = cloth);
-            let expected = color.as_dvec3() * e;
-            all.push(ClosedForm::new(
-                format!("sheen of {roughness} over black at {mu}"),
-                over_black,
-                mu,
-                expected,
-                4e-3,
-            ));
-            let m = f64::from(color.max_element());
-            let under = |x: f64| 1.0 - m * albedo_of_sheen(x, f64::from(roughness * roughness));
-            let n = 40;
-            let left: f64 = (0..n)
-                .map(|i| (f64::from(i) + 0.5) / f64::from(n))
-                .map(|x| 2.0 * x / f64::from(n) * under(mu).min(under(x)))
-                .sum();
-            all.push(ClosedForm::new(
-                format!("sheen of {roughness} over white at {mu}"),
-                with(white(), |l| l.sheen = cloth),
-                mu,
-                expected + left,
-                6e-3,
-            ));
-        }
+        all.extend([0.3, 0.7, 1.0].into_iter().flat_map(|roughness| sheens(roughness, mu)));
     }
     for (roughness, strength, mu) in [(0.5f32, 0.7f32, 0.4), (0.4, 1.0, 0.9), (0.7, 0.5, 0.2)] {
         let brushed = Anisotropy { strength, rotation: 0.6, ..Anisotropy::default() };
@@ -482,6 +455,32 @@ fn closed_forms() -> Vec<ClosedForm> {
     all.extend(volumes());
     all.extend(sheets());
     all
+}
+
+/// Sheen over black and over white, seen under `mu`.
+fn sheens(roughness: f32, mu: f64) -> [ClosedForm; 2] {
+    let color = Vec3::new(0.9, 0.5, 0.2);
+    let cloth = Sheen { color, roughness, ..Sheen::default() };
+    let e = albedo_of_sheen(mu, f64::from(roughness * roughness));
+    let over_black = with(black(), |l| l.sheen = cloth);
+    let expected = color.as_dvec3() * e;
+    let m = f64::from(color.max_element());
+    let under = |x: f64| 1.0 - m * albedo_of_sheen(x, f64::from(roughness * roughness));
+    let n = 40;
+    let left: f64 = (0..n)
+        .map(|i| (f64::from(i) + 0.5) / f64::from(n))
+        .map(|x| 2.0 * x / f64::from(n) * under(mu).min(under(x)))
+        .sum();
+    [
+        ClosedForm::new(format!("sheen of {roughness} over black at {mu}"), over_black, mu, expected, 4e-3),
+        ClosedForm::new(
+            format!("sheen of {roughness} over white at {mu}"),
+            with(white(), |l| l.sheen = cloth),
+            mu,
+            expected + left,
+            6e-3,
+        ),
+    ]
 }
 
 /// The albedo of a white metal that is brushed at 0.6 rad from the tangent, by the integral over outgoing directions.

@@ -211,6 +211,14 @@ pub(super) fn check(rig: &RigConfig, reader: &mut Reader) {
         let origin: Origin = reader.origin_of(key);
         reader.refuse(&origin, key, problem.to_owned(), remedy.to_owned());
     };
+    check_limits(rig, &mut refuse);
+    check_interlock(rig, &mut refuse);
+}
+
+/// Refuses a key, for what is wrong with it, with what to do.
+type Refuse<'a> = dyn FnMut(&str, &str, &str) + 'a;
+
+fn check_limits(rig: &RigConfig, refuse: &mut Refuse) {
     let limits = &rig.safety.limits;
     let white = rig.projector.white_of(limits.measured_with);
     if limits.mean_level > 0.0 && limits.mean_level * white < 0.001 {
@@ -243,6 +251,9 @@ pub(super) fn check(rig: &RigConfig, reader: &mut Reader) {
             "limit its light by the LED currents, or remove the key",
         );
     }
+}
+
+fn check_interlock(rig: &RigConfig, refuse: &mut Refuse) {
     let one_of = |a: bool, b: bool| a != b;
     let is_relative = |path: &Option<PathBuf>| path.as_deref().is_some_and(Path::is_relative);
     match &rig.safety.interlock {

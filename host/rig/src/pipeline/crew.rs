@@ -97,6 +97,23 @@ pub(super) struct Crew {
     gpu_silence: Silence,
 }
 
+impl CrewState {
+    fn new(facts: Arc<CrewFacts>) -> Self {
+        Self {
+            is_abandoned: AtomicBool::new(false),
+            tracking_over: AtomicBool::new(false),
+            planning: AtomicU64::new(0),
+            facts,
+            rendering: AtomicU64::new(0),
+            rendering_since: AtomicU64::new(0),
+            gpu: Pulse::new("GPU"),
+            pulses: [Pulse::new("tracking"), Pulse::new("plan"), Pulse::new("pack")],
+            returned: [const { AtomicBool::new(false) }; 3],
+            failure: Lock::new(None),
+        }
+    }
+}
+
 impl Crew {
     /// Starts the threads. Frames come out of the port and return through it.
     ///
@@ -119,18 +136,7 @@ impl Crew {
         for memory in memory {
             let _ = free_in.push(FrameJob { note: Box::new(FrameNote::new(rig)), memory: Box::new(memory) });
         }
-        let state = Arc::new(CrewState {
-            is_abandoned: AtomicBool::new(false),
-            tracking_over: AtomicBool::new(false),
-            planning: AtomicU64::new(0),
-            facts: facts.clone(),
-            rendering: AtomicU64::new(0),
-            rendering_since: AtomicU64::new(0),
-            gpu: Pulse::new("GPU"),
-            pulses: [Pulse::new("tracking"), Pulse::new("plan"), Pulse::new("pack")],
-            returned: [const { AtomicBool::new(false) }; 3],
-            failure: Lock::new(None),
-        });
+        let state = Arc::new(CrewState::new(facts));
         let (publisher, reader) = latest(TrackSnapshot::empty(rig.tracked_count()));
         let (to_link, tracks) =
             rig.wants_tracks().then(|| latest(TrackSnapshot::empty(rig.tracked_count()))).unzip();

@@ -15,7 +15,6 @@ use crate::engine::facts::Facts;
 use crate::engine::keeper::LinkKeeper;
 use crate::engine::link::LinkStage;
 use crate::engine::options::RunOptions;
-use crate::engine::pulse::Pulse;
 use crate::engine::supervision::{until_gpu_is_back, Remake, Supervision};
 use crate::light::collector::{Collector, Inbox};
 use crate::light::notes::note_channel;
@@ -33,7 +32,7 @@ use dpm_handoff::channel::{channel, Sender};
 use dpm_handoff::path::Lock;
 use dpm_handoff::wake::WaitPolicy;
 use dpm_render::RenderError;
-use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::atomic::Ordering;
 use std::sync::Arc;
 use std::thread::JoinHandle;
 use std::time::Duration;
@@ -85,23 +84,10 @@ pub(super) fn run_at_real_pace(
     let facts = Arc::new(Facts::new(rig.clone(), monitor.clone(), options, &lead, clock.now()));
     facts.made_ns.store(made_ns, Ordering::Relaxed);
     tell_horizon(&facts);
-    let keeper = LinkKeeper::new(
-        time,
-        &link,
-        rig.bodies.len(),
-        far.lights.map(|lights| (lights, rig.config.projector.light_delay_ns())),
-    );
+    let lights_of = far.lights.map(|lights| (lights, rig.config.projector.light_delay_ns()));
+    let keeper = LinkKeeper::new(time, &link, rig.bodies.len(), lights_of);
     let line = Line { stage: LinkStage::new(facts.clone(), link, keeper, lead), medium: far.medium };
-    let shared = Arc::new(RunState {
-        facts: facts.clone(),
-        clock,
-        time,
-        is_link_over: AtomicBool::new(false),
-        is_broken: AtomicBool::new(false),
-        link_pulse: Pulse::new("link"),
-        collector_pulse: Pulse::new("collector"),
-        rights: rights.clone(),
-    });
+    let shared = Arc::new(RunState::new(&facts, clock, time, &rights));
     let mut collector =
         Collector::new(rig.clone(), options.keep_frames.max(options.keep_records), options.verify)
             .about(origin.gpu().is_none(), standstill.as_ref().map(StandstillMonitor::seen));

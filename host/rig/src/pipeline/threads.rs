@@ -79,6 +79,27 @@ pub(super) struct RunState {
     pub(super) rights: Arc<Rights>,
 }
 
+impl RunState {
+    /// The state of a run that begins.
+    pub(super) fn new(
+        facts: &Arc<Facts>,
+        clock: MonotonicClock,
+        time: LinkTime,
+        rights: &Arc<Rights>,
+    ) -> Self {
+        Self {
+            facts: facts.clone(),
+            clock,
+            time,
+            is_link_over: AtomicBool::new(false),
+            is_broken: AtomicBool::new(false),
+            link_pulse: Pulse::new("link"),
+            collector_pulse: Pulse::new("collector"),
+            rights: rights.clone(),
+        }
+    }
+}
+
 /// Stalls if the run's options ask for it. A stall strikes once, also where a new crew works on the same frame again.
 pub(super) fn may_stall(facts: &Facts, stage: StallIn, frame: u64) {
     let Some(stall) = facts.options.stall else { return };

@@ -46,16 +46,14 @@ pub(super) fn run_at_virtual_pace(
     options: RunOptions,
     monitor: &Arc<RunMonitor>,
 ) -> Result<Ran, PipelineError> {
-    // Virtual pace permits only trackers without a clock of their own.
+    // Only trackers without a clock of their own are permitted here.
     let mut parts = CrewParts::new(rig, origin, options, Arc::new(|| HostTime(0)))?;
     monitor.end_set_up();
     // The link comes up just before the first frame. The filters need the time before that.
     let mut now = HostTime(LISTEN_NS);
     let (lights_in, lights) = light_channel();
-    let Some(mock) = rig.config.projector.backend.as_mock() else {
-        let told = "real_time.pace = \"virtual\" works only with the mock projector";
-        return Err(RigError::Unsupported(told.into()).into());
-    };
+    let told = "real_time.pace = \"virtual\" works only with the mock projector";
+    let mock = rig.config.projector.backend.as_mock().ok_or_else(|| RigError::Unsupported(told.into()))?;
     let (mock, recorder) = mock_projector(rig, mock, lights_in, options, origin.is_marked(), now)?;
     let mut cable = Direct::new(mock);
     let watch = Stopwatch::start();
@@ -68,11 +66,10 @@ pub(super) fn run_at_virtual_pace(
     let crew = Arc::new(CrewFacts::new(0, rig.rate().slot_len_ns(0)));
     let keeper = LinkKeeper::new(time, &link, rig.bodies.len(), None);
     let (notes_in, notes) = note_channel(rig, monitor);
-    let free: Vec<_> = std::mem::take(&mut parts.memory)
-        .into_iter()
-        .map(|memory| FrameJob { note: Box::new(FrameNote::new(rig)), memory: Box::new(memory) })
-        .collect();
-    let frames = free.len();
+    let job = |memory| FrameJob { note: Box::new(FrameNote::new(rig)), memory: Box::new(memory) };
+    let free: Vec<_> = std::mem::take(&mut parts.memory).into_iter().map(job).collect();
+    let kept = options.keep_frames.max(options.keep_records);
+    let collector = Collector::new(rig.clone(), kept, options.verify).about(origin.gpu().is_none(), None);
     let mut late = LateTracks::of(rig, origin)?;
     let mut stage = LinkStage::new(facts.clone(), link, keeper, lead);
     if let Some(tracks) = late.as_mut().and_then(|late| late.reader.take()) {
@@ -91,31 +88,17 @@ pub(super) fn run_at_virtual_pace(
         latest: latest(TrackSnapshot::empty(rig.tracked_count())),
         cable,
         recorder: recorder.seen_by(monitor),
+        under_way: VecDeque::with_capacity(free.len()),
         free,
-        under_way: VecDeque::with_capacity(frames),
         notes: Some(notes_in),
-        collector: Collector::new(rig.clone(), options.keep_frames.max(options.keep_records), options.verify)
-            .about(origin.gpu().is_none(), None),
+        collector,
         inbox: Inbox { notes, lights },
         at_work: "plan",
         parts,
-        facts: facts.clone(),
+        facts,
     };
     world.run();
-    let slots = world.collector.finish(monitor);
-    if let Some(error) = facts.take_error() {
-        return Err(error);
-    }
-    Ok(Ran {
-        carried: world.link.report(world.cable.name()),
-        collector: world.collector,
-        slots,
-        recorder: Some(world.recorder),
-        wall_s: watch.elapsed_ns() as f64 * 1e-9,
-        standstills: Standstills::default(),
-        warnings: world.parts.tracking.never_seen(rig).into_iter().collect(),
-        facts,
-    })
+    world.into_ran(rig, monitor, watch.elapsed_ns())
 }
 
 /// The tracker once more, for the tracks that are sent between frames. Frames are planned ahead of the clock of the link
@@ -199,6 +182,24 @@ impl World {
         self.parts.tracking.add_counts(self.now, self.facts.monitor.samples(), true);
         self.recorder.close();
         while !self.collect() {}
+    }
+
+    /// What remains of the run, which took `wall_ns` of real time.
+    fn into_ran(mut self, rig: &Rig, monitor: &RunMonitor, wall_ns: u64) -> Result<Ran, PipelineError> {
+        let slots = self.collector.finish(monitor);
+        if let Some(error) = self.facts.take_error() {
+            return Err(error);
+        }
+        Ok(Ran {
+            carried: self.link.report(self.cable.name()),
+            collector: self.collector,
+            slots,
+            recorder: Some(self.recorder),
+            wall_s: wall_ns as f64 * 1e-9,
+            standstills: Standstills::default(),
+            warnings: self.parts.tracking.never_seen(rig).into_iter().collect(),
+            facts: self.facts,
+        })
     }
 
     fn serve(&mut self) -> Result<(), PipelineError> {

@@ -321,13 +321,12 @@ pub fn of_places(rig: &Rig, places: &[Vec<DAffine3>]) -> Vec<Doubt> {
             key(&a.0).partial_cmp(&key(&b.0)).unwrap_or(std::cmp::Ordering::Equal)
         });
         let Some((best, place)) = best else { continue };
-        let about = format!("body \"{}\"", shape.name);
         let is_turned = |b: &dpm_scene::Body| b.tracked == Some(tracked as u16) && turned(rig, &b.mesh);
         if !rig.scene.bodies.iter().any(is_turned)
             && shows_only_backs(&faces(rig, tracked), camera.position(), &of_body)
         {
             all.push(Doubt {
-                about: about.clone(),
+                about: format!("body \"{}\"", shape.name),
                 told: "the projector sees only backs of its single-sided surface, which stay black".into(),
                 remedy: "flip its faces where it was made, make its material double-sided, or turn the body"
                     .into(),
@@ -338,45 +337,46 @@ pub fn of_places(rig: &Rig, places: &[Vec<DAffine3>]) -> Vec<Doubt> {
         if best.is_near && !far && across >= LEAST_PX {
             continue;
         }
-        all.push(
-            match (projector_unit(rig, &shape, place, best.distance), tracker_unit(rig, &shape, place)) {
-                (Some((unit, name)), _) => Doubt {
-                    about: "projector".into(),
-                    told: format!(
-                        "it stands {} from the bodies, {} times too far: {name}?",
-                        metres(best.distance),
-                        (1.0 / unit).round()
-                    ),
-                    remedy: match rig.config.projector.calibration {
-                        Some(_) => "correct projector.calibration_unit".into(),
-                        None => "give projector.position in metres".into(),
-                    },
-                },
-                (None, Some((_, name))) => Doubt {
-                    about,
-                    told: format!("{}, out of the projector's reach: {name}?", at_place(place)),
-                    remedy: "set the tracking software to metres".into(),
-                },
-                (None, None) if !best.is_near => Doubt {
-                    about,
-                    told: format!("{}, out of the projector's reach", at_place(place)),
-                    remedy: "check the tracker's axes, units and handedness, and the projector's pose".into(),
-                },
-                (None, None) => Doubt {
-                    about,
-                    told: format!(
-                        "the projector covers it with {across:.1} pixels from {}",
-                        metres(best.distance)
-                    ),
-                    remedy: "check the projector's pose and the size of the mesh (scene.scale)".into(),
-                },
-            },
-        );
+        all.push(of_place(rig, &shape, place, (best, across)));
     }
     // The projector's place is one, whichever body shows it.
     let mut is_first = true;
     all.retain(|doubt| doubt.about != "projector" || std::mem::take(&mut is_first));
     all
+}
+
+/// The doubt about a body that is not within the projector's reach, or that is `across` pixels wide there.
+fn of_place(rig: &Rig, shape: &Shape, place: &DAffine3, (best, across): (&View, f64)) -> Doubt {
+    let about = format!("body \"{}\"", shape.name);
+    match (projector_unit(rig, shape, place, best.distance), tracker_unit(rig, shape, place)) {
+        (Some((unit, name)), _) => Doubt {
+            about: "projector".into(),
+            told: format!(
+                "it stands {} from the bodies, {} times too far: {name}?",
+                metres(best.distance),
+                (1.0 / unit).round()
+            ),
+            remedy: match rig.config.projector.calibration {
+                Some(_) => "correct projector.calibration_unit".into(),
+                None => "give projector.position in metres".into(),
+            },
+        },
+        (None, Some((_, name))) => Doubt {
+            about,
+            told: format!("{}, out of the projector's reach: {name}?", at_place(place)),
+            remedy: "set the tracking software to metres".into(),
+        },
+        (None, None) if !best.is_near => Doubt {
+            about,
+            told: format!("{}, out of the projector's reach", at_place(place)),
+            remedy: "check the tracker's axes, units and handedness, and the projector's pose".into(),
+        },
+        (None, None) => Doubt {
+            about,
+            told: format!("the projector covers it with {across:.1} pixels from {}", metres(best.distance)),
+            remedy: "check the projector's pose and the size of the mesh (scene.scale)".into(),
+        },
+    }
 }
 
 fn at_place(place: &DAffine3) -> String {

@@ -291,7 +291,18 @@ fn check_nodes(
         limits.lights,
         "use emissive surfaces or an environment image",
     )?;
+    check_tree(root, nodes, &children, &parent, limits)?;
+    check_scenes(root, counts, &parent, limits)
+}
 
+/// Checks that the nodes form trees of bounded depth. `children` and `parent` are those of each node.
+fn check_tree(
+    root: &Item,
+    nodes: &[Item],
+    children: &[Vec<usize>],
+    parent: &[Option<usize>],
+    limits: &Limits,
+) -> Result<(), SceneError> {
     // The walk reaches every node once from the nodes without parent; an unreached node is part of a cycle.
     let mut reached = 0;
     let mut walk: Vec<(usize, u32)> =
@@ -309,7 +320,16 @@ fn check_nodes(
         return Err(root
             .error(format!("{} of the nodes form a cycle of parents and children", nodes.len() - reached)));
     }
+    Ok(())
+}
 
+/// Checks that scenes list nodes without a parent, each once.
+fn check_scenes(
+    root: &Item,
+    counts: &Counts,
+    parent: &[Option<usize>],
+    limits: &Limits,
+) -> Result<(), SceneError> {
     let scenes = root.list("scenes", "scene", limits.objects)?;
     root.index("scene", scenes.len(), "scene")?;
     for scene in &scenes {

@@ -55,6 +55,7 @@ impl Group {
 }
 
 /// A subtree still to be walked.
+#[derive(Clone, Copy)]
 struct Step {
     node: usize,
     /// World-from-parent at rest.
@@ -214,70 +215,96 @@ impl<'a> Gatherer<'a> {
             .rev()
             .map(|node| Step { node, world, place: world, group, resizes: false })
             .collect();
-        while let Some(Step { node: index, world, place, mut group, mut resizes }) = walk.pop() {
+        while let Some(step) = walk.pop() {
             self.cancel.check(self.limits)?;
-            let Some(node) = document.nodes().nth(index) else { continue };
-            if self.source.hidden.contains(&index) {
+            let Some(node) = document.nodes().nth(step.node) else { continue };
+            if self.source.hidden.contains(&step.node) {
                 continue;
             }
-            let channels = self.source.animation.nodes.get(&index);
-            let local = local_transform(&node, channels);
-            let above = self.place_at(group, &world, &place);
-            let world = world * local;
-            let mut place = place * local;
-            if let Some(&c) = claim_of.get(&index) {
-                group = Group {
-                    claim: Some(c),
-                    is_virtual: !claims.bodies[c].projected,
-                    part: None,
-                    deforming: None,
-                };
-                resizes = false;
-                self.rest[c] = self.rest_of(c, &world)?;
-                if channels.is_some_and(Channels::moves) {
-                    warnings.push(format!(
-                        "node {index} '{}': its own motion is not played: the tracker moves body '{}'",
-                        node.name().unwrap_or(""),
-                        claims.bodies[c].name
-                    ));
-                }
-            } else if let Some(channels) = channels.filter(|channels| channels.moves() || channels.resizes())
-            {
-                resizes |= channels.resizes();
-                match self.part(&node, channels, &above, group) {
-                    Ok((part, scale)) => (group.part, place) = (Some(part), scale),
-                    // Nothing rigid moves so, but a mesh that deforms does.
-                    Err(UNEVEN) => resizes = true,
-                    Err(why) => warnings.push(format!(
-                        "node {index} '{}': its motion is not played, because {why}",
-                        node.name().unwrap_or("")
-                    )),
-                }
-            }
-            let place = self.place_at(group, &world, &place);
-            group.is_virtual |= claims.virtual_nodes.binary_search(&index).is_ok();
-            if let Some(mesh) = node.mesh() {
-                let morphs = channels.is_some_and(Channels::morphs)
-                    && self.source.deformations.has_targets(mesh.index());
-                if self.source.deformations.skin(index, mesh.index()).is_some() {
-                    self.skinned.push((index, group));
-                } else if resizes || morphs {
-                    self.unskinned.push((index, group));
-                } else if is_invertible(&place) {
-                    self.add_mesh((mesh.index(), index), group, &place, None)?;
-                } else {
-                    let name = node.name().unwrap_or("");
-                    warnings.push(format!("node {index} '{name}' is scaled to nothing and is left out"));
-                }
-            }
-            self.places.insert(index, (group, place));
-            if let Some(light) = node.light() {
-                self.lights.extend(place_light(&light, &place).map(|l| (group, l)));
-            }
-            walk.extend(node.children().map(|c| Step { node: c.index(), world, place, group, resizes }));
+            let step = self.enter(step, &node, claim_of.get(&step.node).copied(), warnings)?;
+            self.add_node(&step, &node, warnings)?;
+            walk.extend(node.children().map(|c| Step { node: c.index(), ..step }));
         }
         self.add_skinned_meshes(warnings)?;
         self.add_unskinned_meshes(warnings)
+    }
+
+    /// From the step that leads to `node`, which is `claim`'s body if any, the one that stands at it: its places, and the group
+    /// of what it holds.
+    fn enter(
+        &mut self,
+        step: Step,
+        node: &gltf::Node,
+        claim: Option<usize>,
+        warnings: &mut Vec<String>,
+    ) -> Result<Step, SceneError> {
+        let Step { node: index, world, place, mut group, mut resizes } = step;
+        let claims = self.claims;
+        let channels = self.source.animation.nodes.get(&index);
+        let local = local_transform(node, channels);
+        let above = self.place_at(group, &world, &place);
+        let world = world * local;
+        let mut place = place * local;
+        let name = node.name().unwrap_or("");
+        if let Some(c) = claim {
+            group = Group {
+                claim: Some(c),
+                is_virtual: !claims.bodies[c].projected,
+                part: None,
+                deforming: None,
+            };
+            resizes = false;
+            self.rest[c] = self.rest_of(c, &world)?;
+            if channels.is_some_and(Channels::moves) {
+                warnings.push(format!(
+                    "node {index} '{name}': its own motion is not played: the tracker moves body '{}'",
+                    claims.bodies[c].name
+                ));
+            }
+        } else if let Some(channels) = channels.filter(|channels| channels.moves() || channels.resizes()) {
+            resizes |= channels.resizes();
+            match self.part(node, channels, &above, group) {
+                Ok((part, scale)) => (group.part, place) = (Some(part), scale),
+                // Nothing rigid moves so, but a mesh that deforms does.
+                Err(UNEVEN) => resizes = true,
+                Err(why) => {
+                    warnings.push(format!("node {index} '{name}': its motion is not played, because {why}"))
+                }
+            }
+        }
+        let place = self.place_at(group, &world, &place);
+        group.is_virtual |= claims.virtual_nodes.binary_search(&index).is_ok();
+        Ok(Step { node: index, world, place, group, resizes })
+    }
+
+    /// Adds the mesh and the lamp of the node at which a step stands.
+    fn add_node(
+        &mut self,
+        step: &Step,
+        node: &gltf::Node,
+        warnings: &mut Vec<String>,
+    ) -> Result<(), SceneError> {
+        let Step { node: index, ref place, group, resizes, .. } = *step;
+        if let Some(mesh) = node.mesh() {
+            let deformations = &self.source.deformations;
+            let channels = self.source.animation.nodes.get(&index);
+            let morphs = channels.is_some_and(Channels::morphs) && deformations.has_targets(mesh.index());
+            if deformations.skin(index, mesh.index()).is_some() {
+                self.skinned.push((index, group));
+            } else if resizes || morphs {
+                self.unskinned.push((index, group));
+            } else if is_invertible(place) {
+                self.add_mesh((mesh.index(), index), group, place, None)?;
+            } else {
+                let name = node.name().unwrap_or("");
+                warnings.push(format!("node {index} '{name}' is scaled to nothing and is left out"));
+            }
+        }
+        self.places.insert(index, (group, *place));
+        if let Some(light) = node.light() {
+            self.lights.extend(place_light(&light, place).map(|l| (group, l)));
+        }
+        Ok(())
     }
 
     /// The place of a node in the space of its body or part. `world` is its place at rest, `in_part` that in its part.

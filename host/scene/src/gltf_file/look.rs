@@ -176,16 +176,7 @@ impl Reader<'_> {
             normal_scale: m.normal_texture().map_or(1.0, |n| n.scale()),
             ..Material::default()
         };
-        let uses = [
-            pbr.base_color_texture().map(|i| plain_use("base colour", &i, true)),
-            pbr.metallic_roughness_texture().map(|i| plain_use("metallic-roughness", &i, false)),
-            // The crate does not provide the transform of a normal texture.
-            raw_use(NORMAL, raw, "normalTexture", false)?,
-            m.emissive_texture().map(|i| plain_use("emissive", &i, true)),
-            m.transmission()
-                .and_then(|t| t.transmission_texture())
-                .map(|i| plain_use("transmission", &i, false)),
-        ];
+        let uses = plain_uses(m, raw)?;
         let all = uses.iter().chain(&lobe_uses);
         let mut sets: Vec<u32> = all.map(|u| u.as_ref().map_or(0, |u| u.uv_set)).collect();
         let mut references = [None; 5];
@@ -351,6 +342,20 @@ impl Reader<'_> {
         let name = item.text("mimeType")?.or(item.text("uri")?).unwrap_or_default();
         picture::decode(item, bytes, name, self.texels, self.limits)
     }
+}
+
+/// The uses of the textures that glTF has without extensions of lobes: base colour, metallic-roughness, normal, emissive and
+/// transmission.
+fn plain_uses(m: &gltf::Material, raw: &Item) -> Result<[Option<Use>; 5], SceneError> {
+    let pbr = m.pbr_metallic_roughness();
+    Ok([
+        pbr.base_color_texture().map(|i| plain_use("base colour", &i, true)),
+        pbr.metallic_roughness_texture().map(|i| plain_use("metallic-roughness", &i, false)),
+        // The crate does not provide the transform of a normal texture.
+        raw_use(NORMAL, raw, "normalTexture", false)?,
+        m.emissive_texture().map(|i| plain_use("emissive", &i, true)),
+        m.transmission().and_then(|t| t.transmission_texture()).map(|i| plain_use("transmission", &i, false)),
+    ])
 }
 
 fn plain_use(slot: &'static str, info: &gltf::texture::Info, srgb: bool) -> Use {

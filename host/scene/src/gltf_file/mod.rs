@@ -116,12 +116,7 @@ pub(super) fn read(
     let claims = flatten::choose_bodies(&document, &hidden, options, &mut warnings)?;
     let mut look = look::read_look(&document, &root, &data, folder.as_ref(), limits, cancel, &mut warnings)?;
     let world = flatten::world_from_file(options);
-    // Light goes the further through a solid the larger the file's unit makes it.
-    let unit_m = options.scale.unwrap_or(1.0);
-    for lobes in look.materials.iter_mut().map(|m| &mut m.lobes) {
-        let per_metre = lobes.absorption.as_dvec3() / unit_m;
-        lobes.absorption = per_metre.min(glam::DVec3::splat(f64::from(MOST_ABSORPTION))).as_vec3();
-    }
+    absorb_by_metre(&mut look, options.scale.unwrap_or(1.0));
     let source = flatten::Source {
         document: &document,
         data: &data,
@@ -134,12 +129,6 @@ pub(super) fn read(
     };
     let (flat, paint) = flatten::flatten(&source, &claims, limits, cancel, &mut warnings)?;
     paint.add_to(&mut look);
-    let mut warnings = grouped(warnings);
-    if warnings.len() > MAX_WARNINGS {
-        let more = warnings.len() - MAX_WARNINGS;
-        warnings.truncate(MAX_WARNINGS);
-        warnings.push(format!("and {more} more"));
-    }
     Ok(Scene {
         bodies: flat.bodies,
         materials: look.materials,
@@ -147,8 +136,26 @@ pub(super) fn read(
         live: Vec::new(),
         lights: flat.lights,
         environment: Environment::default(),
-        warnings,
+        warnings: at_most(MAX_WARNINGS, grouped(warnings)),
     })
+}
+
+/// Light goes the further through a solid the larger the file's unit of `unit_m` metres makes it.
+fn absorb_by_metre(look: &mut look::Look, unit_m: f64) {
+    for lobes in look.materials.iter_mut().map(|m| &mut m.lobes) {
+        let per_metre = lobes.absorption.as_dvec3() / unit_m;
+        lobes.absorption = per_metre.min(glam::DVec3::splat(f64::from(MOST_ABSORPTION))).as_vec3();
+    }
+}
+
+/// The first of many warnings, and the number of the others.
+fn at_most(most: usize, mut warnings: Vec<String>) -> Vec<String> {
+    if warnings.len() > most {
+        let more = warnings.len() - most;
+        warnings.truncate(most);
+        warnings.push(format!("and {more} more"));
+    }
+    warnings
 }
 
 /// Warnings that say the same of several objects as one that names the first of them.

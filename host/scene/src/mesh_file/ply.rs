@@ -251,6 +251,27 @@ struct Faces {
     damaged: usize,
 }
 
+impl Faces {
+    /// Leaves out the triangles with a corner that is none of `count` vertices. Returns their number.
+    fn leave_out_without(&mut self, count: usize) -> usize {
+        let has_all = |t: &[u32; 3]| t.iter().all(|i| (*i as usize) < count);
+        let is_there: Vec<bool> = self.triangles.iter().map(has_all).collect();
+        let lost = is_there.iter().filter(|there| !**there).count();
+        if lost > 0 {
+            keep(&mut self.triangles, &is_there);
+            keep(&mut self.colours, &is_there);
+            keep(&mut self.uvs, &is_there);
+            keep(&mut self.textures, &is_there);
+        }
+        lost
+    }
+}
+
+fn keep<T>(list: &mut Vec<T>, is_there: &[bool]) {
+    let mut is_there = is_there.iter();
+    list.retain(|_| *is_there.next().unwrap_or(&false));
+}
+
 /// Number of a corner that is none: no file has so many vertices.
 const NO_VERTEX: u32 = u32::MAX;
 
@@ -319,30 +340,9 @@ fn parts(
     document: &mut Document,
 ) -> Result<Vec<Part>, SceneError> {
     let count = vertices.positions.len();
-    let is_there: Vec<bool> =
-        faces.triangles.iter().map(|t| t.iter().all(|i| (*i as usize) < count)).collect();
-    let lost = is_there.iter().filter(|there| !**there).count();
-    if lost > 0 {
-        let mut keep = is_there.iter();
-        faces.triangles.retain(|_| *keep.next().unwrap_or(&false));
-        let mut keep = is_there.iter();
-        faces.colours.retain(|_| *keep.next().unwrap_or(&false));
-        let mut keep = is_there.iter();
-        faces.uvs.retain(|_| *keep.next().unwrap_or(&false));
-        let mut keep = is_there.iter();
-        faces.textures.retain(|_| *keep.next().unwrap_or(&false));
-    }
+    let lost = faces.leave_out_without(count);
     if faces.triangles.is_empty() {
-        let why = match (count, lost + faces.damaged) {
-            (0, 0) => "is empty: it has no vertices and no faces".into(),
-            (_, 0) => "has no faces: a cloud of points reflects no light, make a mesh of it".into(),
-            (_, n) => {
-                format!("has no face whose vertices are there ({n} name others, of {count}): it is cut off")
-            }
-        };
-        let noted = document.warnings.join("; ");
-        let noted = if noted.is_empty() { noted } else { format!(" ({noted})") };
-        return Err(SceneError::broken("file", format!("{why}{noted}")));
+        return Err(without_faces(count, lost + faces.damaged, &document.warnings));
     }
     if lost + faces.damaged > 0 {
         let told =
@@ -360,47 +360,8 @@ fn parts(
         colours: vertices.colours,
         ..Part::default()
     };
-    // What faces have of their own is said of each corner.
-    if !faces.colours.is_empty() || !faces.uvs.is_empty() {
-        let corners = faces.triangles.as_flattened();
-        let apart =
-            |list: &[[f32; 3]]| corners.iter().filter_map(|i| list.get(*i as usize).copied()).collect();
-        part.positions = apart(&part.positions);
-        part.normals = apart(&part.normals);
-        part.colours = match faces.colours.is_empty() {
-            true => apart(&part.colours),
-            false => faces.colours.iter().flat_map(|c| [*c; 3]).collect(),
-        };
-        part.uvs = match faces.uvs.is_empty() {
-            true => corners.iter().filter_map(|i| part.uvs.get(*i as usize).copied()).collect(),
-            false => faces.uvs.as_flattened().to_vec(),
-        };
-        faces.triangles = (0..faces.triangles.len() as u32).map(|t| [3 * t, 3 * t + 1, 3 * t + 2]).collect();
-    }
-    let mut numbers: Vec<Option<usize>> = vec![];
-    for texture in textures {
-        let uri = uri_of(texture);
-        let made = match mtl::picture(&uri, beside, limits) {
-            _ if part.uvs.is_empty() => Err("no vertex and no face has texture coordinates".into()),
-            Ok(()) => Ok(uri),
-            Err(why) => Err(why),
-        };
-        numbers.push(match made {
-            Ok(uri) => {
-                let look =
-                    json!({"baseColorTexture": {"index": document.textures.len()}, "metallicFactor": 0.0});
-                document.textures.push(uri);
-                document
-                    .materials
-                    .push(json!({"name": texture, "doubleSided": true, "pbrMetallicRoughness": look}));
-                Some(document.materials.len() - 1)
-            }
-            Err(why) => {
-                document.warnings.push(format!("the texture '{texture}' is left out: {why}"));
-                None
-            }
-        });
-    }
+    say_of_corners(&mut part, &mut faces);
+    let numbers = materials(textures, part.uvs.is_empty(), (beside, limits), document);
     let plain = document.materials.len();
     let of = |texture: u32| numbers.get(texture as usize).copied().flatten().unwrap_or(plain);
     let several = faces.textures.iter().any(|t| *t != 0) && numbers.len() > 1;
@@ -415,20 +376,88 @@ fn parts(
         all.push((of(0), faces.triangles));
     }
     document.materials.push(mtl::plain("PLY"));
-    // Each part has all vertices: the reader of glTF keeps those that its triangles name.
     let last = all.len() - 1;
-    let mut out = Vec::with_capacity(all.len());
-    for (i, (material, triangles)) in all.into_iter().enumerate() {
-        let whole = if i == last { std::mem::take(&mut part) } else { compact(&part, &triangles) };
-        let own = Part { material: Some(material), ..whole };
-        let triangles = if i == last {
-            triangles
-        } else {
-            (0..triangles.len() as u32).map(|t| [3 * t, 3 * t + 1, 3 * t + 2]).collect()
+    let own = |(i, (material, triangles)): (usize, (usize, Vec<[u32; 3]>))| {
+        // The last one has all vertices: the reader of glTF keeps those that its triangles name.
+        let (whole, triangles) = match i == last {
+            true => (std::mem::take(&mut part), triangles),
+            false => (compact(&part, &triangles), of_own_corners(triangles.len())),
         };
-        out.push(Part { triangles, ..own });
+        Part { material: Some(material), triangles, ..whole }
+    };
+    Ok(all.into_iter().enumerate().map(own).collect())
+}
+
+/// Why a file without a face that can be shown is refused: of `count` vertices, `named` faces name others.
+fn without_faces(count: usize, named: usize, warnings: &[String]) -> SceneError {
+    let why = match (count, named) {
+        (0, 0) => "is empty: it has no vertices and no faces".into(),
+        (_, 0) => "has no faces: a cloud of points reflects no light, make a mesh of it".into(),
+        (_, n) => {
+            format!("has no face whose vertices are there ({n} name others, of {count}): it is cut off")
+        }
+    };
+    let noted = warnings.join("; ");
+    let noted = if noted.is_empty() { noted } else { format!(" ({noted})") };
+    SceneError::broken("file", format!("{why}{noted}"))
+}
+
+/// Triangles that share no corner, each with the next three.
+fn of_own_corners(count: usize) -> Vec<[u32; 3]> {
+    (0..count as u32).map(|t| [3 * t, 3 * t + 1, 3 * t + 2]).collect()
+}
+
+/// What faces have of their own is said of each corner.
+fn say_of_corners(part: &mut Part, faces: &mut Faces) {
+    if faces.colours.is_empty() && faces.uvs.is_empty() {
+        return;
     }
-    Ok(out)
+    let corners = faces.triangles.as_flattened();
+    let apart = |list: &[[f32; 3]]| corners.iter().filter_map(|i| list.get(*i as usize).copied()).collect();
+    part.positions = apart(&part.positions);
+    part.normals = apart(&part.normals);
+    part.colours = match faces.colours.is_empty() {
+        true => apart(&part.colours),
+        false => faces.colours.iter().flat_map(|c| [*c; 3]).collect(),
+    };
+    part.uvs = match faces.uvs.is_empty() {
+        true => corners.iter().filter_map(|i| part.uvs.get(*i as usize).copied()).collect(),
+        false => faces.uvs.as_flattened().to_vec(),
+    };
+    faces.triangles = of_own_corners(faces.triangles.len());
+}
+
+/// The material of each texture in `document`; `None` where its picture cannot be shown, which is told.
+fn materials(
+    textures: &[String],
+    is_without_coordinates: bool,
+    (beside, limits): (Option<&Path>, &Limits),
+    document: &mut Document,
+) -> Vec<Option<usize>> {
+    let mut material = |texture: &String| {
+        let uri = uri_of(texture);
+        let made = match mtl::picture(&uri, beside, limits) {
+            _ if is_without_coordinates => Err("no vertex and no face has texture coordinates".into()),
+            Ok(()) => Ok(uri),
+            Err(why) => Err(why),
+        };
+        match made {
+            Ok(uri) => {
+                let look =
+                    json!({"baseColorTexture": {"index": document.textures.len()}, "metallicFactor": 0.0});
+                document.textures.push(uri);
+                document
+                    .materials
+                    .push(json!({"name": texture, "doubleSided": true, "pbrMetallicRoughness": look}));
+                Some(document.materials.len() - 1)
+            }
+            Err(why) => {
+                document.warnings.push(format!("the texture '{texture}' is left out: {why}"));
+                None
+            }
+        }
+    };
+    textures.iter().map(&mut material).collect()
 }
 
 /// The corners of some triangles of a part, one after the other.
