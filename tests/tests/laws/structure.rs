@@ -317,6 +317,53 @@ fn no_circle_joins_the_folders_of_a_crate() {
     }
 }
 
+/// A reader sees the whole of a function.
+const MOST_LINES: usize = 70;
+
+/// The functions of a formatted text with more lines than a reader sees, from the line of the name to that of the brace.
+fn long_functions(text: &str) -> Vec<(String, usize)> {
+    let lines: Vec<&str> = text.lines().collect();
+    let indent = |line: &str| line.len() - line.trim_start().len();
+    let words = ["pub", "const", "unsafe", "async", "extern"];
+    let is_function = |line: &str| match line.split_once("fn ") {
+        Some((before, _)) => before.split_whitespace().all(|word| words.iter().any(|w| word.starts_with(w))),
+        None => false,
+    };
+    let length = |from: &[&str]| {
+        // Without a body it ends with its declaration.
+        let is_end =
+            |line: &&str| indent(line) == indent(from[0]) && (line.trim() == "}" || line.ends_with(';'));
+        from.iter().position(is_end).map_or(from.len(), |last| last + 1)
+    };
+    let begins = (0..lines.len()).filter(|at| is_function(lines[*at]));
+    let all = begins.map(|at| (lines[at].trim().to_owned(), length(&lines[at..])));
+    all.filter(|(_, length)| *length > MOST_LINES).collect()
+}
+
+#[test]
+fn a_function_is_seen_whole() {
+    let mut seen = 0;
+    for krate in CRATES {
+        let src = root().join(krate).join("src");
+        for (path, text) in sources(&src) {
+            // Tests are lists.
+            if !path.strip_prefix(&src).unwrap().to_string_lossy().contains("tests") {
+                assert_eq!(long_functions(&code(&text)), [], "{}", path.display());
+                seen += 1;
+            }
+        }
+    }
+    assert!(seen > 500, "{seen} files");
+    let of = |lines: usize| {
+        format!(
+            "    pub(crate) fn a(\n        b: u8,\n    ) {{\n{}    }}\n",
+            "        c();\n".repeat(lines - 4)
+        )
+    };
+    assert_eq!(long_functions(&of(MOST_LINES)), []);
+    assert_eq!(long_functions(&of(MOST_LINES + 1)), [("pub(crate) fn a(".to_owned(), 71)]);
+}
+
 /// The cases are judged by the reference, so not even its tests may lean on them.
 #[test]
 fn the_reference_and_its_tests_name_no_case() {
