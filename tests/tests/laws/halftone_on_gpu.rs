@@ -166,24 +166,50 @@ fn block_sums(raster: Raster, codes: &[[u8; 3]]) -> Vec<[u32; 3]> {
 mod breadth {
     use super::*;
 
+    /// Sums of blocks in the 24 frames of a rig whose bodies stand still.
+    fn light(gpu: &Arc<Gpu>, flags: &[&str]) -> Vec<Vec<[u32; 3]>> {
+        let still = [0, 1].map(|i| format!("scene.bodies.{i}.motion={{kind=\"still\"}}"));
+        let flags = [&still.each_ref().map(String::as_str)[..], flags].concat();
+        let rig = demo_rig(128, 96, &flags);
+        let (outcome, _) = run(gpu, &rig, 24, 24);
+        assert_eq!((outcome.light_mismatches, outcome.report.frames_lit), (0, 24));
+        let sums = |frame: &LightFrame| block_sums(rig.camera.raster, &frame.codes);
+        outcome.light.iter().map(sums).collect()
+    }
+
+    /// Split planes whose projector is as much darker as they are brighter give the picture of binary ones, also where that
+    /// clips. Their steps are two levels of 255, which the halftone spreads.
+    #[test]
+    fn light_of_split_planes_is_that_of_binary_ones() {
+        with_gpu(|gpu| {
+            let binary = light(gpu, &["projector.max_intensity=8"]);
+            let dark = format!("projector.max_intensity={}", 8.0 * 255.0 / 508.0);
+            let split = light(gpu, &["projector.weights=\"split\"", &dark]);
+            let (mut worst, mut off, mut lit) = (0.0f64, 0.0, 0);
+            for (a, b) in binary.iter().flatten().zip(split.iter().flatten()) {
+                for c in (0..3).filter(|c| a[*c] > 0) {
+                    let [a, b] = [a[c], b[c]].map(|sum| f64::from(sum) / 64.0);
+                    worst = worst.max((a - b).abs());
+                    off += a - b;
+                    lit += 1;
+                }
+            }
+            assert!(lit > 1_000, "{lit} blocks are lit");
+            let off = off / f64::from(lit);
+            println!("blocks of split planes differ by {off:.3} levels on average, by {worst:.2} at most");
+            assert!(worst <= 0.40 && off.abs() <= 0.10, "{worst} levels, {off} on average");
+        });
+    }
+
     /// In the light of the whole chain the mean level of 8 x 8 mirrors is that of binary planes, to 0.38 levels of 255 in
     /// every frame. Equal planes give 128 / 255 of full white, so their projector is that much brighter here. The bodies stand
     /// still, because the centres of the two kinds of light are not at the same instant.
     #[test]
     fn light_of_equal_planes_is_that_of_binary_ones() {
         with_gpu(|gpu| {
-            let light = |flags: &[&str]| {
-                let still = [0, 1].map(|i| format!("scene.bodies.{i}.motion={{kind=\"still\"}}"));
-                let flags = [&still.each_ref().map(String::as_str)[..], flags].concat();
-                let rig = demo_rig(128, 96, &flags);
-                let (outcome, _) = run(gpu, &rig, 24, 24);
-                assert_eq!((outcome.light_mismatches, outcome.report.frames_lit), (0, 24));
-                let sums = |frame: &LightFrame| block_sums(rig.camera.raster, &frame.codes);
-                outcome.light.iter().map(sums).collect::<Vec<_>>()
-            };
-            let binary = light(&["projector.max_intensity=8"]);
+            let binary = light(gpu, &["projector.max_intensity=8"]);
             let bright = format!("projector.max_intensity={}", 8.0 * 255.0 / 128.0);
-            let equal = light(&["projector.weights=\"equal\"", &bright]);
+            let equal = light(gpu, &["projector.weights=\"equal\"", &bright]);
             let (mut worst, mut lit) = (0.0f64, 0);
             for (a, b) in binary.iter().flatten().zip(equal.iter().flatten()) {
                 for c in 0..3 {
