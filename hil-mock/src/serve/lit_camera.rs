@@ -95,10 +95,7 @@ fn tell(stage: &LitStage, camera: &CameraHost, lens: &Path) -> Result<(), String
     let size = format!("image_width: {}\nimage_height: {}\n", c.size[0], c.size[1]);
     let (inside, bends) =
         (entry("camera_matrix", [3, 3], &matrix), entry("distortion_coefficients", [5, 1], &c.lens));
-    // Readers ask for a pose; it is not used.
-    let (turn, shift) =
-        (entry("rvec", [3, 1], &[std::f64::consts::PI, 0.0, 0.0]), entry("tvec", [3, 1], &[0.0; 3]));
-    std::fs::write(lens, format!("%YAML:1.0\n---\n{size}{inside}{bends}{turn}{shift}"))
+    std::fs::write(lens, format!("%YAML:1.0\n---\n{size}{inside}{bends}"))
         .map_err(|e| format!("cannot write {}: {e}", lens.display()))?;
     let (place, turn) = (stage.camera_pose.position_m, stage.camera_pose.rotation_xyzw);
     say(format_args!("camera on {}; in the rig file:", camera.address()));

@@ -5,11 +5,13 @@
 
 use super::entries::{joined, Entries, Entry, Matrix};
 use super::names::{meaning, Owner, Role};
-use super::{pose, rotation, Frame, Intrinsics, LensKind, ReadOptions, StorageError, StoredCalibration};
+use super::{
+    pose, rotation, Frame, Intrinsics, LensKind, Purpose, ReadOptions, StorageError, StoredCalibration,
+};
 use dpm_device::planes::Raster;
 use dpm_scene::geometry::lens::Lens;
 use dpm_scene::geometry::projector::ProjectorCamera;
-use glam::{DMat3, DVec3};
+use glam::{DAffine3, DMat3, DVec3};
 use std::collections::{BTreeMap, BTreeSet};
 
 /// Poses of many views, of which none is the projector's.
@@ -666,9 +668,34 @@ fn is_within(told: &PoseEntries, parts: &Parts) -> bool {
     told.by.iter().all(|k| k.section.starts_with(parts.device.section) || parts.device.section.is_empty())
 }
 
+/// The pose of the device.
+fn placed<'k, 'a>(
+    all: &Entries,
+    device: &Device,
+    parts: &Parts<'k, 'a>,
+    used: &mut UseNotes,
+) -> Result<PoseEntries<'k, 'a>, StorageError> {
+    if matches!(&device.owner, Owner::Other(label) if label == "1")
+        && parts.own(Role::Rotation).next().is_none()
+    {
+        let shared = parts.with(Role::Rotation).next();
+        if let Some(shared) = shared.filter(|_| parts.is_shared) {
+            let what = "leads from device 1 to device 2, so device 1 has no pose in a world; calibrate so that the projector is \
+                        the second device, or add its own rvec1 and tvec1";
+            return Err(StorageError::value(&shared.path(), what));
+        }
+    }
+    told_pose(parts, used)?.ok_or_else(|| no_pose(all, parts))
+}
+
 /// Reads a calibration. Rotation and translation take points of the calibration's world, or of its camera, into the
 /// projector's space: `x_proj = R x + T`, looking along +Z with y down, as in OpenCV.
-pub(super) fn read(all: &Entries, options: &ReadOptions) -> Result<StoredCalibration, StorageError> {
+/// A file that is read for the lens alone needs neither.
+pub(super) fn read(
+    all: &Entries,
+    options: &ReadOptions,
+    purpose: Purpose,
+) -> Result<StoredCalibration, StorageError> {
     let known = known(all);
     if known.len() > MOST_KNOWN {
         return Err(StorageError::Refused(format!("it has more than {MOST_KNOWN} entries of a calibration")));
@@ -704,24 +731,20 @@ pub(super) fn read(all: &Entries, options: &ReadOptions) -> Result<StoredCalibra
         ));
     }
     let k_at = k.at(size, options.raster)?;
-    if matches!(&device.owner, Owner::Other(label) if label == "1")
-        && parts.own(Role::Rotation).next().is_none()
-    {
-        let shared = parts.with(Role::Rotation).next();
-        if let Some(shared) = shared.filter(|_| parts.is_shared) {
-            let what = "leads from device 1 to device 2, so device 1 has no pose in a world; calibrate so that the projector is \
-                        the second device, or add its own rvec1 and tvec1";
-            return Err(StorageError::value(&shared.path(), what));
+    let (place, frame) = match purpose {
+        Purpose::Lens => (DAffine3::IDENTITY, Frame::World),
+        Purpose::Place => {
+            let told = placed(all, &device, &parts, &mut used)?;
+            let place = pose(told.rotation, told.translation * options.unit.metres());
+            (place, frame(&told, &parts, &devices, &known))
         }
-    }
-    let told = told_pose(&parts, &mut used)?.ok_or_else(|| no_pose(all, &parts))?;
-    let place = pose(told.rotation, told.translation * options.unit.metres());
+    };
     let lens = lens(&parts, options.lens, &mut used)?;
     let camera =
         ProjectorCamera::new(options.raster, place, k_at.fx, k_at.fy, k_at.cx, k_at.cy)?.with_lens(lens)?;
     Ok(StoredCalibration {
         camera,
-        frame: frame(&told, &parts, &devices, &known),
+        frame,
         image_size: size,
         found: used.found.clone(),
         unread: unread(all, &known, &devices, &parts, &used),

@@ -246,6 +246,34 @@ fn has_names(text: &str) -> bool {
 /// The form is unknown or refused, a part is missing or has unusable numbers, the raster has another shape, or the lens
 /// cannot be inverted over it. Every error says what to do or what was expected.
 pub fn read(bytes: &[u8], options: &ReadOptions) -> Result<StoredCalibration, StorageError> {
+    read_for(bytes, options, Purpose::Place)
+}
+
+/// Reads the lens of a camera that stands alone: its place is told elsewhere, and a pose in the file is not looked at. The
+/// camera stands at the origin, looks along -Z and has +Y up.
+///
+/// # Errors
+/// As [`read`], but a file without a pose is as good as one with it.
+pub fn read_lens(bytes: &[u8], options: &ReadOptions) -> Result<StoredCalibration, StorageError> {
+    let mut stored = read_for(bytes, options, Purpose::Lens)?;
+    (stored.camera.world_from_projector, stored.frame) = (DAffine3::IDENTITY, Frame::World);
+    Ok(stored)
+}
+
+/// What a file is read for.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+enum Purpose {
+    /// Lens and place.
+    Place,
+    /// The lens.
+    Lens,
+}
+
+fn read_for(
+    bytes: &[u8],
+    options: &ReadOptions,
+    purpose: Purpose,
+) -> Result<StoredCalibration, StorageError> {
     if bytes.len() > MAX_BYTES {
         return Err(StorageError::TooLarge(bytes.len()));
     }
@@ -253,7 +281,7 @@ pub fn read(bytes: &[u8], options: &ReadOptions) -> Result<StoredCalibration, St
         return mpcdi::read(&archive::mpcdi(bytes)?, options);
     }
     if bytes.starts_with(&[0x1f, 0x8b]) {
-        return read(archive::unpacked(bytes)?.as_slice(), options);
+        return read_for(archive::unpacked(bytes)?.as_slice(), options, purpose);
     }
     if let Some((_, told)) = REFUSED.iter().find(|(start, _)| bytes.starts_with(start)) {
         return Err(StorageError::Refused((*told).into()));
@@ -270,7 +298,7 @@ pub fn read(bytes: &[u8], options: &ReadOptions) -> Result<StoredCalibration, St
                 .into(),
         ));
     }
-    devices::read(&entries(text)?, options)
+    devices::read(&entries(text)?, options, purpose)
 }
 
 /// First bytes of forms that are not read, with what to give instead.

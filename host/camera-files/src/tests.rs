@@ -46,6 +46,23 @@ fn golden(model: &str) -> Vec<(DVec3, DVec2)> {
     rows.collect()
 }
 
+/// A camera that stands alone needs no pose: with and without one its lens is the same, and it stands at the origin.
+#[test]
+fn the_lens_of_a_camera_is_read_without_a_pose() {
+    let begin = YAML.find("roration").unwrap();
+    let end = YAML.find("error").unwrap();
+    let alone = YAML[..begin].to_owned() + &YAML[end..];
+    assert!(fault(&alone).contains("rotation"), "a projector needs its pose: {}", fault(&alone));
+    let lens = |text: &str| read_lens(text.as_bytes(), &options(LengthUnit::Metre)).unwrap().camera;
+    let (whole, alone) = (lens(YAML), lens(&alone));
+    assert_eq!((whole, whole.world_from_projector), (alone, glam::DAffine3::IDENTITY));
+    let placed = read_text(YAML, LengthUnit::Metre).unwrap().camera;
+    assert_eq!((placed.fx, placed.cy), (alone.fx, alone.cy));
+    // Straight ahead is -Z, and +Y is up: above the middle of the picture.
+    let above = alone.project(DVec3::new(0.0, 0.1, -1.0)).unwrap();
+    assert!(above.y < alone.cy - 50.0, "{above}");
+}
+
 #[test]
 fn files_of_opencv_project_as_opencv_does() {
     for model in MODELS {

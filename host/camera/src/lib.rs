@@ -45,6 +45,7 @@ mod sources;
 mod stream;
 mod threshold;
 mod tracker;
+mod v4l2;
 
 pub use blobs::{SpotDetector, SpotSighting};
 pub use board::{board_pdf, board_view};
@@ -54,6 +55,9 @@ pub use detect::{TagDetector, TagSighting, TAGS};
 pub use image::{GreyImage, LEAST_SIDE, MOST_SIDE};
 pub use pose::{Covariance, Observation, PoseFit, Velocity};
 pub use sightings::{Expectation, Sightings};
-pub use source::{Picture, PictureSource, SourceKind, SourceOpener};
-pub use sources::open_source;
+pub use source::{
+    CameraDoubt, CameraLook, Picture, PictureLosses, PictureRequest, PictureSource, SourceExaminer,
+    SourceKind, SourceOpener,
+};
+pub use sources::{examine_source, open_source};
 pub use tracker::{CameraTracker, CameraTrackerSetup};

@@ -1,6 +1,6 @@
 //! Pictures from a socket of this machine: the mock's.
 
-use crate::source::{Picture, PictureSource, SourceKind};
+use crate::source::{offset_ns, Picture, PictureRequest, PictureSource, SourceKind};
 use dpm_device::picture_stream::{PictureHeader, HEADER_BYTES, MAGIC};
 use dpm_device::time::{HostClock, HostTime};
 use std::io::{ErrorKind, Read};
@@ -9,10 +9,22 @@ use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 /// A server on a socket.
-pub(crate) static KIND: SourceKind =
-    SourceKind { prefix: "tcp:", form: "\"tcp:HOST:PORT\" of `hil-mock serve camera`", open };
+pub(crate) static KIND: SourceKind = SourceKind {
+    place: |device| device.strip_prefix("tcp:"),
+    form: "\"tcp:HOST:PORT\" of `hil-mock serve camera`",
+    open,
+    examine: None,
+};
 
-fn open(place: &str, clock: &Arc<dyn HostClock>) -> Result<Box<dyn PictureSource>, String> {
+fn open(
+    place: &str,
+    request: &PictureRequest,
+    clock: &Arc<dyn HostClock>,
+) -> Result<Box<dyn PictureSource>, String> {
+    if request.exposure_us.is_some() || request.gain.is_some() || request.readout_us > 0 {
+        let own = "its pictures say how they were exposed";
+        return Err(format!("{own}: leave out tracker.exposure_us, tracker.gain and tracker.readout_us"));
+    }
     let found = place.to_socket_addrs().ok().and_then(|mut all| all.next());
     let address = found.ok_or_else(|| format!("{place:?} is no HOST:PORT"))?;
     Ok(Box::new(StreamSource::new(address, clock)))
@@ -35,8 +47,8 @@ pub(crate) struct StreamSource {
 impl StreamSource {
     /// A client of the server at `address`, whose stamps go onto `clock`.
     fn new(address: SocketAddr, clock: &Arc<dyn HostClock>) -> Self {
-        let offset_ns = clock.now().0 - dpm_common::unix::monotonic_ns() as i64;
-        Self { address, name: format!("tcp:{address}"), offset_ns, stream: None, bytes: Vec::new() }
+        let (name, offset_ns) = (format!("tcp:{address}"), offset_ns(&**clock));
+        Self { address, name, offset_ns, stream: None, bytes: Vec::new() }
     }
 
     fn connected(&mut self) -> Result<&mut TcpStream, String> {

@@ -9,7 +9,7 @@ use crate::detect::TagDetector;
 use crate::image::GreyImage;
 use crate::pose::Velocity;
 use crate::sightings::{Expectation, Sightings};
-use crate::source::{Picture, PictureSource};
+use crate::source::{Picture, PictureLosses, PictureSource};
 use dpm_common::so3::{so3_between, so3_exp};
 use dpm_device::pose::{Pose, PoseCovariance};
 use dpm_device::time::{HostClock, HostTime};
@@ -46,8 +46,20 @@ enum Message {
     Sample(TrackerSample),
     /// Why there are no pictures, or that they come.
     Word(String),
-    /// Pictures seen, the mean time to look at one, ms, and samples that found no room.
-    Work(u64, f64, u64),
+    Work(Work),
+}
+
+/// What the thread has done so far.
+#[derive(Clone, Copy, Default, PartialEq)]
+struct Work {
+    /// Pictures that were looked at.
+    pictures: u64,
+    /// Mean time to look at one, ms.
+    ms: f64,
+    /// Samples that found no room.
+    unread: u64,
+    /// Pictures that never came to be looked at.
+    losses: PictureLosses,
 }
 
 /// A camera as a tracker.
@@ -56,7 +68,7 @@ pub struct CameraTracker {
     gate: SampleGate,
     name: String,
     word: String,
-    work: (u64, f64, u64),
+    work: Work,
     over: Arc<AtomicBool>,
     thread: Option<JoinHandle<()>>,
 }
@@ -80,7 +92,7 @@ impl CameraTracker {
         let thread = thread
             .map_err(|source| TrackerError::Io { context: "a thread for the camera".into(), source })?;
         let word = "no picture yet".to_owned();
-        Ok(Self { messages, gate, name, word, work: (0, 0.0, 0), over, thread: Some(thread) })
+        Ok(Self { messages, gate, name, word, work: Work::default(), over, thread: Some(thread) })
     }
 }
 
@@ -106,11 +118,14 @@ impl Tracker for CameraTracker {
                     }
                 }
                 Ok(Message::Word(word)) => self.word = word,
-                Ok(Message::Work(pictures, ms, lost)) => {
+                Ok(Message::Work(work)) => {
                     let packets = self.gate.packets_mut();
-                    packets.received += pictures - self.work.0;
-                    packets.used += pictures - self.work.0;
-                    self.work = (pictures, ms, lost);
+                    let (used, damaged) =
+                        (work.pictures - self.work.pictures, work.losses.damaged - self.work.losses.damaged);
+                    packets.received += used + damaged;
+                    packets.used += used;
+                    packets.malformed += damaged;
+                    self.work = work;
                 }
                 Err(_) => break,
             }
@@ -123,10 +138,17 @@ impl Tracker for CameraTracker {
     }
 
     fn status(&self) -> String {
-        let (pictures, ms, lost) = self.work;
-        let lost = if lost > 0 { format!(", {lost} samples found no room") } else { String::new() };
+        let Work { pictures, ms, unread, losses } = self.work;
+        let counts = [
+            (losses.lost, "pictures lost on the way"),
+            (losses.damaged, "damaged"),
+            (losses.passed_over, "passed over for a newer one"),
+            (unread, "samples found no room"),
+        ];
+        let counts = counts.iter().filter(|(n, _)| *n > 0).map(|(n, what)| format!(", {n} {what}"));
+        let counts: String = counts.collect();
         format!(
-            "{}; {pictures} pictures, {ms:.1} ms to look at one{lost}; {}",
+            "{}; {pictures} pictures, {ms:.1} ms to look at one{counts}; {}",
             self.word,
             self.gate.counters()
         )
@@ -182,20 +204,25 @@ impl Watch {
     }
 
     fn run(&mut self, mut source: Box<dyn PictureSource>, over: &AtomicBool) {
-        let (mut picture, mut word) = (Picture::default(), String::new());
+        let (mut picture, mut word, mut told_work) = (Picture::default(), String::new(), Work::default());
         while !over.load(Ordering::Relaxed) {
             let told = match source.next(PATIENCE, &mut picture) {
-                Ok(true) => match self.look(&picture) {
+                Ok(true) => Some(match self.look(&picture) {
                     Ok(()) => "pictures come".to_owned(),
                     Err(why) => why,
-                },
-                Ok(false) => continue,
+                }),
+                Ok(false) => None,
                 Err(why) => {
                     std::thread::sleep(REST);
-                    why
+                    Some(why)
                 }
             };
-            if told != word {
+            let work = self.work(source.losses());
+            if work != told_work {
+                told_work = work;
+                self.hand_on(Message::Work(work));
+            }
+            if let Some(told) = told.filter(|told| *told != word) {
                 word.clone_from(&told);
                 self.hand_on(Message::Word(told));
             }
@@ -242,9 +269,12 @@ impl Watch {
         let is_marked = |b: &&Markings| !b.tags.is_empty() || !b.markers.is_empty();
         let marked = self.setup.bodies.iter().filter(is_marked).count() as u64;
         self.unread = self.unread.wrapping_add(u32::from(marked > 0 && self.lost == before + marked));
-        let ms = 1e3 * self.busy.as_secs_f64() / self.pictures as f64;
-        self.hand_on(Message::Work(self.pictures, ms, self.lost));
         Ok(())
+    }
+
+    fn work(&self, losses: PictureLosses) -> Work {
+        let ms = 1e3 * self.busy.as_secs_f64() / self.pictures.max(1) as f64;
+        Work { pictures: self.pictures, ms, unread: self.lost, losses }
     }
 
     fn report(&mut self, body: usize, at: HostTime, found: Option<BodyPose>) {

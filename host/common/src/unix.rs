@@ -17,13 +17,22 @@ pub fn user() -> u32 {
 
 /// The name of a user in /etc/passwd, else its number.
 pub fn user_name(uid: u32) -> String {
-    let users = std::fs::read_to_string("/etc/passwd").unwrap_or_default();
-    let entry = users.lines().find_map(|line| {
+    name_in("/etc/passwd", uid).unwrap_or_else(|| format!("uid {uid}"))
+}
+
+/// The name of a group in /etc/group, else its number.
+pub fn group_name(gid: u32) -> String {
+    name_in("/etc/group", gid).unwrap_or_else(|| format!("gid {gid}"))
+}
+
+/// The first field of the line whose third is `number`.
+fn name_in(file: &str, number: u32) -> Option<String> {
+    let text = std::fs::read_to_string(file).unwrap_or_default();
+    text.lines().find_map(|line| {
         let mut fields = line.split(':');
         let name = fields.next()?;
-        (fields.nth(1)?.parse() == Ok(uid)).then(|| name.to_owned())
-    });
-    entry.unwrap_or_else(|| format!("uid {uid}"))
+        (fields.nth(1)?.parse() == Ok(number)).then(|| name.to_owned())
+    })
 }
 
 /// Major and minor number of the device behind a device file.
@@ -174,5 +183,6 @@ mod tests {
         send_signal(here.pid, 0).unwrap();
         assert_eq!(user_name(0), "root");
         assert_eq!(user_name(4_000_000_000), "uid 4000000000");
+        assert_eq!((group_name(0), group_name(4_000_000_000)), ("root".into(), "gid 4000000000".into()));
     }
 }

@@ -3,6 +3,8 @@
 use super::kind::TrackerKind;
 use super::transform::TrackerTransformConfig;
 use crate::mock::Motion;
+#[cfg(feature = "camera")]
+use dpm_camera::{CameraDoubt, CameraLook};
 use dpm_common::keys::read::Reader;
 use dpm_common::keys::rows::{KeyValues, OfKind};
 use dpm_device::time::{HostClock, HostTime};
@@ -79,6 +81,12 @@ pub trait TrackerKeys: KeyValues {
     /// Opens the pictures of a tracker that looks by a camera; `None` for all others.
     #[cfg(feature = "camera")]
     fn view(&self, _clock: &Arc<dyn HostClock>) -> Option<Result<super::CameraView, SourceError>> {
+        None
+    }
+
+    /// Looks at the camera of such a tracker for a second or two; `None` for all others.
+    #[cfg(feature = "camera")]
+    fn examine(&self) -> Option<Result<CameraLook, CameraDoubt>> {
         None
     }
 

@@ -55,6 +55,22 @@ pub(super) struct HeardBody {
 /// What was heard of all bodies, in their order.
 pub(super) type Heard = Vec<HeardBody>;
 
+/// What the camera of a tracker is and what speaks against it, if the tracker looks by one that says so.
+#[cfg(feature = "camera")]
+pub(super) fn camera(config: &RigConfig) -> Option<Finding> {
+    let name = "camera";
+    Some(match config.tracker.examine()? {
+        Err(doubt) => Finding::new(name, State::Missing, doubt.found, doubt.remedy),
+        Ok(look) if look.doubts.is_empty() => Finding::new(name, State::Ok, look.found, ""),
+        Ok(look) => {
+            let doubts: Vec<&str> = look.doubts.iter().map(|doubt| &*doubt.found).collect();
+            let remedies: Vec<&str> = look.doubts.iter().map(|doubt| &*doubt.remedy).collect();
+            let found = format!("{}; {}", doubts.join("; "), look.found);
+            Finding::new(name, State::Warning, found, remedies.join("; "))
+        }
+    })
+}
+
 /// Which bodies the tracker reports, and how often. `rig`: the rig of `config`, if its scene could be read. With it what
 /// was heard, if anybody listened.
 pub(super) fn tracker(config: &RigConfig, rig: Option<&Rig>) -> (Finding, Option<Heard>) {

@@ -42,6 +42,8 @@ pub(super) fn findings(
         }
         Ok(rig) => all.push(scene(rig)),
     }
+    #[cfg(feature = "camera")]
+    all.extend(devices::camera(config));
     let (tracker, heard) = devices::tracker(config, rig.as_ref().ok());
     all.push(tracker);
     all.extend(devices::beat(config, heard.as_ref()));

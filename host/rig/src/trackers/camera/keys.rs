@@ -37,13 +37,23 @@ section! {
 section! {
     /// A camera.
     pub struct CameraTrackerConfig {
+        /// A camera of this machine through V4L2, by `/dev/video0` or better by its name below `/dev/v4l/by-id`; or
         /// `tcp:HOST:PORT` of `hil-mock serve camera`.
         device: String = "tcp:127.0.0.1:8951".into(), "", NotEmpty;
         /// Columns and rows of its pictures.
         size: [u32; 2] = [1280, 800], "px", Within(16, 8192);
         /// Pictures per second.
         rate_hz: u32 = 60, "Hz", Within(1, 1_000);
-        /// A calibration file of its lens, as OpenCV and others write it (docs/CALIBRATION.md); its pose is not used.
+        /// Exposure, which the camera then leaves alone; short, so that what moves is not blurred. Without it the camera's own
+        /// setting counts, which must be by hand. Not for `tcp:`, whose pictures say theirs.
+        exposure_us: Option<u32> = None, "us", Within(1, 1_000_000);
+        /// Gain, in the camera's own units (`v4l2-ctl -L` lists them). Without it the camera keeps its own. Not for `tcp:`.
+        gain: Option<u32> = None, "", Within(0, 1_000_000);
+        /// Time from the exposure of the first row to that of the last, of a camera with a rolling shutter; 0 for a global
+        /// shutter. Not for `tcp:`.
+        readout_us: u32 = 0, "us", Within(0, 1_000_000);
+        /// A calibration file of its lens, as OpenCV and others write it (docs/CALIBRATION.md); it needs
+        /// no pose, and one is not used.
         calibration: Option<PathBuf> = None, "", NotEmpty;
         /// Horizontal angle of view of a camera without a calibration file, whose lens then bends nothing.
         view_deg: f64 = 60.0, "deg", Within(5.0, 170.0);

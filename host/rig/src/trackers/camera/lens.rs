@@ -25,12 +25,12 @@ pub(super) fn camera(keys: &CameraTrackerConfig) -> Result<ProjectorCamera, Sour
 
 #[cfg(feature = "camera-files")]
 fn stored(path: &Path, raster: Raster) -> Result<ProjectorCamera, String> {
-    use dpm_camera_files::{read, LengthUnit, LensKind, ReadOptions, MAX_BYTES};
+    use dpm_camera_files::{read_lens, LengthUnit, LensKind, ReadOptions, MAX_BYTES};
     let named = |e: String| format!("{}: {e}", path.display());
     let bytes = dpm_device::regular_file::read(path, MAX_BYTES as u64).map_err(|e| named(e.to_string()))?;
     let options =
         ReadOptions { raster, unit: LengthUnit::Metre, lens: LensKind::Auto, region: None, device: None };
-    Ok(read(&bytes, &options).map_err(|e| named(e.to_string()))?.camera)
+    Ok(read_lens(&bytes, &options).map_err(|e| named(e.to_string()))?.camera)
 }
 
 #[cfg(not(feature = "camera-files"))]

@@ -9,7 +9,10 @@ pub use keys::{CameraTrackerConfig, MarkerConfig, TagConfig};
 use super::keys::{SourceError, TrackerKeys, TrackerPlace};
 use super::kind::{PoseOrigin, TrackerKind};
 use super::transform::{PoseConfig, TrackerTransformConfig};
-use dpm_camera::{open_source, CameraTracker, CameraTrackerSetup, Markings, PictureSource, TagPlace, TAGS};
+use dpm_camera::{
+    examine_source, open_source, CameraDoubt, CameraLook, CameraTracker, CameraTrackerSetup, Markings,
+    PictureRequest, PictureSource, TagPlace, TAGS,
+};
 use dpm_common::keys::read::{refuse, Reader};
 use dpm_device::picture_stream::{PictureHeader, HEADER_BYTES};
 use dpm_device::planes::Raster;
@@ -123,6 +126,10 @@ impl TrackerKeys for CameraTrackerConfig {
         Some(view())
     }
 
+    fn examine(&self) -> Option<Result<CameraLook, CameraDoubt>> {
+        examine_source(&self.device, &self.request())
+    }
+
     fn eye(&self) -> Option<Result<ProjectorCamera, SourceError>> {
         let placed = |camera: ProjectorCamera| {
             let wrong = || SourceError::of_key("tracker.transform", "its rotation is zero");
@@ -154,7 +161,18 @@ impl TrackerKeys for CameraTrackerConfig {
 
 impl CameraTrackerConfig {
     fn source(&self, clock: &Arc<dyn HostClock>) -> Result<Box<dyn PictureSource>, SourceError> {
-        open_source(&self.device, clock).map_err(|e| SourceError::of_key("tracker.device", e))
+        open_source(&self.device, &self.request(), clock)
+            .map_err(|e| SourceError::of_key("tracker.device", e))
+    }
+
+    fn request(&self) -> PictureRequest {
+        PictureRequest {
+            size: self.size,
+            rate_hz: self.rate_hz,
+            exposure_us: self.exposure_us,
+            gain: self.gain,
+            readout_us: self.readout_us,
+        }
     }
 
     /// The names of the bodies that have tags or markers.
