@@ -31,7 +31,7 @@ use std::path::Path;
 pub type Entry = fn(&[u8]);
 
 /// Every entry with the name of its fuzz target, which is also the name of its folder of seeds.
-pub const ALL: [(&str, Entry); 40] = [
+pub const ALL: [(&str, Entry); 41] = [
     ("link_stream", link_stream),
     ("link_rle", link_rle),
     ("link_tracks", link_tracks),
@@ -42,6 +42,7 @@ pub const ALL: [(&str, Entry); 40] = [
     ("vrpn_stream", vrpn_stream),
     ("serial_pose", serial_pose),
     ("picture_header", picture_header),
+    ("motion_jpeg", motion_jpeg),
     ("sensor_packet", sensor_packet),
     ("texts", texts),
     ("recording", recording),
@@ -220,6 +221,11 @@ pub fn vrpn_stream(bytes: &[u8]) {
 /// The header of a camera's picture.
 pub fn picture_header(bytes: &[u8]) {
     tracker("picture_header", bytes);
+}
+
+/// A picture of a USB camera.
+pub fn motion_jpeg(bytes: &[u8]) {
+    tracker("motion_jpeg", bytes);
 }
 
 /// A packet of the serial pose stream.

@@ -61,3 +61,4 @@ pub use source::{
 };
 pub use sources::{examine_source, open_source};
 pub use tracker::{CameraTracker, CameraTrackerSetup};
+pub use v4l2::motion_jpeg_grey;

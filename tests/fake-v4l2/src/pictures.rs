@@ -114,6 +114,9 @@ fn hand_out(file: &OpenFile, header: &PictureHeader, pixels: &[u8], numbers: &mu
 
 /// Grey levels in the camera's format: rows are padded, and colours say nothing of the grey.
 fn formed(form: &Form, pixels: &[u8]) -> Vec<u8> {
+    if form.code == "MJPG" {
+        return jpeg(form, pixels);
+    }
     let mut out = Vec::with_capacity(form.bytes as usize);
     let colour = |i: usize| (i * 37 % 251) as u8;
     for (y, row) in pixels.chunks_exact(form.size[0] as usize).enumerate() {
@@ -133,6 +136,25 @@ fn formed(form: &Form, pixels: &[u8]) -> Vec<u8> {
         let colours = (0..form.bytes as usize - out.len()).map(colour);
         out.extend(colours);
     }
+    out
+}
+
+/// As USB cameras send it: in colours that are grey, without Huffman tables.
+fn jpeg(form: &Form, pixels: &[u8]) -> Vec<u8> {
+    let colours: Vec<u8> = pixels.iter().flat_map(|grey| [*grey; 3]).collect();
+    let mut whole = Vec::new();
+    let mut encoder = image::codecs::jpeg::JpegEncoder::new_with_quality(&mut whole, 90);
+    let coded = encoder.encode(&colours, form.size[0], form.size[1], image::ExtendedColorType::Rgb8);
+    coded.expect("a picture of this size");
+    let (mut out, mut at) = (whole[..2].to_vec(), 2);
+    while whole[at + 1] != 0xda {
+        let end = at + 2 + usize::from(u16::from_be_bytes([whole[at + 2], whole[at + 3]]));
+        if whole[at + 1] != 0xc4 {
+            out.extend(&whole[at..end]);
+        }
+        at = end;
+    }
+    out.extend(&whole[at..]);
     out
 }
 

@@ -1,5 +1,7 @@
 //! Pixels of a camera into grey levels.
 
+use super::jpeg::motion_jpeg_grey;
+
 /// Where the grey level of a pixel lies.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) enum Place {
@@ -7,6 +9,8 @@ pub(super) enum Place {
     Byte { step: usize, first: usize },
     /// In two bytes, the lower one first, of which the upper 8 of `bits` bits count.
     Word { bits: u32 },
+    /// In a picture that is a JPEG.
+    Jpeg,
 }
 
 /// A format that is read.
@@ -30,12 +34,24 @@ impl Layout {
         match self.place {
             Place::Byte { step, .. } => step * width,
             Place::Word { .. } => 2 * width,
+            Place::Jpeg => 0,
+        }
+    }
+
+    /// Bytes that a picture has at least, whose rows begin every `stride` bytes.
+    pub(super) const fn least_bytes(&self, stride: usize, [width, height]: [usize; 2]) -> usize {
+        match self.place {
+            Place::Jpeg => 1,
+            _ => stride * (height - 1) + self.row_bytes(width),
         }
     }
 
     /// Fills `out` with `size[0] * size[1]` grey levels of a picture whose rows begin every `stride` bytes. False, and
-    /// nothing of use in `out`, if `bytes` are too few.
+    /// nothing of use in `out`, if `bytes` are too few or damaged.
     pub(super) fn grey(&self, bytes: &[u8], stride: usize, size: [usize; 2], out: &mut Vec<u8>) -> bool {
+        if self.place == Place::Jpeg {
+            return motion_jpeg_grey(bytes, size, out);
+        }
         let [width, height] = size;
         let row = self.row_bytes(width);
         out.clear();
@@ -57,14 +73,16 @@ impl Layout {
                     };
                     out.extend(row.chunks_exact(2).map(level));
                 }
+                Place::Jpeg => unreachable!("decoded above"),
             }
         }
         true
     }
 }
 
-/// The formats that are read; first those that carry nothing but grey in the fewest bytes.
-pub(super) static LAYOUTS: [Layout; 11] = [
+/// The formats that are read; first those that carry nothing but grey in the fewest bytes, last the one that takes time and
+/// loses edges.
+pub(super) static LAYOUTS: [Layout; 12] = [
     Layout::of(b"GREY", "V4L2_PIX_FMT_GREY", Place::Byte { step: 1, first: 0 }),
     Layout::of(b"NV12", "V4L2_PIX_FMT_NV12", Place::Byte { step: 1, first: 0 }),
     Layout::of(b"NV21", "V4L2_PIX_FMT_NV21", Place::Byte { step: 1, first: 0 }),
@@ -76,6 +94,7 @@ pub(super) static LAYOUTS: [Layout; 11] = [
     Layout::of(b"YVYU", "V4L2_PIX_FMT_YVYU", Place::Byte { step: 2, first: 0 }),
     Layout::of(b"UYVY", "V4L2_PIX_FMT_UYVY", Place::Byte { step: 2, first: 1 }),
     Layout::of(b"VYUY", "V4L2_PIX_FMT_VYUY", Place::Byte { step: 2, first: 1 }),
+    Layout::of(b"MJPG", "V4L2_PIX_FMT_MJPEG", Place::Jpeg),
 ];
 
 /// The four characters of a format, for messages.

@@ -1,11 +1,12 @@
 //! Pictures from the cameras of this machine, through V4L2: USB cameras and others whose driver streams into memory.
 //!
 //! `abi` has the kernel's structs and numbers, `kernel` makes the calls, `device` and `exposure` set the camera to what the
-//! rig file asks, `luma` reads its pixels, `stamp` its stamps. This file keeps a camera open.
+//! rig file asks, `luma` and `jpeg` read its pixels, `stamp` its stamps. This file keeps a camera open.
 
 mod abi;
 mod device;
 mod exposure;
+mod jpeg;
 mod kernel;
 mod luma;
 mod stamp;
@@ -13,6 +14,8 @@ mod stamp;
 use crate::source::{
     offset_ns, CameraDoubt, CameraLook, Picture, PictureLosses, PictureRequest, PictureSource, SourceKind,
 };
+pub use jpeg::motion_jpeg_grey;
+
 use device::{Identity, PictureForm};
 use dpm_common::unix::monotonic_ns;
 use dpm_device::time::{HostClock, HostTime};
@@ -107,8 +110,7 @@ impl Running {
             };
             self.heard = Instant::now();
             losses.lost += self.missing_before(taken.sequence);
-            let [width, height] = self.form.size;
-            let least = self.form.stride * (height - 1) + self.form.layout.row_bytes(width);
+            let least = self.form.layout.least_bytes(self.form.stride, self.form.size);
             let mut back = Some(taken.index);
             if taken.flags & abi::IS_DAMAGED != 0 || taken.bytes < least {
                 losses.damaged += 1;
@@ -200,6 +202,7 @@ impl V4l2Source {
             )
         });
         running.stream.give(taken.index).map_err(|e| device::failure(place, "a buffer", &e))?;
+        self.losses.damaged += u64::from(read == Ok(false));
         read
     }
 }

@@ -51,7 +51,7 @@ fn pictures_and_their_times_are_those_of_the_camera() {
     ] {
         let name = format!("times-{format}");
         // A format that cannot be read is listed first, and is not taken.
-        let fake = camera(&name, &host, &format!("formats=MJPG,{format} rates=100 stamp={stamp}"));
+        let fake = camera(&name, &host, &format!("formats=H264,{format} rates=100 stamp={stamp}"));
         let request = PictureRequest { readout_us, ..request(100) };
         let mut source = source(&name, &request, &clock);
         for seen in pictures(&mut *source, 5) {
@@ -136,21 +136,6 @@ fn an_unplugged_camera_is_opened_again_and_another_one_is_not_taken_for_it() {
     assert!(after[0].number > before && after[0].number < before + 100, "numbers go on");
 }
 
-/// A stream that falls silent is begun anew, and says so.
-#[test]
-fn a_silent_camera_is_opened_anew() {
-    let clock = clock();
-    let host = host(100, 0, "", &clock);
-    let fake = camera("silent", &host, "rates=100 silent");
-    let mut source = source("silent", &request(100), &clock);
-    let begin = Instant::now();
-    let why = error(&mut *source);
-    assert!(why.contains("given no picture for 3 s"), "{why}");
-    assert!(begin.elapsed() >= Duration::from_secs(3) && fake.witness().open == 0);
-    fake.return_as(&words("silent", &host, "rates=100"));
-    pictures(&mut *source, 1);
-}
-
 /// Whatever request fails, the error names the camera, nothing stays open, and the next call works.
 #[test]
 fn every_request_may_fail() {
@@ -204,5 +189,25 @@ fn stamps_that_say_nothing_are_refused() {
             let why = error(&mut *source);
             assert!(why.contains(told) && why.contains("none is used"), "{stamp}: {why}");
         }
+    }
+}
+
+/// What takes seconds.
+mod breadth {
+    use super::*;
+
+    /// A stream that falls silent is begun anew, and says so.
+    #[test]
+    fn a_silent_camera_is_opened_anew() {
+        let clock = clock();
+        let host = host(100, 0, "", &clock);
+        let fake = camera("silent", &host, "rates=100 silent");
+        let mut source = source("silent", &request(100), &clock);
+        let begin = Instant::now();
+        let why = error(&mut *source);
+        assert!(why.contains("given no picture for 3 s"), "{why}");
+        assert!(begin.elapsed() >= Duration::from_secs(3) && fake.witness().open == 0);
+        fake.return_as(&words("silent", &host, "rates=100"));
+        pictures(&mut *source, 1);
     }
 }

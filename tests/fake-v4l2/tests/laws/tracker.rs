@@ -90,8 +90,11 @@ fn seen(tracker: &mut dyn Tracker, stage: &Stage, count: usize) -> Vec<TrackerSa
 #[test]
 fn a_rigs_camera_gives_poses_where_the_body_was() {
     let stage = stage("");
-    for (name, more) in [("poses-begin", "formats=YUYV stamp=begin"), ("poses-end", "formats=GREY stamp=end")]
-    {
+    for (name, more) in [
+        ("poses-begin", "formats=YUYV stamp=begin"),
+        ("poses-end", "formats=GREY stamp=end"),
+        ("poses-jpeg", "formats=MJPG stamp=begin padding=0"),
+    ] {
         let _fake = FakeCamera::plug_in(&stage.words(name, more));
         let mut tracker = stage.tracker(name);
         let samples = seen(&mut *tracker, &stage, 25);
@@ -117,7 +120,8 @@ fn a_pulled_plug_and_a_lost_picture_are_told_and_survived() {
     seen(&mut *tracker, &stage, 30);
     let lost = |tracker: &dyn Tracker| {
         let status = tracker.status();
-        let count = status.split(", ").find_map(|part| part.strip_suffix(" pictures lost on the way"));
+        let count =
+            status.split([',', ';']).find_map(|part| part.trim().strip_suffix(" pictures lost on the way"));
         count.map_or(0, |n| n.parse::<u32>().unwrap())
     };
     assert!(lost(&*tracker) >= 1, "{}", tracker.status());

@@ -2,6 +2,7 @@
 
 mod alp;
 mod browsers;
+mod camera;
 mod cli_profile;
 mod conformance;
 mod dlpc900;

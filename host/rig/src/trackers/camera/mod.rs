@@ -10,8 +10,8 @@ use super::keys::{SourceError, TrackerKeys, TrackerPlace};
 use super::kind::{PoseOrigin, TrackerKind};
 use super::transform::{PoseConfig, TrackerTransformConfig};
 use dpm_camera::{
-    examine_source, open_source, CameraDoubt, CameraLook, CameraTracker, CameraTrackerSetup, Markings,
-    PictureRequest, PictureSource, TagPlace, TAGS,
+    examine_source, motion_jpeg_grey, open_source, CameraDoubt, CameraLook, CameraTracker,
+    CameraTrackerSetup, Markings, PictureRequest, PictureSource, TagPlace, TAGS,
 };
 use dpm_common::keys::read::{refuse, Reader};
 use dpm_device::picture_stream::{PictureHeader, HEADER_BYTES};
@@ -28,7 +28,7 @@ pub(super) static KIND: TrackerKind = TrackerKind::of::<CameraTrackerConfig>(
     "a camera that sees printed tags or bright markers on the bodies.",
     PoseOrigin::Measured,
     "docs/TRACKERS.md#camera",
-    &[("picture_header", any_header)],
+    &[("picture_header", any_header), ("motion_jpeg", any_motion_jpeg)],
     mock::mock,
 );
 
@@ -202,6 +202,16 @@ fn any_header(bytes: &[u8]) {
     if let Some(header) = PictureHeader::decode(first) {
         assert_eq!(PictureHeader::decode(&header.encode()), Some(header));
         assert!(header.pixel_bytes() <= 8192 * 8192);
+    }
+}
+
+/// A picture of a USB camera: it is read whole or not at all. The first byte chooses one of a few sizes.
+fn any_motion_jpeg(bytes: &[u8]) {
+    let Some((first, bytes)) = bytes.split_first() else { return };
+    let size = [[40, 24], [16, 16], [64, 8]][usize::from(first % 3)];
+    let mut out = vec![1];
+    if motion_jpeg_grey(bytes, size, &mut out) {
+        assert_eq!(out.len(), size[0] * size[1]);
     }
 }
 
