@@ -44,7 +44,7 @@ impl Buffers {
     pub(crate) fn give(&mut self, index: usize) -> Option<()> {
         let buffer = self.all.get_mut(index).filter(|b| !b.is_given)?;
         buffer.is_given = true;
-        let noise: Vec<u8> = (0..self.bytes).map(|i| (i * 151 >> 3) as u8).collect();
+        let noise: Vec<u8> = (0..self.bytes).map(|i| ((i * 151) >> 3) as u8).collect();
         buffer.memory.write_all_at(&noise, 0).ok()?;
         self.empty.push_back(index);
         Some(())

@@ -95,7 +95,7 @@ fn hand_out(file: &OpenFile, header: &PictureHeader, pixels: &[u8], numbers: &mu
         eprintln!("fake-v4l2: the socket sends {} x {}", header.width, header.height);
         return;
     }
-    let is_every = |n: u32| n > 0 && numbers.count % n == 0;
+    let is_every = |n: u32| n > 0 && numbers.count.is_multiple_of(n);
     let mut bytes = formed(&form, pixels);
     if is_every(settings.short_every) {
         bytes.truncate(bytes.len() - form.stride as usize - bytes.len() / 3);
