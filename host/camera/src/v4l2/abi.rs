@@ -259,6 +259,7 @@ impl Buffer {
 
     /// The time of its stamp, nanoseconds of the clock that its flags name.
     pub(super) fn stamp_ns(&self) -> i64 {
+        #[allow(clippy::unnecessary_cast, reason = "a long has 32 bits on some machines")]
         let [s, us] = self.stamp.map(|part| part as i64);
         s.saturating_mul(1_000_000_000).saturating_add(us.saturating_mul(1_000))
     }
@@ -392,6 +393,7 @@ mod tests {
     }
 
     fn calls() -> Vec<(String, u64)> {
+        #[allow(clippy::unnecessary_cast, reason = "musl has signed numbers")]
         fn of<T>(name: &str, call: &Call<T>) -> (String, u64) {
             (name.to_owned(), call.number as u64)
         }

@@ -26,7 +26,7 @@ fn doubted(name: &str, more: &str, request: &PictureRequest, told: &[&str]) {
     let look = of(name, more, request).unwrap_or_else(|e| panic!("{more}: {e}"));
     let all: Vec<String> = look.doubts.iter().map(ToString::to_string).collect();
     let has = |word: &&str| all.iter().any(|doubt| doubt.contains(word));
-    assert!(told.iter().all(|word| has(&word)), "{more}: {look:?}");
+    assert!(told.iter().all(has), "{more}: {look:?}");
 }
 
 #[test]
