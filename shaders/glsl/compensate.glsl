@@ -98,17 +98,23 @@ vec3 albedo_at(uint map, vec2 uv) {
     return albedo;
 }
 
+// Where the pixel's surface is, unless the shader that includes this file has it elsewhere.
+#ifndef SURFACE_OF
+#define SURFACE_OF(index) surface_at(index)
+#define WEIGHTS_OF(index) barycentric_at(index).weights
+#endif
+
 // Defined by the shader that includes this file: the radiance toward the eye that a lit pixel shows.
 vec3 light_at(uvec2 pixel, uint index);
 
 // Writes the code values of the pixel at `index`. To be called by every invocation that has a pixel.
 void compensate(uvec2 pixel, uint index) {
-    SurfaceHit surface = surface_at(index);
+    SurfaceHit surface = SURFACE_OF(index);
     uint nans = 0u, clipped = 0u, lit = 0u, code = 0u;
     if (surface.id != NO_HIT && surface.distance > 0.0) {
         uint instance = surface.id >> 24u;
         TriangleRef ref = triangle_ref_at(instance_at(instance).triangle_offset + (surface.id & 0xffffffu));
-        vec2 b = barycentric_at(index).weights;
+        vec2 b = WEIGHTS_OF(index);
         // The real surface is smooth, so its normal is the interpolated one, without the normal map of the look.
         float cosine = real_cosine(instance_at(instance).world_from_object, vertex_at(ref.vertices.x).normal, vertex_at(ref.vertices.y).normal,
                                    vertex_at(ref.vertices.z).normal, b, ray_of(pixel));

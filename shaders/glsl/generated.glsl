@@ -105,6 +105,10 @@
 #define B_PLANE_GROUPS 35u
 #define B_QUEUE 37u
 #define B_QUEUE_ROWS 38u
+#define B_COARSE_FRAME 39u
+#define B_COARSE_SURFACES 40u
+#define B_COARSE_LIGHT 41u
+#define B_COARSE_LIGHT_ROWS 42u
 #define B_BODY_TREE 36u
 // Index of a pixel's element in a part of a buffer.
 #define SURFACES_HIT_AT(i) (((i) >> 6u) * 128u + 0u + ((i) & 63u))
@@ -113,6 +117,8 @@
 #define GUIDES_TINT_AT(i) (((i) >> 6u) * 288u + 128u + ((i) & 63u))
 #define GUIDES_SHIFT_AT(i) (((i) >> 6u) * 288u + 192u + ((i) & 63u))
 #define GUIDES_DEMAND_AT(i) (((i) >> 6u) * 576u + 512u + ((i) & 63u))
+#define COARSE_SURFACES_HIT_AT(i) (((i) >> 6u) * 128u + 0u + ((i) & 63u))
+#define COARSE_SURFACES_INSIDE_AT(i) (((i) >> 6u) * 128u + 64u + ((i) & 63u))
 #define HISTORY_LIGHT_AT(i) (((i) >> 6u) * 256u + 0u + ((i) & 63u))
 #define HISTORY_PLACE_AT(i) (((i) >> 6u) * 256u + 64u + ((i) & 63u))
 #define HISTORY_NOISE_AT(i) (((i) >> 6u) * 256u + 128u + ((i) & 63u))

@@ -367,6 +367,55 @@ layout(set = 0, binding = B_SURFACES, scalar) writeonly buffer barycentric_out_b
 void set_barycentric(uint i, Barycentric v) { barycentric_out[SURFACES_INSIDE_AT(i)] = v; }
 #endif
 
+#ifdef COARSE_TABLES
+#ifdef TEXEL_TABLES
+layout(set = 0, binding = B_COARSE_SURFACES, rgba32ui) uniform readonly uimageBuffer coarse_surfaces_image;
+SurfaceHit coarse_surface_at(uint i) {
+    uint at = COARSE_SURFACES_HIT_AT(i);
+    uvec4 row = imageLoad(coarse_surfaces_image, int(at >> 1u));
+    uvec4 r0 = (at & 1u) == 0u ? row : row.zwxy;
+    return SurfaceHit(r0.x,
+        uintBitsToFloat(r0.y));
+}
+#else
+layout(set = 0, binding = B_COARSE_SURFACES, scalar) readonly buffer coarse_surface_block { SurfaceHit coarse_surface_table[]; };
+SurfaceHit coarse_surface_at(uint i) {
+    uint at = COARSE_SURFACES_HIT_AT(i);
+    return SurfaceHit(coarse_surface_table[at].id,
+        coarse_surface_table[at].distance);
+}
+#endif
+#endif
+
+#ifdef COARSE_TABLES
+#ifdef TEXEL_TABLES
+layout(set = 0, binding = B_COARSE_LIGHT_ROWS, rgba32ui) uniform readonly uimageBuffer coarse_light_rows_image;
+Filtered coarse_light_at(uint i) {
+    uint at = i;
+    uvec4 r0 = imageLoad(coarse_light_rows_image, int(at) * 1 + 0);
+    return Filtered(vec3(uintBitsToFloat(r0.x), uintBitsToFloat(r0.y), uintBitsToFloat(r0.z)),
+        r0.w);
+}
+#else
+layout(set = 0, binding = B_COARSE_LIGHT, scalar) readonly buffer coarse_light_block { Filtered coarse_light_table[]; };
+Filtered coarse_light_at(uint i) {
+    uint at = i;
+    return Filtered(coarse_light_table[at].light,
+        coarse_light_table[at].weight_and_albedo);
+}
+#endif
+#endif
+
+#ifdef COARSE_TABLES
+#ifdef TEXEL_TABLES
+layout(set = 0, binding = B_COARSE_LIGHT, scalar) writeonly buffer coarse_light_uvec4s_block { uvec4 coarse_light_uvec4s[]; };
+void set_coarse_light(uint i, Filtered v) { coarse_light_uvec4s[i] = uvec4(floatBitsToUint(v.light), v.weight_and_albedo); }
+#else
+layout(set = 0, binding = B_COARSE_LIGHT, scalar) writeonly buffer coarse_light_out_block { Filtered coarse_light_out[]; };
+void set_coarse_light(uint i, Filtered v) { coarse_light_out[i] = v; }
+#endif
+#endif
+
 #ifdef TEXEL_TABLES
 layout(set = 0, binding = B_GUIDE_ROWS, rgba32ui) uniform readonly uimageBuffer guide_rows_image;
 Sight sight_at(uint i) {

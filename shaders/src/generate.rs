@@ -178,6 +178,9 @@ pub fn tables_glsl() -> String {
                 .collect(),
         };
         let at = part.map_or("i".to_owned(), |part| format!("{}(i)", macro_of(&part)));
+        // What only the pass `enlarge` reads, so that it changes nothing of the other shaders.
+        let is_coarse = storage.starts_with("B_COARSE");
+        out.push_str(if is_coarse { "\n#ifdef COARSE_TABLES" } else { "" });
         out.push_str(&format!(
             "\n#ifdef TEXEL_TABLES\n\
              {declaration}\
@@ -187,6 +190,7 @@ pub fn tables_glsl() -> String {
              {name} {reader}_at(uint i) {{\n    uint at = {at};\n    return {from_storage};\n}}\n\
              #endif\n"
         ));
+        out.push_str(if is_coarse { "#endif\n" } else { "" });
         // What some shader writes. Of `B_FORMER` the frame before wrote it.
         let row = match bytes {
             16 => "uvec4",
@@ -202,6 +206,7 @@ pub fn tables_glsl() -> String {
         } else {
             format!("layout(set = 0, binding = {storage}, scalar) writeonly buffer {rows}_block {{ {row} {rows}[]; }};\n")
         };
+        out.push_str(if is_coarse { "\n#ifdef COARSE_TABLES" } else { "" });
         out.push_str(&format!(
             "\n#ifdef TEXEL_TABLES\n\
              {declaration}\
@@ -211,6 +216,7 @@ pub fn tables_glsl() -> String {
              void set_{reader}(uint i, {name} v) {{ {reader}_out[{at}] = v; }}\n\
              #endif\n"
         ));
+        out.push_str(if is_coarse { "#endif\n" } else { "" });
         written.push(rows);
     }
     out

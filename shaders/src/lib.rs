@@ -121,6 +121,12 @@ table_shaders! {
     SPATIAL_DISK = "spatial_disk";
     /// Compensation for distance, angle and albedo, then quantisation to code values.
     COMPENSATE = "compensate";
+    /// What enlarging needs of each traced pixel, in one row.
+    PREPARE = "prepare";
+    /// The light of a reduced raster at the panel's pixels on even surface, and its code values.
+    ENLARGE = "enlarge";
+    /// The same at edges.
+    EDGES = "edges" with "edges.query";
     /// Code values into halftones, for planes of equal light.
     HALFTONE = "halftone";
     /// How far the surface of each pixel moves while the planes last.

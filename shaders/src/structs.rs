@@ -881,6 +881,7 @@ const fn element_name(of: &'static str) -> &'static str {
 parts! {
     "B_SURFACES": "hit" SurfaceHit, "inside" Barycentric,;
     "B_GUIDES": "sight" Sight, "tint" Tint, "shift" Shift, "demand" u32,;
+    "B_COARSE_SURFACES": "hit" SurfaceHit, "inside" Barycentric,;
     "B_HISTORY": "light" HistoryLight, "place" HistoryPlace, "noise" HistoryNoise, "tag" HistoryTag, "seed" HistorySeed, "used" HistoryUsed,;
     "B_FORMER": "light" HistoryLight, "place" HistoryPlace, "noise" HistoryNoise, "tag" HistoryTag, "seed" HistorySeed, "used" HistoryUsed,;
 }
@@ -951,6 +952,8 @@ tables! {
     AlbedoCell "albedo_cell", "B_ALBEDO" or "B_ALBEDO";
     SurfaceHit "surface", "B_SURFACES"."hit" or "B_SURFACE_ROWS";
     Barycentric "barycentric", "B_SURFACES"."inside" or "B_SURFACE_ROWS";
+    SurfaceHit "coarse_surface", "B_COARSE_SURFACES"."hit" or "B_COARSE_SURFACES";
+    Filtered "coarse_light", "B_COARSE_LIGHT" or "B_COARSE_LIGHT_ROWS";
     Sight "sight", "B_GUIDES"."sight" or "B_GUIDE_ROWS";
     Tint "tint", "B_GUIDES"."tint" or "B_GUIDE_ROWS";
     Shift "shift", "B_GUIDES"."shift" or "B_GUIDE_ROWS";
@@ -1008,6 +1011,10 @@ pub const BINDINGS: &[(&str, u32)] = &[
     ("B_PLANE_GROUPS", 35),
     ("B_QUEUE", 37),
     ("B_QUEUE_ROWS", 38),
+    ("B_COARSE_FRAME", 39),
+    ("B_COARSE_SURFACES", 40),
+    ("B_COARSE_LIGHT", 41),
+    ("B_COARSE_LIGHT_ROWS", 42),
 ];
 
 /// Whether a binding is bound on software Vulkan only: the second bindings of buffers, as texels, and the rays that the host walks.

@@ -10,7 +10,7 @@ use dpm_render::method::{Method, SamplerKind};
 use dpm_render::scene_data::{SceneData, SceneNeeds};
 use dpm_render::warp::LEAST_MOTION_PX;
 use dpm_render::{traffic, Keep, Output, RenderError, RendererSettings, Traffic};
-use dpm_rig::config::{EffectsConfig, PlanePoses, RenderConfig, RenderMethod, RigConfig};
+use dpm_rig::config::{EffectsConfig, PlanePoses, RenderConfig, RenderMethod, RenderScale, RigConfig};
 use dpm_rig::failure::{Failure, FailureKind};
 use dpm_rig::method_choice::{self, MethodChoice};
 use dpm_rig::pipeline::{renderer_settings, PipelineError};
@@ -281,6 +281,15 @@ fn rig_entries(rig: &Rig) -> Vec<PlanEntry> {
             "plane not sent; radiance still has three channels",
         ),
         planes_that_follow(rig),
+        entry(
+            "reduced raster",
+            (config.render.scale != RenderScale::Share(1.0)).then(|| match config.render.scale {
+                RenderScale::Share(share) => format!("render.scale = {share}"),
+                RenderScale::Auto => "render.scale = \"auto\"".into(),
+            }),
+            "render.scale = 1",
+            "passes prepare, enlarge and edges not recorded, and no buffers for them",
+        ),
     ]
 }
 

@@ -8,7 +8,7 @@ use dpm_common::clock::Stopwatch;
 use dpm_device::planes::Raster;
 use dpm_render::gpu::Gpu;
 use dpm_render::method::Method;
-use dpm_render::{FrameCost, FrameSlot, RenderError, Renderer, RendererSettings, Surface};
+use dpm_render::{FrameCost, FrameSlot, RenderError, Renderer, RendererSettings, Scale, Surface};
 use dpm_rig::pipeline::renderer_settings;
 use dpm_rig::rig::Rig;
 use dpm_rig::still::tracked_poses;
@@ -111,6 +111,7 @@ impl Theatre {
     fn build(rig: Arc<Rig>, gpu: Arc<Gpu>, span: Span, frozen: bool) -> Result<Self, RenderError> {
         let settings = RendererSettings {
             method: Method { temporal: true, ..Method::full(1) },
+            scale: Scale::WHOLE,
             plane_groups: Vec::new(),
             ..renderer_settings(&rig)
         };
@@ -162,8 +163,28 @@ impl Theatre {
         seed: u32,
         each: &mut dyn FnMut(u32, &FrameSlot),
     ) -> Result<Seen, RenderError> {
+        self.play_at(renderer_settings(&self.rig).scale, method, spp, seed, each)
+    }
+
+    /// The same with every pixel traced, whatever the rig's scale: what others are judged by.
+    ///
+    /// # Errors
+    /// The renderer's.
+    pub(crate) fn play_whole(&self, method: &Method, spp: f32, seed: u32) -> Result<Seen, RenderError> {
+        self.play_at(Scale::WHOLE, method, spp, seed, &mut |_, _| ())
+    }
+
+    fn play_at(
+        &self,
+        scale: Scale,
+        method: &Method,
+        spp: f32,
+        seed: u32,
+        each: &mut dyn FnMut(u32, &FrameSlot),
+    ) -> Result<Seen, RenderError> {
         let rig = &self.rig;
         let settings = RendererSettings {
+            scale,
             method: method.clone(),
             seed,
             plane_groups: Vec::new(),

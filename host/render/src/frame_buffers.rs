@@ -70,6 +70,36 @@ pub(super) struct FrameBuffers {
     pub textures: Option<LatchBuffer>,
     /// What goes to the GPU of live pictures.
     pub piece: Option<Piece>,
+    /// What the panel's pixels have of their own where fewer are traced; `None`: these are all of the panel's.
+    pub panel: Option<PanelBuffers>,
+}
+
+/// What the passes have of their own that work on the panel's pixels, where fewer pixels are traced than the panel has.
+pub(super) struct PanelBuffers {
+    pub frame: LatchBuffer,
+    pub arguments: Buffer,
+    pub tiles: Buffer,
+    pub counters: Buffer,
+    pub counters_host: Buffer,
+    pub surfaces: Buffer,
+    /// The picture before compensation, which only a host that reads everything gets.
+    pub shown: Buffer,
+    /// Of each traced pixel what enlarging needs.
+    lights: Buffer,
+    /// The panel's pixels on edges, and how many there are.
+    edges: Buffer,
+    pub schedule: Buffer,
+    /// Code values of the traced pixels, which nobody reads.
+    unread_codes: Buffer,
+}
+
+/// Whose pixels a pass works on.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(super) enum Pixels {
+    /// Those that are traced.
+    Traced,
+    /// Those of the panel.
+    Panel,
 }
 
 /// A buffer that the host writes, with its copy for the shaders. The frame's first commands make the copy.
@@ -96,7 +126,8 @@ pub(super) struct DebugBuffers {
 }
 
 impl FrameBuffers {
-    /// Memory for the scene `data`, whose tables shaders read in this way, and a raster of `tiles` tiles. `debug` adds the copies for debugging.
+    /// Memory for the scene `data`, whose tables shaders read in this way, for so many tiles of the traced raster and of the panel. `debug` adds the
+    /// copies for debugging.
     ///
     /// # Errors
     /// Out of memory.
@@ -104,14 +135,16 @@ impl FrameBuffers {
         gpu: &Arc<Gpu>,
         settings: &RendererSettings,
         (data, reading, apart): (&SceneData, Reading, Option<apart::Layout>),
-        tiles: usize,
+        (tiles, panel_tiles): (usize, usize),
         body_tree: BodyTree,
         live: Option<&LiveTextures>,
         debug: bool,
     ) -> Result<Self, GpuError> {
         use MemoryKind::{Device, Readback, Upload};
         let (bodies, asks_device) = (data.bodies.len(), reading == Reading::Query);
-        let pixels = in_blocks(settings.raster.pixel_count());
+        let pixels = in_blocks(settings.on_traced().raster.pixel_count());
+        let panel_pixels = in_blocks(settings.raster.pixel_count());
+        let is_reduced = settings.is_reduced();
         let size = |what, bytes, kind| Buffer::new(gpu, what, bytes, kind);
         let table = |what, bytes, kind| table_buffer(gpu, what, bytes, kind);
         let latched = |what, len_bytes| -> Result<LatchBuffer, GpuError> {
@@ -125,7 +158,9 @@ impl FrameBuffers {
         let plane_bytes = packed.map_or(4, |schedule| pack::gpu::len_bytes(settings.raster, schedule));
         let codes_host = match settings.output {
             Output::Planes(_) => None,
-            Output::Codes | Output::Both(_) => Some(size("code values", pixels * each.codes, Readback)?),
+            Output::Codes | Output::Both(_) => {
+                Some(size("code values", panel_pixels * each.codes, Readback)?)
+            }
         };
         let nodes = body_tree.most_nodes();
         let apart = apart.map(|layout| ApartFrame::new(gpu, layout, bodies, nodes, pixels)).transpose()?;
@@ -146,7 +181,7 @@ impl FrameBuffers {
             counters_host: size("counters", size_of::<Counters>(), Readback)?,
             surfaces: table("surfaces", pixels * each.surfaces, Device)?,
             radiance: size("radiance", pixels * each.radiance, Device)?,
-            codes: size("code values", pixels * each.codes, Device)?,
+            codes: size("code values", panel_pixels * each.codes, Device)?,
             codes_host,
             planes: size("bit planes", plane_bytes, Device)?,
             planes_host: packed.map(|_| size("bit planes", plane_bytes, Readback)).transpose()?,
@@ -157,14 +192,22 @@ impl FrameBuffers {
             apart: apart.map(Arc::new),
             no_queue,
             filtered: with("filtered radiance", each.filtered)?,
-            filtered_shown: with("shown radiance", if debug { SHOWN_BYTES } else { each.shown })?,
-            motion: with("motion of surfaces", each.motion)?,
+            filtered_shown: with(
+                "shown radiance",
+                if debug || is_reduced { SHOWN_BYTES } else { each.shown },
+            )?,
+            motion: table("motion of surfaces", (panel_pixels * each.motion).max(16), Device)?,
             movers: latched("movers", size_of::<Mover>() * bodies.max(1))?,
             device_tree: asks_device.then(|| FrameTree::new(gpu, bodies)).transpose()?,
             deformed: DeformedTables::new(gpu, data, reading)?,
             textures: texture_table(gpu, data)?,
             piece: live.map(|live| live.piece(gpu)).transpose()?,
-            debug_host: debug.then(|| DebugBuffers::new(gpu, pixels, tiles, each)).transpose()?,
+            debug_host: debug
+                .then(|| DebugBuffers::new(gpu, (pixels, panel_pixels), tiles, each))
+                .transpose()?,
+            panel: is_reduced
+                .then(|| PanelBuffers::new(gpu, (pixels, panel_pixels), panel_tiles, each, debug))
+                .transpose()?,
             each,
         })
     }
@@ -197,9 +240,16 @@ impl FrameBuffers {
     /// # Errors
     /// The GPU's own.
     pub(super) fn clear(&self, gpu: &Arc<Gpu>, settings: &RendererSettings) -> Result<(), GpuError> {
-        let pixels = in_blocks(settings.raster.pixel_count());
+        let pixels = in_blocks(settings.on_traced().raster.pixel_count());
+        let panel_pixels = in_blocks(settings.raster.pixel_count());
         fill(gpu, &self.surfaces, &Surface::block_of_none(), pixels / PART_BLOCK)?;
-        fill(gpu, &self.codes, &0u32, pixels)?;
+        fill(gpu, &self.codes, &0u32, panel_pixels)?;
+        if let Some(panel) = &self.panel {
+            fill(gpu, &panel.surfaces, &Surface::block_of_none(), panel_pixels / PART_BLOCK)?;
+            if self.debug_host.is_some() {
+                fill(gpu, &panel.shown, &[0u8; SHOWN_BYTES], panel_pixels)?;
+            }
+        }
         fill(gpu, &self.radiance, &[0f32; 4], pixels)?;
         if self.each.guides > 0 {
             fill(gpu, &self.guides, &0u32, pixels * Guide::BYTES / 4)?;
@@ -207,7 +257,7 @@ impl FrameBuffers {
         if self.each.filtered > 0 {
             fill(gpu, &self.filtered, &[0u8; size_of::<Filtered>()], pixels)?;
         }
-        let is_shown = !settings.method.dpm || self.debug_host.is_some();
+        let is_shown = !settings.method.dpm || self.debug_host.is_some() || self.panel.is_some();
         if is_shown {
             fill(gpu, self.shown(settings), &[0u8; SHOWN_BYTES], pixels)
         } else {
@@ -223,6 +273,14 @@ impl FrameBuffers {
             &self.filtered
         } else {
             &self.radiance
+        }
+    }
+
+    /// The picture that the host may read, and the surfaces to which it belongs: those of the panel's pixels.
+    pub(super) fn seen(&self, settings: &RendererSettings) -> [&Buffer; 2] {
+        match &self.panel {
+            Some(panel) => [&panel.shown, &panel.surfaces],
+            None => [self.shown(settings), &self.surfaces],
         }
     }
 
@@ -264,8 +322,33 @@ impl FrameBuffers {
         self.deformed.as_ref().map_or(&scene.geometry, |deformed| &deformed.geometry)
     }
 
-    /// The buffer of the binding `name`, in frames that write the history buffer `parity`.
+    /// The buffer of the binding `name` for the passes of one side, in frames that write the history buffer `parity`.
     pub(super) fn of<'a>(
+        &'a self,
+        name: &str,
+        (parity, side): (usize, Pixels),
+        settings: &RendererSettings,
+        (shared, scene): (&'a SharedBuffers, &'a SceneGpu),
+    ) -> &'a Buffer {
+        let of_side = self.panel.as_ref().and_then(|panel| match (side, name) {
+            (Pixels::Traced, "B_CODES") => Some(&panel.unread_codes),
+            (_, "B_COARSE_LIGHT" | "B_COARSE_LIGHT_ROWS") => Some(&panel.lights),
+            (Pixels::Traced, _) => None,
+            (Pixels::Panel, "B_SCHEDULE") => Some(&panel.schedule),
+            (Pixels::Panel, "B_WORK") => Some(&panel.edges),
+            (Pixels::Panel, "B_FRAME") => Some(&panel.frame.device),
+            (Pixels::Panel, "B_TILES") => Some(&panel.tiles),
+            (Pixels::Panel, "B_COUNTERS") => Some(&panel.counters),
+            (Pixels::Panel, "B_SURFACES" | "B_SURFACE_ROWS") => Some(&panel.surfaces),
+            (Pixels::Panel, "B_SHOWN") => Some(&panel.shown),
+            (Pixels::Panel, "B_OPTICS") => shared.panel_optics.as_ref(),
+            (Pixels::Panel, _) => None,
+        });
+        of_side.unwrap_or_else(|| self.of_traced(name, parity, settings, (shared, scene)))
+    }
+
+    /// The same, but for what the panel's pixels have of their own.
+    fn of_traced<'a>(
         &'a self,
         name: &str,
         parity: usize,
@@ -273,6 +356,10 @@ impl FrameBuffers {
         (shared, scene): (&'a SharedBuffers, &'a SceneGpu),
     ) -> &'a Buffer {
         match name {
+            "B_COARSE_FRAME" => &self.frame.device,
+            "B_COARSE_SURFACES" => &self.surfaces,
+            // Bound and never used where the panel has nothing of its own.
+            "B_COARSE_LIGHT" | "B_COARSE_LIGHT_ROWS" => &self.surfaces,
             "B_FRAME" => &self.frame.device,
             "B_INSTANCES" => &self.instances.device,
             "B_BODY_NODES" => &self.body_nodes.device,
@@ -329,13 +416,52 @@ fn texture_table(gpu: &Arc<Gpu>, data: &SceneData) -> Result<Option<LatchBuffer>
     }))
 }
 
+impl PanelBuffers {
+    /// For so many pixels that are traced and of the panel. `debug`: the host reads the picture before compensation.
+    fn new(
+        gpu: &Arc<Gpu>,
+        (pixels, panel_pixels): (usize, usize),
+        tiles: usize,
+        each: BytesPerPixel,
+        debug: bool,
+    ) -> Result<Self, GpuError> {
+        use MemoryKind::{Device, Readback, Upload};
+        let size = |what, bytes, kind| Buffer::new(gpu, what, bytes, kind);
+        let len_bytes = size_of::<Frame>();
+        let frame = size("frame uniforms of the panel", len_bytes, Upload)?;
+        Ok(Self {
+            frame: LatchBuffer {
+                host: frame,
+                device: table_buffer(gpu, "frame uniforms of the panel", len_bytes, Device)?,
+                len_bytes,
+            },
+            arguments: size("dispatch arguments of the panel", 48, Upload)?,
+            tiles: size("tile list of the panel", tiles * 4, Upload)?,
+            counters: size("counters of the panel", size_of::<Counters>(), Device)?,
+            counters_host: size("counters of the panel", size_of::<Counters>(), Readback)?,
+            surfaces: table_buffer(gpu, "surfaces of the panel", panel_pixels * each.surfaces, Device)?,
+            shown: size("shown radiance", if debug { panel_pixels * SHOWN_BYTES } else { 16 }, Device)?,
+            lights: table_buffer(gpu, "light of traced pixels", pixels * size_of::<Filtered>(), Device)?,
+            edges: size("pixels on edges", panel_pixels * each.work, Device)?,
+            schedule: size("schedule of the panel", size_of::<Schedule>(), Device)?,
+            unread_codes: size("code values of traced pixels", pixels * each.codes, Device)?,
+        })
+    }
+}
+
 impl DebugBuffers {
-    fn new(gpu: &Arc<Gpu>, pixels: usize, tiles: usize, each: BytesPerPixel) -> Result<Self, GpuError> {
+    /// For so many pixels that are traced and of the panel.
+    fn new(
+        gpu: &Arc<Gpu>,
+        (pixels, panel_pixels): (usize, usize),
+        tiles: usize,
+        each: BytesPerPixel,
+    ) -> Result<Self, GpuError> {
         let size = |what, bytes| Buffer::new(gpu, what, bytes, MemoryKind::Readback);
         let kept = |what, each: usize| (each > 0).then(|| size(what, pixels * each)).transpose();
         Ok(Self {
-            shown: size("shown radiance", pixels * SHOWN_BYTES)?,
-            surfaces: size("surfaces", pixels * each.surfaces)?,
+            shown: size("shown radiance", panel_pixels * SHOWN_BYTES)?,
+            surfaces: size("surfaces", panel_pixels * each.surfaces)?,
             guides: kept("guides", each.guides)?,
             history: kept("history", each.history)?,
             prior: kept("prior history", each.history)?,
@@ -343,7 +469,9 @@ impl DebugBuffers {
             rates: size("shading rates", tiles * 4)?,
             schedule: size("schedule", size_of::<Schedule>())?,
             work: size("work list", pixels * each.work)?,
-            motion: kept("motion of surfaces", each.motion)?,
+            motion: (each.motion > 0)
+                .then(|| size("motion of surfaces", panel_pixels * each.motion))
+                .transpose()?,
         })
     }
 }

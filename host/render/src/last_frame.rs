@@ -3,6 +3,7 @@
 use super::scene_data::BodyData;
 use super::settings::FrameInputs;
 use super::tiles::corners;
+use dpm_device::planes::Raster;
 use dpm_scene::geometry::projector::ProjectorCamera;
 use dpm_shaders::structs::{INSTANCE_EMPTY, NO_FRAME};
 use glam::{DAffine3, DVec3};
@@ -83,6 +84,14 @@ impl LastFrame {
                             }
                         }))
             })
+    }
+
+    /// Its number, if it traced this raster: what it left is of no use on another one. Else `NO_FRAME`.
+    pub(super) fn frame_on(&self, raster: Raster) -> u32 {
+        match &self.camera {
+            Some(camera) if camera.raster != raster => NO_FRAME,
+            _ => self.frame,
+        }
     }
 
     /// The turn of the frame with this number. A number that is not larger than the last one begins a new run (after a warm-up), and the turns begin

@@ -6,6 +6,7 @@ use super::fill::fill;
 use super::method::Method;
 use super::optics::OpticsLayout;
 use super::read_back::{Guide, History, Surface};
+use super::scale::Scale;
 use super::scene_gpu::table_buffer;
 use super::settings::{RasterTooLarge, RenderError, RendererSettings};
 use super::tiles::TILE;
@@ -72,7 +73,7 @@ impl BytesPerPixel {
         let part = PARTS.iter().find(|part| part.binding == binding && part.name == name);
         let part = part.map_or(0, |part| part.bytes);
         Some(match binding {
-            "B_SURFACES" => part,
+            "B_SURFACES" | "B_COARSE_SURFACES" => part,
             "B_GUIDES" if self.guides > 0 => part,
             "B_HISTORY" | "B_FORMER" if self.history > 0 => part,
             "B_RADIANCE" => self.radiance,
@@ -80,6 +81,7 @@ impl BytesPerPixel {
             // The picture that is shown: that of the last pass that the method has.
             "B_SHOWN" if self.shown > 0 => self.shown,
             "B_SHOWN" => self.radiance,
+            "B_COARSE_LIGHT" => size_of::<Filtered>(),
             "B_WORK" => self.work,
             "B_CODES" => self.codes,
             "B_MOTION" => self.motion,
@@ -113,9 +115,16 @@ impl BytesPerPixel {
     }
 }
 
-/// Memory on the GPU that a run with so many frames in flight takes at least, bytes: the buffers that grow with the raster, without the scene.
-pub fn least_memory_bytes(raster: Raster, method: &Method, slots: usize) -> u64 {
-    (raster.pixel_count() * BytesPerPixel::of(method).on_device(slots)) as u64
+/// Memory on the GPU that a run with so many frames in flight takes at least, bytes: the buffers that grow with the raster of the panel and with
+/// what is traced of it, without the scene.
+pub fn least_memory_bytes(raster: Raster, scale: Scale, method: &Method, slots: usize) -> u64 {
+    let each = BytesPerPixel::of(method);
+    let traced = scale.rasters(raster).next().unwrap_or(raster).pixel_count() * each.on_device(slots);
+    let of_panel = match scale == Scale::WHOLE {
+        true => 0,
+        false => raster.pixel_count() * slots * (each.surfaces + each.codes + each.work),
+    };
+    (traced + of_panel) as u64
 }
 
 /// Refuses a raster that `method` cannot trace on a device that binds buffers of at most `limit` bytes.
@@ -152,8 +161,11 @@ pub(super) struct SharedBuffers {
     pub history: [Buffer; 2],
     pub rates: Buffer,
     pub noise: Buffer,
-    /// Response, flat field and rays of the projector's pixels, albedo maps, and the blur of a moving eye.
+    /// Response, flat field and rays of the projector's pixels, albedo maps, and the blur of a moving eye. Where fewer pixels are traced, of each
+    /// traced raster one after the other.
     pub optics: Buffer,
+    /// The same of the panel, where fewer pixels are traced than it has.
+    pub panel_optics: Option<Buffer>,
     /// Groups of planes that follow the bodies.
     pub plane_groups: Buffer,
     /// The schedule at the start of a frame.
@@ -166,9 +178,14 @@ impl SharedBuffers {
     /// # Errors
     /// The raster is too large for the device, or the GPU's own.
     pub(crate) fn new(gpu: &Arc<Gpu>, settings: &RendererSettings) -> Result<Self, RenderError> {
-        let raster = settings.raster;
+        let raster = settings.on_traced().raster;
         check_raster(raster, &settings.method, gpu.max_buffer_bytes(), &gpu.summary().name)?;
-        let optics = OpticsLayout::new(settings);
+        let optics = |settings: &RendererSettings| {
+            OpticsLayout::new(settings).table(&settings.drive, settings.lens.as_ref())
+        };
+        let tables: Vec<f32> =
+            settings.scale.rasters(settings.raster).flat_map(|raster| optics(&settings.on(raster))).collect();
+        let panel_optics = || Buffer::from_slice(gpu, "optics of the panel", &optics(settings));
         let pixels = if settings.method.needs_history() { raster.pixel_count() } else { 1 };
         let none = History::block_of_none();
         let history = || -> Result<Buffer, GpuError> {
@@ -182,11 +199,8 @@ impl SharedBuffers {
         Ok(Self {
             history: [history()?, history()?],
             rates: Buffer::from_slice(gpu, "shading rates", &vec![0u32; tiles as usize])?,
-            optics: Buffer::from_slice(
-                gpu,
-                "optics",
-                &optics.table(&settings.drive, settings.lens.as_ref()),
-            )?,
+            optics: Buffer::from_slice(gpu, "optics", &tables)?,
+            panel_optics: settings.is_reduced().then(panel_optics).transpose()?,
             noise: Buffer::from_slice(gpu, "blue noise", blue_noise::MASK)?,
             plane_groups: match &settings.plane_groups[..] {
                 [] => Buffer::from_slice(gpu, "plane groups", &[PlaneGroup::zeroed()])?,

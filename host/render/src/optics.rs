@@ -73,6 +73,11 @@ impl OpticsLayout {
         self.maps_at() + self.maps.iter().sum::<u32>()
     }
 
+    /// Elements of the table.
+    pub(super) fn len(&self) -> u32 {
+        (self.len_bytes() / 4).max(1) as u32
+    }
+
     /// Size of the table.
     pub(super) fn len_bytes(&self) -> usize {
         let rates = if self.rates { 2 * (RATE_TABLE_OCTAVE * RATE_TABLE_OCTAVES) as usize } else { 0 };
@@ -115,11 +120,11 @@ impl OpticsLayout {
         table
     }
 
-    /// Writes what the shaders need to know of the lens and of this table.
-    pub(super) fn describe(&self, camera: &ProjectorCamera, frame: &mut Frame) {
-        frame.flat_field_at = self.flat_field_at();
-        frame.rays_at = self.rays_at();
-        frame.rate_table_at = self.rate_table_at();
+    /// Writes what the shaders need to know of the lens and of this table, which begins at the element `first`.
+    pub(super) fn describe(&self, camera: &ProjectorCamera, first: u32, frame: &mut Frame) {
+        frame.flat_field_at = first + self.flat_field_at();
+        frame.rays_at = first + self.rays_at();
+        frame.rate_table_at = first + self.rate_table_at();
         frame.lens_limit = camera.lens.limit() as f32;
         let coefficients = match camera.lens.model() {
             LensModel::Pinhole => return,

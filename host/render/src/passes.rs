@@ -20,6 +20,8 @@ pub(super) struct Pass {
     pub grid: Grid,
     /// Its rays walk through the scene.
     pub walks: bool,
+    /// It works on the panel's own pixels, and not on those of the traced raster.
+    pub at_panel: bool,
     /// The next frame may begin meanwhile: it needs nothing that this pass writes, and writes nothing that it reads.
     pub overlaps: bool,
 }
@@ -67,7 +69,7 @@ pub(super) enum Grid {
 }
 
 /// Every pass, in the order in which they run. Between two of them lies a barrier.
-pub(super) const TABLE: [Pass; 13] = [
+pub(super) const TABLE: [Pass; 16] = [
     Pass {
         name: "primary",
         code: Code::ByMethod {
@@ -87,6 +89,7 @@ pub(super) const TABLE: [Pass; 13] = [
         when: |_, _| true,
         grid: Grid::Tiles,
         walks: true,
+        at_panel: false,
         overlaps: false,
     },
     Pass {
@@ -141,6 +144,7 @@ pub(super) const TABLE: [Pass; 13] = [
         when: |s, _| s.method.needs_history(),
         grid: Grid::Tiles,
         walks: false,
+        at_panel: false,
         overlaps: false,
     },
     Pass {
@@ -154,6 +158,7 @@ pub(super) const TABLE: [Pass; 13] = [
         when: |s, keep| s.method.needs_rates() || keep.rate_map && s.method.needs_history(),
         grid: Grid::Rates,
         walks: false,
+        at_panel: false,
         overlaps: false,
     },
     Pass {
@@ -175,6 +180,7 @@ pub(super) const TABLE: [Pass; 13] = [
         when: |_, _| true,
         grid: Grid::Tiles,
         walks: false,
+        at_panel: false,
         overlaps: false,
     },
     Pass {
@@ -204,6 +210,7 @@ pub(super) const TABLE: [Pass; 13] = [
         when: |_, _| true,
         grid: Grid::Work,
         walks: true,
+        at_panel: false,
         overlaps: false,
     },
     Pass {
@@ -232,6 +239,7 @@ pub(super) const TABLE: [Pass; 13] = [
         when: |s, _| s.method.needs_history(),
         grid: Grid::Tiles,
         walks: false,
+        at_panel: false,
         overlaps: false,
     },
     Pass {
@@ -262,6 +270,7 @@ pub(super) const TABLE: [Pass; 13] = [
         when: |s, _| s.method.needs_spatial(),
         grid: Grid::Tiles,
         walks: false,
+        at_panel: false,
         overlaps: true,
     },
     Pass {
@@ -272,9 +281,62 @@ pub(super) const TABLE: [Pass; 13] = [
             writes: &["B_CODES", "B_COUNTERS"],
             seldom: &[],
         }),
-        when: |s, _| !s.method.dpm,
+        when: |s, _| !s.method.dpm && !s.is_reduced(),
         grid: Grid::Tiles,
         walks: false,
+        at_panel: false,
+        overlaps: true,
+    },
+    Pass {
+        // This pass and the next two take the place of the pass `compensate`, and of what the pass `spatial` does of it, where fewer pixels are traced
+        // than the panel has.
+        name: "prepare",
+        code: Code::ByMethod {
+            dpm: Kernel {
+                shader: |reading| shaders::PREPARE.reading(reading),
+                reads: &["B_SURFACES.hit", "B_SURFACES.inside", "B_GUIDES.tint", "B_SHOWN"],
+                writes: &["B_COARSE_LIGHT"],
+                seldom: &[],
+            },
+            others: Kernel {
+                shader: |reading| shaders::PREPARE.reading(reading),
+                reads: &["B_SURFACES.hit", "B_SURFACES.inside", "B_SHOWN"],
+                writes: &["B_COARSE_LIGHT"],
+                seldom: &["B_GUIDES.tint"],
+            },
+        },
+        when: |s, _| s.is_reduced(),
+        grid: Grid::Tiles,
+        walks: false,
+        at_panel: false,
+        overlaps: true,
+    },
+    Pass {
+        name: "enlarge",
+        code: Code::OfAll(Kernel {
+            shader: |reading| shaders::ENLARGE.reading(reading),
+            reads: &["B_COARSE_SURFACES.hit", "B_COARSE_LIGHT", "B_COUNTERS", "B_SCHEDULE"],
+            writes: &["B_SURFACES.hit", "B_SURFACES.inside", "B_CODES", "B_COUNTERS", "B_SCHEDULE", "B_WORK"],
+            seldom: &["B_SHOWN"],
+        }),
+        when: |s, _| s.is_reduced(),
+        grid: Grid::Tiles,
+        walks: false,
+        at_panel: true,
+        overlaps: true,
+    },
+    Pass {
+        name: "edges",
+        code: Code::OfAll(Kernel {
+            shader: |reading| shaders::EDGES.reading(reading),
+            reads: &["B_COARSE_SURFACES.hit", "B_COARSE_LIGHT", "B_COUNTERS", "B_SCHEDULE", "B_WORK"],
+            writes: &["B_SURFACES.hit", "B_SURFACES.inside", "B_CODES", "B_COUNTERS"],
+            seldom: &["B_SHOWN"],
+        }),
+        when: |s, _| s.is_reduced(),
+        grid: Grid::Work,
+        walks: true,
+        at_panel: true,
         overlaps: true,
     },
     Pass {
@@ -288,6 +350,7 @@ pub(super) const TABLE: [Pass; 13] = [
         when: |s, _| s.halftone.is_some_and(|halftone| !halftone.is_cut()),
         grid: Grid::Tiles,
         walks: false,
+        at_panel: true,
         overlaps: true,
     },
     Pass {
@@ -301,6 +364,7 @@ pub(super) const TABLE: [Pass; 13] = [
         when: |s, _| !s.plane_groups.is_empty(),
         grid: Grid::Moving,
         walks: false,
+        at_panel: true,
         overlaps: true,
     },
     Pass {
@@ -315,6 +379,7 @@ pub(super) const TABLE: [Pass; 13] = [
         when: |s, _| s.halftone.is_some_and(pack::Halftone::is_cut),
         grid: Grid::Tiles,
         walks: false,
+        at_panel: true,
         overlaps: true,
     },
     Pass {
@@ -328,6 +393,7 @@ pub(super) const TABLE: [Pass; 13] = [
         when: |s, _| !s.plane_groups.is_empty(),
         grid: Grid::Moving,
         walks: false,
+        at_panel: true,
         overlaps: true,
     },
     Pass {
@@ -341,6 +407,7 @@ pub(super) const TABLE: [Pass; 13] = [
         when: |s, _| s.output.schedule().is_some(),
         grid: Grid::Planes,
         walks: false,
+        at_panel: true,
         overlaps: true,
     },
 ];

@@ -120,14 +120,15 @@ impl RendererPlan {
     /// The programs of the passes that the plan needs; `None` for the others. `groups`: see [`trace_groups`].
     fn wanted(&self, reading: Reading, groups: u32) -> impl Iterator<Item = Option<Program>> + '_ {
         let settings = &self.settings;
-        let optics = OpticsLayout::new(settings);
-        let shared = self.constants(&optics, groups);
+        let of_panel = self.constants(&OpticsLayout::new(settings), groups);
+        let of_traced = self.constants(&OpticsLayout::new(&settings.on_traced()), groups);
         TABLE.iter().map(move |pass| {
+            let shared = if pass.at_panel { &of_panel } else { &of_traced };
             (pass.when)(settings, self.keep).then(|| Program {
                 pass: pass.name,
                 walks: pass.walks,
                 shader: pass.shader(&settings.method, reading),
-                constants: pass.constants(&shared, settings),
+                constants: pass.constants(shared, settings),
             })
         })
     }
@@ -144,7 +145,7 @@ impl RendererPlan {
         let each = each.collect::<Result<_, _>>()?;
         let apart = match self.layout_apart(gpu, reading) {
             Ok(layout) => {
-                let optics = OpticsLayout::new(&self.settings);
+                let optics = OpticsLayout::new(&self.settings.on_traced());
                 let constants = self.constants(&optics, trace_groups(gpu.summary()));
                 Some((ApartPipelines::new(&table, &constants)?, layout))
             }
@@ -179,7 +180,7 @@ impl RendererPlan {
             return Err(reason);
         }
         let most = gpu.max_buffer_bytes();
-        apart::Layout::new(&self.settings, needs.absorption, needs.emissive, most)
+        apart::Layout::new(&self.settings.on_traced(), needs.absorption, needs.emissive, most)
             .ok_or("paths have no rays, or more than there is room for")
     }
 

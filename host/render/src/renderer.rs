@@ -3,7 +3,7 @@
 use super::apart::{ApartLists, Crew, Side};
 use super::body_tree::BodyTree;
 use super::fill;
-use super::frame_buffers::FrameBuffers;
+use super::frame_buffers::{FrameBuffers, Pixels};
 use super::last_frame::{LastFrame, Turn};
 use super::live_textures::{LiveTextures, Piece};
 use super::memory::{SharedBuffers, SHOWN_BYTES};
@@ -15,7 +15,7 @@ use super::read_back::{History, Surface};
 use super::resources::Resources;
 use super::scene_data::{rows, world_bounds, BodyData, Keep, SceneData};
 use super::settings::{FrameInputs, Overlapping, RenderError, RendererSettings};
-use super::slot::FrameSlot;
+use super::slot::{FrameSlot, Sets};
 use super::tiles::TileList;
 use super::warp::Movers;
 use crate::gpu::{
@@ -23,6 +23,7 @@ use crate::gpu::{
 };
 use crate::pack;
 use bytemuck::Zeroable;
+use dpm_device::planes::Raster;
 use dpm_scene::Scene;
 use dpm_shaders::structs::{
     self as gpu_structs, in_blocks, BodyNode, Counters, Frame, Instance, Mover, Schedule,
@@ -65,8 +66,10 @@ pub struct Renderer {
     last: LastFrame,
     /// The tiles that were active when shading rates were last decided. All others have the full rate.
     rated: Vec<bool>,
-    /// Copied into every slot.
-    tile_list: TileList,
+    /// The rasters that frames may trace, the largest first.
+    rungs: Vec<Rung>,
+    /// The tiles of the panel, where fewer pixels are traced than it has. Copied into every slot.
+    panel_tiles: Option<TileList>,
     /// The bodies that move while the planes of a frame last.
     movers: Movers,
     /// The textures that show what another program makes.
@@ -79,14 +82,47 @@ pub struct Renderer {
     orders: Orders,
     /// The next question that a frame may ask of the threads that walk.
     next_question: u64,
+    /// That of the panel.
     optics: OpticsLayout,
     prepared: PreparedScene,
     pub(super) gpu: Arc<Gpu>,
 }
 
+/// A raster that frames may trace.
+struct Rung {
+    raster: Raster,
+    /// Where its part of the table of optics lies, and what is in it.
+    optics: (u32, OpticsLayout),
+    /// Copied into every slot.
+    tile_list: TileList,
+}
+
+impl Rung {
+    /// All of a renderer with these settings.
+    fn all(settings: &RendererSettings) -> Vec<Self> {
+        let mut first = 0;
+        let rung = |raster| {
+            let of = settings.on(raster);
+            let optics = (first, OpticsLayout::new(&of));
+            first += optics.1.len();
+            Self { raster, optics, tile_list: TileList::new(raster, of.lens.as_ref()) }
+        };
+        settings.scale.rasters(settings.raster).map(rung).collect()
+    }
+}
+
 /// `tracked`: for each body of the scene the tracked body that carries it.
 fn is_lost(tracked: &[Option<u16>], body: usize, lost: &[bool]) -> bool {
     tracked[body].is_some_and(|t| lost.get(usize::from(t)).copied().unwrap_or(false))
+}
+
+/// Lists the tiles on which light can fall, or every tile.
+fn list_tiles(tiles: &mut TileList, every: bool, inputs: &FrameInputs<'_>, bodies: &[BodyData]) {
+    if every {
+        tiles.fill();
+    } else {
+        tiles.update(inputs.camera, bodies, inputs.poses, gpu_structs::INSTANCE_PROJECTED);
+    }
 }
 
 impl Renderer {
@@ -151,8 +187,10 @@ impl Renderer {
         };
         let overlap = overlaps.then(|| Overlap::new(gpu)).transpose()?;
         let last = LastFrame::none(tracked.len());
-        let tile_list = TileList::new(settings.raster, settings.lens.as_ref());
-        let rated = vec![false; tile_list.len()];
+        let rungs = Rung::all(&settings);
+        let panel_tiles =
+            settings.is_reduced().then(|| TileList::new(settings.raster, settings.lens.as_ref()));
+        let rated = vec![false; rungs[0].tile_list.len()];
         let movers = Movers::new(data.bodies.len(), &settings.plane_groups, !settings.shows_halftones());
         let live = LiveTextures::new(&data.live, settings.most_live_texels);
         let walks_tree = plan.walks_body_tree(reading);
@@ -176,7 +214,8 @@ impl Renderer {
             decides_rates,
             last,
             rated,
-            tile_list,
+            rungs,
+            panel_tiles,
             movers,
             live,
             walks_tree,
@@ -244,22 +283,28 @@ impl Renderer {
     /// Out of memory.
     pub fn create_slot(&self, debug: bool) -> Result<FrameSlot, GpuError> {
         let (gpu, resources, settings) = (&self.gpu, &self.resources, &self.settings);
-        let tile_list = self.tile_list.clone();
+        let tile_lists: Vec<_> = self.rungs.iter().map(|rung| rung.tile_list.clone()).collect();
+        let tiles = tile_lists[0].len();
+        let panel_tiles = self.panel_tiles.as_ref().map_or(tiles, TileList::len);
         let body_tree = BodyTree::new(if self.walks_tree { self.data.bodies.len() } else { 0 });
         let apart = resources.crew.as_ref().and(resources.pipelines.apart.as_ref());
         let scene = (&*self.data, self.reading, apart.map(|(_, layout)| *layout));
         let live = self.live.as_ref();
-        let buffers = FrameBuffers::new(gpu, settings, scene, tile_list.len(), body_tree, live, debug)?;
+        let buffers = FrameBuffers::new(gpu, settings, scene, (tiles, panel_tiles), body_tree, live, debug)?;
         buffers.clear(gpu, settings)?;
-        let set_of = |parity| {
+        let set_of = |parity, side| {
             let all = (&resources.shared, &*resources.scene);
             let bindings: Vec<_> = gpu_structs::BINDINGS
                 .iter()
-                .map(|&(name, binding)| (binding, buffers.of(name, parity, settings, all)))
+                .map(|&(name, binding)| (binding, buffers.of(name, (parity, side), settings, all)))
                 .collect();
             BindingSet::with_tree(&resources.pipelines.table, &bindings, buffers.device_tree.as_ref())
         };
-        let sets = [set_of(0)?, set_of(1)?];
+        let sets_of = |parity| -> Result<Sets, GpuError> {
+            let panel = buffers.panel.as_ref().map(|_| set_of(parity, Pixels::Panel)).transpose()?;
+            Ok(Sets { traced: set_of(parity, Pixels::Traced)?, panel })
+        };
+        let sets = [sets_of(0)?, sets_of(1)?];
         let lists = |parity: usize| -> Result<[CommandList; 2], GpuError> {
             let (set, stamps) = (&sets[parity], [FIRST_PASSES, PASSES.len() - FIRST_PASSES]);
             let [first, second] = stamps.map(|passes| passes as u32 + 1);
@@ -271,7 +316,7 @@ impl Renderer {
                 CommandList::record(gpu, second, |r| {
                     r.stamp();
                     self.record_passes(r, FIRST_PASSES..TABLE.len(), set, &buffers, parity);
-                    self.record_readback(r, &buffers, parity, tile_list.len());
+                    self.record_readback(r, &buffers, parity, tiles);
                 })?,
             ])
         };
@@ -286,8 +331,11 @@ impl Renderer {
             was_apart: false,
             _sets: sets,
             buffers,
-            tile_list,
+            tile_lists,
+            panel_tiles: self.panel_tiles.clone(),
+            rung: 0,
             raster: settings.raster,
+            traced: self.rungs[0].raster,
             parity: 0,
             stamps: [0; PASSES.len() + 2],
             resources: resources.clone(),
@@ -298,6 +346,11 @@ impl Renderer {
     /// it builds the tree over the bodies at the same poses.
     fn record_latch(&self, r: &mut Recorder<'_>, b: &FrameBuffers) {
         r.clear(&b.counters);
+        if let Some(panel) = &b.panel {
+            r.clear(&panel.counters);
+            r.copy(&self.resources.shared.schedule_start, &panel.schedule, size_of::<Schedule>());
+            r.copy(&panel.frame.host, &panel.frame.device, panel.frame.len_bytes);
+        }
         r.copy(&self.resources.shared.schedule_start, &b.schedule, size_of::<Schedule>());
         for latched in [&b.frame, &b.instances, &b.body_nodes, &b.movers] {
             r.copy(&latched.host, &latched.device, latched.len_bytes);
@@ -316,12 +369,7 @@ impl Renderer {
     }
 
     /// Records the first lists of frames whose rays the host walks.
-    fn record_apart(
-        &self,
-        set: &BindingSet,
-        b: &FrameBuffers,
-        parity: usize,
-    ) -> Result<ApartLists, GpuError> {
+    fn record_apart(&self, set: &Sets, b: &FrameBuffers, parity: usize) -> Result<ApartLists, GpuError> {
         let frame = b.apart.as_ref().expect("made with the frame");
         let (pipelines, _) = self.resources.pipelines.apart.as_ref().expect("compiled for it");
         let around = |r: &mut Recorder<'_>, what: Side| match what {
@@ -332,7 +380,13 @@ impl Renderer {
             Side::After => self.record_passes(r, TRACE + 1..FIRST_PASSES, set, b, parity),
         };
         let stamps = [1 + TRACE, FIRST_PASSES - TRACE - 1].map(|n| n as u32);
-        ApartLists::record(&self.gpu, (frame, pipelines, set), (&b.schedule, &b.counters), stamps, &around)
+        ApartLists::record(
+            &self.gpu,
+            (frame, pipelines, &set.traced),
+            (&b.schedule, &b.counters),
+            stamps,
+            &around,
+        )
     }
 
     /// Records `rows` of [`TABLE`] in their order, with a barrier after each. Of a pass that the method does not need only the time stamp is recorded.
@@ -340,18 +394,22 @@ impl Renderer {
         &self,
         r: &mut Recorder<'_>,
         rows: Range<usize>,
-        set: &BindingSet,
+        sets: &Sets,
         b: &FrameBuffers,
         parity: usize,
     ) {
         let (resources, raster) = (&self.resources, self.settings.raster);
         for (pass, pipeline) in TABLE[rows.clone()].iter().zip(&resources.pipelines.each[rows]) {
             if let Some(pipeline) = pipeline {
+                let (set, arguments, schedule) = match (&sets.panel, &b.panel) {
+                    (Some(set), Some(panel)) if pass.at_panel => (set, &panel.arguments, &panel.schedule),
+                    _ => (&sets.traced, &b.arguments, &b.schedule),
+                };
                 match pass.grid {
-                    Grid::Tiles => r.dispatch_indirect(pipeline, set, &b.arguments, PER_TILE_QUARTER),
-                    Grid::Rates => r.dispatch_indirect(pipeline, set, &b.arguments, PER_TILE_RATES),
-                    Grid::Work => r.dispatch_indirect(pipeline, set, &b.schedule, 0),
-                    Grid::Moving => r.dispatch_indirect(pipeline, set, &b.arguments, PER_MOVING_QUARTER),
+                    Grid::Tiles => r.dispatch_indirect(pipeline, set, arguments, PER_TILE_QUARTER),
+                    Grid::Rates => r.dispatch_indirect(pipeline, set, arguments, PER_TILE_RATES),
+                    Grid::Work => r.dispatch_indirect(pipeline, set, schedule, 0),
+                    Grid::Moving => r.dispatch_indirect(pipeline, set, arguments, PER_MOVING_QUARTER),
                     Grid::Planes => r.dispatch(pipeline, set, pack::gpu::workgroups(raster)),
                 }
                 r.barrier();
@@ -363,7 +421,7 @@ impl Renderer {
                 r.copy(
                     &resources.shared.history[parity],
                     prior,
-                    in_blocks(raster.pixel_count()) * b.each.history,
+                    in_blocks(self.rungs[0].raster.pixel_count()) * b.each.history,
                 );
                 r.barrier();
             }
@@ -372,17 +430,22 @@ impl Renderer {
 
     /// Records the copies that the host reads, those for debugging included.
     fn record_readback(&self, r: &mut Recorder<'_>, b: &FrameBuffers, parity: usize, tiles: usize) {
-        let (shared, pixels) = (&self.resources.shared, in_blocks(self.settings.raster.pixel_count()));
+        let (shared, pixels) = (&self.resources.shared, in_blocks(self.rungs[0].raster.pixel_count()));
+        let panel_pixels = in_blocks(self.settings.raster.pixel_count());
         if let Some(planes_host) = &b.planes_host {
             r.copy(&b.planes, planes_host, b.plane_bytes);
         }
         if let Some(codes_host) = &b.codes_host {
-            r.copy(&b.codes, codes_host, pixels * b.each.codes);
+            r.copy(&b.codes, codes_host, panel_pixels * b.each.codes);
         }
         r.copy(&b.counters, &b.counters_host, size_of::<Counters>());
+        if let Some(panel) = &b.panel {
+            r.copy(&panel.counters, &panel.counters_host, size_of::<Counters>());
+        }
         if let Some(d) = &b.debug_host {
-            r.copy(b.shown(&self.settings), &d.shown, pixels * SHOWN_BYTES);
-            r.copy(&b.surfaces, &d.surfaces, pixels * b.each.surfaces);
+            let [shown, surfaces] = b.seen(&self.settings);
+            r.copy(shown, &d.shown, panel_pixels * SHOWN_BYTES);
+            r.copy(surfaces, &d.surfaces, panel_pixels * b.each.surfaces);
             if let Some(to) = &d.guides {
                 r.copy(&b.guides, to, pixels * b.each.guides);
             }
@@ -394,7 +457,7 @@ impl Renderer {
             r.copy(&b.schedule, &d.schedule, size_of::<Schedule>());
             r.copy(b.work(), &d.work, pixels * b.each.work);
             if let Some(to) = &d.motion {
-                r.copy(&b.motion, to, pixels * b.each.motion);
+                r.copy(&b.motion, to, panel_pixels * b.each.motion);
             }
         }
         r.barrier_to_host();
@@ -417,23 +480,29 @@ impl Renderer {
             _ => false,
         };
         slot.buffers.show(&self.data, self.live.as_ref(), inputs.animated_at_ns, &mut self.bodies);
-        if self.settings.camera_is_eye || self.keep.every_tile {
-            slot.tile_list.fill();
-        } else {
-            slot.tile_list.update(inputs.camera, &self.bodies, inputs.poses, gpu_structs::INSTANCE_PROJECTED);
-        }
+        let rung = inputs.rung.min(self.rungs.len() - 1);
+        let traced = self.rungs[rung].raster;
+        // Where another raster was traced last, what lies in the slot's buffers is not that of these tiles.
+        let is_new = std::mem::replace(&mut slot.rung, rung) != rung;
+        slot.traced = traced;
+        let every_tile = self.settings.camera_is_eye || self.keep.every_tile;
         let turn = self.last.turn_of(inputs.frame);
-        self.movers.find(
-            inputs.camera,
-            &self.bodies,
-            inputs.poses,
-            inputs.sweep,
-            turn.drawn,
-            &mut slot.tile_list,
-        );
+        // Movers are found on the panel's tiles.
+        let tiles = slot.panel_tiles.as_mut().unwrap_or(&mut slot.tile_lists[0]);
+        list_tiles(tiles, every_tile, inputs, &self.bodies);
+        self.movers.find(inputs.camera, &self.bodies, inputs.poses, inputs.sweep, turn.drawn, tiles);
         slot.buffers.movers.host.write(self.movers.movers());
         // From here on the bodies are where this frame draws them.
         let inputs = &FrameInputs { poses: self.movers.poses(), ..*inputs };
+        let panel_camera = inputs.camera;
+        let traced_camera = inputs.camera.at_raster(traced);
+        let on_traced = FrameInputs { camera: &traced_camera, ..*inputs };
+        let inputs = if slot.panel_tiles.is_some() {
+            list_tiles(&mut slot.tile_lists[rung], every_tile || is_new, &on_traced, &self.bodies);
+            &on_traced
+        } else {
+            inputs
+        };
         // A tile has four workgroups of 8 x 8 pixels, and one workgroup in the pass that decides rates, which runs in every second frame that is
         // drawn. The checkerboard uses the same count of frames, so that both of its halves are traced at one rate.
         let decides_rates = self.decides_rates && turn.drawn.is_multiple_of(2);
@@ -441,15 +510,25 @@ impl Renderer {
         // slot and none in another, and a run could not be repeated.
         let left = if decides_rates { &self.rated[..] } else { &[] };
         let out = bytemuck::cast_slice_mut(slot.buffers.tiles.bytes_mut());
-        let (tile_count, moving_tiles) = slot.tile_list.write(left, out);
+        let tile_list = &slot.tile_lists[rung];
+        let (tile_count, moving_tiles) = tile_list.write(left, out);
+        let tiles_x = tile_list.tiles_x();
         let rate_tiles = if decides_rates { tile_count } else { 0 };
         let groups = [tile_count * 4, rate_tiles, moving_tiles * 4];
         slot.buffers.arguments.write(&groups.map(|groups| [groups, 1u32, 1, 0]));
         let body_nodes = self.write_bodies(&mut slot.buffers, inputs);
-        let constants = self.frame_constants(inputs, &turn, (tile_count, slot.tile_list.tiles_x()));
+        let constants = self.frame_constants(inputs, &turn, &self.rungs[rung], (tile_count, tiles_x));
         let shows_all = if slot.buffers.debug_host.is_some() { gpu_structs::FRAME_SHOWS_ALL } else { 0 };
-        let frame = Frame { body_nodes, flags: constants.flags | shows_all, ..constants };
+        let has_panel = slot.buffers.panel.is_some();
+        // The pass `prepare` reads the light that is shown.
+        let shows_light = if has_panel { gpu_structs::FRAME_SHOWS_ALL } else { shows_all };
+        let frame = Frame { body_nodes, flags: constants.flags | shows_light, ..constants };
         slot.buffers.frame.host.write(&[frame]);
+        self.write_panel(
+            slot,
+            &FrameInputs { camera: panel_camera, ..*inputs },
+            &Frame { flags: constants.flags | shows_all, ..frame },
+        );
         slot.parity = 1 - self.last.parity;
         let order = self.orders.next(slot.parity);
         let samples = (inputs.budget_spp, inputs.spp, u64::from(tile_count) * 256);
@@ -462,11 +541,35 @@ impl Renderer {
         submitted?;
         self.orders.submitted(slot.parity, order);
         if decides_rates {
-            self.rated.copy_from_slice(slot.tile_list.active());
+            let active = slot.tile_lists[rung].active();
+            self.rated.fill(false);
+            self.rated[..active.len()].copy_from_slice(active);
         }
         let lost = (0..inputs.poses.len()).map(|i| is_lost(&self.tracked, i, inputs.lost));
         self.last.becomes(inputs, slot.parity, lost);
         Ok(())
+    }
+
+    /// Writes what the panel's pixels have of their own, where fewer are traced: their tiles, and the constants `frame` of the traced pixels with
+    /// their raster, of which no history is known.
+    fn write_panel(&self, slot: &mut FrameSlot, inputs: &FrameInputs<'_>, frame: &Frame) {
+        let (Some(tiles), Some(panel)) = (&slot.panel_tiles, &mut slot.buffers.panel) else { return };
+        let (tile_count, moving) = tiles.write(&[], bytemuck::cast_slice_mut(panel.tiles.bytes_mut()));
+        panel.arguments.write(&[tile_count * 4, 0, moving * 4].map(|groups| [groups, 1u32, 1, 0]));
+        let c = inputs.camera;
+        let mut frame = Frame {
+            intrinsics: [c.fx as f32, c.fy as f32, c.cx as f32, c.cy as f32],
+            width: c.raster.width(),
+            height: c.raster.height(),
+            tile_count,
+            tiles_x: tiles.tiles_x(),
+            pixel_size: (1.0 / c.fx) as f32,
+            history_frame: gpu_structs::NO_FRAME,
+            flags: frame.flags & !gpu_structs::FRAME_STEADY,
+            ..*frame
+        };
+        self.optics.describe(c, 0, &mut frame);
+        panel.frame.host.write(&[frame]);
     }
 
     /// Starts the lists of a slot that has all of its inputs: those between which the host walks rays if it can and all samples surely have room.
@@ -533,7 +636,7 @@ impl Renderer {
             return Ok(());
         }
         (self.resources.shared.history.iter()).try_for_each(|buffer| {
-            let pixels = self.settings.raster.pixel_count();
+            let pixels = self.rungs[0].raster.pixel_count();
             fill::edit(&self.gpu, buffer, History::buffer_bytes(pixels), |bytes| {
                 let mut all = History::all(bytes, pixels);
                 all[range.clone()].iter_mut().for_each(&mut change);
@@ -583,10 +686,10 @@ impl Renderer {
         &self,
         inputs: &FrameInputs<'_>,
         turn: &Turn,
+        Rung { raster, optics: (first_optics, optics), .. }: &Rung,
         (tile_count, tiles_x): (u32, u32),
     ) -> Frame {
         let origin = inputs.camera.position();
-        let raster = self.settings.raster;
         let method = &self.settings.method;
         let c = inputs.camera;
         // What deforms moves by more than its pose tells.
@@ -627,7 +730,7 @@ impl Renderer {
                 self.data.environment_select
             },
             world_origin: origin.as_vec3().into(),
-            history_frame: self.last.frame,
+            history_frame: self.last.frame_on(c.raster),
             budget_spp: inputs.budget_spp.min(method.most_spp() as f32),
             history_cap: method.history_cap,
             zone_spp: method.paper.zone_spp,
@@ -645,7 +748,7 @@ impl Renderer {
             group_count: self.settings.plane_groups.len() as u32,
             ..Frame::zeroed()
         };
-        self.optics.describe(c, &mut frame);
+        optics.describe(c, *first_optics, &mut frame);
         frame
     }
 }

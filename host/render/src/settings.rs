@@ -2,6 +2,7 @@
 
 use super::drive::Drive;
 use super::method::Method;
+use super::scale::Scale;
 use super::scene_data::SceneDataError;
 use crate::gpu::{DeviceSummary, GpuError};
 use crate::pack::Halftone;
@@ -14,8 +15,10 @@ use glam::{DAffine3, DVec3};
 /// What does not change while a renderer lives.
 #[derive(Clone, Debug)]
 pub struct RendererSettings {
-    /// Raster traced.
+    /// Raster of the panel.
     pub raster: Raster,
+    /// Which share of it is traced.
+    pub scale: Scale,
     /// Most closest-hit rays of a path, the primary ray included.
     pub depth: u32,
     /// Seed of the run.
@@ -140,6 +143,9 @@ pub struct FrameInputs<'a> {
     pub sweep: Option<Sweep<'a>>,
     /// For each tracked body whether it is lost, so that no light falls on it. Bodies beyond the end are not lost.
     pub lost: &'a [bool],
+    /// Which of the shares of [`RendererSettings::scale`] is traced, from 0 for the largest; beyond the end the smallest. Another one than in the
+    /// frame before begins all histories anew.
+    pub rung: usize,
 }
 
 impl<'a> FrameInputs<'a> {
@@ -164,6 +170,7 @@ impl<'a> FrameInputs<'a> {
             animated_at_ns: 0,
             sweep: None,
             lost: &[],
+            rung: 0,
         }
     }
 }

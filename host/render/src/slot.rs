@@ -42,6 +42,12 @@ impl FrameCost {
     }
 }
 
+/// What the shaders are given: the passes that work on the traced pixels, and those that work on the panel's, if these are others.
+pub(super) struct Sets {
+    pub traced: BindingSet,
+    pub panel: Option<BindingSet>,
+}
+
 /// The memory of one frame in flight. It moves between threads: one fills and submits it, another waits for it and reads it. It keeps alive what its
 /// submission reads, so it may outlive its renderer. Dropping it waits for the submission as [`FrameFence`] does.
 pub struct FrameSlot {
@@ -53,10 +59,18 @@ pub struct FrameSlot {
     pub(super) apart: Option<[ApartLists; 2]>,
     /// The frame that ran last did so.
     pub(super) was_apart: bool,
-    pub(super) _sets: [BindingSet; 2],
+    pub(super) _sets: [Sets; 2],
     pub(super) buffers: FrameBuffers,
-    pub(super) tile_list: TileList,
+    /// Of each raster that a frame may trace, the largest first.
+    pub(super) tile_lists: Vec<TileList>,
+    /// Of the panel, where fewer pixels are traced than it has.
+    pub(super) panel_tiles: Option<TileList>,
+    /// The list of them that was traced last.
+    pub(super) rung: usize,
+    /// Raster of the panel.
     pub(super) raster: Raster,
+    /// The raster that was traced last.
+    pub(super) traced: Raster,
     /// The list that ran last.
     pub(super) parity: usize,
     pub(super) stamps: [u64; PASSES.len() + 2],
@@ -89,6 +103,18 @@ impl FrameSlot {
             counters: bytemuck::cast(self.buffers.counters_host.read::<Counters>(1)[0]),
             ..FrameCost::default()
         };
+        if let Some(panel) = &self.buffers.panel {
+            let panel = panel.counters_host.read::<Counters>(1)[0];
+            let traced = cost.counters();
+            cost.counters = bytemuck::cast(Counters {
+                rays: traced.rays + panel.rays,
+                camera_rays: traced.camera_rays + panel.camera_rays,
+                lit_pixels: panel.lit_pixels,
+                clipped_values: panel.clipped_values,
+                nan_values: panel.nan_values,
+                ..traced
+            });
+        }
         cost.overlaps = self.resources.overlap.is_some();
         let [first, second] = &self.lists[self.parity];
         let (of_first, of_second) = self.stamps.split_at_mut(FIRST_PASSES + 1);
@@ -137,14 +163,14 @@ impl FrameSlot {
     /// Motion, apparent size, angle and albedo of each lit pixel. Only with `debug` at creation, and for methods that use them.
     pub fn guides(&self) -> Option<Vec<Guide>> {
         let guides = self.buffers.debug_host.as_ref()?.guides.as_ref()?;
-        let pixels = self.raster.pixel_count();
+        let pixels = self.traced.pixel_count();
         Some(Guide::all(guides.read(Guide::buffer_bytes(pixels)), pixels))
     }
 
     /// The history after this frame. Only with `debug` at creation, and for methods that keep one.
     pub fn history(&self) -> Option<Vec<History>> {
         let history = self.buffers.debug_host.as_ref()?.history.as_ref()?;
-        let pixels = self.raster.pixel_count();
+        let pixels = self.traced.pixel_count();
         Some(History::all(history.read(History::buffer_bytes(pixels)), pixels))
     }
 
@@ -160,7 +186,7 @@ impl FrameSlot {
                     -1.0
                 }
             };
-            let pixels = self.raster.pixel_count();
+            let pixels = self.traced.pixel_count();
             let bytes = prior.read(History::buffer_bytes(pixels));
             elements(bytes, part("B_HISTORY", "light"), pixels).iter().map(known).collect()
         })
@@ -168,7 +194,7 @@ impl FrameSlot {
 
     /// Mean of the samples of each pixel in this frame, and their number as the fourth value. Only with `debug` at creation.
     pub fn traced(&self) -> Option<&[[f32; 4]]> {
-        self.buffers.debug_host.as_ref().map(|d| d.traced.read(self.raster.pixel_count()))
+        self.buffers.debug_host.as_ref().map(|d| d.traced.read(self.traced.pixel_count()))
     }
 
     /// The work items of the pass `trace`, in the order of their samples, and how many samples they have together. Only with `debug` at creation.
@@ -176,7 +202,7 @@ impl FrameSlot {
         let debug = self.buffers.debug_host.as_ref()?;
         let listed = debug.schedule.read::<Schedule>(1)[0].listed;
         let items = (listed as u32) as usize;
-        Some((debug.work.read(items.min(self.raster.pixel_count())), (listed >> 32) as u32))
+        Some((debug.work.read(items.min(self.traced.pixel_count())), (listed >> 32) as u32))
     }
 
     /// The rays that each path of the frame has asked for last, in the order of the samples, with the bodies and the tree over them; `None` unless the
@@ -200,7 +226,7 @@ impl FrameSlot {
 
     /// Pixels of the tiles that the frame worked on.
     pub fn listed_pixels(&self) -> u64 {
-        let tiles = self.tile_list.active().iter().filter(|is_active| **is_active).count();
+        let tiles = self.tile_lists[self.rung].active().iter().filter(|is_active| **is_active).count();
         tiles as u64 * u64::from(TILE * TILE)
     }
 
@@ -213,6 +239,6 @@ impl FrameSlot {
 
     /// Shading rate of every tile: log2 of the coarse pixel's sides in bits 0..1 and 2..3. Only with `debug` at creation.
     pub fn rates(&self) -> Option<&[u32]> {
-        self.buffers.debug_host.as_ref().map(|d| d.rates.read(self.tile_list.len()))
+        self.buffers.debug_host.as_ref().map(|d| d.rates.read(self.tile_lists[self.rung].len()))
     }
 }

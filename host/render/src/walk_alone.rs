@@ -1,5 +1,6 @@
 //! The walk alone on a device: for measurements.
 
+use super::frame_buffers::Pixels;
 use super::renderer::Renderer;
 use super::walker::{Kernel, Ray, WalkScene};
 use crate::gpu::{BindingSet, Buffer, CommandList, FrameFence, GpuError, MemoryKind};
@@ -39,7 +40,7 @@ impl Renderer {
                 let buffer = match name {
                     "B_SHOWN" => &queue,
                     "B_CODES" => &hits,
-                    name => b.of(name, 0, &self.settings, all),
+                    name => b.of(name, (0, Pixels::Traced), &self.settings, all),
                 };
                 (binding, buffer)
             })

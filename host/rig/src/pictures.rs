@@ -16,7 +16,7 @@ use dpm_device::projector::light_of_planes;
 use dpm_render::drive::Drive;
 use dpm_render::gpu::{Gpu, GpuError};
 use dpm_render::method::Method;
-use dpm_render::{FrameInputs, RenderError, Renderer, RendererSettings};
+use dpm_render::{FrameInputs, RenderError, Renderer, RendererSettings, Scale};
 use dpm_scene::geometry::projector::ProjectorCamera;
 use dpm_shaders::structs::NO_HIT;
 use glam::{DAffine3, DVec2, DVec3, Vec3};
@@ -135,6 +135,7 @@ pub fn pictures(
     // The pictures need only the surfaces, so the simplest method is enough.
     let settings = |lens| RendererSettings {
         method: Method::full(1),
+        scale: Scale::WHOLE,
         lens,
         plane_groups: Vec::new(),
         ..renderer_settings(rig)

@@ -4,6 +4,7 @@
 use crate::config::RigConfig;
 use crate::failure::{Failure, FailureKind};
 use crate::pipeline::projector;
+use crate::plan::scale::scale_of;
 use dpm_render::gpu::{Gpu, GpuOptions};
 use dpm_render::least_memory_bytes;
 
@@ -55,7 +56,12 @@ pub(crate) fn gpu_options(config: &RigConfig) -> GpuOptions {
     GpuOptions {
         validation: std::env::var_os("DPM_VALIDATION").is_some(),
         device: config.render.gpu.clone(),
-        memory_bytes: least_memory_bytes(config.projector.raster(), &config.render.to_method(), FEWEST_SLOTS),
+        memory_bytes: least_memory_bytes(
+            config.projector.raster(),
+            scale_of(&config.render),
+            &config.render.to_method(),
+            FEWEST_SLOTS,
+        ),
         ..GpuOptions::default()
     }
 }

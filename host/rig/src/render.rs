@@ -32,6 +32,7 @@ pub(crate) fn submit(
             animated_at_ns: plan.centre_at.0,
             sweep: plan.sweep(),
             lost: &plan.lost,
+            rung: plan.rung,
         },
     )
 }
@@ -45,7 +46,8 @@ pub(crate) struct WarmUp {
     pub gpu_ns: Option<i64>,
 }
 
-/// Renders one frame that is never shown, with at most `budget_milli` thousandths of a sample per pixel, so that one-time
+/// Renders one frame that is never shown, with at most `budget_milli` thousandths of a sample per pixel on this share of
+/// the raster, so that one-time
 /// work of the driver (translating shaders) is done before a slot depends on it.
 ///
 /// # Errors
@@ -54,7 +56,7 @@ pub(crate) fn warm_up(
     slot: &mut FrameSlot,
     rig: &Rig,
     renderer: &mut Renderer,
-    budget_milli: u64,
+    (budget_milli, rung): (u64, usize),
     timeout_ns: u64,
 ) -> Result<WarmUp, GpuError> {
     let watch = Stopwatch::start();
@@ -62,7 +64,7 @@ pub(crate) fn warm_up(
     plan.tracked_poses.extend(rig.tracked().map(|b| affine(&b.rest)));
     rig.scene_poses(&plan.tracked_poses, 0, &mut plan.scene_poses);
     (plan.eye, plan.gaze) = rig.observer.eye_and_gaze(&plan.tracked_poses);
-    plan.budget_milli = budget_milli;
+    (plan.budget_milli, plan.rung) = (budget_milli, rung);
     submit(&plan, slot, renderer)?;
     let cost = slot.wait(timeout_ns)?;
     let gpu_ns = cost.pass_ns.iter().sum::<u64>() as i64;

@@ -19,6 +19,9 @@ const WITH_TABLES: &[&str] = &[
     "spatial_regression",
     "spatial_disk",
     "compensate",
+    "prepare",
+    "enlarge",
+    "edges",
     "halftone",
     "motion",
     "warp",
@@ -26,7 +29,7 @@ const WITH_TABLES: &[&str] = &[
 ];
 
 /// Those of them whose rays walk through the scene: each is built a third time, for devices that trace rays themselves.
-const WITH_QUERIES: &[&str] = &["primary", "trace"];
+const WITH_QUERIES: &[&str] = &["primary", "trace", "edges"];
 
 /// Parts of the pass `trace` for software Vulkan, where the host walks the rays: output, source, and a define beside that of texels.
 const APART: &[(&str, &str, &str)] = &[

@@ -14,7 +14,7 @@ use dpm_render::method::Method;
 use dpm_render::pack::{source_bits, Halftone};
 use dpm_render::warp::{plane_groups, Sweep, FOLLOW_SHARE};
 use dpm_render::{
-    FrameInputs, FrameSlot, Output, Overlapping, RenderError, Renderer, RendererSettings, Tracing,
+    FrameInputs, FrameSlot, Output, Overlapping, RenderError, Renderer, RendererSettings, Scale, Tracing,
 };
 use dpm_scene::geometry::projector::ProjectorCamera;
 use dpm_scene::{shapes, Material, Scene, Texture};
@@ -262,6 +262,7 @@ impl Card {
     ) -> Result<Frames, RenderError> {
         let settings = RendererSettings {
             raster: camera.raster,
+            scale: Scale::WHOLE,
             depth: 2,
             seed: 1,
             clamp_indirect: None,

@@ -49,7 +49,7 @@ impl Reference {
                 Some(frames) => frames,
                 None => {
                     each("reference");
-                    let seen = theatre.play(&method, spp as f32, 0x9e37_0000 + half, &mut |_, _| ())?;
+                    let seen = theatre.play_whole(&method, spp as f32, 0x9e37_0000 + half)?;
                     write_frames(&path, &seen.frames)?;
                     seen.frames
                 }

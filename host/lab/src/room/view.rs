@@ -3,7 +3,7 @@
 use dpm_render::drive::Drive;
 use dpm_render::gpu::Gpu;
 use dpm_render::method::Method;
-use dpm_render::{FrameInputs, FrameSlot, RenderError, Renderer, RendererSettings};
+use dpm_render::{FrameInputs, FrameSlot, RenderError, Renderer, RendererSettings, Scale};
 use dpm_rig::pipeline::renderer_settings;
 use dpm_rig::rig::Rig;
 use dpm_scene::geometry::projector::ProjectorCamera;
@@ -50,6 +50,7 @@ impl View {
         // Only the surfaces are asked for, so the simplest method is enough.
         let settings = RendererSettings {
             raster: camera.raster,
+            scale: Scale::WHOLE,
             method: Method::full(1),
             drive: Drive::even(1.0),
             lens: (!camera.lens.is_pinhole()).then_some(camera),

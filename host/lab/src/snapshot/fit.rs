@@ -4,7 +4,7 @@ use crate::sequence::{draw, BodyPlaces};
 use dpm_device::planes::Raster;
 use dpm_render::gpu::Gpu;
 use dpm_render::method::Method;
-use dpm_render::{RenderError, Renderer, RendererSettings};
+use dpm_render::{RenderError, Renderer, RendererSettings, Scale};
 use dpm_rig::config::{CalibrationConfig, GazeConfig, GazePointConfig, ObserverConfig, PerChannel};
 use dpm_rig::config::{ProjectorConfig, RigConfig};
 use dpm_rig::pipeline::renderer_settings;
@@ -157,6 +157,7 @@ const CLIPPED: f64 = 0.01;
 pub(crate) fn exposure(rig: &Rig, gpu: &Arc<Gpu>, poses: &BodyPlaces) -> Result<f64, RenderError> {
     let settings = RendererSettings {
         method: Method::full(EXPOSURE_SPP),
+        scale: Scale::WHOLE,
         halftone: None,
         plane_groups: Vec::new(),
         ..renderer_settings(rig)

@@ -15,7 +15,7 @@ use dpm_common::files::{check_folder, write_atomically};
 use dpm_device::time::HostTime;
 use dpm_render::gpu::Gpu;
 use dpm_render::method::Method;
-use dpm_render::{FrameSlot, Keep, RenderError, Renderer, RendererSettings};
+use dpm_render::{FrameSlot, Keep, RenderError, Renderer, RendererSettings, Scale};
 use dpm_rig::config::{BodyConfig, MotionValue, RenderConfig, RigConfig};
 use dpm_rig::failure::{Failure, FailureKind};
 use dpm_rig::light::recorder::LightFrame;
@@ -317,9 +317,13 @@ impl<'a> Player<'a> {
     fn new(rig: &'a Rig, gpu: &'a Arc<Gpu>) -> Result<Self, Failure> {
         // What surfaces are like is of interest out of the light too.
         let keep = Keep { every_pixel: true, ..Keep::default() };
-        // The views show code values, whatever the planes make of them.
-        let settings =
-            RendererSettings { halftone: None, plane_groups: Vec::new(), ..renderer_settings(rig) };
+        // The views show code values, whatever the planes make of them, and every pixel as it is traced itself.
+        let settings = RendererSettings {
+            halftone: None,
+            plane_groups: Vec::new(),
+            scale: Scale::WHOLE,
+            ..renderer_settings(rig)
+        };
         let renderer = Renderer::keeping(gpu, &rig.scene, settings, keep).map_err(gpu_failure)?;
         let slot = renderer.create_slot(true).map_err(gpu_failure)?;
         let method = rig.config.render.to_method();

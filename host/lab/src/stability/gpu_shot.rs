@@ -5,7 +5,9 @@ use dpm_render::drive::Drive;
 use dpm_render::gpu::Gpu;
 use dpm_render::method::Method;
 use dpm_render::scene_data::Keep;
-use dpm_render::{FrameInputs, FrameSlot, Output, Overlapping, Renderer, RendererSettings, Surface, Tracing};
+use dpm_render::{
+    FrameInputs, FrameSlot, Output, Overlapping, Renderer, RendererSettings, Scale, Surface, Tracing,
+};
 use dpm_scene::geometry::projector::ProjectorCamera;
 use dpm_scene::Scene;
 use dpm_shaders::structs::{Counters, NO_HIT};
@@ -53,6 +55,8 @@ pub struct Shot<'a> {
     pub method: Option<Method>,
     /// Who finds what a ray meets.
     pub tracing: Tracing,
+    /// The share of the raster that is traced.
+    pub scale: Scale,
 }
 
 impl<'a> Shot<'a> {
@@ -76,6 +80,7 @@ impl<'a> Shot<'a> {
             leave_nothing_out: false,
             method: None,
             tracing: Tracing::Auto,
+            scale: Scale::WHOLE,
         }
     }
 
@@ -92,6 +97,7 @@ impl<'a> Shot<'a> {
     pub fn settings(&self) -> RendererSettings {
         RendererSettings {
             raster: self.camera.raster,
+            scale: self.scale,
             depth: self.depth,
             seed: self.seed,
             clamp_indirect: self.clamp_indirect,

@@ -24,6 +24,7 @@ fn dpm(spp: u32) -> Method {
 fn settings(method: &Method, camera: &ProjectorCamera, tracing: Tracing) -> RendererSettings {
     RendererSettings {
         raster: camera.raster,
+        scale: crate::Scale::WHOLE,
         depth: 4,
         seed: 7,
         clamp_indirect: None,

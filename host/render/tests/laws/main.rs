@@ -3,3 +3,4 @@
 #[path = "../../../scene/tests/laws/common/mod.rs"]
 mod common;
 mod hostile_gltf;
+mod scale;

@@ -36,7 +36,7 @@ pub use safety::{
     EyesConfig, InterlockConfig, InterlockSignal, KeyInterlockConfig, LimitsConfig, LineInterlockConfig,
     NoInterlockConfig, ProcessInterlockConfig, Restart, SafetyConfig,
 };
-pub use values::{BitOrder, LiveSource, PerChannel, PictureSource};
+pub use values::{BitOrder, LiveSource, PerChannel, PictureSource, RenderScale};
 pub use wearable::{Wearable, WearableConfig};
 pub use world::*;
 

@@ -1,6 +1,6 @@
 //! Kinds of values that several sections use: numbers by channel, sources of pictures, and the order of bits.
 
-use dpm_common::keys::read::{ConfigValue, Limit, Reader};
+use dpm_common::keys::read::{ConfigValue, Limit, Reader, Within};
 use dpm_common::keys::source::{Node, Value};
 use dpm_device::planes::PlaneSchedule;
 use std::fmt;
@@ -48,6 +48,47 @@ impl Limit<Option<PerChannel>> for Each {
     }
     fn describe(&self) -> String {
         Limit::<PerChannel>::describe(self)
+    }
+}
+
+/// Which share of the projector's columns and rows is traced.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub enum RenderScale {
+    /// Always this one.
+    Share(f64),
+    /// The largest that fits into a slot.
+    Auto,
+}
+
+impl ConfigValue for RenderScale {
+    fn kind() -> String {
+        "a number, or \"auto\"".into()
+    }
+
+    fn read(node: &Node, reader: &mut Reader, key: &str) -> Option<Self> {
+        match &node.value {
+            Value::String(word) if word == "auto" => Some(Self::Auto),
+            _ => f64::read(node, reader, key).map(Self::Share),
+        }
+    }
+
+    fn show(&self) -> String {
+        match self {
+            Self::Share(share) => share.show(),
+            Self::Auto => format!("{:?}", "auto"),
+        }
+    }
+}
+
+impl Limit<RenderScale> for Within<f64> {
+    fn allows(&self, value: &RenderScale) -> bool {
+        match value {
+            RenderScale::Share(share) => Limit::<f64>::allows(self, share),
+            RenderScale::Auto => true,
+        }
+    }
+    fn describe(&self) -> String {
+        Limit::<f64>::describe(self)
     }
 }
 

@@ -13,7 +13,7 @@ use crate::telemetry::report::Recovery;
 use crate::tracks::SampleRhythm;
 use dpm_device::time::HostTime;
 use dpm_handoff::path::Lock;
-use std::sync::atomic::{AtomicBool, AtomicI64, AtomicU64, Ordering};
+use std::sync::atomic::{AtomicBool, AtomicI64, AtomicU64, AtomicUsize, Ordering};
 use std::sync::Arc;
 
 /// Time that a projector needs to receive and check a frame after the medium has accepted all of it, nanoseconds, for one
@@ -247,11 +247,17 @@ pub(crate) struct CrewFacts {
     /// Largest average of samples per pixel that the GPU's times allow, in thousandths; `u64::MAX` while nothing is
     /// known of them.
     pub budget_milli: AtomicU64,
+    /// Which of the shares of the raster the next frames trace.
+    pub rung: AtomicUsize,
 }
 
 impl CrewFacts {
     /// For a crew that begins, on a GPU that took `frame_ns` for a frame while it was otherwise idle, with slots of `slot_ns`.
     pub(crate) fn new(frame_ns: i64, slot_ns: i64) -> Self {
-        Self { gpu: GpuPace::new(frame_ns, slot_ns), budget_milli: AtomicU64::new(u64::MAX) }
+        Self {
+            gpu: GpuPace::new(frame_ns, slot_ns),
+            budget_milli: AtomicU64::new(u64::MAX),
+            rung: AtomicUsize::new(0),
+        }
     }
 }

@@ -4,6 +4,7 @@
 use super::facts::{CrewFacts, Facts};
 use crate::frame::job::{Fate, FrameNote};
 use crate::plan::budget::BudgetController;
+use crate::plan::scale::{Samples, ScaleController};
 use dpm_device::time::HostTime;
 use std::sync::atomic::Ordering;
 use std::sync::Arc;
@@ -80,6 +81,8 @@ pub(crate) struct PackStage {
     crew: Arc<CrewFacts>,
     times: GpuTimes,
     budget: Option<BudgetController>,
+    /// `None` if every frame traces the same share of the raster.
+    scale: Option<ScaleController>,
     late_in_a_row: usize,
     /// Samples that the last frame might take, by each of the two bounds.
     allowed: [u64; 2],
@@ -88,8 +91,15 @@ pub(crate) struct PackStage {
 impl PackStage {
     /// For a crew. `budget`: `None` if every frame gets the rays that the rig file asks for.
     pub(crate) fn new(facts: Arc<Facts>, crew: Arc<CrewFacts>, budget: Option<BudgetController>) -> Self {
-        let this =
-            Self { facts, crew, times: GpuTimes::new(false), budget, late_in_a_row: 0, allowed: [0; 2] };
+        let this = Self {
+            facts,
+            crew,
+            times: GpuTimes::new(false),
+            budget,
+            scale: None,
+            late_in_a_row: 0,
+            allowed: [0; 2],
+        };
         this.wait_is_over();
         this
     }
@@ -97,6 +107,11 @@ impl PackStage {
     /// The same with software Vulkan in the place of a GPU, if `is_software`.
     pub(crate) fn on_software(self, is_software: bool) -> Self {
         Self { times: GpuTimes::new(is_software), ..self }
+    }
+
+    /// The same with a share of the raster that follows the frames' times.
+    pub(crate) fn scaling(self, scale: Option<ScaleController>) -> Self {
+        Self { scale, ..self }
     }
 
     /// From `now` on packing waits for the GPU to finish the frame of `note`. Returns how long it may take, nanoseconds.
@@ -129,6 +144,16 @@ impl PackStage {
             // rays would fit, and light would come a slot later (measured on an H100).
             controller.measured(note.plan.budget_milli, took_ns);
             self.crew.budget_milli.store(controller.rays(), Ordering::Relaxed);
+        }
+        if let Some(scale) = &mut self.scale {
+            let samples = match &self.budget {
+                None => Samples::Fixed,
+                Some(budget) if budget.is_at_minimum() => Samples::Fewest,
+                Some(budget) if budget.is_at_maximum() => Samples::All,
+                Some(_) => Samples::Between,
+            };
+            scale.measured(note.plan.rung, samples, took_ns, now);
+            self.crew.rung.store(scale.rung(), Ordering::Relaxed);
         }
     }
 

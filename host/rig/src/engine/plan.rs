@@ -171,6 +171,7 @@ impl<P: Pace> PlanStage<P> {
             predict_ns,
             fresh_ns: self.horizon.fresh_ns(snapshot.latency_ns),
             budget_milli: self.crew.budget_milli.load(Ordering::Relaxed).min(applied.most_milli),
+            rung: self.crew.rung.load(Ordering::Relaxed),
             applied,
             now,
         };

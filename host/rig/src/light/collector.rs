@@ -1,7 +1,7 @@
 //! Combines finished frames and light into a report. It runs on its own thread beside the frame path, so it may
 //! allocate.
 
-use crate::config::Pace;
+use crate::config::{Pace, RenderScale};
 use crate::frame::job::{Fate, FrameNote};
 use crate::frame::slots::OrderedDark;
 use crate::frame::{FrameTimeline, Stage, STAGES};
@@ -14,6 +14,7 @@ use crate::light::placement::Placement;
 use crate::light::record::FrameRecord;
 use crate::light::recorder::{LightNote, LightReceiver};
 use crate::plan::light_centre::light_centre_ns;
+use crate::plan::scale::scale_of_run;
 use crate::rig::Rig;
 use crate::telemetry::flight::FlightRecorder;
 use crate::telemetry::interval::Interval;
@@ -21,7 +22,7 @@ use crate::telemetry::live::{LiveBody, LiveFrame};
 use crate::telemetry::miss_log::MissLog;
 use crate::telemetry::monitor::RunMonitor;
 use crate::telemetry::profile::{missed_by_cause, ordered_dark, Profiler};
-use crate::telemetry::report::{Latency, Percentiles, Report, StageTime};
+use crate::telemetry::report::{Latency, Percentiles, Report, StageTime, TracedScale};
 use crate::telemetry::signed::SignedHistogram;
 use crate::telemetry::slots::{SlotCounts, SlotLedger};
 use crate::telemetry::trace::TracedFrame;
@@ -111,6 +112,8 @@ pub(crate) struct Collector {
     pub(super) walked_rays: u64,
     pub(super) samples: u64,
     gpu_ns: u64,
+    /// Sum of the shares of the raster that drawn frames traced, the least of them, and the number of these frames.
+    shares: (f64, f64, u64),
     lit_values: u64,
     clipped_values: u64,
     nan_values: u64,
@@ -203,6 +206,7 @@ impl Collector {
             walked_rays: 0,
             samples: 0,
             gpu_ns: 0,
+            shares: (0.0, f64::INFINITY, 0),
             lit_values: 0,
             clipped_values: 0,
             nan_values: 0,
@@ -413,6 +417,13 @@ impl Collector {
         self.walked_rays += u64::from(c.walked_rays());
         self.samples += u64::from(c.samples);
         self.gpu_ns += cost.pass_ns.iter().sum::<u64>();
+        if job.cost.is_some() {
+            let scale = scale_of_run(&self.rig);
+            let shares = scale.shares();
+            let share = shares[job.plan.rung.min(shares.len() - 1)];
+            let (sum, least, frames) = self.shares;
+            self.shares = (sum + share, least.min(share), frames + 1);
+        }
         self.lit_values += 3 * u64::from(c.lit_pixels);
         self.clipped_values += u64::from(c.clipped_values);
         self.nan_values += u64::from(c.nan_values);
@@ -583,6 +594,9 @@ impl Collector {
             .collect();
         let rate = |rays: u64| (self.gpu_ns > 0).then(|| rays as f64 / self.gpu_ns as f64 * 1e3);
         (report.mrays_per_s, report.walked_mrays_per_s) = (rate(self.rays), rate(self.walked_rays));
+        let (sum, least, frames) = self.shares;
+        let is_whole = self.rig.config.render.scale == RenderScale::Share(1.0);
+        report.scale = (frames > 0 && !is_whole).then(|| TracedScale { mean: sum / frames as f64, least });
         report.clipped =
             if self.lit_values > 0 { self.clipped_values as f64 / self.lit_values as f64 } else { 0.0 };
         report.nan_pixels = self.nan_values;

@@ -14,6 +14,7 @@ use crate::engine::pulse::{Pulse, Silence};
 use crate::engine::supervision::Trouble;
 use crate::frame::job::{FrameJob, FrameNote};
 use crate::plan::link_time::LinkTime;
+use crate::plan::scale::ScaleController;
 use crate::tracks::TrackSnapshot;
 use dpm_common::realtime::os::standing_of;
 use dpm_device::time::HostTime;
@@ -120,14 +121,17 @@ impl Crew {
     /// # Errors
     /// The system cannot start a thread.
     pub(super) fn start(shared: &Arc<RunState>, parts: CrewParts) -> Result<(Self, Port), PipelineError> {
-        let CrewParts { tracking, renderer, packer, budget, memory, first, budget_milli } = parts;
+        let CrewParts { tracking, renderer, packer, budget, scale, memory, first, budget_milli } = parts;
         let rig = &shared.facts.rig;
         let policy = policy(rig);
         let frame_ns = first.gpu_ns.unwrap_or(first.wall_ns);
         let facts = Arc::new(CrewFacts::new(frame_ns, rig.rate().slot_len_ns(0)));
         facts.budget_milli.store(budget_milli, Ordering::Relaxed);
+        facts.rung.store(scale.as_ref().map_or(0, ScaleController::rung), Ordering::Relaxed);
         let is_software = renderer.as_ref().is_some_and(|r| r.prepared().gpu().summary().software);
-        let stage = PackStage::new(shared.facts.clone(), facts.clone(), budget).on_software(is_software);
+        let stage = PackStage::new(shared.facts.clone(), facts.clone(), budget)
+            .on_software(is_software)
+            .scaling(scale);
         // There is room for all of them: no stage ever finds the next one's channel full.
         let jobs = memory.len();
         let (mut free_in, free) = channel(jobs, policy);

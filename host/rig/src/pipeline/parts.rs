@@ -15,6 +15,7 @@ use crate::pack::Packer;
 use crate::pipeline::projector;
 use crate::plan::budget::BudgetController;
 use crate::plan::link_time::LinkTime;
+use crate::plan::scale::{scale_of_run, ScaleController};
 use crate::projectors::MockProjectorConfig;
 use crate::render::WarmUp;
 use crate::rig::{Rig, RigError};
@@ -27,7 +28,7 @@ use dpm_device::tracker::Tracker;
 use dpm_device::transport::Transport;
 use dpm_render::gpu::Gpu;
 use dpm_render::pack::{BitPlaneFrame, Kernel};
-use dpm_render::{PreparedScene, RenderError, Renderer, RendererSettings};
+use dpm_render::{PreparedScene, RenderError, Renderer, RendererSettings, Scale, LADDER};
 use std::sync::Arc;
 use std::time::Duration;
 
@@ -91,6 +92,8 @@ pub(super) struct CrewParts {
     pub(super) packer: Packer,
     /// `None` if every frame gets the rays that the rig file asks for.
     pub(super) budget: Option<BudgetController>,
+    /// `None` if every frame traces the same share of the raster.
+    pub(super) scale: Option<ScaleController>,
     /// Memory for the frames.
     pub(super) memory: Vec<FrameMemory>,
     /// Time that a frame took while the GPU was otherwise idle.
@@ -105,6 +108,7 @@ pub(super) struct Heritage {
     /// `None` if nothing is rendered.
     scene: Option<PreparedScene>,
     budget: Option<BudgetController>,
+    scale: Option<ScaleController>,
     first: WarmUp,
     budget_milli: u64,
 }
@@ -122,6 +126,7 @@ impl CrewParts {
     ) -> Result<Self, PipelineError> {
         let settings = |gpu: &Gpu| RendererSettings {
             output: output(rig, gpu, options.verify),
+            scale: scale_of_run(rig),
             ..renderer_settings(rig)
         };
         let renderer = || origin.gpu().map(|gpu| Renderer::new(gpu, &rig.scene, settings(gpu))).transpose();
@@ -140,10 +145,10 @@ impl CrewParts {
         options: RunOptions,
         clock: Arc<dyn HostClock>,
     ) -> Result<Self, PipelineError> {
-        let Heritage { scene, budget, first, budget_milli } = heritage.clone();
+        let Heritage { scene, budget, scale, first, budget_milli } = heritage.clone();
         let renderer = || scene.as_ref().map(Renderer::from_prepared).transpose();
         let parts = Self::drawn_by(renderer, rig, origin, options, clock)?;
-        Ok(Self { budget, first, budget_milli, ..parts })
+        Ok(Self { budget, scale, first, budget_milli, ..parts })
     }
 
     /// What a crew that takes over on the same device needs of this one.
@@ -151,6 +156,7 @@ impl CrewParts {
         Heritage {
             scene: self.renderer.as_ref().map(|renderer| renderer.prepared().clone()),
             budget: self.budget.clone(),
+            scale: self.scale.clone(),
             first: self.first,
             budget_milli: self.budget_milli,
         }
@@ -184,6 +190,7 @@ impl CrewParts {
                 eyes: EyeMask::of_rig(rig),
             },
             budget: None,
+            scale: None,
             memory,
             first: WarmUp::default(),
             budget_milli: u64::MAX,
@@ -208,6 +215,7 @@ impl CrewParts {
             self.budget = budget_controller(rig);
         }
         self.draw_unseen(rig)?;
+        self.fit_scale(rig)?;
         let watch = Stopwatch::start();
         let wake = origin.gpu().map_or(Duration::ZERO, |gpu| gpu.summary().wakes_within());
         // A GPU that needs a small part of a slot keeps up at any clock.
@@ -226,6 +234,22 @@ impl CrewParts {
         Ok(self)
     }
 
+    /// Finds the largest share of the raster at which a frame with the fewest samples fits into a slot, if the rig file leaves that to the device.
+    fn fit_scale(&mut self, rig: &Rig) -> Result<(), PipelineError> {
+        if self.renderer.is_none() || scale_of_run(rig) != Scale::Ladder {
+            return Ok(());
+        }
+        let mut scale = ScaleController::new(rig.rate().slot_len_ns(0), &LADDER);
+        loop {
+            self.scale = Some(scale.clone());
+            let fewest = self.budget.as_ref().map(BudgetController::fewest);
+            self.draw_with(rig, fewest.unwrap_or(u64::from(rig.config.render.spp) * 1000))?;
+            if !scale.tried(self.first.gpu_ns.unwrap_or(self.first.wall_ns)) {
+                return Ok(());
+            }
+        }
+    }
+
     /// The same, in a run that has seen the bodies of `seen` before.
     pub(super) fn remembering(self, seen: &Arc<SeenBodies>) -> Self {
         Self { tracking: self.tracking.remembering(seen.clone()), ..self }
@@ -236,12 +260,20 @@ impl CrewParts {
     fn draw_unseen(&mut self, rig: &Rig) -> Result<u64, PipelineError> {
         let full = u64::from(rig.config.render.spp) * 1000;
         let budget_milli = self.budget.as_ref().map_or(full, BudgetController::rays);
+        self.draw_with(rig, budget_milli)?;
+        Ok(budget_milli)
+    }
+
+    /// The same with so many samples.
+    fn draw_with(&mut self, rig: &Rig, budget_milli: u64) -> Result<(), PipelineError> {
+        let rung = self.scale.as_ref().map_or(0, ScaleController::rung);
         let slot = self.memory.first_mut().and_then(|memory| memory.gpu.as_mut());
         if let (Some(renderer), Some(slot)) = (&mut self.renderer, slot) {
-            self.first = crate::render::warm_up(slot, rig, renderer, budget_milli, FIRST_FRAME_TIMEOUT_NS)
-                .map_err(RenderError::from)?;
+            self.first =
+                crate::render::warm_up(slot, rig, renderer, (budget_milli, rung), FIRST_FRAME_TIMEOUT_NS)
+                    .map_err(RenderError::from)?;
         }
-        Ok(budget_milli)
+        Ok(())
     }
 }
 

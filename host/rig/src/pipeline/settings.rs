@@ -5,6 +5,7 @@ use crate::config::{self, Packer};
 use crate::plan::budget::{BudgetConfig, BudgetController, FEWEST_OF_MOST};
 use crate::plan::lead::LeadEstimator;
 use crate::plan::light_centre::groups_that_follow;
+use crate::plan::scale::scale_of;
 use crate::rig::Rig;
 use dpm_device::link::HostLink;
 use dpm_render::gpu::Gpu;
@@ -52,6 +53,7 @@ pub fn renderer_settings(rig: &Rig) -> RendererSettings {
     let r = &rig.config.render;
     RendererSettings {
         raster: rig.camera.raster,
+        scale: scale_of(r),
         depth: r.depth,
         seed: r.seed as u32,
         clamp_indirect: (r.clamp_indirect > 0.0).then_some(r.clamp_indirect as f32),

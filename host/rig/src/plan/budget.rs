@@ -150,9 +150,18 @@ impl BudgetController {
     }
 
     /// True when the budget is at its minimum: if frames are still late, rays are not the reason.
-    #[cfg(test)]
     pub(crate) fn is_at_minimum(&self) -> bool {
         self.rays() == self.config.min_rays
+    }
+
+    /// True when frames get all rays that they may have.
+    pub(crate) fn is_at_maximum(&self) -> bool {
+        self.rays() == self.config.max_rays
+    }
+
+    /// Fewest rays of a frame.
+    pub(crate) fn fewest(&self) -> u64 {
+        self.config.min_rays
     }
 
     /// The number of impossible measurements, and the number of cuts.

@@ -78,6 +78,8 @@ pub(crate) struct FramePlan {
     pub budget_milli: u64,
     /// The same at most, whatever the GPU's times allow.
     pub most_milli: u64,
+    /// Which of the shares of the raster is traced, from 0 for the largest.
+    pub rung: usize,
     /// Which version of the operator's parameters it uses.
     pub parameters: u64,
     /// Samples of a traced pixel, where neither the angle nor a budget decides them.
@@ -105,6 +107,8 @@ pub(crate) struct PlanInputs<'a> {
     pub fresh_ns: i64,
     /// Average samples per pixel, in thousandths.
     pub budget_milli: u64,
+    /// Which of the shares of the raster is traced.
+    pub rung: usize,
     /// What the operator may change while the run goes on.
     pub applied: &'a ParameterVersion,
     /// Now.
@@ -143,6 +147,7 @@ impl FramePlan {
             widen_deg: 0.0,
             budget_milli: 0,
             most_milli: 0,
+            rung: 0,
             parameters: 0,
             samples: rig.config.render.spp,
             brighter: 1.0,
@@ -155,7 +160,7 @@ impl FramePlan {
     pub(crate) fn fill(&mut self, rig: &Rig, snapshot: &TrackSnapshot, inputs: &PlanInputs<'_>) {
         let &PlanInputs { slots, id, slot, stride, predict_ns, .. } = inputs;
         (self.id, self.slot) = (FrameId(id), slot);
-        (self.predict_ns, self.budget_milli) = (predict_ns, inputs.budget_milli);
+        (self.predict_ns, self.budget_milli, self.rung) = (predict_ns, inputs.budget_milli, inputs.rung);
         self.take(inputs.applied);
         self.target_at = slots.start(slot);
         // Light falls later than the projector's clock says by this much.

@@ -11,3 +11,4 @@ pub mod lead;
 pub(crate) mod light_centre;
 pub mod light_course;
 pub(crate) mod link_time;
+pub mod scale;

@@ -303,6 +303,9 @@ pub struct Report {
     pub mrays_per_s: Option<f64>,
     /// Those of them that were walked through the scene.
     pub walked_mrays_per_s: Option<f64>,
+    /// Share of the raster's columns and rows that was traced (`render.scale`); absent if that was all of it, or nothing was rendered.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub scale: Option<TracedScale>,
     /// Share of lit channel values that exceeded the projector's power, 0 to 1.
     pub clipped: f64,
     /// Pixels that were not a number and were made black.
@@ -318,6 +321,15 @@ pub struct Report {
     pub files: Vec<PathBuf>,
     /// Wall time of the run after set-up, seconds.
     pub wall_s: f64,
+}
+
+/// The share of the raster's columns and rows that frames traced, above 0 and at most 1.
+#[derive(Clone, Copy, Debug, PartialEq, serde::Serialize)]
+pub struct TracedScale {
+    /// Its mean over the frames.
+    pub mean: f64,
+    /// The least of any frame.
+    pub least: f64,
 }
 
 fn stages_as_map<S: Serializer>(stages: &[StageTime], serializer: S) -> Result<S::Ok, S::Error> {
@@ -386,6 +398,7 @@ impl Default for Report {
             frames_per_wall_second: 0.0,
             mrays_per_s: None,
             walked_mrays_per_s: None,
+            scale: None,
             clipped: 0.0,
             nan_pixels: 0,
             light_hash: String::new(),

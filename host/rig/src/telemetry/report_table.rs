@@ -197,6 +197,11 @@ impl Report {
             let proven = rays - walked;
             table.row("rays", format!("{walked:.2} million/s walked, {proven:.2} million/s proven to miss"));
         }
+        if let Some(scale) = self.scale {
+            let line =
+                format!("mean {:.2}, least {:.2} of the raster's columns and rows", scale.mean, scale.least);
+            table.row("traced scale", line);
+        }
         if self.clipped > 0.0 {
             let advice = "raise projector.max_intensity or lower render.exposure";
             table.row("clipped", format!("{:.2} % of the light: {advice}", 100.0 * self.clipped));

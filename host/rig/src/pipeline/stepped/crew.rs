@@ -48,6 +48,7 @@ impl CrewParts {
             renderer: None,
             packer: Packer { kernel: Kernel::best(), pictures: None, eyes: EyeMask::of_rig(rig) },
             budget: None,
+            scale: None,
             memory: (0..in_flight.max(2)).map(|_| memory()).collect(),
             first: WarmUp { wall_ns: frame_ns, gpu_ns: None },
             budget_milli: u64::MAX,

@@ -1,0 +1,91 @@
+//! The share of the panel's raster that is traced. A smaller one costs less; the pass `enlarge` brings its light to the panel's pixels.
+
+use super::drive::Drive;
+use super::settings::{Output, RendererSettings};
+use dpm_device::planes::Raster;
+
+/// Shares among which a run chooses by its frame times, the largest first. Each step saves about half of the work.
+pub const LADDER: [f64; 5] = [1.0, 0.75, 0.5, 0.35, 0.25];
+
+/// Which share of the panel's columns and rows is traced.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub enum Scale {
+    /// Always this one, above 0 and at most 1.
+    Share(f64),
+    /// The one of [`LADDER`] that each frame asks for ([`crate::FrameInputs::rung`]).
+    Ladder,
+}
+
+impl Scale {
+    /// Every pixel of the panel is traced.
+    pub const WHOLE: Self = Self::Share(1.0);
+
+    /// The shares that frames may ask for, the largest first.
+    pub fn shares(&self) -> &[f64] {
+        match self {
+            Self::Share(share) => std::slice::from_ref(share),
+            Self::Ladder => &LADDER,
+        }
+    }
+
+    /// The traced rasters of a panel, the largest first.
+    pub(super) fn rasters(&self, panel: Raster) -> impl Iterator<Item = Raster> + '_ {
+        self.shares().iter().map(move |&share| reduced(panel, share))
+    }
+}
+
+/// The raster of this share of a panel's columns and rows, rounded up.
+pub fn reduced(panel: Raster, share: f64) -> Raster {
+    let side = |n: u32| ((f64::from(n) * share).ceil() as u32).clamp(1, n);
+    Raster::new(side(panel.width()), side(panel.height())).expect("sides within those of a raster")
+}
+
+impl RendererSettings {
+    /// Frames may trace fewer pixels than the panel has: the pass `enlarge` is recorded.
+    pub fn is_reduced(&self) -> bool {
+        self.scale.rasters(self.raster).any(|raster| raster != self.raster)
+    }
+
+    /// The settings of the passes that work on a traced raster. What only the panel's own pixels have is not among them.
+    pub(super) fn on(&self, raster: Raster) -> Self {
+        if !self.is_reduced() {
+            return self.clone();
+        }
+        let Drive { gain, gain_of_body, ambient, .. } = self.drive.clone();
+        Self {
+            raster,
+            scale: Scale::WHOLE,
+            lens: self.lens.map(|camera| camera.at_raster(raster)),
+            drive: Drive { gain, gain_of_body, ambient, ..Drive::default() },
+            halftone: None,
+            plane_groups: Vec::new(),
+            output: Output::Codes,
+            ..self.clone()
+        }
+    }
+
+    /// The same for the largest raster that frames may trace.
+    pub(super) fn on_traced(&self) -> Self {
+        let largest = self.scale.rasters(self.raster).next().unwrap_or(self.raster);
+        self.on(largest)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_share_is_rounded_up_and_never_beyond_the_panel() {
+        let panel = Raster::new(1921, 7).unwrap();
+        let sides = |share| {
+            let raster = reduced(panel, share);
+            (raster.width(), raster.height())
+        };
+        assert_eq!(sides(1.0), (1921, 7));
+        assert_eq!(sides(0.5), (961, 4));
+        assert_eq!(sides(0.25), (481, 2));
+        assert_eq!(sides(1e-9), (1, 1));
+        assert!(LADDER.windows(2).all(|two| two[0] > two[1]) && LADDER[0] == 1.0);
+    }
+}

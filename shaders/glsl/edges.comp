@@ -1,0 +1,76 @@
+// The panel's pixels around which traced pixels do not show one even surface: their rays are traced through the scene, and to the eye. A lane takes a
+// pixel of the list that the pass `enlarge` has left. See enlarge.glsl.
+#version 460
+#extension GL_GOOGLE_include_directive : require
+#ifdef RAY_QUERY
+#define FRAME_WHERE_USED
+#endif
+#include "enlarge.glsl"
+
+layout(local_size_x = 64) in;
+
+layout(set = 0, binding = B_WORK, scalar) readonly buffer Edges { WorkItem edges[]; };
+
+// Rank of a tap on the same body that does not agree, among those from which light is taken if nothing agrees: behind all that do.
+const float DISAGREES = 1e3, NO_TAP = 1e9;
+
+// The light of the nearest of the 4 x 4 traced pixels around that agrees; else of the nearest lit one on the body; else none.
+vec3 nearest_light(Surround g, Taps t, bool wanted) {
+    float best = NO_TAP;
+    vec3 found = vec3(0.0);
+    int i = wanted ? 0 : 15;
+    do {
+        ivec2 q = t.corner + ivec2(i & 3, i >> 2) - 1;
+        uint at = coarse_index(q);
+        SurfaceHit surface = coarse_surface_at(at);
+        Filtered tap = coarse_light_at(at);
+        bool lit = surface.id != NO_HIT && surface.distance > 0.0 && instance_of(surface.id) == g.body;
+        vec2 apart = vec2(q) - t.place;
+        float rank = dot(apart, apart) + (agreement(g, t, q, surface.id, surface.distance, tap.weight_and_albedo) > 0.0 ? 0.0 : DISAGREES);
+        bool nearer = wanted && lit && rank < best;
+        best = nearer ? rank : best;
+        found = nearer ? tap.light : found;
+        i++;
+    } while (i < 16);
+    return found;
+}
+
+// Whether the eye sees a surface from the side that the projector lights.
+bool is_seen(vec3 p, Hit hit, vec3 direction, inout uint rays) {
+    uint body = instance_of(hit.id);
+    vec3 g = transform_normal(instance_at(body).world_from_object, object_normal(body, triangle_of(hit.id)));
+    vec3 to_eye = frame.eye_position - p;
+    float projector_side = -dot(g, direction), eye_side = dot(g, to_eye);
+    bool lit = projector_side * eye_side > 0.0;
+    if (lit) {
+        vec3 offset = g * (sign(eye_side) * surface_offset(p, body));
+        Hit blocker;
+        blocker.t = 1.0;
+        rays++;
+        lit = !trace_ray(p + offset, to_eye - offset, INSTANCE_PROJECTED, NONE_LEFT, true, blocker);
+    }
+    return lit;
+}
+
+void main() {
+    uint item = gl_GlobalInvocationID.x + gl_WorkGroupID.y * (EDGE_GROUPS_IN_A_ROW * EDGE_LANES);
+    if (item >= uint(schedule.listed)) return;
+    uint index = edges[item].pixel, rays = 1u;
+    uvec2 pixel = uvec2(index % frame.width, index / frame.width);
+    vec3 direction = pixel_direction(pixel);
+    Taps t = taps_of(pixel);
+    Hit hit = Hit(NO_HIT, vec2(0.0), INFINITY);
+    bool lit = trace_ray(frame.projector_position, direction, INSTANCE_PROJECTED, NONE_LEFT, false, hit);
+    own_light = vec3(0.0);
+    if (lit) {
+        lit = is_seen(direction * hit.t, hit, direction, rays);
+        Surround g = surround_of(pixel, hit, direction);
+        float least;
+        vec4 light = mean_of(g, t, least);
+        vec3 other = nearest_light(g, t, light.w <= 0.0);
+        own_light = lit ? with_texture(light.w > 0.0 ? light.rgb : other, hit, direction) : vec3(0.0);
+    }
+    write_pixel(pixel, index, hit, lit);
+    COUNT(rays, rays)
+    COUNT(camera_rays, rays)
+}
