@@ -144,7 +144,7 @@ impl FrameBuffers {
         let (bodies, asks_device) = (data.bodies.len(), reading == Reading::Query);
         let pixels = in_blocks(settings.on_traced().raster.pixel_count());
         let panel_pixels = in_blocks(settings.raster.pixel_count());
-        let is_reduced = settings.is_reduced();
+        let (both, is_reduced) = ((pixels, panel_pixels), settings.is_reduced());
         let size = |what, bytes, kind| Buffer::new(gpu, what, bytes, kind);
         let table = |what, bytes, kind| table_buffer(gpu, what, bytes, kind);
         let latched = |what, len_bytes| -> Result<LatchBuffer, GpuError> {
@@ -154,14 +154,11 @@ impl FrameBuffers {
         let each = BytesPerPixel::of(&settings.method).and_planes_follow(!settings.plane_groups.is_empty());
         // A buffer that the method does not need is bound all the same, but is as small as possible.
         let with = |what, each: usize| table(what, (pixels * each).max(16), Device);
+        let shown_bytes = if debug || is_reduced { SHOWN_BYTES } else { each.shown };
         let packed = settings.output.schedule();
         let plane_bytes = packed.map_or(4, |schedule| pack::gpu::len_bytes(settings.raster, schedule));
-        let codes_host = match settings.output {
-            Output::Planes(_) => None,
-            Output::Codes | Output::Both(_) => {
-                Some(size("code values", panel_pixels * each.codes, Readback)?)
-            }
-        };
+        let reads_codes = !matches!(settings.output, Output::Planes(_));
+        let codes_host = reads_codes.then(|| size("code values", panel_pixels * each.codes, Readback));
         let nodes = body_tree.most_nodes();
         let apart = apart.map(|layout| ApartFrame::new(gpu, layout, bodies, nodes, pixels)).transpose()?;
         let own_work = apart.is_none().then(|| size("work list", pixels * each.work, Device)).transpose()?;
@@ -182,7 +179,7 @@ impl FrameBuffers {
             surfaces: table("surfaces", pixels * each.surfaces, Device)?,
             radiance: size("radiance", pixels * each.radiance, Device)?,
             codes: size("code values", panel_pixels * each.codes, Device)?,
-            codes_host,
+            codes_host: codes_host.transpose()?,
             planes: size("bit planes", plane_bytes, Device)?,
             planes_host: packed.map(|_| size("bit planes", plane_bytes, Readback)).transpose()?,
             plane_bytes,
@@ -192,22 +189,15 @@ impl FrameBuffers {
             apart: apart.map(Arc::new),
             no_queue,
             filtered: with("filtered radiance", each.filtered)?,
-            filtered_shown: with(
-                "shown radiance",
-                if debug || is_reduced { SHOWN_BYTES } else { each.shown },
-            )?,
+            filtered_shown: with("shown radiance", shown_bytes)?,
             motion: table("motion of surfaces", (panel_pixels * each.motion).max(16), Device)?,
             movers: latched("movers", size_of::<Mover>() * bodies.max(1))?,
             device_tree: asks_device.then(|| FrameTree::new(gpu, bodies)).transpose()?,
             deformed: DeformedTables::new(gpu, data, reading)?,
             textures: texture_table(gpu, data)?,
             piece: live.map(|live| live.piece(gpu)).transpose()?,
-            debug_host: debug
-                .then(|| DebugBuffers::new(gpu, (pixels, panel_pixels), tiles, each))
-                .transpose()?,
-            panel: is_reduced
-                .then(|| PanelBuffers::new(gpu, (pixels, panel_pixels), panel_tiles, each, debug))
-                .transpose()?,
+            debug_host: debug.then(|| DebugBuffers::new(gpu, both, tiles, each)).transpose()?,
+            panel: is_reduced.then(|| PanelBuffers::new(gpu, both, panel_tiles, each, debug)).transpose()?,
             each,
         })
     }

@@ -24,6 +24,7 @@ use crate::gpu::{
 use crate::pack;
 use bytemuck::Zeroable;
 use dpm_device::planes::Raster;
+use dpm_scene::geometry::projector::ProjectorCamera;
 use dpm_scene::Scene;
 use dpm_shaders::structs::{
     self as gpu_structs, in_blocks, BodyNode, Counters, Frame, Instance, Mover, Schedule,
@@ -487,11 +488,7 @@ impl Renderer {
         slot.traced = traced;
         let every_tile = self.settings.camera_is_eye || self.keep.every_tile;
         let turn = self.last.turn_of(inputs.frame);
-        // Movers are found on the panel's tiles.
-        let tiles = slot.panel_tiles.as_mut().unwrap_or(&mut slot.tile_lists[0]);
-        list_tiles(tiles, every_tile, inputs, &self.bodies);
-        self.movers.find(inputs.camera, &self.bodies, inputs.poses, inputs.sweep, turn.drawn, tiles);
-        slot.buffers.movers.host.write(self.movers.movers());
+        self.find_movers(slot, inputs, every_tile, turn.drawn);
         // From here on the bodies are where this frame draws them.
         let inputs = &FrameInputs { poses: self.movers.poses(), ..*inputs };
         let panel_camera = inputs.camera;
@@ -518,17 +515,7 @@ impl Renderer {
         slot.buffers.arguments.write(&groups.map(|groups| [groups, 1u32, 1, 0]));
         let body_nodes = self.write_bodies(&mut slot.buffers, inputs);
         let constants = self.frame_constants(inputs, &turn, &self.rungs[rung], (tile_count, tiles_x));
-        let shows_all = if slot.buffers.debug_host.is_some() { gpu_structs::FRAME_SHOWS_ALL } else { 0 };
-        let has_panel = slot.buffers.panel.is_some();
-        // The pass `prepare` reads the light that is shown.
-        let shows_light = if has_panel { gpu_structs::FRAME_SHOWS_ALL } else { shows_all };
-        let frame = Frame { body_nodes, flags: constants.flags | shows_light, ..constants };
-        slot.buffers.frame.host.write(&[frame]);
-        self.write_panel(
-            slot,
-            &FrameInputs { camera: panel_camera, ..*inputs },
-            &Frame { flags: constants.flags | shows_all, ..frame },
-        );
+        self.write_constants(slot, Frame { body_nodes, ..constants }, panel_camera);
         slot.parity = 1 - self.last.parity;
         let order = self.orders.next(slot.parity);
         let samples = (inputs.budget_spp, inputs.spp, u64::from(tile_count) * 256);
@@ -541,22 +528,32 @@ impl Renderer {
         submitted?;
         self.orders.submitted(slot.parity, order);
         if decides_rates {
-            let active = slot.tile_lists[rung].active();
             self.rated.fill(false);
-            self.rated[..active.len()].copy_from_slice(active);
+            self.rated[..slot.tile_lists[rung].len()].copy_from_slice(slot.tile_lists[rung].active());
         }
         let lost = (0..inputs.poses.len()).map(|i| is_lost(&self.tracked, i, inputs.lost));
         self.last.becomes(inputs, slot.parity, lost);
         Ok(())
     }
 
-    /// Writes what the panel's pixels have of their own, where fewer are traced: their tiles, and the constants `frame` of the traced pixels with
+    /// Lists the panel's tiles, and finds the bodies that move on them, after so many frames.
+    fn find_movers(&mut self, slot: &mut FrameSlot, inputs: &FrameInputs<'_>, every_tile: bool, drawn: u32) {
+        let tiles = slot.panel_tiles.as_mut().unwrap_or(&mut slot.tile_lists[0]);
+        list_tiles(tiles, every_tile, inputs, &self.bodies);
+        self.movers.find(inputs.camera, &self.bodies, inputs.poses, inputs.sweep, drawn, tiles);
+        slot.buffers.movers.host.write(self.movers.movers());
+    }
+
+    /// Writes the constants of a frame, and what the panel's pixels have of their own where fewer are traced: their tiles, and the same constants with
     /// their raster, of which no history is known.
-    fn write_panel(&self, slot: &mut FrameSlot, inputs: &FrameInputs<'_>, frame: &Frame) {
+    fn write_constants(&self, slot: &mut FrameSlot, constants: Frame, c: &ProjectorCamera) {
+        let shows_all = if slot.buffers.debug_host.is_some() { gpu_structs::FRAME_SHOWS_ALL } else { 0 };
+        // The pass `prepare` reads the light that is shown.
+        let shows_light = if slot.buffers.panel.is_some() { gpu_structs::FRAME_SHOWS_ALL } else { shows_all };
+        slot.buffers.frame.host.write(&[Frame { flags: constants.flags | shows_light, ..constants }]);
         let (Some(tiles), Some(panel)) = (&slot.panel_tiles, &mut slot.buffers.panel) else { return };
         let (tile_count, moving) = tiles.write(&[], bytemuck::cast_slice_mut(panel.tiles.bytes_mut()));
         panel.arguments.write(&[tile_count * 4, 0, moving * 4].map(|groups| [groups, 1u32, 1, 0]));
-        let c = inputs.camera;
         let mut frame = Frame {
             intrinsics: [c.fx as f32, c.fy as f32, c.cx as f32, c.cy as f32],
             width: c.raster.width(),
@@ -565,8 +562,8 @@ impl Renderer {
             tiles_x: tiles.tiles_x(),
             pixel_size: (1.0 / c.fx) as f32,
             history_frame: gpu_structs::NO_FRAME,
-            flags: frame.flags & !gpu_structs::FRAME_STEADY,
-            ..*frame
+            flags: (constants.flags | shows_all) & !gpu_structs::FRAME_STEADY,
+            ..constants
         };
         self.optics.describe(c, 0, &mut frame);
         panel.frame.host.write(&[frame]);

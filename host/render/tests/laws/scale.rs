@@ -201,201 +201,210 @@ fn a_whole_scale_adds_nothing() {
     assert!(NEW.iter().all(|pass| PASSES.contains(pass)));
 }
 
-/// Silhouettes, the border of what the eye sees and the border between bodies are those of the panel's own rays in f64. By plain enlargement, each
-/// pixel as the nearest reduced one shows it, they err by reduced pixels.
-#[test]
-fn silhouettes_are_those_of_the_panel() {
-    let scene = balls();
-    let view = view_of_balls(&scene);
-    let panel = view.camera.raster;
-    let truth = view.truth(panel);
-    for method in [dpm(), Method::full(2)] {
-        for share in [0.75, 0.5, 0.35, 0.25] {
-            let shown = view.at(share, &method);
-            let coarse = reduced(panel, share);
-            let traced = view.truth(coarse);
-            let wrong = |of: &dyn Fn(usize) -> Option<(usize, bool)>| {
-                (0..truth.len()).filter(|&i| of(i) != truth[i]).count()
-            };
-            let enlarged = wrong(&|i| body_of(&shown.surfaces[i]));
-            let plain = wrong(&|i| {
-                let (x, y) = (i as u32 % panel.width(), i as u32 / panel.width());
-                let near =
-                    |v: u32, n: u32, of: u32| ((f64::from(v) + 0.5) * f64::from(n) / f64::from(of)) as u32;
-                let (x, y) =
-                    (near(x, coarse.width(), panel.width()), near(y, coarse.height(), panel.height()));
-                traced[(y * coarse.width() + x) as usize]
-            });
-            let dark = |i: usize| shown.codes[i] == 0;
-            let spilt =
-                (0..truth.len()).filter(|&i| !dark(i) && truth[i].is_none_or(|(_, lit)| !lit)).count();
-            let sizes = [panel, coarse].map(|r| [r.width(), r.height()]);
-            let inside = |i: usize| {
-                let pixel = [i as u32 % panel.width(), i as u32 / panel.width()];
-                let taps = around(sizes[0], sizes[1], pixel).map(|at| traced[at]);
-                truth[i].is_some_and(|(_, lit)| lit) && taps.iter().all(|tap| *tap == truth[i])
-            };
-            let missing = (0..truth.len()).filter(|&i| inside(i) && dark(i)).count();
-            println!(
+/// What draws frames.
+mod breadth {
+    use super::*;
+
+    /// Silhouettes, the border of what the eye sees and the border between bodies are those of the panel's own rays in f64. By plain enlargement, each
+    /// pixel as the nearest reduced one shows it, they err by reduced pixels.
+    #[test]
+    fn silhouettes_are_those_of_the_panel() {
+        let scene = balls();
+        let view = view_of_balls(&scene);
+        let panel = view.camera.raster;
+        let truth = view.truth(panel);
+        for method in [dpm(), Method::full(2)] {
+            for share in [0.75, 0.5, 0.35, 0.25] {
+                let shown = view.at(share, &method);
+                let coarse = reduced(panel, share);
+                let traced = view.truth(coarse);
+                let wrong = |of: &dyn Fn(usize) -> Option<(usize, bool)>| {
+                    (0..truth.len()).filter(|&i| of(i) != truth[i]).count()
+                };
+                let enlarged = wrong(&|i| body_of(&shown.surfaces[i]));
+                let plain = wrong(&|i| {
+                    let (x, y) = (i as u32 % panel.width(), i as u32 / panel.width());
+                    let near = |v: u32, n: u32, of: u32| {
+                        ((f64::from(v) + 0.5) * f64::from(n) / f64::from(of)) as u32
+                    };
+                    let (x, y) =
+                        (near(x, coarse.width(), panel.width()), near(y, coarse.height(), panel.height()));
+                    traced[(y * coarse.width() + x) as usize]
+                });
+                let dark = |i: usize| shown.codes[i] == 0;
+                let spilt =
+                    (0..truth.len()).filter(|&i| !dark(i) && truth[i].is_none_or(|(_, lit)| !lit)).count();
+                let sizes = [panel, coarse].map(|r| [r.width(), r.height()]);
+                let inside = |i: usize| {
+                    let pixel = [i as u32 % panel.width(), i as u32 / panel.width()];
+                    let taps = around(sizes[0], sizes[1], pixel).map(|at| traced[at]);
+                    truth[i].is_some_and(|(_, lit)| lit) && taps.iter().all(|tap| *tap == truth[i])
+                };
+                let missing = (0..truth.len()).filter(|&i| inside(i) && dark(i)).count();
+                println!(
                 "scale {share}, dpm {}: {enlarged} pixels of {} show another surface than in f64, {plain} by plain enlargement; {spilt} are lit \
                  and should not be, {missing} dark",
                 method.dpm,
                 truth.len()
             );
-            // Where rounding decides.
-            assert!(enlarged <= 4 + plain / 50, "{enlarged} against {plain}");
-            assert!(plain > 100, "{plain}: the test sees little");
-            assert!(spilt <= 4 && missing == 0, "{spilt}, {missing}");
-            let lit = truth.iter().flatten().filter(|(_, lit)| *lit).count();
-            assert!(shown.lit.abs_diff(lit as u32) <= 8, "{} and {lit} lit pixels", shown.lit);
-        }
-    }
-}
-
-/// The same through a lens: the reduced raster has the panel's view.
-#[test]
-fn a_lens_bends_both_rasters() {
-    let scene = balls();
-    let mut view = view_of_balls(&scene);
-    view.camera = view.camera.with_lens(Lens::opencv(&[-0.2, 0.08, 0.004, -0.003]).unwrap()).unwrap();
-    let truth = view.truth(view.camera.raster);
-    let shown = view.at(0.5, &dpm());
-    let wrong = (0..truth.len()).filter(|&i| body_of(&shown.surfaces[i]) != truth[i]).count();
-    assert!(wrong <= 8, "{wrong} of {}", truth.len());
-}
-
-/// Light that is known exactly: that of surfaces that glow. Two bodies side by side in one plane, two faces of one body at a crease, and a step in depth of one body: no light of one comes to the other, by any of the three guides alone. This
-/// fails if one of them is taken out of the shader.
-#[test]
-fn light_stays_on_its_side_of_an_edge() {
-    let (dark, bright) = (Vec3::splat(0.1), Vec3::splat(0.8));
-    let at = |x: f32, z: f32, u: Vec3| quad(Vec3::new(x, -0.6, z), u, Vec3::Y * 1.2);
-    // The edge is not on a border of reduced pixels.
-    let edge = 0.013;
-    let mut bodies = scene_of(at(edge - 0.7, 0.0, Vec3::X * 0.7), emitter(dark));
-    add(&mut bodies, at(edge, 0.0, Vec3::X * 0.7), emitter(bright));
-    let one_body = |left, right| {
-        let mut scene = scene_of(join([left, right]), emitter(dark));
-        scene.materials.push(emitter(bright));
-        let body = &mut scene.bodies[0];
-        let half = body.mesh.materials.len() / 2;
-        body.mesh.materials[half..].fill(1);
-        scene
-    };
-    // The faces of the crease open away from each other, and each faces projector and eye.
-    let slope = Vec3::new(0.4, 0.0, -0.57);
-    let crease = one_body(at(edge - 0.4, -0.57, Vec3::new(0.4, 0.0, 0.57)), at(edge, 0.0, slope));
-    let step = one_body(at(edge - 0.7, 0.0, Vec3::X * 0.7), at(edge, -0.3, Vec3::X * 0.7));
-    for (name, scene) in [("body", bodies), ("normal", crease), ("depth", step)] {
-        let eye = DVec3::new(0.0, 0.05, 2.6);
-        let view = View::new(&scene, camera(160, 120, DVec3::new(0.0, 0.0, 2.6), DVec3::ZERO), eye);
-        let method = Method::full(2);
-        let whole = view.at(1.0, &method);
-        for share in [0.5, 0.25] {
-            let shown = view.at(share, &method);
-            let (mut worst, mut wrong, mut lit) = (0.0f32, 0, 0);
-            for (i, surface) in whole.surfaces.iter().enumerate().filter(|(_, s)| s.is_lit()) {
-                assert_eq!(body_of(&shown.surfaces[i]), body_of(surface), "{name}: pixel {i}");
-                let apart = (shown.light[i] - whole.light[i]).abs().max_element();
-                worst = worst.max(apart);
-                wrong += u32::from(apart > 0.25);
-                lit += 1;
+                // Where rounding decides.
+                assert!(enlarged <= 4 + plain / 50, "{enlarged} against {plain}");
+                assert!(plain > 100, "{plain}: the test sees little");
+                assert!(spilt <= 4 && missing == 0, "{spilt}, {missing}");
+                let lit = truth.iter().flatten().filter(|(_, lit)| *lit).count();
+                assert!(shown.lit.abs_diff(lit as u32) <= 8, "{} and {lit} lit pixels", shown.lit);
             }
-            println!(
-                "{name}, scale {share}: of {lit} pixels {wrong} show other light, by {worst:.5} at most"
-            );
-            assert!(lit > 3000, "{lit}");
-            assert!(worst < 1e-3 && wrong == 0, "{name}, scale {share}: {wrong}, {worst}");
         }
     }
-}
 
-/// A plane under an even sky has the same light as if every pixel were traced, and so has its mean.
-#[test]
-fn a_plane_keeps_its_light() {
-    let mut scene = scene_of(
-        quad(Vec3::new(-0.9, -0.7, 0.0), Vec3::X * 1.8, Vec3::Y * 1.4),
-        diffuse(Vec3::new(0.7, 0.5, 0.3)),
-    );
-    scene.environment = sky(SKY);
-    let eye = DVec3::new(0.1, 0.2, 2.0);
-    let view = View::new(&scene, camera(160, 120, DVec3::new(0.3, 0.4, 2.0), DVec3::ZERO), eye);
-    for method in [dpm(), Method::full(2)] {
-        let mean = |shown: &Shown| {
-            let codes = shown
-                .codes
-                .iter()
-                .map(|c| f64::from(c & 255) + f64::from(c >> 8 & 255) + f64::from(c >> 16 & 255));
-            codes.sum::<f64>() / shown.codes.len() as f64
+    /// The same through a lens: the reduced raster has the panel's view.
+    #[test]
+    fn a_lens_bends_both_rasters() {
+        let scene = balls();
+        let mut view = view_of_balls(&scene);
+        view.camera = view.camera.with_lens(Lens::opencv(&[-0.2, 0.08, 0.004, -0.003]).unwrap()).unwrap();
+        let truth = view.truth(view.camera.raster);
+        let shown = view.at(0.5, &dpm());
+        let wrong = (0..truth.len()).filter(|&i| body_of(&shown.surfaces[i]) != truth[i]).count();
+        assert!(wrong <= 8, "{wrong} of {}", truth.len());
+    }
+
+    /// Light that is known exactly: that of surfaces that glow. Two bodies side by side in one plane, two faces of one body at a crease, and a step in depth of one body: no light of one comes to the other, by any of the three guides alone. This
+    /// fails if one of them is taken out of the shader.
+    #[test]
+    fn light_stays_on_its_side_of_an_edge() {
+        let (dark, bright) = (Vec3::splat(0.1), Vec3::splat(0.8));
+        let at = |x: f32, z: f32, u: Vec3| quad(Vec3::new(x, -0.6, z), u, Vec3::Y * 1.2);
+        // The edge is not on a border of reduced pixels.
+        let edge = 0.013;
+        let mut bodies = scene_of(at(edge - 0.7, 0.0, Vec3::X * 0.7), emitter(dark));
+        add(&mut bodies, at(edge, 0.0, Vec3::X * 0.7), emitter(bright));
+        let one_body = |left, right| {
+            let mut scene = scene_of(join([left, right]), emitter(dark));
+            scene.materials.push(emitter(bright));
+            let body = &mut scene.bodies[0];
+            let half = body.mesh.materials.len() / 2;
+            body.mesh.materials[half..].fill(1);
+            scene
         };
-        let whole = mean(&view.at(1.0, &method));
-        for share in [0.75, 0.5, 0.25] {
-            let scaled = mean(&view.at(share, &method));
-            println!("scale {share}: mean code {scaled:.4}, {whole:.4} with every pixel traced");
-            assert!((scaled / whole - 1.0).abs() < 0.005, "scale {share}: {scaled} and {whole}");
+        // The faces of the crease open away from each other, and each faces projector and eye.
+        let slope = Vec3::new(0.4, 0.0, -0.57);
+        let crease = one_body(at(edge - 0.4, -0.57, Vec3::new(0.4, 0.0, 0.57)), at(edge, 0.0, slope));
+        let step = one_body(at(edge - 0.7, 0.0, Vec3::X * 0.7), at(edge, -0.3, Vec3::X * 0.7));
+        for (name, scene) in [("body", bodies), ("normal", crease), ("depth", step)] {
+            let eye = DVec3::new(0.0, 0.05, 2.6);
+            let view = View::new(&scene, camera(160, 120, DVec3::new(0.0, 0.0, 2.6), DVec3::ZERO), eye);
+            let method = Method::full(2);
+            let whole = view.at(1.0, &method);
+            for share in [0.5, 0.25] {
+                let shown = view.at(share, &method);
+                let (mut worst, mut wrong, mut lit) = (0.0f32, 0, 0);
+                for (i, surface) in whole.surfaces.iter().enumerate().filter(|(_, s)| s.is_lit()) {
+                    assert_eq!(body_of(&shown.surfaces[i]), body_of(surface), "{name}: pixel {i}");
+                    let apart = (shown.light[i] - whole.light[i]).abs().max_element();
+                    worst = worst.max(apart);
+                    wrong += u32::from(apart > 0.25);
+                    lit += 1;
+                }
+                println!(
+                    "{name}, scale {share}: of {lit} pixels {wrong} show other light, by {worst:.5} at most"
+                );
+                assert!(lit > 3000, "{lit}");
+                assert!(worst < 1e-3 && wrong == 0, "{name}, scale {share}: {wrong}, {worst}");
+            }
         }
     }
-}
 
-/// What a texture divides the light by is that of the panel's own pixels: it stays sharp.
-#[test]
-fn textures_stay_sharp() {
-    let square = quad(Vec3::new(-0.9, -0.7, 0.0), Vec3::X * 1.8, Vec3::Y * 1.4);
-    let mut scene = scene_of(square, Material { ..diffuse(Vec3::ONE) });
-    let texture = use_texture(&mut scene, noise_texture(64, 5, 40, 220, false));
-    scene.materials[0].base_color_texture = texture;
-    scene.environment = sky(SKY);
-    let eye = DVec3::new(0.1, 0.2, 2.0);
-    let view = View::new(&scene, camera(160, 120, DVec3::new(0.0, 0.0, 2.0), DVec3::ZERO), eye);
-    let whole = view.at(1.0, &dpm());
-    let rmse = |shown: &Shown| {
-        let apart =
-            whole.light.iter().zip(&shown.light).map(|(a, b)| f64::from((*a - *b).length_squared()) / 3.0);
-        (apart.sum::<f64>() / whole.light.len() as f64).sqrt()
-    };
-    let [sharp, blurred] = [dpm(), Method::full(2)].map(|method| rmse(&view.at(0.5, &method)));
-    println!(
+    /// A plane under an even sky has the same light as if every pixel were traced, and so has its mean.
+    #[test]
+    fn a_plane_keeps_its_light() {
+        let mut scene = scene_of(
+            quad(Vec3::new(-0.9, -0.7, 0.0), Vec3::X * 1.8, Vec3::Y * 1.4),
+            diffuse(Vec3::new(0.7, 0.5, 0.3)),
+        );
+        scene.environment = sky(SKY);
+        let eye = DVec3::new(0.1, 0.2, 2.0);
+        let view = View::new(&scene, camera(160, 120, DVec3::new(0.3, 0.4, 2.0), DVec3::ZERO), eye);
+        for method in [dpm(), Method::full(2)] {
+            let mean = |shown: &Shown| {
+                let codes = shown
+                    .codes
+                    .iter()
+                    .map(|c| f64::from(c & 255) + f64::from(c >> 8 & 255) + f64::from(c >> 16 & 255));
+                codes.sum::<f64>() / shown.codes.len() as f64
+            };
+            let whole = mean(&view.at(1.0, &method));
+            for share in [0.75, 0.5, 0.25] {
+                let scaled = mean(&view.at(share, &method));
+                println!("scale {share}: mean code {scaled:.4}, {whole:.4} with every pixel traced");
+                assert!((scaled / whole - 1.0).abs() < 0.005, "scale {share}: {scaled} and {whole}");
+            }
+        }
+    }
+
+    /// What a texture divides the light by is that of the panel's own pixels: it stays sharp.
+    #[test]
+    fn textures_stay_sharp() {
+        let square = quad(Vec3::new(-0.9, -0.7, 0.0), Vec3::X * 1.8, Vec3::Y * 1.4);
+        let mut scene = scene_of(square, Material { ..diffuse(Vec3::ONE) });
+        let texture = use_texture(&mut scene, noise_texture(64, 5, 40, 220, false));
+        scene.materials[0].base_color_texture = texture;
+        scene.environment = sky(SKY);
+        let eye = DVec3::new(0.1, 0.2, 2.0);
+        let view = View::new(&scene, camera(160, 120, DVec3::new(0.0, 0.0, 2.0), DVec3::ZERO), eye);
+        let whole = view.at(1.0, &dpm());
+        let rmse = |shown: &Shown| {
+            let apart = whole
+                .light
+                .iter()
+                .zip(&shown.light)
+                .map(|(a, b)| f64::from((*a - *b).length_squared()) / 3.0);
+            (apart.sum::<f64>() / whole.light.len() as f64).sqrt()
+        };
+        let [sharp, blurred] = [dpm(), Method::full(2)].map(|method| rmse(&view.at(0.5, &method)));
+        println!(
         "error of a noise texture at half the raster: {sharp:.5}; {blurred:.5} if its light is interpolated"
     );
-    assert!(sharp < 0.1 * blurred, "{sharp} and {blurred}");
-}
+        assert!(sharp < 0.1 * blurred, "{sharp} and {blurred}");
+    }
 
-/// Frames that change the raster, either way, show what a renderer shows that has had this raster all along: nothing of another raster is left.
-#[test]
-fn a_change_of_the_raster_leaves_nothing_behind() {
-    let scene = balls();
-    let view = view_of_balls(&scene);
-    for method in [dpm(), Method::full(2)] {
-        for rung in [0, 2, 4] {
-            let [steady, later] =
-                [3, 7].map(|frames| view.show(Scale::Ladder, &method, &[rung; 7][..frames]));
-            let apart = |a: &Shown, b: &Shown| {
-                let apart = a.light.iter().zip(&b.light).map(|(a, b)| (*a - *b).abs().max_element());
-                apart.sum::<f32>() / a.light.len() as f32
-            };
-            // How much noise the same renderer has.
-            let noise = apart(&steady, &later);
-            for before in [[4, 4, 1], [0, 1, 2]] {
-                let rungs: Vec<_> = before.into_iter().chain([rung; 4]).collect();
-                let shown = view.show(Scale::Ladder, &method, &rungs);
-                let same = shown
-                    .surfaces
-                    .iter()
-                    .zip(&steady.surfaces)
-                    .filter(|(a, b)| body_of(a) == body_of(b))
-                    .count();
-                assert_eq!(same, steady.surfaces.len(), "rung {rung} after {before:?}");
-                let off = |s: &Shown| {
-                    (0..s.codes.len()).filter(|&i| s.codes[i] != 0 && !s.surfaces[i].is_lit()).count()
+    /// Frames that change the raster, either way, show what a renderer shows that has had this raster all along: nothing of another raster is left.
+    #[test]
+    fn a_change_of_the_raster_leaves_nothing_behind() {
+        let scene = balls();
+        let view = view_of_balls(&scene);
+        for method in [dpm(), Method::full(2)] {
+            for rung in [0, 2, 4] {
+                let [steady, later] =
+                    [3, 7].map(|frames| view.show(Scale::Ladder, &method, &[rung; 7][..frames]));
+                let apart = |a: &Shown, b: &Shown| {
+                    let apart = a.light.iter().zip(&b.light).map(|(a, b)| (*a - *b).abs().max_element());
+                    apart.sum::<f32>() / a.light.len() as f32
                 };
-                assert_eq!(off(&shown), 0);
-                let mean = apart(&shown, &steady);
-                assert!(
-                    mean < 0.005 + 1.5 * noise,
-                    "rung {rung} after {before:?}: {mean}, {noise} by chance"
-                );
+                // How much noise the same renderer has.
+                let noise = apart(&steady, &later);
+                for before in [[4, 4, 1], [0, 1, 2]] {
+                    let rungs: Vec<_> = before.into_iter().chain([rung; 4]).collect();
+                    let shown = view.show(Scale::Ladder, &method, &rungs);
+                    let same = shown
+                        .surfaces
+                        .iter()
+                        .zip(&steady.surfaces)
+                        .filter(|(a, b)| body_of(a) == body_of(b))
+                        .count();
+                    assert_eq!(same, steady.surfaces.len(), "rung {rung} after {before:?}");
+                    let off = |s: &Shown| {
+                        (0..s.codes.len()).filter(|&i| s.codes[i] != 0 && !s.surfaces[i].is_lit()).count()
+                    };
+                    assert_eq!(off(&shown), 0);
+                    let mean = apart(&shown, &steady);
+                    assert!(
+                        mean < 0.005 + 1.5 * noise,
+                        "rung {rung} after {before:?}: {mean}, {noise} by chance"
+                    );
+                }
             }
         }
+        assert_eq!(LADDER.len(), 5);
     }
-    assert_eq!(LADDER.len(), 5);
 }
