@@ -56,7 +56,7 @@ fn settings(camera: &ProjectorCamera, scale: Scale, method: &Method) -> Renderer
 }
 
 /// What a frame shows on the panel.
-struct Shown {
+struct Picture {
     codes: Vec<u32>,
     light: Vec<Vec3>,
     surfaces: Vec<Surface>,
@@ -78,7 +78,7 @@ impl<'a> View<'a> {
     }
 
     /// The last of so many frames, each on its rung.
-    fn show(&self, scale: Scale, method: &Method, rungs: &[usize]) -> Shown {
+    fn show(&self, scale: Scale, method: &Method, rungs: &[usize]) -> Picture {
         let settings = settings(&self.camera, scale, method);
         let mut renderer = Renderer::new(&self.gpu, self.scene, settings).expect("the scene fits");
         let mut slot = renderer.create_slot(true).expect("memory");
@@ -91,7 +91,7 @@ impl<'a> View<'a> {
             lit = slot.wait(WAIT_NS).expect("the frame ends").counters().lit_pixels;
         }
         let light = slot.radiance().expect("for debugging").iter().map(|&[r, g, b, _]| Vec3::new(r, g, b));
-        Shown {
+        Picture {
             codes: slot.codes().to_vec(),
             light: light.collect(),
             surfaces: slot.surfaces().expect("for debugging"),
@@ -99,7 +99,7 @@ impl<'a> View<'a> {
         }
     }
 
-    fn at(&self, share: f64, method: &Method) -> Shown {
+    fn at(&self, share: f64, method: &Method) -> Picture {
         self.show(Scale::Share(share), method, &[0, 0, 0])
     }
 
@@ -326,7 +326,7 @@ mod breadth {
         let eye = DVec3::new(0.1, 0.2, 2.0);
         let view = View::new(&scene, camera(160, 120, DVec3::new(0.3, 0.4, 2.0), DVec3::ZERO), eye);
         for method in [dpm(), Method::full(2)] {
-            let mean = |shown: &Shown| {
+            let mean = |shown: &Picture| {
                 let codes = shown
                     .codes
                     .iter()
@@ -353,7 +353,7 @@ mod breadth {
         let eye = DVec3::new(0.1, 0.2, 2.0);
         let view = View::new(&scene, camera(160, 120, DVec3::new(0.0, 0.0, 2.0), DVec3::ZERO), eye);
         let whole = view.at(1.0, &dpm());
-        let rmse = |shown: &Shown| {
+        let rmse = |shown: &Picture| {
             let apart = whole
                 .light
                 .iter()
@@ -377,7 +377,7 @@ mod breadth {
             for rung in [0, 2, 4] {
                 let [steady, later] =
                     [3, 7].map(|frames| view.show(Scale::Ladder, &method, &[rung; 7][..frames]));
-                let apart = |a: &Shown, b: &Shown| {
+                let apart = |a: &Picture, b: &Picture| {
                     let apart = a.light.iter().zip(&b.light).map(|(a, b)| (*a - *b).abs().max_element());
                     apart.sum::<f32>() / a.light.len() as f32
                 };
@@ -393,7 +393,7 @@ mod breadth {
                         .filter(|(a, b)| body_of(a) == body_of(b))
                         .count();
                     assert_eq!(same, steady.surfaces.len(), "rung {rung} after {before:?}");
-                    let off = |s: &Shown| {
+                    let off = |s: &Picture| {
                         (0..s.codes.len()).filter(|&i| s.codes[i] != 0 && !s.surfaces[i].is_lit()).count()
                     };
                     assert_eq!(off(&shown), 0);
