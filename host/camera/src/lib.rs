@@ -35,6 +35,7 @@ mod constellation;
 mod decode;
 mod detect;
 mod edges;
+mod finder;
 mod image;
 mod outline;
 mod planar;
@@ -52,6 +53,7 @@ pub use board::{board_pdf, board_view};
 pub use body::{BodyPose, Markings, TagPlace};
 pub use coded::{board_markings, coded_view};
 pub use detect::{TagDetector, TagSighting, TAGS};
+pub use finder::{sample_of, BodyFinder, FinderSetup};
 pub use image::{GreyImage, LEAST_SIDE, MOST_SIDE};
 pub use pose::{Covariance, Observation, PoseFit, Velocity};
 pub use sightings::{Expectation, Sightings};
@@ -60,5 +62,5 @@ pub use source::{
     SourceKind, SourceOpener,
 };
 pub use sources::{examine_source, open_source};
-pub use tracker::{CameraTracker, CameraTrackerSetup};
+pub use tracker::CameraTracker;
 pub use v4l2::motion_jpeg_grey;

@@ -259,9 +259,66 @@ pub(crate) fn prediction_table(rows: &[PredictionRow]) -> String {
 mod tests {
     use super::*;
 
+    /// Five waves at once, which together have the power of a swing of 0.5 m/s and 5 m/s2.
+    fn hand() -> MotionSpec {
+        let peak_speed_m_s = 0.5 / 5f64.sqrt();
+        let wave = |(i, by): (usize, f64)| {
+            let (sin, cos) = (1.3 * i as f64).sin_cos();
+            let peak_acceleration_m_s2 = 10.0 * by * peak_speed_m_s;
+            MotionSpec::Sinusoid { direction: [cos, sin, 0.0], peak_speed_m_s, peak_acceleration_m_s2 }
+        };
+        let waves = [0.34, 0.64, 0.96, 1.22, 1.47];
+        MotionSpec::Together { parts: waves.into_iter().enumerate().map(wave).collect() }
+    }
+
     /// Every motion and every predictor.
     mod breadth {
         use super::*;
+
+        /// `cargo test -p dpm-tracking --lib far_ahead_table -- --nocapture` prints the table: a tracker at 120 Hz with 0.2 mm
+        /// of noise, frames at 60 a second, 32, 42 and 50 ms ahead.
+        #[test]
+        fn far_ahead_table_keeps_its_bounds() {
+            let swing = MotionSpec::Sinusoid {
+                direction: [1.0, 0.0, 0.0],
+                peak_speed_m_s: 0.5,
+                peak_acceleration_m_s2: 5.0,
+            };
+            let circle = MotionSpec::Rotate {
+                axis: [0.0, 0.0, 1.0],
+                rate_rad_s: 10.0,
+                pivot_offset_m: [0.05, 0.0, 0.0],
+            };
+            let turns = MotionSpec::shuttle(0.5, 0.15, 5.0);
+            let rows = [
+                ("swing", swing, [1.4, 1.7, 2.2]),
+                ("circle", circle, [1.4, 1.8, 2.2]),
+                ("a hand", hand(), [3.3, 4.6, 6.2]),
+                ("to and fro with sudden turns", turns, [5.6, 6.8, 10.0]),
+            ];
+            for (name, motion, most) in rows {
+                let p99 = [16, 26, 36].map(|latch_ms| {
+                    let rate = FrameRate::new(120, 1).unwrap();
+                    let mut rig = EvaluationConfig::with_noise(2e-4, 1e-3);
+                    rig.tracker = MockTrackerConfig { rate, latency_ns: 10_000_000, ..rig.tracker };
+                    let frame_rate = FrameRate::new(60, 1).unwrap();
+                    let latch_to_light_ns = latch_ms * 1_000_000;
+                    let rig = EvaluationConfig {
+                        frame_rate,
+                        latch_to_light_ns,
+                        frames: 1800,
+                        settle_frames: 120,
+                        ..rig
+                    };
+                    let far =
+                        PoseFilterConfig { lost_after_ns: 1_000_000_000, ..PoseFilterConfig::default() };
+                    let errors = evaluate(&motion, far, &rig).unwrap();
+                    (1e-6 * errors.horizon_ns.1 as f64, 1e3 * errors.position_m.p99)
+                });
+                println!("{name}: {p99:.2?}");
+                assert!(p99.iter().zip(most).all(|((_, mm), most)| *mm <= most), "{name}: {p99:?}");
+            }
+        }
 
         /// `cargo test -p dpm-tracking --lib prediction_table -- --nocapture` prints the table.
         #[test]

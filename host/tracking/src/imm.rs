@@ -301,7 +301,7 @@ impl<P: Copy> Kinematics<P> {
 }
 
 /// A prediction carries an acceleration on for this long, seconds.
-const ACCELERATES_S: f64 = 0.012;
+pub(crate) const ACCELERATES_S: f64 = 0.012;
 
 /// The motion of a body the last time that it passed this place, over one step ([`super::recall`]).
 #[derive(Clone, Copy, Debug, PartialEq)]

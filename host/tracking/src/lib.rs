@@ -34,6 +34,7 @@
 //! ```
 
 mod bank;
+mod course;
 #[cfg(test)]
 mod evaluation;
 pub mod imm;
@@ -45,6 +46,7 @@ mod smooth;
 mod state;
 
 pub use bank::PoseFilterBank;
+pub use course::Continuation;
 pub use pose_filter::{PoseFilter, PoseFilterConfig, Prediction, Verdict};
 pub use state::{Freshness, PosePrediction, TrackState};
 

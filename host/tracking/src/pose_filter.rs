@@ -5,6 +5,7 @@
 //! three such samples that agree replace the track. So a teleport is accepted within three samples and never
 //! extrapolated across, and a burst of outliers changes nothing.
 
+use super::course::{Continuation, Course};
 use super::imm::{Kinematics, Rotations, Translations};
 use super::learner::Learner;
 use super::noise::NoiseEstimator;
@@ -210,6 +211,8 @@ struct PoseReading {
 struct Track {
     position: Learner<Translations>,
     rotation: Learner<Rotations>,
+    /// Of the position alone.
+    course: Course,
     newest: PoseReading,
     /// Length of the current run of identical poses, and whether the body moved before it.
     repeats: u32,
@@ -345,6 +348,10 @@ impl PoseFilter {
         Some(TrackState {
             captured_at: track.newest.at,
             position,
+            continuation: match self.config.prediction {
+                Prediction::On => track.course.of(&position.mean),
+                Prediction::Off => Continuation::default(),
+            },
             rotation,
             tracked_for_ns: self.tracked_for_ns(),
             lost_after_ns: self.config.lost_after_ns,
@@ -413,6 +420,7 @@ impl PoseFilter {
                         position.update(to_ns, z.position, rp),
                         rotation.update(to_ns, z.rotation, rr),
                     ]);
+                    take_course(&mut track.course, position, to_ns, z.position, rp);
                     self.candidates = [None; ACQUIRE_SAMPLES];
                     self.position_noise.push(z.at.0, z.position);
                     self.rotation_noise.push(z.at.0, z.rotation);
@@ -468,7 +476,9 @@ impl PoseFilter {
         }
         self.last_nis = None;
         self.candidates = [None; ACQUIRE_SAMPLES];
-        self.track = Some(Track { position, rotation, newest: z, repeats: 0, moved_before_repeats: false });
+        let course = Course::default();
+        self.track =
+            Some(Track { position, rotation, course, newest: z, repeats: 0, moved_before_repeats: false });
         Verdict::Acquired
     }
 
@@ -492,6 +502,11 @@ impl PoseFilter {
         let foretold = (last.position - previous.position) * (h / h0);
         (step - foretold).length() <= c.max_acceleration_m_s2 * h * (h + h0) + noise * (2.0 + 2.0 * h / h0)
     }
+}
+
+/// Shows the course of a position what came, and what the filters make of it.
+fn take_course(course: &mut Course, position: &Learner<Translations>, at_ns: i64, z: DVec3, r: DVec3) {
+    course.take(at_ns, z, r, position.combined().mean);
 }
 
 impl Track {

@@ -1,5 +1,6 @@
 //! The filter's state as plain data: small enough for a latest-wins slot, and sufficient to predict without the filter.
 
+use super::course::Continuation;
 use super::imm::{Kinematics, Rotations, Translations};
 use dpm_device::pose::Pose;
 use dpm_device::time::HostTime;
@@ -41,6 +42,8 @@ pub struct TrackState {
     pub captured_at: HostTime,
     /// Position, m.
     pub position: Kinematics<DVec3>,
+    /// How it goes on where light lies far ahead.
+    pub continuation: Continuation,
     /// Rotation, rad.
     pub rotation: Kinematics<DQuat>,
     /// Horizons up to this are normal operation.
@@ -55,7 +58,7 @@ impl TrackState {
     pub fn predict(&self, at: HostTime) -> PosePrediction {
         let horizon_ns = at.ns_since(self.captured_at);
         let h = horizon_ns.clamp(-self.lost_after_ns, self.lost_after_ns) as f64 * 1e-9;
-        let position = self.position.mean.point_after::<Translations>(h);
+        let position = self.position.mean.point_after::<Translations>(h) + self.continuation.after(h);
         let rotation = self.rotation.mean.point_after::<Rotations>(h);
         let freshness = if horizon_ns > self.lost_after_ns {
             Freshness::Lost

@@ -43,6 +43,8 @@ mod profile;
 mod progress;
 mod record;
 #[cfg(feature = "lab")]
+mod rehearse;
+#[cfg(feature = "lab")]
 mod report;
 mod rig_args;
 #[cfg(feature = "page")]
@@ -137,6 +139,12 @@ enum Command {
     Calibrate(calibrate::CalibrateArgs),
     /// Record the samples of a rig's tracker into a file that `tracker.kind = "replay"` plays
     Record(record::RecordArgs),
+    /// Say what to expect of a rig before its parts are there: registration, latency, and what better parts would win
+    ///
+    /// Runs the rig's own engine at virtual pace against mocks with the rates, delays, noise and calibration errors of its
+    /// parts. Needs neither hardware nor a GPU, and repeats bit for bit. The keys of [rehearsal] say what is assumed.
+    #[cfg(feature = "lab")]
+    Rehearse(rehearse::RehearseArgs),
     /// Measure where the time between motion and light goes
     Profile(profile::ProfileArgs),
     /// Show what this machine can do, and how to fix what is missing
@@ -284,6 +292,8 @@ fn dispatch(command: &Command) -> Result<(), Failure> {
         #[cfg(feature = "calibrate")]
         Command::Calibrate(args) => calibrate::execute(args),
         Command::Record(args) => record::execute(args),
+        #[cfg(feature = "lab")]
+        Command::Rehearse(args) => rehearse::execute(args),
         Command::Profile(args) => profile::execute(args),
         Command::Doctor(args) => doctor::execute(args),
         #[cfg(feature = "lab")]

@@ -12,6 +12,7 @@ mod osc;
 mod page;
 mod prediction;
 mod projector;
+mod rehearsal;
 mod run;
 mod safety;
 mod values;
@@ -31,6 +32,7 @@ pub use dpm_common::keys::{ConfigError, ConfigErrors, Origin};
 pub use osc::{OscConfig, MOST_OSC_TOKEN};
 pub use page::{PageConfig, DEFAULT_PAGE};
 pub use projector::*;
+pub use rehearsal::{RehearsalConfig, RehearsedMotion};
 pub use run::*;
 pub use safety::{
     EyesConfig, InterlockConfig, InterlockSignal, KeyInterlockConfig, LimitsConfig, LineInterlockConfig,
@@ -79,6 +81,8 @@ section! {
         output: OutputConfig = OutputConfig::default(), "", Any;
         /// What happens when something fails.
         safety: SafetyConfig = SafetyConfig::default(), "", Any;
+        /// What a rehearsal assumes.
+        rehearsal: RehearsalConfig = RehearsalConfig::default(), "", Any;
         /// What an operator sees in a browser.
         page: PageConfig = PageConfig::default(), "", Any;
         /// What other programs may change.

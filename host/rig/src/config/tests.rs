@@ -637,7 +637,7 @@ fn product_code(dir: &Path, out: &mut String) {
 fn every_key_is_read_somewhere() {
     const LIMITS: [&str; 1] = ["projector.max_planes_per_second"];
     let mut code = String::new();
-    for crate_src in ["src", "../dpm/src"] {
+    for crate_src in ["src", "../dpm/src", "../rehearsal/src"] {
         product_code(&Path::new(env!("CARGO_MANIFEST_DIR")).join(crate_src), &mut code);
     }
     let reads = |name: &str| {

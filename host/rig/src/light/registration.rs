@@ -56,7 +56,7 @@ impl RegistrationMeter {
     }
 
     /// Per tracked body: its points in its own space, metres.
-    pub(crate) fn points(&self) -> &[Vec<DVec3>] {
+    pub fn points(&self) -> &[Vec<DVec3>] {
         &self.points
     }
 

@@ -38,6 +38,17 @@ impl SourceError {
     }
 }
 
+/// What is between a pose and its sample.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct SampleErrors {
+    /// Standard deviation of the position along each axis, metres.
+    pub position_m: f64,
+    /// Standard deviation of the rotation about each axis, rad.
+    pub rotation_rad: f64,
+    /// From the instant of the pose to the sample's arrival, nanoseconds.
+    pub delivery_ns: i64,
+}
+
 /// What a tracker is opened with.
 pub struct TrackerPlace {
     /// The rig's bodies in their order.
@@ -87,6 +98,17 @@ pub trait TrackerKeys: KeyValues {
     /// Looks at the camera of such a tracker for a second or two; `None` for all others.
     #[cfg(feature = "camera")]
     fn examine(&self) -> Option<Result<CameraLook, CameraDoubt>> {
+        None
+    }
+
+    /// What such a camera looks for on a body; `None` for all others.
+    #[cfg(feature = "camera")]
+    fn seen_of(&self, _body: &str) -> Option<dpm_camera::Markings> {
+        None
+    }
+
+    /// The errors of its samples, where the rig file gives them: those of a tracker in this process.
+    fn errors(&self) -> Option<SampleErrors> {
         None
     }
 

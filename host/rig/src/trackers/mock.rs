@@ -1,6 +1,6 @@
 //! `tracker.kind = "mock"`: a software tracker in this process.
 
-use super::keys::{SourceError, TrackerConfig, TrackerKeys, TrackerPlace};
+use super::keys::{SampleErrors, SourceError, TrackerConfig, TrackerKeys, TrackerPlace};
 use super::kind::{MockServer, PoseOrigin, TrackerKind};
 use super::transform::TrackerTransformConfig;
 use crate::mock::{self, FaultPlan, MockTracker};
@@ -57,6 +57,14 @@ impl TrackerKeys for MockTrackerConfig {
 
     fn frame(&self) -> Option<(&TrackerTransformConfig, i64)> {
         None
+    }
+
+    fn errors(&self) -> Option<SampleErrors> {
+        Some(SampleErrors {
+            position_m: self.noise_m,
+            rotation_rad: self.noise_rad,
+            delivery_ns: i64::from(self.latency_us) * 1000,
+        })
     }
 
     fn place(&self) -> String {

@@ -4,7 +4,7 @@ use super::{form_of, seconds};
 use crate::cli::rig_args::RigArgs;
 use crate::cli::watch::print;
 use dpm_calibrate::camera::{calibrate, told_of, Task};
-use dpm_camera::board_pdf;
+use dpm_camera::{board_pdf, TAGS};
 use dpm_camera_files::{export, MAX_BYTES};
 use dpm_common::files::{keep_old, write_atomically};
 use dpm_device::tag36h11::TagBoard;
@@ -21,6 +21,12 @@ pub(super) struct CameraArgs {
     /// Write the board as a page of PDF, to be printed at 100 % and fixed to something flat, and do nothing else
     #[arg(long, value_name = "FILE.pdf", conflicts_with = "rig")]
     print: Option<PathBuf>,
+    /// With --print: tags for bodies in place of the board, from this number on, as many as the paper holds
+    #[arg(long, value_name = "FIRST", requires = "print", value_parser = clap::value_parser!(u16).range(0..TAGS as i64))]
+    tags: Option<u16>,
+    /// With --tags: length of a side of each tag's black border, millimetres (tracker.tags[].side_m)
+    #[arg(long, value_name = "MM", default_value_t = 60.0, requires = "tags", value_parser = side_mm)]
+    side_mm: f64,
     /// The paper on which the board is printed
     #[arg(long, value_enum, default_value = "a4")]
     paper: Paper,
@@ -67,6 +73,11 @@ impl CameraArgs {
     pub(super) fn execute(&self) -> Result<(), Failure> {
         let (board, sheet) = self.paper.board();
         match (&self.print, &self.rig) {
+            (Some(path), _) if self.tags.is_some() => {
+                let page = sheet_of_tags(self.tags.unwrap_or(0), self.side_mm, sheet);
+                let page = page.map_err(|told| Failure::new(FailureKind::BadInput, told))?;
+                print_board(path, &board_pdf(&page, sheet))
+            }
             (Some(path), _) => print_board(path, &board_pdf(&board, sheet)),
             (None, Some(rig)) => self.measure(rig, board),
             // The command line asks for one of the two.
@@ -106,6 +117,33 @@ impl CameraArgs {
     }
 }
 
+/// Room below the tags for the line of 100 mm and its words, on both sides because tags stand in the middle; and at the sides.
+const BELOW_MM: f64 = 12.0;
+const BESIDE_MM: f64 = 6.0;
+
+fn side_mm(text: &str) -> Result<f64, String> {
+    let side: f64 = text.parse().map_err(|_| format!("{text:?} is no number"))?;
+    (5.0..=320.0).contains(&side).then_some(side).ok_or_else(|| "must be from 5 to 320".into())
+}
+
+/// As many tags of this side as a sheet holds, in rows from the number `first` on.
+fn sheet_of_tags(first: u16, side_mm: f64, [w, h]: [f64; 2]) -> Result<TagBoard, String> {
+    let one = TagBoard { columns: 1, rows: 1, side_m: 1e-3 * side_mm, first };
+    let pitch = 1e3 * one.pitch_m();
+    let fit = |room: f64| (room / pitch).floor().max(0.0) as u16;
+    let (columns, rows) = (fit(w - 2.0 * BESIDE_MM), fit(h - 2.0 * BELOW_MM));
+    let left = (TAGS as u16).saturating_sub(first);
+    let columns = columns.min(left);
+    let rows = rows.min(left / columns.max(1));
+    if columns == 0 || rows == 0 {
+        return Err(format!(
+            "the paper of {w:.0} x {h:.0} mm holds no tag with a border of {side_mm} mm and its white margin: give a smaller \
+             --side-mm or a larger --paper"
+        ));
+    }
+    Ok(TagBoard { columns, rows, ..one })
+}
+
 fn print_board(path: &Path, page: &[u8]) -> Result<(), Failure> {
     let named = |e: std::io::Error| Failure::new(FailureKind::BadInput, format!("{}: {e}", path.display()));
     write_atomically(path, |out| out.write_all(page)).map_err(named)?;
@@ -114,4 +152,26 @@ fn print_board(path: &Path, page: &[u8]) -> Result<(), Failure> {
         path.display()
     ));
     Ok(())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// Every sheet of tags stays on its paper with the words below, and shows only numbers that exist.
+    #[test]
+    fn tags_fit_their_sheet() {
+        for (w, h) in [(297.0, 210.0), (279.4, 215.9), (420.0, 297.0)] {
+            for side in [5.0, 28.0, 60.0, 120.0] {
+                for first in [0, 580, 586] {
+                    let board = sheet_of_tags(first, side, [w, h]).unwrap();
+                    let [wide, high] = board.size_m().map(|m| 1e3 * m);
+                    assert!(wide <= w - 10.0 && high <= h - 20.0, "{board:?}");
+                    assert!(usize::from(board.first + board.columns * board.rows) <= TAGS, "{board:?}");
+                }
+            }
+        }
+        assert_eq!(sheet_of_tags(0, 60.0, [297.0, 210.0]).unwrap().tags().count(), 6);
+        assert!(sheet_of_tags(0, 300.0, [297.0, 210.0]).unwrap_err().contains("--side-mm"));
+    }
 }

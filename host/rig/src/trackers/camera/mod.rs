@@ -10,8 +10,8 @@ use super::keys::{SourceError, TrackerKeys, TrackerPlace};
 use super::kind::{PoseOrigin, TrackerKind};
 use super::transform::{PoseConfig, TrackerTransformConfig};
 use dpm_camera::{
-    examine_source, motion_jpeg_grey, open_source, CameraDoubt, CameraLook, CameraTracker,
-    CameraTrackerSetup, Markings, PictureRequest, PictureSource, TagPlace, TAGS,
+    examine_source, motion_jpeg_grey, open_source, CameraDoubt, CameraLook, CameraTracker, FinderSetup,
+    Markings, PictureRequest, PictureSource, TagPlace, TAGS,
 };
 use dpm_common::keys::read::{refuse, Reader};
 use dpm_device::picture_stream::{PictureHeader, HEADER_BYTES};
@@ -130,6 +130,10 @@ impl TrackerKeys for CameraTrackerConfig {
         examine_source(&self.device, &self.request())
     }
 
+    fn seen_of(&self, body: &str) -> Option<Markings> {
+        Some(self.markings(body))
+    }
+
     fn eye(&self) -> Option<Result<ProjectorCamera, SourceError>> {
         let placed = |camera: ProjectorCamera| {
             let wrong = || SourceError::of_key("tracker.transform", "its rotation is zero");
@@ -149,7 +153,7 @@ impl TrackerKeys for CameraTrackerConfig {
                 ));
             }
         }
-        let setup = CameraTrackerSetup {
+        let setup = FinderSetup {
             camera: lens::camera(self)?,
             bodies: place.bodies.iter().map(|b| self.markings(&b.name)).collect(),
             marker_level: self.marker_level,
