@@ -622,6 +622,14 @@ fn sheets() -> Vec<ClosedForm> {
     add(&mut shadow.scene, quad(Vec3::new(-0.3, 0.3, 0.3), Vec3::X * 0.6, Vec3::NEG_Z * 0.6), veil);
     shadow.scene.lights.push(light_from_above());
     all.push(shadow);
+    // Eye and sun look through one triangle of a veil, and each of their rays decides for itself.
+    let mut under =
+        ClosedForm::new("a floor seen and lit through a veil", white(), 0.5, DVec3::splat(0.36 / PI), 3e-3);
+    under.scene.environment = Environment::default();
+    let veil = Material { alpha: 0.4, alpha_blend: true, double_sided: true, ..black() };
+    add(&mut under.scene, quad(Vec3::new(-1.0, 0.3, 2.0), Vec3::X * 6.0, Vec3::NEG_Z * 6.0), veil);
+    under.scene.lights.push(light_from_above());
+    all.push(under);
     all
 }
 
