@@ -1022,5 +1022,10 @@ pub fn is_of_software(binding: &str) -> bool {
     binding.ends_with("_ROWS") || binding == "B_QUEUE"
 }
 
+/// Whether a binding is bound only where a reduced raster is enlarged: some devices bind no more than the 32 buffers of the others.
+pub fn is_of_enlarging(binding: &str) -> bool {
+    binding.starts_with("B_COARSE")
+}
+
 /// The binding after them, of the shaders that ask the device for hits: no buffer, but the tree over the bodies of the frame.
 pub const TREE_BINDING: (&str, u32) = ("B_BODY_TREE", 36);

@@ -4,7 +4,7 @@ use dpm_render::gpu::{
     validation_messages, BindingKind, BindingSet, BindingTable, Buffer, CommandList, ComputePipeline,
     FrameFence, Gpu, GpuOptions, MemoryKind,
 };
-use dpm_shaders::structs::{is_of_software, BINDINGS};
+use dpm_shaders::structs::{is_of_enlarging, is_of_software, BINDINGS};
 use dpm_shaders::Shader;
 use std::sync::Arc;
 
@@ -37,7 +37,7 @@ pub fn run_shader(
     let unused = Buffer::new(gpu, "unused", 16, MemoryKind::Device).unwrap();
     let host = Buffer::new(gpu, "result", len, MemoryKind::Readback).unwrap();
     // As the renderer on a GPU: devices bind a limited number, and second bindings as texels are for software Vulkan.
-    let bound = || BINDINGS.iter().filter(|(name, _)| !is_of_software(name));
+    let bound = || BINDINGS.iter().filter(|(name, _)| !is_of_software(name) && !is_of_enlarging(name));
     let kinds: Vec<_> = bound().map(|&(_, binding)| (binding, BindingKind::Storage)).collect();
     let table = BindingTable::new(gpu, &kinds).unwrap();
     let pipeline = ComputePipeline::new(&table, shader, constants).unwrap();

@@ -12,7 +12,7 @@ mod stage;
 mod tracker;
 mod truth;
 
-pub use report::{CaseReport, RehearsalReport, Spread};
+pub use report::{CaseReport, Percentiles, RehearsalReport};
 
 use dpm_device::time::FrameRate;
 use dpm_rig::config::{ProjectorBackend, RigConfig};
@@ -208,8 +208,8 @@ fn pictures(stage: &mut Stage, own: &Case) -> Result<Option<PicturesReport>, Fai
     let count = f64::from(own.rate_hz) * (PICTURES_S + 1e-9 * stage::SETTLE_NS as f64);
     Ok(Some(PicturesReport {
         pictures: count as u64,
-        painted_mm: Spread::of(&painted.mm),
-        drawn_mm: Spread::of(&drawn.mm),
+        painted_mm: Percentiles::of(&painted.mm),
+        drawn_mm: Percentiles::of(&drawn.mm),
     }))
 }
 

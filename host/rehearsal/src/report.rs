@@ -6,16 +6,16 @@ use dpm_rig::config::RigConfig;
 use serde::Serialize;
 use std::fmt::Write;
 
-/// Quantiles of a distribution.
+/// Percentiles of a distribution.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Serialize)]
 #[allow(missing_docs)] // named after what they are
-pub struct Spread {
+pub struct Percentiles {
     pub p50: f64,
     pub p95: f64,
     pub p99: f64,
 }
 
-impl Spread {
+impl Percentiles {
     /// Of `values` in any order; all 0 without any.
     pub(super) fn of(values: &[f64]) -> Self {
         let mut sorted = values.to_vec();
@@ -34,29 +34,29 @@ pub struct CaseReport {
     /// What is other in it.
     pub name: String,
     /// Registration, millimetres across the light.
-    pub mm: Spread,
+    pub mm: Percentiles,
     /// The same, pixels of the projector.
-    pub px: Spread,
+    pub px: Percentiles,
     /// From motion to the centre of its light, milliseconds.
-    pub motion_to_light_ms: Spread,
+    pub motion_to_light_ms: Percentiles,
     /// The 99th percentile of registration by the closed form, millimetres.
     pub predicted_p99_mm: f64,
     /// Share of the bodies in frames that stayed dark.
     pub dark_share: f64,
     /// Registration if bodies were drawn where they were measured, without prediction, millimetres.
-    pub unpredicted_mm: Spread,
+    pub unpredicted_mm: Percentiles,
 }
 
 impl CaseReport {
     pub(super) fn new(name: &str, predicted_p99_mm: f64, fallen: &LightFall) -> Self {
         Self {
             name: name.to_owned(),
-            mm: Spread::of(&fallen.mm),
-            px: Spread::of(&fallen.px),
-            motion_to_light_ms: Spread::of(&fallen.late_ms),
+            mm: Percentiles::of(&fallen.mm),
+            px: Percentiles::of(&fallen.px),
+            motion_to_light_ms: Percentiles::of(&fallen.late_ms),
             predicted_p99_mm,
             dark_share: fallen.dark as f64 / fallen.bodies.max(1) as f64,
-            unpredicted_mm: Spread::of(&fallen.held_mm),
+            unpredicted_mm: Percentiles::of(&fallen.held_mm),
         }
     }
 }
@@ -67,9 +67,9 @@ pub struct PicturesReport {
     /// Pictures that were painted and looked at.
     pub pictures: u64,
     /// Registration in them, millimetres.
-    pub painted_mm: Spread,
+    pub painted_mm: Percentiles,
     /// The same by drawn corners, millimetres.
-    pub drawn_mm: Spread,
+    pub drawn_mm: Percentiles,
 }
 
 /// What a rig can be expected to do.
@@ -185,17 +185,20 @@ impl RehearsalReport {
         );
     }
 
+    /// How many times worse painted pictures are than drawn corners of the same run, at least 1: what the rows of drawn corners
+    /// leave out.
+    pub fn worse_by_pictures(&self) -> f64 {
+        self.pictures.map_or(1.0, |p| p.painted_mm.p99 / p.drawn_mm.p99).max(1.0)
+    }
+
     fn sentence(&self) -> String {
-        let verdict = if self.rig.mm.p99 <= self.noticed_mm {
-            "nobody would notice that"
-        } else {
-            "people notice that"
-        };
+        let [mm, px] = [self.rig.mm.p99, self.rig.px.p99].map(|p99| p99 * self.worse_by_pictures());
+        let verdict = if mm <= self.noticed_mm { "nobody would notice that" } else { "people notice that" };
         format!(
             "99 of 100 points would lie within {:.2} mm, {:.1} px of their light, {:.1} ms behind the motion. At {} m/s {verdict}: \
              the threshold is {:.2} mm.",
-            self.rig.mm.p99,
-            self.rig.px.p99,
+            mm,
+            px,
             self.rig.motion_to_light_ms.p50,
             self.motion.1,
             self.noticed_mm

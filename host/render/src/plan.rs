@@ -138,7 +138,7 @@ impl RendererPlan {
     /// # Errors
     /// The GPU's own.
     pub(super) fn pipelines(&self, gpu: &Arc<Gpu>, reading: Reading) -> Result<Pipelines, GpuError> {
-        let table = BindingTable::new(gpu, &shared_bindings(reading))?;
+        let table = BindingTable::new(gpu, &shared_bindings(reading, self.settings.is_reduced()))?;
         let compiled = |p: Program| ComputePipeline::new(&table, p.shader, &p.constants);
         let wanted = self.wanted(reading, trace_groups(gpu.summary()));
         let each = wanted.map(|program| program.map(compiled).transpose());
@@ -209,7 +209,7 @@ impl RendererPlan {
     /// # Errors
     /// The GPU's own.
     pub fn compile(&self, gpu: &Arc<Gpu>) -> Result<Vec<(Program, Vec<Executable>)>, GpuError> {
-        compile(gpu, Reading::Storage, self.programs())
+        compile(gpu, (Reading::Storage, self.settings.is_reduced()), self.programs())
     }
 
     /// The same of each of [`RendererPlan::programs_with_queries`].
@@ -220,16 +220,16 @@ impl RendererPlan {
         if !gpu.summary().ray_query {
             return Err(GpuError::NoRayQuery { device: gpu.summary().name.as_str().into() });
         }
-        compile(gpu, Reading::Query, self.programs_with_queries())
+        compile(gpu, (Reading::Query, self.settings.is_reduced()), self.programs_with_queries())
     }
 }
 
 fn compile(
     gpu: &Arc<Gpu>,
-    reading: Reading,
+    (reading, enlarges): (Reading, bool),
     programs: Vec<Program>,
 ) -> Result<Vec<(Program, Vec<Executable>)>, GpuError> {
-    let table = BindingTable::new(gpu, &shared_bindings(reading))?;
+    let table = BindingTable::new(gpu, &shared_bindings(reading, enlarges))?;
     let made = |p: Program| {
         let made = ComputePipeline::new(&table, p.shader, &p.constants)?.executables()?;
         Ok((p, made))

@@ -1,7 +1,5 @@
 //! The share of the panel's raster that is traced. A smaller one costs less; the pass `enlarge` brings its light to the panel's pixels.
 
-use super::drive::Drive;
-use super::settings::{Output, RendererSettings};
 use dpm_device::planes::Raster;
 
 /// Shares among which a run chooses by its frame times, the largest first. Each step saves about half of the work.
@@ -38,37 +36,6 @@ impl Scale {
 pub fn reduced(panel: Raster, share: f64) -> Raster {
     let side = |n: u32| ((f64::from(n) * share).ceil() as u32).clamp(1, n);
     Raster::new(side(panel.width()), side(panel.height())).expect("sides within those of a raster")
-}
-
-impl RendererSettings {
-    /// Frames may trace fewer pixels than the panel has: the pass `enlarge` is recorded.
-    pub fn is_reduced(&self) -> bool {
-        self.scale.rasters(self.raster).any(|raster| raster != self.raster)
-    }
-
-    /// The settings of the passes that work on a traced raster. What only the panel's own pixels have is not among them.
-    pub(super) fn on(&self, raster: Raster) -> Self {
-        if !self.is_reduced() {
-            return self.clone();
-        }
-        let Drive { gain, gain_of_body, ambient, .. } = self.drive.clone();
-        Self {
-            raster,
-            scale: Scale::WHOLE,
-            lens: self.lens.map(|camera| camera.at_raster(raster)),
-            drive: Drive { gain, gain_of_body, ambient, ..Drive::default() },
-            halftone: None,
-            plane_groups: Vec::new(),
-            output: Output::Codes,
-            ..self.clone()
-        }
-    }
-
-    /// The same for the largest raster that frames may trace.
-    pub(super) fn on_traced(&self) -> Self {
-        let largest = self.scale.rasters(self.raster).next().unwrap_or(self.raster);
-        self.on(largest)
-    }
 }
 
 #[cfg(test)]

@@ -109,6 +109,35 @@ impl Output {
 }
 
 impl RendererSettings {
+    /// Frames may trace fewer pixels than the panel has: the pass `enlarge` is recorded.
+    pub fn is_reduced(&self) -> bool {
+        self.scale.rasters(self.raster).any(|raster| raster != self.raster)
+    }
+
+    /// The settings of the passes that work on a traced raster. What only the panel's own pixels have is not among them.
+    pub(super) fn on(&self, raster: Raster) -> Self {
+        if !self.is_reduced() {
+            return self.clone();
+        }
+        let Drive { gain, gain_of_body, ambient, .. } = self.drive.clone();
+        Self {
+            raster,
+            scale: Scale::WHOLE,
+            lens: self.lens.map(|camera| camera.at_raster(raster)),
+            drive: Drive { gain, gain_of_body, ambient, ..Drive::default() },
+            halftone: None,
+            plane_groups: Vec::new(),
+            output: Output::Codes,
+            ..self.clone()
+        }
+    }
+
+    /// The same for the largest raster that frames may trace.
+    pub(super) fn on_traced(&self) -> Self {
+        let largest = self.scale.rasters(self.raster).next().unwrap_or(self.raster);
+        self.on(largest)
+    }
+
     /// The words that planes follow by are halftones, of which nothing lies between two pixels, and not code values.
     pub(crate) fn shows_halftones(&self) -> bool {
         self.halftone.is_some_and(|halftone| !halftone.is_exact() && !halftone.is_cut())

@@ -114,7 +114,7 @@ fn on_gpu_through(gpu: &Arc<Gpu>, input: &Input, texel: bool) -> (Vec<u32>, Coun
     let counters_host = host("counters", size_of::<Counters>());
     let bound = || BINDINGS.iter().filter(|(name, _)| texel || !is_of_software(name));
     let reading = if texel { Reading::Texels } else { Reading::Storage };
-    let table = BindingTable::new(gpu, &shared_bindings(reading)).unwrap();
+    let table = BindingTable::new(gpu, &shared_bindings(reading, false)).unwrap();
     let mut constants = SceneNeeds::default().everything().constants();
     constants.extend(optics_constants);
     let shader = dpm_shaders::COMPENSATE.reading(reading);

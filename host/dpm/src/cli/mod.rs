@@ -142,7 +142,7 @@ enum Command {
     /// Say what to expect of a rig before its parts are there: registration, latency, and what better parts would win
     ///
     /// Runs the rig's own engine at virtual pace against mocks with the rates, delays, noise and calibration errors of its
-    /// parts. Needs neither hardware nor a GPU, and repeats bit for bit. The keys of [rehearsal] say what is assumed.
+    /// parts. Needs neither hardware nor a GPU, and repeats bit for bit. The section `rehearsal` of the rig file says what is assumed.
     #[cfg(feature = "lab")]
     Rehearse(rehearse::RehearseArgs),
     /// Measure where the time between motion and light goes

@@ -108,7 +108,7 @@ fn version_text(v: u32) -> String {
 
 /// The bindings that every device must have: those of the shaders' own walk.
 fn bindings_of(software: bool) -> Vec<(u32, BindingKind)> {
-    shared_bindings(if software { Reading::Texels } else { Reading::Storage })
+    shared_bindings(if software { Reading::Texels } else { Reading::Storage }, false)
 }
 
 impl Abilities {

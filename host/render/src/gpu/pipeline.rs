@@ -34,13 +34,14 @@ impl BindingKind {
 }
 
 /// The bindings that all shaders share, with their kinds. The second bindings of a buffer, as texels, and the rays that the host walks are bound only
-/// for shaders that read tables so,
-/// because devices bind a limited number; and the tree over the bodies only for those that ask the device for hits.
-pub fn shared_bindings(reading: Reading) -> Vec<(u32, BindingKind)> {
+/// for shaders that read tables so, and what `enlarges` a reduced raster only where there is one, because devices bind a limited
+/// number; and the tree over the bodies only for those that ask the device for hits.
+pub fn shared_bindings(reading: Reading, enlarges: bool) -> Vec<(u32, BindingKind)> {
     let texel = reading == Reading::Texels;
     let tree = (reading == Reading::Query).then_some((structs::TREE_BINDING.1, BindingKind::BodyTree));
     (structs::BINDINGS.iter())
         .filter(|(name, _)| texel || !structs::is_of_software(name))
+        .filter(|(name, _)| enlarges || !structs::is_of_enlarging(name))
         .map(|&(name, binding)| {
             let rows = texel && structs::TEXEL_BINDINGS.contains(&name);
             (binding, if rows { BindingKind::Texel } else { BindingKind::Storage })
