@@ -75,7 +75,7 @@ def libusb_version(package):
 
 
 def main():
-    everything = metadata()
+    everything = metadata("--all-features")
     linux = metadata("--filter-platform", LINUX)
     contents = {program: linked(linux, name) for program, name in PROGRAMS.items()}
     foreign = sorted((p for p in everything["packages"] if p["source"]), key=lambda p: (p["name"], p["version"]))

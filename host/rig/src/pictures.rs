@@ -92,8 +92,12 @@ impl FallenLight {
 
     /// Drive from 0 to 1 in the projector's ray through the point `world`.
     pub fn at(&self, rig: &Rig, world: DVec3) -> Vec3 {
-        let pixel = rig.camera.project(world);
-        pixel.map_or(Vec3::ZERO, |p| sample(&rig.drive, &self.light, rig.camera.raster, p))
+        rig.camera.project(world).map_or(Vec3::ZERO, |pixel| self.through(rig, pixel))
+    }
+
+    /// Drive from 0 to 1 in the projector's ray through `pixel` of its raster, between pixel centres if need be.
+    pub fn through(&self, rig: &Rig, pixel: DVec2) -> Vec3 {
+        sample(&rig.drive, &self.light, rig.camera.raster, pixel)
     }
 }
 

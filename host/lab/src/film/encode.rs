@@ -1,6 +1,6 @@
-//! Pictures into an animated file: GIF, or PNG with animation.
+//! Pictures into an animated file: GIF, PNG with animation, or WebM.
 //!
-//! Both share one palette for the whole film, and both store only what changes. A pixel whose colour differs from the one that
+//! GIF and PNG share one palette for the whole film, and both store only what changes. A pixel whose colour differs from the one that
 //! is shown by less than the eye finds in noise stays, which is what makes a film of path-traced pictures small.
 
 use crate::paint::Canvas;
@@ -28,6 +28,8 @@ pub enum FilmFormat {
     Gif,
     /// PNG with animation.
     AnimatedPng,
+    /// WebM with AV1, where the feature `webm` is built in.
+    WebM,
 }
 
 impl FilmFormat {
@@ -37,6 +39,7 @@ impl FilmFormat {
         match end.to_ascii_lowercase().as_str() {
             "gif" => Some(Self::Gif),
             "png" | "apng" => Some(Self::AnimatedPng),
+            "webm" => Some(Self::WebM),
             _ => None,
         }
     }
@@ -62,19 +65,31 @@ pub(super) fn write(path: &Path, format: FilmFormat, pictures: &[Canvas], per_se
 }
 
 fn encoded(format: FilmFormat, pictures: &[Canvas], per_second: u32) -> io::Result<Vec<u8>> {
+    let in_palette: fn(&PaletteFilm, u32) -> io::Result<Vec<u8>> = match format {
+        FilmFormat::Gif => gif,
+        FilmFormat::AnimatedPng => animated_png,
+        FilmFormat::WebM => return video(pictures, per_second),
+    };
     let palette = Palette::of(pictures);
     let mut film = Vec::new();
     for tolerance in TOLERANCES {
         let indexed = palette.index(pictures, tolerance);
-        film = match format {
-            FilmFormat::Gif => gif(&indexed, per_second),
-            FilmFormat::AnimatedPng => animated_png(&indexed, per_second),
-        }?;
+        film = in_palette(&indexed, per_second)?;
         if film.len() <= LARGEST {
             break;
         }
     }
     Ok(film)
+}
+
+#[cfg(feature = "webm")]
+fn video(pictures: &[Canvas], per_second: u32) -> io::Result<Vec<u8>> {
+    super::webm::encoded(pictures, per_second, LARGEST)
+}
+
+#[cfg(not(feature = "webm"))]
+fn video(_: &[Canvas], _: u32) -> io::Result<Vec<u8>> {
+    Err(io::Error::other("this build has no encoder for WebM"))
 }
 
 struct Palette {
@@ -215,6 +230,7 @@ mod tests {
                 FilmFormat::AnimatedPng => {
                     image::codecs::png::PngDecoder::new(bytes).unwrap().apng().unwrap().into_frames()
                 }
+                FilmFormat::WebM => unreachable!("not in a palette"),
             };
             let frames = frames.collect_frames().unwrap();
             assert_eq!(frames.len(), film.len());

@@ -6,6 +6,8 @@
 mod encode;
 mod picture;
 mod stages;
+#[cfg(feature = "webm")]
+mod webm;
 
 pub use encode::FilmFormat;
 
@@ -52,7 +54,7 @@ impl FilmRequest {
     /// A film of `seconds` in the file `path`, whose end says what it is.
     ///
     /// # Errors
-    /// The end is neither .gif nor .png.
+    /// The end is none of .gif, .png and .webm, or the program was built without the feature `webm` and it is .webm.
     pub fn new(path: &Path, seconds: f64) -> Result<Self, Failure> {
         let bad = |text: String| Failure::new(FailureKind::BadInput, text);
         if !(LENGTHS_S[0]..=LENGTHS_S[1]).contains(&seconds) {
@@ -60,8 +62,18 @@ impl FilmRequest {
             return Err(bad(format!("--film-seconds {seconds}: a film lasts {least} to {most} s")));
         }
         let format = FilmFormat::of(path).ok_or_else(|| {
-            bad(format!("--film {}: the name of a film ends in .gif or .png (animated)", path.display()))
+            bad(format!(
+                "--film {}: the name of a film ends in .gif, .png (animated) or .webm",
+                path.display()
+            ))
         })?;
+        if format == FilmFormat::WebM && !cfg!(feature = "webm") {
+            let name = path.display();
+            return Err(bad(format!(
+                "--film {name}: this dpm was built without an encoder for WebM; take .gif or .png, or build it with \
+                 --features webm"
+            )));
+        }
         Ok(Self { path: path.to_owned(), format, seconds })
     }
 

@@ -166,7 +166,7 @@ impl RoomPicture {
     ) {
         let camera = self.camera();
         let columns = camera.raster.width();
-        let air: Vec<&FallenLight> = window.iter().step_by(window.len().div_ceil(AIR_SLOTS).max(1)).collect();
+        let beams = self.beams(window);
         for (i, (pixel, point)) in picture.iter_mut().zip(points).enumerate() {
             let at = DVec2::new(f64::from(i as u32 % columns) + 0.5, f64::from(i as u32 / columns) + 0.5);
             let ray = camera.ray(at);
@@ -179,9 +179,24 @@ impl RoomPicture {
                 *pixel = thing.albedo * (room_light(thing.normal) * (0.25 + 0.75 * light.room));
             }
             if light.projector > 0.0 {
-                *pixel += self.air(ray.origin, ray.direction, end, shadow, &air) * light.projector;
+                *pixel += self.air(ray.origin, ray.direction, end, shadow, &beams) * light.projector;
             }
         }
+    }
+
+    /// Mean light in the projector's rays through each pixel of the shadow's raster.
+    fn beams(&self, window: &[FallenLight]) -> Vec<Vec3> {
+        let slots: Vec<&FallenLight> =
+            window.iter().step_by(window.len().div_ceil(AIR_SLOTS).max(1)).collect();
+        let (whole, half) = (self.rig.camera.raster, self.shadow.camera.raster);
+        let scale = DVec2::new(whole.width().into(), whole.height().into())
+            / DVec2::new(half.width().into(), half.height().into());
+        let beam = |i: usize| {
+            let (x, y) = (i as u32 % half.width(), i as u32 / half.width());
+            let pixel = (DVec2::new(x.into(), y.into()) + 0.5) * scale;
+            slots.iter().map(|slot| slot.through(&self.rig, pixel)).sum::<Vec3>() / slots.len().max(1) as f32
+        };
+        (0..half.pixel_count()).map(beam).collect()
     }
 
     /// Light that the air scatters along a ray up to `end` metres.
@@ -191,7 +206,7 @@ impl RoomPicture {
         direction: DVec3,
         end: f64,
         shadow: &[Option<SeenPoint>],
-        window: &[&FallenLight],
+        beams: &[Vec3],
     ) -> Vec3 {
         let rig = &*self.rig;
         let bodies = self.bounds.ball();
@@ -230,12 +245,11 @@ impl RoomPicture {
             if shadow[pixel].is_some_and(|met| met.distance < away) {
                 continue;
             }
-            let light: Vec3 = window.iter().map(|slot| slot.at(rig, at)).sum::<Vec3>() / window.len() as f32;
             // Light thins out with the square of the distance, but for the place next to the lens.
             let thin = (reach / away.max(0.15 * reach)).powi(2).min(6.0) as f32;
             // The cone ends softly.
             let fade = ((behind - away) / (0.4 * bodies.radius)).clamp(0.0, 1.0) as f32;
-            sum += (light * HAZE + Vec3::splat(CONE)) * thin * fade;
+            sum += (beams[pixel] * HAZE + Vec3::splat(CONE)) * thin * fade;
         }
         sum * (step / (2.0 * bodies.radius)) as f32
     }
