@@ -36,7 +36,8 @@ pub(crate) struct DemoArgs {
     #[command(flatten)]
     page: PageArgs,
     #[cfg(feature = "lab")]
-    /// Also make a film of the room and of what the observer sees: a .gif, an animated .png, or a .webm. Four instants of it lie beside it
+    /// Also make a film of the room and of what the observer sees: a .gif, an animated .png, or a .webm. Four instants of it lie
+    /// beside it
     #[arg(long, value_name = "FILE")]
     film: Option<PathBuf>,
     #[cfg(feature = "lab")]
