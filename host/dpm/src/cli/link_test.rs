@@ -4,7 +4,7 @@ use super::rig_args::RigArgs;
 use super::watch::{print, refuse_where_dark_stands, take_locks};
 use crate::signals;
 use dpm_common::stopping;
-use dpm_lab::conformance::{rules, Extent};
+use dpm_lab::conformance::{rules, Extent, Rule};
 use dpm_lab::link_test::{judge_projector, link_test, Content};
 use dpm_rig::calibration_steps::is_simulated;
 use dpm_rig::config::RigConfig;
@@ -21,8 +21,8 @@ use std::path::PathBuf;
 #[derive(clap::Args, Clone, Debug)]
 pub(crate) struct LinkTestArgs {
     /// The rig file
-    #[arg(value_name = "RIG.toml")]
-    rig: PathBuf,
+    #[arg(value_name = "RIG.toml", required_unless_present = "list_rules")]
+    rig: Option<PathBuf>,
     #[command(flatten)]
     flags: RigArgs,
     /// Send a moving pattern instead of pictures of the rig's scene; needs no GPU
@@ -38,6 +38,9 @@ pub(crate) struct LinkTestArgs {
     /// broken. This shows almost no light, except for up to half a second in the rules on limits
     #[arg(long, conflicts_with_all = ["prepared", "count", "way_seconds"])]
     conformance: bool,
+    /// Print the rules that --conformance checks, with the section of docs/PROTOCOL.md and what each demands
+    #[arg(long, exclusive = true)]
+    list_rules: bool,
     /// Check only this rule; may be given several times
     #[arg(long = "rule", value_name = "RULE", requires = "conformance")]
     rules: Vec<String>,
@@ -57,7 +60,12 @@ pub(crate) struct LinkTestArgs {
 /// Bad rig or flags, no GPU, no projector.
 pub(super) fn execute(args: &LinkTestArgs) -> Result<(), Failure> {
     args.flags.refuse("dpm link-test", &["--frames", "--seconds", "--no-prediction", "--out"])?;
-    let config = args.flags.rig_at_rest(Some(&args.rig))?;
+    if args.list_rules {
+        let line = |r: &Rule| format!("{:<22} {:<4} {}\n", r.id, r.section, r.statement);
+        print(&rules().map(line).collect::<String>());
+        return Ok(());
+    }
+    let config = args.flags.rig_at_rest(args.rig.as_deref())?;
     if let (Some(head), false) = (config.heads().first(), is_simulated(&config)) {
         return Err(Failure::new(
             FailureKind::BadInput,

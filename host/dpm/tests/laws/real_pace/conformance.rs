@@ -117,14 +117,12 @@ fn every_rule_has_a_name_of_its_own_and_a_section_of_the_document() {
         assert!(!seen.contains(&rule.id), "{} stands twice", rule.id);
         seen.push(rule.id);
         assert!(text.contains(&format!("\n## {}. ", rule.section)), "{}: section {}", rule.id, rule.section);
-        assert!(
-            text.contains(&format!("| `{}` | {} |", rule.id, rule.section)),
-            "{} is not in the document's list",
-            rule.id
-        );
     }
-    let listed = text.lines().filter(|l| l.starts_with("| `")).count();
-    assert_eq!(listed, seen.len(), "the document lists rules that are none");
+    let output = dpm(&["link-test", "--list-rules"], &[]);
+    assert!(output.status.success());
+    let listed = String::from_utf8_lossy(&output.stdout);
+    let listed: Vec<&str> = listed.lines().filter_map(|line| line.split(' ').next()).collect();
+    assert_eq!(listed, seen);
 }
 
 /// Found in use, as a new user: "no conformance run against my device". The program checks a device on a serial line,
