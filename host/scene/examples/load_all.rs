@@ -1,6 +1,8 @@
 //! Loads every file that is named, and prints one line for each: what it holds, or why it is refused. With `--json` in front
 //! each line is an object that `tests/peers/files/run.py` compares with what other programs read: with the milliseconds, the
-//! greatest piece of memory that was asked for at once, and what the process had at most beyond what it had before.
+//! greatest piece of memory that was asked for at once, and what the process had at most beyond what it had before. After that
+//! `--texels DIR` writes the red, green, blue and alpha of every texel of a picture to a file there, named by its place in the
+//! list.
 
 use counting_allocator::{Counting, Request};
 use dpm_camera_files::{LengthUnit, LensKind, ReadOptions, StorageError};
@@ -9,7 +11,7 @@ use dpm_scene::srgb::to_linear;
 use dpm_scene::{Body, Environment, LoadOptions, Material, Scene, SceneError, UpAxis};
 use glam::{DVec3, Vec2, Vec3};
 use serde_json::{json, Value};
-use std::path::Path;
+use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicUsize, Ordering};
 
 /// Endings of skies.
@@ -35,10 +37,13 @@ fn main() {
     if as_json {
         files.remove(0);
     }
-    for file in files {
+    let texels = (files.first().is_some_and(|first| first == "--texels") && files.len() > 1)
+        .then(|| PathBuf::from(files.drain(..2).next_back().unwrap_or_default()));
+    for (i, file) in files.into_iter().enumerate() {
+        let out = texels.as_ref().map(|folder| folder.join(i.to_string()));
         let (begin, before) = (std::time::Instant::now(), resident(true));
         GREATEST.store(0, Ordering::Relaxed);
-        let told = read(Path::new(&file)).unwrap_or_else(|e| json!({"refused": e}));
+        let told = read(Path::new(&file), out.as_deref()).unwrap_or_else(|e| json!({"refused": e}));
         let (piece, at_most) = (GREATEST.load(Ordering::Relaxed), resident(false).saturating_sub(before));
         let ms = begin.elapsed().as_millis() as u64;
         if as_json {
@@ -60,7 +65,8 @@ fn resident(anew: bool) -> usize {
     line.trim().trim_end_matches(" kB").parse::<usize>().unwrap_or(0) << 10
 }
 
-fn read(path: &Path) -> Result<Value, String> {
+/// `texels` is where those of a picture are written.
+fn read(path: &Path, texels: Option<&Path>) -> Result<Value, String> {
     let ending = path.extension().map(|e| e.to_string_lossy().to_lowercase()).unwrap_or_default();
     let is_of = |endings: &[&str]| endings.contains(&ending.as_str());
     let told = |e: SceneError| e.to_string();
@@ -69,7 +75,11 @@ fn read(path: &Path) -> Result<Value, String> {
         Ok(of_sky(&sky.environment, &sky.warnings))
     } else if is_of(&PICTURES) || ending == "ktx2" {
         let bytes = std::fs::read(path).map_err(|e| e.to_string())?;
-        of_picture(&dpm_scene::load_bytes(&card(&bytes), &options()).map_err(told)?)
+        let scene = dpm_scene::load_bytes(&card(&bytes), &options()).map_err(told)?;
+        if let Some((path, texture)) = texels.zip(scene.textures.first()) {
+            std::fs::write(path, texture.texels.as_flattened()).map_err(|e| e.to_string())?;
+        }
+        of_picture(&scene)
     } else if is_of(&CALIBRATIONS) {
         of_calibration(&std::fs::read(path).map_err(|e| e.to_string())?)
     } else {

@@ -18,6 +18,7 @@ use super::limits::{largest_piece, of_header, of_picture, Limits};
 use super::load::contained;
 use super::primaries::Primaries;
 use super::srgb::to_linear;
+use super::tiff_picture::{is_tiff, Tiff};
 use super::{Environment, SceneError};
 #[cfg(feature = "exr")]
 use exr_picture::read_exr;
@@ -175,8 +176,8 @@ pub fn decode_environment(bytes: &[u8], rotation_rad: f32, scale: f32) -> Result
         [b'P', b'F' | b'f', ..] => read_pfm(bytes)?.into(),
         [b'#', b'?', ..] => read_rgbe(bytes)?,
         [0x76, 0x2f, 0x31, 0x01, ..] => read_exr(bytes)?,
+        _ if is_tiff(bytes) => read_tiff(bytes)?,
         _ => match image::guess_format(bytes) {
-            Ok(ImageFormat::Tiff) => read_tiff(bytes)?,
             Ok(format @ (ImageFormat::Png | ImageFormat::Jpeg | ImageFormat::WebP | ImageFormat::Bmp)) => {
                 read_srgb(bytes, format)?
             }
@@ -432,14 +433,19 @@ fn collected(((width, height, texels), told): (Pixels, Option<String>)) -> Read 
 
 /// TIFF of whole numbers is a picture for a display, and one of floats is light.
 fn read_tiff(bytes: &[u8]) -> Result<Read, SceneError> {
-    use image::DynamicImage::{ImageRgb32F, ImageRgba32F};
-    let picture = decode_bounded(bytes, ImageFormat::Tiff, 32)?;
-    let sides = [picture.width(), picture.height()];
-    check_piece(sides[0] as usize * sides[1] as usize, 12, bytes.len())?;
-    let is_linear = matches!(picture, ImageRgb32F(_) | ImageRgba32F(_));
-    let rgb = picture.into_rgb32f();
-    let of = |x: f32| if is_linear { x } else { to_linear(x) };
-    Ok(collected(collect(sides, bytes.len(), |x, y| Vec3::from(rgb.get_pixel(x, y).0.map(of)))))
+    let failed = |problem| SceneError::broken("image", problem);
+    let file = Tiff::open(bytes).map_err(failed)?;
+    let [width, height] = file.sides();
+    let texels = check_size(width, height)?;
+    check_piece(texels, size_of::<Vec3>() as u64, bytes.len())?;
+    let of = |x: f32| if file.is_light() { x } else { to_linear(x) };
+    let mut light = vec![Vec3::ZERO; texels];
+    let allowed = largest_piece(bytes.len() as u64);
+    let put = |[x, y]: [u32; 2], [r, g, b, _]: [f32; 4]| {
+        light[y as usize * width as usize + x as usize] = Vec3::new(of(r), of(g), of(b));
+    };
+    let warnings = file.read(allowed, put).map_err(failed)?;
+    Ok(Read { width, height, texels: light, warnings, ..Read::default() })
 }
 
 #[cfg(test)]

@@ -44,6 +44,7 @@ pub mod srgb;
 mod stats;
 mod studio;
 mod texels;
+mod tiff_picture;
 
 use std::sync::Arc;
 

@@ -350,7 +350,6 @@ fn files() -> Vec<(&'static str, &'static str, Vec<u8>)> {
         ("png", ::image::ImageFormat::Png),
         ("tga", ::image::ImageFormat::Tga),
         ("bmp", ::image::ImageFormat::Bmp),
-        ("tiff", ::image::ImageFormat::Tiff),
         ("webp", ::image::ImageFormat::WebP),
     ] {
         let mut file = std::io::Cursor::new(Vec::new());

@@ -253,6 +253,8 @@ impl Reader<'_> {
                     self.image_items[image].name
                 ));
             }
+            let notes = decoded.iter().flat_map(|d| &d.notes);
+            warnings.extend(notes.map(|note| format!("{}: {note}", self.image_items[image].name)));
             if let Some((kept, stored)) = decoded.as_ref().and_then(|d| Some((d.size, d.stored?))) {
                 warnings.push(format!(
                     "{}: it is read with {} x {} of its {} x {} texels, as many as so short a file may take",

@@ -9,6 +9,8 @@ use super::super::limits::{largest_piece, of_header, of_picture};
 use super::super::{Limits, SceneError};
 use super::json::Item;
 use super::ktx2_image;
+use super::ktx2_image::numbers::Rounder;
+use crate::tiff_picture::{is_tiff, Tiff};
 
 /// Texels along the sides of a picture, each above 0.
 #[derive(Clone, Copy)]
@@ -40,6 +42,8 @@ pub(super) struct Picture {
     pub cut_off: bool,
     /// The sides in the file, of which means are read, because all texels would take more than so short a file may.
     pub stored: Option<Size>,
+    /// What else should be said of it.
+    pub notes: Vec<String>,
 }
 
 impl Picture {
@@ -70,8 +74,8 @@ pub(super) fn decode(
         return ktx2_image::decode(item, bytes, texels_so_far, limits);
     }
     let format = format_of(item, bytes, name)?;
-    if format == ImageFormat::Tiff && is_tiled_in_planes(bytes) {
-        return Err(item.error("is a TIFF with tiles in planes of colours: save it with strips, or as PNG"));
+    if format == ImageFormat::Tiff {
+        return tiff(item, bytes, texels_so_far, limits);
     }
     let mut reader = ImageReader::with_format(Cursor::new(bytes), format);
     reader.limits(of_header());
@@ -91,7 +95,15 @@ pub(super) fn decode(
         .map_err(failed)?;
     let (kept, texels) = as_rgba(decoded, allowed(bytes, limits));
     let stored = (kept.texels() < size.texels()).then_some(size);
-    Ok(Picture { size: kept, texels, srgb: None, red_green_only: false, cut_off: false, stored })
+    Ok(Picture {
+        size: kept,
+        texels,
+        srgb: None,
+        red_green_only: false,
+        cut_off: false,
+        stored,
+        notes: vec![],
+    })
 }
 
 /// The texels of a decoded picture, or the means of squares of them, of which all fit into `allowed` bytes.
@@ -125,32 +137,53 @@ fn as_rgba(decoded: image::DynamicImage, allowed: u64) -> (Size, Vec<[u8; 4]>) {
     (size, texels)
 }
 
-/// Whether a TIFF stores tiles of one colour each, which the decoder does not survive.
-fn is_tiled_in_planes(bytes: &[u8]) -> bool {
-    let is_big = bytes.starts_with(b"MM");
-    let number = |at: usize, length: usize| {
-        let of = bytes.get(at..at + length)?.iter();
-        let add = |sum: usize, byte: &u8| sum << 8 | usize::from(*byte);
-        Some(if is_big { of.fold(0, add) } else { of.rev().fold(0, add) })
+/// The texels of a TIFF, or the means of squares of them, of which all fit into the memory of so long a file.
+fn tiff(item: &Item, bytes: &[u8], texels_so_far: u64, limits: &Limits) -> Result<Picture, SceneError> {
+    let file = Tiff::open(bytes).map_err(|e| item.error(e))?;
+    let [width, height] = file.sides();
+    let stored = Size { width, height };
+    check_size(item, stored, texels_so_far, limits)?;
+    let allowed = allowed(bytes, limits);
+    let side = |length: u32, step: u32| length.div_ceil(step);
+    let bytes_of = |step: u32| {
+        // Sums of means are four times as wide as texels.
+        let width_of_texel = if step == 1 { 4 } else { 16 };
+        width_of_texel * u64::from(side(width, step)) * u64::from(side(height, step))
     };
-    let entries = || {
-        let begin = number(4, 4)?;
-        let count = number(begin, 2)?;
-        Some((0..count).map(move |i| begin + 2 + 12 * i))
+    let step = (1..).find(|step| bytes_of(*step) <= allowed).unwrap_or(1);
+    let size = Size { width: side(width, step), height: side(height, step) };
+    let mut rounder = Rounder::default();
+    let mut round = |texel: [f32; 4]| texel.map(|x| rounder.byte(x));
+    let place = |[x, y]: [u32; 2]| (y / step) as usize * size.width as usize + (x / step) as usize;
+    let failed = |e: String| item.error(e);
+    let (texels, notes) = if step == 1 {
+        let mut texels = vec![[0, 0, 0, u8::MAX]; size.texels()];
+        let notes = file.read(allowed, |at, texel| texels[place(at)] = round(texel)).map_err(failed)?;
+        (texels, notes)
+    } else {
+        let mut sums = vec![[0u32; 4]; size.texels()];
+        let add = |at, texel| {
+            sums[place(at)].iter_mut().zip(round(texel)).for_each(|(sum, code)| *sum += u32::from(code));
+        };
+        let notes = file.read(allowed, add).map_err(failed)?;
+        let mean = |(i, sum): (usize, &[u32; 4])| {
+            let of = |length: u32, at: usize| step.min(length - at as u32 * step);
+            let count = of(width, i % size.width as usize) * of(height, i / size.width as usize);
+            sum.map(|sum| ((sum + count / 2) / count) as u8)
+        };
+        (sums.iter().enumerate().map(mean).collect(), notes)
     };
-    let value = |wanted: usize| {
-        let at = entries()?.find(|at| number(*at, 2) == Some(wanted))?;
-        number(at + 8, 2)
-    };
-    // PlanarConfiguration, TileWidth.
-    value(284) == Some(2) && value(322).is_some()
+    let stored = (step > 1).then_some(stored);
+    let cut_off = rounder.cut_off;
+    Ok(Picture { size, texels, srgb: None, red_green_only: false, cut_off, stored, notes })
 }
 
 /// The format of an image by its first bytes. TGA has none of its own: its header, its last bytes or its name show it.
 fn format_of(item: &Item, bytes: &[u8], name: &str) -> Result<ImageFormat, SceneError> {
     use ImageFormat::{Bmp, Jpeg, Png, Tga, Tiff, WebP};
     match image::guess_format(bytes) {
-        Ok(format @ (Png | Jpeg | Bmp | Tiff | WebP)) => Ok(format),
+        _ if is_tiff(bytes) => Ok(Tiff),
+        Ok(format @ (Png | Jpeg | Bmp | WebP)) => Ok(format),
         Ok(other) => Err(SceneError::unsupported(
             format!("{}: an image of format {other:?}", item.name),
             "convert it to PNG",
@@ -176,6 +209,10 @@ pub(super) fn check(item: &Item, bytes: &[u8], name: &str, limits: &Limits) -> R
         return Ok(());
     }
     let format = format_of(item, bytes, name)?;
+    if format == ImageFormat::Tiff {
+        let [width, height] = Tiff::open(bytes).map_err(|e| item.error(e))?.sides();
+        return check_size(item, Size { width, height }, 0, limits);
+    }
     let mut reader = ImageReader::with_format(Cursor::new(bytes), format);
     reader.limits(of_header());
     let (width, height) =

@@ -8,7 +8,7 @@ mod basis;
 mod blocks;
 mod container;
 mod etc;
-mod numbers;
+pub(super) mod numbers;
 mod plain;
 
 use std::borrow::Cow;
@@ -116,6 +116,7 @@ pub(super) fn decode(
         red_green_only: stored.channels == 2 && as_stored,
         cut_off: stored.cut_off,
         stored: None,
+        notes: vec![],
     })
 }
 
