@@ -1,12 +1,12 @@
 #!/usr/bin/env python3
-"""Writes one projector in sixteen dialects of calibration files, and the pixels to which OpenCV itself takes points.
+"""Writes one projector in the dialects of many calibration programs, and the pixels to which OpenCV itself takes points.
 
     python3 -m venv V && V/bin/pip install opencv-python-headless numpy pyyaml
     V/bin/python tests/peers/calibrations.py
 
 `tests/assets/dialects/` has what it writes: the files, `dialects.tsv` with what a person says of each (unit, device, frame)
 and what is right of it, and `pixels.csv` with world points [m] and their pixels by cv2.projectPoints (OpenCV's, with the
-centres of pixels at whole numbers): with the lens of all files, and without a lens for MPCDI, which has none. Nothing is
+centres of pixels at whole numbers): with the lens of all files, of four numbers, without one (MPCDI has none), and a fisheye. Nothing is
 random. The test `dialects_project_as_opencv_does` of `dpm-scene` holds the readers to them.
 """
 
@@ -24,6 +24,8 @@ SIZE = (1024, 768)
 K = np.array([[1480.0, 0, 508.5], [0, 1510.0, 702.25], [0, 0, 1]])
 # Brown's model in full: radial, tangential and k3.
 LENS = np.array([-0.08, 0.05, 0.002, -0.003, -0.02])
+# Equidistant.
+FISHEYE = np.array([0.02, -0.004, 0.001, -0.0002])
 # Another device of the same file, so that what is read by chance is seen.
 CAMERA = np.array([[900.0, 0, 327], [0, 905.0, 235], [0, 0, 1]])
 CAMERA_LENS = np.array([-0.11, 0.17, 0.0001, 0.003, 0.0])
@@ -136,6 +138,141 @@ def mpcdi():
             f"<frustum>{frustum}</frustum><coordinateFrame>{frame}</coordinateFrame></region></buffer></display></MPCDI>\n")
 
 
+def link(vector, shift):
+    out = np.eye(4)
+    out[:3, :3], out[:3, 3] = cv2.Rodrigues(np.array(vector))[0], shift
+    return out
+
+
+def kalibr_chains(add):
+    """Cameras that are told from the one before, the first one from the inertial unit or from nothing."""
+    one = {"camera_model": "pinhole", "distortion_model": "radtan", "resolution": list(SIZE)}
+    other = {**one, "intrinsics": [900.0, 905.0, 327.0, 235.0], "distortion_coeffs": CAMERA_LENS[:4].tolist()}
+    ours = {**one, "intrinsics": [1480.0, 1510.0, 508.5, 702.25], "distortion_coeffs": LENS[:4].tolist()}
+    first, second = link([0.1, -0.2, 0.05], [0.1, 0.02, -0.03]), link([-0.05, 0.1, 0.02], [-0.05, 0.01, 0.02])
+    before = np.linalg.inv(second @ first) @ POSE
+    from_unit = [{**other, "T_cam_imu": before.tolist()}, {**other, "T_cn_cnm1": first.tolist()}, {**ours, "T_cn_cnm1": second.tolist()}]
+    from_camera = [other, {**other, "T_cn_cnm1": first.tolist()}, {**ours, "T_cn_cnm1": (POSE @ np.linalg.inv(first)).tolist()}]
+    for name, cameras, frame in (("unit", from_unit, "world"), ("camera", from_camera, "camera")):
+        (OUT / f"kalibr-chain-{name}.yaml").write_text(yaml.safe_dump({f"cam{i}": c for i, c in enumerate(cameras)}))
+        add(f"kalibr-chain-{name}.yaml", device="cam2", frame=frame, right="lens of four")
+
+
+def kalibr_models(add):
+    intrinsics = [1480.0, 1510.0, 508.5, 702.25]
+    base = {"resolution": list(SIZE), "T_cam_imu": POSE.tolist()}
+    four = LENS[:4].tolist()
+    for name, model, more, lens, numbers, right in (
+        ("equi", "pinhole", [], "equidistant", FISHEYE.tolist(), "fisheye"),
+        ("omni", "omni", [1.1], "radtan", four, "refused: omnidirectional, cv2.fisheye"),
+        ("eucm", "eucm", [0.6, 1.05], "none", [], "refused: EUCM, cv2.fisheye"),
+        ("ds", "ds", [-0.2, 0.6], "none", [], "refused: double sphere, cv2.fisheye"),
+        ("fov", "pinhole", [], "fov", [0.92], "refused: FOV, cv2.fisheye"),
+    ):
+        camera = {**base, "camera_model": model, "intrinsics": more + intrinsics, "distortion_model": lens, "distortion_coeffs": numbers}
+        (OUT / f"kalibr-{name}.yaml").write_text(yaml.safe_dump({"cam0": camera}))
+        add(f"kalibr-{name}.yaml", right=right)
+
+
+def camodocal(add):
+    head = f"%YAML:1.0\n---\nimage_width: {SIZE[0]}\nimage_height: {SIZE[1]}\nrvec: {RVEC.ravel().tolist()}\ntvec: {T.tolist()}\n"
+    block = lambda name, entries: f"{name}:\n" + "".join(f"   {k}: {v}\n" for k, v in entries.items())
+    brown = dict(zip(("k1", "k2", "p1", "p2"), LENS.tolist()))
+    focal = lambda a, b, c, d: {a: 1480.0, b: 1510.0, c: 508.5, d: 702.25}
+    for name, model, blocks, right in (
+        ("pinhole", "PINHOLE", [("distortion_parameters", brown), ("projection_parameters", focal("fx", "fy", "cx", "cy"))], "lens of four"),
+        ("kb", "KANNALA_BRANDT", [("projection_parameters", {**dict(zip(("k2", "k3", "k4", "k5"), FISHEYE.tolist())), **focal("mu", "mv", "u0", "v0")})], "fisheye"),
+        ("mei", "MEI", [("mirror_parameters", {"xi": 1.9}), ("distortion_parameters", brown), ("projection_parameters", focal("gamma1", "gamma2", "u0", "v0"))], "refused: omnidirectional, cv2.fisheye"),
+        ("scaramuzza", "scaramuzza", [("poly_parameters", {"p0": -400.0, "p1": 0.0}), ("affine_parameters", {"ac": 1.0, "cx": 500.0, "cy": 380.0})], "refused: no intrinsics"),
+    ):
+        text = head + f"model_type: {model}\n" + "".join(block(*b) for b in blocks)
+        (OUT / f"camodocal-{name}.yml").write_text(text)
+        add(f"camodocal-{name}.yml", right=right)
+
+
+def robots(add):
+    """ORB-SLAM, EuRoC, ROS's topic, and a stereo pair of OpenCV's sample."""
+    pose_text = f"rvec: {RVEC.ravel().tolist()}\ntvec: {T.tolist()}\n"
+    for name, model, coefficients, right in (
+        ("orbslam", "PinHole", dict(zip(("k1", "k2", "p1", "p2", "k3"), LENS.tolist())), "lens"),
+        ("orbslam-kb", "KannalaBrandt8", dict(zip(("k1", "k2", "k3", "k4"), FISHEYE.tolist())), "fisheye"),
+    ):
+        numbers = {"fx": 1480.0, "fy": 1510.0, "cx": 508.5, "cy": 702.25, **coefficients, "width": SIZE[0], "height": SIZE[1]}
+        text = f'%YAML:1.0\nCamera.type: "{model}"\n' + "".join(f"Camera.{k}: {v}\n" for k, v in numbers.items()) + pose_text
+        (OUT / f"{name}.yaml").write_text(text)
+        add(f"{name}.yaml", device="camera", right=right)
+    (OUT / "euroc.yaml").write_text(
+        "sensor_type: camera\ncomment: cam0\n\nT_BS:\n  cols: 4\n  rows: 4\n"
+        f"  data: {np.linalg.inv(POSE).ravel().tolist()}\n\nrate_hz: 20\nresolution: [{SIZE[0]}, {SIZE[1]}]\ncamera_model: pinhole\n"
+        f"intrinsics: [1480.0, 1510.0, 508.5, 702.25] #fu, fv, cu, cv\ndistortion_model: radial-tangential\ndistortion_coefficients: {LENS[:4].tolist()}\n")
+    add("euroc.yaml", right="lens of four")
+    (OUT / "camera_info-topic.yaml").write_text(
+        f"header:\n  frame_id: camera\nheight: {SIZE[1]}\nwidth: {SIZE[0]}\ndistortion_model: plumb_bob\nD: {LENS.tolist()}\nK: {K.ravel().tolist()}\n"
+        f"R: {np.eye(3).ravel().tolist()}\nP: {np.column_stack([K, np.zeros(3)]).ravel().tolist()}\nroi:\n  x_offset: 0\n  height: 0\n  width: 0\n")
+    add("camera_info-topic.yaml", right="refused: no translation")
+    r1, r2, p1, p2, q = cv2.stereoRectify(CAMERA, CAMERA_LENS, K, LENS, SIZE, R, T.reshape(3, 1))[:5]
+    pairs = (("M1", CAMERA), ("D1", CAMERA_LENS), ("M2", K), ("D2", LENS.reshape(1, -1)), ("R", R), ("T", T.reshape(3, 1)),
+             ("R1", r1), ("R2", r2), ("P1", p1), ("P2", p2), ("Q", q))
+    storage("stereo.yml", lambda f: [f.write(*pair) for pair in pairs])
+    add("stereo.yml", device="2", frame="camera")
+    storage("omnidir.yml", lambda f: [f.write(*pair) for pair in (("K", K), ("D", LENS[:4]), ("xi", np.array([[1.2]])), ("rvec", RVEC), ("tvec", T))])
+    add("omnidir.yml", right="refused: omnidirectional, cv2.fisheye")
+
+
+def sensors(add):
+    numbers = {"width": SIZE[0], "height": SIZE[1], "ppx": 508.5, "ppy": 702.25, "fx": 1480.0, "fy": 1510.0, "coeffs": LENS.tolist(),
+               "rotation": R.ravel().tolist(), "translation": T.tolist()}
+    for name, model, right in (
+        ("brown", "distortion.brown_conrady", "lens"), ("four", 4, "lens"), ("named", "LAMP 3000", "lens"),
+        ("inverse", "distortion.inverse_brown_conrady", "refused: inverse, calibrateCamera"), ("two", 2, "refused: inverse, calibrateCamera"),
+    ):
+        (OUT / f"realsense-{name}.json").write_text(json.dumps({**numbers, "model": model}))
+        add(f"realsense-{name}.json", right=right)
+    focal = {"fx": 1480.0, "fy": 1510.0, "cx": 508.5, "cy": 702.25}
+    unit = {"px": 0.1, "py": 0.2, "pz": 0.3, "qx": 0.0, "qy": 0.0, "qz": 0.0, "qw": 1.0}
+    for name, more, right in (("ds", {"xi": -0.2, "alpha": 0.6}, "double sphere"), ("kb4", dict(zip(("k1", "k2", "k3", "k4"), FISHEYE.tolist())), "Basalt, JSON")):
+        value = {"T_imu_cam": [unit], "intrinsics": [{"camera_type": name, "intrinsics": {**focal, **more}}], "resolution": [list(SIZE)]}
+        (OUT / f"basalt-{name}.json").write_text(json.dumps({"value0": value}))
+        add(f"basalt-{name}.json", right=f"refused: {right}")
+    azure = {"Intrinsics": {"ModelParameters": [0.5, 0.51, 0.49, 0.49, 0.3], "ModelType": "CALIBRATION_LensDistortionModelBrownConrady"},
+             "Rt": {"Rotation": R.ravel().tolist(), "Translation": T.tolist()}}
+    (OUT / "azure.json").write_text(json.dumps({"CalibrationInformation": {"Cameras": [azure]}}))
+    add("azure.json", right="refused: Azure Kinect, JSON")
+    matlab = {"K": K.tolist(), "RadialDistortion": [-0.08, 0.05], "TangentialDistortion": [0.002, -0.003], "ImageSize": [768, 1024], "R": R.tolist(), "T": T.tolist()}
+    (OUT / "matlab.json").write_text(json.dumps(matlab))
+    add("matlab.json", right="refused: MATLAB, cameraIntrinsicsToOpenCV")
+    turned = {"K": K.tolist(), "dist": LENS.tolist(), "quaternion": [0.1, 0.2, 0.3, 0.9], "tvec": T.tolist()}
+    (OUT / "quaternion.json").write_text(json.dumps(turned))
+    add("quaternion.json", right="refused: quaternion, rotation matrix R")
+
+
+def photogrammetry(add):
+    place = np.linalg.inv(POSE)
+    nerf = {"fl_x": 1480.0, "fl_y": 1510.0, "cx": 509.0, "cy": 702.75, "w": SIZE[0], "h": SIZE[1],
+            "frames": [{"file_path": "a.png", "transform_matrix": (place @ np.diag([1, -1, -1, 1])).tolist()}]}
+    texts = (
+        ("transforms.json", json.dumps(nerf), "nerfstudio, 0.5"),
+        ("cameras.txt", "# Camera list with one line of data per camera:\n1 OPENCV 1024 768 1480 1510 509 702.75 -0.08 0.05 0.002 -0.003\n", "COLMAP, 0.5"),
+        ("bundler.out", "# Bundle file v0.3\n1 0\n1480 -0.08 0.05\n1 0 0\n0 1 0\n0 0 1\n0 0 0\n", "Bundler, JSON"),
+        ("agisoft.xml", "<?xml version=\"1.0\"?>\n<calibration>\n  <projection>frame</projection>\n  <width>1024</width>\n  <height>768</height>\n"
+         "  <f>1510</f>\n  <cx>-3.5</cx>\n  <cy>318.25</cy>\n  <k1>-0.08</k1>\n</calibration>\n", "Agisoft, OpenCV"),
+        ("calibu.xml", "<rig>\n<camera>\n<camera_model type=\"calibu_fu_fv_u0_v0\">\n<params> [ 1480; 1510; 508.5; 702.25 ] </params>\n</camera_model>\n"
+         "</camera>\n</rig>\n", "Calibu, JSON"),
+        ("ost.ini", "# oST version 5.0 parameters\n\n[image]\n\nwidth\n1024\n\nheight\n768\n", "convert, YAML"),
+        ("anipose.toml", f"[cam_0]\nname = \"a\"\nsize = [ 1024, 768,]\nmatrix = {K.tolist()}\ndistortions = {LENS.tolist()}\n"
+         f"rotation = {RVEC.ravel().tolist()}\ntranslation = {T.tolist()}\n", "Anipose, JSON"),
+    )
+    for name, text, right in texts:
+        (OUT / name).write_text(text)
+        add(name, right=f"refused: {right}")
+
+
+def strangers(add):
+    """What people who calibrate cameras bring."""
+    for write in (kalibr_chains, kalibr_models, camodocal, robots, sensors, photogrammetry):
+        write(add)
+
+
 def main():
     OUT.mkdir(parents=True, exist_ok=True)
     lists = {"K": K.tolist(), "dist": LENS.tolist(), "rvec": RVEC.ravel().tolist(), "tvec": T.tolist()}
@@ -198,6 +335,7 @@ def main():
             np.save(content, value)
             archive.writestr(zipfile.ZipInfo(f"{name}.npy", (2026, 1, 1, 0, 0, 0)), content.getvalue())
     add("numpy.npz", right="refused: save mtx, dist, rvec, tvec as JSON")
+    strangers(add)
     (OUT / "dialects.tsv").write_text("file\tunit\tdevice\tframe\tright\n" + "\n".join(rows) + "\n")
 
     # Points whose pixels cover the raster, at several depths.
@@ -208,8 +346,9 @@ def main():
     table = [world]
     for lens in (LENS, LENS[:4], np.zeros(4)):
         table.append(cv2.projectPoints(world.reshape(-1, 1, 3), RVEC, T, K, lens)[0].reshape(-1, 2))
+    table.append(cv2.fisheye.projectPoints(world.reshape(1, -1, 3), RVEC, T, K, FISHEYE)[0].reshape(-1, 2))
     lines = [",".join(f"{v:.9g}" if i < 3 else f"{v:.6f}" for i, v in enumerate(row)) for row in np.hstack(table)]
-    (OUT / "pixels.csv").write_text("x,y,z,u,v,u of four,v of four,u without,v without\n" + "\n".join(lines) + "\n")
+    (OUT / "pixels.csv").write_text("x,y,z,u,v,u of four,v of four,u without,v without,u of fisheye,v of fisheye\n" + "\n".join(lines) + "\n")
 
 
 if __name__ == "__main__":

@@ -3,15 +3,15 @@
 //! A file that describes several devices is a question to the operator, unless the names of its entries (`proj_K` beside
 //! `cam_K`) leave one answer.
 
+mod lens;
+
 use super::entries::{joined, Entries, Entry, Matrix};
 use super::names::{meaning, Owner, Role};
-use super::{
-    pose, rotation, Frame, Intrinsics, LensKind, Purpose, ReadOptions, StorageError, StoredCalibration,
-};
+use super::{pose, rotation, Frame, Intrinsics, Purpose, ReadOptions, StorageError, StoredCalibration};
 use dpm_device::planes::Raster;
-use dpm_scene::geometry::lens::Lens;
 use dpm_scene::geometry::projector::ProjectorCamera;
 use glam::{DAffine3, DMat3, DVec3};
+use lens::{check_mirror, check_unused_lens, is_fisheye, lens};
 use std::collections::{BTreeMap, BTreeSet};
 
 /// Poses of many views, of which none is the projector's.
@@ -64,6 +64,10 @@ struct Device<'a> {
 fn known(all: &Entries) -> Vec<NamedEntry<'_>> {
     let mut out = Vec::new();
     for (section, inside) in &all.sections {
+        // A part of the picture that a driver was asked for.
+        if section.rsplit('/').next() == Some("roi") {
+            continue;
+        }
         for (name, entry) in inside {
             let Some((owner, role, from_camera)) = meaning(name) else { continue };
             let digit = || Owner::Other(name.chars().filter(char::is_ascii_digit).collect());
@@ -466,94 +470,6 @@ fn no_pose(all: &Entries, parts: &Parts) -> StorageError {
     missing(parts, "rotation")
 }
 
-/// Whether the file says that its lens is a fisheye's; `None` if it says nothing.
-fn says_fisheye(parts: &Parts, used: &mut UseNotes) -> Result<Option<(String, bool)>, StorageError> {
-    let mut said: Option<(String, bool)> = None;
-    for k in parts.with(Role::LensModel) {
-        used.paths.insert(k.path());
-        let is_model =
-            k.name.eq_ignore_ascii_case("camera_model") || k.name.eq_ignore_ascii_case("camera_type");
-        let fisheye = match k.entry {
-            Entry::Number(flag) => Some(*flag != 0.0),
-            Entry::Text(word) => match word.to_ascii_lowercase().as_str() {
-                "fisheye" | "equidistant" | "equi" | "kannala_brandt" | "true" => Some(true),
-                "pinhole" if is_model => None,
-                "plumb_bob" | "rational_polynomial" | "radtan" | "brown" | "opencv" | "none" | "" | "false"
-                | "pinhole" | "brown-conrady" | "brown_conrady" | "rational" | "radial-tangential" => Some(false),
-                _ => {
-                    return Err(StorageError::value(
-                        &k.path(),
-                        format!(
-                            "is {word:?}; known are plumb_bob, radtan, rational_polynomial, fisheye and equidistant; calibrate \
-                             with one of these"
-                        ),
-                    ))
-                }
-            },
-            _ => None,
-        };
-        said = said.or(fisheye.map(|f| (k.path(), f)));
-    }
-    Ok(said)
-}
-
-/// The lens, by the coefficients in OpenCV's order.
-fn lens(parts: &Parts, kind: LensKind, used: &mut UseNotes) -> Result<Lens, StorageError> {
-    let fisheye = match (kind, says_fisheye(parts, used)?) {
-        (LensKind::Fisheye, Some((name, false))) => {
-            let what =
-                "says that the lens is no fisheye, but the rig file says calibration_lens = \"fisheye\"";
-            return Err(StorageError::value(&name, what));
-        }
-        (LensKind::Fisheye, _) => true,
-        (LensKind::Auto, said) => said.is_some_and(|(_, fisheye)| fisheye),
-    };
-    let mut first: Option<(String, Vec<f64>)> = None;
-    let mut from: Option<&NamedEntry> = None;
-    for k in parts.own(Role::Distortion) {
-        let data = match k.entry {
-            Entry::Number(_) => continue,
-            _ => &k.matrix()?.data,
-        };
-        match (&first, from) {
-            (Some((_, told)), Some(other)) if told != data && !data.is_empty() => {
-                return Err(contradiction(other, k, "distortions"))
-            }
-            _ => first = Some((k.path(), data.clone())),
-        }
-        from = Some(k);
-        used.note("distortion", k);
-    }
-    let numbers: Vec<_> = (0..8).filter_map(|i| Some((i, parts.number(Role::Coefficient(i))?))).collect();
-    if let (None, Some((_, (k, _)))) = (&first, numbers.first()) {
-        let mut data = vec![0.0; if numbers.iter().any(|(i, _)| *i > 4) { 8 } else { 5 }];
-        numbers.iter().for_each(|(i, (_, v))| data[*i] = *v);
-        numbers.iter().for_each(|(_, (k, _))| used.note("distortion", k));
-        if fisheye {
-            // Its coefficients are k1 to k4.
-            data = [0, 1, 4, 5].map(|i| data.get(i).copied().unwrap_or(0.0)).to_vec();
-        }
-        first = Some((k.path(), data));
-    }
-    let Some((name, d)) = first.filter(|(_, d)| !d.is_empty()) else {
-        // An equidistant lens without coefficients still bends; OpenCV writes its four zeros.
-        return match fisheye {
-            false => Ok(Lens::default()),
-            true => Lens::fisheye([0.0; 4]).map_err(|e| StorageError::lens("fisheye_model", e)),
-        };
-    };
-    if !fisheye {
-        return Lens::opencv(&d).map_err(|e| StorageError::lens(&name, e));
-    }
-    match d.as_slice().try_into() {
-        Ok(k) => Lens::fisheye(k).map_err(|e| StorageError::lens(&name, e)),
-        Err(_) => {
-            let what = format!("has {} numbers, but a fisheye lens has 4", d.len());
-            Err(StorageError::value(&name, what))
-        }
-    }
-}
-
 fn image_size(parts: &Parts, used: &mut UseNotes) -> Result<Option<(u32, u32)>, StorageError> {
     let mut sizes: Vec<(&NamedEntry, f64, f64)> = Vec::new();
     if let (Some((k, w)), Some((l, h))) = (parts.number(Role::Width), parts.number(Role::Height)) {
@@ -710,6 +626,9 @@ pub(super) fn read(
     let device = choose(all, &devices, options.device)?;
     let parts = Parts::of(&device, &devices, &known);
     let mut used = UseNotes::default();
+    // Two models have an xi: the word for the model comes first.
+    let fisheye = is_fisheye(&parts, options.lens, &mut used)?;
+    check_mirror(&parts)?;
     let (k_name, k) = intrinsics(&parts, &mut used)?;
     let size = image_size(&parts, &mut used)?;
     let columns = size.map_or(options.raster.width(), |s| s.0);
@@ -739,7 +658,8 @@ pub(super) fn read(
             (place, frame(&told, &parts, &devices, &known))
         }
     };
-    let lens = lens(&parts, options.lens, &mut used)?;
+    let lens = lens(&parts, fisheye, &mut used)?;
+    check_unused_lens(all, &devices, &used)?;
     let camera =
         ProjectorCamera::new(options.raster, place, k_at.fx, k_at.fy, k_at.cx, k_at.cy)?.with_lens(lens)?;
     Ok(StoredCalibration {

@@ -8,6 +8,7 @@ mod archive;
 mod devices;
 mod entries;
 mod export;
+mod foreign;
 mod json;
 mod mpcdi;
 mod names;
@@ -291,14 +292,12 @@ fn read_for(
     if text.contains("<MPCDI") {
         return mpcdi::read(text, options);
     }
-    if text.contains("<ProjectorCameraEnsemble") {
-        return Err(StorageError::Refused(
-            "it is an ensemble of RoomAlive Toolkit, whose poses are told from its depth camera; save the projector's \
-             cameraMatrix, lensDistortion and pose as K, dist, rvec and tvec in JSON"
-                .into(),
-        ));
+    if let Some(refused) = foreign::refused_text(text) {
+        return Err(refused);
     }
-    devices::read(&entries(text)?, options, purpose)
+    let mut all = entries(text)?;
+    foreign::join_chain(&mut all)?;
+    devices::read(&all, options, purpose).map_err(|e| foreign::explained(e, &all))
 }
 
 /// First bytes of forms that are not read, with what to give instead.

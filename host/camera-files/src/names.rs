@@ -60,6 +60,10 @@ pub(super) enum Role {
     Shape,
     /// Words that say which lens it is.
     LensModel,
+    /// The mirror of an omnidirectional model, 0 without one.
+    Mirror,
+    /// The lens as MATLAB has it, whose other numbers count from 1.
+    Other,
     /// What says nothing more of the projector: other forms of what was read, and how the calibration was made.
     ByProduct,
 }
@@ -70,12 +74,17 @@ pub(super) fn meaning(name: &str) -> Option<(Owner, Role, bool)> {
     if let Some((_, owner, role, from_camera)) = exact {
         return Some((owner.clone(), *role, *from_camera));
     }
-    let plain: String = name.chars().filter(|c| c.is_alphanumeric()).flat_map(char::to_lowercase).collect();
+    let plain = plain(name);
     if let Some(role) = role(&plain) {
         return Some((Owner::Own, role, false));
     }
     let (owner, rest) = owner(&plain)?;
     Some((owner, role(rest)?, false))
+}
+
+/// A name in lower case, of letters and digits alone.
+pub(super) fn plain(name: &str) -> String {
+    name.chars().filter(|c| c.is_alphanumeric()).flat_map(char::to_lowercase).collect()
 }
 
 /// Names whose case or meaning is their dialect's own. The last column: the pose leads from a camera to the projector.
@@ -95,6 +104,7 @@ const EXACT: &[(&str, Owner, Role, bool)] = &[
     ("screenResY", Owner::Projector, Role::Height, false),
     ("frameWidth", Owner::Camera, Role::Width, false),
     ("frameHeight", Owner::Camera, Role::Height, false),
+    ("T_cn_cnm1", Owner::Own, Role::Pose, true),
     ("img_shape", Owner::Camera, Role::Shape, false),
 ];
 
@@ -140,12 +150,12 @@ const ROLES: &[(Role, &str)] = &[
     (
         Role::Intrinsics,
         "cameramatrix k mtx m intrinsicmatrix intrinsics intrinsic int matrix intrinsicsmatrix kmatrix \
-         intrinsicparameters cammatrix",
+         intrinsicparameters cammatrix projectionparameters",
     ),
-    (Role::Intrinsic(0), "fx focalx focallengthx"),
-    (Role::Intrinsic(1), "fy focaly focallengthy"),
-    (Role::Intrinsic(2), "cx ppx principalpointx"),
-    (Role::Intrinsic(3), "cy ppy principalpointy"),
+    (Role::Intrinsic(0), "fx focalx focallengthx gamma1 mu"),
+    (Role::Intrinsic(1), "fy focaly focallengthy gamma2 mv"),
+    (Role::Intrinsic(2), "cx ppx principalpointx u0"),
+    (Role::Intrinsic(3), "cy ppy principalpointy v0"),
     (
         Role::Distortion,
         "distortioncoefficients distcoeffs distortioncoeffs distcoeff distortion dist d distcoefs \
@@ -170,7 +180,7 @@ const ROLES: &[(Role, &str)] = &[
     (
         Role::Placement,
         "cameratoworld camtoworld c2w twc tworldcam tworldproj tworldprojector tworldcamera \
-         projectortoworld projtoworld timucam worldfromcamera worldfromprojector",
+         projectortoworld projtoworld tbs timucam worldfromcamera worldfromprojector",
     ),
     (Role::EitherPose, "pose posematrix transform transformmatrix transformation transformationmatrix"),
     (
@@ -189,7 +199,9 @@ const ROLES: &[(Role, &str)] = &[
          raster dimensions",
     ),
     (Role::Shape, "shape imageshape imgshape"),
-    (Role::LensModel, "fisheyemodel distortionmodel cameramodel lensmodel cameratype"),
+    (Role::LensModel, "fisheyemodel distortionmodel cameramodel lensmodel cameratype modeltype model"),
+    (Role::Mirror, "xi"),
+    (Role::Other, "radialdistortion tangentialdistortion"),
     (
         Role::ByProduct,
         "e f essentialmatrix fundamentalmatrix rotationaxis euler fov rotationangleradians \
