@@ -51,6 +51,9 @@ pub(crate) struct CameraArguments {
     /// From the end of the exposure to the arrival, milliseconds
     #[arg(long, default_value_t = 4.0)]
     latency_ms: f64,
+    /// How far the lens spreads the light of a point: standard deviation along each axis, pixels
+    #[arg(long, default_value_t = 0.5)]
+    softness_px: f64,
     /// Noise of reading, grey levels
     #[arg(long, default_value_t = 1.5)]
     noise: f64,
@@ -105,6 +108,7 @@ pub(super) fn run(arguments: &CameraArguments) -> Result<(), Box<dyn Error>> {
         exposure_ns: (arguments.exposure_ms * 1e6) as i64,
         row_ns: (arguments.row_us * 1e3) as i64,
         latency_ns: (arguments.latency_ms * 1e6) as i64,
+        softness_px: arguments.softness_px,
         read_noise: arguments.noise,
         clutter: arguments.clutter,
         seed: arguments.seed,

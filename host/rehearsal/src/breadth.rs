@@ -69,17 +69,21 @@ fn every_error_shows_and_goes_where_it_is_switched_off() {
     assert!(with("rehearsal.projector_px=10") < 10.0 && with("rehearsal.body_m=0.003") < 15.0);
 }
 
-/// Painted pictures and drawn corners say the same of the same run within the factor that the prediction is held to.
+/// Painted pictures and drawn corners say the same of the same run within the factor that the prediction is held to, by sharp
+/// lenses and soft ones, and by exposures that blur and that do not.
 #[test]
-#[ignore = "missed: 1.64 at the 99th percentile, 1.00 at the median; docs/BUDGET.md has what is known of it"]
 fn painted_pictures_agree_with_drawn_corners() {
-    let extent = Extent { pictures: true, ..SHORT };
-    let report = rehearsed(&rig("budget.toml", &[]), extent);
-    println!("{}", report.to_table());
-    let p = report.pictures.expect("a camera's rehearsal has pictures");
-    let ratio = p.painted_mm.p99 / p.drawn_mm.p99;
-    assert!((1.0 / 1.5..1.5).contains(&ratio), "{}", report.to_table());
-    assert!(p.pictures > 300);
+    let extent = Extent { seeds: 1, pictures: true, ..SHORT };
+    for (exposure_us, softness_px) in [(2000, 0.5), (200, 0.5), (200, 0.0), (4000, 1.0)] {
+        let set =
+            [format!("tracker.exposure_us={exposure_us}"), format!("rehearsal.softness_px={softness_px:?}")];
+        let report = rehearsed(&rig("budget.toml", &set), extent);
+        let p = report.pictures.expect("a camera's rehearsal has pictures");
+        let ratio = p.painted_mm.p99 / p.drawn_mm.p99;
+        println!("{exposure_us} us, {softness_px} px: {ratio:.2}; {:?}, {:?}", p.painted_mm, p.drawn_mm);
+        assert!((1.0 / 1.5..1.5).contains(&ratio), "{}", report.to_table());
+        assert!(p.pictures > 300);
+    }
 }
 
 /// Rigs with other trackers are rehearsed too: the mock by its own keys, NatNet by those of `[rehearsal]`.
@@ -124,7 +128,7 @@ fn drawn(seed: u64, is_camera: bool) -> Vec<String> {
     if is_camera {
         set.push(format!("tracker.rate_hz={}", of(7, &[60.0, 90.0, 120.0])));
         set.push(format!("rehearsal.corner_px={:?}", between(8, 0.03, 0.3)));
-        set.push(format!("rehearsal.exposure_us={}", between(9, 500.0, 4000.0) as u32));
+        set.push(format!("tracker.exposure_us={}", between(9, 500.0, 4000.0) as u32));
         set.push(format!("rehearsal.camera_px={:?}", between(10, 0.1, 1.0)));
         set.push(format!("projector.latency_us={}", between(11, 1000.0, 12_000.0) as u32));
     } else {
@@ -162,7 +166,8 @@ fn rows_that_change_nothing_are_left_out() {
     let mock = rig("demo.toml", &[]);
     let idle = |config: &RigConfig| {
         let stage = Stage::new(config).unwrap_or_else(|e| panic!("{e}"));
-        let own = Case { config: config.clone(), rate_hz: 120, is_prompt: false, paints: false };
+        let own =
+            Case { config: config.clone(), rate_hz: 120, exposure_us: 2000, is_prompt: false, paints: false };
         let rows = SUSPECTS.iter().chain(&PARTS);
         let idle = rows.filter(|(_, change)| is_idle(&stage, &own, *change)).map(|(name, _)| *name);
         idle.collect::<Vec<_>>()

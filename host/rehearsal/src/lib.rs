@@ -26,6 +26,8 @@ pub const SECONDS: f64 = 6.0;
 pub const SEEDS: u64 = 5;
 /// Time of the run whose pictures are painted, seconds.
 const PICTURES_S: f64 = 1.0;
+/// Exposure of a camera's picture where the rig file gives none, microseconds.
+const EXPOSURE_US: u32 = 2_000;
 /// Speed of the surface by which a misalignment that people notice is that many seconds \[Misalignment23\].
 const NOTICED_S: f64 = 3.87e-3;
 
@@ -58,8 +60,7 @@ const SUSPECTS: [(&str, Change); 7] = [
         (r.corner_px, r.noise_m, r.noise_rad) = (0.0, 0.0, 0.0);
     }),
     ("delays of tracker, computer and projector", |c| {
-        let r = &mut c.config.rehearsal;
-        (r.exposure_us, r.delivery_us, c.is_prompt) = (1, Some(0), true);
+        (c.exposure_us, c.config.rehearsal.delivery_us, c.is_prompt) = (1, Some(0), true);
         c.config.projector.latency_us = 0;
         render_within(c, 0);
     }),
@@ -77,7 +78,7 @@ const PARTS: [(&str, Change); 10] = [
         let r = &mut c.config.rehearsal;
         (r.corner_px, r.noise_m, r.noise_rad) = (0.5 * r.corner_px, 0.5 * r.noise_m, 0.5 * r.noise_rad);
     }),
-    ("half the exposure", |c| c.config.rehearsal.exposure_us = (c.config.rehearsal.exposure_us / 2).max(1)),
+    ("half the exposure", |c| c.exposure_us = (c.exposure_us / 2).max(1)),
     ("pictures and poses in half the time", |c| {
         let period_us = 1_000_000 / c.rate_hz.max(1);
         let r = &mut c.config.rehearsal;
@@ -128,7 +129,8 @@ pub fn rehearse(
 ) -> Result<RehearsalReport, Failure> {
     let mut stage = Stage::new(config)?;
     let rate_hz = config.tracker.rate_hz().unwrap_or(100);
-    let own = Case { config: config.clone(), rate_hz, is_prompt: false, paints: false };
+    let exposure_us = config.tracker.exposure_us().unwrap_or(EXPOSURE_US);
+    let own = Case { config: config.clone(), rate_hz, exposure_us, is_prompt: false, paints: false };
     let row = |stage: &mut Stage, name: &str, change: Option<Change>| {
         let mut case = own.clone();
         change.into_iter().for_each(|change| change(&mut case));
@@ -166,16 +168,17 @@ fn is_idle(stage: &Stage, own: &Case, change: Change) -> bool {
         if stage.camera.is_some() {
             (r.noise_m, r.noise_rad) = (0.0, 0.0);
         } else {
-            (r.corner_px, r.exposure_us, r.camera_px) = (0.0, 1, 0.0);
+            (r.corner_px, r.camera_px, case.exposure_us) = (0.0, 0.0, 1);
             if is_mock {
                 (r.noise_m, r.noise_rad, r.delivery_us) = (0.0, 0.0, None);
             }
         }
         let c = &case.config;
         format!(
-            "{:?} {} {} {:?} {} {:?} {}",
+            "{:?} {} {} {} {:?} {} {:?} {}",
             c.rehearsal,
             case.rate_hz,
+            case.exposure_us,
             case.is_prompt && c.projector.backend.light_delay_ns(1_000_000) > 0,
             c.projector.frame_rate,
             c.projector.latency_us,

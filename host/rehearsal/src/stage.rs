@@ -35,6 +35,8 @@ pub(super) struct Case {
     pub config: RigConfig,
     /// Samples of the tracker a second.
     pub rate_hz: u32,
+    /// Exposure of a picture of the camera, microseconds.
+    pub exposure_us: u32,
     /// Nothing delays the light of the projector, beside its rate.
     pub is_prompt: bool,
     /// The camera's pictures are painted.
@@ -167,6 +169,7 @@ impl Stage {
             off: vec![DVec3::ZERO; markings.len()],
             corner_px: 0.0,
             exposure_ns: 1,
+            softness_px: 0.0,
             paints: false,
         };
         for (i, rest) in self.rests.iter().enumerate().filter(|(i, _)| self.seen[*i]) {
@@ -276,6 +279,7 @@ impl Stage {
                 markings: markings.clone(),
                 corner_px: rehearsal.corner_px,
                 exposure_ns: delivery_of(case, true)[0],
+                softness_px: rehearsal.softness_px,
                 paints: case.paints,
             })),
         }
@@ -321,7 +325,7 @@ fn delivery_of(case: &Case, is_camera: bool) -> [i64; 2] {
     let written = rehearsal.delivery_us.map(|us| i64::from(us) * 1000);
     if is_camera {
         let period_ns = 1_000_000_000 / i64::from(case.rate_hz.max(1));
-        [i64::from(rehearsal.exposure_us) * 1000, written.unwrap_or(period_ns)]
+        [i64::from(case.exposure_us) * 1000, written.unwrap_or(period_ns)]
     } else {
         let errors = case.config.tracker.errors();
         [0, errors.map(|e| e.delivery_ns).or(written).unwrap_or(Stage::errors(case).delivery_ns)]

@@ -47,6 +47,8 @@ pub(super) struct CameraPart {
     pub corner_px: f64,
     /// Of each picture, nanoseconds.
     pub exposure_ns: i64,
+    /// How far its lens spreads the light of a point in them, pixels.
+    pub softness_px: f64,
     /// The pictures are painted, and the detector looks at them.
     pub paints: bool,
 }
@@ -407,6 +409,7 @@ fn mock_config(keys: &TrackerPart, camera: &CameraPart) -> Result<MockCameraConf
         pose: pose(&camera.truth.world_from_projector),
         rate: keys.rate(),
         exposure_ns: camera.exposure_ns,
+        softness_px: camera.softness_px,
         latency_ns: keys.delivery_ns,
         seed: keys.truth.noise().bits(1),
         ..MockCameraConfig::default()

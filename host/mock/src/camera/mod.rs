@@ -1,7 +1,7 @@
 //! A camera made of software: what it would see of bodies with printed tags and bright markers.
 //!
 //! Every pixel is an integral over its area and over the exposure, by stratified samples along true rays: perspective, lens,
-//! blur by motion, rolling shutter, shading, noise of photons and of reading, and a background with clutter. A picture is a
+//! blur by motion and by the lens, rolling shutter, shading, noise of photons and of reading, and a background with clutter. A picture is a
 //! pure function of the seed and its number; the optics share no code with what they judge.
 
 mod board;
@@ -11,6 +11,7 @@ mod lit;
 mod lit_camera;
 mod optics;
 mod paint;
+mod soften;
 
 pub use board::BoardHold;
 pub use host::{CameraHost, PictureMaker};
@@ -23,6 +24,7 @@ use crate::motion::Motion;
 use dpm_device::pose::Pose;
 use dpm_device::rng::Draws;
 use dpm_device::time::FrameRate;
+use soften::Softness;
 
 /// A printed tag of the family AprilTag 36h11 on a body.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -89,6 +91,9 @@ pub struct MockCameraConfig {
     pub row_ns: i64,
     /// From the end of a picture's exposure to its arrival, nanoseconds.
     pub latency_ns: i64,
+    /// How far the lens spreads the light of a point: standard deviation along each axis, pixels, 0 to 10. The area of a
+    /// pixel comes on top.
+    pub softness_px: f64,
     /// Grey level of white paper that faces the camera, 0 to 255.
     pub white: f64,
     /// Noise of reading, grey levels.
@@ -112,7 +117,8 @@ pub const CAMERA_FAULTS: [FaultKind; 5] =
     [FaultKind::Loss, FaultKind::Dropout, FaultKind::Stuck, FaultKind::Slow, FaultKind::Stall];
 
 impl Default for MockCameraConfig {
-    /// 1280 x 800 at 60 Hz, 60 degrees, 2 ms of exposure, global shutter, two grey levels of noise.
+    /// 1280 x 800 at 60 Hz, 60 degrees, 2 ms of exposure, global shutter, a lens as soft as those of small cameras in
+    /// focus, two grey levels of noise.
     fn default() -> Self {
         Self {
             optics: CameraOptics::pinhole([1280, 800], 60.0),
@@ -121,6 +127,7 @@ impl Default for MockCameraConfig {
             exposure_ns: 2_000_000,
             row_ns: 0,
             latency_ns: 4_000_000,
+            softness_px: 0.5,
             white: 200.0,
             read_noise: 1.5,
             photon_noise: 0.01,
@@ -168,8 +175,13 @@ pub struct MockCamera {
     config: MockCameraConfig,
     bodies: Vec<MarkedBody>,
     grid: Vec<[f32; 2]>,
+    /// What stands behind all bodies, sharp and as the lens shows it.
     background: Vec<f32>,
+    soft_background: Vec<f32>,
+    /// The picture, in the same two ways.
     light: Vec<f32>,
+    soft: Vec<f32>,
+    lens: Softness,
     noise: Vec<f32>,
     draws: Draws,
 }
@@ -192,6 +204,7 @@ impl MockCamera {
         }
         within("exposure_ns", config.exposure_ns as f64, 1.0, 1e9, "above 0, and 1 s at most")?;
         within("row_ns", config.row_ns as f64, 0.0, 1e6, "0 to 1e6 ns")?;
+        within("softness_px", config.softness_px, 0.0, 10.0, "0 to 10 pixels")?;
         within("white", config.white, 1.0, 255.0, "1 to 255")?;
         within("read_noise", config.read_noise, 0.0, 100.0, "0 to 100")?;
         within("photon_noise", config.photon_noise, 0.0, 10.0, "0 to 10")?;
@@ -202,7 +215,13 @@ impl MockCamera {
         let grid = config.optics.grid();
         let background = clutter::background(&config, draws.stream(1));
         let noise = (0..NOISES as u64).map(|i| draws.stream(2).normal(i) as f32).collect();
-        Ok(Self { light: background.clone(), config, bodies, grid, background, noise, draws })
+        let width = config.optics.size[0] as usize;
+        let mut lens = Softness::new(config.softness_px, width);
+        let mut soft_background = background.clone();
+        let whole = [[0, width], [0, config.optics.size[1] as usize]];
+        lens.soften(&background, whole, &mut soft_background);
+        let (light, soft) = (background.clone(), soft_background.clone());
+        Ok(Self { config, bodies, grid, background, soft_background, light, soft, lens, noise, draws })
     }
 
     /// What it was made with.
@@ -240,6 +259,10 @@ impl MockCamera {
         for sheet in &sheets {
             paint::paint(&self.config, &self.grid, sheet, begin_ns, &mut self.light);
         }
+        self.soft.copy_from_slice(&self.soft_background);
+        for sheet in &sheets {
+            self.lens.soften(&self.light, sheet.extent(), &mut self.soft);
+        }
         self.develop(exposure.number, pixels);
     }
 
@@ -247,10 +270,10 @@ impl MockCamera {
     fn develop(&self, number: u64, pixels: &mut Vec<u8>) {
         let width = self.config.optics.size[0] as usize;
         let (read, photon) = (self.config.read_noise.powi(2) as f32, self.config.photon_noise as f32);
-        pixels.resize(self.light.len(), 0);
+        pixels.resize(self.soft.len(), 0);
         let draws = self.draws.stream(3).stream(number);
         for (row, (out, light)) in
-            pixels.chunks_exact_mut(width).zip(self.light.chunks_exact(width)).enumerate()
+            pixels.chunks_exact_mut(width).zip(self.soft.chunks_exact(width)).enumerate()
         {
             let first = draws.bits(row as u64) as usize % (NOISES - width);
             for ((o, l), n) in out.iter_mut().zip(light).zip(&self.noise[first..first + width]) {

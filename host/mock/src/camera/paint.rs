@@ -28,6 +28,13 @@ pub(super) struct Sheet<'a> {
     rows: [usize; 2],
 }
 
+impl Sheet<'_> {
+    /// First column and the one behind the last, and rows, in which something of it may lie.
+    pub(super) fn extent(&self) -> [[usize; 2]; 2] {
+        [self.columns, self.rows]
+    }
+}
+
 fn inverse(q: [f64; 4]) -> [f64; 4] {
     [-q[0], -q[1], -q[2], q[3]]
 }
@@ -267,11 +274,15 @@ fn pixel(
     let (begin, stride) = (drawn as usize & 0xff, 2 * (drawn as usize >> 8 & 0xff) + 1);
     let rounds = instants.len().div_ceil(n * n).max(1);
     let count = n * n * rounds;
+    // No two samples of a pixel lie above or beside one another, and the pattern is shifted from pixel to pixel: an edge that
+    // runs along the pixels is where it is, and not at the next line of samples.
+    let shift = [drawn >> 16 & 0xf, drawn >> 20 & 0xf].map(|bits| (bits as f64 + 0.5) / 16.0);
     let (mut sum, mut hits) = (0.0, 0usize);
     for k in 0..count {
-        let (i, j) = (k % n, k / n % n);
+        let [i, j] = [k % n, k / n % n].map(|i| i as f64);
         let instant = &instants[(begin + k * stride) % instants.len()];
-        let (u, v) = ((i as f64 + 0.5) / n as f64, (j as f64 + 0.5) / n as f64);
+        let side = n as f64;
+        let [u, v] = [i + (j + shift[0]) / side, j + (i + shift[1]) / side].map(|at| at / side);
         let mix = |c: usize| {
             let upper = corners[0][c] + u * (corners[1][c] - corners[0][c]);
             let lower = corners[2][c] + u * (corners[3][c] - corners[2][c]);

@@ -112,6 +112,11 @@ pub trait TrackerKeys: KeyValues {
         None
     }
 
+    /// Exposure of a picture of such a camera, microseconds, if the rig file gives it.
+    fn exposure_us(&self) -> Option<u32> {
+        None
+    }
+
     /// Lens and place in the world of such a camera.
     #[cfg(feature = "camera")]
     fn eye(&self) -> Option<Result<ProjectorCamera, SourceError>> {

@@ -134,6 +134,10 @@ impl TrackerKeys for CameraTrackerConfig {
         Some(self.markings(body))
     }
 
+    fn exposure_us(&self) -> Option<u32> {
+        self.exposure_us
+    }
+
     fn eye(&self) -> Option<Result<ProjectorCamera, SourceError>> {
         let placed = |camera: ProjectorCamera| {
             let wrong = || SourceError::of_key("tracker.transform", "its rotation is zero");
