@@ -23,7 +23,7 @@ use dpm_rig::method_choice;
 use dpm_rig::pipeline::{self, RunOptions, RunOutcome};
 use dpm_rig::presence;
 use dpm_rig::rig::Rig;
-use dpm_rig::run_rig::{cannot_write, check_output_folder, open_gpu, traced_raster};
+use dpm_rig::run_rig::{cannot_write, check_output_folder, open_gpu, planes_offered, traced_raster};
 use dpm_rig::telemetry::interval::Interval;
 #[cfg(feature = "plots")]
 use dpm_rig::telemetry::interval::IntervalKind;
@@ -62,21 +62,37 @@ pub fn profile_rig(
     prepared: bool,
     monitor: &Arc<RunMonitor>,
 ) -> Result<Ended<Profile>, Failure> {
+    profile_with(config, prepared, monitor, Vec::new())
+}
+
+/// As [`profile_rig`], with notes for the report.
+fn profile_with(
+    config: &RigConfig,
+    prepared: bool,
+    monitor: &Arc<RunMonitor>,
+    mut notes: Vec<String>,
+) -> Result<Ended<Profile>, Failure> {
     check_output_folder(&config.output.dir)?;
     // As many slots, not frames: a rig that cannot keep its rate must not profile for minutes.
     let slots = if config.run.frames > 0 { config.run.frames } else { config.slots_to_run() };
     let options = RunOptions { slots, ..RunOptions::default() };
-    let (outcome, notes, rig) = if prepared {
+    let (ran, rig) = if prepared {
         let rig = Arc::new(Rig::build(config, None)?);
-        (pipeline::run_prepared(rig.clone(), options, monitor)?, Vec::new(), rig)
+        (pipeline::run_prepared(rig.clone(), options, monitor), rig)
     } else {
         presence::look(config)?;
         let gpu = open_gpu(config)?;
-        let mut notes = Vec::new();
         let mut rig = Rig::build(config, traced_raster(config, &gpu, &mut notes))?;
         method_choice::decide(&mut rig, &gpu);
         let rig = Arc::new(rig);
-        (pipeline::run(rig.clone(), &gpu, options, monitor)?, notes, rig)
+        (pipeline::run(rig.clone(), &gpu, options, monitor), rig)
+    };
+    let outcome = match ran {
+        Ok(outcome) => outcome,
+        Err(error) => {
+            let Some((config, note)) = planes_offered(config, &error) else { return Err(error.into()) };
+            return profile_with(&config, prepared, monitor, vec![note]);
+        }
     };
     let mut profile = summary(&outcome, &rig, prepared);
     profile.report.warnings.splice(0..0, notes);

@@ -1,7 +1,7 @@
 //! `dpm run` and `dpm demo`: from a configuration to a report and pictures.
 
 use super::pictures::{pictures, to_srgb};
-use crate::config::RigConfig;
+use crate::config::{PlaneWeights, RigConfig};
 use crate::engine::connect::ConnectError;
 use crate::failure::{Ended, Failure, FailureKind};
 use crate::method_choice;
@@ -13,6 +13,7 @@ use crate::telemetry::report::Report;
 use crate::telemetry::trace::write_trace;
 use crate::trackers::SourceError;
 use dpm_common::files::{check_folder, write_atomically};
+use dpm_device::link::LinkError;
 use dpm_device::planes::{Channel, Raster};
 use dpm_render::gpu::{validation_messages, Gpu, GpuError};
 use dpm_render::RenderError;
@@ -27,6 +28,15 @@ use std::sync::Arc;
 ///
 /// A failure after the run does not discard the report, so no measurement is lost; see [`Ended`].
 pub fn run_rig(config: &RigConfig, monitor: &Arc<RunMonitor>) -> Result<Ended<Report>, Failure> {
+    run_with(config, monitor, Vec::new())
+}
+
+/// As [`run_rig`], with notes for the operator and the report.
+fn run_with(
+    config: &RigConfig,
+    monitor: &Arc<RunMonitor>,
+    mut notes: Vec<String>,
+) -> Result<Ended<Report>, Failure> {
     // Checked before the run, because the run's report is written there.
     check_output_folder(&config.output.dir)?;
     // What can be seen missing is, before minutes are spent.
@@ -34,7 +44,6 @@ pub fn run_rig(config: &RigConfig, monitor: &Arc<RunMonitor>) -> Result<Ended<Re
     // Nothing is lit yet: whoever stops the run waits for nothing.
     let setting_up = monitor.begin_set_up();
     let gpu = open_gpu(config)?;
-    let mut notes = Vec::new();
     let raster = traced_raster(config, &gpu, &mut notes);
     let mut rig = Rig::build(config, raster)?;
     method_choice::decide(&mut rig, &gpu);
@@ -57,11 +66,29 @@ pub fn run_rig(config: &RigConfig, monitor: &Arc<RunMonitor>) -> Result<Ended<Re
     let keep_frames = if output.images && has_light { window } else { 0 };
     let slots = config.slots_to_run();
     let options = RunOptions { frames: config.run.frames, slots, keep_frames, ..RunOptions::default() };
-    let mut outcome = match pipeline::run(rig.clone(), &gpu, options, monitor) {
+    let outcome = match pipeline::run(rig.clone(), &gpu, options, monitor) {
+        Ok(outcome) => outcome,
         Err(PipelineError::Connect(ConnectError::Stopped)) => return Ok(stopped_before_light(config)),
-        other => other?,
+        Err(error) => {
+            // Nothing is lit yet. Tables and programs are of other planes than the projector's, so all is made anew.
+            let Some((config, note)) = planes_offered(config, &error) else { return Err(error.into()) };
+            drop((rig, gpu, setting_up));
+            return run_with(&config, monitor, vec![note]);
+        }
     };
     drop(setting_up);
+    Ok(finished(&rig, &gpu, outcome, notes, keep_frames))
+}
+
+/// What a run left, with its files written.
+fn finished(
+    rig: &Rig,
+    gpu: &Arc<Gpu>,
+    mut outcome: RunOutcome,
+    notes: Vec<String>,
+    keep_frames: usize,
+) -> Ended<Report> {
+    let output = &rig.config.output;
     let _writing = dpm_common::stopping::WritingFiles::begin();
     let mut ended = Ended::from(std::mem::take(&mut outcome.report));
     ended.report.warnings.splice(0..0, notes);
@@ -70,7 +97,7 @@ pub fn run_rig(config: &RigConfig, monitor: &Arc<RunMonitor>) -> Result<Ended<Re
         ended.fail(Failure::new(FailureKind::CheckFailed, told));
     }
     if keep_frames > 0 {
-        let written = write_pictures(&rig, &gpu, &outcome);
+        let written = write_pictures(rig, gpu, &outcome);
         if let Some((files, why_not)) = ended.keep(written) {
             ended.report.files.extend(files);
             ended.report.warnings.extend(why_not);
@@ -91,7 +118,20 @@ pub fn run_rig(config: &RigConfig, monitor: &Arc<RunMonitor>) -> Result<Ended<Re
             .push(format!("{count} messages of the Vulkan validation layer, the first: {first}"));
     }
     write_report(&mut ended, &output.dir);
-    Ok(ended)
+    ended
+}
+
+/// The configuration with the planes that the projector offers, if `error` says that it does not offer those of
+/// `projector.weights = "auto"`, and what to say of it.
+pub fn planes_offered(config: &RigConfig, error: &PipelineError) -> Option<(RigConfig, String)> {
+    let PipelineError::Connect(ConnectError::Link(LinkError::Exceeds { device })) = error else {
+        return None;
+    };
+    let mut binary = config.clone();
+    binary.projector.weights = PlaneWeights::Binary;
+    let note =
+        format!("{device}: projector.weights = \"auto\" is \"binary\", because the projector does not offer split planes");
+    (config.projector.weights == PlaneWeights::Auto).then_some((binary, note))
 }
 
 /// The end of a run that was stopped before its projector was up, with its report in the output folder.

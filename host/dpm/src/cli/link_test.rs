@@ -7,7 +7,7 @@ use dpm_common::stopping;
 use dpm_lab::conformance::{rules, Extent, Rule};
 use dpm_lab::link_test::{judge_projector, link_test, Content};
 use dpm_rig::calibration_steps::is_simulated;
-use dpm_rig::config::RigConfig;
+use dpm_rig::config::{PlaneWeights, RigConfig};
 use dpm_rig::failure::{Failure, FailureKind};
 use dpm_rig::interlock::Interlock;
 use dpm_rig::presence;
@@ -65,7 +65,11 @@ pub(super) fn execute(args: &LinkTestArgs) -> Result<(), Failure> {
         print(&rules().map(line).collect::<String>());
         return Ok(());
     }
-    let config = args.flags.rig_at_rest(args.rig.as_deref())?;
+    let mut config = args.flags.rig_at_rest(args.rig.as_deref())?;
+    // Throughput is measured whatever the projector offers, and both kinds of planes are as long.
+    if config.projector.weights == PlaneWeights::Auto {
+        config.projector.weights = PlaneWeights::Binary;
+    }
     if let (Some(head), false) = (config.heads().first(), is_simulated(&config)) {
         return Err(Failure::new(
             FailureKind::BadInput,

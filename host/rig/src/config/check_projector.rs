@@ -61,8 +61,7 @@ pub(super) fn projector(rig: &RigConfig, reader: &mut Reader) {
     }
     measured_light(p, reader);
     p.backend.check(&p.frame_keys(), reader);
-    let is_dimmed = !p.backend.is_lit_fully() && !p.backend.kind().is_loaded();
-    if p.weights == PlaneWeights::Split && !is_dimmed {
+    if p.weights == PlaneWeights::Split && !p.dims_planes() {
         contradict(
             reader,
             &[

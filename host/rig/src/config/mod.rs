@@ -206,6 +206,20 @@ impl RigConfig {
         (output.images, output.trace, output.flight_recorder) = (false, false, false);
     }
 
+    /// Takes the binary planes in place of "auto" where something speaks against split ones. What speaks against them is everything
+    /// that was measured or set with other planes in mind, and a purpose that measures, or shows patterns for it.
+    fn settle_weights(&mut self, purpose: Purpose) {
+        let p = &self.projector;
+        let is_measured = p.response != ResponseConfig::default()
+            || p.flat_field.is_some()
+            || self.calibration.file.is_some()
+            || !self.safety.limits.is_off();
+        let is_free = p.dims_planes() && p.plane_order == values::BitOrder::default() && !is_measured;
+        if p.weights == PlaneWeights::Auto && (!is_free || purpose.projector_only || purpose.calibrates) {
+            self.projector.weights = PlaneWeights::Binary;
+        }
+    }
+
     /// What people wear that is no body of the scene, each once: the observer first, then the heads of `safety.eyes`.
     pub fn worn(&self) -> Vec<&WearableConfig> {
         let mut worn: Vec<&WearableConfig> = Vec::new();
@@ -347,6 +361,7 @@ impl RigConfig {
             if purpose.projector_only {
                 rig.keep_projector();
             }
+            rig.settle_weights(purpose);
             check::check(&rig, purpose, &mut reader);
             check::resolve_files(&mut rig, base, purpose, &mut reader);
         }

@@ -31,7 +31,9 @@ section! {
         /// bit-plane projector equal planes together give 128 / 255 of full white. "split" shows the highest bit three
         /// times, apart from one another, in place of the two lowest: twice the light at the same peak, less modulated,
         /// and half the levels, of which the rest comes back over two frames. It is for bit-plane projectors that offer
-        /// planes that exceed full light (docs/PROTOCOL.md, section 17).
+        /// planes that exceed full light (docs/PROTOCOL.md, section 17). "auto" is "split" for a run on a projector that
+        /// offers it, if the rig has no limits on light, no calibration file, no `response`, no `flat_field` and no
+        /// `plane_order` of its own; otherwise it is "binary".
         weights: PlaneWeights = PlaneWeights::Binary, "", Any;
         /// The order in which a frame shows the bits of a code value, from its first plane on; red, green and blue in
         /// turn for each bit. By default the highest bits are lit together, which smears a moving picture least. The
@@ -152,6 +154,12 @@ impl ProjectorConfig {
         self.max_intensity.0.map(|intensity| intensity * times)
     }
 
+    /// True if each plane has a brightness of its own, as on the bit-plane link: its light source is dimmed, and nothing was
+    /// loaded before.
+    pub fn dims_planes(&self) -> bool {
+        !self.backend.is_lit_fully() && !self.backend.kind().is_loaded()
+    }
+
     /// `schedule` as this projector lights it: a light source that is not dimmed from plane to plane gives full white where
     /// all planes are on, whatever their bits.
     pub fn lit_by(&self, schedule: PlaneSchedule) -> PlaneSchedule {
@@ -188,7 +196,7 @@ impl ProjectorConfig {
     /// The weights of the planes with which light is taken to have been measured, by what a rig file or a calibration file says of
     /// it. What says nothing is older than planes that exceed full light.
     pub(super) fn weights_measured(&self, told: Option<PlaneWeights>) -> PlaneWeights {
-        let own = Some(self.weights).filter(|weights| *weights != PlaneWeights::Split);
+        let own = Some(self.weights).filter(|weights| !weights.are_split());
         told.or(own).unwrap_or(PlaneWeights::Binary)
     }
 
@@ -202,8 +210,8 @@ impl ProjectorConfig {
         match (self.planes, weights) {
             (8, PlaneWeights::Equal) => PlaneSchedule::equal_mono8(),
             (_, PlaneWeights::Equal) => PlaneSchedule::equal_rgb24(),
-            (8, PlaneWeights::Split) => PlaneSchedule::split_mono8(),
-            (_, PlaneWeights::Split) => PlaneSchedule::split_rgb24(),
+            (8, PlaneWeights::Split | PlaneWeights::Auto) => PlaneSchedule::split_mono8(),
+            (_, PlaneWeights::Split | PlaneWeights::Auto) => PlaneSchedule::split_rgb24(),
             (_, PlaneWeights::Binary) => {
                 binary.expect("the order was checked when the configuration was read")
             }

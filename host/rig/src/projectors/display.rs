@@ -329,7 +329,7 @@ impl DisplayConfig {
         if reader.is_written("projector.weights") && frames.weights != self.encoding.weights() {
             let why = match self.encoding.weights() {
                 PlaneWeights::Equal => "a DLPC900 lights all planes of a pixel equally long",
-                PlaneWeights::Binary | PlaneWeights::Split => {
+                PlaneWeights::Binary | PlaneWeights::Split | PlaneWeights::Auto => {
                     "a DLPC900 weights the bits of a pattern itself"
                 }
             };

@@ -51,5 +51,15 @@ words! {
         Equal = "equal",
         /// Half as much from plane to plane, but for the highest bit, which three planes of equal light show.
         Split = "split",
+        /// Split where the projector offers it and nothing was measured with other planes, else binary.
+        Auto = "auto",
+    }
+}
+
+impl PlaneWeights {
+    /// True if three planes show the highest bit. [`PlaneWeights::Auto`] counts: of a configuration that was accepted it is left
+    /// only where nothing but the projector can forbid it.
+    pub fn are_split(self) -> bool {
+        matches!(self, Self::Split | Self::Auto)
     }
 }

@@ -1,6 +1,7 @@
 //! `dpm run` on a projector behind a real serial line (a pseudo-terminal): light, reports, orders, faults,
 //! unplugging, the dark at the end.
 
+use crate::cli_common::{code, dpm, err, Folder};
 use crate::link_common::{raster, rig, served_time, start, Projector, PtyProjector};
 use dpm_device::link::{faults, DeviceState};
 use dpm_rig::order::Order;
@@ -203,4 +204,29 @@ fn an_absent_a_taken_and_a_silent_port_are_told_apart() {
     let quiet = told(&format!("{{ kind = \"serial\", port = {silent:?} }}"));
     assert!(quiet.contains("is switched on") && quiet.contains("the cable"), "{quiet}");
     drop(line);
+}
+
+/// `projector.weights = "auto"` takes the planes that the projector offers, and the report says where that are binary ones.
+#[test]
+fn a_projector_that_offers_no_split_planes_is_lit_by_binary_ones() {
+    for exceeds in [false, true] {
+        let name = format!("offers-{exceeds}");
+        let far = PtyProjector::new(&name, MockConfig { exceeds, ..MockConfig::new(raster()) });
+        let folder = Folder::new(&name);
+        let text = format!(
+            "[projector]\nwidth = {}\nheight = {}\nframe_rate = 60\nplanes = 8\nweights = \"auto\"\nbackend = {}\n\
+             [render]\nspp = 1\nmethod = \"full\"\n[[scene.bodies]]\nname = \"bunny\"\n",
+            raster().width(),
+            raster().height(),
+            far.backend(""),
+        );
+        let path = folder.write("rig.toml", &text);
+        let told = dpm(&["run", &path, "--frames", "30", "--out", folder.text()], &[]);
+        assert_eq!(code(&told), 0, "{}", err(&told));
+        assert!(far.status().frames_lit > 0);
+        let report = std::fs::read_to_string(folder.path("report.json")).expect("it was written");
+        let report: serde_json::Value = serde_json::from_str(&report).expect("it is JSON");
+        let is_noted = report["warnings"].to_string().contains("does not offer split planes");
+        assert_eq!(is_noted, !exceeds, "{}", report["warnings"]);
+    }
 }

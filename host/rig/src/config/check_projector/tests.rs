@@ -139,17 +139,61 @@ fn a_controller_behind_a_display_shows_frames_that_have_arrived() {
 #[test]
 fn only_projectors_that_dim_their_planes_split_the_highest_bit() {
     let split = "projector.weights=\"split\"";
+    let binary = "projector.weights=\"binary\"";
     for name in ["usb-natnet.toml", "demo.toml"] {
         let schedule = |keys: &[&str]| {
             template(name, keys).unwrap_or_else(|e| panic!("{name}, {keys:?}: {e}")).projector.schedule()
         };
-        assert!(!schedule(&[]).exceeds() && !schedule(&["projector.weights=\"equal\""]).exceeds(), "{name}");
+        assert!(
+            !schedule(&[binary]).exceeds() && !schedule(&["projector.weights=\"equal\""]).exceeds(),
+            "{name}"
+        );
         assert_eq!(schedule(&[split]), PlaneSchedule::split_rgb24(), "{name}");
         assert_eq!(schedule(&[split, "projector.planes=8"]), PlaneSchedule::split_mono8(), "{name}");
     }
     for name in ["display.toml", "window.toml", "alp.toml", "dlpc900-live.toml", "dlpc900.toml"] {
         let told = template(name, &[split]).expect_err(name).to_string();
         assert!(told.contains("does not dim its light from plane to plane"), "{name}: {told}");
+    }
+}
+
+/// "auto" splits the highest bit only where nothing was measured or limited with other planes, and where the light is for a run.
+#[test]
+fn auto_splits_the_highest_bit_only_where_nothing_speaks_against_it() {
+    let auto = "projector.weights=\"auto\"";
+    let exceeds = |name: &str, keys: &[&str]| {
+        let keys = [&[auto][..], keys].concat();
+        template(name, &keys)
+            .unwrap_or_else(|e| panic!("{name}, {keys:?}: {e}"))
+            .projector
+            .schedule()
+            .exceeds()
+    };
+    assert!(
+        exceeds("demo.toml", &[])
+            && exceeds("usb-natnet.toml", &[])
+            && exceeds("demo.toml", &["projector.planes=8"])
+    );
+    assert!(template("usb-natnet.toml", &[]).unwrap().projector.schedule().exceeds(), "the template has it");
+    for key in [
+        "safety.limits.mean_level=0.3",
+        "safety.limits.full_white_s=2",
+        "projector.response={kind=\"gamma\"}",
+        concat!("projector.flat_field=\"", env!("CARGO_MANIFEST_DIR"), "/Cargo.toml\""),
+        "projector.plane_order=\"7 6 5 4 3 2 1 0\"",
+    ] {
+        assert!(!exceeds("usb-natnet.toml", &[key]), "{key}");
+    }
+    for name in ["display.toml", "window.toml", "alp.toml", "dlpc900.toml"] {
+        assert!(!exceeds(name, &[]), "{name}");
+    }
+    let overrides = Overrides { flags: vec![auto.into()], ..Overrides::default() };
+    for purpose in [
+        Purpose { projector_only: true, at_rest: true, ..Purpose::default() },
+        Purpose { calibrates: true, at_rest: true, ..Purpose::default() },
+    ] {
+        let rig = RigConfig::demo_for(&overrides, purpose).unwrap();
+        assert_eq!(rig.projector.weights, PlaneWeights::Binary, "{purpose:?}");
     }
 }
 
