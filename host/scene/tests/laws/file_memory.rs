@@ -84,6 +84,40 @@ fn bmp_of_bits(side: u32) -> Vec<u8> {
     [out, rows].concat()
 }
 
+/// A TIFF whose strips, or tiles of these sides, are all the same zeros in a few bytes.
+fn tiff([width, height]: [u32; 2], [bits, samples]: [u32; 2], [wide, high]: [u32; 2]) -> Vec<u8> {
+    let is_tile = wide != width;
+    let mut packed = ZlibEncoder::new(vec![], Compression::best());
+    let texels = u64::from(wide) * u64::from(high);
+    let unpacked = texels.saturating_mul(u64::from(bits * samples) / 8).min(20_000_000);
+    packed.write_all(&vec![0; unpacked as usize]).unwrap();
+    let packed = packed.finish().unwrap();
+    let count = width.div_ceil(wide) * height.div_ceil(high);
+    let (place, length) = if is_tile { (324, 325) } else { (273, 279) };
+    let mut tags =
+        vec![(256, width), (257, height), (258, bits), (259, 8), (262, 1 + u32::from(samples > 2))];
+    tags.extend([(277, samples), (place, 0), (length, 0)]);
+    tags.extend(if is_tile { vec![(322, wide), (323, high)] } else { vec![(278, high)] });
+    tags.sort_unstable();
+    let behind = 14 + 12 * tags.len() as u32;
+    let mut out = [&b"II*\0\x08\0\0\0"[..], &(tags.len() as u16).to_le_bytes()].concat();
+    for (tag, value) in tags {
+        let (numbers, value) = match tag {
+            tag if tag == place => (count, if count == 1 { behind + 8 } else { behind }),
+            tag if tag == length => {
+                (count, if count == 1 { packed.len() as u32 } else { behind + 4 * count })
+            }
+            _ => (1, value),
+        };
+        out.extend([(tag as u16).to_le_bytes(), 4u16.to_le_bytes()].concat());
+        out.extend([numbers.to_le_bytes(), value.to_le_bytes()].concat());
+    }
+    out.extend([0; 4]);
+    out.extend((behind + 8 * count).to_le_bytes().repeat(count as usize));
+    out.extend((packed.len() as u32).to_le_bytes().repeat(count as usize));
+    [out, packed].concat()
+}
+
 /// Files that promise much in few bytes.
 fn bombs() -> Vec<(&'static str, Vec<u8>)> {
     let text = |text: String| text.into_bytes();
@@ -138,6 +172,12 @@ fn bombs() -> Vec<(&'static str, Vec<u8>)> {
         ("PNG with a long profile", png_with_long_profile()),
         ("glTF with a long profile", with_image(&png_with_long_profile()).bytes()),
         ("glTF with a BMP of bits", with_image(&bmp_of_bits(7000)).bytes()),
+        ("TIFF in one strip", with_image(&tiff([8000, 8000], [8, 3], [8000, 8000])).bytes()),
+        ("TIFF in strips", with_image(&tiff([8000, 4000], [8, 3], [8000, 100])).bytes()),
+        ("TIFF of wide numbers", with_image(&tiff([8000, 4000], [64, 3], [8000, 10])).bytes()),
+        ("TIFF of a column in wide tiles", with_image(&tiff([1, 9000], [8, 1], [16_000_000, 1])).bytes()),
+        ("TIFF of one huge tile", with_image(&tiff([16, 16], [8, 1], [u32::MAX, u32::MAX])).bytes()),
+        ("TIFF of a sky", tiff([8000, 4000], [32, 3], [8000, 100])),
         ("STL of solids", STL_SOLID.repeat(20_000)),
     ]
 }
