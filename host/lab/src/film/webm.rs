@@ -1,7 +1,7 @@
 //! Pictures into a WebM: AV1 by `rav1e`, in the few elements of Matroska that a player asks for.
 //!
 //! GIF and PNG stand beside it because any page shows them. A WebM is for a film that would be too coarse in 255 colours.
-//! Source of the container: \[RFC 9559\], and "AV1 in Matroska" of the Alliance for Open Media for what a block holds.
+//! Source of the container: \[RFC9559\]; of what a block holds: "Carriage of AV1 in Matroska and WebM" of the Alliance for Open Media.
 
 use crate::paint::Canvas;
 use rav1e::prelude::*;
@@ -89,7 +89,7 @@ struct SamplePlane {
     values: Vec<u8>,
 }
 
-/// The planes of `picture` in limited range, the colour differences at half the width and height \[BT.709\].
+/// The planes of `picture` in limited range, the colour differences at half the width and height (BT.709).
 fn planes(picture: &Canvas) -> [SamplePlane; 3] {
     let (width, height) = (picture.width, picture.height);
     let at = |x: usize, y: usize| {
