@@ -282,8 +282,17 @@ impl Crew {
 
     /// The projector must come into a state, with light.
     pub(crate) fn expect_state(&mut self, laws: &mut Laws, state: &str, cause: &str) {
+        self.expect(laws, state, cause, |log| log.now().is_some_and(|c| c.is_lit && c.state == state));
+    }
+
+    /// What was on the mirrors must be held: light, or the dark of a machine that stood still just then.
+    pub(crate) fn expect_held(&mut self, laws: &mut Laws, cause: &str) {
+        self.expect(laws, "frozen", cause, LightLog::is_held);
+    }
+
+    fn expect(&mut self, laws: &mut Laws, state: &str, cause: &str, done: impl Fn(&LightLog) -> bool) {
         let limit = Duration::from_secs(5);
-        match self.until(limit, |crew| crew.log.now().is_some_and(|c| c.is_lit && c.state == state)) {
+        match self.until(limit, |crew| done(&crew.log)) {
             Some(time) => laws.took(&format!("{state} after {cause}"), time.as_secs_f64() * 1e3),
             None => laws.found(format!("{cause}: {:?} and not {state} after {limit:?}", self.log.now())),
         }

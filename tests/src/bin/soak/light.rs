@@ -54,6 +54,15 @@ impl LightLog {
         self.changes.last()
     }
 
+    /// True if the projector is frozen with what it showed before: FREEZE takes no light away, and makes none (docs/PROTOCOL.md,
+    /// section 6).
+    pub(crate) fn is_held(&self) -> bool {
+        let frozen = self.changes.iter().rev().take_while(|c| c.state == "frozen");
+        let count = frozen.clone().count();
+        let before = self.changes.iter().rev().nth(count);
+        count > 0 && before.is_some_and(|before| frozen.into_iter().all(|c| c.is_lit == before.is_lit))
+    }
+
     /// When light went off for good, at or after `since`: `None` while it is on.
     pub(crate) fn dark_since(&self, since_ns: i64) -> Option<i64> {
         let last = self.now()?;
@@ -114,6 +123,18 @@ mod tests {
                 .collect();
         assert_eq!((log.dark_since(0), log.longest_dark(0, 100)), (None, 20));
         assert_eq!((log.longest_dark(30, 100), log.longest_dark(50, 100)), (10, 0));
+        assert!(!log.is_held());
+        for (lines, is_held) in [
+            (&["1 lit 1 armed", "2 lit 1 frozen"][..], true),
+            (&["1 dark armed", "2 dark frozen"], true),
+            (&["1 lit 1 armed", "2 dark frozen"], false),
+            (&["1 dark armed", "2 lit 1 frozen"], false),
+            (&["1 lit 1 armed", "2 lit 1 frozen", "3 dark frozen"], false),
+            (&["1 lit 1 frozen", "2 lit 1 armed"], false),
+        ] {
+            let changes = lines.iter().filter_map(|l| parse(l)).collect();
+            assert_eq!(LightLog { changes, ..LightLog::new("".into()) }.is_held(), is_held, "{lines:?}");
+        }
         log.changes.extend(parse("60 dark armed"));
         log.changes.extend(parse("61 dark faulted: watchdog"));
         assert_eq!((log.dark_since(0), log.dark_since(65)), (Some(60), Some(65)));

@@ -121,9 +121,9 @@ impl Crew {
             }
             Deed::Freeze => {
                 self.order("freeze", laws);
-                self.expect_state(laws, "frozen", "FREEZE");
+                self.expect_held(laws, "FREEZE");
                 self.rest(DEED);
-                self.expect_state(laws, "frozen", "FREEZE, held");
+                self.expect_held(laws, "FREEZE, held");
                 self.order("arm", laws);
                 self.expect_state(laws, "armed", "ARM after FREEZE");
             }
