@@ -16,12 +16,13 @@ use glam::{DQuat, DVec3};
 pub trait Chart: Copy {
     /// A point on it.
     type Point: Copy + std::fmt::Debug + PartialEq;
-    /// Tangents up to this length add up like vectors, with enough precision to fit curves to them.
-    const FLAT: f64;
     /// The tangent that leads from `from` to `to`.
     fn between(from: Self::Point, to: Self::Point) -> DVec3;
     /// The point reached from `from` along a tangent.
     fn moved(from: Self::Point, by: DVec3) -> Self::Point;
+    /// True if the tangents of points as near as `from` and `to` add up like vectors, with enough precision to fit curves to
+    /// them.
+    fn is_flat(from: Self::Point, to: Self::Point) -> bool;
 }
 
 /// Translations, metres.
@@ -30,12 +31,14 @@ pub struct Translations;
 
 impl Chart for Translations {
     type Point = DVec3;
-    const FLAT: f64 = f64::INFINITY;
     fn between(from: DVec3, to: DVec3) -> DVec3 {
         to - from
     }
     fn moved(from: DVec3, by: DVec3) -> DVec3 {
         from + by
+    }
+    fn is_flat(_from: DVec3, _to: DVec3) -> bool {
+        true
     }
 }
 
@@ -45,12 +48,16 @@ pub(crate) struct Rotations;
 
 impl Chart for Rotations {
     type Point = DQuat;
-    const FLAT: f64 = 1.0;
     fn between(from: DQuat, to: DQuat) -> DVec3 {
         so3_between(from, to)
     }
     fn moved(from: DQuat, by: DVec3) -> DQuat {
         (so3_exp(by) * from).normalize()
+    }
+    fn is_flat(from: DQuat, to: DQuat) -> bool {
+        // The product of two unit quaternions is the cosine of half the angle between them: up to 1 rad.
+        const COS_HALF: f64 = 0.877_582_561_890_372_8;
+        from.dot(to).abs() >= COS_HALF
     }
 }
 

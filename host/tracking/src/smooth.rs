@@ -8,6 +8,7 @@
 
 use super::imm::Chart;
 use glam::{DMat3, DVec3};
+use std::ops::Range;
 
 /// Reach of a point's windows on either side, ns.
 pub(crate) const MARGIN_NS: i64 = 80_000_000;
@@ -60,27 +61,16 @@ pub(crate) fn smoothed<C: Chart>(
     sigma: f64,
 ) -> Option<(i64, SmoothMotion<C::Point>)> {
     let (at_ns, origin) = (*samples.get(middle)?)?;
-    // Each tangent is taken once, for all windows.
-    let (mut tangents, mut around) = ([(0.0, DVec3::ZERO); MOST_SAMPLES], 0);
-    for (t, z) in samples.iter().flatten().filter(|(t, _)| t.abs_diff(at_ns) <= MARGIN_NS as u64) {
-        let tangent = C::between(origin, *z);
-        if tangent.length_squared() > C::FLAT * C::FLAT {
-            return None;
-        }
-        // Milliseconds, so that fourth powers stay small.
-        *tangents.get_mut(around)? = (t.saturating_sub(at_ns) as f64 * 1e-6, tangent);
-        around += 1;
-    }
-    let around = &tangents[..around];
-    if around.len() < LEAST_AROUND {
-        return None;
-    }
+    let is_around =
+        |sample: &Option<(i64, C::Point)>| sample.is_some_and(|(t, _)| t.abs_diff(at_ns) <= MARGIN_NS as u64);
+    let first = samples.iter().position(is_around)?;
+    let after =
+        samples[first..].iter().position(|sample| !is_around(sample)).unwrap_or(samples.len() - first);
+    let mut tangents = Tangents::<C>::at(at_ns, origin, &samples[first..first + after])?;
     let mut chosen: [Option<Parabola>; 3] = [None; 3];
     let mut least: [Option<(f64, Parabola)>; 3] = [None; 3];
     for [before, after] in WINDOWS_MS {
-        let begin = around.partition_point(|(t, _)| *t < -before);
-        let end = around.partition_point(|(t, _)| *t <= after);
-        let Some((parabola, n)) = Parabola::through(&around[begin..end]) else { continue };
+        let Some((parabola, n)) = Parabola::through(tangents.between(-before, after)) else { continue };
         let freedom = n as f64 - 3.0;
         for axis in 0..3 {
             let ratio = parabola.residual[axis] / (freedom * sigma * sigma);
@@ -108,6 +98,50 @@ pub(crate) fn smoothed<C: Chart>(
         fits: chosen.map(|p| p.is_some()),
     };
     Some((at_ns, motion))
+}
+
+/// The samples around an instant as tangents at the point of that instant. Each is taken once for all windows, and only if a
+/// window needs it.
+struct Tangents<'a, C: Chart> {
+    samples: &'a [Option<(i64, C::Point)>],
+    origin: C::Point,
+    /// Milliseconds from the instant, so that fourth powers stay small, and tangents.
+    all: [(f64, DVec3); MOST_SAMPLES],
+    /// The tangents that have been taken.
+    taken: Range<usize>,
+}
+
+impl<'a, C: Chart> Tangents<'a, C> {
+    /// `None` if there are too few samples or too many, or if they are so far apart that their tangents are no vectors.
+    fn at(at_ns: i64, origin: C::Point, samples: &'a [Option<(i64, C::Point)>]) -> Option<Self> {
+        if samples.len() < LEAST_AROUND {
+            return None;
+        }
+        let mut all = [(0.0, DVec3::ZERO); MOST_SAMPLES];
+        for (k, (t, z)) in samples.iter().flatten().enumerate() {
+            if !C::is_flat(origin, *z) {
+                return None;
+            }
+            all.get_mut(k)?.0 = t.saturating_sub(at_ns) as f64 * 1e-6;
+        }
+        let middle = all[..samples.len()].partition_point(|(t, _)| *t < 0.0);
+        Some(Self { samples, origin, all, taken: middle..middle })
+    }
+
+    /// Those of a window around the instant, ms.
+    fn between(&mut self, from: f64, to: f64) -> &[(f64, DVec3)] {
+        let times = &self.all[..self.samples.len()];
+        let begin = times.partition_point(|(t, _)| *t < from);
+        let end = times.partition_point(|(t, _)| *t <= to);
+        let Range { start: before, end: after } = self.taken.clone();
+        for k in (begin..before).chain(after..end) {
+            if let Some((_, z)) = self.samples[k] {
+                self.all[k].1 = C::between(self.origin, z);
+            }
+        }
+        self.taken = begin.min(before)..end.max(after);
+        &self.all[begin..end]
+    }
 }
 
 /// A least-squares parabola along each axis.
