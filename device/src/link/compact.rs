@@ -53,6 +53,8 @@ pub(super) struct Compactor {
     frames: u32,
     /// Bit k: plane k differs from the frame sent before.
     changed: u32,
+    /// Bytes that were read and written.
+    touched: u64,
 }
 
 impl std::fmt::Debug for Compactor {
@@ -85,6 +87,7 @@ impl Compactor {
             tried_base: 0,
             frames: 0,
             changed: u32::MAX,
+            touched: 0,
         }
     }
 
@@ -112,8 +115,12 @@ impl Compactor {
 
     fn plane(&mut self, k: usize, plane: &[u8], has_base: bool) -> PlaneForm {
         let share = k * self.plane_bytes..(k + 1) * self.plane_bytes;
-        if has_base && self.before[share.clone()] == *plane {
-            return PlaneForm::Kept;
+        if has_base {
+            let (is_kept, compared) = are_equal(&self.before[share.clone()], plane);
+            self.touched += 2 * compared;
+            if is_kept {
+                return PlaneForm::Kept;
+            }
         }
         self.changed |= 1 << k;
         let trial = self.frames.wrapping_add(k as u32).is_multiple_of(RETRIAL)
@@ -138,6 +145,7 @@ impl Compactor {
                     self.lz4_saves[k] = best.1 - n;
                 }
                 self.coded[share.start..share.start + n].copy_from_slice(&self.scratch[..n]);
+                self.touched += 3 * n as u64;
                 best = (codec, n);
             }
         }
@@ -172,6 +180,8 @@ impl Compactor {
         below: usize,
     ) -> Option<usize> {
         let room = below.checked_sub(1)?;
+        // The plane is read; for the difference the one before is read too, and the difference is written and read.
+        self.touched += plane.len() as u64 * if codec == Codec::XorRle { 4 } else { 1 };
         match codec {
             Codec::Raw => None,
             Codec::Rle => rle_encode(plane, &mut self.scratch[..room]),
@@ -199,8 +209,24 @@ impl Compactor {
         for (k, (before, plane)) in pairs.enumerate() {
             if self.changed >> k & 1 == 1 {
                 before.copy_from_slice(plane);
+                self.touched += 2 * plane.len() as u64;
             }
         }
+    }
+
+    /// Bytes that the processor has read and written since this was asked last.
+    pub(super) fn take_touched(&mut self) -> u64 {
+        core::mem::take(&mut self.touched)
+    }
+}
+
+/// Whether two planes are equal, and how many bytes of each were read to see it.
+fn are_equal(before: &[u8], plane: &[u8]) -> (bool, u64) {
+    const STEP: usize = 1024;
+    let pieces = before.chunks(STEP).zip(plane.chunks(STEP));
+    match pieces.enumerate().find(|(_, (a, b))| a != b) {
+        Some((k, _)) => (false, ((k + 1) * STEP).min(plane.len()) as u64),
+        None => (true, plane.len() as u64),
     }
 }
 

@@ -125,3 +125,23 @@ fn lz4_takes_at_most_half_a_frames_time_and_goes_where_it_saves_most() {
     let slow = Compactor::new(raster, 8, 33_000_000, Codec::ALL);
     assert_eq!(slow.lz4_planes, MAX_PLANES, "thirty frames a second leave time for all");
 }
+
+/// What is touched is counted: a kept plane is compared and no more; noise is compared to its first difference and becomes the
+/// next base; between trials nothing else is read.
+#[test]
+fn touched_bytes_are_those_that_were_read_and_written() {
+    let raster = Raster::new(512, 64).unwrap();
+    let bytes = raster.plane_bytes();
+    let mut c = Compactor::new(raster, 2, FAST_NS, Codec::ALL);
+    let still = noise(9, bytes);
+    for n in 0..3 {
+        let planes = [still.clone(), noise(100 + n, bytes)].concat();
+        c.compact(&planes, n > 0);
+        c.sent(&planes);
+        let touched = c.take_touched();
+        let (compared, base) = (2 * bytes as u64, 2 * bytes as u64);
+        if n == 2 {
+            assert_eq!(touched, compared + 2 * 1024 + base);
+        }
+    }
+}

@@ -524,11 +524,6 @@ impl HostLink {
         Ok(())
     }
 
-    /// True if planes may be sent otherwise than raw.
-    pub fn compacts(&self) -> bool {
-        self.compactor.is_some()
-    }
-
     /// Frames that the device has room for.
     pub fn credit(&self) -> u32 {
         let limit = self.inbox.status.map_or(0, |s| s.frame_limit);

@@ -163,6 +163,7 @@ impl HostLink {
         self.key_due = false;
         if let Some(compactor) = &mut self.compactor {
             compactor.sent(planes);
+            self.counters.compaction_bytes += compactor.take_touched();
         }
         self.frames_sent = self.frames_sent.wrapping_add(1);
         self.last_frame = Some(frame);

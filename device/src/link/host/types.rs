@@ -179,6 +179,8 @@ pub struct LinkCounters {
     pub bytes_sent: u64,
     /// Of these, bytes of frames.
     pub frame_bytes_sent: u64,
+    /// Bytes that the processor has read and written to compact frames before they were handed on.
+    pub compaction_bytes: u64,
     /// Planes sent raw.
     pub planes_raw: u64,
     /// Planes sent compressed.

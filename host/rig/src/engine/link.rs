@@ -14,7 +14,7 @@ use crate::frame::job::{Fate, FrameNote};
 use crate::plan::lead::LeadEstimator;
 use crate::telemetry::projector::ProjectorReport;
 use crate::tracks::{SampleRhythm, TrackSnapshot};
-use dpm_device::link::{DropReason, HostLink, LinkState, SendOutcome};
+use dpm_device::link::{DropReason, HostLink, LinkCounters, LinkState, SendOutcome};
 use dpm_device::time::HostTime;
 use dpm_device::transport::{Lane, Transport};
 use dpm_handoff::latest::{Publisher, Reader};
@@ -265,11 +265,11 @@ impl<P: Pace> LinkStage<P> {
             return Offer::Settled;
         }
         let plan = &note.plan;
-        let wire_before = self.link.counters().frame_bytes_sent;
+        let before = self.link.counters();
         let outcome = self.link.send_frame(now, plan.id.0, plan.target_at, plan.dark_from, planes, transport);
         note.fate = Fate::Offered(outcome);
         if outcome == SendOutcome::Sent {
-            self.count_touches(note.touched_bytes, planes.len() as u64, wire_before);
+            self.count_touches(note.touched_bytes, planes.len() as u64, &before);
             self.keeper.sent(plan, has_light(planes), now);
             if let Some(follower) = &mut self.follower {
                 follower.sent(plan);
@@ -303,15 +303,15 @@ impl<P: Pace> LinkStage<P> {
         }
     }
 
-    /// Counts what the processor has read and written of a frame of `planes` bytes: `before` it was offered, and to put it
-    /// on the wire, which had carried `wire_before` bytes.
-    fn count_touches(&mut self, before: u64, planes: u64, wire_before: u64) {
+    /// Counts what the processor has read and written of a frame of `planes` bytes: `packed` bytes before it was offered, and
+    /// what was added to the link's counters, which were `before`, to compact it and to put it on the wire.
+    fn count_touches(&mut self, packed: u64, planes: u64, before: &LinkCounters) {
+        let now = self.link.counters();
         // A payload is read once, for its checksum and its copy together, and written once.
-        let wire = 2 * (self.link.counters().frame_bytes_sent - wire_before);
-        // To be compacted it is compared with the frame before.
-        let compacted = if self.link.compacts() { 2 * planes } else { 0 };
+        let wire = 2 * (now.frame_bytes_sent - before.frame_bytes_sent);
+        let compacted = now.compaction_bytes - before.compaction_bytes;
         self.planes_bytes += planes;
-        self.touched_bytes += before + wire + compacted;
+        self.touched_bytes += packed + wire + compacted;
     }
 
     /// True if the frame was planned by a clock of the projector that has since started anew, or whose map was wrong by

@@ -47,10 +47,10 @@ impl Packer {
                 }
             },
             (None, Some(Pictures::Marked(prepared))) => {
-                prepared.pack(self.kernel, note.plan.id.0, &mut memory.planes);
+                note.touched_bytes += prepared.pack(self.kernel, note.plan.id.0, &mut memory.planes);
             }
             (None, Some(Pictures::Drawn(painter))) => {
-                painter.pack(self.kernel, (note.plan.id.0, note.plan.slot), memory);
+                note.touched_bytes = painter.pack(self.kernel, (note.plan.id.0, note.plan.slot), memory);
             }
             (None, None) => return,
         }

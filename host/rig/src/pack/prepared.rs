@@ -37,13 +37,14 @@ impl PreparedFrames {
         &mut self.codes[from..from + self.raster.pixel_count()]
     }
 
-    /// Marks the next frame with its number and packs it.
-    pub fn pack(&mut self, kernel: Kernel, id: u64, planes: &mut BitPlaneFrame) {
+    /// Marks the next frame with its number and packs it. Returns the bytes of code values that were read for it.
+    pub fn pack(&mut self, kernel: Kernel, id: u64, planes: &mut BitPlaneFrame) -> u64 {
         let rows = MARK_ROWS * self.raster.width() as usize;
         let codes = self.frame(id);
         // Marks of other positions remain; they are isolated pixels like any others.
         codes.iter_mut().step_by(rows).for_each(|code| *code = id as u32 & MARK_BITS);
         pack::pack(kernel, codes, planes);
+        size_of_val(codes) as u64
     }
 }
 

@@ -98,13 +98,21 @@ impl PatternPainter {
         self.source.draw(picture, &mut Canvas { raster, kernel, codes, words, picture, is_filled, planes });
     }
 
-    /// The planes of frame `frame` into its memory, which may hold them from a former frame.
-    pub(crate) fn pack(&mut self, kernel: Kernel, (frame, slot): (u64, u64), memory: &mut FrameMemory) {
+    /// The planes of frame `frame` into its memory, which may hold them from a former frame. Returns the bytes that were read
+    /// and written for it.
+    pub(crate) fn pack(
+        &mut self,
+        kernel: Kernel,
+        (frame, slot): (u64, u64),
+        memory: &mut FrameMemory,
+    ) -> u64 {
         let picture = self.source.picture(frame, slot);
-        if memory.picture != Some(picture) {
-            self.draw(kernel, picture, &mut memory.planes);
-            memory.picture = Some(picture);
+        if memory.picture == Some(picture) {
+            return 0;
         }
+        self.draw(kernel, picture, &mut memory.planes);
+        memory.picture = Some(picture);
+        (memory.planes.bytes().len() + size_of_val(&self.codes[..])) as u64
     }
 
     /// The light of `planes` as code values, for a comparison with the light that was made. The next picture is drawn
