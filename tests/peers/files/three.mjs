@@ -29,7 +29,7 @@ function ofGeometry(geometry) {
 function ofObject(object) {
   object.updateMatrixWorld(true);
   let triangles = 0;
-  object.traverse((part) => { if (part.isMesh) triangles += count(part.geometry); });
+  object.traverse((part) => { if (part.isMesh) triangles += count(part.geometry) * (part.isInstancedMesh ? part.count : 1); });
   const sides = new Box3().setFromObject(object, true).getSize(new Vector3()).toArray();
   return { triangles, sides };
 }

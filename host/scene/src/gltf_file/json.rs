@@ -154,17 +154,7 @@ impl<'a> Item<'a> {
             limit,
             "split or simplify the scene",
         )?;
-        values
-            .iter()
-            .enumerate()
-            .map(|(i, v)| {
-                let label = v
-                    .get("name")
-                    .and_then(Value::as_str)
-                    .map_or(String::new(), |n| format!(" '{}'", shorten(n)));
-                Item::new(v, format!("{kind} {i}{label}"))
-            })
-            .collect()
+        values.iter().enumerate().map(|(i, v)| Item::new(v, label(kind, i, v))).collect()
     }
 
     /// A non-negative integer.
@@ -241,6 +231,12 @@ impl<'a> Item<'a> {
             v.as_bool().ok_or_else(|| self.error(format!("'{key}' must be true or false")))
         })
     }
+}
+
+/// What messages call entry `i` of a list: `kind` and its index, with its "name" if it has one.
+pub(super) fn label(kind: &str, i: usize, value: &Value) -> String {
+    let name = value.get("name").and_then(Value::as_str);
+    name.map_or_else(|| format!("{kind} {i}"), |name| format!("{kind} {i} '{}'", shorten(name)))
 }
 
 /// Text from a file, shortened to one line for a message.

@@ -1,77 +1,10 @@
-//! The extensions of materials that bring lobes of their own: their checks, and their values as [`Lobes`].
+//! The extensions of materials that bring lobes of their own, as [`Lobes`].
 
 use super::super::lobes::*;
 use super::super::SceneError;
-use super::check::Counts;
-use super::check_look::{check_texture, ranged, ranged_list, UNIT};
 use super::json::Item;
 use super::look::{raw_use, Use};
 use glam::Vec3;
-
-/// Colours of a specular reflection beyond this count as damage. The reflectance itself is at most 1.
-const GREATEST_COLOR: f32 = 1.0e6;
-/// Thickness of a film beyond this counts as damage, nanometres: light of a wavelength has long lost its order there.
-const THICKEST_FILM_NM: f32 = 1.0e9;
-
-/// Extensions that this file reads.
-pub(super) const LOBES: [&str; 7] = [
-    "KHR_materials_anisotropy",
-    "KHR_materials_clearcoat",
-    "KHR_materials_diffuse_transmission",
-    "KHR_materials_dispersion",
-    "KHR_materials_iridescence",
-    "KHR_materials_sheen",
-    "KHR_materials_specular",
-];
-
-/// Checks all of them.
-pub(super) fn check_lobes(material: &Item, counts: &Counts) -> Result<(), SceneError> {
-    if let Some(e) = material.extension("KHR_materials_clearcoat")? {
-        ranged(&e, "clearcoatFactor", 0.0, UNIT)?;
-        ranged(&e, "clearcoatRoughnessFactor", 0.0, UNIT)?;
-        for key in ["clearcoatTexture", "clearcoatRoughnessTexture", "clearcoatNormalTexture"] {
-            check_texture(&e, key, counts)?;
-        }
-        if let Some(normal) = e.object("clearcoatNormalTexture")? {
-            ranged(&normal, "scale", -100.0, 100.0)?;
-        }
-    }
-    if let Some(e) = material.extension("KHR_materials_specular")? {
-        ranged(&e, "specularFactor", 0.0, UNIT)?;
-        ranged_list::<3>(&e, "specularColorFactor", GREATEST_COLOR)?;
-        check_texture(&e, "specularTexture", counts)?;
-        check_texture(&e, "specularColorTexture", counts)?;
-    }
-    if let Some(e) = material.extension("KHR_materials_anisotropy")? {
-        ranged(&e, "anisotropyStrength", 0.0, UNIT)?;
-        e.number("anisotropyRotation")?;
-        check_texture(&e, "anisotropyTexture", counts)?;
-    }
-    if let Some(e) = material.extension("KHR_materials_sheen")? {
-        ranged_list::<3>(&e, "sheenColorFactor", UNIT)?;
-        ranged(&e, "sheenRoughnessFactor", 0.0, UNIT)?;
-        check_texture(&e, "sheenColorTexture", counts)?;
-        check_texture(&e, "sheenRoughnessTexture", counts)?;
-    }
-    if let Some(e) = material.extension("KHR_materials_iridescence")? {
-        ranged(&e, "iridescenceFactor", 0.0, UNIT)?;
-        ranged(&e, "iridescenceIor", 1.0, 10.0)?;
-        ranged(&e, "iridescenceThicknessMinimum", 0.0, THICKEST_FILM_NM)?;
-        ranged(&e, "iridescenceThicknessMaximum", 0.0, THICKEST_FILM_NM)?;
-        check_texture(&e, "iridescenceTexture", counts)?;
-        check_texture(&e, "iridescenceThicknessTexture", counts)?;
-    }
-    if let Some(e) = material.extension("KHR_materials_diffuse_transmission")? {
-        ranged(&e, "diffuseTransmissionFactor", 0.0, UNIT)?;
-        ranged_list::<3>(&e, "diffuseTransmissionColorFactor", UNIT)?;
-        check_texture(&e, "diffuseTransmissionTexture", counts)?;
-        check_texture(&e, "diffuseTransmissionColorTexture", counts)?;
-    }
-    if let Some(e) = material.extension("KHR_materials_dispersion")? {
-        ranged(&e, "dispersion", 0.0, f32::MAX)?;
-    }
-    Ok(())
-}
 
 fn unit(item: &Item, key: &str, default: f32) -> Result<f32, SceneError> {
     Ok(item.number(key)?.unwrap_or(default).clamp(0.0, 1.0))

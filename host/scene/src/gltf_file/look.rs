@@ -331,7 +331,8 @@ impl Reader<'_> {
         };
         let fetched;
         let bytes = match (item.text("uri")?, item.whole("bufferView")?) {
-            (Some(uri), _) => {
+            (Some(_), Some(_)) => return Err(item.error("must have either a 'uri' or a 'bufferView'")),
+            (Some(uri), None) => {
                 fetched =
                     fetch(uri, self.folder, self.limits.bytes).map_err(|e| item.error(e.to_string()))?;
                 fetched.as_slice()

@@ -1,11 +1,11 @@
-//! Reads a glTF file as a [`Scene`]: container, compressed meshes and textures in KTX2 made plain, check, then the
-//! `gltf` crate's typed view of the checked document, look and geometry.
+//! Reads a glTF file as a [`Scene`]: container, damage of the look left out, compressed meshes and textures in KTX2 made
+//! plain, check, then the `gltf` crate's typed view of the checked document, look and geometry.
 
 mod accessor;
+mod amend_look;
 mod animation;
 mod bake;
 mod check;
-mod check_look;
 mod clip;
 mod compressed;
 mod container;
@@ -20,6 +20,7 @@ mod picture;
 mod primitive;
 mod vertex_paint;
 
+use std::collections::HashMap;
 use std::path::Path;
 
 use serde_json::Value;
@@ -81,8 +82,9 @@ pub(super) fn read(
     let limits = &options.limits;
     let folder = beside.map(Folder::of).transpose()?;
     let container::Container { root: mut tree, binary, told } = container::split(bytes, limits)?;
+    check::check_asset(&Item::new(&tree, "document".into())?)?;
+    let left_out = amend_look::amend_look(&mut tree);
     let root = Item::new(&tree, "document".into())?;
-    check::check_asset(&root)?;
     let (mut buffers, of_others) = container::load_buffers(&root, binary, folder.as_ref(), limits)?;
     compressed::decompress(&mut tree, &mut buffers, limits, cancel)?;
     ktx2_image::make_plain(&mut tree, limits)?;
@@ -96,7 +98,7 @@ pub(super) fn read(
     };
     let data = accessor::Data::new(&root, buffers, limits)?;
     let check::CheckResults { mut warnings, instances } = check::check(&root, &data, limits)?;
-    warnings.extend(told);
+    warnings.extend(told.into_iter().chain(left_out));
     let nodes = root.list("nodes", "node", limits.objects)?;
     let animation = animation::read(&root, &data, &nodes, options, &mut warnings)?;
     let deformations = deform::Deformations::read(&root, &data, &nodes, limits, &mut warnings)?;
@@ -161,17 +163,24 @@ fn at_most(most: usize, mut warnings: Vec<String>) -> Vec<String> {
 /// Warnings that say the same of several objects as one that names the first of them.
 fn grouped(warnings: Vec<String>) -> Vec<String> {
     let mut told: Vec<(String, String, usize)> = vec![];
+    let mut places: HashMap<String, usize> = HashMap::new();
     for warning in warnings {
         // "material 3 'glass': ..." names an object, other lines with a colon do not.
         let named = |object: &str| {
-            ["image ", "material ", "mesh ", "node "].iter().any(|kind| object.starts_with(kind))
+            ["image ", "light ", "material ", "mesh ", "node ", "sampler ", "texture "]
+                .iter()
+                .any(|kind| object.starts_with(kind))
         };
         let (object, what) =
             warning.split_once(": ").filter(|(object, _)| named(object)).unwrap_or(("", &warning));
-        match told.iter_mut().find(|(first, said, _)| !first.is_empty() && !object.is_empty() && said == what)
-        {
-            Some((_, _, times)) => *times += 1,
-            None => told.push((object.to_owned(), what.to_owned(), 1)),
+        match places.get(what).filter(|_| !object.is_empty()) {
+            Some(&place) => told[place].2 += 1,
+            None => {
+                if !object.is_empty() {
+                    places.insert(what.to_owned(), told.len());
+                }
+                told.push((object.to_owned(), what.to_owned(), 1));
+            }
         }
     }
     let line = |(object, what, times): (String, String, usize)| match (object.as_str(), times) {
@@ -198,6 +207,8 @@ fn reduced(tree: &Value) -> Value {
     ];
     let mut top: serde_json::Map<String, Value> =
         kept.iter().filter_map(|key| Some(((*key).to_owned(), tree.get(key)?.clone()))).collect();
+    // The version is checked by then, and nothing else of it is read.
+    top.insert("asset".into(), serde_json::json!({"version": "2.0"}));
     let strip = |object: &mut Value, keys: &[&str]| {
         if let Some(object) = object.as_object_mut() {
             object.retain(|key, _| !keys.contains(&key.as_str()));

@@ -353,23 +353,6 @@ fn lobes_of_materials_arrive() {
         .set("/materials/0/extensions/KHR_materials_clearcoat/clearcoatFactor", json!(0.0));
     let l = load(&thin).materials[0].lobes;
     assert!(l.absorption == Vec3::ZERO && l.textures()[..3].iter().all(|t| t.is_none()), "{l:?}");
-    for (path, bad) in [
-        ("clearcoat/clearcoatFactor", json!(1.5)),
-        ("specular/specularColorFactor", json!([1.0, -1.0, 0.0])),
-        ("sheen/sheenRoughnessFactor", json!(-0.1)),
-        ("anisotropy/anisotropyTexture", json!({"index": 9})),
-        ("iridescence/iridescenceIor", json!(0.5)),
-        ("diffuse_transmission/diffuseTransmissionFactor", json!(2.0)),
-        ("dispersion/dispersion", json!(-1.0)),
-    ] {
-        let glb = glb.clone().set(&format!("/materials/0/extensions/KHR_materials_{path}"), bad);
-        let error = dpm_scene::load_bytes(&glb.bytes(), &LoadOptions::default()).unwrap_err().to_string();
-        let key = path.split('/').next_back().unwrap();
-        assert!(
-            error.contains("material 0") && (error.contains(key) || error.contains("index")),
-            "{path}: {error}"
-        );
-    }
 }
 
 /// BLEND is coverage where something is not fully there, and nothing where everything is.

@@ -1,7 +1,7 @@
 //! What is odd in a glTF file costs what is odd, and not the scene: pictures that no decoder reads or that are too large for
-//! their file, and nodes that stand on the globe.
+//! their file, values of extensions that are none, and nodes that stand on the globe.
 
-use crate::common::{tetrahedra, with_image};
+use crate::common::{png, tetrahedra, with_image};
 use dpm_scene::{load_bytes, LoadOptions, Scene};
 use image::codecs::png::{CompressionType, FilterType, PngEncoder};
 use image::ImageEncoder;
@@ -77,4 +77,66 @@ fn bodies_on_the_globe_are_moved_together() {
     let near = tetrahedra().set("/nodes/0/translation", json!([900_000.0, 0.0, 0.0]));
     let scene = load(&near.bytes());
     assert_eq!(scene.bodies[0].world_from_body_rest.translation.x, 900_000.0);
+}
+
+/// A value of an extension that is no such value costs itself: what is left is the file without it.
+#[test]
+fn bad_values_of_extensions_leave_the_scene_as_if_they_were_not_there() {
+    let good = with_image(&png(2, 2, &[[9, 8, 7, 255]; 4]))
+        .set("/nodes/0/extensions", json!({"KHR_lights_punctual": {"light": 0}}))
+        .set("/extensions", json!({"KHR_lights_punctual": {"lights": [{"type": "spot", "spot": {}}]}}));
+    let look = |scene: &Scene| format!("{:?} {:?} {:?}", scene.materials, scene.lights, scene.bodies);
+    let material =
+        |name: &str, value: serde_json::Value| (format!("/materials/0/extensions/KHR_{name}"), value);
+    let cases = [
+        material("materials_ior", json!({"ior": 0.3})),
+        material("materials_ior", json!(7)),
+        material("materials_emissive_strength", json!({"emissiveStrength": "bright"})),
+        material("materials_transmission", json!({"transmissionFactor": -2})),
+        material("materials_transmission", json!({"transmissionTexture": {"index": 9}})),
+        material("materials_volume", json!({"attenuationColor": [1, 1]})),
+        material("materials_clearcoat", json!({"clearcoatFactor": 1.5})),
+        material("materials_specular", json!({"specularColorFactor": [1, -1, 0]})),
+        material("materials_sheen", json!({"sheenColorFactor": null})),
+        material("materials_anisotropy", json!({"anisotropyRotation": "left"})),
+        material("materials_iridescence", json!({"iridescenceIor": 0.5})),
+        material("materials_diffuse_transmission", json!({"diffuseTransmissionFactor": 2})),
+        material("materials_dispersion", json!({"dispersion": -1})),
+        ("/materials/0/extensions".into(), json!("none")),
+        ("/extensions/KHR_lights_punctual/lights/0/spot/innerConeAngle".into(), json!(7)),
+        ("/extensions/KHR_lights_punctual/lights/0/color".into(), json!([1, 1])),
+        ("/nodes/0/extensions/KHR_node_visibility".into(), json!({"visible": "no"})),
+        (
+            "/materials/0/pbrMetallicRoughness/baseColorTexture/extensions".into(),
+            json!({"KHR_texture_transform": {"scale": [2], "offset": 1, "rotation": null, "texCoord": -1}}),
+        ),
+    ];
+    for (pointer, value) in cases {
+        let file = good.clone().set("/materials/0/extensions", json!({})).set(&pointer, value.clone());
+        let scene = load(&file.bytes());
+        // An extension without its values is there yet.
+        let is_there = pointer.contains("/materials/0/extensions/") && value.is_object();
+        let without = if is_there {
+            good.clone().set("/materials/0/extensions", json!({})).set(&pointer, json!({}))
+        } else {
+            good.clone()
+        };
+        assert_eq!(look(&scene), look(&load(&without.bytes())), "{pointer}");
+        let told = scene.warnings.join("\n");
+        let name = pointer.split('/').find(|step| step.starts_with("KHR_")).unwrap_or("material 0 'paint'");
+        assert!(told.contains(name) && told.contains("left out"), "{pointer}: {told}");
+    }
+}
+
+/// What geometry hangs on is no matter of taste: without it there is another body, and not a plainer one.
+#[test]
+fn bad_values_that_place_geometry_refuse_the_file() {
+    let name = "EXT_mesh_gpu_instancing";
+    for value in
+        [json!({}), json!({"attributes": {"TRANSLATION": 99}}), json!({"attributes": {"TRANSLATION": 2}})]
+    {
+        let file = tetrahedra().set("/nodes/0/extensions", json!({name: value}));
+        let told = load_bytes(&file.bytes(), &LoadOptions::default()).unwrap_err().to_string();
+        assert!(told.contains("node 0 'left'") && told.contains(name), "{told}");
+    }
 }

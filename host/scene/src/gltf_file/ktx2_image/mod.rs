@@ -47,7 +47,7 @@ const WINDOW_FOR_ALL: u64 = 8 << 20;
 /// another image for programs that do not know the extension.
 ///
 /// # Errors
-/// An extension that is no object, or names an image that is not there.
+/// Lists that are none, or are longer than the limits allow.
 pub(super) fn make_plain(tree: &mut Value, limits: &Limits) -> Result<(), SceneError> {
     let root = Item::new(tree, "document".into())?;
     let images = root.list("images", "image", limits.objects)?.len();
