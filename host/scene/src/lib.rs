@@ -27,6 +27,7 @@ mod error;
 pub mod geometry;
 mod gltf_file;
 pub mod horizon;
+mod jpeg_picture;
 mod limits;
 mod linear_picture;
 mod live_pictures;

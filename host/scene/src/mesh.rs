@@ -269,6 +269,13 @@ impl TriangleMesh {
         let linear = transform.matrix3;
         let mirrored = linear.determinant() < 0.0;
         let normal_map = cofactor(linear) * if mirrored { -1.0 } else { 1.0 };
+        let (vertices, triangles) = (other.positions.len(), other.triangles.len());
+        make_room(&mut self.positions, vertices);
+        make_room(&mut self.normals, vertices);
+        make_room(&mut self.uvs, vertices);
+        make_room(&mut self.tangents, vertices);
+        make_room(&mut self.triangles, triangles);
+        make_room(&mut self.materials, triangles);
         self.positions
             .extend(other.positions.iter().map(|p| transform.transform_point3(p.as_dvec3()).as_vec3()));
         self.normals.extend(
@@ -299,6 +306,14 @@ impl TriangleMesh {
             }
         }));
         self.materials.extend_from_slice(&other.materials);
+    }
+}
+
+/// Room for so many more elements, and for an eighth of those that are there: a list that doubles would take more memory at once
+/// than the triangles of a short file may ([`super::limits::largest_piece`]).
+fn make_room<T>(list: &mut Vec<T>, more: usize) {
+    if list.capacity() - list.len() < more {
+        list.reserve_exact(more.max(list.len() / 8));
     }
 }
 

@@ -24,13 +24,16 @@ import tempfile
 
 ROOT = pathlib.Path(__file__).resolve().parents[3]
 HERE = pathlib.Path(__file__).resolve().parent
-PACKAGES = ["trimesh", "numpy", "numpy-stl", "OpenEXR", "opencv-python-headless", "scipy", "pillow"]
+PACKAGES = ["trimesh", "numpy", "numpy-stl", "OpenEXR", "opencv-python-headless", "scipy", "pillow", "tifffile"]
 MESHES = {".obj", ".ply", ".stl", ".glb", ".gltf"}
 SKIES = {".exr", ".hdr"}
 PICTURES = {".png", ".jpg", ".jpeg", ".tga", ".tif", ".tiff", ".webp", ".bmp"}
 # What dpm alone reads here; `calibrations.py` compares such files with OpenCV.
 OTHERS = {".ktx2", ".yml", ".yaml", ".xml", ".json", ".gz", ".zip", ".mpcdi", ".npz"}
 LARGEST = 20 << 20
+# What a note says where dpm reads a file otherwise than others on purpose; a difference without one of these is silent.
+REASONS = ["without area", "it is read with", "missing and black", "cut off there", "play", "left out", "primaries", "no light",
+           "sampled anew", "is hidden", "hides", "as many as", "moved by as much"]
 
 
 def prepare(work):
@@ -136,6 +139,61 @@ def write_skies(folder):
             cv2.imwrite(str(own / f"light.{ending}"), light[:, :, ::-1])
         except cv2.error as e:
             print(f"OpenCV writes no .{ending}: {e.err}", file=sys.stderr)
+
+
+def write_pictures(folder):
+    """Pictures as Pillow, OpenCV and tifffile write them: most of all TIFF, of which there are the most kinds."""
+    import cv2
+    import numpy as np
+    import tifffile
+    from PIL import Image
+
+    rng = np.random.default_rng(55)
+    y, x = np.mgrid[0:45, 0:70]
+    smooth = np.stack([x * 3, y * 5, 255 - x - y, np.full_like(x, 200)], axis=-1).astype(np.uint8)
+    codes = np.where(rng.random((45, 70, 1)) < 0.9, smooth, 255 - smooth).astype(np.uint8)
+    rgba = Image.fromarray(codes)
+    own = folder / "Pillow"
+    own.mkdir(parents=True, exist_ok=True)
+
+    def save(name, mode, **options):
+        try:
+            (rgba if mode == "RGBA" else rgba.convert("RGB").convert(mode)).save(own / name, **options)
+        except (OSError, ValueError, KeyError) as e:
+            print(f"Pillow writes no {name}: {e}", file=sys.stderr)
+
+    packings = [None, "packbits", "tiff_lzw", "tiff_adobe_deflate", "jpeg", "zstd", "webp", "group3", "group4", "tiff_ccitt"]
+    for packing in packings:
+        for mode in ("1", "L", "LA", "P", "RGB", "RGBA", "CMYK", "YCbCr", "LAB", "I;16", "F"):
+            is_fax = packing in ("group3", "group4", "tiff_ccitt")
+            if is_fax == (mode == "1") or packing is None:
+                save(f"{mode.replace(';', '')}-{packing}.tif", mode, compression=packing)
+    for mode in ("1", "L", "P", "RGB", "RGBA"):
+        for ending in ("png", "bmp", "tga"):
+            save(f"{mode}.{ending}", mode)
+        save(f"{mode}-runs.tga", mode, compression="tga_rle")
+    for mode in ("L", "RGB", "CMYK"):
+        for name, options in (("even", {"subsampling": 0}), ("half", {"subsampling": 2}), ("steps", {"progressive": True})):
+            save(f"{mode}-{name}.jpg", mode, quality=95, **options)
+    save("loss.webp", "RGBA", quality=95)
+    save("same.webp", "RGBA", lossless=True)
+    own = folder / "OpenCV"
+    own.mkdir(parents=True, exist_ok=True)
+    for name, array in (("8", codes), ("16", codes.astype(np.uint16) * 257), ("32", codes[..., :3].astype(np.float32) / 255)):
+        for packing in (1, 5, 8, 32773):
+            cv2.imwrite(str(own / f"{name}-{packing}.tif"), array, [cv2.IMWRITE_TIFF_COMPRESSION, packing])
+    own = folder / "tifffile"
+    own.mkdir(parents=True, exist_ok=True)
+    for kind in ("u1", "u2", "f2", "f4"):
+        array = (codes[..., :3] / 255).astype(kind) if kind[0] == "f" else codes[..., :3].astype(kind) * (257 if kind == "u2" else 1)
+        for order in "<>":
+            for name, options in (
+                ("strips", {"rowsperstrip": 7}), ("tiles", {"tile": (16, 32)}), ("planes", {"planarconfig": "separate"}),
+                ("tiles-in-planes", {"planarconfig": "separate", "tile": (16, 16)}), ("big", {"bigtiff": True}),
+            ):
+                data = np.moveaxis(array, -1, 0) if "planarconfig" in options else array
+                label = f"{kind}-{'little' if order == '<' else 'big-end'}-{name}.tif"
+                tifffile.imwrite(own / label, data, photometric="rgb", byteorder=order, **options)
 
 
 def trimesh_reads(path):
@@ -248,13 +306,36 @@ def picture_reads(path):
         return {"refused": f"{type(e).__name__}: {e}"[:200]}
 
 
-def picture_differs(ours, file, peer):
-    """What of a picture is read otherwise than by Pillow: '' if every channel is off by at most a code in the mean of all texels."""
+def opencv_reads(path):
+    """The same as OpenCV reads it, which is asked where Pillow differs: Pillow takes 16 bits in planes for 8, for one."""
+    import cv2
     import numpy as np
 
-    if "refused" in peer or "refused" in ours:
+    try:
+        texels = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
+        scale = {"uint8": 1.0, "uint16": 1 / 257, "float32": 255.0, "float64": 255.0}[str(texels.dtype)]
+        texels = np.clip(np.atleast_3d(texels).astype(np.float64) * scale, 0, 255)
+        if texels.shape[2] == 1:
+            texels = texels.repeat(3, axis=2)
+        alpha = texels[..., 3:] if texels.shape[2] == 4 else np.full((*texels.shape[:2], 1), 255.0)
+        return {"texels": np.concatenate([texels[..., 2::-1], alpha], axis=2)}
+    except Exception as e:
+        return {"refused": f"{type(e).__name__}: {e}"[:200]}
+
+
+def picture_differs(ours, file, path, pillow):
+    """What of a picture is read otherwise than by Pillow and by OpenCV: '' if one agrees."""
+    if "refused" in pillow or "refused" in ours:
         return ""
-    theirs = peer["texels"]
+    told = texels_differ(ours, file, pillow["texels"])
+    second = opencv_reads(path) if told else {"refused": ""}
+    return told if "refused" in second else told and texels_differ(ours, file, second["texels"])
+
+
+def texels_differ(ours, file, theirs):
+    """'' if every channel is off by at most a code in the mean of all texels."""
+    import numpy as np
+
     size = (ours["height"], ours["width"])
     if size != theirs.shape[:2]:
         return f"{size[1]} x {size[0]}, not {theirs.shape[1]} x {theirs.shape[0]}"
@@ -290,7 +371,7 @@ def ours_reads(program, paths, is_compared=False):
                     if is_compared and path.suffix.lower() in PICTURES:
                         peer = picture_reads(path)
                         one["is_peer_open"] = "refused" not in peer
-                        one["other"] = picture_differs(one["read"], pathlib.Path(folder) / str(place), peer)
+                        one["other"] = picture_differs(one["read"], pathlib.Path(folder) / str(place), path, peer)
                     out[str(path)] = one
             waiting = waiting[len(read) :]
             if waiting:
@@ -398,10 +479,14 @@ def corpus_files(args):
         write_meshes(own)
         vary(own)
         write_skies(own)
+        write_pictures(own)
     packages = [own, args.work / "venv/lib", args.work / "node_modules"]
     paths, seen = {}, set()
     for root in [] if args.only_more else packages:
         for path in sorted(p for p in root.rglob("*") if p.suffix.lower() in MESHES | SKIES and p.is_file()):
+            note(paths, seen, path, path.parent.name)
+    if not args.only_more:
+        for path in sorted(p for p in own.rglob("*") if p.suffix.lower() in PICTURES):
             note(paths, seen, path, path.parent.name)
     for root in args.more:
         endings = MESHES | SKIES | PICTURES | OTHERS
@@ -436,16 +521,18 @@ def compare(args):
         else:
             peers = [{"other": one.get("other", "")} if one.get("is_peer_open", "crashed" in one) else {"refused": ""}]
         opened = [p for p in peers if "refused" not in p]
-        group = groups.setdefault((name, ending), [0] * 7)
+        group = groups.setdefault((name, ending), [0] * 8)
         told = differs(one["read"], opened) if opened else ""
         is_both = len(opened) == len(peers)
-        wrong += [f"{path}: {told}"] if told and is_both else []
+        wrong += [f"{path}: {told}; notes: {one['read'].get('warnings')}"] if told and is_both else []
         found = list(faults(one, path))
         wrong += found
         refused = "refused" in one["read"]
-        for i, add in enumerate((1, is_both, not refused, is_both and refused, is_both and told != "", len(found) > 0)):
+        is_told = refused or any(reason in note for note in one["read"].get("warnings", []) for reason in REASONS)
+        adds = (1, is_both, not refused, is_both and refused, is_both and told != "", is_both and told != "" and not is_told, len(found) > 0)
+        for i, add in enumerate(adds):
             group[i] += add
-        group[6] = max(group[6], one["piece"])
+        group[7] = max(group[7], one["piece"])
     table = report(groups)
     print(table)
     print("\n".join(wrong))
@@ -455,12 +542,12 @@ def compare(args):
 
 
 def report(groups):
-    rows = sorted(groups.items(), key=lambda g: (-(g[1][4] / g[1][0]), g[0]))
-    total = [sum(g[i] for g in groups.values()) for i in range(6)] + [max(g[6] for g in groups.values())]
+    rows = sorted(groups.items(), key=lambda g: (-(g[1][5] / g[1][0]), -(g[1][4] / g[1][0]), g[0]))
+    total = [sum(g[i] for g in groups.values()) for i in range(7)] + [max(g[7] for g in groups.values())]
     cells = [(name, f"`{ending}`", row) for (name, ending), row in rows] + [("all", "", total)]
-    table = ["| written by | ending | files | opened by all peers | opened by dpm | refused alone | of these refused or other | faults "
-             "| at once, MiB |", "|---|---|---:|---:|---:|---:|---:|---:|---:|"]
-    table += [f"| {name} | {ending} | {' | '.join(map(str, row[:6]))} | {row[6] / (1 << 20):.1f} |" for name, ending, row in cells]
+    table = ["| written by | ending | files | opened by all peers | opened by dpm | refused alone | refused or other | of these silent "
+             "| faults | at once, MiB |", "|---|---|---:|---:|---:|---:|---:|---:|---:|---:|"]
+    table += [f"| {name} | {ending} | {' | '.join(map(str, row[:7]))} | {row[7] / (1 << 20):.1f} |" for name, ending, row in cells]
     return "\n".join(table) + "\n"
 
 

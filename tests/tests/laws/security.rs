@@ -126,6 +126,9 @@ fn every_fuzz_target_has_its_row() {
     assert!(targets.len() > 30, "{targets:?}");
     let missing: Vec<_> = targets.difference(&rows("What is read")).cloned().collect();
     assert!(missing.is_empty(), "SECURITY.md, \"What is read\", has no row for {missing:?}");
+    let run = read("fuzz/run");
+    let idle: Vec<_> = targets.iter().filter(|name| !run.contains(&format!("    (\"{name}\", \""))).collect();
+    assert!(idle.is_empty(), "fuzz/run does not run {idle:?}");
 }
 
 /// The packages by others that the crates of the product name as dependencies.

@@ -445,12 +445,12 @@ fn images_that_lie() {
         (
             "65,535 x 65,535 texels",
             with_image(&png_claiming(65_535, 65_535)).bytes(),
-            &["image 0", "65535", "limit"],
+            &["image 0", "left out", "limit"],
         ),
         (
             "16,000 x 16,000 texels",
             with_image(&png_claiming(16_000, 16_000)).bytes(),
-            &["texels", "256000000", "limit"],
+            &["image 0", "left out", "limit"],
         ),
         ("size beyond the data", with_image(&png_claiming(4000, 4000)).bytes(), &["image 0", "decoded"]),
         ("image cut off", with_image(&good[..good.len() / 2]).bytes(), &["image 0", "decoded"]),

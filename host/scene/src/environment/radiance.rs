@@ -64,13 +64,21 @@ fn read_rgbe_header(rest: &mut &[u8]) -> Result<RadianceHeader, SceneError> {
             said.take_in(name.trim(), value.trim())?;
         }
     }
-    if !(said.gain.is_finite() && said.gain.min_element() > 0.0) {
-        return Err(header("has an EXPOSURE or COLORCORR that is not above zero"));
-    }
     Ok(said)
 }
 
 impl RadianceHeader {
+    /// Some programs write an exposure of 0 where they have none.
+    fn multiply(&mut self, name: &str, factor: Vec3) {
+        let product = self.gain * factor;
+        if product.is_finite() && product.min_element() > 0.0 {
+            self.gain = product;
+        } else {
+            self.warnings
+                .push(format!("its {name} is {factor}, which is no factor of light: it is left out"));
+        }
+    }
+
     fn take_in(&mut self, name: &str, value: &str) -> Result<(), SceneError> {
         let numbers: Vec<f32> = value.split_ascii_whitespace().map_while(|w| w.parse().ok()).collect();
         match (name, &numbers[..]) {
@@ -82,15 +90,14 @@ impl RadianceHeader {
                     return Err(SceneError::unsupported(what, "save it as RGBE"));
                 }
             },
-            ("EXPOSURE", [value, ..]) => self.gain *= *value,
-            ("EXPOSURE", []) => return Err(header("has an EXPOSURE that is not a number")),
-            ("COLORCORR", [r, g, b, ..]) => self.gain *= Vec3::new(*r, *g, *b),
+            ("EXPOSURE", [value, ..]) => self.multiply(name, Vec3::splat(*value)),
+            ("COLORCORR", [r, g, b, ..]) => self.multiply(name, Vec3::new(*r, *g, *b)),
             ("PRIMARIES", [rx, ry, gx, gy, bx, by, wx, wy, ..]) => {
                 let at = |x: &f32, y: &f32| glam::DVec2::new(f64::from(*x), f64::from(*y));
                 let rgb = [at(rx, ry), at(gx, gy), at(bx, by)];
                 self.primaries = Some(Primaries { rgb, white: at(wx, wy) });
             }
-            ("COLORCORR" | "PRIMARIES", _) => {
+            ("EXPOSURE" | "COLORCORR" | "PRIMARIES", _) => {
                 self.warnings.push(format!("its {name} has too few numbers: it is left out"))
             }
             ("VIEW", _) if value.contains("-vt") && !value.contains("-vta") => {

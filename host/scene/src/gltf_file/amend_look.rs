@@ -10,6 +10,7 @@ use serde_json::{json, Map, Value};
 use super::flatten::VISIBILITY;
 use super::json::{label, shorten};
 use super::ktx2_image::{BASISU, WEBP};
+use super::spec_gloss;
 
 type Object = Map<String, Value>;
 
@@ -83,7 +84,7 @@ const METALLIC_ROUGHNESS: Rules = &[
 ];
 
 /// The extensions of materials that are reproduced.
-const EXTENSIONS: [(&str, Rules); 12] = [
+const EXTENSIONS: [(&str, Rules); 13] = [
     (
         "KHR_materials_anisotropy",
         &[
@@ -123,6 +124,16 @@ const EXTENSIONS: [(&str, Rules); 12] = [
             ("iridescenceThicknessMaximum", Rule::Number(0.0, THICKEST_FILM_NM)),
             ("iridescenceTexture", Rule::Texture),
             ("iridescenceThicknessTexture", Rule::Texture),
+        ],
+    ),
+    (
+        spec_gloss::NAME,
+        &[
+            ("diffuseFactor", Rule::Numbers(4, 0.0, UNIT)),
+            ("specularFactor", COLOR),
+            ("glossinessFactor", FACTOR),
+            ("diffuseTexture", Rule::Texture),
+            ("specularGlossinessTexture", Rule::Texture),
         ],
     ),
     (
@@ -387,6 +398,9 @@ impl Amender {
                 self.values(extension, &format!("{name}, {key}"), rules);
             }
         }
+        if let Some(told) = spec_gloss::convert(material) {
+            self.note(format!("{name}: {told}"));
+        }
     }
 
     fn lights(&mut self, root: &mut Object) {
@@ -531,7 +545,8 @@ mod tests {
             (below(&lights, &["spot"]), format!("light 0, {LIGHTS}, spot"), CONE),
             (vec!["nodes", "0"], "node 0".into(), NAME),
         ];
-        all.extend(EXTENSIONS.map(|(key, rules)| {
+        // What is converted is not there afterwards.
+        all.extend(EXTENSIONS.into_iter().filter(|(key, _)| *key != spec_gloss::NAME).map(|(key, rules)| {
             (below(&material, &["extensions", key]), format!("material 0 'glass', {key}"), rules)
         }));
         all

@@ -12,7 +12,7 @@ use super::json::{shorten, Item};
 use super::ktx2_image;
 
 /// Extensions that this program understands, or may ignore without a wrong picture.
-const UNDERSTOOD: [&str; 24] = [
+const UNDERSTOOD: [&str; 25] = [
     compressed::DRACO,
     compressed::MESHOPT[0],
     compressed::MESHOPT[1],
@@ -33,6 +33,7 @@ const UNDERSTOOD: [&str; 24] = [
     "KHR_materials_volume",
     "KHR_mesh_quantization",
     super::flatten::VISIBILITY,
+    super::spec_gloss::NAME,
     ktx2_image::BASISU,
     ktx2_image::WEBP,
     "KHR_texture_transform",
@@ -104,7 +105,6 @@ pub(crate) fn check_asset(root: &Item) -> Result<(), SceneError> {
         }
         let remedy = match name {
             "EXT_texture_avif" | "MSFT_texture_dds" => "re-export with PNG, JPEG, WebP or KTX2 textures",
-            "KHR_materials_pbrSpecularGlossiness" => "convert the materials to metallic-roughness",
             _ => "re-export without it, or list it only in extensionsUsed if the scene can do without",
         };
         return Err(SceneError::unsupported(format!("the required extension {}", shorten(name)), remedy));

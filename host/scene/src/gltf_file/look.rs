@@ -240,8 +240,7 @@ impl Reader<'_> {
             self.cancel.check(self.limits)?;
             let decoded = match self.decode(image) {
                 Ok(decoded) => Some(decoded),
-                // A limit is not left out: what it guards would be asked for by the next file as well.
-                Err(e @ (SceneError::TooLarge { .. } | SceneError::TimedOut(_))) => return Err(e),
+                Err(e @ SceneError::TimedOut(_)) => return Err(e),
                 Err(e) => {
                     warnings.push(format!("the {} texture is left out: {e}", u.slot));
                     None
@@ -257,7 +256,7 @@ impl Reader<'_> {
             warnings.extend(notes.map(|note| format!("{}: {note}", self.image_items[image].name)));
             if let Some((kept, stored)) = decoded.as_ref().and_then(|d| Some((d.size, d.stored?))) {
                 warnings.push(format!(
-                    "{}: it is read with {} x {} of its {} x {} texels, as many as so short a file may take",
+                    "{}: it is read with {} x {} of its {} x {} texels, as many as so short a file, or other textures, leave room for",
                     self.image_items[image].name, kept.width, kept.height, stored.width, stored.height
                 ));
             }

@@ -18,6 +18,7 @@ mod lobes;
 mod look;
 mod picture;
 mod primitive;
+mod spec_gloss;
 mod vertex_paint;
 
 use std::collections::HashMap;
@@ -57,6 +58,10 @@ pub(super) fn decode_picture(
         return Ok(clip);
     }
     let picture = picture::decode(&item, bytes, "", texels_so_far, limits)?;
+    // Nobody would read a note.
+    if let Some(stored) = picture.stored {
+        picture::check_size(&item, stored, texels_so_far, limits)?;
+    }
     let picture::Size { width, height } = picture.size;
     Ok(Texture::repeated([width, height], picture.texels, picture.srgb.unwrap_or(true)))
 }

@@ -10,6 +10,7 @@ use super::super::{Limits, SceneError};
 use super::json::Item;
 use super::ktx2_image;
 use super::ktx2_image::numbers::Rounder;
+use crate::jpeg_picture::Frame;
 use crate::tiff_picture::{is_tiff, Tiff};
 
 /// Texels along the sides of a picture, each above 0.
@@ -22,9 +23,16 @@ pub(super) struct Size {
 }
 
 impl Size {
-    /// All texels, after [`check_size`].
+    /// All texels.
     pub(super) fn texels(self) -> usize {
         self.width as usize * self.height as usize
+    }
+
+    fn not_empty(self, item: &Item) -> Result<Self, SceneError> {
+        if self.width == 0 || self.height == 0 {
+            return Err(item.error("has no texels"));
+        }
+        Ok(self)
     }
 }
 
@@ -40,7 +48,8 @@ pub(super) struct Picture {
     pub red_green_only: bool,
     /// Some of its numbers lay outside of 0 to 1 and were cut off there.
     pub cut_off: bool,
-    /// The sides in the file, of which means are read, because all texels would take more than so short a file may.
+    /// The sides in the file, of which means are read, because all texels would take more than so short a file may, or than the
+    /// scene's other textures leave.
     pub stored: Option<Size>,
     /// What else should be said of it.
     pub notes: Vec<String>,
@@ -74,44 +83,102 @@ pub(super) fn decode(
         return ktx2_image::decode(item, bytes, texels_so_far, limits);
     }
     let format = format_of(item, bytes, name)?;
+    let room = Room::of(item, bytes, texels_so_far, limits)?;
     if format == ImageFormat::Tiff {
-        return tiff(item, bytes, texels_so_far, limits);
+        return tiff(item, bytes, &room);
+    }
+    let rewritten = if format == ImageFormat::Bmp { without_os2(bytes) } else { None };
+    let bytes = rewritten.as_deref().unwrap_or(bytes);
+    if let Some(frame) = Frame::of(bytes).filter(|frame| format == ImageFormat::Jpeg && frame.is_odd()) {
+        let [width, height] = frame.sides;
+        let size = Size { width, height }.not_empty(item)?;
+        check_decoded(item, bytes, 3 * size.texels() as u64, limits)?;
+        let decoded = frame.decode(bytes, room.bytes, false).map_err(|e| item.error(e))?;
+        return Ok(of_decoded(decoded, size, &room));
     }
     let mut reader = ImageReader::with_format(Cursor::new(bytes), format);
     reader.limits(of_header());
     let failed = |e: image::ImageError| item.error(format!("cannot be decoded: {e}"));
     let decoder = reader.into_decoder().map_err(failed)?;
     let (width, height) = image::ImageDecoder::dimensions(&decoder);
-    let size = Size { width, height };
-    check_size(item, size, texels_so_far, limits)?;
+    let size = Size { width, height }.not_empty(item)?;
     check_decoded(item, bytes, image::ImageDecoder::total_bytes(&decoder), limits)?;
     let mut bounded = ImageReader::with_format(Cursor::new(bytes), format);
     // 16-bit RGBA is the widest decoded format.
-    bounded.limits(of_picture(format, [width, height], 8, allowed(bytes, limits)));
+    bounded.limits(of_picture(format, [width, height], 8, room.bytes));
     // A decoder that panics leaves its picture out, and not the scene.
     let decode = std::panic::AssertUnwindSafe(|| bounded.decode());
     let decoded = std::panic::catch_unwind(decode)
         .map_err(|_| item.error("cannot be decoded: its decoder failed; save it as PNG"))?
         .map_err(failed)?;
-    let (kept, texels) = as_rgba(decoded, allowed(bytes, limits));
-    let stored = (kept.texels() < size.texels()).then_some(size);
-    Ok(Picture {
-        size: kept,
-        texels,
-        srgb: None,
-        red_green_only: false,
-        cut_off: false,
-        stored,
-        notes: vec![],
-    })
+    Ok(of_decoded(decoded, size, &room))
 }
 
-/// The texels of a decoded picture, or the means of squares of them, of which all fit into `allowed` bytes.
-fn as_rgba(decoded: image::DynamicImage, allowed: u64) -> (Size, Vec<[u8; 4]>) {
+/// What a picture may take.
+struct Room {
+    /// Bytes of the largest piece of memory.
+    bytes: u64,
+    /// Texels that the scene's other textures leave.
+    texels: u64,
+    /// Texels along a side.
+    side: u32,
+}
+
+impl Room {
+    fn of(item: &Item, bytes: &[u8], texels_so_far: u64, limits: &Limits) -> Result<Self, SceneError> {
+        let texels = limits.texels.saturating_sub(texels_so_far);
+        if texels == 0 {
+            let limit = limits.texels;
+            return Err(item.error(format!("has no room: all textures together may have {limit} texels")));
+        }
+        Ok(Self { bytes: allowed(bytes, limits), texels, side: limits.texture_side })
+    }
+
+    /// The sides of the squares whose means are read so that a picture fits. `width_of_texel`: bytes of each square for steps of
+    /// 1 and of more.
+    fn step(&self, size: Size, width_of_texel: [u64; 2]) -> u32 {
+        let fits = |step: u32| {
+            let [across, down] = [size.width, size.height].map(|side| side.div_ceil(step));
+            let texels = u64::from(across) * u64::from(down);
+            let bytes = texels.saturating_mul(width_of_texel[usize::from(step > 1)]);
+            across.max(down) <= self.side && texels <= self.texels && bytes <= self.bytes
+        };
+        (1..).find(|step| fits(*step)).unwrap_or(1)
+    }
+}
+
+/// A BMP of OS/2's second version, whose header is longer or shorter than that of Windows, with the header of Windows; `None`
+/// where it is none, or packed as only OS/2 did.
+fn without_os2(bytes: &[u8]) -> Option<Vec<u8>> {
+    let number = |at: usize| bytes.get(at..)?.first_chunk().map(|b| u32::from_le_bytes(*b));
+    let header = number(14)? as usize;
+    if !(16..=64).contains(&header) || matches!(header, 40 | 52 | 56) {
+        return None;
+    }
+    let own = bytes.get(14..14 + header)?;
+    let packing = if header >= 20 { own.get(16..20)? } else { &[0; 4] };
+    if packing[0] > 2 || packing[1..] != [0; 3] {
+        return None;
+    }
+    let mut windows = own[..header.min(40)].to_vec();
+    windows.resize(40, 0);
+    windows[..4].copy_from_slice(&40u32.to_le_bytes());
+    let place = number(10)?.wrapping_add(40).wrapping_sub(header as u32);
+    Some([&bytes[..10], &place.to_le_bytes(), &windows, &bytes[14 + header..]].concat())
+}
+
+/// A picture of a size in its file, with as many texels as there is room for.
+fn of_decoded(decoded: image::DynamicImage, size: Size, room: &Room) -> Picture {
+    let (kept, texels) = as_rgba(decoded, room);
+    let stored = (kept.texels() < size.texels()).then_some(size);
+    Picture { size: kept, texels, srgb: None, red_green_only: false, cut_off: false, stored, notes: vec![] }
+}
+
+/// The texels of a decoded picture, or the means of squares of them.
+fn as_rgba(decoded: image::DynamicImage, room: &Room) -> (Size, Vec<[u8; 4]>) {
     use image::GenericImageView;
     let (width, height) = decoded.dimensions();
-    let bytes = |step: u32| 4 * u64::from(width.div_ceil(step)) * u64::from(height.div_ceil(step));
-    let step = (1..).find(|step| bytes(*step) <= allowed).unwrap_or(1);
+    let step = room.step(Size { width, height }, [4, 4]);
     if step == 1 {
         // A decoder may leave room for a part of a texel, which only a copy gets rid of.
         let copy = |raw: Vec<u8>| raw.chunks_exact(4).map(|c| [c[0], c[1], c[2], c[3]]).collect();
@@ -137,21 +204,15 @@ fn as_rgba(decoded: image::DynamicImage, allowed: u64) -> (Size, Vec<[u8; 4]>) {
     (size, texels)
 }
 
-/// The texels of a TIFF, or the means of squares of them, of which all fit into the memory of so long a file.
-fn tiff(item: &Item, bytes: &[u8], texels_so_far: u64, limits: &Limits) -> Result<Picture, SceneError> {
+/// The texels of a TIFF, or the means of squares of them.
+fn tiff(item: &Item, bytes: &[u8], room: &Room) -> Result<Picture, SceneError> {
     let file = Tiff::open(bytes).map_err(|e| item.error(e))?;
     let [width, height] = file.sides();
-    let stored = Size { width, height };
-    check_size(item, stored, texels_so_far, limits)?;
-    let allowed = allowed(bytes, limits);
-    let side = |length: u32, step: u32| length.div_ceil(step);
-    let bytes_of = |step: u32| {
-        // Sums of means are four times as wide as texels.
-        let width_of_texel = if step == 1 { 4 } else { 16 };
-        width_of_texel * u64::from(side(width, step)) * u64::from(side(height, step))
-    };
-    let step = (1..).find(|step| bytes_of(*step) <= allowed).unwrap_or(1);
-    let size = Size { width: side(width, step), height: side(height, step) };
+    let stored = Size { width, height }.not_empty(item)?;
+    let allowed = room.bytes;
+    // Sums of means are four times as wide as texels.
+    let step = room.step(stored, [4, 16]);
+    let size = Size { width: width.div_ceil(step), height: height.div_ceil(step) };
     let mut rounder = Rounder::default();
     let mut round = |texel: [f32; 4]| texel.map(|x| rounder.byte(x));
     let place = |[x, y]: [u32; 2]| (y / step) as usize * size.width as usize + (x / step) as usize;
@@ -213,6 +274,10 @@ pub(super) fn check(item: &Item, bytes: &[u8], name: &str, limits: &Limits) -> R
         let [width, height] = Tiff::open(bytes).map_err(|e| item.error(e))?.sides();
         return check_size(item, Size { width, height }, 0, limits);
     }
+    if let Some(frame) = Frame::of(bytes).filter(|frame| format == ImageFormat::Jpeg && frame.is_odd()) {
+        let [width, height] = frame.sides;
+        return check_size(item, Size { width, height }, 0, limits);
+    }
     let mut reader = ImageReader::with_format(Cursor::new(bytes), format);
     reader.limits(of_header());
     let (width, height) =
@@ -247,10 +312,7 @@ pub(super) fn check_size(
     texels_so_far: u64,
     limits: &Limits,
 ) -> Result<(), SceneError> {
-    let Size { width, height } = size;
-    if width == 0 || height == 0 {
-        return Err(item.error("has no texels"));
-    }
+    let Size { width, height } = size.not_empty(item)?;
     SceneError::check_limit(
         &format!("the longer side of {}", item.name),
         width.max(height).into(),

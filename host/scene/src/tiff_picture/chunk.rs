@@ -4,12 +4,14 @@ use std::borrow::Cow;
 use std::convert::Infallible;
 use std::io::Read;
 
+use crate::jpeg_picture::Frame;
 use fax::decoder::{DecodeStatus, Group3Decoder};
 use flate2::read::ZlibDecoder;
 use ruzstd::decoding::StreamingDecoder;
 use weezl::decode::Configuration;
 use weezl::BitOrder;
 use zune_jpeg::zune_core::bytestream::ZCursor;
+use zune_jpeg::zune_core::colorspace::ColorSpace;
 use zune_jpeg::zune_core::options::DecoderOptions;
 
 /// A window of Zstandard that every reader has to grant.
@@ -87,6 +89,10 @@ pub(super) struct Unpacking<'a> {
     pub packing: Packing,
     /// Tables that all JPEG of the file share.
     pub tables: Option<&'a [u8]>,
+    /// The picture is a whole JPEG file, whose marks say what its colours are.
+    pub is_file: bool,
+    /// Bytes of the largest piece of memory.
+    pub allowed: u64,
     /// Bits are stored from the lowest to the highest of each byte.
     pub is_reversed: bool,
     /// Texels across and down of the largest strip or tile.
@@ -143,7 +149,7 @@ impl Unpacking<'_> {
         }
     }
 
-    /// The numbers of a JPEG as they are stored, chroma spread over all texels.
+    /// The numbers of a JPEG as they are stored, or those of red, green and blue of a whole file; chroma spread over all texels.
     fn jpeg(&self, packed: &[u8], width: usize, samples: usize) -> Option<Vec<u8>> {
         // The tables stand between two marks, of which the picture has its own.
         let tables = self.tables.and_then(|tables| tables.get(..tables.len().checked_sub(2)?));
@@ -151,6 +157,19 @@ impl Unpacking<'_> {
             Some(tables) => [tables, packed.get(2..)?].concat().into(),
             None => packed.into(),
         };
+        let fits = |across: usize, down: usize| {
+            // The last strip may be padded to the height of the others.
+            across >= width && across < self.greatest[0] + 64 && down < self.greatest[1] + 64
+        };
+        if let Some(frame) = Frame::of(&whole).filter(Frame::is_odd) {
+            let [across, down] = frame.sides.map(|side| side as usize);
+            if !fits(across, down) {
+                return None;
+            }
+            let picture = frame.decode(&whole, self.allowed, !self.is_file).ok()?;
+            let is_whole = usize::from(picture.color().channel_count()) == samples;
+            return is_whole.then(|| rows_of(picture.into_bytes(), across * samples, width * samples));
+        }
         let mut decoder = zune_jpeg::JpegDecoder::new_with_options(
             ZCursor::new(&*whole),
             DecoderOptions::default().set_strict_mode(false),
@@ -158,12 +177,11 @@ impl Unpacking<'_> {
         decoder.decode_headers().ok()?;
         let (across, down) = decoder.dimensions()?;
         let stored = decoder.input_colorspace()?;
-        // The last strip may be padded to the height of the others.
-        let fits = across >= width && across < self.greatest[0] + 64 && down < self.greatest[1] + 64;
-        if stored.num_components() != samples || !fits {
+        if stored.num_components() != samples || !fits(across, down) {
             return None;
         }
-        decoder.set_options(decoder.options().jpeg_set_out_colorspace(stored));
+        let out = if self.is_file && samples == 3 { ColorSpace::RGB } else { stored };
+        decoder.set_options(decoder.options().jpeg_set_out_colorspace(out));
         let texels = decoder.decode().ok()?;
         Some(rows_of(texels, across * samples, width * samples))
     }

@@ -119,11 +119,6 @@ impl<'a> Directory<'a> {
         self.bytes
     }
 
-    /// Whether a JPEG file begins at a place.
-    pub(super) fn has_jpeg_at(&self, place: u64) -> bool {
-        Numbers { bytes: self.bytes, is_big_endian: true }.number(place, 2) == Some(0xffd8)
-    }
-
     /// The bytes of a tag, if all of them are there.
     pub(super) fn raw(&self, tag: u16) -> Option<&'a [u8]> {
         let entry = self.entries.get(&tag)?;

@@ -10,6 +10,7 @@ mod numbers;
 #[cfg(test)]
 mod tests;
 
+use crate::jpeg_picture::Frame;
 use chunk::{Packing, Unpacking};
 use colour::{Chroma, Colours};
 use directory::Directory;
@@ -44,6 +45,8 @@ pub(crate) struct Tiff<'a> {
     /// The number that is alpha, and whether the colours are multiplied by it.
     alpha: Option<(usize, bool)>,
     packing: Packing,
+    /// The picture is a whole JPEG file.
+    is_file: bool,
     /// 1: none, 2: differences, 3: differences of the bytes of floats.
     predictor: u64,
     /// Each strip or tile has one number of the texels.
@@ -75,7 +78,9 @@ fn colours_of(directory: &Directory, samples: usize, bits: u32, packing: Packing
             let three =
                 |tag: u16| Some(directory.fractions(tag)?.into_iter().map(|x| x as f32).collect::<Vec<_>>());
             let luma: Option<[f32; 3]> = three(529).and_then(|luma| luma.try_into().ok());
-            let luma = luma.filter(|luma| luma.iter().all(|x| x.is_finite()) && luma[1] != 0.0);
+            // A JPEG has its own, which all programs take.
+            let is_own = packing != Packing::Jpeg;
+            let luma = luma.filter(|luma| is_own && luma.iter().all(|x| x.is_finite()) && luma[1] != 0.0);
             let range: Option<[f32; 6]> = three(532).and_then(|range| range.try_into().ok());
             let range = range.filter(|range| range.iter().all(|x| x.is_finite()));
             Colours::Chroma(Chroma {
@@ -154,8 +159,12 @@ impl<'a> Tiff<'a> {
             return Err("is a TIFF without the sides of its picture".into());
         };
         let named = directory.number(259).unwrap_or(1);
-        // Before 1995 a whole JPEG file could stand in the place of strips.
-        let file = directory.number(513).filter(|at| named == 6 && directory.has_jpeg_at(*at));
+        // Before 1995 a whole JPEG file could stand in the place of strips. Some put its tables alone there.
+        let has_file = |at: &u64| {
+            let from = usize::try_from(*at).ok().and_then(|at| bytes.get(at..));
+            from.and_then(Frame::of).is_some_and(|frame| frame.has_scan())
+        };
+        let file = directory.number(513).filter(|at| named == 6 && has_file(at));
         let packing = Packing::of(if file.is_some() { 7 } else { named })?;
         let listed = directory.integers(258).map_or(1, |bits| bits.len() as u64);
         let samples = directory.number(277).unwrap_or(listed) as usize;
@@ -163,7 +172,11 @@ impl<'a> Tiff<'a> {
             return Err(format!("is a TIFF of {samples} numbers for each texel: save it as RGB"));
         }
         let (kind, bits) = numbers_of(&directory, samples)?;
-        let colours = colours_of(&directory, samples, bits[0], packing)?;
+        let colours = match (file, samples) {
+            // The marks of the JPEG say what its colours are.
+            (Some(_), 3) => Colours::Rgb,
+            _ => colours_of(&directory, samples, bits[0], packing)?,
+        };
         let (wide, high) = (side(322), side(323));
         let chunk = match wide.zip(high) {
             _ if file.is_some() => [width, height],
@@ -188,6 +201,7 @@ impl<'a> Tiff<'a> {
             height,
             alpha: None,
             packing,
+            is_file: file.is_some(),
             predictor: if packing.has_predictor() { directory.number(317).unwrap_or(1) } else { 1 },
             is_planar: directory.number(284) == Some(2) && samples > 1,
             subsampling,
@@ -338,6 +352,8 @@ impl<'a> Tiff<'a> {
         let unpacking = Unpacking {
             packing: self.packing,
             tables: self.directory.raw(347),
+            is_file: self.is_file,
+            allowed,
             is_reversed: self.directory.number(266) == Some(2),
             greatest: self.chunk.map(|side| side as usize),
         };

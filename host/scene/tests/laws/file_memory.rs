@@ -1,6 +1,6 @@
 //! No file makes the readers ask for more memory at once than 64 MB and sixteen times its bytes, however much it promises.
 
-use crate::common::{chance, with_image};
+use crate::common::{chance, tetrahedra, with_image};
 use crate::ktx2_textures::greatest_in;
 use dpm_camera_files::{self as camera_files, LengthUnit, LensKind, ReadOptions};
 use dpm_scene::{
@@ -9,6 +9,7 @@ use dpm_scene::{
 };
 use flate2::write::{GzEncoder, ZlibEncoder};
 use flate2::Compression;
+use serde_json::json;
 use std::io::{Cursor, Write};
 use std::path::Path;
 
@@ -118,6 +119,19 @@ fn tiff([width, height]: [u32; 2], [bits, samples]: [u32; 2], [wide, high]: [u32
     [out, packed].concat()
 }
 
+/// 400 triangles in 2,490 places: a list of their corners that doubles would be longer than allowed.
+fn instances() -> Vec<u8> {
+    let mut file = tetrahedra();
+    let places: Vec<f32> = (0..3 * 2490).map(|i| i as f32 * 1e-4).collect();
+    let at = file.push_numbers("VEC3", &places);
+    let corners: Vec<f32> = (0..3 * 1200).map(|i| (i * i % 251) as f32).collect();
+    let corners = file.push_numbers("VEC3", &corners);
+    file.set("/meshes/1", json!({"primitives": [{"attributes": {"POSITION": corners}}]}))
+        .set("/nodes/0/mesh", json!(1))
+        .set("/nodes/0/extensions", json!({"EXT_mesh_gpu_instancing": {"attributes": {"TRANSLATION": at}}}))
+        .bytes()
+}
+
 /// Files that promise much in few bytes.
 fn bombs() -> Vec<(&'static str, Vec<u8>)> {
     let text = |text: String| text.into_bytes();
@@ -163,6 +177,7 @@ fn bombs() -> Vec<(&'static str, Vec<u8>)> {
         ("OBJ with far indices", text("f 2000000000 1999999999 4000000000\n".repeat(1000))),
         ("accessor", accessor(2_000_000_000)),
         ("accessor within the limits", accessor(3_000_000)),
+        ("instances", instances()),
         (
             "JSON of numbers",
             text(format!("{{\"asset\":{{\"version\":\"2.0\"}},\"extras\":[{}0]}}", "0,".repeat(1_500_000))),

@@ -12,4 +12,5 @@ mod ktx2_formats;
 mod ktx2_textures;
 mod mutated_gltf;
 mod odd_gltf;
+mod odd_pictures;
 mod opencv_lens;

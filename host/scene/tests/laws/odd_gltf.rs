@@ -3,6 +3,7 @@
 
 use crate::common::{png, tetrahedra, with_image};
 use dpm_scene::{load_bytes, LoadOptions, Scene};
+use glam::Vec3;
 use image::codecs::png::{CompressionType, FilterType, PngEncoder};
 use image::ImageEncoder;
 use serde_json::json;
@@ -139,4 +140,40 @@ fn bad_values_that_place_geometry_refuse_the_file() {
         let told = load_bytes(&file.bytes(), &LoadOptions::default()).unwrap_err().to_string();
         assert!(told.contains("node 0 'left'") && told.contains(name), "{told}");
     }
+}
+
+/// Materials of older exporters: specular and diffuse colours, glossiness, and their textures.
+#[test]
+fn specular_and_glossiness_are_shown_as_what_reflects_the_same() {
+    let name = "KHR_materials_pbrSpecularGlossiness";
+    let old = json!({"diffuseFactor": [0.2, 0.4, 0.6, 1], "specularFactor": [0.04, 0.02, 1], "glossinessFactor": 0.7,
+        "diffuseTexture": {"index": 0}});
+    let file = |old: serde_json::Value| {
+        with_image(&png(2, 2, &[[9, 8, 7, 255]; 4]))
+            .set("/materials/0", json!({"extensions": {name: old}}))
+            .set("/extensionsRequired", json!([name]))
+    };
+    let scene = load(&file(old.clone()).bytes());
+    let m = &scene.materials[0];
+    assert!((m.roughness - 0.3).abs() < 1e-6 && m.metallic == 0.0 && m.base_color_texture.is_some(), "{m:?}");
+    assert!(m.base_color.distance(Vec3::new(0.2, 0.4, 0.6)) < 1e-6);
+    // 4 % of this colour are reflected along the normal.
+    assert!(m.lobes.specular.color.distance(Vec3::new(1.0, 0.5, 25.0)) < 1e-4, "{m:?}");
+    assert!(scene.warnings.join("\n").contains("is shown as metallic-roughness"), "{:?}", scene.warnings);
+
+    let mut textured = old.clone();
+    textured["specularGlossinessTexture"] = json!({"index": 0});
+    textured["specularFactor"] = json!([2, 0, 0]);
+    let scene = load(&file(textured).bytes());
+    let m = &scene.materials[0];
+    assert!(m.lobes.specular.color_texture.is_some() && (m.roughness - 0.65).abs() < 1e-6, "{m:?}");
+    assert_eq!(m.lobes.specular.color, Vec3::splat(25.0));
+    let told = scene.warnings.join("\n");
+    assert!(told.contains("taken for one half") && told.contains("'specularFactor' is [2,0,0]"), "{told}");
+
+    // A file with metallic-roughness of its own means that for programs without the extension.
+    let both = file(old).set("/materials/0/pbrMetallicRoughness", json!({"baseColorFactor": [1, 0, 0, 1]}));
+    let scene = load(&both.bytes());
+    assert_eq!(scene.materials[0].base_color, Vec3::X);
+    assert!(scene.warnings.join("\n").contains("own metallic-roughness is shown"), "{:?}", scene.warnings);
 }
