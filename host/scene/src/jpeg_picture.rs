@@ -125,7 +125,8 @@ mod tests {
     #[test]
     fn the_kinds_that_the_fast_decoder_misreads_are_found() {
         let usual: &[[u8; 2]] = &[[2, 2], [1, 1], [1, 1]];
-        let cases: [(u8, &[[u8; 2]], &[&[u8]], bool); 8] = [
+        type Case<'a> = (u8, &'a [[u8; 2]], &'a [&'a [u8]], bool);
+        let cases: [Case; 8] = [
             (0, usual, &[&[1, 2, 3]], false),
             (0, usual, &[&[1], &[2, 3]], true),
             (0, usual, &[&[1], &[2], &[3]], true),
