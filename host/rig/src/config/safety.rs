@@ -20,9 +20,9 @@ section! {
         /// Prediction extends a body's track for at most this long, from the tracker's newest sample to the middle of
         /// the light; then its light goes off. A frame that would be lit later than that plus one slot is not sent. A
         /// frame that arrives late or is repeated goes dark when its poses reach this age, but never sooner than three
-        /// slots after its own. If left out: the tracker's latency, two of its samples, the time from latch to light
-        /// and two slots, at least 20 ms. A value in the file is binding: a rig whose frames take longer stays dark and
-        /// reports it.
+        /// slots after its own. If left out: the tracker's latency, two of its samples, the time from latch to light, a
+        /// slot, and those until the next frame is due for certain (one, or as many as a slow link needs), at least 20
+        /// ms. A value in the file is binding: a rig whose frames take longer stays dark and reports it.
         predict_ms: Option<u32> = None, "ms", Within(0, 1_000);
         /// Permitted general flashes of the whole picture per second; beyond this the projector rests in the dark for
         /// two seconds. WCAG 2.3.1 allows 3; 0 is off.

@@ -96,7 +96,7 @@ impl Facts {
         now: HostTime,
     ) -> Self {
         monitor.samples().begin(rig.tracked_count());
-        let predict_ns = Horizon::of_rig(&rig.config).predict_ns(lead.lead_ns() + RECEIPT_NS, 0);
+        let predict_ns = Horizon::of_rig(&rig.config).predict_ns(lead.lead_ns() + RECEIPT_NS, 0, 1);
         Self {
             rig,
             monitor,

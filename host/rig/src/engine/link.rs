@@ -171,7 +171,9 @@ impl<P: Pace> LinkStage<P> {
 
     /// Polls the link and does what is due between frames.
     pub(crate) fn poll(&mut self, now: HostTime, transport: &mut dyn Transport) {
-        let Self { facts, link, keeper, follower, slack, seen, slot_ns, medium_queue, stands, .. } = self;
+        let Self {
+            facts, link, keeper, follower, slack, seen, slot_ns, medium_queue, stands, cadence, ..
+        } = self;
         let lost = facts.crew_lost.swap(false, Ordering::Relaxed);
         let alive =
             !lost && now.ns_since(HostTime(facts.alive_at_ns.load(Ordering::Relaxed))) <= ALIVE_WITHIN_NS;
@@ -183,6 +185,10 @@ impl<P: Pace> LinkStage<P> {
         }
         let timing = link.status().and_then(|status| status.timing);
         let need = timing.and_then(|timing| slack.observe(timing, now));
+        if let Some(timing) = timing.filter(|_| need.is_some()) {
+            cadence.transferred(i64::from(timing.transfer_ns));
+            slack.lit().into_iter().for_each(|lit| cadence.lit(lit));
+        }
         let beyond_ns = if link.measures_timing() { 0 } else { keeper.travel_ns() + RECEIPT_NS };
         facts.travel_ns.store(beyond_ns, Ordering::Relaxed);
         if let Err(e) = result {

@@ -154,10 +154,11 @@ impl<P: Pace> PlanStage<P> {
         snapshot: &TrackSnapshot,
         now: HostTime,
     ) {
-        let predict_ns = self.horizon.predict_ns(latch.lead_ns, snapshot.latency_ns);
+        let light_slots = self.facts.light_slots.load(Ordering::Relaxed);
+        let predict_ns = self.horizon.predict_ns(latch.lead_ns, snapshot.latency_ns, light_slots);
         self.facts.predict_ns.store(predict_ns, Ordering::Relaxed);
         // The light of a frame lasts until the next one is due.
-        let stride = self.stride(latch.slot).max(self.facts.light_slots.load(Ordering::Relaxed));
+        let stride = self.stride(latch.slot).max(light_slots);
         let applied = self.parameters.latest().0;
         if self.used != Some(applied.version) {
             self.used = Some(applied.version);

@@ -48,6 +48,8 @@ pub(crate) struct SlackMeter {
     /// When the frame of that report was sent and whole, and how long it waited on the medium for the one before, nanoseconds.
     whole: Option<[HostTime; 2]>,
     queued_ns: i64,
+    /// When the slot of that frame began, and when its light did.
+    lit: Option<[HostTime; 2]>,
     /// Of frames that travel alone: mean and mean deviation of the time from sent to whole, nanoseconds.
     travel_ns: Option<(i64, i64)>,
     slack: SignedHistogram,
@@ -62,6 +64,7 @@ impl SlackMeter {
             read: None,
             whole: None,
             queued_ns: 0,
+            lit: None,
             travel_ns: None,
             slack: SignedHistogram::new(LONGEST_NS as u64),
             transfer: SignedHistogram::new(LONGEST_NS as u64),
@@ -77,7 +80,12 @@ impl SlackMeter {
     /// Frames that were sent to a former session, or planned by a wrong map of the clock, are not judged any more.
     pub(crate) fn forget(&mut self) {
         (self.sent, self.read, self.travel_ns) = ([None; REMEMBERED], None, None);
-        (self.whole, self.queued_ns) = (None, 0);
+        (self.whole, self.queued_ns, self.lit) = (None, 0, None);
+    }
+
+    /// When the slot of the frame of the newest report began, and when it was lit if that was later.
+    pub(crate) fn lit(&self) -> Option<[HostTime; 2]> {
+        self.lit
     }
 
     /// How long the frame of the newest report waited on the medium for the frame before it, nanoseconds: from sent until that
@@ -127,6 +135,7 @@ impl SlackMeter {
         let whole_at = sent.due_at.plus_ns(-slack_ns).max(sent.sent_at).min(now.max(sent.sent_at));
         let travel_ns = whole_at.ns_since(sent.sent_at);
         let before = self.whole.replace([sent.sent_at, whole_at]);
+        self.lit = Some([sent.due_at, sent.due_at.max(whole_at)]);
         self.queued_ns =
             before.map_or(0, |[_, whole_at]| whole_at.ns_since(sent.sent_at).clamp(0, travel_ns));
         let travel_ns = travel_ns - self.queued_ns;

@@ -34,15 +34,16 @@ impl Horizon {
     }
 
     /// The longest time for which prediction may extend a body's track, nanoseconds. It is the rig file's value if
-    /// there is one. Otherwise it is the sum of the tracker's latency, two of its samples, the lead, two slots, and the
-    /// time from a slot to its light, and at least 20 ms. `lead_ns`: how long before its slot a frame is latched. `latency_ns`: from the capture of
-    /// a sample to its arrival.
-    pub(crate) fn predict_ns(&self, lead_ns: i64, latency_ns: i64) -> i64 {
+    /// there is one. Otherwise it is the sum of the tracker's latency, two of its samples, the lead, a slot and those for
+    /// which the light of a frame must last, and the time from a slot to its light, and at least 20 ms. `lead_ns`: how long
+    /// before its slot a frame is latched. `latency_ns`: from the capture of a sample to its arrival. `light_slots`: until
+    /// the next frame is due for certain, so that a frame which is as late as that is still lit.
+    pub(crate) fn predict_ns(&self, lead_ns: i64, latency_ns: i64, light_slots: u64) -> i64 {
         self.written_ns.unwrap_or_else(|| {
             let needed = latency_ns
                 .saturating_add(2 * self.period_ns)
                 .saturating_add(lead_ns)
-                .saturating_add(2 * self.slot_ns)
+                .saturating_add(self.slot_ns.saturating_mul(1 + light_slots.clamp(1, 1000) as i64))
                 .saturating_add(self.light_delay_ns);
             needed.clamp(SHORTEST_NS, LONGEST_NS)
         })
@@ -71,12 +72,14 @@ mod tests {
     #[test]
     fn a_rig_that_names_no_horizon_has_one_that_its_frames_can_keep() {
         let fast = horizon(&["projector.frame_rate=947", "tracker.rate_hz=500"]);
-        assert_eq!(fast.predict_ns(2 * MS, 2 * MS), 20 * MS);
+        assert_eq!(fast.predict_ns(2 * MS, 2 * MS, 1), 20 * MS);
         let slow = horizon(&["projector.frame_rate=24", "tracker.rate_hz=30"]);
         // 5 + 2 * 33.3 + 60 + 2 * 41.7
-        assert_eq!(slow.predict_ns(60 * MS, 5 * MS) / MS, 214);
-        assert_eq!(slow.predict_ns(5_000 * MS, 0), LONGEST_NS);
+        assert_eq!(slow.predict_ns(60 * MS, 5 * MS, 1) / MS, 214);
+        assert_eq!(slow.predict_ns(5_000 * MS, 0, 1), LONGEST_NS);
+        // A cable that carries every tenth frame: 2 + 2 * 2 + 18 + 16 * 1.056
+        assert_eq!(fast.predict_ns(18 * MS, 2 * MS, 15) / MS, 40);
         let written = horizon(&["projector.frame_rate=24", "tracker.rate_hz=500", "safety.predict_ms=70"]);
-        assert_eq!(written.predict_ns(600 * MS, 5 * MS), 70 * MS, "what is written is law");
+        assert_eq!(written.predict_ns(600 * MS, 5 * MS, 9), 70 * MS, "what is written is law");
     }
 }
