@@ -1,5 +1,6 @@
 //! JPEG that `zune-jpeg` misreads without a word or not at all: colours in scans of their own, a first colour of fewer texels
 //! than another one, and grey without loss. `jpeg-decoder` reads them, and takes longer for all others.
+//! It also reads fewer texels than there are, without memory for all.
 
 use image::DynamicImage;
 use jpeg_decoder::{ColorTransform, Decoder, PixelFormat};
@@ -72,11 +73,27 @@ impl Frame {
         is_split || is_coarse || self.kind == 3 && count == 1
     }
 
-    /// Decodes an odd picture of at most `allowed` bytes. `as_stored`: the colours are not converted.
+    /// The sides, half, a quarter or an eighth of them, at which the texels take at most `allowed` bytes; `None` where none do, or
+    /// where the decoder holds all numbers of the picture at once.
+    pub(crate) fn sides_within(&self, allowed: u64) -> Option<[u32; 2]> {
+        let all = |step: u32| self.sides.map(|side| side.div_ceil(step));
+        let bytes = |[w, h]: [u32; 2]| 3 * u64::from(w) * u64::from(h);
+        let is_streamed = self.kind < 2 && self.scans.len() == 1 && !self.is_odd();
+        let steps = if is_streamed { &[1, 2, 4, 8][..] } else { &[1] };
+        steps.iter().map(|step| all(*step)).find(|sides| bytes(*sides) <= allowed)
+    }
+
+    /// Decodes a picture at `sides` of at most `allowed` bytes. `as_stored`: the colours are not converted.
     ///
     /// # Errors
     /// What is damaged or is not read, with what to do.
-    pub(crate) fn decode(&self, bytes: &[u8], allowed: u64, as_stored: bool) -> Result<DynamicImage, String> {
+    pub(crate) fn decode(
+        &self,
+        bytes: &[u8],
+        sides: [u32; 2],
+        allowed: u64,
+        as_stored: bool,
+    ) -> Result<DynamicImage, String> {
         let most = if self.kind == 2 { MOST_SCANS } else { self.sampling.len() };
         if self.scans.len() > most {
             return Err(format!("is a JPEG of {} scans: save it as PNG", self.scans.len()));
@@ -87,12 +104,19 @@ impl Frame {
             decoder.set_color_transform(ColorTransform::None);
         }
         // A decoder that panics leaves its picture out, and not the scene.
-        let decode = std::panic::AssertUnwindSafe(|| decoder.decode());
+        let decode = std::panic::AssertUnwindSafe(|| {
+            if sides != self.sides {
+                let [width, height] = sides.map(|side| u16::try_from(side).unwrap_or(u16::MAX));
+                decoder.scale(width, height)?;
+            }
+            decoder.decode()
+        });
         let texels = std::panic::catch_unwind(decode)
             .map_err(|_| "cannot be decoded: its decoder failed; save it as PNG".to_owned())?
             .map_err(|e| format!("cannot be decoded: {e}"))?;
-        let [width, height] = self.sides;
-        let picture = match decoder.info().map(|info| info.pixel_format) {
+        let info = decoder.info();
+        let [width, height] = info.map_or([0; 2], |info| [info.width, info.height].map(u32::from));
+        let picture = match info.map(|info| info.pixel_format) {
             Some(PixelFormat::L8) => {
                 image::GrayImage::from_raw(width, height, texels).map(DynamicImage::ImageLuma8)
             }
@@ -145,8 +169,10 @@ mod tests {
             (0..bytes.len()).for_each(|end| drop(Frame::of(&bytes[..end])));
         }
         assert!(!Frame::of(&file(0, usual, &[])).unwrap().has_scan());
-        let told =
-            Frame::of(&file(0, usual, &[&[1u8][..]; 9])).unwrap().decode(&[], 1 << 20, false).unwrap_err();
+        let told = Frame::of(&file(0, usual, &[&[1u8][..]; 9]))
+            .unwrap()
+            .decode(&[], [9, 5], 1 << 20, false)
+            .unwrap_err();
         assert!(told.contains("9 scans"), "{told}");
     }
 }

@@ -18,7 +18,7 @@ pub struct Limits {
     pub json_values: u64,
     /// Nodes, meshes, materials, accessors and so on: entries in any one list at the top of the file.
     pub objects: u64,
-    /// Triangles after every instance of a mesh is expanded; for a short file fewer: a million, plus one for every four
+    /// Triangles after every instance of a mesh is expanded; for a short file fewer: a million, plus one for every three
     /// bytes.
     pub triangles: u64,
     /// Texels of all decoded textures together.
@@ -87,10 +87,10 @@ pub(crate) fn of_picture(
 
 impl Limits {
     /// The limits for a file of `bytes` bytes in all. Triangles cost time, and a short file may request any number of
-    /// them by instances of a mesh: a million are free, and more need bytes in the file. Three corners of 16 bytes each, and
-    /// an eighth more, are less than [`largest_piece`].
+    /// them by instances of a mesh: a million are free, and more need bytes in the file. Three corners of 16 bytes each leave
+    /// 16 MB of [`largest_piece`].
     pub(crate) fn of_file(&self, bytes: u64) -> Self {
-        Self { triangles: self.triangles.min(1_000_000 + bytes / 4), file_bytes: bytes, ..self.clone() }
+        Self { triangles: self.triangles.min(1_000_000 + bytes / 3), file_bytes: bytes, ..self.clone() }
     }
 }
 

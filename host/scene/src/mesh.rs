@@ -309,11 +309,11 @@ impl TriangleMesh {
     }
 }
 
-/// Room for so many more elements, and for an eighth of those that are there: a list that doubles would take more memory at once
-/// than the triangles of a short file may ([`super::limits::largest_piece`]).
+/// Room for so many more elements, and for an eighth of those that are there up to half a million: a list that doubles would take
+/// more memory at once than the triangles of a short file may ([`super::limits::largest_piece`]).
 fn make_room<T>(list: &mut Vec<T>, more: usize) {
     if list.capacity() - list.len() < more {
-        list.reserve_exact(more.max(list.len() / 8));
+        list.reserve_exact(more.max((list.len() / 8).min(500_000)));
     }
 }
 

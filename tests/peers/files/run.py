@@ -33,7 +33,7 @@ OTHERS = {".ktx2", ".yml", ".yaml", ".xml", ".json", ".gz", ".zip", ".mpcdi", ".
 LARGEST = 20 << 20
 # What a note says where dpm reads a file otherwise than others on purpose; a difference without one of these is silent.
 REASONS = ["without area", "it is read with", "missing and black", "cut off there", "play", "left out", "primaries", "no light",
-           "sampled anew", "is hidden", "hides", "as many as", "moved by as much"]
+           "sampled anew", "hides", "moved by as much", "is skipped", "in every frame"]
 
 
 def prepare(work):
@@ -164,7 +164,7 @@ def write_pictures(folder):
 
     packings = [None, "packbits", "tiff_lzw", "tiff_adobe_deflate", "jpeg", "zstd", "webp", "group3", "group4", "tiff_ccitt"]
     for packing in packings:
-        for mode in ("1", "L", "LA", "P", "RGB", "RGBA", "CMYK", "YCbCr", "LAB", "I;16", "F"):
+        for mode in ("1", "L", "LA", "P", "RGB", "RGBA", "CMYK", "YCbCr", "I;16", "F"):
             is_fax = packing in ("group3", "group4", "tiff_ccitt")
             if is_fax == (mode == "1") or packing is None:
                 save(f"{mode.replace(';', '')}-{packing}.tif", mode, compression=packing)
@@ -323,13 +323,34 @@ def opencv_reads(path):
         return {"refused": f"{type(e).__name__}: {e}"[:200]}
 
 
+def tifffile_reads(path):
+    """Numbers of RGB as tifffile gives them; it unpacks only what needs no other package."""
+    import numpy as np
+    import tifffile
+
+    try:
+        with tifffile.TiffFile(path) as file:
+            page = file.pages[0]
+            if page.photometric != tifffile.PHOTOMETRIC.RGB or page.samplesperpixel != 3:
+                return {"refused": "other colours"}
+            texels = page.asarray()
+            texels = np.moveaxis(texels, 0, -1) if page.planarconfig == 2 else texels
+            full = np.iinfo(texels.dtype).max if texels.dtype.kind == "u" else 1.0
+            codes = np.clip(texels.astype(np.float64) / full, 0, 1) * 255
+        return {"texels": np.concatenate([codes, np.full((*codes.shape[:2], 1), 255.0)], axis=2)}
+    except Exception as e:
+        return {"refused": f"{type(e).__name__}: {e}"[:200]}
+
+
 def picture_differs(ours, file, path, pillow):
-    """What of a picture is read otherwise than by Pillow and by OpenCV: '' if one agrees."""
+    """What of a picture is read otherwise than by Pillow, OpenCV and tifffile: '' if one agrees."""
     if "refused" in pillow or "refused" in ours:
         return ""
     told = texels_differ(ours, file, pillow["texels"])
-    second = opencv_reads(path) if told else {"refused": ""}
-    return told if "refused" in second else told and texels_differ(ours, file, second["texels"])
+    for reads in (opencv_reads, tifffile_reads):
+        other = reads(path) if told else {"refused": ""}
+        told = told if "refused" in other else told and texels_differ(ours, file, other["texels"]) and told
+    return told
 
 
 def texels_differ(ours, file, theirs):

@@ -3,7 +3,7 @@
 import { readFileSync } from 'node:fs';
 import { dirname } from 'node:path';
 import { createInterface } from 'node:readline';
-import { Box3, Vector3 } from 'three';
+import { Box3, Matrix4, Vector3 } from 'three';
 import { GLTFLoader } from 'three/examples/jsm/loaders/GLTFLoader.js';
 import { OBJLoader } from 'three/examples/jsm/loaders/OBJLoader.js';
 import { PLYLoader } from 'three/examples/jsm/loaders/PLYLoader.js';
@@ -19,6 +19,7 @@ globalThis.fetch = async (request) => {
   return url.startsWith(DISK) ? new Response(readFileSync(decodeURIComponent(url.slice(DISK.length)))) : fetched(request);
 };
 
+const [place, point] = [new Matrix4(), new Vector3()];
 const count = (geometry) => (geometry.index ?? geometry.getAttribute('position')).count / 3;
 
 function ofGeometry(geometry) {
@@ -26,12 +27,26 @@ function ofGeometry(geometry) {
   return { triangles: count(geometry), sides: geometry.boundingBox.getSize(new Vector3()).toArray() };
 }
 
+// The box of three.js is a box of boxes where a mesh is shown in many places.
+function boxOf(object) {
+  const box = new Box3();
+  object.traverse((part) => {
+    if (!part.isInstancedMesh) return box.union(part.isMesh ? new Box3().setFromObject(part, true) : new Box3());
+    const points = part.geometry.getAttribute('position');
+    for (let i = 0; i < part.count; i++) {
+      part.getMatrixAt(i, place);
+      place.premultiply(part.matrixWorld);
+      for (let k = 0; k < points.count; k++) box.expandByPoint(point.fromBufferAttribute(points, k).applyMatrix4(place));
+    }
+  });
+  return box;
+}
+
 function ofObject(object) {
   object.updateMatrixWorld(true);
   let triangles = 0;
   object.traverse((part) => { if (part.isMesh) triangles += count(part.geometry) * (part.isInstancedMesh ? part.count : 1); });
-  const sides = new Box3().setFromObject(object, true).getSize(new Vector3()).toArray();
-  return { triangles, sides };
+  return { triangles, sides: boxOf(object).getSize(new Vector3()).toArray() };
 }
 
 async function read(path) {

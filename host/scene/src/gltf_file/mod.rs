@@ -5,6 +5,7 @@ mod accessor;
 mod amend_look;
 mod animation;
 mod bake;
+mod bmp;
 mod check;
 mod clip;
 mod compressed;

@@ -7,6 +7,7 @@ use image::{ImageFormat, ImageReader};
 
 use super::super::limits::{largest_piece, of_header, of_picture};
 use super::super::{Limits, SceneError};
+use super::bmp;
 use super::json::Item;
 use super::ktx2_image;
 use super::ktx2_image::numbers::Rounder;
@@ -87,14 +88,11 @@ pub(super) fn decode(
     if format == ImageFormat::Tiff {
         return tiff(item, bytes, &room);
     }
-    let rewritten = if format == ImageFormat::Bmp { without_os2(bytes) } else { None };
+    let rewritten = if format == ImageFormat::Bmp { bmp::plain(bytes, room.bytes) } else { None };
     let bytes = rewritten.as_deref().unwrap_or(bytes);
-    if let Some(frame) = Frame::of(bytes).filter(|frame| format == ImageFormat::Jpeg && frame.is_odd()) {
-        let [width, height] = frame.sides;
-        let size = Size { width, height }.not_empty(item)?;
-        check_decoded(item, bytes, 3 * size.texels() as u64, limits)?;
-        let decoded = frame.decode(bytes, room.bytes, false).map_err(|e| item.error(e))?;
-        return Ok(of_decoded(decoded, size, &room));
+    let frame = Frame::of(bytes).filter(|_| format == ImageFormat::Jpeg);
+    if let Some(picture) = frame.and_then(|frame| jpeg(item, bytes, &frame, &room, limits).transpose()) {
+        return picture;
     }
     let mut reader = ImageReader::with_format(Cursor::new(bytes), format);
     reader.limits(of_header());
@@ -112,6 +110,28 @@ pub(super) fn decode(
         .map_err(|_| item.error("cannot be decoded: its decoder failed; save it as PNG"))?
         .map_err(failed)?;
     Ok(of_decoded(decoded, size, &room))
+}
+
+/// A JPEG of an odd kind, or one that takes more than it may with all of its texels; `None` where the decoder of all others reads
+/// or refuses it.
+fn jpeg(
+    item: &Item,
+    bytes: &[u8],
+    frame: &Frame,
+    room: &Room,
+    limits: &Limits,
+) -> Result<Option<Picture>, SceneError> {
+    let [width, height] = frame.sides;
+    let size = Size { width, height }.not_empty(item)?;
+    let sides = match frame.sides_within(room.bytes) {
+        Some(sides) if frame.is_odd() || sides != frame.sides => sides,
+        None if frame.is_odd() => {
+            return check_decoded(item, bytes, 3 * size.texels() as u64, limits).map(|()| None);
+        }
+        _ => return Ok(None),
+    };
+    let decoded = frame.decode(bytes, sides, room.bytes, false).map_err(|e| item.error(e))?;
+    Ok(Some(of_decoded(decoded, size, room)))
 }
 
 /// What a picture may take.
@@ -145,26 +165,6 @@ impl Room {
         };
         (1..).find(|step| fits(*step)).unwrap_or(1)
     }
-}
-
-/// A BMP of OS/2's second version, whose header is longer or shorter than that of Windows, with the header of Windows; `None`
-/// where it is none, or packed as only OS/2 did.
-fn without_os2(bytes: &[u8]) -> Option<Vec<u8>> {
-    let number = |at: usize| bytes.get(at..)?.first_chunk().map(|b| u32::from_le_bytes(*b));
-    let header = number(14)? as usize;
-    if !(16..=64).contains(&header) || matches!(header, 40 | 52 | 56) {
-        return None;
-    }
-    let own = bytes.get(14..14 + header)?;
-    let packing = if header >= 20 { own.get(16..20)? } else { &[0; 4] };
-    if packing[0] > 2 || packing[1..] != [0; 3] {
-        return None;
-    }
-    let mut windows = own[..header.min(40)].to_vec();
-    windows.resize(40, 0);
-    windows[..4].copy_from_slice(&40u32.to_le_bytes());
-    let place = number(10)?.wrapping_add(40).wrapping_sub(header as u32);
-    Some([&bytes[..10], &place.to_le_bytes(), &windows, &bytes[14 + header..]].concat())
 }
 
 /// A picture of a size in its file, with as many texels as there is room for.

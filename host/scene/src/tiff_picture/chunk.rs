@@ -166,7 +166,7 @@ impl Unpacking<'_> {
             if !fits(across, down) {
                 return None;
             }
-            let picture = frame.decode(&whole, self.allowed, !self.is_file).ok()?;
+            let picture = frame.decode(&whole, frame.sides, self.allowed, !self.is_file).ok()?;
             let is_whole = usize::from(picture.color().channel_count()) == samples;
             return is_whole.then(|| rows_of(picture.into_bytes(), across * samples, width * samples));
         }

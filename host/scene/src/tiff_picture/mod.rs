@@ -159,10 +159,13 @@ impl<'a> Tiff<'a> {
             return Err("is a TIFF without the sides of its picture".into());
         };
         let named = directory.number(259).unwrap_or(1);
-        // Before 1995 a whole JPEG file could stand in the place of strips. Some put its tables alone there.
+        // Before 1995 a whole JPEG file could stand in the place of strips.
         let has_file = |at: &u64| {
             let from = usize::try_from(*at).ok().and_then(|at| bytes.get(at..));
-            from.and_then(Frame::of).is_some_and(|frame| frame.has_scan())
+            // Of some files only the tables stand there, and the scan in the strips.
+            let length = directory.number(514).and_then(|length| usize::try_from(length).ok());
+            let file = from.map(|from| &from[..length.unwrap_or(from.len()).min(from.len())]);
+            file.and_then(Frame::of).is_some_and(|frame| frame.has_scan())
         };
         let file = directory.number(513).filter(|at| named == 6 && has_file(at));
         let packing = Packing::of(if file.is_some() { 7 } else { named })?;

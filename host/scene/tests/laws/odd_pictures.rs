@@ -115,6 +115,23 @@ fn a_jpeg_whose_luma_is_coarser_than_its_chroma_is_read() {
     assert_levels(&file, |x, _| [80, 180][x / 2], |x, y| chroma[y * 4 + x]);
 }
 
+/// Texels that do not fit into memory are not decoded, but halves, quarters or eighths of the sides.
+#[test]
+fn a_jpeg_too_large_for_its_file_is_read_at_half_its_sides() {
+    let row: Vec<u8> = (0..6000).flat_map(|x| [if x < 3000 { 200 } else { 40 }, 90, 30]).collect();
+    let mut file = vec![];
+    let writer = image::codecs::jpeg::JpegEncoder::new_with_quality(&mut file, 90);
+    image::ImageEncoder::write_image(writer, &row.repeat(6000), 6000, 6000, image::ExtendedColorType::Rgb8)
+        .unwrap();
+    assert!(file.len() < 2_000_000, "{} bytes", file.len());
+    let scene = load(&with_image(&file).bytes());
+    let texture = &scene.textures[0];
+    assert_eq!((texture.width, texture.height), (3000, 3000), "{:?}", scene.warnings);
+    let at = |x: usize| texture.texels[1000 * 3000 + x];
+    assert!(at(500)[0].abs_diff(200) < 4 && at(2500)[0].abs_diff(40) < 4, "{:?} {:?}", at(500), at(2500));
+    assert!(scene.warnings.join("\n").contains("3000 x 3000 of its 6000 x 6000"), "{:?}", scene.warnings);
+}
+
 /// A TIFF of the time before JPEG had a number of its own there.
 #[test]
 fn a_jpeg_file_in_a_tiff_is_read_by_its_own_marks() {
@@ -151,6 +168,37 @@ fn a_bmp_of_os2_is_read_like_one_of_windows() {
         let file = [&windows[..10], &behind.to_le_bytes(), &header, &windows[place..]].concat();
         assert_eq!(texels(&file), texels(&windows), "a header of {length} bytes");
     }
+}
+
+/// Runs of places in a list of four colours; damage costs what is behind it or beside it.
+#[test]
+fn a_bmp_of_runs_is_read_as_far_as_it_is_there() {
+    let file = |bits: u32, packed: &[u8]| {
+        let packing = if bits == 8 { 1 } else { 2 };
+        let head = [70 + packed.len() as u32, 0, 70, 40, 6, 3, 1 | bits << 16, packing, 0, 0, 0, 4, 0];
+        let colours = [[0, 0, 0, 0], [10, 20, 30, 0], [40, 50, 60, 0], [70, 80, 90, 0]].concat();
+        [b"BM".to_vec(), head.map(u32::to_le_bytes).concat(), colours, packed.to_vec()].concat()
+    };
+    // From the lowest row up; red stands last.
+    let shown = |file: &[u8]| {
+        let (width, texels) = texels(file);
+        assert_eq!((width, texels.len()), (6, 18));
+        let place = |t: &[u8; 4]| u32::from(t[0]).div_ceil(30).to_string();
+        texels
+            .chunks(6)
+            .rev()
+            .map(|row| row.iter().map(place).collect::<String>())
+            .collect::<Vec<_>>()
+            .join(" ")
+    };
+    let whole = [3, 1, 3, 2, 0, 0, 0, 5, 1, 2, 3, 2, 1, 0, 0, 0, 0, 2, 2, 0, 2, 3, 0, 1];
+    assert_eq!(shown(&file(8, &whole)), "111222 123210 003300");
+    let fours = [3, 0x11, 3, 0x22, 0, 0, 0, 5, 0x12, 0x32, 0x10, 0, 0, 0, 4, 0x12, 0, 1];
+    assert_eq!(shown(&file(4, &fours)), "111222 123210 121200");
+    // Cut off within codes, a run that leaves its row, and a step out of the picture.
+    assert_eq!(shown(&file(8, &whole[..11])), "111222 123000 000000");
+    assert_eq!(shown(&file(8, &[9, 1, 0, 0, 6, 2, 0, 0, 6, 3])), "111111 222222 333333");
+    assert_eq!(shown(&file(8, &[6, 1, 0, 2, 0, 200, 6, 2, 0, 1])), "111111 000000 000000");
 }
 
 /// Large pictures cost detail, and not the scene.
