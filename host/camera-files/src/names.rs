@@ -195,7 +195,7 @@ const ROLES: &[(Role, &str)] = &[
     ),
     (
         Role::Size,
-        "resolution imagesize size imgsize rastersize screenresolution screensize imageresolution res \
+        "resolution imagesize size imgsize calibrationimagesize rastersize screenresolution screensize imageresolution res \
          raster dimensions",
     ),
     (Role::Shape, "shape imageshape imgshape"),

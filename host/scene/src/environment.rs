@@ -228,11 +228,11 @@ fn clamp(read: &mut Read, scale: f32) -> Result<(), SceneError> {
     let Some(first) = first else { return Ok(()) };
     let (x, y) = (first % read.width as usize, first / read.width as usize);
     let count = read.texels.len();
-    if (infinite + none + bright) as f64 > MOST_CLAMPED * count as f64 && infinite + none + bright > 1 {
+    // Numbers that are too great may be those of another unit, and are told; the others are damage.
+    if (infinite + none) as f64 > MOST_CLAMPED * count as f64 && infinite + none > 1 {
         let problem = format!(
-            "is the first of {} of {count} texels that are infinite, no numbers or beyond {MAX_RADIANCE:e} after scaling: the \
-             picture is damaged",
-            infinite + none + bright
+            "is the first of {} of {count} texels that are infinite or no numbers: the picture is damaged",
+            infinite + none
         );
         return Err(SceneError::broken(format!("texel {x}, {y}"), problem));
     }
@@ -518,8 +518,14 @@ mod tests {
     #[test]
     fn hostile_images_are_refused_with_reasons() {
         let of = |value: f32| pfm("1 2", "-1", &[1.0, value, 1.0, 1.0, value, 2.0].map(f32::to_le_bytes));
-        assert!(refused(&of(f32::NAN)).contains("texel 0, 0") && refused(&of(1e30)).contains("2 of 2"));
-        assert!(refused(&of(f32::INFINITY)).contains("damaged"));
+        assert!(
+            refused(&of(f32::NAN)).contains("texel 0, 0") && refused(&of(f32::INFINITY)).contains("2 of 2")
+        );
+        // A picture of another unit has nothing but such light.
+        let bright = decode_environment(&of(1e30), 0.0, 1.0).unwrap();
+        let told = bright.warnings.join(" ");
+        assert!(told.contains("2 texels") && told.contains("beyond 1e9"), "{told}");
+        assert_eq!(texels(&of(1e30)).2[1], Vec3::new(1.0, MAX_RADIANCE, 2.0));
         assert!(refused(&pfm("65535 65535", "-1", &[])).contains("limit"));
         assert!(refused(&pfm("4 4", "-1", &[])).contains("cut off"));
         assert!(refused(&pfm("0 4", "-1", &[])).contains("at least 1"));

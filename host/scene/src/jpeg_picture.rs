@@ -100,8 +100,9 @@ impl Frame {
         }
         let mut decoder = Decoder::new(bytes);
         decoder.set_max_decoding_buffer_size(usize::try_from(allowed).unwrap_or(usize::MAX));
-        if as_stored {
-            decoder.set_color_transform(ColorTransform::None);
+        if as_stored && self.sampling.len() == 3 {
+            // As they are: without any conversion it gives rows of one colour after the other, and leaves the buffer.
+            decoder.set_color_transform(ColorTransform::RGB);
         }
         // A decoder that panics leaves its picture out, and not the scene.
         let decode = std::panic::AssertUnwindSafe(|| {

@@ -1,11 +1,12 @@
 //! BMP as the decoder of `image` takes them: with a header of Windows in the place of one of OS/2, and without runs, whose damage
 //! ends a decoder that others go on with.
 
-/// A BMP that is the same picture, where it has to be another file: `allowed` is the greatest piece of memory in bytes.
-pub(super) fn plain(bytes: &[u8], allowed: u64) -> Option<Vec<u8>> {
+/// A BMP that is the same picture, where it has to be another file, with what should be said of it. `allowed` is the greatest piece
+/// of memory in bytes.
+pub(super) fn plain(bytes: &[u8], allowed: u64) -> Option<(Vec<u8>, Option<String>)> {
     let of_windows = without_os2(bytes);
     let bytes = of_windows.as_deref().unwrap_or(bytes);
-    without_runs(bytes, allowed).or(of_windows)
+    without_runs(bytes, allowed).or(of_windows.map(|file| (file, None)))
 }
 
 fn number(bytes: &[u8], at: usize) -> Option<u32> {
@@ -31,7 +32,7 @@ fn without_os2(bytes: &[u8]) -> Option<Vec<u8>> {
 }
 
 /// Places in a list of colours, packed as runs of 8 or 4 bits, as bytes. What is missing or damaged is the first colour.
-fn without_runs(bytes: &[u8], allowed: u64) -> Option<Vec<u8>> {
+fn without_runs(bytes: &[u8], allowed: u64) -> Option<(Vec<u8>, Option<String>)> {
     let [header, place, width, height, packing] = [14, 10, 18, 22, 30].map(|at| number(bytes, at));
     let (header, place, width, height) = (header? as usize, place? as usize, width?, height?);
     let bits = number(bytes, 28)? & 0xffff;
@@ -49,16 +50,22 @@ fn without_runs(bytes: &[u8], allowed: u64) -> Option<Vec<u8>> {
     out[30..38].fill(0);
     out[46..50].copy_from_slice(&(colours as u32).to_le_bytes());
     out.resize(place + texels, 0);
-    unpack(&bytes[place..], bits, [width as usize, height as usize], &mut out[place..]);
-    Some(out)
+    let (beyond, is_ended) =
+        unpack(&bytes[place..], bits, [width as usize, height as usize], &mut out[place..]);
+    let end = if is_ended { "" } else { ", and its end is missing" };
+    let told = format!("{beyond} texels of its runs lie outside of the picture{end}: the BMP is damaged");
+    Some((out, (beyond > 0 || !is_ended).then_some(told)))
 }
 
-fn unpack(packed: &[u8], bits: u32, [width, height]: [usize; 2], out: &mut [u8]) {
+/// Returns how many texels lay outside, and whether the end was there.
+fn unpack(packed: &[u8], bits: u32, [width, height]: [usize; 2], out: &mut [u8]) -> (usize, bool) {
     let stride = width.next_multiple_of(4);
-    let (mut x, mut y, mut rest) = (0, 0, packed);
+    let (mut x, mut y, mut rest, mut beyond) = (0, 0, packed, 0);
     let mut put = |x: usize, y: usize, code: u8| {
         if x < width && y < height {
             out[y * stride + x] = code;
+        } else {
+            beyond += 1;
         }
     };
     // Place `i` of a run or of codes that are stored one by one.
@@ -71,10 +78,13 @@ fn unpack(packed: &[u8], bits: u32, [width, height]: [usize; 2], out: &mut [u8])
         rest = after;
         match (*first, *second) {
             (0, 0) => (x, y) = (0, y + 1),
-            (0, 1) => break,
+            (0, 1) => return (beyond, true),
             (0, 2) => {
                 let [right, up, after @ ..] = rest else { break };
                 (x, y, rest) = (x + usize::from(*right), y + usize::from(*up), after);
+                if y >= height {
+                    break;
+                }
             }
             (0, count) => {
                 let count = usize::from(count);
@@ -93,8 +103,10 @@ fn unpack(packed: &[u8], bits: u32, [width, height]: [usize; 2], out: &mut [u8])
                 x += usize::from(count);
             }
         }
+        // Some programs leave the end out.
         if y >= height {
-            break;
+            return (beyond, true);
         }
     }
+    (beyond, y + 1 == height && x >= width)
 }

@@ -88,12 +88,27 @@ pub(super) fn decode(
     if format == ImageFormat::Tiff {
         return tiff(item, bytes, &room);
     }
-    let rewritten = if format == ImageFormat::Bmp { bmp::plain(bytes, room.bytes) } else { None };
-    let bytes = rewritten.as_deref().unwrap_or(bytes);
+    if let Some((plain, told)) = (format == ImageFormat::Bmp).then(|| bmp::plain(bytes, room.bytes)).flatten()
+    {
+        let mut picture = of_image(item, &plain, format, &room, limits)?;
+        picture.notes.extend(told);
+        return Ok(picture);
+    }
     let frame = Frame::of(bytes).filter(|_| format == ImageFormat::Jpeg);
     if let Some(picture) = frame.and_then(|frame| jpeg(item, bytes, &frame, &room, limits).transpose()) {
         return picture;
     }
+    of_image(item, bytes, format, &room, limits)
+}
+
+/// A picture by the decoders of `image`.
+fn of_image(
+    item: &Item,
+    bytes: &[u8],
+    format: ImageFormat,
+    room: &Room,
+    limits: &Limits,
+) -> Result<Picture, SceneError> {
     let mut reader = ImageReader::with_format(Cursor::new(bytes), format);
     reader.limits(of_header());
     let failed = |e: image::ImageError| item.error(format!("cannot be decoded: {e}"));
@@ -109,7 +124,7 @@ pub(super) fn decode(
     let decoded = std::panic::catch_unwind(decode)
         .map_err(|_| item.error("cannot be decoded: its decoder failed; save it as PNG"))?
         .map_err(failed)?;
-    Ok(of_decoded(decoded, size, &room))
+    Ok(of_decoded(decoded, size, room))
 }
 
 /// A JPEG of an odd kind, or one that takes more than it may with all of its texels; `None` where the decoder of all others reads

@@ -132,13 +132,19 @@ fn a_jpeg_too_large_for_its_file_is_read_at_half_its_sides() {
     assert!(scene.warnings.join("\n").contains("3000 x 3000 of its 6000 x 6000"), "{:?}", scene.warnings);
 }
 
-/// A TIFF of the time before JPEG had a number of its own there.
-#[test]
-fn a_jpeg_file_in_a_tiff_is_read_by_its_own_marks() {
-    let file = jpeg([&FINE, &COARSE, &[128; 2]], [0x22, 0x11, 0x11], &[&[0, 1, 2]]);
-    // The directory says that the colours are RGB, and the JPEG that they are not.
-    let tags: [(u16, u32); 8] =
-        [(256, 32), (257, 16), (258, 8), (259, 6), (262, 2), (277, 3), (278, 16), (513, 110)];
+/// The head of a TIFF of 32 x 16 texels, packed in this way and of this kind of colours; what is behind it is named by a tag.
+fn directory([packing, colours]: [u32; 2], place: u16) -> Vec<u8> {
+    let mut tags = vec![
+        (256, 32),
+        (257, 16),
+        (258, 8),
+        (259, packing),
+        (262, colours),
+        (277, 3),
+        (278, 16),
+        (place, 110),
+    ];
+    tags.sort_unstable();
     let mut tiff = b"II*\0\x08\0\0\0\x08\0".to_vec();
     for (tag, value) in tags {
         tiff.extend([tag.to_le_bytes(), 4u16.to_le_bytes()].concat());
@@ -146,6 +152,31 @@ fn a_jpeg_file_in_a_tiff_is_read_by_its_own_marks() {
     }
     tiff.extend([0; 4]);
     assert_eq!(tiff.len(), 110);
+    tiff
+}
+
+/// A strip that is a JPEG has colours in the order of the directory, whatever the order of its scans.
+#[test]
+fn a_jpeg_in_a_tiff_is_the_same_in_one_scan_and_in_one_for_each_colour() {
+    let file = |scans: &[&[usize]]| {
+        let picture = jpeg([&FINE, &COARSE, &[100, 180]], [0x22, 0x11, 0x11], scans);
+        texels(&[directory([7, 6], 273), picture].concat()).1
+    };
+    let off: Vec<f64> = file(&[&[0, 1, 2]])
+        .iter()
+        .zip(file(&[&[0], &[1], &[2]]))
+        .flat_map(|(a, b)| (0..3).map(move |c| f64::from(a[c].abs_diff(b[c]))))
+        .collect();
+    let mean = off.iter().sum::<f64>() / off.len() as f64;
+    assert!(mean < 2.0, "{mean}");
+}
+
+/// A TIFF of the time before JPEG had a number of its own there.
+#[test]
+fn a_jpeg_file_in_a_tiff_is_read_by_its_own_marks() {
+    let file = jpeg([&FINE, &COARSE, &[128; 2]], [0x22, 0x11, 0x11], &[&[0, 1, 2]]);
+    // The directory says that the colours are RGB, and the JPEG that they are not.
+    let tiff = directory([6, 2], 513);
     assert_eq!(texels(&[&tiff[..], &file].concat()), texels(&file));
     // Tables without a picture are refused by name, and are not read as something else.
     let tables = file.windows(2).position(|mark| mark == [0xff, 0xda]).unwrap();
@@ -198,7 +229,14 @@ fn a_bmp_of_runs_is_read_as_far_as_it_is_there() {
     // Cut off within codes, a run that leaves its row, and a step out of the picture.
     assert_eq!(shown(&file(8, &whole[..11])), "111222 123000 000000");
     assert_eq!(shown(&file(8, &[9, 1, 0, 0, 6, 2, 0, 0, 6, 3])), "111111 222222 333333");
-    assert_eq!(shown(&file(8, &[6, 1, 0, 2, 0, 200, 6, 2, 0, 1])), "111111 000000 000000");
+    let outside = file(8, &[6, 1, 0, 2, 0, 200, 6, 2, 0, 1]);
+    assert_eq!(shown(&outside), "111111 000000 000000");
+    let told = |file: &[u8]| load(&with_image(file).bytes()).warnings.join("\n");
+    assert!(told(&outside).contains("its end is missing"), "{}", told(&outside));
+    let wide = told(&file(8, &[9, 1, 0, 0, 6, 2, 0, 0, 6, 3]));
+    assert!(wide.contains("3 texels of its runs lie outside of the picture: the BMP"), "{wide}");
+    assert!(told(&file(8, &whole[..11])).contains("its end is missing"), "{}", told(&file(8, &whole[..11])));
+    assert_eq!(told(&file(8, &whole)), "");
 }
 
 /// Large pictures cost detail, and not the scene.
