@@ -8,6 +8,11 @@ use jpeg_decoder::{ColorTransform, Decoder, PixelFormat};
 /// Scans of a progressive picture that are decoded; each costs time for the whole picture.
 const MOST_SCANS: usize = 100;
 
+/// Whether a JPEG is of a kind that `zune-jpeg`, and with it `image`, misreads or panics at. The marks before its data are read.
+pub fn is_odd_jpeg(bytes: &[u8]) -> bool {
+    Frame::read(bytes, 1).is_some_and(|frame| frame.is_odd())
+}
+
 /// What the header of a JPEG says.
 pub(crate) struct Frame {
     /// 0 and 1: sequential, 2: progressive, 3: without loss.
@@ -23,6 +28,11 @@ pub(crate) struct Frame {
 impl Frame {
     /// Reads the marks of a file; `None` where they make no picture.
     pub(crate) fn of(bytes: &[u8]) -> Option<Self> {
+        Self::read(bytes, usize::MAX)
+    }
+
+    /// The same up to so many scans.
+    fn read(bytes: &[u8], most_scans: usize) -> Option<Self> {
         let mut frame: Option<Self> = None;
         let mut rest = bytes.strip_prefix(&[0xff, 0xd8])?;
         while let Some(at) = rest.iter().position(|byte| *byte == 0xff) {
@@ -44,7 +54,13 @@ impl Frame {
                 // Tables of codes and of arithmetic coding stand between the frames.
                 0xc4 | 0xc8 | 0xcc => {}
                 0xc0..=0xcf if frame.is_none() => frame = Some(Self::of_header(mark - 0xc0, content)?),
-                0xda => frame.as_mut()?.scans.push(usize::from(*content.first()?)),
+                0xda => {
+                    let scans = &mut frame.as_mut()?.scans;
+                    scans.push(usize::from(*content.first()?));
+                    if scans.len() == most_scans {
+                        break;
+                    }
+                }
                 _ => {}
             }
             rest = &after[length..];
@@ -164,6 +180,7 @@ mod tests {
         for (kind, colours, scans, odd) in cases {
             let bytes = file(kind, colours, scans);
             let frame = Frame::of(&bytes).unwrap();
+            assert_eq!(is_odd_jpeg(&bytes), odd);
             assert_eq!((frame.is_odd(), frame.sides), (odd, [9, 5]), "{kind} {colours:?} {scans:?}");
             assert!(frame.has_scan() && frame.scans.len() == scans.len());
             // No part of it makes the reader of marks fall.

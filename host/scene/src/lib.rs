@@ -57,6 +57,7 @@ pub use deforming::{Deformed, DeformingMesh};
 pub use environment::decode_environment;
 pub use environment::{load_environment, Sky};
 pub use error::SceneError;
+pub use jpeg_picture::is_odd_jpeg;
 pub use limits::Limits;
 pub use linear_picture::{load_linear_picture, LinearPicture};
 pub use live_pictures::{LivePicture, LivePictures};
