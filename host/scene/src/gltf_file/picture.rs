@@ -114,7 +114,7 @@ fn of_image(
     let failed = |e: image::ImageError| item.error(format!("cannot be decoded: {e}"));
     let decoder = reader.into_decoder().map_err(failed)?;
     let (width, height) = image::ImageDecoder::dimensions(&decoder);
-    let size = Size { width, height }.not_empty(item)?;
+    let size = room.admitted(item, Size { width, height })?;
     check_decoded(item, bytes, image::ImageDecoder::total_bytes(&decoder), limits)?;
     let mut bounded = ImageReader::with_format(Cursor::new(bytes), format);
     // 16-bit RGBA is the widest decoded format.
@@ -137,7 +137,7 @@ fn jpeg(
     limits: &Limits,
 ) -> Result<Option<Picture>, SceneError> {
     let [width, height] = frame.sides;
-    let size = Size { width, height }.not_empty(item)?;
+    let size = room.admitted(item, Size { width, height })?;
     let sides = match frame.sides_within(room.bytes) {
         Some(sides) if frame.is_odd() || sides != frame.sides => sides,
         None if frame.is_odd() => {
@@ -157,7 +157,12 @@ struct Room {
     texels: u64,
     /// Texels along a side.
     side: u32,
+    /// Texels that a file of its length may store: each costs time.
+    stored: u64,
 }
+
+/// Texels for each byte of a file that may have more than the limit: a JPEG of a smooth picture has some forty.
+const MOST_IN_A_BYTE: u64 = 64;
 
 impl Room {
     fn of(item: &Item, bytes: &[u8], texels_so_far: u64, limits: &Limits) -> Result<Self, SceneError> {
@@ -166,7 +171,19 @@ impl Room {
             let limit = limits.texels;
             return Err(item.error(format!("has no room: all textures together may have {limit} texels")));
         }
-        Ok(Self { bytes: allowed(bytes, limits), texels, side: limits.texture_side })
+        let stored = limits.texels.max(MOST_IN_A_BYTE.saturating_mul(bytes.len() as u64));
+        Ok(Self { bytes: allowed(bytes, limits), texels, side: limits.texture_side, stored })
+    }
+
+    fn admitted(&self, item: &Item, size: Size) -> Result<Size, SceneError> {
+        let Size { width, height } = size.not_empty(item)?;
+        if u64::from(width) * u64::from(height) > self.stored {
+            let most = self.stored;
+            return Err(item.error(format!(
+                "says that it has {width} x {height} texels; so short a file may have {most}: use a smaller picture"
+            )));
+        }
+        Ok(size)
     }
 
     /// The sides of the squares whose means are read so that a picture fits. `width_of_texel`: bytes of each square for steps of
@@ -223,7 +240,7 @@ fn as_rgba(decoded: image::DynamicImage, room: &Room) -> (Size, Vec<[u8; 4]>) {
 fn tiff(item: &Item, bytes: &[u8], room: &Room) -> Result<Picture, SceneError> {
     let file = Tiff::open(bytes).map_err(|e| item.error(e))?;
     let [width, height] = file.sides();
-    let stored = Size { width, height }.not_empty(item)?;
+    let stored = room.admitted(item, Size { width, height })?;
     let allowed = room.bytes;
     // Sums of means are four times as wide as texels.
     let step = room.step(stored, [4, 16]);
