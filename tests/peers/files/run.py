@@ -33,7 +33,7 @@ OTHERS = {".ktx2", ".yml", ".yaml", ".xml", ".json", ".gz", ".zip", ".mpcdi", ".
 LARGEST = 20 << 20
 # What a note says where dpm reads a file otherwise than others on purpose; a difference without one of these is silent.
 REASONS = ["without area", "it is read with", "missing and black", "cut off there", "play", "left out", "primaries", "no light",
-           "sampled anew", "hides", "moved by as much", "is skipped", "in every frame"]
+           "sampled anew", "hides", "moved by as much", "is skipped", "in every frame", "is damaged"]
 
 
 def prepare(work):
