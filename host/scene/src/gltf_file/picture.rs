@@ -180,7 +180,7 @@ impl Room {
         if u64::from(width) * u64::from(height) > self.stored {
             let most = self.stored;
             return Err(item.error(format!(
-                "says that it has {width} x {height} texels; so short a file may have {most}: use a smaller picture"
+                "says that it has {width} x {height} texels, and the limit of so short a file is {most}: use a smaller picture"
             )));
         }
         Ok(size)
