@@ -179,7 +179,10 @@ impl Cadence {
         self.count += 1;
         self.sum_ns += interval_ns;
         self.longest_ns = self.longest_ns.max(interval_ns);
-        self.outlast(interval_ns, now);
+        if self.due_before.is_none() {
+            // Nothing was reported of when light began. What was must not count twice.
+            self.outlast(interval_ns, now);
+        }
         if interval_ns > (self.steady_slots() as i64 + LIGHT_RESERVE_SLOTS) * self.slot_ns {
             self.flicker = (self.flicker.0 + 1, self.flicker.1 + interval_ns);
         } else {
@@ -404,6 +407,23 @@ mod tests {
             cadence.sent(HostTime(now));
         }
         assert_eq!(cadence.outlasted, 0);
+    }
+
+    /// One stall, however long, makes no light last longer, whether the device reports of its light or not.
+    #[test]
+    fn one_stall_decides_nothing_about_light() {
+        for reports in [false, true] {
+            let mut cadence = Cadence::new(SLOT);
+            let mut now = 0;
+            for frame in 0..2_000 {
+                now += if frame == 1_000 { 200 * SLOT } else { SLOT };
+                cadence.sent(HostTime(now));
+                if reports {
+                    cadence.lit([HostTime(now + SLOT), HostTime(now + SLOT)]);
+                }
+                assert_eq!(cadence.light_slots(), 1, "{reports}, frame {frame}");
+            }
+        }
     }
 
     #[test]
