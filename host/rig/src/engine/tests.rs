@@ -350,7 +350,7 @@ impl Transport for Narrow {
 }
 
 /// What became of the light over a narrow cable.
-struct Carried {
+struct NarrowLight {
     status: Status,
     /// Dark slots until the end of the first second, and until the end.
     dark: [u32; 2],
@@ -360,7 +360,7 @@ struct Carried {
 }
 
 /// 4 s of bright frames over a cable that takes so many tenths of a slot for each.
-fn carried(tenths: i64, is_even: bool) -> Carried {
+fn carried(tenths: i64, is_even: bool) -> NarrowLight {
     let mut bench = bench_with(&["real_time.pace=\"real\""], RunOptions::default(), 4);
     let (mut plan, mut stage) = (bench.plan::<Real>(), bench.link::<Real>());
     let frame_ns = tenths * bench.slot_ns / 10;
@@ -394,7 +394,7 @@ fn carried(tenths: i64, is_even: bool) -> Carried {
         }
     }
     let status = medium.cable.device_mut().projector().status();
-    Carried { status, dark, slots: bench.facts.slots_a_frame.load(Ordering::Relaxed), rested }
+    NarrowLight { status, dark, slots: bench.facts.slots_a_frame.load(Ordering::Relaxed), rested }
 }
 
 /// Light is steady, at every n-th slot, over a cable that carries no frame for each slot: after a quarter of a second no slot
@@ -402,7 +402,7 @@ fn carried(tenths: i64, is_even: bool) -> Carried {
 #[test]
 fn a_cable_slower_than_its_slots_carries_every_nth_frame_steadily() {
     for tenths in [15, 125] {
-        let Carried { status, dark, slots, rested } = carried(tenths, true);
+        let NarrowLight { status, dark, slots, rested } = carried(tenths, true);
         let fits = (tenths as u64).div_ceil(10);
         assert_eq!((status.state, status.faults, rested), (DeviceState::Armed, 0, 0), "{tenths}");
         assert!((fits - fits / 4..=fits).contains(&slots), "{tenths}: {slots} slots a frame");
@@ -416,7 +416,7 @@ fn a_cable_slower_than_its_slots_carries_every_nth_frame_steadily() {
 #[test]
 fn a_cable_that_is_slow_and_uneven_carries_light_without_a_flicker() {
     for tenths in [30, 60] {
-        let Carried { status, dark, rested, slots } = carried(tenths, false);
+        let NarrowLight { status, dark, rested, slots } = carried(tenths, false);
         assert_eq!((status.state, status.faults, rested), (DeviceState::Armed, 0, 0), "{tenths}: {slots}");
         let (blank, all) = (u64::from(dark[1] - dark[0]), 3 * 947);
         assert!(50 * blank < all, "{tenths}: {blank} dark slots, {slots} slots a frame");
