@@ -140,8 +140,11 @@ fn a_renderer_slower_than_its_slots_lights_every_nth_slot_in_time() {
                 return Err(format!("registration p99 {} px", error.p99));
             }
             let told: Vec<String> = monitor.take_notes();
+            // Software Vulkan fills all cores: where other programs do too, that is what holds frames up.
+            let says_why =
+                |n: &String| n.contains("slower than its slots") || n.contains("short of processor");
             told.iter()
-                .any(|n| n.contains("slower than its slots"))
+                .any(|n| says_why(n) && n.contains("one frame per"))
                 .then_some(())
                 .ok_or_else(|| format!("the rate is not said: {told:?}"))
         });
