@@ -1,5 +1,5 @@
 //! The mocks of [`dpm_mock`] for other programs, over USB/IP, pseudo-terminals, UDP and TCP, and mocks of devices that the
-//! controller itself needs not: a TI DLPC900 and a wand with a light sensor.
+//! controller itself needs not: a TI DLPC900, Pupil Capture and a wand with a light sensor.
 //!
 //! Reading order: [`usb_model`] is a USB device, [`usb_plug`] its cable, [`usbip`] the cable to another kernel.
 
@@ -10,6 +10,7 @@ pub use dpm_mock::{
 
 pub mod dlpc900;
 pub mod projector;
+pub mod pupil;
 pub mod sensor_wand;
 pub mod usb_model;
 pub mod usb_plug;

@@ -1,7 +1,7 @@
 //! Feeds arbitrary bytes to every decoder of external input. Each decoder has one entry, with the laws that hold for
 //! all bytes. The fuzz targets in `fuzz/` and the test over the committed seeds call the same entries.
 
-use crate::conversations::{link, sensor, trackers, usb};
+use crate::conversations::{gaze, link, sensor, trackers, usb};
 use dpm_camera_files::{self as camera_files, Form, LengthUnit, LensKind, ReadOptions, StorageError};
 use dpm_device::clock_map::{ClockMap, ExchangeOutcome};
 use dpm_device::cobs::{encode, encoded_bytes, Deframer};
@@ -31,7 +31,7 @@ use std::path::Path;
 pub type Entry = fn(&[u8]);
 
 /// Every entry with the name of its fuzz target, which is also the name of its folder of seeds.
-pub const ALL: [(&str, Entry); 41] = [
+pub const ALL: [(&str, Entry); 43] = [
     ("link_stream", link_stream),
     ("link_rle", link_rle),
     ("link_tracks", link_tracks),
@@ -60,6 +60,8 @@ pub const ALL: [(&str, Entry); 41] = [
     ("natnet_server", trackers::natnet_server),
     ("vrpn_client", trackers::vrpn_client),
     ("vrpn_server", trackers::vrpn_server),
+    ("pupil_stream", gaze::pupil_stream),
+    ("pupil_gaze", gaze::pupil_gaze),
     ("serial_client", trackers::serial_client),
     ("serial_device", trackers::serial_device),
     ("sensor_client", sensor::sensor_client),

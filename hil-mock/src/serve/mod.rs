@@ -7,6 +7,7 @@ mod lit_camera;
 mod natnet;
 mod orders;
 mod projector;
+mod pupil;
 mod sensor_wand;
 mod serial;
 mod usb;
@@ -30,6 +31,8 @@ pub(crate) enum Device {
     Natnet(natnet::NatNetArguments),
     /// Bit-plane projector: a USB device over USB/IP, or on a serial port or pseudo-terminal
     Projector(projector::ProjectorArguments),
+    /// Pupil Capture with eyes that look about: gaze over ZeroMQ
+    Pupil(pupil::PupilArguments),
     /// Tracked wand with a light sensor in the beam of a bit-plane projector: projector, NatNet server and sensor in one
     SensorWand(Box<sensor_wand::SensorWandArguments>),
     /// Serial pose stream on a port or a pseudo-terminal
@@ -82,6 +85,7 @@ pub(crate) fn run(device: Device) -> Result<(), Box<dyn Error>> {
         Device::LitCamera(arguments) => lit_camera::run(&arguments),
         Device::Natnet(arguments) => natnet::run(&arguments),
         Device::Projector(arguments) => projector::run(&arguments),
+        Device::Pupil(arguments) => pupil::run(&arguments),
         Device::SensorWand(arguments) => sensor_wand::run(&arguments),
         Device::Serial(arguments) => serial::run(&arguments),
         Device::Vrpn(arguments) => vrpn::run(&arguments),

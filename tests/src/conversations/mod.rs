@@ -2,6 +2,7 @@
 //! with the session, the stamps and the checksums that a fuzzer would not guess, so that the code behind these is
 //! reached; what a conversation patches in stands at its head.
 
+pub mod gaze;
 pub mod link;
 pub mod sensor;
 pub mod trackers;

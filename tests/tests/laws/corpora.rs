@@ -13,6 +13,7 @@ use dpm_device::picture_stream::PictureHeader;
 use dpm_device::planes::Raster;
 use dpm_device::sensor::wire::{BlockHead, LevelBits, Levels, SensorMessage, MAX_FRAME};
 use dpm_device::time::DeviceTicks;
+use dpm_device::time::FrameRate;
 use dpm_device::tracker::natnet::frame::{encode_frame, FrameContent, FrameInfo, RigidBody};
 use dpm_device::tracker::natnet::messages::{encode_echo_response, encode_request};
 use dpm_device::tracker::natnet::Version;
@@ -21,7 +22,9 @@ use dpm_device::tracker::serial::wire::SerialMessage;
 use dpm_device::tracker::vrpn::wire as vrpn;
 use dpm_dlpc900::command::{Command, Opcode};
 use dpm_dlpc900::image::{self, Compression, PlaneOrder};
+use dpm_pupil::zmtp::{put_message, put_subscription, put_words, Peer, SocketKind};
 use dpm_tests::decoders::ALL;
+use hil_mock::pupil::messages::PupilConfig;
 use hil_mock::usbip::wire as usbip;
 use serde_json::json;
 use std::path::PathBuf;
@@ -164,6 +167,7 @@ fn made() -> Vec<(&'static str, &'static str, Vec<u8>)> {
     seeds.push(("host_link", "answers", answers));
     let rig = b"[projector]\nframe_rate = \"60000/1001\"\n[[scene.bodies]]\nname = \"a\"\n".to_vec();
     seeds.push(("texts", "rig.toml", rig));
+    seeds.extend(gaze());
     seeds.extend(calibrations());
     seeds.extend(dpm_tests::conversations::recorded());
     seeds.extend(words());
@@ -176,6 +180,46 @@ fn made() -> Vec<(&'static str, &'static str, Vec<u8>)> {
         seeds.push(("tracker_kinds", name, [&[k][..], &bytes].concat()));
     }
     seeds
+}
+
+/// A dialogue of ZMTP by each end, and answers and messages of Pupil with a blink.
+fn gaze() -> Vec<(&'static str, &'static str, Vec<u8>)> {
+    let pupil = PupilConfig { rate: FrameRate::new(10, 1).expect("above 0"), ..PupilConfig::default() };
+    let mut data = vec![4];
+    let mut script = Vec::new();
+    let mut step = |what: u8, ms: u8, bytes: &[u8]| {
+        let bytes = &bytes[..bytes.len().min(255)];
+        script.extend_from_slice(&[&[what, ms, bytes.len() as u8], bytes].concat());
+    };
+    for k in 100..104u64 {
+        let time = format!("{:?}", pupil.clock_s(pupil.seen_ns(k)));
+        step(0, 2, time.as_bytes());
+        for (topic, payload) in pupil.messages(k, 0.0) {
+            put_message(&[topic.as_bytes(), &payload], &mut data);
+            step(1, 20, &payload);
+        }
+    }
+    // A map of what is needed and nothing else: it fits into a step.
+    let short =
+        b"\x85\xa9timestamp\xcb\x40\xb3\x92\x80\0\0\0\0\xaaconfidence\x01\xadgaze_point_3d\x93\0\0\x7f\
+        \xadeye_center_3d\x93\0\0\0\xaegaze_normal_3d\x93\0\0\x01";
+    step(0, 1, b"5010.5");
+    step(1, 1, short);
+    let mut asks = vec![7];
+    put_words(b"SUB_PORT", &mut asks);
+    put_words(b"t", &mut asks);
+    let mut wants = vec![5];
+    put_subscription(b"gaze", &mut wants);
+    wants.extend_from_slice(b"\x04\x0e\x09SUBSCRIBEgaze\x04\x09\x04PING\0\x64hi");
+    let mut greets = vec![0];
+    Peer::new(SocketKind::Pub, &mut greets);
+    vec![
+        ("pupil_stream", "data", data),
+        ("pupil_stream", "asks", asks),
+        ("pupil_stream", "wants", wants),
+        ("pupil_stream", "greets", greets),
+        ("pupil_gaze", "samples", script),
+    ]
 }
 
 /// Calibration files as OpenCV writes them, and one of MPCDI.
