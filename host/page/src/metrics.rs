@@ -4,6 +4,7 @@
 
 use crate::state::State;
 use dpm_rig::control::rig_name;
+use dpm_rig::gaze::GazeReport;
 use dpm_rig::order::Order;
 use dpm_rig::plan::dark::DarkCause;
 use dpm_rig::telemetry::histogram_steps::UPPER_NS;
@@ -53,6 +54,11 @@ families! {
     REGISTRATION = "dpm_registration_error_pixels", "gauge", "Distance of light from its place in projector pixels; only with a mock tracker";
     PICTURES = "dpm_live_pictures_total", "counter", "Pictures of another program that the body was given (scene.bodies[].texture)";
     TRACKER = "dpm_tracker_samples_total", "counter", "Samples of the tracker by what became of them; lost ones never came";
+    GAZE = "dpm_gaze_samples_total", "counter", "Samples of the device that measures the observer's gaze, by what became of them";
+    GAZE_AGE = "dpm_gaze_age_seconds", "gauge", "Age of the newest gaze that was used; absent before the first";
+    GAZE_RATE = "dpm_gaze_samples_per_second", "gauge", "Samples of gaze that were used in the last second";
+    GAZE_FRAMES = "dpm_gaze_frames_total", "counter", "Frames by where their gaze was from: measured, or the axis of the glasses";
+    GAZE_RECONNECTS = "dpm_gaze_reconnects_total", "counter", "Connections to the device after the first";
     SESSIONS = "dpm_link_sessions_total", "counter", "Sessions opened with the projector";
     REARMED = "dpm_link_rearmed_total", "counter", "Times that light came back after the watchdog or damaged packets";
     SENT = "dpm_link_sent_bytes_total", "counter", "Bytes handed to the medium";
@@ -76,6 +82,7 @@ pub(crate) fn text(state: &State) -> String {
         out.value(&[("body", body)], *count as f64);
     }
     tracker(&mut out, state.tracker.as_ref());
+    gaze(&mut out, state.gaze.as_ref());
     link(&mut out, &state.carried);
     out.family(CELSIUS);
     if let Some(celsius) = state.carried.celsius {
@@ -126,6 +133,27 @@ fn tracker(out: &mut Out, told: Option<&TrackerReport>) {
     ] {
         out.value(&[("fate", fate)], n as f64);
     }
+}
+
+fn gaze(out: &mut Out, told: Option<&GazeReport>) {
+    out.family(GAZE);
+    for (fate, n) in told.iter().flat_map(|g| {
+        ["used", "unsure", "refused", "ill_timed"].into_iter().zip([g.used, g.unsure, g.refused, g.ill_timed])
+    }) {
+        out.value(&[("fate", fate)], n as f64);
+    }
+    out.family(GAZE_AGE);
+    if let Some(age_ms) = told.and_then(|g| g.age_ms) {
+        out.value(&[], age_ms * 1e-3);
+    }
+    out.family(GAZE_RATE);
+    told.iter().for_each(|g| out.value(&[], g.rate_hz));
+    out.family(GAZE_FRAMES);
+    for (by, n) in told.iter().flat_map(|g| [("measured", g.frames_measured), ("axis", g.frames_without)]) {
+        out.value(&[("by", by)], n as f64);
+    }
+    out.family(GAZE_RECONNECTS);
+    told.iter().for_each(|g| out.value(&[], g.reconnects as f64));
 }
 
 /// What is known of a run without a collector, or before its first figures.

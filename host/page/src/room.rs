@@ -46,8 +46,8 @@ pub(crate) fn places(shared: &RunView) -> Option<Value> {
     let live = shared.monitor.live();
     let rig = live.rig()?;
     // Before the first frame the bodies stand where the rig file puts them.
-    let tracked =
-        live.drawn(None).map(|drawn| drawn.poses).filter(|poses| poses.len() == rig.tracked_count());
+    let drawn = live.drawn(None).filter(|drawn| drawn.poses.len() == rig.tracked_count());
+    let (tracked, seen) = drawn.map(|drawn| (drawn.poses, drawn.gaze)).unzip();
     let tracked = tracked.unwrap_or_else(|| rig.bodies.iter().map(|body| affine(&body.rest)).collect());
     let t_ns = live.snapshot().map_or(0, |figures| figures.frame.due_at.0);
     let mut poses = Vec::new();
@@ -58,7 +58,7 @@ pub(crate) fn places(shared: &RunView) -> Option<Value> {
         "bodies": poses.iter().map(columns).collect::<Vec<_>>(),
         "projector": columns(&projector),
         "eye": rounded(eye),
-        "gaze": rounded(gaze),
+        "gaze": rounded(seen.unwrap_or(gaze)),
     }))
 }
 

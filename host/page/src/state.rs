@@ -2,6 +2,7 @@
 
 use crate::shared::RunView;
 use dpm_rig::control::rig_name;
+use dpm_rig::gaze::GazeReport;
 use dpm_rig::plan::dark::DarkCause;
 use dpm_rig::telemetry::histogram_steps::UPPER_NS;
 use dpm_rig::telemetry::light_state::LightState;
@@ -64,6 +65,8 @@ pub(crate) struct State {
     pub carried: ProjectorReport,
     /// What became of the tracker's samples; `None` before the first ones.
     pub tracker: Option<TrackerReport>,
+    /// Where a device sees the observer look; `None` where none measures it.
+    pub gaze: Option<GazeReport>,
     /// The bodies that show another program's pictures, and how many of them have come.
     pub pictures: Vec<(String, u64)>,
     setup: Value,
@@ -94,9 +97,18 @@ impl State {
         let pictures = monitor.live().rig().map_or(Vec::new(), |rig| {
             rig.live_pictures().map(|(body, _, pictures)| (body.to_owned(), pictures.count())).collect()
         });
-        let tracker = monitor.sample_counts();
+        let (tracker, gaze) = (monitor.sample_counts(), monitor.gaze().report());
         let bodies = monitor.bodies().into_iter().map(|(name, dark)| (name.to_owned(), dark)).collect();
-        Self { now, bodies, figures, carried: monitor.carried(), tracker, pictures, setup: setup(shared) }
+        Self {
+            now,
+            bodies,
+            figures,
+            carried: monitor.carried(),
+            tracker,
+            gaze,
+            pictures,
+            setup: setup(shared),
+        }
     }
 
     pub(crate) fn to_json(&self) -> StateJson<'_> {
@@ -104,6 +116,7 @@ impl State {
         figures["setup"] = self.setup.clone();
         figures["link"] = json!(self.carried);
         figures["tracker"] = json!(self.tracker);
+        figures["gaze"] = json!(self.gaze);
         StateJson { now: &self.now, figures }
     }
 

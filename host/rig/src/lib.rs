@@ -37,6 +37,8 @@ pub mod drive;
 mod engine;
 pub mod failure;
 pub mod frame;
+pub mod gaze;
+mod gaze_stream;
 pub mod interlock;
 pub mod light;
 pub mod method_choice;

@@ -5,10 +5,11 @@ pub mod plausible;
 use crate::calibrated::{measured, measured_camera, told_of_measured};
 use crate::camera_file::{calibrated_camera, CameraFileError};
 use crate::config::{
-    BodyConfig, BuiltinScene, EnvironmentConfig, FileAxis, GazeConfig, LiveSource, PictureSource, RigConfig,
-    Tracing, TracksUse, MAX_TRACKED,
+    BodyConfig, BuiltinScene, EnvironmentConfig, FileAxis, LiveSource, PictureSource, RigConfig, Tracing,
+    TracksUse, MAX_TRACKED,
 };
 use crate::drive::{albedo_of, drive, DriveError, MAX_PICTURE_BYTES};
+use crate::gaze::Aim;
 use crate::mock::{Motion, MotionError, MotionSpec};
 use dpm_calibration_file::CalibrationFile;
 use dpm_device::planes::{PlaneSchedule, Raster};
@@ -150,6 +151,7 @@ enum Gaze {
     Point(DVec3),
     Body(usize),
     Straight,
+    Measured,
 }
 
 impl Observer {
@@ -163,8 +165,18 @@ impl Observer {
         match self.gaze {
             Gaze::Point(_) => None,
             Gaze::Body(i) => Some(i),
-            Gaze::Straight => self.carrier,
+            Gaze::Straight | Gaze::Measured => self.carrier,
         }
+    }
+
+    /// The body in whose frame a device measures the gaze; `None` if none does.
+    pub(crate) fn measured_on(&self) -> Option<usize> {
+        self.carrier.filter(|_| matches!(self.gaze, Gaze::Measured))
+    }
+
+    /// True for a gaze that was last known so long ago that it is not held any more.
+    pub(crate) fn is_gaze_lost(&self, unseen_ns: i64) -> bool {
+        unseen_ns > self.gaze_hold_ns
     }
 
     /// How far all zones around the gaze grow when the gaze's body was last seen `unseen_ns` ago, in degrees: 0 while
@@ -174,14 +186,17 @@ impl Observer {
         (beyond_s * self.gaze_widen_deg_per_s).min(180.0)
     }
 
-    /// The eye and the gaze point, in world coordinates.
+    /// The eye and the gaze point, in world coordinates. A gaze that is measured is straight ahead here: what is known without
+    /// the device.
     pub fn eye_and_gaze(&self, world_from_body: &[DAffine3]) -> (DVec3, DVec3) {
         let carrier = self.carrier.and_then(|i| world_from_body.get(i));
         let eye = carrier.map_or(self.position, |m| m.transform_point3(self.eye_offset));
         let gaze = match self.gaze {
             Gaze::Point(p) => p,
             Gaze::Body(i) => world_from_body.get(i).map_or(eye - DVec3::Z, |m| m.translation),
-            Gaze::Straight => eye + carrier.map_or(-DVec3::Z, |m| m.transform_vector3(-DVec3::Z)),
+            Gaze::Straight | Gaze::Measured => {
+                eye + carrier.map_or(-DVec3::Z, |m| m.transform_vector3(-DVec3::Z))
+            }
         };
         (eye, gaze)
     }
@@ -678,10 +693,11 @@ fn observer(config: &RigConfig, bodies: &[RigBody], worn: &[RigBody]) -> Result<
         position: DVec3::from_array(c.position),
         carrier,
         eye_offset: DVec3::from_array(c.eye_offset),
-        gaze: match &c.gaze {
-            GazeConfig::Point(p) => Gaze::Point(DVec3::from_array(p.point)),
-            GazeConfig::Tracked(t) => Gaze::Body(find("observer.gaze.target", &t.target)?),
-            GazeConfig::Straight(_) => Gaze::Straight,
+        gaze: match c.gaze.aim() {
+            Aim::Point(point) => Gaze::Point(point),
+            Aim::Body(key, name) => Gaze::Body(find(key, &name)?),
+            Aim::Ahead => Gaze::Straight,
+            Aim::Measured => Gaze::Measured,
         },
         gaze_hold_ns: i64::from(c.gaze_hold_ms) * 1_000_000,
         gaze_widen_deg_per_s: c.gaze_widen_deg_per_s,

@@ -5,7 +5,7 @@ use dpm_device::planes::Raster;
 use dpm_render::gpu::Gpu;
 use dpm_render::method::Method;
 use dpm_render::{RenderError, Renderer, RendererSettings, Scale};
-use dpm_rig::config::{CalibrationConfig, GazeConfig, GazePointConfig, ObserverConfig, PerChannel};
+use dpm_rig::config::{CalibrationConfig, ObserverConfig, PerChannel};
 use dpm_rig::config::{ProjectorConfig, RigConfig};
 use dpm_rig::pipeline::renderer_settings;
 use dpm_rig::rig::Rig;
@@ -134,7 +134,7 @@ impl FittedView {
         if asked == SnapshotView::Fit || config.observer == ObserverConfig::default() {
             config.observer = ObserverConfig {
                 position: self.position,
-                gaze: GazeConfig::Point(GazePointConfig { point: self.look_at }),
+                gaze: dpm_rig::gaze::at_point(self.look_at),
                 ..ObserverConfig::default()
             };
         }

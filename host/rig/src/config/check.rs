@@ -1,8 +1,9 @@
 //! Contradictions between keys. Each is reported at a key that was written, with what would resolve it.
 
 use super::check_projector::projector;
-use super::world::{EnvironmentConfig, GazeConfig};
+use super::world::EnvironmentConfig;
 use super::{LiveSource, Pace, PictureSource, Purpose, ResponseConfig, RigConfig, Wearable, WearableConfig};
+use crate::gaze::Aim;
 use crate::trackers::PoseOrigin;
 use dpm_common::keys::read::Reader;
 pub(super) use dpm_common::keys::read::{contradict, refuse, shown};
@@ -120,8 +121,8 @@ fn observer(rig: &RigConfig, reader: &mut Reader) {
     if let Some(name) = &rig.observer.body {
         must_exist("observer.body", name, &[]);
     }
-    if let GazeConfig::Tracked(gaze) = &rig.observer.gaze {
-        must_exist("observer.gaze.target", &gaze.target, &rig.worn());
+    if let Aim::Body(key, name) = rig.observer.gaze.aim() {
+        must_exist(key, &name, &rig.worn());
     }
     if rig.scene.file.is_some() && reader.is_written("scene.builtin") {
         refuse(
@@ -132,6 +133,19 @@ fn observer(rig: &RigConfig, reader: &mut Reader) {
         );
     }
     let is_carried = rig.observer.body.is_some() || rig.observer.tracked.is_some();
+    rig.observer.gaze.check(reader);
+    if !is_carried && rig.observer.gaze.aim() == Aim::Measured {
+        let problem = format!(
+            "{:?} measures in the space of the glasses, and none are tracked",
+            rig.observer.gaze.word()
+        );
+        refuse(
+            reader,
+            &["observer.gaze.kind"],
+            problem,
+            "set `observer.tracked` to the rigid body of the glasses".into(),
+        );
+    }
     if !is_carried && reader.is_written("observer.eye_offset") {
         refuse(
             reader,
@@ -239,6 +253,14 @@ fn time(rig: &RigConfig, purpose: Purpose, reader: &mut Reader) {
                 reader,
                 &["tracker.kind", "real_time.pace"],
                 format!("a tracker of kind {:?} runs on its own clock", rig.tracker.word()),
+                "use real_time.pace = \"real\"".into(),
+            );
+        }
+        if rig.observer.gaze.aim() == Aim::Measured {
+            refuse(
+                reader,
+                &["observer.gaze.kind", "real_time.pace"],
+                format!("a gaze of kind {:?} runs on its own clock", rig.observer.gaze.word()),
                 "use real_time.pace = \"real\"".into(),
             );
         }

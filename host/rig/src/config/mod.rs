@@ -22,6 +22,8 @@ mod world;
 #[cfg(test)]
 mod tests;
 
+use crate::gaze::Aim;
+pub use crate::gaze::GazeConfig;
 pub use crate::projectors::{LitTime, PlaneTiming, PlaneWeights, ProjectorBackend};
 pub use crate::trackers::{PoseConfig, TrackerConfig, TrackerTransformConfig};
 pub use calibration::CalibrationConfig;
@@ -172,10 +174,14 @@ impl RigConfig {
     }
 
     /// Replaces a real tracker (or a recording) and a real projector by the mocks. The mock tracker has the sample
-    /// rate of the real one, and moves bodies by `scene.bodies[].motion`, or by its defaults if that is left out.
+    /// rate of the real one, and moves bodies by `scene.bodies[].motion`, or by its defaults if that is left out. A gaze
+    /// that a device would measure follows the axis of the glasses.
     pub fn simulate(&mut self) {
         if !self.tracker.is_mock() {
             self.tracker = crate::trackers::simulated(self.tracker.rate_hz());
+        }
+        if self.observer.gaze.aim() == Aim::Measured {
+            self.observer.gaze = crate::gaze::straight();
         }
         if !self.projector.backend.is_mock() {
             self.projector.backend = Default::default();

@@ -2,6 +2,7 @@
 
 use super::values::{Each, PerChannel, PictureSource};
 use super::wearable::Wearable;
+use crate::gaze::GazeConfig;
 use crate::mock::{Motion, MotionSpec};
 use crate::trackers::PoseConfig;
 use dpm_common::keys::read::{Any, ConfigValue, NotEmpty, Reader, Within};
@@ -26,45 +27,13 @@ section! {
         eye_offset: [f64; 3] = [0.0, 0.0, 0.0], "m", Within(-10.0, 10.0);
         /// Where the eye looks.
         gaze: GazeConfig = GazeConfig::default(), "", Any;
-        /// A gaze whose tracked body is no longer seen stays where it was for this long.
+        /// A gaze whose tracked body is no longer seen, or that is measured and no longer sure, stays where it was for
+        /// this long; a measured one then follows the axis of the glasses.
         gaze_hold_ms: u32 = 200, "ms", Within(0, 60_000);
-        /// After that, the zones of full quality around the gaze grow at this rate until the body is seen again.
+        /// After that, the zones of full quality around the gaze grow at this rate until it is known
+        /// again.
         gaze_widen_deg_per_s: f64 = 60.0, "deg/s", Within(0.0, 1e4);
     }
-}
-
-kinds! {
-    /// Where the eye looks.
-    pub enum GazeConfig {
-        /// at a fixed point of the world.
-        Point(GazePointConfig) = "point",
-        /// at the centre of a tracked body.
-        Tracked(GazeTrackedConfig) = "tracked",
-        /// along -Z of the body that carries the eye, or of the world.
-        Straight(GazeStraightConfig) = "straight",
-    }
-    default Point
-}
-
-section! {
-    /// Gaze at a fixed point.
-    pub struct GazePointConfig {
-        /// The point.
-        point: [f64; 3] = [0.0, 0.1, 0.0], "m", Within(-1e6, 1e6);
-    }
-}
-
-section! {
-    /// Gaze that follows a body.
-    pub struct GazeTrackedConfig {
-        /// Name of the body: one of `scene.bodies[].name`, or what a person wears.
-        target: String = String::new(), "", NotEmpty;
-    }
-}
-
-section! {
-    /// Gaze straight ahead.
-    pub struct GazeStraightConfig {}
 }
 
 section! {

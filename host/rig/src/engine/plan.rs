@@ -5,6 +5,7 @@ use super::genlock::{self, SampleWait};
 use super::pace::{modelled_ns, Pace};
 use crate::frame::job::{Fate, FrameNote};
 use crate::frame::FrameTimeline;
+use crate::gaze::GazeSample;
 use crate::parameters::applied::ParameterVersion;
 use crate::plan::eyes::HeadWatch;
 use crate::plan::frame::PlanInputs;
@@ -51,6 +52,8 @@ pub(crate) struct PlanStage<P> {
     heads: HeadWatch,
     /// What the operator may change while the run goes on.
     parameters: Reader<ParameterVersion>,
+    /// The newest gaze of a device.
+    gaze: Reader<Option<GazeSample>>,
     /// The newest version of them that was used; `None` before the first frame.
     used: Option<u64>,
     slot_ns: i64,
@@ -73,6 +76,7 @@ impl<P: Pace> PlanStage<P> {
         let horizon = Horizon::of_rig(&facts.rig.config);
         let slot_ns = facts.rig.rate().slot_len_ns(0);
         let parameters = facts.monitor.parameters().follow(&facts.rig);
+        let gaze = facts.monitor.gaze().follow();
         let (used, last_slot) = (None, None);
         let heads = HeadWatch::new(&facts.rig);
         Self {
@@ -81,6 +85,7 @@ impl<P: Pace> PlanStage<P> {
             horizon,
             heads,
             parameters,
+            gaze,
             used,
             slot_ns,
             next_slot,
@@ -174,9 +179,13 @@ impl<P: Pace> PlanStage<P> {
             budget_milli: self.crew.budget_milli.load(Ordering::Relaxed).min(applied.most_milli),
             rung: self.crew.rung.load(Ordering::Relaxed),
             applied,
+            gaze: *self.gaze.latest().0,
             now,
         };
         note.plan.fill(&self.facts.rig, snapshot, &inputs);
+        if let Some(is_measured) = note.plan.is_gaze_measured {
+            self.facts.monitor.gaze().count_frame(is_measured);
+        }
         note.plan.spare(&mut self.heads, &self.facts.rig, snapshot, &inputs);
         note.fate = Fate::UnderWay;
         note.latch_due_at = latch.due_at;

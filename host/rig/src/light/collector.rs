@@ -141,6 +141,7 @@ fn record_of(job: &FrameNote) -> FrameRecord {
         guard_radius_m: job.plan.eyes.spheres.iter().fold(0.0, |most, s| s.radius_m.max(most)),
         head_lost: job.plan.eyes.lost,
         eye: job.plan.eye,
+        gaze: job.plan.gaze,
         parameters: job.plan.parameters,
         code_hash: job.code_hash,
         pass_ns: job.cost.unwrap_or_default().pass_ns,

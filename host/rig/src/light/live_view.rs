@@ -21,7 +21,7 @@ impl Collector {
     pub(super) fn look_at(&mut self, note: &FrameNote, live: &Live) {
         let plan = &note.plan;
         if live.is_looked_at() {
-            live.drew(plan.id.0 as u32, &plan.tracked_poses, &plan.dark);
+            live.drew(plan.id.0 as u32, &plan.tracked_poses, &plan.dark, plan.gaze);
         }
         let (frame, bodies) = &mut self.newest_live;
         *frame = LiveFrame {

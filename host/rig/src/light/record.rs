@@ -34,6 +34,8 @@ pub struct FrameRecord {
     pub head_lost: Option<usize>,
     /// The eye in world coordinates.
     pub eye: DVec3,
+    /// What it looks at, in world coordinates.
+    pub gaze: DVec3,
     /// Which version of the operator's parameters it was drawn with; 0 is the rig file's.
     pub parameters: u64,
     /// Hash of its code values.

@@ -3,8 +3,9 @@
 
 use super::applied::{middles, ParameterVersion};
 use super::{told_of, ChangeRefusal, Parameter, Values};
-use crate::config::GazeConfig;
+use crate::gaze::at_point;
 use crate::rig::Rig;
+use dpm_common::keys::source::{Node, Value};
 use dpm_handoff::latest::{latest, Publisher, Reader};
 use dpm_handoff::path::Lock;
 use glam::{DAffine3, DVec3};
@@ -303,14 +304,25 @@ impl State {
 
 /// A gaze point, or what the rig file said when the run began.
 fn gaze(point: Option<[f64; 3]>, rig: &Rig) -> Setting {
-    let kind = |word: &str| ("kind", Setting::Text(word.to_owned()));
-    let point = match (&rig.config.observer.gaze, point) {
-        (_, Some(point)) => point,
-        (GazeConfig::Point(p), None) => p.point,
-        (GazeConfig::Tracked(t), None) => {
-            return Setting::Table(vec![kind("tracked"), ("target", Setting::Text(t.target.clone()))]);
+    let gaze = point.map_or_else(|| rig.config.observer.gaze.clone(), at_point);
+    let keys = gaze.written().into_iter().filter_map(|(key, value)| Some((key, setting(&value)?)));
+    let kind = ("kind", Setting::Text(gaze.word().to_owned()));
+    Setting::Table(std::iter::once(kind).chain(keys).collect())
+}
+
+/// A value of the rig file as it is kept; `None` for one that no kept key has.
+fn setting(value: &Value) -> Option<Setting> {
+    Some(match value {
+        Value::Float(number) => Setting::Number(*number),
+        Value::Integer(number) => Setting::Whole(*number),
+        Value::String(text) => Setting::Text(text.clone()),
+        Value::Array(nodes) => {
+            let number = |node: &Node| match node.value {
+                Value::Float(number) => Some(number),
+                _ => None,
+            };
+            Setting::Point(nodes.iter().map(number).collect::<Option<Vec<_>>>()?.try_into().ok()?)
         }
-        (GazeConfig::Straight(_), None) => return Setting::Table(vec![kind("straight")]),
-    };
-    Setting::Table(vec![kind("point"), ("point", Setting::Point(point))])
+        _ => return None,
+    })
 }

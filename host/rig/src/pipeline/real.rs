@@ -16,6 +16,7 @@ use crate::engine::keeper::LinkKeeper;
 use crate::engine::link::LinkStage;
 use crate::engine::options::RunOptions;
 use crate::engine::supervision::{until_gpu_is_back, Remake, Supervision};
+use crate::gaze_stream::GazeStream;
 use crate::light::collector::{Collector, Inbox};
 use crate::light::notes::note_channel;
 use crate::light::recorder::{light_channel, LightNote, LightReceiver, LightRecorder, LightSender};
@@ -80,6 +81,7 @@ pub(super) fn run_at_real_pace(
     let (link, time) = bring_up(rig, far.medium.as_mut(), monitor, &mut || {
         clock.wait_until(clock.now().plus_ns(CONNECT_STEP_NS))
     })?;
+    let _gaze = hear_gaze(rig, origin, monitor, clock);
     let lead = lead_estimator(rig, &link, parts.first.wall_ns);
     let facts = Arc::new(Facts::new(rig.clone(), monitor.clone(), options, &lead, clock.now()));
     facts.made_ns.store(made_ns, Ordering::Relaxed);
@@ -169,6 +171,17 @@ fn maker(
         *heritage = Some(parts.heritage());
         Ok(parts.remembering(&seen))
     })
+}
+
+/// Begins to hear where the observer looks, if a scene is drawn.
+fn hear_gaze(
+    rig: &Rig,
+    origin: &Origin,
+    monitor: &Arc<RunMonitor>,
+    clock: MonotonicClock,
+) -> Option<GazeStream> {
+    let is_drawn = !matches!(origin, Origin::Pattern(..));
+    is_drawn.then(|| GazeStream::start(rig, monitor, Arc::new(move || clock.now())))
 }
 
 /// Reports how long prediction may extend a body's track if the rig file leaves it open.

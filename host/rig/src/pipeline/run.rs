@@ -9,6 +9,7 @@ use crate::config::Pace;
 use crate::engine::error::PipelineError;
 use crate::engine::facts::Facts;
 use crate::engine::options::RunOptions;
+use crate::gaze::GazeReport;
 use crate::light::collector::Collector;
 use crate::light::recorder::LightRecorder;
 use crate::pack::source::PatternSource;
@@ -170,6 +171,8 @@ impl Ran {
             let pair = RatePair { tracker_hz: 1e9 / rhythm.period_ns as f64, slots_hz: rig.rate().hz() };
             BeatReport::new(pair, facts.in_step.load(Ordering::Relaxed))
         });
+        report.gaze = facts.monitor.gaze().report();
+        report.warnings.extend(report.gaze.as_ref().and_then(GazeReport::warning));
         report.warnings.extend(report.tracker.as_ref().and_then(TrackerReport::warning));
         report.stopped = facts.monitor.stop_requested();
         report.recoveries = facts.recoveries();

@@ -5,6 +5,7 @@ use super::dark::DarkCause;
 use super::eyes::{GuardedEyes, HeadWatch};
 use super::light_centre::{light_centre_ns, planes_follow};
 use super::link_time::LinkTime;
+use crate::gaze::GazeSample;
 use crate::parameters::applied::ParameterVersion;
 use crate::rig::{affine, Rig};
 use crate::tracks::TrackSnapshot;
@@ -74,6 +75,8 @@ pub(crate) struct FramePlan {
     pub gaze: DVec3,
     /// Degrees by which the zones around a gaze have grown that is no longer tracked.
     pub widen_deg: f32,
+    /// Whether the gaze is measured; `None` if it should not be.
+    pub is_gaze_measured: Option<bool>,
     /// Average samples per pixel, in thousandths.
     pub budget_milli: u64,
     /// The same at most, whatever the GPU's times allow.
@@ -111,6 +114,8 @@ pub(crate) struct PlanInputs<'a> {
     pub rung: usize,
     /// What the operator may change while the run goes on.
     pub applied: &'a ParameterVersion,
+    /// The newest gaze of a device.
+    pub gaze: Option<GazeSample>,
     /// Now.
     pub now: HostTime,
 }
@@ -145,6 +150,7 @@ impl FramePlan {
             eye: DVec3::ZERO,
             gaze: DVec3::ZERO,
             widen_deg: 0.0,
+            is_gaze_measured: None,
             budget_milli: 0,
             most_milli: 0,
             rung: 0,
@@ -174,16 +180,33 @@ impl FramePlan {
         let first = self.due_at.plus_ns(late_ns);
         (self.centre_at, self.swept_at) = (centre, [first, first.plus_ns(exposure_ns)]);
         self.sweep_bodies(rig, snapshot, inputs.applied);
-        (self.eye, self.gaze) = rig.observer.eye_and_gaze(&self.tracked_poses);
-        self.widen_deg = rig.observer.gaze_body().map_or(0.0, |body| {
-            let track = snapshot.tracks.get(body).copied().flatten();
-            let unseen_ns = track.map_or(i64::MAX, |(state, _)| centre.ns_since(state.captured_at));
-            rig.observer.widening_deg(unseen_ns) as f32
-        });
+        self.aim(rig, snapshot, inputs.gaze);
         if let Some(point) = inputs.applied.gaze {
             // A point that the operator names is never lost.
-            (self.gaze, self.widen_deg) = (point, 0.0);
+            (self.gaze, self.widen_deg, self.is_gaze_measured) = (point, 0.0, None);
         }
+    }
+
+    /// Where the eye is and looks. A measured gaze is a point of the world: where the glasses were when the eyes were seen,
+    /// so that a head which turns while the eyes rest on something leaves it there.
+    fn aim(&mut self, rig: &Rig, snapshot: &TrackSnapshot, sample: Option<GazeSample>) {
+        let observer = &rig.observer;
+        (self.eye, self.gaze) = observer.eye_and_gaze(&self.tracked_poses);
+        let track = |body: usize| snapshot.tracks.get(body).copied().flatten();
+        let since_ns = |at: Option<HostTime>| at.map_or(i64::MAX, |at| self.centre_at.ns_since(at));
+        let mut unseen_ns =
+            observer.gaze_body().map_or(0, |body| since_ns(track(body).map(|(state, _)| state.captured_at)));
+        self.is_gaze_measured = observer.measured_on().map(|body| {
+            let unmeasured_ns = since_ns(sample.map(|sample| sample.at));
+            unseen_ns = unseen_ns.max(unmeasured_ns);
+            let known = sample.zip(track(body)).filter(|_| !observer.is_gaze_lost(unmeasured_ns));
+            let Some((sample, (state, _))) = known else { return false };
+            let body_from_mesh = self.mesh_to_body.get(body).copied().unwrap_or(DAffine3::IDENTITY);
+            let world_from_mesh = affine(&state.predict(sample.at).pose) * body_from_mesh;
+            self.gaze = world_from_mesh.transform_point3(sample.point_m);
+            true
+        });
+        self.widen_deg = observer.widening_deg(unseen_ns) as f32;
     }
 
     /// Spares the heads of `rig`, as `watch` knows them by `snapshot`. While one is lost, no body is lit.
@@ -316,5 +339,73 @@ impl FramePlan {
     /// dark body has no age of light.
     pub(crate) fn oldest_captured_at(&self) -> Option<HostTime> {
         self.is_lit.then_some(self.captured_at)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::config::{Overrides, RigConfig};
+    use crate::tracks::{open_for, TrackingStage};
+    use dpm_device::planes::Raster;
+    use dpm_handoff::latest::latest;
+    use std::sync::Arc;
+
+    const MS: i64 = 1_000_000;
+
+    /// A rig whose observer wears glasses that turn, with its tracks at 500 ms, and a plan for light 15 ms later.
+    fn plan() -> (Rig, TrackSnapshot, FramePlan) {
+        let flags = [
+            "observer.tracked={name=\"glasses\",motion={kind=\"rotate\",axis=[0,1,0],rate_rad_s=2.0}}",
+            "observer.gaze={kind=\"pupil\"}",
+            "observer.gaze_hold_ms=100",
+            "observer.gaze_widen_deg_per_s=60.0",
+            "real_time.pace=\"real\"",
+        ];
+        let flags = flags.iter().map(|f| (*f).to_owned()).collect();
+        let config =
+            RigConfig::demo(&Overrides { flags, ..Default::default() }).unwrap_or_else(|e| panic!("{e}"));
+        let rig = Rig::build(&config, Raster::new(8, 8)).unwrap_or_else(|e| panic!("{e}"));
+        let tracker = open_for(&rig, Arc::new(|| HostTime(0)), HostTime(0)).unwrap_or_else(|e| panic!("{e}"));
+        let mut stage = TrackingStage::new(&rig, tracker);
+        let (mut publisher, mut reader) = latest(TrackSnapshot::empty(rig.tracked_count()));
+        for step in 0..=500 {
+            stage.step(HostTime(step * MS), &mut publisher).expect("the mock");
+        }
+        let mut plan = FramePlan::empty(&rig);
+        plan.centre_at = HostTime(515 * MS);
+        plan.tracked_poses = rig.true_poses(plan.centre_at.0).expect("the mock");
+        let snapshot = reader.latest().0.clone();
+        (rig, snapshot, plan)
+    }
+
+    /// The point is fixed in the world where the glasses were when the eyes were seen; it is held, and then follows their axis
+    /// with zones that grow. What the operator names and what was never seen need no sample.
+    #[test]
+    fn a_measured_gaze_is_a_point_of_the_world_until_it_is_lost() {
+        let (rig, snapshot, mut plan) = plan();
+        let point_m = DVec3::new(0.2, -0.1, -0.7);
+        let glasses = |t_ns: i64| rig.true_poses(t_ns).expect("the mock")[rig.bodies.len()];
+        let mut at = |ms: i64| {
+            let sample = GazeSample { at: HostTime(ms * MS), received_at: HostTime(500 * MS), point_m };
+            plan.aim(&rig, &snapshot, Some(sample));
+            (plan.gaze, plan.eye, plan.widen_deg, plan.is_gaze_measured)
+        };
+        let off_deg = |eye: DVec3, a: DVec3, b: DVec3| (a - eye).angle_between(b - eye).to_degrees();
+        for ms in [495, 470, 420] {
+            let (gaze, eye, widen, measured) = at(ms);
+            let truth = glasses(ms * MS).transform_point3(point_m);
+            let off = off_deg(eye, gaze, truth);
+            // By the pose of the light it would be off by as much as the head has turned since.
+            let late = off_deg(eye, glasses(515 * MS).transform_point3(point_m), truth);
+            assert!(off < 0.15 && late > 1.8, "{ms}: {off} and {late} degrees");
+            assert_eq!((widen, measured), (0.0, Some(true)));
+        }
+        let axis = glasses(515 * MS).transform_vector3(-DVec3::Z);
+        let (gaze, eye, widen, measured) = at(365);
+        assert!((gaze - eye - axis).length() < 1e-9, "after 150 ms: the axis");
+        assert!((f64::from(widen) - 60.0 * 0.05).abs() < 1e-3 && measured == Some(false), "{widen}");
+        plan.aim(&rig, &snapshot, None);
+        assert_eq!((plan.widen_deg, plan.is_gaze_measured), (180.0, Some(false)));
     }
 }

@@ -13,7 +13,7 @@ use crate::rig::Rig;
 use dpm_common::unix::monotonic_ns;
 use dpm_device::time::HostTime;
 use dpm_handoff::path::Lock;
-use glam::DAffine3;
+use glam::{DAffine3, DVec3};
 use std::collections::VecDeque;
 use std::fmt;
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
@@ -104,6 +104,8 @@ pub struct FrameSubject {
     pub poses: Vec<DAffine3>,
     /// Per tracked body: no light falls on it.
     pub dark: Vec<bool>,
+    /// What the observer looks at, in world coordinates, metres.
+    pub gaze: DVec3,
 }
 
 /// The light of a mock projector at one moment.
@@ -183,10 +185,10 @@ impl Live {
     }
 
     /// Remembers what frame `frame` was drawn for. Called for every frame while somebody looks.
-    pub(crate) fn drew(&self, frame: u32, poses: &[DAffine3], dark: &[Option<DarkCause>]) {
+    pub(crate) fn drew(&self, frame: u32, poses: &[DAffine3], dark: &[Option<DarkCause>], gaze: DVec3) {
         let mut drawn = held(&self.drawn);
         let mut one = if drawn.len() >= DRAWN { drawn.pop_front() } else { None }.unwrap_or_default();
-        one.frame = frame;
+        (one.frame, one.gaze) = (frame, gaze);
         one.poses.clear();
         one.poses.extend_from_slice(poses);
         one.dark.clear();
@@ -289,7 +291,7 @@ mod tests {
         assert_eq!(live.drawn(Some(1)), None);
         let pose = |k: u32| DAffine3::from_translation(glam::DVec3::splat(f64::from(k)));
         for k in 0..100 {
-            live.drew(k, &[pose(k)], &[(k % 2 == 0).then_some(DarkCause::Silent)]);
+            live.drew(k, &[pose(k)], &[(k % 2 == 0).then_some(DarkCause::Silent)], DVec3::ZERO);
         }
         let of = |frame| live.drawn(frame).map(|d| (d.frame, d.poses[0], d.dark[0]));
         assert_eq!(of(Some(98)), Some((98, pose(98), true)));

@@ -7,6 +7,7 @@ use super::link_gauges::LinkGauges;
 use super::live::Live;
 use super::ordered::DarkLog;
 use super::projector::ProjectorReport;
+use crate::gaze::GazeDesk;
 use crate::interlock::Interlock;
 use crate::order::Order;
 use crate::parameters::ParameterDesk;
@@ -207,6 +208,8 @@ pub struct RunMonitor {
     live: Live,
     /// What operators may change while it goes on.
     parameters: ParameterDesk,
+    /// Where a device sees the observer look.
+    gaze: GazeDesk,
 }
 
 #[derive(Debug, Default)]
@@ -523,6 +526,11 @@ impl RunMonitor {
     /// What operators may change while the run goes on.
     pub fn parameters(&self) -> &ParameterDesk {
         &self.parameters
+    }
+
+    /// Where a device sees the observer look.
+    pub fn gaze(&self) -> &GazeDesk {
+        &self.gaze
     }
 
     /// Counts a planned frame.

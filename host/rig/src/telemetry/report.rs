@@ -4,6 +4,7 @@ use super::projector::ProjectorReport;
 use super::signed::SignedHistogram;
 use crate::failure::{Failure, FailureKind};
 use crate::frame::slots::MissCause;
+use crate::gaze::GazeReport;
 use crate::plan::beat::BeatReport;
 use crate::plan::dark::DarkCause;
 use crate::tracks::gauges::TrackerReport;
@@ -225,6 +226,9 @@ pub struct Report {
     pub frames_too_old: u64,
     /// What became of the tracker's samples; null for a rig without a tracker that counts them.
     pub tracker: Option<TrackerReport>,
+    /// Where a device saw the observer look; absent where none measures it.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub gaze: Option<GazeReport>,
     /// How the slots and the tracker went together; null while the tracker's rhythm is not known, and at virtual pace.
     pub beat: Option<BeatReport>,
     /// Average number of slots from one planned frame to the next, at the end: 1 if the renderer keeps up.
@@ -364,6 +368,7 @@ impl Default for Report {
             frames_withheld: 0,
             frames_unrecorded: 0,
             tracker: None,
+            gaze: None,
             beat: None,
             frames_late: 0,
             frames_repeated: 0,

@@ -111,6 +111,14 @@ impl Report {
             let lost = lost.into_iter().filter(|(_, n)| *n > 0).map(|(what, n)| format!(", {n} {what}"));
             table.row("samples", format!("{} used{}", t.used, lost.collect::<String>()));
         }
+        if let Some(g) = &self.gaze {
+            let share = 100.0 * g.unsure_share.unwrap_or(0.0);
+            let text = format!(
+                "{}: {} of {} samples used, {share:.1} % unsure, {} reconnects; {} frames by it, {} without",
+                g.kind, g.used, g.samples, g.reconnects, g.frames_measured, g.frames_without
+            );
+            table.row("gaze", text);
+        }
         if let Some(beat) = &self.beat {
             table.row("beat", beat.told(self.frame_rate_hz));
         }

@@ -8,6 +8,7 @@ mod frame_path_sockets;
 mod frame_path_usb;
 mod frame_path_vulkan;
 mod full_raster;
+mod gaze;
 mod own_process;
 mod rates;
 mod ray_query;

@@ -168,6 +168,41 @@ fn with_exchanges(finding: Finding, exchanges: &Exchanges, heard: &Heard) -> Fin
     Finding { state, found: format!("{}; {}", finding.found, swaps.join(", ")), remedy, ..finding }
 }
 
+/// What a device says of where the observer looks, if one measures it. Without it the gaze follows the axis of the glasses, so
+/// nothing is missing.
+pub(super) fn gaze(config: &RigConfig) -> Option<Finding> {
+    let name = "gaze";
+    let clock = MonotonicClock::new(0);
+    let mut source = config.observer.gaze.open(Arc::new(move || clock.now()), true)?;
+    let (start, mut latency_ns) = (clock.now(), 0);
+    while clock.now().ns_since(start) < LISTEN_NS {
+        source.poll(Duration::from_millis(20), &mut |sample| {
+            latency_ns += sample.received_at.ns_since(sample.at);
+        });
+    }
+    let counts = source.counts();
+    if let Some(doubt) = source.doubt() {
+        let remedy = format!("{}; see docs/TRACKERS.md", doubt.remedy);
+        return Some(Finding::new(name, State::Warning, doubt.found, remedy));
+    }
+    if counts.used == 0 {
+        let found = format!(
+            "{} samples in {} s, none of which can be used",
+            counts.samples,
+            LISTEN_NS / 1_000_000_000
+        );
+        return Some(Finding::new(name, State::Warning, found, "see docs/TRACKERS.md"));
+    }
+    let found = format!(
+        "{:.0} samples a second, {:.0} % of them unsure, {:.1} ms old when they come, clocks within {:.1} ms",
+        counts.samples as f64 * 1e9 / LISTEN_NS as f64,
+        100.0 * counts.unsure as f64 / counts.samples.max(1) as f64,
+        latency_ns as f64 * 1e-6 / counts.used as f64,
+        counts.clock_bound_ns as f64 * 1e-6
+    );
+    Some(Finding::new(name, State::Ok, found, ""))
+}
+
 /// Whether the slots can follow the tracker: its rate in the rig file beside that of frames. If it was `heard` at another
 /// rate, that one counts. `None` if neither is known.
 pub(super) fn beat(config: &RigConfig, heard: Option<&Heard>) -> Option<Finding> {

@@ -48,6 +48,7 @@ pub(super) fn findings(
     all.push(tracker);
     all.extend(devices::beat(config, heard.as_ref()));
     all.push(observer(config, heard.as_ref()));
+    all.extend(devices::gaze(config));
     all.extend(rig.as_ref().ok().and_then(|rig| reach(rig, heard.as_ref())));
     all.extend(pictures(config));
     all.push(calibration(config));
