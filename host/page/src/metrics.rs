@@ -316,3 +316,41 @@ impl Out {
 fn escaped(text: &str) -> String {
     text.replace('\\', "\\\\").replace('"', "\\\"").replace('\n', "\\n")
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_measured_gaze_has_its_figures_and_another_none() {
+        let told = |report: Option<&GazeReport>| {
+            let mut out = Out { text: String::new(), family: "" };
+            gaze(&mut out, report);
+            out.text.lines().filter(|line| !line.starts_with('#')).map(str::to_owned).collect::<Vec<_>>()
+        };
+        assert_eq!(told(None), [""; 0]);
+        let report = GazeReport {
+            used: 7,
+            unsure: 2,
+            ill_timed: 1,
+            age_ms: Some(12.5),
+            rate_hz: 120.0,
+            frames_measured: 30,
+            frames_without: 4,
+            reconnects: 3,
+            ..GazeReport::default()
+        };
+        let expected = [
+            "dpm_gaze_samples_total{fate=\"used\"} 7",
+            "dpm_gaze_samples_total{fate=\"unsure\"} 2",
+            "dpm_gaze_samples_total{fate=\"refused\"} 0",
+            "dpm_gaze_samples_total{fate=\"ill_timed\"} 1",
+            "dpm_gaze_age_seconds 0.0125",
+            "dpm_gaze_samples_per_second 120",
+            "dpm_gaze_frames_total{by=\"measured\"} 30",
+            "dpm_gaze_frames_total{by=\"axis\"} 4",
+            "dpm_gaze_reconnects_total 3",
+        ];
+        assert_eq!(told(Some(&report)), expected);
+    }
+}

@@ -203,8 +203,8 @@ fn gaze() -> Vec<(&'static str, &'static str, Vec<u8>)> {
     let short =
         b"\x85\xa9timestamp\xcb\x40\xb3\x92\x80\0\0\0\0\xaaconfidence\x01\xadgaze_point_3d\x93\0\0\x7f\
         \xadeye_center_3d\x93\0\0\0\xaegaze_normal_3d\x93\0\0\x01";
-    step(0, 1, b"5010.5");
-    step(1, 1, short);
+    // Its clock is known by one answer, and the sample is used.
+    let look = [&b"\0\x01\x065010.5\x01\x01"[..], &[short.len() as u8], short].concat();
     let mut asks = vec![7];
     put_words(b"SUB_PORT", &mut asks);
     put_words(b"t", &mut asks);
@@ -219,6 +219,7 @@ fn gaze() -> Vec<(&'static str, &'static str, Vec<u8>)> {
         ("pupil_stream", "wants", wants),
         ("pupil_stream", "greets", greets),
         ("pupil_gaze", "samples", script),
+        ("pupil_gaze", "look", look),
     ]
 }
 

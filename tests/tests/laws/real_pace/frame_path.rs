@@ -2,16 +2,20 @@
 
 use crate::scene_files::{flag, rig_of};
 use counting_allocator::{Counting, Request};
+use dpm_device::time::HostTime;
 use dpm_handoff::path;
 use dpm_render::gpu::Gpu;
 use dpm_rig::pipeline::on_frame_path;
 use dpm_rig::rig::Rig;
+use dpm_rig::telemetry::monitor::RunMonitor;
 use dpm_tests::gpu::with_gpu;
 use dpm_tests::rigs::{demo_rig, run};
+use hil_mock::pupil::host::PupilHost;
+use hil_mock::pupil::messages::PupilConfig;
 use std::cell::Cell;
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 use std::sync::Arc;
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
 /// Allocations and releases on the frame path.
 static COUNTED: AtomicU64 = AtomicU64::new(0);
@@ -82,12 +86,27 @@ fn the_steady_state_allocates_nothing() {
         rig_allocates_nothing(gpu, &rig, "live pictures");
         is_over.store(true, Ordering::Relaxed);
         assert!(program.join().unwrap() > 5, "pictures came");
+        // An eye tracker says 200 times a second where the observer looks.
+        let begin = Instant::now();
+        let clock = Arc::new(move || HostTime(begin.elapsed().as_nanos() as i64));
+        let pupil = PupilHost::here(PupilConfig::default(), clock).expect("sockets");
+        let gaze = format!("observer.gaze={{kind=\"pupil\",port={}}}", pupil.address().port());
+        let real = [
+            "real_time.pace=\"real\"",
+            "projector.frame_rate=\"200\"",
+            "observer.tracked=\"glasses\"",
+            &gaze,
+        ];
+        let (rig, locks) = (demo_rig(32, 16, &real), path::locks_taken());
+        let monitor = rig_allocates_nothing(gpu, &rig, "a gaze that a device measures");
+        let told = monitor.gaze().report().expect("it is measured");
+        assert!(told.frames_measured > 20 && path::locks_taken() == locks, "{told:?}");
         // The probe itself: a box that is made here is not on the frame path.
         assert!(!on_frame_path());
     });
 }
 
-fn rig_allocates_nothing(gpu: &Arc<Gpu>, rig: &Arc<Rig>, what: &str) {
+fn rig_allocates_nothing(gpu: &Arc<Gpu>, rig: &Arc<Rig>, what: &str) -> Arc<RunMonitor> {
     let (before, all) = (COUNTED.load(Ordering::Relaxed), ALL.load(Ordering::Relaxed));
     let (_, monitor) = run(gpu, rig, 220, 0);
     let counts = monitor.counts();
@@ -96,4 +115,5 @@ fn rig_allocates_nothing(gpu: &Arc<Gpu>, rig: &Arc<Rig>, what: &str) {
     let during = COUNTED.load(Ordering::Relaxed) - before;
     assert_eq!(during, 0, "{what}: allocations and releases on the frame path");
     assert!(ALL.load(Ordering::Relaxed) > all, "the allocator is not the one in use");
+    monitor
 }
