@@ -467,6 +467,16 @@ struct Light {
     float cone_scale;
     float cone_offset;
     float range;
+    uvec2 unused;
+};
+
+struct Texel {
+    uvec2 shares;
+};
+
+struct SkyTexel {
+    vec3 light;
+    float cumulative;
 };
 
 struct AlbedoCell {

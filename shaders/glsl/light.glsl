@@ -1,9 +1,5 @@
 // Light sampling: one of the emissive triangles, the punctual lights and the environment is chosen by power.
 
-layout(set = 0, binding = B_LIGHTS, scalar) readonly buffer Lights { Light lights[]; };
-// Rows of (r, g, b, conditional cdf), then one row with the marginal cdf in x.
-layout(set = 0, binding = B_ENVIRONMENT, scalar) readonly buffer EnvironmentBlock { vec4 environment_texels[]; };
-
 struct LightSample {
     vec3 to_light;  // From the surface point to the light's point, or to a far point. Not of unit length.
     vec3 radiance;  // Divided by the pdf.
@@ -26,14 +22,14 @@ vec3 environment_radiance(vec3 d) {
     vec2 uv = environment_position(d);
     uint x = min(uint(uv.x * float(frame.environment_width)), frame.environment_width - 1u);
     uint y = min(uint(uv.y * float(frame.environment_height)), frame.environment_height - 1u);
-    return environment_texels[y * frame.environment_width + x].rgb;
+    return sky_at(y * frame.environment_width + x).light;
 }
 
 // Pdf over solid angle of the directions of a texel.
 float texel_pdf(uint x, uint y) {
     uint w = frame.environment_width, h = frame.environment_height;
-    float row = environment_texels[w * h + y].x - (y > 0u ? environment_texels[w * h + y - 1u].x : 0.0);
-    float column = environment_texels[y * w + x].w - (x > 0u ? environment_texels[y * w + x - 1u].w : 0.0);
+    float row = sky_at(w * h + y).light.x - (y > 0u ? sky_at(w * h + y - 1u).light.x : 0.0);
+    float column = sky_at(y * w + x).cumulative - (x > 0u ? sky_at(y * w + x - 1u).cumulative : 0.0);
     // Texels are constant and rows are sampled uniformly in the cosine of the polar angle.
     float c0 = cos(PI * float(y) / float(h)), c1 = cos(PI * float(y + 1u) / float(h));
     float solid_angle = 2.0 * PI / float(w) * max(c0 - c1, 1e-12);
@@ -70,20 +66,20 @@ LightSample sample_environment(vec3 n, vec2 u) {
         uint lo = 0u, hi = h - 1u;
         while (lo < hi) {
             uint mid = (lo + hi) / 2u;
-            if (environment_texels[w * h + mid].x > u.y) hi = mid; else lo = mid + 1u;
+            if (sky_at(w * h + mid).light.x > u.y) hi = mid; else lo = mid + 1u;
         }
         uint y = lo;
-        float below = y > 0u ? environment_texels[w * h + y - 1u].x : 0.0;
-        float in_row = clamp((u.y - below) / max(environment_texels[w * h + y].x - below, 1e-12), 0.0, 0.999999);
+        float below = y > 0u ? sky_at(w * h + y - 1u).light.x : 0.0;
+        float in_row = clamp((u.y - below) / max(sky_at(w * h + y).light.x - below, 1e-12), 0.0, 0.999999);
         lo = 0u;
         hi = w - 1u;
         while (lo < hi) {
             uint mid = (lo + hi) / 2u;
-            if (environment_texels[y * w + mid].w > u.x) hi = mid; else lo = mid + 1u;
+            if (sky_at(y * w + mid).cumulative > u.x) hi = mid; else lo = mid + 1u;
         }
         uint x = lo;
-        float left = x > 0u ? environment_texels[y * w + x - 1u].w : 0.0;
-        float in_column = clamp((u.x - left) / max(environment_texels[y * w + x].w - left, 1e-12), 0.0, 0.999999);
+        float left = x > 0u ? sky_at(y * w + x - 1u).cumulative : 0.0;
+        float in_column = clamp((u.x - left) / max(sky_at(y * w + x).cumulative - left, 1e-12), 0.0, 0.999999);
         float c0 = cos(PI * float(y) / float(h)), c1 = cos(PI * float(y + 1u) / float(h));
         float cosine = mix(c0, c1, in_row);
         float sine = sqrt(max(1.0 - cosine * cosine, 0.0));
@@ -91,7 +87,7 @@ LightSample sample_environment(vec3 n, vec2 u) {
         r.to_light = vec3(sine * sin(azimuth), cosine, -sine * cos(azimuth));
         // By the texel that was chosen. At its edge the direction is rounded into the next one, whose pdf may be a ten thousandth.
         r.pdf = texel_pdf(x, y);
-        r.radiance = environment_texels[y * w + x].rgb;
+        r.radiance = sky_at(y * w + x).light;
         r.valid = r.pdf > 1e-12;
     }
     return r;
@@ -117,13 +113,13 @@ LightSample sample_light(vec3 p, vec3 n, float u_pick, vec2 u) {
     float rest = clamp((u_pick - to_environment) / max(1.0 - to_environment, 1e-7), 0.0, 0.9999999);
     float scaled = rest * float(frame.light_count);
     uint slot = min(uint(scaled), frame.light_count - 1u);
-    uint index = scaled - float(slot) < lights[slot].alias_keep ? slot : lights[slot].alias_other;
-    uint kind = lights[index].kind;
-    float select = lights[index].select * (1.0 - to_environment);
+    uint index = scaled - float(slot) < light_at(slot).alias_keep ? slot : light_at(slot).alias_other;
+    uint kind = light_at(index).kind;
+    float select = light_at(index).select * (1.0 - to_environment);
     if (select <= 0.0) return r;
-    uint carrier = lights[index].instance;
+    uint carrier = light_at(index).instance;
     if (HAS_EMISSIVE && kind == LIGHT_TRIANGLE) {
-        uint row = (instance_at(carrier).triangle_offset + lights[index].triangle) * 3u;
+        uint row = (instance_at(carrier).triangle_offset + light_at(index).triangle) * 3u;
         vec3 p0 = TRI(row).xyz;
         vec3 e1 = TRI(row + 1u).xyz - p0, e2 = TRI(row + 2u).xyz - p0;
         float su = sqrt(u.x);
@@ -136,7 +132,7 @@ LightSample sample_light(vec3 p, vec3 n, float u_pick, vec2 u) {
         float d2 = dot(d, d);
         float cosine = -dot(normal, d) * inversesqrt(max(d2, 1e-30));
         if (cosine > 0.0 && leaves_body(carrier, row, normal, -d)) r.left = carrier;
-        TriangleRef ref = triangle_ref_at(instance_at(carrier).triangle_offset + lights[index].triangle);
+        TriangleRef ref = triangle_ref_at(instance_at(carrier).triangle_offset + light_at(index).triangle);
         bool both = (material_at(ref.material).flags & MATERIAL_DOUBLE_SIDED) != 0u;
         if (both) {
             normal = cosine < 0.0 ? -normal : normal;
@@ -146,7 +142,7 @@ LightSample sample_light(vec3 p, vec3 n, float u_pick, vec2 u) {
         vec3 emitted = material_at(ref.material).emissive;
         if (HAS_TEXTURES && material_at(ref.material).emissive_texture.texture != NO_TEXTURE)
             emitted *= sample_texture(material_at(ref.material).emissive_texture, interpolate_uv(ref, b)).rgb;
-        if (HAS_ALPHA_MASK && !alpha_present(carrier, lights[index].triangle, b)) return r;
+        if (HAS_ALPHA_MASK && !alpha_present(carrier, light_at(index).triangle, b)) return r;
         if (HAS_CLEARCOAT || HAS_SHEEN) emitted *= emission_through_layers(ref.material, HAS_TEXTURES ? interpolate_uv(ref, b) : vec2(0.0), cosine);
         r.pdf = select * d2 / (cosine * area);
         r.radiance = emitted / r.pdf;
@@ -155,7 +151,7 @@ LightSample sample_light(vec3 p, vec3 n, float u_pick, vec2 u) {
         return r;
     }
     if (HAS_PUNCTUAL && kind != LIGHT_TRIANGLE) {
-        vec3 position = lights[index].position, direction = lights[index].direction;
+        vec3 position = light_at(index).position, direction = light_at(index).direction;
         if (carrier != NO_INSTANCE) {
             position = transform_point(instance_at(carrier).world_from_object, position);
             direction = transform_vector(instance_at(carrier).world_from_object, direction);
@@ -165,7 +161,7 @@ LightSample sample_light(vec3 p, vec3 n, float u_pick, vec2 u) {
         if (kind == LIGHT_DIRECTIONAL) {
             r.to_light = -direction;
             r.finite_distance = false;
-            r.radiance = lights[index].intensity / select;
+            r.radiance = light_at(index).intensity / select;
             r.valid = true;
             return r;
         }
@@ -174,18 +170,18 @@ LightSample sample_light(vec3 p, vec3 n, float u_pick, vec2 u) {
         if (d2 <= 1e-20) return r;
         float distance_ = sqrt(d2);
         float falloff = 1.0 / d2;
-        if (lights[index].range < 1.0e30) {
+        if (light_at(index).range < 1.0e30) {
             // The smooth window of KHR_lights_punctual.
-            float x = distance_ / lights[index].range;
+            float x = distance_ / light_at(index).range;
             x *= x;
             falloff *= clamp(1.0 - x * x, 0.0, 1.0);
         }
         if (kind == LIGHT_SPOT) {
-            float c = clamp(dot(-d / distance_, direction) * lights[index].cone_scale + lights[index].cone_offset, 0.0, 1.0);
+            float c = clamp(dot(-d / distance_, direction) * light_at(index).cone_scale + light_at(index).cone_offset, 0.0, 1.0);
             falloff *= c * c;
         }
         r.to_light = d;
-        r.radiance = lights[index].intensity * (falloff / select);
+        r.radiance = light_at(index).intensity * (falloff / select);
         r.valid = falloff > 0.0;
     }
     return r;
@@ -200,5 +196,5 @@ float emissive_pdf(uint light, uint instance, uint triangle, vec3 p, vec3 q, vec
     float d2 = dot(d, d);
     float cosine = abs(dot(g, d)) * inversesqrt(max(d2, 1e-30));
     float denominator = cosine * area;
-    return denominator > 1e-30 ? lights[light].select * (1.0 - frame.environment_select) * d2 / denominator : 0.0;
+    return denominator > 1e-30 ? light_at(light).select * (1.0 - frame.environment_select) * d2 / denominator : 0.0;
 }

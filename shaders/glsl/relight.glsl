@@ -2,9 +2,6 @@
 // nothing in the way. So histories hold what of it arrives, which changes little while a body turns or a lamp moves. It is relative to the mean light
 // of the scene: under an even sky it is the reflectance. The filtered sky and the lamps are those of host/render/src/scene_data/relight.rs.
 
-layout(set = 0, binding = B_LIGHTS, scalar) readonly buffer Lights { Light lights[]; };
-layout(set = 0, binding = B_ENVIRONMENT, scalar) readonly buffer EnvironmentBlock { vec4 environment_texels[]; };
-
 // Of the mean light, what arrives at every point at the least: light that others reflect. Without it what is divided by would vanish where neither sky nor
 // lamps shine.
 const float LEAST_LIGHT = 0.05;
@@ -22,9 +19,9 @@ vec3 filtered_sky(vec3 d, uint lobe) {
     vec2 beyond = x - node;
     uint first = frame.environment_height * (frame.environment_width + 1u);
     uint at = first + (lobe * SKY_NODES + uint(node.y)) * SKY_NODES + uint(node.x);
-    vec3 upper = mix(environment_texels[at].rgb, environment_texels[at + 1u].rgb, beyond.x);
+    vec3 upper = mix(sky_at(at).light, sky_at(at + 1u).light, beyond.x);
     at += SKY_NODES;
-    return mix(upper, mix(environment_texels[at].rgb, environment_texels[at + 1u].rgb, beyond.x), beyond.y);
+    return mix(upper, mix(sky_at(at).light, sky_at(at + 1u).light, beyond.x), beyond.y);
 }
 
 // The same over a lobe of GGX of this width, between the two that are nearest.
@@ -49,7 +46,7 @@ struct Seen {
 };
 
 Seen lamp_from(vec3 p, uint index) {
-    Light lamp = lights[index];
+    Light lamp = light_at(index);
     vec3 position = lamp.position, direction = lamp.direction;
     if (lamp.instance != NO_INSTANCE) {
         position = transform_point(instance_at(lamp.instance).world_from_object, position);

@@ -53,7 +53,8 @@ Place place_of(uvec2 pixel, uint at) {
 // The history that a surface point starts from: nothing is known of it, and its sample sequence begins.
 History begin_history(Place place, uint at) {
     History h;
-    h.mean = vec3(0.0);
+    // As long as no sample says otherwise, the light that the scene has on average arrives. Nothing that is weighed takes it in.
+    h.mean = vec3(frame.mean_light);
     h.weight = 0.0;
     h.position = place.position;
     h.normal = encode_normal(place.normal);

@@ -1,8 +1,5 @@
 // A hit into a shading point: its position, its normals, and the material there.
 
-layout(set = 0, binding = B_TEXTURES, scalar) readonly buffer Textures { TextureInfo textures[]; };
-layout(set = 0, binding = B_TEXELS, scalar) readonly buffer Texels { uvec2 texels[]; };
-
 struct Point {
     vec3 p;         // Position, world space.
     vec3 g;         // Geometric normal on the side of v.
@@ -58,12 +55,12 @@ uint wrap_texel(int x, uint size, uint mode) {
 }
 
 vec4 texel(TextureInfo info, int x, int y) {
-    uvec2 w = texels[info.offset + wrap_texel(y, info.height, (info.flags >> 2u) & 3u) * info.width + wrap_texel(x, info.width, info.flags & 3u)];
+    uvec2 w = texel_at(info.offset + wrap_texel(y, info.height, (info.flags >> 2u) & 3u) * info.width + wrap_texel(x, info.width, info.flags & 3u)).shares;
     return vec4(unpackUnorm2x16(w.x), unpackUnorm2x16(w.y));
 }
 
 vec4 sample_texture(TextureUse use, vec2 uv) {
-    TextureInfo info = textures[use.texture];
+    TextureInfo info = texture_at(use.texture);
     vec2 st = vec2(dot(use.row_u, vec3(uv, 1.0)), dot(use.row_v, vec3(uv, 1.0))) * vec2(info.width, info.height);
     // Coordinates that are very large or not finite must not overflow the conversion to integers.
     st = clamp(st, vec2(-1.0e6), vec2(1.0e6));

@@ -30,6 +30,8 @@ const float LIKE_NORMAL = 0.6, DEPTH = 3.0;
 const float RASTER_SLOPES = 4e-4, NORMAL_SLOPES = 0.1;
 // Squared error of what light is divided by, relative to how it varies around: 5 %.
 const float STEEP = 0.0025;
+// Samples that a pixel is taken to hold at the least, so that one can divide by their number.
+const float LEAST_HELD = 1e-6;
 // What is left of an unknown is never taken as smaller, so that one can divide by it.
 const float LEAST_PIVOT = 1e-12;
 
@@ -220,8 +222,9 @@ vec3 regressed(uvec2 pixel, uint at, vec3 own) {
     // A single pixel hardly knows the variance of its samples, so that of the neighbourhood is taken. It does know their number.
     // Beside a highlight it is larger relative to the light than on it, and on a highlight larger as it is: the smaller counts.
     vec2 held_and_divisor = unpackHalf2x16(filtered_at(at).weight_and_albedo);
-    float held = held_and_divisor.x;
-    float noise = min(s.single, s.plain / (held_and_divisor.y * held_and_divisor.y)) / s.used / max(held, 1e-6);
+    // A pixel without a sample takes all of its neighbours' light.
+    float held = max(held_and_divisor.x, LEAST_HELD);
+    float noise = min(s.single, s.plain / (held_and_divisor.y * held_and_divisor.y)) / s.used / held;
     float apart = luminance(step_);
     // In the periphery the eye sees flicker better than blur.
     float beyond = periphery(angle_of(tint_at(at)));

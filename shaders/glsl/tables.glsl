@@ -320,6 +320,103 @@ AlbedoCell albedo_cell_at(uint i) {
 #endif
 
 #ifdef TEXEL_TABLES
+layout(set = 0, binding = B_TEXTURES, rgba32ui) uniform readonly uimageBuffer textures_image;
+TextureInfo texture_at(uint i) {
+    uint at = i;
+    uvec4 r0 = imageLoad(textures_image, int(at) * 1 + 0);
+    return TextureInfo(r0.x,
+        r0.y,
+        r0.z,
+        r0.w);
+}
+#else
+layout(set = 0, binding = B_TEXTURES, scalar) readonly buffer texture_block { TextureInfo texture_table[]; };
+TextureInfo texture_at(uint i) {
+    uint at = i;
+    return TextureInfo(texture_table[at].offset,
+        texture_table[at].width,
+        texture_table[at].height,
+        texture_table[at].flags);
+}
+#endif
+
+#ifdef TEXEL_TABLES
+layout(set = 0, binding = B_TEXELS, rgba32ui) uniform readonly uimageBuffer texels_image;
+Texel texel_at(uint i) {
+    uint at = i;
+    uvec4 row = imageLoad(texels_image, int(at >> 1u));
+    uvec4 r0 = (at & 1u) == 0u ? row : row.zwxy;
+    return Texel(uvec2(r0.x, r0.y));
+}
+#else
+layout(set = 0, binding = B_TEXELS, scalar) readonly buffer texel_block { Texel texel_table[]; };
+Texel texel_at(uint i) {
+    uint at = i;
+    return Texel(texel_table[at].shares);
+}
+#endif
+
+#ifdef TEXEL_TABLES
+layout(set = 0, binding = B_LIGHTS, rgba32ui) uniform readonly uimageBuffer lights_image;
+Light light_at(uint i) {
+    uint at = i;
+    uvec4 r0 = imageLoad(lights_image, int(at) * 5 + 0);
+    uvec4 r1 = imageLoad(lights_image, int(at) * 5 + 1);
+    uvec4 r2 = imageLoad(lights_image, int(at) * 5 + 2);
+    uvec4 r3 = imageLoad(lights_image, int(at) * 5 + 3);
+    uvec4 r4 = imageLoad(lights_image, int(at) * 5 + 4);
+    return Light(r0.x,
+        r0.y,
+        r0.z,
+        uintBitsToFloat(r0.w),
+        uintBitsToFloat(r1.x),
+        r1.y,
+        vec3(uintBitsToFloat(r1.z), uintBitsToFloat(r1.w), uintBitsToFloat(r2.x)),
+        vec3(uintBitsToFloat(r2.y), uintBitsToFloat(r2.z), uintBitsToFloat(r2.w)),
+        vec3(uintBitsToFloat(r3.x), uintBitsToFloat(r3.y), uintBitsToFloat(r3.z)),
+        uintBitsToFloat(r3.w),
+        uintBitsToFloat(r4.x),
+        uintBitsToFloat(r4.y),
+        uvec2(r4.z, r4.w));
+}
+#else
+layout(set = 0, binding = B_LIGHTS, scalar) readonly buffer light_block { Light light_table[]; };
+Light light_at(uint i) {
+    uint at = i;
+    return Light(light_table[at].kind,
+        light_table[at].instance,
+        light_table[at].triangle,
+        light_table[at].select,
+        light_table[at].alias_keep,
+        light_table[at].alias_other,
+        light_table[at].position,
+        light_table[at].direction,
+        light_table[at].intensity,
+        light_table[at].cone_scale,
+        light_table[at].cone_offset,
+        light_table[at].range,
+        light_table[at].unused);
+}
+#endif
+
+#ifdef TEXEL_TABLES
+layout(set = 0, binding = B_ENVIRONMENT, rgba32ui) uniform readonly uimageBuffer environment_image;
+SkyTexel sky_at(uint i) {
+    uint at = i;
+    uvec4 r0 = imageLoad(environment_image, int(at) * 1 + 0);
+    return SkyTexel(vec3(uintBitsToFloat(r0.x), uintBitsToFloat(r0.y), uintBitsToFloat(r0.z)),
+        uintBitsToFloat(r0.w));
+}
+#else
+layout(set = 0, binding = B_ENVIRONMENT, scalar) readonly buffer sky_block { SkyTexel sky_table[]; };
+SkyTexel sky_at(uint i) {
+    uint at = i;
+    return SkyTexel(sky_table[at].light,
+        sky_table[at].cumulative);
+}
+#endif
+
+#ifdef TEXEL_TABLES
 layout(set = 0, binding = B_SURFACE_ROWS, rgba32ui) uniform readonly uimageBuffer surface_rows_image;
 SurfaceHit surface_at(uint i) {
     uint at = SURFACES_HIT_AT(i);

@@ -85,6 +85,8 @@ const BLOCKS: &[(&str, &str, usize)] = &[
     ("B_MATERIALS", "Material", size_of::<structs::Material>()),
     ("B_TEXTURES", "TextureInfo", size_of::<structs::TextureInfo>()),
     ("B_LIGHTS", "Light", size_of::<structs::Light>()),
+    ("B_TEXELS", "Texel", size_of::<structs::Texel>()),
+    ("B_ENVIRONMENT", "SkyTexel", size_of::<structs::SkyTexel>()),
     ("B_ALBEDO", "AlbedoCell", size_of::<structs::AlbedoCell>()),
     ("B_SURFACES", "SurfaceHit", size_of::<structs::SurfaceHit>()),
     ("B_SURFACES", "Barycentric", size_of::<structs::Barycentric>()),

@@ -519,6 +519,22 @@ gpu_structs! {
         cone_offset: f32,
         /// Range, metres.
         range: f32,
+        /// Nothing.
+        unused: [u32; 2],
+    }
+
+    /// A texel of a picture.
+    struct Texel {
+        /// Red and green, and blue and alpha, as shares of 65535.
+        shares: [u32; 2],
+    }
+
+    /// A texel of the sky, or of its filtered copies. The last row of the sky has the cumulative shares of its rows in `light`.
+    struct SkyTexel {
+        /// Radiance.
+        light: [f32; 3],
+        /// Cumulative share of the row's power up to this texel.
+        cumulative: f32,
     }
 
     /// Four neighbours of a table of directional albedo; of the averages the first two.
@@ -950,6 +966,10 @@ tables! {
     TriangleRef "triangle_ref", "B_TRIANGLE_REFS" or "B_TRIANGLE_REFS";
     Material "material", "B_MATERIALS" or "B_MATERIALS";
     AlbedoCell "albedo_cell", "B_ALBEDO" or "B_ALBEDO";
+    TextureInfo "texture", "B_TEXTURES" or "B_TEXTURES";
+    Texel "texel", "B_TEXELS" or "B_TEXELS";
+    Light "light", "B_LIGHTS" or "B_LIGHTS";
+    SkyTexel "sky", "B_ENVIRONMENT" or "B_ENVIRONMENT";
     SurfaceHit "surface", "B_SURFACES"."hit" or "B_SURFACE_ROWS";
     Barycentric "barycentric", "B_SURFACES"."inside" or "B_SURFACE_ROWS";
     SurfaceHit "coarse_surface", "B_COARSE_SURFACES"."hit" or "B_COARSE_SURFACES";

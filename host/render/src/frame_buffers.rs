@@ -8,7 +8,7 @@ use super::live_textures::{LiveTextures, Piece};
 use super::memory::{BytesPerPixel, SharedBuffers, SHOWN_BYTES};
 use super::read_back::{Guide, Surface};
 use super::scene_data::{BodyData, SceneData};
-use super::scene_gpu::{table_buffer, Geometry, SceneGpu};
+use super::scene_gpu::{self, table_buffer, Geometry, SceneGpu};
 use super::settings::{Output, RendererSettings};
 use crate::gpu::{Buffer, FrameTree, Gpu, GpuError, MemoryKind, Place};
 use crate::pack;
@@ -194,7 +194,7 @@ impl FrameBuffers {
             movers: latched("movers", size_of::<Mover>() * bodies.max(1))?,
             device_tree: asks_device.then(|| FrameTree::new(gpu, bodies)).transpose()?,
             deformed: DeformedTables::new(gpu, data, reading)?,
-            textures: texture_table(gpu, data)?,
+            textures: texture_table(gpu, reading, data)?,
             piece: live.map(|live| live.piece(gpu)).transpose()?,
             debug_host: debug.then(|| DebugBuffers::new(gpu, both, tiles, each)).transpose()?,
             panel: is_reduced.then(|| PanelBuffers::new(gpu, both, panel_tiles, each, debug)).transpose()?,
@@ -392,18 +392,19 @@ impl FrameBuffers {
 }
 
 /// The texture table of a frame in flight; `None` if the pictures of the scene stay.
-fn texture_table(gpu: &Arc<Gpu>, data: &SceneData) -> Result<Option<LatchBuffer>, GpuError> {
+fn texture_table(
+    gpu: &Arc<Gpu>,
+    reading: Reading,
+    data: &SceneData,
+) -> Result<Option<LatchBuffer>, GpuError> {
     if data.clips.is_empty() && data.live.is_empty() {
         return Ok(None);
     }
     let len_bytes = size_of_val(&data.textures[..]);
     let mut host = Buffer::new(gpu, "texture table", len_bytes, MemoryKind::Upload)?;
     host.write(&data.textures);
-    Ok(Some(LatchBuffer {
-        host,
-        device: Buffer::from_slice(gpu, "texture table", &data.textures)?,
-        len_bytes,
-    }))
+    let device = scene_gpu::texture_table(gpu, reading, data)?;
+    Ok(Some(LatchBuffer { host, device, len_bytes }))
 }
 
 impl PanelBuffers {

@@ -3,6 +3,7 @@
 use super::scene_data::SceneData;
 use crate::gpu::{triangle_buffer, BodyTrees, Buffer, Gpu, GpuError, MemoryKind};
 use bytemuck::cast_slice;
+use dpm_scene::LinearTexel;
 use dpm_shaders::Reading;
 use std::borrow::Cow;
 use std::sync::Arc;
@@ -37,10 +38,33 @@ fn rows(
     words: &[[u32; 4]],
     float: bool,
 ) -> Result<Buffer, GpuError> {
+    // Buffers cannot be empty; what pads them is never read.
+    let words = if words.is_empty() { &PADDING[..] } else { words };
     if reading == Reading::Texels {
         Buffer::texels(gpu, what, words, float)
     } else {
         Buffer::from_slice(gpu, what, words)
+    }
+}
+
+/// An element of the longest row: five texels.
+const PADDING: [[u32; 4]; 5] = [[0; 4]; 5];
+
+/// The texture table of a scene, for either way of reading it.
+///
+/// # Errors
+/// As [`Buffer::texels`].
+pub(super) fn texture_table(gpu: &Arc<Gpu>, reading: Reading, data: &SceneData) -> Result<Buffer, GpuError> {
+    rows(gpu, reading, "texture table", cast_slice(&data.textures), false)
+}
+
+/// The texels as rows of two.
+fn pairs(texels: &[LinearTexel]) -> Cow<'_, [[u32; 4]]> {
+    match bytemuck::try_cast_slice(texels) {
+        Ok(rows) => Cow::from(rows),
+        Err(_) => {
+            texels.chunks(2).map(|c| [c[0][0], c[0][1], c[c.len() - 1][0], c[c.len() - 1][1]]).collect()
+        }
     }
 }
 
@@ -56,16 +80,14 @@ impl Geometry {
         host_walks: bool,
     ) -> Result<Self, GpuError> {
         let (texel, query) = (reading == Reading::Texels, reading == Reading::Query);
-        // Buffers cannot be empty; one element of padding is never read.
-        let empty = [[0u32; 4]; 5];
-        let nodes = if data.nodes.is_empty() || query { &empty[..] } else { &data.nodes };
+        let nodes = if query { &[][..] } else { &data.nodes };
         // Where the shaders of software Vulkan walk, a run is too short, and its rays too few, to be worth the time that horizons take.
         let triangles = if texel && !host_walks {
             Cow::from(&data.triangles)
         } else {
             Cow::from(data.triangles_with_horizons())
         };
-        let triangles = if triangles.is_empty() { &empty[..] } else { &triangles };
+        let triangles = if triangles.is_empty() { &PADDING[..] } else { &triangles };
         let rows = |what, words: &[[u32; 4]], float| rows(gpu, reading, what, words, float);
         let (triangles, trees) = if query {
             let triangles = triangle_buffer(gpu, triangles)?;
@@ -100,13 +122,13 @@ impl SceneGpu {
             geometry: Geometry::new(gpu, data, reading, host_walks)?,
             refs: rows("triangle indices", cast_slice(&data.refs), false)?,
             materials: rows("materials", cast_slice(&data.materials), false)?,
-            textures: Buffer::from_slice(gpu, "texture table", &data.textures)?,
-            texels: Buffer::from_slice(gpu, "textures", &data.texels)?,
-            lights: Buffer::from_slice(gpu, "lights", &[&data.lights[..], &data.lamps].concat())?,
-            environment: Buffer::from_slice(
-                gpu,
+            textures: texture_table(gpu, reading, data)?,
+            texels: rows("textures", &pairs(&data.texels), false)?,
+            lights: rows("lights", cast_slice(&[&data.lights[..], &data.lamps].concat()), false)?,
+            environment: rows(
                 "environment map",
-                &[&data.environment[..], &data.filtered_sky].concat(),
+                cast_slice(&[&data.environment[..], &data.filtered_sky].concat()),
+                false,
             )?,
             albedo: rows("albedo tables", cast_slice(&data.albedo), false)?,
         })

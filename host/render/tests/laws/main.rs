@@ -2,5 +2,6 @@
 
 #[path = "../../../scene/tests/laws/common/mod.rs"]
 mod common;
+mod few_samples;
 mod hostile_gltf;
 mod scale;

@@ -22,7 +22,7 @@ const GAIN: f32 = 0.05;
 /// The even sky's radiance.
 const SKY: f32 = 1.0;
 
-fn dpm() -> Method {
+pub(super) fn dpm() -> Method {
     Method {
         dpm: true,
         rate_map: true,
@@ -56,18 +56,18 @@ fn settings(camera: &ProjectorCamera, scale: Scale, method: &Method) -> Renderer
 }
 
 /// What a frame shows on the panel.
-struct Picture {
-    codes: Vec<u32>,
-    light: Vec<Vec3>,
+pub(super) struct Picture {
+    pub(super) codes: Vec<u32>,
+    pub(super) light: Vec<Vec3>,
     surfaces: Vec<Surface>,
     lit: u32,
 }
 
 /// A scene before a projector and an eye.
-struct View<'a> {
+pub(super) struct View<'a> {
     gpu: Arc<Gpu>,
     scene: &'a Scene,
-    camera: ProjectorCamera,
+    pub(super) camera: ProjectorCamera,
     eye: DVec3,
 }
 
@@ -79,6 +79,11 @@ impl<'a> View<'a> {
 
     /// The last of so many frames, each on its rung.
     fn show(&self, scale: Scale, method: &Method, rungs: &[usize]) -> Picture {
+        self.show_by(2.0, scale, method, rungs)
+    }
+
+    /// The same by so many samples of a pixel a frame.
+    pub(super) fn show_by(&self, budget_spp: f32, scale: Scale, method: &Method, rungs: &[usize]) -> Picture {
         let settings = settings(&self.camera, scale, method);
         let mut renderer = Renderer::new(&self.gpu, self.scene, settings).expect("the scene fits");
         let mut slot = renderer.create_slot(true).expect("memory");
@@ -86,7 +91,7 @@ impl<'a> View<'a> {
         let mut lit = 0;
         for (frame, &rung) in rungs.iter().enumerate() {
             let still = FrameInputs::new(&self.camera, (self.eye, DVec3::ZERO), &poses);
-            let inputs = FrameInputs { frame: frame as u32, spp: 2, budget_spp: 2.0, rung, ..still };
+            let inputs = FrameInputs { frame: frame as u32, spp: 2, budget_spp, rung, ..still };
             renderer.submit(&mut slot, &inputs).expect("a frame");
             lit = slot.wait(WAIT_NS).expect("the frame ends").counters().lit_pixels;
         }
@@ -104,7 +109,7 @@ impl<'a> View<'a> {
     }
 
     /// Of each pixel of a raster with the same view the body that its ray meets first, in f64 and without any tree, and whether the eye sees it.
-    fn truth(&self, raster: dpm_device::planes::Raster) -> Vec<Option<(usize, bool)>> {
+    pub(super) fn truth(&self, raster: dpm_device::planes::Raster) -> Vec<Option<(usize, bool)>> {
         let camera = self.camera.at_raster(raster);
         let triangles: Vec<(usize, [DVec3; 3])> = (self.scene.bodies.iter().enumerate())
             .flat_map(|(i, body)| {
@@ -153,7 +158,7 @@ fn body_of(surface: &Surface) -> Option<(usize, bool)> {
 }
 
 /// A ball before another and before a wall that does not fill the raster, seen by an eye beside the projector.
-fn balls() -> Scene {
+pub(super) fn balls() -> Scene {
     let mut scene =
         scene_of(sphere(Vec3::new(0.0, 0.0, 0.0), 0.3, 3, true), diffuse(Vec3::new(0.8, 0.4, 0.2)));
     add(&mut scene, sphere(Vec3::new(0.35, 0.1, 0.4), 0.12, 3, true), diffuse(Vec3::new(0.2, 0.5, 0.8)));
@@ -166,7 +171,7 @@ fn balls() -> Scene {
     scene
 }
 
-fn view_of_balls(scene: &Scene) -> View<'_> {
+pub(super) fn view_of_balls(scene: &Scene) -> View<'_> {
     View::new(scene, camera(161, 121, DVec3::new(0.0, 0.0, 2.6), DVec3::ZERO), DVec3::new(0.25, 0.15, 2.6))
 }
 
