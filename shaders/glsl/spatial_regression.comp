@@ -30,6 +30,8 @@ const float LIKE_NORMAL = 0.6, DEPTH = 3.0;
 const float RASTER_SLOPES = 4e-4, NORMAL_SLOPES = 0.1;
 // Squared error of what light is divided by, relative to how it varies around: 5 %.
 const float STEEP = 0.0025;
+// With next to no samples a frame, half of what a pixel of so many samples differs from its neighbours is taken for chance.
+const float DOUBTED_SAMPLES = 4.0;
 // Samples that a pixel is taken to hold at the least, so that one can divide by their number.
 const float LEAST_HELD = 1e-6;
 // What is left of an unknown is never taken as smaller, so that one can divide by it.
@@ -228,7 +230,9 @@ vec3 regressed(uvec2 pixel, uint at, vec3 own) {
     float apart = luminance(step_);
     // In the periphery the eye sees flicker better than blur.
     float beyond = periphery(angle_of(tint_at(at)));
-    structure = max(structure, apart * apart - mix(3.0, 16.0, beyond) * noise);
+    // Where a pixel waits for its samples, its few ones do not show that it differs from its neighbours.
+    float sure = held / (held + DOUBTED_SAMPLES * max(1.0 - frame.budget_spp, 0.0));
+    structure = max(structure, sure * apart * apart - mix(3.0, 16.0, beyond) * noise);
     // What histories are divided by errs the more the steeper it is.
     structure = max(structure, STEEP * max(s.divisor.y * s.used / (s.divisor.x * s.divisor.x) - 1.0, 0.0));
     // The eye's mean removes what changes from frame to frame. Of a young point that is little, because all its frames share the same samples.
