@@ -292,6 +292,7 @@ pub fn usbip_stream(bytes: &[u8]) {
 /// A rig file.
 pub fn texts(bytes: &[u8]) {
     let Ok(text) = std::str::from_utf8(bytes) else { return };
+    dpm_dlpc900_rig::register();
     if let Err(errors) = RigConfig::parse("seed.toml", text, Path::new("/nonexistent"), &Overrides::default())
     {
         assert!(!errors.to_string().is_empty());
@@ -335,6 +336,7 @@ pub fn settings(bytes: &[u8]) {
             None => overrides.flags.push(line.into()),
         }
     }
+    dpm_dlpc900_rig::register();
     if let Err(errors) = RigConfig::parse("seed.toml", "", Path::new("/nonexistent"), &overrides) {
         assert!(!errors.to_string().is_empty());
     }

@@ -5,13 +5,12 @@
 //! blank. [`mode`] says what a mode is, [`set_up`] chooses connector, mode and properties or says why not, [`encoding`] puts
 //! planes into pixels, [`pacer`] follows the blanks, [`panel`] is the state machine, and [`transport`] its thread at the end
 //! of an in-process cable. [`scan_out`] is the trait that a panel draws through, [`kms`] the other calls of the kernel,
-//! [`card`] the real kernel, [`fake`] the kernel of tests. [`lease`] asks a desktop for a part of a card, [`dlpc900`] is a
-//! controller that the display feeds, and [`window`] a window for a desk without a projector.
+//! [`card`] the real kernel, [`fake`] the kernel of tests. [`lease`] asks a desktop for a part of a card, and [`window`] is a
+//! window for a desk without a projector.
 //!
 //! **Nothing of this has run on real hardware yet.**
 
 pub mod card;
-pub mod dlpc900;
 pub mod encoding;
 pub mod fake;
 pub mod kms;

@@ -4,9 +4,6 @@
 #![cfg_attr(not(all(feature = "satellites", feature = "terminal")), allow(dead_code))]
 
 pub mod cli;
-#[cfg(feature = "dlpc900")]
-mod dlpc900;
 mod keep_parameters;
 mod notify;
-mod own_run;
-pub mod signals;
+pub mod satellites;

@@ -101,6 +101,7 @@ fn refusals_say_why() {
     let told = |file: &str, set: &[&str]| {
         rehearse(&rig(file, &keys(set)), SHORT, &mut |_| ()).expect_err("refused").to_string()
     };
+    dpm_dlpc900_rig::register();
     assert!(told("dlpc900.toml", &[]).contains("loaded before their time"));
     assert!(told("budget.toml", &["tracker.tags=[]"]).contains("no body has tags"));
     let behind = told("budget.toml", &["tracker.transform.position=[0.0, 0.2, -3.0]"]);

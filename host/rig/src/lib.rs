@@ -44,6 +44,7 @@ pub mod light;
 pub mod method_choice;
 mod mock;
 pub mod order;
+pub mod own_run;
 pub mod pack;
 pub mod parameters;
 pub mod pattern;

@@ -17,6 +17,7 @@ mod port;
 pub use identity::Identity;
 
 use crate::config::Restart;
+use crate::failure::{Failure, FailureKind};
 use crate::order::Order;
 use crate::telemetry::monitor::RunMonitor;
 use dpm_common::folder::{Folder, FolderError, Owner};
@@ -585,6 +586,22 @@ fn holding(
 /// What stands for `identity` on this machine: in the state folder of this user, and by orders of others.
 pub fn standing(identity: &Identity) -> Option<Stands> {
     standing_beside(&state_folder()?, Others::of_this_machine().as_ref(), identity)
+}
+
+/// Fails if SAFE or BLACK stands for the projector of `identity`. For commands that emit light without a rig that could
+/// be armed.
+///
+/// # Errors
+/// The standing order, since when and by whom (exit code 3).
+pub fn refuse_where_dark_stands(identity: &Identity) -> Result<(), Failure> {
+    match standing(identity) {
+        None => Ok(()),
+        Some(stands) => {
+            let word = if stands.order == Order::Safe { "SAFE" } else { "BLACK" };
+            let told = format!("{identity}: {word} stands {}; run its rig and say `dpm arm`", stands.told);
+            Err(Failure::new(FailureKind::Device, told))
+        }
+    }
 }
 
 /// What stands on this machine for the projector that says HELLO with this serial number, whatever port its order names:

@@ -125,6 +125,7 @@ fn write(folder: &Path) -> Result<(), String> {
 }
 
 fn main() -> ExitCode {
+    dpm_dlpc900_rig::register();
     let Some(folder) = std::env::args_os().nth(1) else {
         eprintln!("usage: demo_frames FOLDER");
         return ExitCode::from(2);

@@ -22,6 +22,7 @@ mod gpu_against_reference;
 mod halftone_on_gpu;
 mod leaving_out;
 mod lens_on_gpu;
+mod light_course;
 #[path = "../../../host/dpm/tests/laws/link_common/mod.rs"]
 mod link_common;
 mod live_pictures;

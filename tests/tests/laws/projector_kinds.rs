@@ -145,6 +145,7 @@ fn judge(kind: &ProjectorKind) {
 
 #[test]
 fn every_kind_of_projectors_keeps_the_laws_of_all() {
+    dpm::satellites::register();
     assert!(kinds().len() >= 7);
     kinds().into_iter().for_each(judge);
 }
@@ -169,6 +170,7 @@ impl ProjectorKeys for LanternConfig {
 /// A stranger's kind: its keys, what names it, and this row.
 #[test]
 fn a_kind_is_an_object_and_a_row() {
+    dpm::satellites::register();
     add(&LANTERN);
     judge(&LANTERN);
     assert!(RigConfig::manual().contains("## `[projector.backend]` with `kind = \"lantern\"`"));

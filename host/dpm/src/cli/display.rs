@@ -1,8 +1,8 @@
 //! `dpm display`: the displays of this machine, and what to write for each mode; and the guardian of a run.
 
 use super::watch::print;
-use crate::signals;
 use dpm_common::guardian;
+use dpm_common::signals;
 use dpm_display::card::{cards, show_black, Card};
 use dpm_display::kms::{Connector, Kms};
 use dpm_display::mode::written;

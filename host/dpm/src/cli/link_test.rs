@@ -1,8 +1,8 @@
 //! `dpm link-test RIG.toml`: measures the throughput of the link to the projector.
 
 use super::rig_args::RigArgs;
-use super::watch::{print, refuse_where_dark_stands, take_locks};
-use crate::signals;
+use super::watch::{print, take_locks};
+use dpm_common::signals;
 use dpm_common::stopping;
 use dpm_lab::conformance::{rules, Extent, Rule};
 use dpm_lab::link_test::{judge_projector, link_test, Content};
@@ -13,7 +13,7 @@ use dpm_rig::interlock::Interlock;
 use dpm_rig::presence;
 use dpm_rig::rig::Rig;
 use dpm_rig::run_rig::open_gpu;
-use dpm_rig::standing::Identity;
+use dpm_rig::standing::{refuse_where_dark_stands, Identity};
 use dpm_rig::telemetry::report::to_json;
 use std::path::PathBuf;
 

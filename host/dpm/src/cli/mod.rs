@@ -7,8 +7,6 @@ mod calibrate;
 mod completion;
 #[cfg(feature = "display")]
 mod display;
-#[cfg(feature = "dlpc900")]
-mod dlpc900;
 mod doctor;
 #[cfg(feature = "lab")]
 mod error;
@@ -32,7 +30,6 @@ mod manual;
 mod order;
 mod os;
 mod osc;
-mod own_runs;
 #[cfg(feature = "page")]
 mod page;
 mod pattern;
@@ -170,9 +167,8 @@ enum Command {
     /// Show what a rig needs from the renderer, and what is left out, why and how; with --measure also the savings
     #[cfg(feature = "lab")]
     Plan(plan::PlanArgs),
-    /// Control a DLPC900 projector (LightCrafter 6500 / 9000): status, patterns, rest
-    #[cfg(feature = "dlpc900")]
-    Dlpc900(dlpc900::Dlpc900Args),
+    #[command(flatten)]
+    Satellite(crate::satellites::Command),
     /// List the displays that can serve as projectors, and what to write in a rig file for each mode
     #[cfg(feature = "display")]
     Display(display::DisplayArgs),
@@ -190,6 +186,7 @@ enum Command {
 /// [`dpm_common::commit::get`].
 pub fn main(commit: &'static str) -> ExitCode {
     dpm_common::commit::set(commit);
+    crate::satellites::register();
     completion::answer();
     let command = coloured(command());
     let parsed = command.try_get_matches().and_then(|m| Cli::from_arg_matches(&m));
@@ -234,33 +231,10 @@ fn coloured(command: clap::Command) -> clap::Command {
     command
 }
 
-/// What this program was built with: what it always has, and the features of Cargo that were asked for.
-fn features() -> String {
-    let chosen = [
-        ("alp", cfg!(feature = "alp")),
-        ("calibrate", cfg!(feature = "calibrate")),
-        ("camera-files", cfg!(feature = "camera-files")),
-        ("display", cfg!(feature = "display")),
-        ("dlpc900", cfg!(feature = "dlpc900")),
-        ("lab", cfg!(feature = "lab")),
-        ("manual", cfg!(feature = "manual")),
-        ("page", cfg!(feature = "page")),
-        ("plots", cfg!(feature = "plots")),
-        ("terminal", cfg!(feature = "terminal")),
-        ("exr", cfg!(feature = "exr")),
-        ("wayland", cfg!(feature = "wayland")),
-        ("x11", cfg!(feature = "x11")),
-        ("vendored-libusb", cfg!(feature = "vendored-libusb")),
-    ];
-    let always = ["usb", "serial", "net"];
-    let chosen = chosen.into_iter().filter(|(_, is_there)| *is_there).map(|(name, _)| name);
-    always.into_iter().chain(chosen).collect::<Vec<_>>().join(", ")
-}
-
 /// The command line. `-V` tells version and commit; `--version` adds the features.
 fn command() -> clap::Command {
     let version = format!("{} ({})", env!("CARGO_PKG_VERSION"), dpm_common::commit::get());
-    let long = format!("{version}\nfeatures: {}", features());
+    let long = format!("{version}\nfeatures: {}", crate::satellites::features());
     // Leaked once or twice per process; the parser keeps them for as long.
     negatives_reach_their_checks(Cli::command().version(&*version.leak()).long_version(&*long.leak()))
 }
@@ -310,8 +284,7 @@ fn dispatch(command: &Command) -> Result<(), Failure> {
         Command::Error(args) => error::execute(args),
         #[cfg(feature = "lab")]
         Command::Plan(args) => plan::execute(args),
-        #[cfg(feature = "dlpc900")]
-        Command::Dlpc900(args) => dlpc900::execute(args),
+        Command::Satellite(command) => crate::satellites::execute(command).map(|text| watch::print(&text)),
         #[cfg(feature = "display")]
         Command::Display(args) => display::execute(args),
         #[cfg(feature = "manual")]

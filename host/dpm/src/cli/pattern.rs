@@ -1,12 +1,12 @@
 //! `dpm pattern KIND RIG.toml`: shows a pattern on the rig's projector, or writes it as pictures.
 
-use super::own_runs;
 use super::rig_args::RigArgs;
 use super::watch::{print, run_and_report, watch};
 use clap::ValueEnum;
 use dpm_device::planes::Channel;
 use dpm_rig::config::RigConfig;
 use dpm_rig::failure::{Failure, FailureKind};
+use dpm_rig::own_run;
 use dpm_rig::pattern::{
     flashes, run_pattern, shortest_hold_ms, Axis, Ink, Pattern, PatternError, PatternShow,
 };
@@ -201,7 +201,7 @@ pub(super) fn execute(args: &PatternArgs) -> Result<(), Failure> {
         return write_pictures(&show, file, args.json);
     }
     refuse_flashes(&rig, &show)?;
-    if let Some(own) = own_runs::of(&rig)? {
+    if let Some(own) = own_run::of(&rig)? {
         let report = watch(rig, move |rig, monitor| (own.pattern)(rig, &show, monitor))?;
         print(&if args.json { report.json() + "\n" } else { report.table() });
         return Ok(());

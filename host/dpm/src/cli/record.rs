@@ -4,9 +4,9 @@
 use super::completion::rig_keys;
 use super::rig_args::RigArgs;
 use super::watch::print;
-use crate::signals;
 use clap_complete::engine::ArgValueCompleter;
 use dpm_common::clock::{Clock, MonotonicClock};
+use dpm_common::signals;
 use dpm_device::tracker::record::Recorder;
 use dpm_device::tracker::{BodyKey, Tracker};
 use dpm_rig::failure::{Failure, FailureKind};

@@ -1,6 +1,6 @@
 //! `dpm rigs`: serves the overview of several rigs until it is asked to end.
 
-use crate::signals;
+use dpm_common::signals;
 use dpm_page::rigs::{RigAddress, Rigs, DEFAULT_LISTEN};
 use dpm_page::Page;
 use dpm_rig::failure::{Failure, FailureKind};

@@ -1,6 +1,5 @@
 //! `dpm run RIG.toml` and `dpm demo`: run a rig from its file to light.
 
-use super::own_runs;
 use super::rig_args::RigArgs;
 #[cfg(feature = "lab")]
 use super::watch::check_file;
@@ -10,6 +9,7 @@ use crate::keep_parameters;
 use dpm_lab::film::{film, FilmRequest};
 use dpm_rig::config::DEFAULT_PAGE;
 use dpm_rig::failure::Failure;
+use dpm_rig::own_run;
 use dpm_rig::run_rig::run_rig;
 use std::path::{Path, PathBuf};
 
@@ -94,7 +94,7 @@ pub(crate) fn execute_demo(args: &DemoArgs) -> Result<(), Failure> {
 
 fn start(path: Option<&Path>, flags: &RigArgs, json: bool) -> Result<(), Failure> {
     let rig = flags.rig(path)?;
-    if let Some(own) = own_runs::of(&rig)? {
+    if let Some(own) = own_run::of(&rig)? {
         check_out(flags.out.as_deref())?;
         let report = watch(rig, |rig, monitor| (own.run)(rig, monitor))?;
         let text = report.json() + "\n";

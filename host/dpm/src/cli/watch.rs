@@ -11,10 +11,10 @@ use super::live_page;
 use super::osc;
 use super::tell::{Teller, SHOWN_EVERY};
 use crate::notify::Notifier;
-use crate::signals;
 use crossbeam::channel::{unbounded, Receiver, RecvTimeoutError};
 use dpm_common::files::{check_folder, folder_of, write_atomically, InstanceLock, LockError};
 use dpm_common::folder::{Folder, FolderError};
+use dpm_common::signals;
 use dpm_common::stopping;
 use dpm_rig::config::{OutputConfig, RigConfig};
 use dpm_rig::control::orders::Orders;
@@ -460,20 +460,4 @@ pub(super) fn take_locks(rig: &RigConfig) -> Result<Locks, Failure> {
         );
     }
     Ok(Locks { _held: held, runtime })
-}
-
-/// Fails if SAFE stands for the projector of `identity`. For commands that emit light without a rig that could be
-/// armed.
-///
-/// # Errors
-/// The standing order, since when and by whom (exit code 3).
-pub(super) fn refuse_where_dark_stands(identity: &Identity) -> Result<(), Failure> {
-    match dpm_rig::standing::standing(identity) {
-        None => Ok(()),
-        Some(stands) => {
-            let word = if stands.order == Order::Safe { "SAFE" } else { "BLACK" };
-            let told = format!("{identity}: {word} stands {}; run its rig and say `dpm arm`", stands.told);
-            Err(Failure::new(FailureKind::Device, told))
-        }
-    }
 }

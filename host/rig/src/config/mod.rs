@@ -426,7 +426,7 @@ impl RigConfig {
 const MANUAL_HEAD: &str = "# The rig file
 
 This page is generated from the declarations in `host/rig/src/config/` and beside it. To renew it, run
-`DPM_UPDATE_MANUAL=1 cargo test -p dpm-rig --lib manual`.
+`DPM_UPDATE_MANUAL=1 cargo test -p dpm-tests --test laws the_manual`.
 
 A rig file is TOML. Keys that it leaves out have their defaults. Environment variables override the file
 (`DPM_SET_PROJECTOR__WIDTH=640` sets `projector.width`; two underscores separate the levels). The flag

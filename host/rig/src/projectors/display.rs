@@ -1,24 +1,20 @@
-//! `projector.backend.kind = "display"`: a display on a graphics card, and the DLPC900 behind it if there is one.
+//! `projector.backend.kind = "display"`: a display on a graphics card, and the controller behind it if there is one.
 
-use super::dlpc900::{check_panel, guardian_of, Dlpc900Panel, VideoInput, NO_WATCHDOG};
-use super::keys::{DeviceName, FrameKeys, Medium, Opening, Panel, ProjectorKeys, Surroundings};
+use super::controller::Behind;
+use super::keys::{DeviceName, FrameKeys, Medium, Opening, Panel, ProjectorKeys};
 use super::kind::{ProjectorKind, SlotClock};
 use super::light::{LitTime, PlaneTiming, PlaneWeights};
 use dpm_common::keys::read::{contradict, refuse, shown, Any, NotEmpty, Reader, Within};
 use dpm_common::{section, words};
 use dpm_device::planes::{Parts, PlaneSchedule};
-use dpm_device::time::FrameRate;
 use dpm_device::transport::TransportError;
 use dpm_display::encoding::Encoding;
 use dpm_display::lease::{self, Access, Lender};
 use dpm_display::mode::ModeWish;
 use dpm_display::set_up::DisplaySettings;
 use dpm_display::transport::{on_card, DisplayTransport, Opener};
-use dpm_dlpc900::usb::{self, UsbPlace};
-use dpm_dlpc900::video::{dark_us, exposure_us, BadExposure, VideoBits, VideoPatterns};
 use dpm_handoff::wake::WaitPolicy;
 use std::path::PathBuf;
-use std::sync::Arc;
 
 section! {
     /// A display on a graphics card of this machine, which shows nothing else meanwhile, or lends this display alone.
@@ -46,29 +42,12 @@ section! {
         /// RGB"]. Name one only after you have measured that bits arrive.
         without: Vec<String> = Vec::new(), "", Any;
         /// The DLPC900 at the other end of the cable, if the display is one. The rig sets it up over USB, and watches it.
-        dlpc900: Option<Dlpc900BehindConfig> = None, "", Any;
-    }
-}
-
-section! {
-    /// A TI DLPC900 whose video input the display feeds: every frame is cut into patterns, which are shown one after the other
-    /// while the next frame arrives. `encoding` says into which; the planes and their weights follow from it, so leave
-    /// `projector.weights` out.
-    pub struct Dlpc900BehindConfig {
-        /// The panel at the controller; it must have the projector's width and height.
-        panel: Dlpc900Panel = Dlpc900Panel::Dlp6500, "", Any;
-        /// Its video input.
-        input: VideoInput = VideoInput::Hdmi, "", Any;
-        /// The controller, as BUS:ADDRESS in `lsusb`; needed if several are plugged in.
-        device: Option<String> = None, "", NotEmpty;
-        /// Exposure of each pattern. If left out, nine tenths of what a frame has for it: 620 of at most 684 for 24
-        /// patterns at 60 frames/s. What is left is dark after each pattern, so that no long gap flickers.
-        exposure_us: Option<u32> = None, "us", Within(24, 40_000);
+        dlpc900: Behind = Behind::default(), "", Any;
     }
 }
 
 impl DisplayEncoding {
-    /// How each channel shows its code value in a frame of a DLPC900.
+    /// How each channel shows its code value in a frame of a controller.
     pub const fn parts(self) -> Parts {
         let (count, depth, white) = match self {
             Self::Rgb8 => (1, 8, false),
@@ -85,12 +64,7 @@ impl DisplayEncoding {
         Parts { count, depth, low: 0, white }
     }
 
-    /// How a DLPC900 cuts a pixel into patterns.
-    pub const fn video_bits(self) -> VideoBits {
-        VideoBits::new(self.parts().depth).expect("each word's bits fill a pixel")
-    }
-
-    /// How much light the planes of a channel give behind a DLPC900: the bits of a pattern weigh as those of a number do.
+    /// How much light the planes of a channel give behind a controller: the bits of a pattern weigh as those of a number do.
     pub const fn weights(self) -> PlaneWeights {
         match self.parts().depth {
             1 => PlaneWeights::Equal,
@@ -98,8 +72,8 @@ impl DisplayEncoding {
         }
     }
 
-    /// It says how a DLPC900 cuts pixels, and nothing to a display by itself.
-    pub const fn needs_dlpc900(self) -> bool {
+    /// It says how a controller cuts pixels, and nothing to a display by itself.
+    pub const fn needs_controller(self) -> bool {
         !matches!(self, Self::Rgb8 | Self::Planes24)
     }
 }
@@ -109,25 +83,6 @@ impl DisplayConfig {
     /// `frame_ns`: time of a frame.
     pub fn commit_ns(&self, frame_ns: i64) -> i64 {
         self.commit_us.map_or((frame_ns / 2).min(8_000_000), |us| i64::from(us) * 1000)
-    }
-
-    /// How long each pattern of the DLPC900 behind this display is lit, microseconds; `None` without one.
-    pub fn exposure_us(&self, rate: FrameRate) -> Option<Result<u32, BadExposure>> {
-        let behind = self.dlpc900.as_ref()?;
-        Some(exposure_us(self.encoding.video_bits(), behind.panel.dmd(), rate, behind.exposure_us))
-    }
-
-    /// The patterns of the DLPC900 behind this display; `None` without one.
-    pub fn video_patterns(
-        &self,
-        rate: FrameRate,
-        schedule: &PlaneSchedule,
-    ) -> Option<Result<VideoPatterns, BadExposure>> {
-        let behind = self.dlpc900.as_ref()?;
-        let (dmd, receiver) = (behind.panel.dmd(), behind.input.receiver());
-        let bits = self.encoding.video_bits();
-        let of = |us| VideoPatterns::of_rig(dmd, receiver, rate, schedule, bits, us);
-        self.exposure_us(rate).map(|us| us.map(of))
     }
 }
 
@@ -206,8 +161,8 @@ impl ProjectorKeys for DisplayConfig {
             );
         }
         let encoding = ("projector.backend.encoding", shown(self.encoding));
-        let is_behind = self.dlpc900.is_some();
-        if frames.planes != 24 && (self.encoding != DisplayEncoding::Rgb8 || is_behind) {
+        let behind = self.dlpc900.get();
+        if frames.planes != 24 && (self.encoding != DisplayEncoding::Rgb8 || behind.is_some()) {
             contradict(
                 reader,
                 &[
@@ -219,7 +174,7 @@ impl ProjectorKeys for DisplayConfig {
                 "set projector.planes = 24".into(),
             );
         }
-        if self.encoding.needs_dlpc900() && !is_behind {
+        if self.encoding.needs_controller() && behind.is_none() {
             contradict(
                 reader,
                 &[encoding.clone(), ("projector.backend.dlpc900", "not there".into())],
@@ -227,7 +182,8 @@ impl ProjectorKeys for DisplayConfig {
                 "add the table [projector.backend.dlpc900], or use encoding = \"rgb8\"".into(),
             );
         }
-        if self.encoding == DisplayEncoding::Rgb8 && frames.weights == PlaneWeights::Equal && !is_behind {
+        if self.encoding == DisplayEncoding::Rgb8 && frames.weights == PlaneWeights::Equal && behind.is_none()
+        {
             contradict(
                 reader,
                 &[
@@ -239,15 +195,15 @@ impl ProjectorKeys for DisplayConfig {
                 "leave `projector.weights` out, or use encoding = \"planes24\"".into(),
             );
         }
-        if let Some(behind) = &self.dlpc900 {
-            check_panel(frames, &KIND, "projector.backend.dlpc900.panel", behind.panel, reader);
-            self.check_behind(frames, reader);
+        if let Some(behind) = behind {
+            self.check_weights(frames, reader);
+            behind.check(self.encoding.parts(), frames, reader);
         }
     }
 
     fn plane_timing(&self) -> PlaneTiming {
-        match (&self.dlpc900, self.encoding) {
-            (Some(_), encoding) => match encoding.video_bits().depth() {
+        match (self.dlpc900.get(), self.encoding) {
+            (Some(_), encoding) => match encoding.parts().depth {
                 1 => PlaneTiming::Equal,
                 planes => PlaneTiming::Together { planes },
             },
@@ -257,20 +213,12 @@ impl ProjectorKeys for DisplayConfig {
     }
 
     fn lit_time(&self, frames: &FrameKeys) -> LitTime {
-        let Some(Ok(exposure_us)) = self.exposure_us(frames.rate) else {
-            return LitTime::all_of(frames.rate);
-        };
-        let patterns = self.encoding.video_bits().patterns();
-        let dark_us = dark_us(self.encoding.video_bits(), frames.rate, exposure_us);
-        LitTime {
-            whole_ns: i64::from((exposure_us + dark_us) * patterns) * 1000,
-            dark_ns: i64::from(dark_us) * 1000,
-            ..LitTime::all_of(frames.rate)
-        }
+        let behind = self.dlpc900.get();
+        behind.map_or(LitTime::all_of(frames.rate), |it| it.lit_time(self.encoding.parts(), frames))
     }
 
     fn schedule(&self) -> Option<PlaneSchedule> {
-        self.dlpc900.as_ref()?;
+        self.dlpc900.get()?;
         match self.encoding.parts() {
             // Colours in turn: a moving edge of grey is less coloured than with eight planes of green, of red, of blue.
             Parts { depth: 1, white: false, .. } => Some(PlaneSchedule::equal_rgb24().filled()),
@@ -282,39 +230,36 @@ impl ProjectorKeys for DisplayConfig {
         true
     }
 
-    /// A DLPC900 behind a display shows a frame from the vertical pulse on that follows it.
+    /// A controller behind a display shows a frame from the vertical pulse on that follows it.
     fn light_delay_ns(&self, frame_ns: i64) -> i64 {
         // From the vertical pulse before the first row to the one after the last row is a whole frame.
-        let behind_ns = if self.dlpc900.is_some() { frame_ns / 2 } else { 0 };
+        let behind_ns = if self.dlpc900.get().is_some() { frame_ns / 2 } else { 0 };
         middle_row_ns(self.commit_ns(frame_ns) + behind_ns, frame_ns)
     }
 
     fn guardian(&self) -> Option<Vec<String>> {
-        self.dlpc900.as_ref().map(|behind| guardian_of(behind.device.as_deref()))
+        self.dlpc900.get().map(|behind| behind.guardian())
     }
 
     fn look(&self, panel: &Panel) -> Result<(), TransportError> {
         let settings = self.settings(panel)?;
         dpm_display::transport::look(self.card.as_deref(), self.access(), &settings)?;
-        let Some(behind) = &self.dlpc900 else { return Ok(()) };
-        let place = place_of(behind)?;
-        usb::look(place)
-            .map_err(|e| TransportError::Unsuitable { device: usb::describe(place), why: e.to_string() })
+        self.dlpc900.get().map_or(Ok(()), |behind| behind.look())
     }
 
     fn open(&self, opening: &Opening<'_>) -> Result<Option<Medium>, TransportError> {
         let panel = opening.panel;
         let card = lease::opener(self.card.clone(), self.connector.clone(), self.access());
         let mut opener = on_card(card, self.settings(panel)?);
-        if let Some(behind) = &self.dlpc900 {
-            opener = self.feeding(opener, panel, behind, opening.around)?;
+        if let Some(behind) = self.dlpc900.get() {
+            opener = behind.feed(opener, self.encoding.parts(), panel, opening.around)?;
         }
         let mut medium = open_panel(panel, opener)?;
         medium
             .warnings
             .push("a display as projector has not been tried on real hardware yet (docs/DISPLAY.md)".into());
-        if self.dlpc900.is_some() {
-            medium.warnings.push(NO_WATCHDOG.into());
+        if let Some(behind) = self.dlpc900.get() {
+            medium.warnings.push(behind.warning().into());
         } else if self.encoding == DisplayEncoding::Rgb8 {
             medium.warnings.extend(linear_code_values(panel));
         }
@@ -323,39 +268,20 @@ impl ProjectorKeys for DisplayConfig {
 }
 
 impl DisplayConfig {
-    /// A controller behind a display: its patterns must fit a frame, and weights be those of its patterns if they are told at
-    /// all.
-    fn check_behind(&self, frames: &FrameKeys, reader: &mut Reader) {
-        if reader.is_written("projector.weights") && frames.weights != self.encoding.weights() {
-            let why = match self.encoding.weights() {
-                PlaneWeights::Equal => "a DLPC900 lights all planes of a pixel equally long",
-                PlaneWeights::Binary | PlaneWeights::Split | PlaneWeights::Auto => {
-                    "a DLPC900 weights the bits of a pattern itself"
-                }
-            };
-            contradict(
-                reader,
-                &[frames.weights_key(), ("projector.backend.encoding", shown(self.encoding))],
-                why,
-                "leave `projector.weights` out: the encoding decides it".into(),
-            );
+    /// The weights of planes behind a controller are those of its patterns.
+    fn check_weights(&self, frames: &FrameKeys, reader: &mut Reader) {
+        let weights = self.encoding.weights();
+        if !reader.is_written("projector.weights") || frames.weights == weights {
+            return;
         }
-        if let Some(Err(why)) = self.exposure_us(frames.rate) {
-            refuse(
-                reader,
-                &["projector.backend.dlpc900.exposure_us", "projector.frame_rate"],
-                why.to_string(),
-                "leave `projector.backend.dlpc900.exposure_us` out, or lower `projector.frame_rate`".into(),
-            );
-        }
-        if frames.rate.num() > 120 * frames.rate.den() {
-            contradict(
-                reader,
-                &[("projector.frame_rate", shown(frames.rate))],
-                "a DLPC900 receives at most 120 video frames/s",
-                "choose a mode with a lower rate".into(),
-            );
-        }
+        let why = match weights {
+            PlaneWeights::Equal => "a DLPC900 lights all planes of a pixel equally long",
+            PlaneWeights::Binary | PlaneWeights::Split | PlaneWeights::Auto => {
+                "a DLPC900 weights the bits of a pattern itself"
+            }
+        };
+        let keys = [frames.weights_key(), ("projector.backend.encoding", shown(self.encoding))];
+        contradict(reader, &keys, why, "leave `projector.weights` out: the encoding decides it".into());
     }
 
     /// What the display is set up with.
@@ -374,7 +300,7 @@ impl DisplayConfig {
             },
             without: self.without.clone(),
             commit_ns: self.commit_ns(panel.rate.slot_len_ns(0)),
-            shows_at_pulse: self.dlpc900.is_some(),
+            shows_at_pulse: self.dlpc900.get().is_some(),
             raster: panel.raster,
             schedule: panel.schedule,
             rate: panel.rate,
@@ -390,32 +316,6 @@ impl DisplayConfig {
             DisplayLease::Wayland => Access::Lent(Lender::Wayland),
         }
     }
-
-    /// The opener of a display with the DLPC900 that it feeds.
-    fn feeding(
-        &self,
-        opener: Opener,
-        panel: &Panel,
-        behind: &Dlpc900BehindConfig,
-        around: &Surroundings,
-    ) -> Result<Opener, TransportError> {
-        let place = place_of(behind)?;
-        let Some(video) = self.video_patterns(panel.rate, &panel.schedule) else { return Ok(opener) };
-        let video = video.map_err(|e| refused_behind("exposure_us", e.to_string()))?;
-        let open = Arc::new(move || usb::open(place));
-        Ok(dpm_display::dlpc900::behind(opener, open, video, around.stop.clone()))
-    }
-}
-
-/// A key of the DLPC900 behind a display, refused.
-fn refused_behind(key: &str, why: String) -> TransportError {
-    TransportError::Unsuitable { device: format!("projector.backend.dlpc900.{key}"), why }
-}
-
-/// Where the DLPC900 behind a display is plugged in, if the rig file says it.
-fn place_of(behind: &Dlpc900BehindConfig) -> Result<Option<UsbPlace>, TransportError> {
-    let place = behind.device.as_deref().map(str::parse::<UsbPlace>).transpose();
-    place.map_err(|e| refused_behind("device", e.to_string()))
 }
 
 /// A panel in this process behind what `opener` opens.

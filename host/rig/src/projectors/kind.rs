@@ -4,6 +4,7 @@ use super::keys::ProjectorKeys;
 use dpm_common::keys::read::Reader;
 use dpm_common::keys::rows::{KindWord, Registry, Row, Section};
 use dpm_common::keys::source::Entry;
+use std::any::Any;
 use std::collections::BTreeMap;
 use std::sync::Arc;
 
@@ -39,6 +40,8 @@ pub struct ProjectorKind {
     pub name: &'static str,
     /// The road of its frames.
     pub road: FrameRoad,
+    /// Its own run: an [`OwnRun`](crate::own_run::OwnRun), which this folder does not name, because whole rigs run in it.
+    pub own_run: Option<&'static (dyn Any + Send + Sync)>,
     /// Its slots.
     pub slots: SlotClock,
     /// A picture on a video cable reaches it, so another kind of which this is true may be the same projector.
@@ -63,6 +66,7 @@ impl ProjectorKind {
             word: KindWord::of::<K>(word, about),
             name,
             road: FrameRoad::Fed,
+            own_run: None,
             slots: SlotClock::Firmware,
             is_video: false,
             usb: None,
@@ -74,6 +78,11 @@ impl ProjectorKind {
     /// The same on another road.
     pub const fn on(self, road: FrameRoad) -> Self {
         Self { road, ..self }
+    }
+
+    /// The same with frames that are loaded before their time, by the [`OwnRun`](crate::own_run::OwnRun) `own_run`.
+    pub const fn loaded(self, own_run: &'static (dyn Any + Send + Sync)) -> Self {
+        Self { road: FrameRoad::Loaded, own_run: Some(own_run), ..self }
     }
 
     /// The same on a video cable; with `slots` that follow its blanks or not.

@@ -11,9 +11,9 @@ mod alp;
 pub mod alp_library;
 mod compaction;
 #[cfg(feature = "display")]
+pub mod controller;
+#[cfg(feature = "display")]
 pub mod display;
-#[cfg(feature = "dlpc900")]
-pub mod dlpc900;
 mod keys;
 mod kind;
 mod light;
@@ -41,8 +41,6 @@ static KINDS: Registry<ProjectorKind> = Registry::new(&[
     &serial::KIND,
     #[cfg(feature = "alp")]
     &alp::KIND,
-    #[cfg(feature = "dlpc900")]
-    &dlpc900::KIND,
     #[cfg(feature = "display")]
     &display::KIND,
     #[cfg(feature = "display")]

@@ -3,7 +3,9 @@
 use super::room_tests::Disk;
 use super::*;
 use crate::config::{Overrides, RigConfig};
-use crate::projectors::ProjectorBackend;
+use crate::projectors::{self, DeviceName, ProjectorBackend, ProjectorKeys, ProjectorKind, SlotClock};
+use dpm_common::keys::read::NotEmpty;
+use dpm_common::section;
 use port::{Node, System};
 use std::fs;
 use std::os::unix::fs::symlink;
@@ -21,8 +23,27 @@ fn node(file: &Path) -> Option<Node> {
     Some(Node { number: [next()?, next()?], since: [next()?.into(), 0] })
 }
 
+section! {
+    /// A board on a video cable whose name does not last, as a crate beside the rig adds it.
+    pub struct BoardConfig {
+        /// Its place on the bus.
+        device: Option<String> = None, "", NotEmpty;
+    }
+}
+
+impl ProjectorKeys for BoardConfig {
+    fn device(&self) -> DeviceName {
+        DeviceName { named: self.device.clone(), is_lasting: false, ..DeviceName::of("board") }
+    }
+}
+
+static BOARD: ProjectorKind =
+    ProjectorKind::of::<BoardConfig>("board", "board", "a board of a test.", "docs/PROJECTORS.md")
+        .by_video(SlotClock::Firmware);
+
 /// A projector of a rig file.
 pub(super) fn backend(text: &str) -> ProjectorBackend {
+    projectors::add(&BOARD);
     let overrides = Overrides {
         variables: vec![],
         flags: vec![
@@ -254,18 +275,18 @@ fn an_order_of_version_1_holds_every_port_and_goes_when_its_own_is_armed() {
 }
 
 #[test]
-fn an_order_for_one_display_holds_all_and_windows_and_a_dlpc900_too() {
+fn an_order_for_one_display_holds_all_and_windows_and_video_boards_too() {
     let machine = Machine::new("displays");
-    let [hdmi, dp, window, dlpc900] = [
+    let [hdmi, dp, window, board] = [
         "{ kind = \"display\", connector = \"HDMI-A-1\" }",
         "{ kind = \"display\", connector = \"DP-1\" }",
         "{ kind = \"window\" }",
-        "{ kind = \"dlpc900\" }",
+        "{ kind = \"board\" }",
     ]
     .map(|text| Identity::on(machine.system(), &backend(text)));
     let disk = Disk::default();
     let of = |identity: &Identity| OrderFile::in_folder(Box::new(disk.clone()), identity.clone()).0;
-    let all = [&hdmi, &dp, &window, &dlpc900];
+    let all = [&hdmi, &dp, &window, &board];
     for order_of in all {
         of(order_of).keep(Order::Black, By::Key).unwrap();
         for other in all {

@@ -113,11 +113,9 @@ fn an_order_for_any_projector_of_a_kind_is_for_each_and_the_other_way_round() {
     opened(&dir, &any).0.forget().unwrap();
     opened(&dir, &long).0.keep(Order::Safe, By::Key).unwrap();
     assert!(stands(&long) && !stands(&longer));
-    // The place on the bus does not identify a DLPC900.
+    // A place on the bus that does not last identifies nothing.
     let [one, two] = ["1:4", "1:5"].map(|place| {
-        Identity::of(&super::identity_tests::backend(&format!(
-            "{{ kind = \"dlpc900\", device = {place:?} }}"
-        )))
+        Identity::of(&super::identity_tests::backend(&format!("{{ kind = \"board\", device = {place:?} }}")))
     });
     assert_ne!(one.lock_name(), two.lock_name());
     opened(&dir, &one).0.keep(Order::Safe, By::Key).unwrap();

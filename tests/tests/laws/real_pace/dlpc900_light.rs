@@ -8,6 +8,7 @@ use dpm_device::time::HostTime;
 use dpm_display::encoding::PixelMap;
 use dpm_dlpc900::driver::Dlpc900;
 use dpm_dlpc900::lut::led;
+use dpm_dlpc900_rig::behind::BehindConfig;
 use dpm_lab::reference::Sampler;
 use dpm_render::pack::{halftone, pack, BitPlaneFrame, Halftone, Kernel};
 use dpm_rig::config::{Overrides, ProjectorConfig, RigConfig};
@@ -24,6 +25,7 @@ const ENCODINGS: [&str; 11] = [
 /// The template of a rig behind a controller, with another encoding.
 fn rig(encoding: &str) -> RigConfig {
     const RIG: &str = include_str!("../../../../rigs/dlpc900-live.toml");
+    dpm_dlpc900_rig::register();
     let flags = vec![format!("projector.backend.encoding={encoding:?}")];
     let overrides = Overrides { variables: vec![], flags };
     RigConfig::parse("rigs/dlpc900-live.toml", RIG, Path::new(""), &overrides)
@@ -55,7 +57,8 @@ fn light_of(config: &RigConfig, codes: &[u32]) -> Vec<[f64; 3]> {
     let (raster, schedule) = (projector.raster(), projector.schedule());
     let model = Arc::new(Mutex::new(Dlpc900Model::default()));
     let mut driver = Dlpc900::new(VirtualHid::new(model.clone())).unwrap();
-    let video = display.video_patterns(projector.frame_rate, &schedule).unwrap().unwrap();
+    let behind: &BehindConfig = display.dlpc900.keys().expect("a controller");
+    let video = behind.video_patterns(display.encoding.parts(), projector.frame_rate, &schedule).unwrap();
     driver.start_video_patterns(&video).unwrap();
     let map = PixelMap::new(display.settings(&panel(config, raster)).unwrap().encoding, &schedule).unwrap();
     let mut light = vec![[0; 3]; raster.pixel_count()];

@@ -7,13 +7,14 @@ use std::sync::{Arc, Mutex};
 
 use dpm_device::planes::Raster;
 use dpm_device::time::HostTime;
-use dpm_display::dlpc900::behind;
 use dpm_display::fake::{display, FakeKms, ScanFrame};
 use dpm_display::kms::Kms;
 use dpm_display::mode::Timing;
 use dpm_display::transport::{on_card, DisplayTransport};
 use dpm_dlpc900::driver::Dlpc900;
 use dpm_dlpc900::video::VideoPatterns;
+use dpm_dlpc900_rig::behind::BehindConfig;
+use dpm_dlpc900_rig::feed::behind;
 use dpm_handoff::path::Lock;
 use dpm_rig::config::{Overrides, RigConfig};
 use dpm_rig::pipeline::projector::{panel, Medium, OpenMedium};
@@ -89,6 +90,7 @@ fn rig(folder: &Path, settings: &[&str]) -> Arc<Rig> {
         &[format!("scene.file={:?}", file.to_str().unwrap())][..],
         &settings.iter().map(|s| (*s).to_owned()).collect::<Vec<_>>(),
     ];
+    dpm_dlpc900_rig::register();
     let overrides = Overrides { variables: vec![], flags: flags.concat() };
     let mut config =
         RigConfig::parse("rig.toml", RIG, Path::new(""), &overrides).unwrap_or_else(|e| panic!("{e}"));
@@ -102,7 +104,9 @@ fn display_of(config: &RigConfig) -> &DisplayConfig {
 }
 
 fn video_of(rig: &Rig) -> VideoPatterns {
-    display_of(&rig.config).video_patterns(rig.rate(), &rig.schedule).unwrap().unwrap()
+    let display = display_of(&rig.config);
+    let behind: &BehindConfig = display.dlpc900.keys().expect("a controller");
+    behind.video_patterns(display.encoding.parts(), rig.rate(), &rig.schedule).unwrap()
 }
 
 /// Runs the rig, and returns what the graphics card sent, and how many frames were late by the report.

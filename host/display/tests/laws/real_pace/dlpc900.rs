@@ -9,7 +9,6 @@ use crate::common::{link_settings, lit, planes, raster, run, settings, shared, w
 use dpm_device::link::{HostLink, LinkState};
 use dpm_device::time::{HostClock, HostTime};
 use dpm_device::transport::{Transport, TransportError};
-use dpm_display::dlpc900::behind;
 use dpm_display::encoding::Encoding;
 use dpm_display::fake::{FakeKms, Shared};
 use dpm_display::kms::Kms;
@@ -18,6 +17,7 @@ use dpm_dlpc900::command::{Opcode, REPORT_BYTES};
 use dpm_dlpc900::driver::{Dlpc900, HidPort, PortError};
 use dpm_dlpc900::lut::Dmd;
 use dpm_dlpc900::video::{exposure_us, Receiver, VideoBits, VideoPatterns};
+use dpm_dlpc900_rig::feed::behind;
 use dpm_handoff::wake::WaitPolicy;
 use hil_mock::dlpc900::{Dlpc900Fault, Dlpc900Model};
 

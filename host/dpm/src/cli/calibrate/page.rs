@@ -3,7 +3,7 @@
 use crate::cli::guide::RigGuide;
 use crate::cli::live_page::{link, token, Link};
 use crate::cli::rig_args::RigArgs;
-use crate::signals;
+use dpm_common::signals;
 use dpm_page::{Page, Settings};
 use dpm_rig::config::DEFAULT_PAGE;
 use dpm_rig::failure::{Failure, FailureKind};

@@ -457,6 +457,7 @@ mod tests {
 
     impl Root {
         fn new(name: &str, files: &[(&str, &str)]) -> (Self, System) {
+            crate::satellites::register();
             let root = std::env::temp_dir().join(format!("dpm-doctor-{}-{name}", std::process::id()));
             for (path, text) in files {
                 let path = root.join(path);
@@ -493,11 +494,15 @@ mod tests {
     #[test]
     fn a_projector_is_known_by_the_numbers_that_its_driver_opens() {
         use dpm_device::transport::usb as link;
-        use dpm_dlpc900::usb as dlpc900;
+        crate::satellites::register();
         let known =
             |vendor: u16, product: u16| known_projector(&format!("{vendor:04x}"), &format!("{product:04x}"));
         assert_eq!(known(link::VENDOR_ID, link::PRODUCT_ID), Some("bit-plane projector"));
-        assert_eq!(known(dlpc900::VENDOR, dlpc900::PRODUCT), Some("TI DLPC900"));
+        let numbers: Vec<_> = dpm_rig::projectors::kinds().iter().filter_map(|kind| kind.usb).collect();
+        assert!(numbers.len() > 1, "{numbers:?}");
+        for (vendor, product, name) in numbers {
+            assert_eq!(known(vendor, product), Some(name));
+        }
         assert_eq!(known(link::VENDOR_ID, link::PRODUCT_ID + 1), None);
         assert_eq!(known_projector("", "000d"), None);
     }

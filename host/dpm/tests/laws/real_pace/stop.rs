@@ -212,7 +212,7 @@ fn panics_and_hangs() {
     if std::env::var_os("PANICS").is_none() {
         return;
     }
-    dpm::signals::install().unwrap();
+    dpm_common::signals::install().unwrap();
     let monitor = RunMonitor::default();
     assert!(!monitor.stop_requested());
     let thread = std::thread::spawn(|| panic!("as a stage might"));

@@ -1,9 +1,8 @@
-//! What a rig file says of its projector: instants and planes of displays and of controllers behind them, and refusals.
+//! What a rig file says of its projector: instants and planes of displays, and refusals.
 
 use crate::config::*;
 use crate::projectors::display::{DisplayConfig, DisplayEncoding, DisplayLease};
-use dpm_device::planes::{Channel, PlaneSchedule};
-use dpm_dlpc900::lut::led;
+use dpm_device::planes::PlaneSchedule;
 use std::path::Path;
 
 /// A template of a rig file, with some keys changed.
@@ -65,75 +64,6 @@ fn the_light_of_a_display_is_later_than_its_slots() {
     }
 }
 
-/// A controller behind a display shows a frame once it has all of it, and each of its planes for the same time; what does not
-/// fit it is refused.
-#[test]
-fn a_controller_behind_a_display_shows_frames_that_have_arrived() {
-    let parsed = |keys: &[&str]| template("dlpc900-live.toml", keys);
-    let projector = parsed(&[]).unwrap_or_else(|e| panic!("{e}")).projector;
-    assert_eq!(projector.light_delay_ns(), 8_000_000 + 2 * (16_666_667 / 2));
-    assert_eq!(projector.plane_timing(), PlaneTiming::Equal);
-    let lit = LitTime { whole_ns: 24 * 684_000, dark_ns: 64_000, frame_ns: 16_666_666 };
-    assert_eq!(projector.lit_time(), lit);
-    assert!(!projector.is_lit_without_gap());
-    assert_eq!(projector.schedule(), PlaneSchedule::equal_rgb24().filled());
-    // The encoding says everything of the planes: their number of bits, their LEDs, their instants, their weights.
-    let rgb8 = "projector.backend.encoding=\"rgb8\"";
-    for (encoding, patterns, white, exposure_us) in [
-        ("rgb8", 3, false, 4960),
-        ("rgb4x2", 6, false, 2480),
-        ("rgb2x4", 12, false, 1240),
-        ("planes24", 24, false, 620),
-        ("binary24", 24, false, 620),
-        ("mono8x3", 3, true, 4960),
-        ("mono6x4", 4, true, 3720),
-        ("mono4x6", 6, true, 2480),
-        ("mono3x8", 8, true, 1860),
-        ("mono2x12", 12, true, 1240),
-        ("mono1x24", 24, true, 620),
-    ] {
-        let key = format!("projector.backend.encoding={encoding:?}");
-        let p = parsed(&[&key]).unwrap_or_else(|e| panic!("{encoding}: {e}")).projector;
-        let (timing, schedule) = (p.plane_timing(), p.schedule());
-        match patterns {
-            24 => assert_eq!(timing, PlaneTiming::Equal),
-            _ => assert_eq!(timing, PlaneTiming::Together { planes: 24 / patterns as u8 }),
-        }
-        // What the patterns leave of the frame is a gap after each of them, and 250 us at its end.
-        let LitTime { whole_ns, dark_ns, frame_ns } = p.lit_time();
-        assert_eq!(whole_ns, patterns * (exposure_us * 1000 + dark_ns), "{encoding}");
-        assert!(
-            (250_000..250_000 + patterns * 1000).contains(&(frame_ns - whole_ns)),
-            "{encoding}: {whole_ns}"
-        );
-        assert_eq!(schedule.planes().iter().all(|p| p.channel == Channel::White), white, "{encoding}");
-        assert_eq!((schedule.len(), schedule.fills(), p.full_light()), (24, true, 255), "{encoding}");
-        let display: &DisplayConfig = p.backend.keys().expect("a display");
-        let video = display.video_patterns(p.frame_rate, &schedule).unwrap().unwrap();
-        assert_eq!(video.entries.len() as i64, patterns, "{encoding}");
-        let lit_us: u32 = video.entries.iter().map(|e| e.exposure_us).sum();
-        let (last, others) = video.entries.split_last().unwrap();
-        assert!(
-            others.iter().all(|e| i64::from(e.dark_us) * 1000 == dark_ns) && last.dark_us == 0,
-            "{encoding}"
-        );
-        assert!(video.entries.iter().all(|e| e.leds == led::WHITE) == white && lit_us < 16_417, "{encoding}");
-    }
-    for (keys, names) in [
-        (&["projector.weights=\"binary\""][..], "lights all planes of a pixel equally long"),
-        (&[rgb8, "projector.weights=\"equal\""], "weights the bits of a pattern itself"),
-        (&["projector.width=1024"], "a DLP6500 has 1920 x 1080 mirrors"),
-        (&["projector.backend.dlpc900.panel=\"dlp9000\""], "a DLP9000 has 2560 x 1600 mirrors"),
-        (&["projector.backend.dlpc900.exposure_us=685"], "not within 105 to 684 us"),
-        (&["projector.frame_rate=144"], "at most 120 video frames/s"),
-        (&[rgb8, "projector.frame_rate=90"], "lower the frame rate"),
-        (&[rgb8, "projector.planes=8"], "set projector.planes = 24"),
-    ] {
-        let told = parsed(keys).expect_err("refused").to_string();
-        assert!(told.contains(names), "{keys:?}: {told}");
-    }
-}
-
 /// Planes whose highest bit is split are for projectors that dim their light from plane to plane, and nothing else asks a device
 /// for planes that exceed full light.
 #[test]
@@ -151,7 +81,7 @@ fn only_projectors_that_dim_their_planes_split_the_highest_bit() {
         assert_eq!(schedule(&[split]), PlaneSchedule::split_rgb24(), "{name}");
         assert_eq!(schedule(&[split, "projector.planes=8"]), PlaneSchedule::split_mono8(), "{name}");
     }
-    for name in ["display.toml", "window.toml", "alp.toml", "dlpc900-live.toml", "dlpc900.toml"] {
+    for name in ["display.toml", "window.toml", "alp.toml"] {
         let told = template(name, &[split]).expect_err(name).to_string();
         assert!(told.contains("does not dim its light from plane to plane"), "{name}: {told}");
     }
@@ -184,7 +114,7 @@ fn auto_splits_the_highest_bit_only_where_nothing_speaks_against_it() {
     ] {
         assert!(!exceeds("usb-natnet.toml", &[key]), "{key}");
     }
-    for name in ["display.toml", "window.toml", "alp.toml", "dlpc900.toml"] {
+    for name in ["display.toml", "window.toml", "alp.toml"] {
         assert!(!exceeds(name, &[]), "{name}");
     }
     let overrides = Overrides { flags: vec![auto.into()], ..Overrides::default() };

@@ -1,4 +1,4 @@
-//! Turns signals and panics into the flags of [`dpm_common::stopping`], and limits how long the process lives after
+//! Turns signals and panics into the flags of [`crate::stopping`], and limits how long the process lives after
 //! them.
 //!
 //! SIGINT, SIGTERM, SIGHUP and a panic request a stop. Every thread sees the request at once, the link's first of
@@ -7,7 +7,7 @@
 //! stopped.
 #![allow(unsafe_code)]
 
-use dpm_common::stopping;
+use crate::stopping;
 use std::io;
 use std::sync::atomic::{AtomicBool, AtomicU32, Ordering};
 use std::sync::Once;
@@ -122,7 +122,7 @@ pub fn install() -> io::Result<()> {
 ///
 /// # Errors
 /// An error of the operating system, which does not occur for these signals.
-pub(crate) fn ignore() -> io::Result<()> {
+pub fn ignore() -> io::Result<()> {
     STOPS.into_iter().try_for_each(|signal| handle(signal, libc::SIG_IGN))
 }
 
@@ -160,14 +160,14 @@ fn unblock() -> io::Result<()> {
 }
 
 /// Waits until a signal requests a stop. For a thread whose program works on others.
-pub(crate) fn wait() {
+pub fn wait() {
     while received().is_none() {
         std::thread::sleep(LOOK);
     }
 }
 
 /// The name of the signal that requested a stop; `None` if there was none.
-pub(crate) fn received() -> Option<&'static str> {
+pub fn received() -> Option<&'static str> {
     Some(match stopping::signal()? {
         libc::SIGINT => "SIGINT",
         libc::SIGTERM => "SIGTERM",

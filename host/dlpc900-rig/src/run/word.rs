@@ -1,7 +1,7 @@
 //! What the run of a DLPC900 and its dark thread tell each other: orders, the interlock, the end.
 
-use crate::signals;
 use dpm_common::clock::Stopwatch;
+use dpm_common::signals;
 use dpm_dlpc900::driver::DarkLine;
 use dpm_rig::order::Order;
 use dpm_rig::telemetry::monitor::RunMonitor;

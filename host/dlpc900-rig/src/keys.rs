@@ -1,16 +1,14 @@
-//! `projector.backend.kind = "dlpc900"`: a TI DLPC900 whose frames are loaded before they are shown, and the keys of one
-//! behind a display. `dpm`'s folder `dlpc900/` drives the former, [`super::display`] feeds the latter.
+//! `projector.backend.kind = "dlpc900"`: a TI DLPC900 whose frames are loaded before they are shown.
 
-use super::keys::{DeviceName, FrameKeys, Look, ProjectorKeys};
-use super::kind::{FrameRoad, ProjectorKind, SlotClock};
-use super::light::{LitTime, PlaneTiming, PlaneWeights};
-use crate::failure::{Failure, FailureKind};
 use dpm_common::keys::read::{contradict, shown, Any, NotEmpty, Reader, Within};
 use dpm_common::{section, words};
-use dpm_dlpc900::driver::{Dlpc900, Dlpc900Error};
+use dpm_dlpc900::driver::Dlpc900;
 use dpm_dlpc900::lut::Dmd;
 use dpm_dlpc900::usb::{describe, UsbHid, UsbPlace, PRODUCT, VENDOR};
 use dpm_dlpc900::video::Receiver;
+use dpm_rig::projectors::{
+    DeviceName, FrameKeys, LitTime, Look, PlaneTiming, PlaneWeights, ProjectorKeys, ProjectorKind, SlotClock,
+};
 
 /// What an operator of a DLPC900 must know.
 pub const NO_WATCHDOG: &str =
@@ -95,25 +93,19 @@ impl VideoInput {
     }
 }
 
-pub(super) static KIND: ProjectorKind = ProjectorKind::of::<Dlpc900Config>(
-    "dlpc900",
+/// Its word in a rig file, and the name of its command and of its table behind a display.
+pub(crate) const WORD: &str = "dlpc900";
+
+/// Its row in the table of projectors.
+pub static KIND: ProjectorKind = ProjectorKind::of::<Dlpc900Config>(
+    WORD,
     "DLPC900",
     "a TI DLPC900 evaluation module, driven by its USB HID commands.",
     "docs/DLPC900.md",
 )
-.on(FrameRoad::Loaded)
+.loaded(&crate::OWN_RUN)
 .by_video(SlotClock::Firmware)
 .by_usb(VENDOR, PRODUCT, "TI DLPC900");
-
-impl From<Dlpc900Error> for Failure {
-    fn from(e: Dlpc900Error) -> Self {
-        let kind = match e {
-            Dlpc900Error::Sequence(_) => FailureKind::BadInput,
-            _ => FailureKind::Device,
-        };
-        Self::new(kind, e)
-    }
-}
 
 impl ProjectorKeys for Dlpc900Config {
     fn device(&self) -> DeviceName {
@@ -121,8 +113,8 @@ impl ProjectorKeys for Dlpc900Config {
     }
 
     fn check(&self, frames: &FrameKeys, reader: &mut Reader) {
-        check_panel(frames, &KIND, "projector.backend.panel", self.panel, reader);
-        let backend = || ("projector.backend.kind", format!("{:?}", KIND.word.word));
+        check_panel(frames, WORD, "projector.backend.panel", self.panel, reader);
+        let backend = || ("projector.backend.kind", format!("{WORD:?}"));
         if frames.weights == PlaneWeights::Equal {
             let why = "a DLPC900 weights the bits of loaded frames itself";
             let remedy = "leave `projector.weights` out";
@@ -167,9 +159,9 @@ impl ProjectorKeys for Dlpc900Config {
 }
 
 /// The words of the command that puts the controller at `device` to rest.
-pub(super) fn guardian_of(device: Option<&str>) -> Vec<String> {
+pub(crate) fn guardian_of(device: Option<&str>) -> Vec<String> {
     let place = device.into_iter().flat_map(|place| ["--device", place]);
-    [KIND.word.word, "guard"].into_iter().chain(place).map(str::to_owned).collect()
+    [WORD, "guard"].into_iter().chain(place).map(str::to_owned).collect()
 }
 
 fn examined(device: Option<&str>) -> Result<Look, String> {
@@ -183,10 +175,10 @@ fn examined(device: Option<&str>) -> Result<Look, String> {
     Ok(Look { found: lines.join("; "), is_doubtful: false, remedy: String::new() })
 }
 
-/// A controller's panel has as many mirrors as the projector.
-pub(super) fn check_panel(
+/// A controller's panel has as many mirrors as the projector, of kind `kind`.
+pub(crate) fn check_panel(
     frames: &FrameKeys,
-    kind: &ProjectorKind,
+    kind: &str,
     key: &str,
     panel: Dlpc900Panel,
     reader: &mut Reader,
@@ -199,7 +191,7 @@ pub(super) fn check_panel(
                 ("projector.width", shown(frames.size[0])),
                 ("projector.height", shown(frames.size[1])),
                 (key, shown(panel)),
-                ("projector.backend.kind", format!("{:?}", kind.word.word)),
+                ("projector.backend.kind", format!("{kind:?}")),
             ],
             &format!("a {} has {} x {} mirrors", panel.dmd().name(), raster.width(), raster.height()),
             format!("set projector.width = {} and projector.height = {}", raster.width(), raster.height()),

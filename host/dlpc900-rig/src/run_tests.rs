@@ -4,6 +4,7 @@ use super::*;
 use dpm_device::time::HostTime;
 use dpm_dlpc900::command::Opcode;
 use dpm_dlpc900::lut::DisplayMode;
+use dpm_dlpc900::video::Receiver;
 use dpm_render::pack::unpack;
 use dpm_rig::interlock::{Contact, Interlock};
 use dpm_rig::pack::prepared::PreparedFrames;

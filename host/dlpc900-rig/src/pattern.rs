@@ -1,6 +1,7 @@
 //! `dpm pattern` on a DLPC900: the pattern's pictures are uploaded as a sequence, as `dpm dlpc900 upload` does, and
 //! supervised as in `dpm run`.
 
+use super::keys::NO_WATCHDOG;
 use super::pictures::planes_of;
 use super::run::{check_panel, opener, present, Dlpc900Report, Show};
 use dpm_device::planes::Channel;
@@ -11,7 +12,6 @@ use dpm_dlpc900::usb::UsbPlace;
 use dpm_rig::config::RigConfig;
 use dpm_rig::failure::{Failure, FailureKind};
 use dpm_rig::pattern::{Pattern, PatternShow};
-use dpm_rig::projectors::dlpc900::NO_WATCHDOG;
 use dpm_rig::telemetry::monitor::RunMonitor;
 
 /// Shows the pattern on the controller that `config` names until its run is over or `monitor` requests a stop.
@@ -23,7 +23,7 @@ pub(crate) fn run_pattern_dlpc900(
     show: &PatternShow,
     monitor: &RunMonitor,
 ) -> Result<Dlpc900Report, Failure> {
-    let backend = super::keys(&config.projector.backend)?;
+    let backend = super::keys_of(&config.projector.backend)?;
     let place = backend.device.as_deref().map(str::parse::<UsbPlace>).transpose();
     let place =
         place.map_err(|e| Failure::new(FailureKind::BadInput, format!("projector.backend.device: {e}")))?;

@@ -13,8 +13,8 @@ use dpm_device::transport::TransportError;
 use dpm_dlpc900::driver::{Dlpc900, Dlpc900Error, HidPort, StopAsked};
 use dpm_dlpc900::video::VideoPatterns;
 
-use crate::scan_out::{DisplayError, Flip, Picture, Pixels, ScanOut};
-use crate::transport::Opener;
+use dpm_display::scan_out::{DisplayError, Flip, Picture, Pixels, ScanOut};
+use dpm_display::transport::Opener;
 
 /// How often the controller is asked for its state.
 const LOOK: Duration = Duration::from_millis(200);

@@ -8,6 +8,8 @@
 
 mod word;
 
+use super::failure;
+use super::keys::{Dlpc900Config, Dlpc900Mode, NO_WATCHDOG};
 use dpm_common::clock::Stopwatch;
 use dpm_device::link::faults;
 use dpm_device::planes::{Channel, PlaneSchedule};
@@ -16,7 +18,7 @@ use dpm_dlpc900::image::PlaneOrder;
 use dpm_dlpc900::lut::{led, Dmd, LutEntry, IMAGE_PLANES, MAX_IMAGES};
 use dpm_dlpc900::sequence::{LedSetup, Pattern, PatternSequence, Repeat, SequenceBuilder, SequenceError};
 use dpm_dlpc900::usb::{self, UsbHid, UsbPlace};
-use dpm_dlpc900::video::{share_us, Receiver, VideoPatterns};
+use dpm_dlpc900::video::{share_us, VideoPatterns};
 use dpm_render::pack::{pack, BitPlaneFrame, Kernel};
 use dpm_render::{RenderError, Renderer};
 use dpm_rig::config::RigConfig;
@@ -25,7 +27,6 @@ use dpm_rig::method_choice;
 use dpm_rig::order::Order;
 use dpm_rig::pipeline::{renderer_settings, PipelineError};
 use dpm_rig::presence;
-use dpm_rig::projectors::dlpc900::{Dlpc900Config, Dlpc900Mode, VideoInput, NO_WATCHDOG};
 use dpm_rig::rig::Rig;
 use dpm_rig::run_rig::open_gpu;
 use dpm_rig::still::{draw, poses_at};
@@ -173,7 +174,7 @@ pub(crate) fn preload(
 /// # Errors
 /// A bad scene or a broken rule of the controller (exit code 2), a controller that fails (3), or no GPU (4).
 pub(crate) fn run_dlpc900(config: &RigConfig, monitor: &RunMonitor) -> Result<Dlpc900Report, Failure> {
-    let backend = super::keys(&config.projector.backend)?;
+    let backend = super::keys_of(&config.projector.backend)?;
     let place = backend.device.as_deref().map(str::parse::<UsbPlace>).transpose();
     let place =
         place.map_err(|e| Failure::new(FailureKind::BadInput, format!("projector.backend.device: {e}")))?;
@@ -230,7 +231,7 @@ pub(crate) fn check_panel(
     open: &mut dyn FnMut() -> Result<Dlpc900<UsbHid>, Dlpc900Error>,
     backend: &Dlpc900Config,
 ) -> Result<(), Failure> {
-    let found = open()?.dmd();
+    let found = open().map_err(failure)?.dmd();
     if found == backend.panel.dmd() {
         return Ok(());
     }
@@ -309,11 +310,7 @@ fn video(config: &RigConfig, backend: &Dlpc900Config, dmd: Dmd) -> VideoPatterns
     let entry = |i: u8| LutEntry { leds: led::WHITE, ..LutEntry::one_bit(i.into(), 0, i, exposure_us) };
     VideoPatterns {
         dmd,
-        receiver: match backend.input {
-            VideoInput::Parallel => Receiver::None,
-            VideoInput::Hdmi => Receiver::Hdmi,
-            VideoInput::DisplayPort => Receiver::DisplayPort,
-        },
+        receiver: backend.input.receiver(),
         ports: None,
         frame_hz,
         entries: (0..patterns).map(entry).collect(),
@@ -356,7 +353,7 @@ pub(crate) fn present<P: HidPort>(
     seconds: Option<f64>,
     monitor: &RunMonitor,
 ) -> Result<Dlpc900Report, Failure> {
-    let mut d = open()?;
+    let mut d = open().map_err(failure)?;
     let mut report = report_of(d.dmd(), show);
     let word = Word::default();
     if let Some(order) = monitor.take_order() {
@@ -397,7 +394,7 @@ pub(crate) fn present<P: HidPort>(
     monitor.set_projector_and_light(ProjectorHealth::Stopped);
     result?;
     match rested {
-        Err(e) if !e.is_gone() => Err(e.into()),
+        Err(e) if !e.is_gone() => Err(failure(e)),
         _ => Ok(report),
     }
 }
@@ -429,7 +426,7 @@ impl<P: HidPort> Watch<'_, P> {
         self.wait_for_interlock()?;
         match self.set_up() {
             Err(Dlpc900Error::Stopped) => return Ok(()),
-            other => other?,
+            other => other.map_err(failure)?,
         }
         let shown = Stopwatch::start();
         let is_over = |shown: &Stopwatch| seconds.is_some_and(|s| shown.elapsed_ns() as f64 * 1e-9 >= s);
@@ -449,7 +446,7 @@ impl<P: HidPort> Watch<'_, P> {
             // A run that was killed may have left it lit. A controller that rests refuses the command, and is dark.
             match self.d.stop() {
                 Ok(()) | Err(Dlpc900Error::Refused { .. }) => {}
-                Err(e) => return Err(e.into()),
+                Err(e) => return Err(failure(e)),
             }
         }
         while !self.monitor.light_allowed() && !self.monitor.stop_requested() {
@@ -566,7 +563,7 @@ impl<P: HidPort> Watch<'_, P> {
                 self.lost = true;
                 self.monitor.set_projector_and_light(ProjectorHealth::Lost);
             }
-            Err(e) => return Err(e.into()),
+            Err(e) => return Err(failure(e)),
         }
         Ok(())
     }

@@ -1,12 +1,12 @@
 //! `dpm dlpc900`: passes the command line to the DLPC900 driver.
 
-use super::watch::{print, refuse_where_dark_stands};
-use crate::dlpc900::pictures::{sequence_of, PatternFileError, ShowAs};
-use crate::dlpc900::rest::put_to_rest;
-use crate::signals;
+use crate::failure;
+use crate::keys::WORD;
+use crate::pictures::{sequence_of, PatternFileError, ShowAs};
+use crate::rest::put_to_rest;
 use clap::ValueEnum;
-use dpm_common::guardian;
-use dpm_dlpc900::driver::{Dlpc900, UploadProgress};
+use dpm_common::{guardian, signals};
+use dpm_dlpc900::driver::{Dlpc900, Dlpc900Error, UploadProgress};
 use dpm_dlpc900::image::{Compression, PlaneOrder};
 use dpm_dlpc900::lut::{led, LutEntry};
 use dpm_dlpc900::sequence::{LedSetup, Repeat};
@@ -14,13 +14,13 @@ use dpm_dlpc900::usb::{self, describe, list, UsbHid, UsbPlace};
 use dpm_dlpc900::video::{share_us, Receiver, VideoPatterns};
 use dpm_rig::failure::{Failure, FailureKind};
 use dpm_rig::projectors;
-use dpm_rig::standing::Identity;
+use dpm_rig::standing::{refuse_where_dark_stands, Identity};
 use std::io::Write;
 use std::path::PathBuf;
 
 /// Flags of `dpm dlpc900`.
 #[derive(clap::Args, Clone, Debug)]
-pub(crate) struct Dlpc900Args {
+pub struct Dlpc900Args {
     /// The controller, as BUS:ADDRESS in lsusb; needed if several are plugged in
     #[arg(long, value_name = "BUS:ADDRESS", global = true)]
     device: Option<UsbPlace>,
@@ -186,17 +186,17 @@ fn open(args: &Dlpc900Args) -> Result<Dlpc900<UsbHid>, Failure> {
         place = all.first().copied();
     }
     let named = |e| device(format!("{}: {e}", describe(place)));
-    Ok(Dlpc900::new(UsbHid::open(place).map_err(named)?)?)
+    Dlpc900::new(UsbHid::open(place).map_err(named)?).map_err(failure)
 }
 
-/// Runs the command.
+/// Runs the command, and returns what it prints.
 ///
 /// # Errors
 /// [`FailureKind::Device`] if the controller cannot be reached or refuses; [`FailureKind::BadInput`] if pictures or
 /// times break a rule, with the LUT entry and the rule.
-pub(super) fn execute(args: &Dlpc900Args) -> Result<(), Failure> {
+pub fn execute(args: &Dlpc900Args) -> Result<String, Failure> {
     if let Action::Guard = args.action {
-        return guard(args.device);
+        return guard(args.device).map(|()| String::new());
     }
     let lights = match &args.action {
         Action::Upload(upload) => upload.start,
@@ -205,16 +205,23 @@ pub(super) fn execute(args: &Dlpc900Args) -> Result<(), Failure> {
     };
     if lights {
         // Whichever it is: its place on the bus says nothing of it.
-        projectors::backend("dlpc900").map_or(Ok(()), |any| refuse_where_dark_stands(&Identity::of(&any)))?;
+        projectors::backend(WORD).map_or(Ok(()), |any| refuse_where_dark_stands(&Identity::of(&any)))?;
     }
     let mut d = open(args)?;
     match &args.action {
-        Action::Guard => {}
-        Action::Status => print(&d.status()?.to_string()),
-        Action::Upload(upload) => execute_upload(&mut d, upload)?,
-        Action::VideoPattern(video) => execute_video(&mut d, video)?,
+        Action::Upload(upload) => execute_upload(&mut d, upload),
+        Action::VideoPattern(video) => execute_video(&mut d, video),
+        other => act(&mut d, other).map_err(failure),
+    }
+}
+
+/// What needs only the controller.
+fn act(d: &mut Dlpc900<UsbHid>, action: &Action) -> Result<String, Dlpc900Error> {
+    match action {
+        Action::Guard | Action::Upload(_) | Action::VideoPattern(_) => {}
+        Action::Status => return Ok(d.status()?.to_string()),
         Action::Start => {
-            make_ready(&mut d)?;
+            make_ready(d)?;
             d.start()?;
         }
         Action::Pause => d.pause()?,
@@ -225,15 +232,15 @@ pub(super) fn execute(args: &Dlpc900Args) -> Result<(), Failure> {
         Action::Unpark => d.unpark()?,
         Action::Standby => {
             d.standby()?;
-            print("in standby; the mirrors are safe for a loss of power in 123 s\n");
+            return Ok("in standby; the mirrors are safe for a loss of power in 123 s\n".into());
         }
         Action::Wake => d.wake()?,
     }
-    Ok(())
+    Ok(String::new())
 }
 
 /// Wakes a resting controller before it shows something. The mirrors need 3 s to leave the exercise.
-fn make_ready(d: &mut Dlpc900<UsbHid>) -> Result<(), Failure> {
+fn make_ready(d: &mut Dlpc900<UsbHid>) -> Result<(), Dlpc900Error> {
     if d.make_ready()? {
         let _ = writeln!(
             std::io::stderr(),
@@ -262,7 +269,7 @@ fn guard(place: Option<UsbPlace>) -> Result<(), Failure> {
     Ok(())
 }
 
-fn execute_upload(d: &mut Dlpc900<UsbHid>, u: &UploadArgs) -> Result<(), Failure> {
+fn execute_upload(d: &mut Dlpc900<UsbHid>, u: &UploadArgs) -> Result<String, Failure> {
     let show = ShowAs {
         depth: u.depth,
         exposure_us: u.exposure_us,
@@ -286,23 +293,22 @@ fn execute_upload(d: &mut Dlpc900<UsbHid>, u: &UploadArgs) -> Result<(), Failure
     let leds = LedSetup { current: u.led_current, polarity: None };
     if u.start {
         // Done before the upload, which takes many seconds and would otherwise be in vain.
-        make_ready(d)?;
+        make_ready(d).map_err(failure)?;
     }
-    d.upload(&sequence, leds, &mut |p: UploadProgress| bar.set_position(p.sent as u64))?;
+    d.upload(&sequence, leds, &mut |p: UploadProgress| bar.set_position(p.sent as u64)).map_err(failure)?;
     bar.finish_and_clear();
     if u.start {
-        d.start()?;
+        d.start().map_err(failure)?;
     }
     let (patterns, images, bytes) =
         (sequence.entries().len(), sequence.images().len(), sequence.image_bytes());
-    print(&format!("{patterns} patterns in {images} images, {bytes} bytes\n"));
-    Ok(())
+    Ok(format!("{patterns} patterns in {images} images, {bytes} bytes\n"))
 }
 
-fn execute_video(d: &mut Dlpc900<UsbHid>, v: &VideoArgs) -> Result<(), Failure> {
+fn execute_video(d: &mut Dlpc900<UsbHid>, v: &VideoArgs) -> Result<String, Failure> {
     let exposure_us = v.exposure_us.unwrap_or_else(|| share_us(1_000_000 / v.frame_hz, v.patterns.into()));
     let entry = |i: u8| LutEntry { leds: v.leds.bits(), ..LutEntry::one_bit(i.into(), 0, i, exposure_us) };
-    make_ready(d)?;
+    make_ready(d).map_err(failure)?;
     d.start_video_patterns(&VideoPatterns {
         dmd: d.dmd(),
         receiver: match v.input {
@@ -314,10 +320,10 @@ fn execute_video(d: &mut Dlpc900<UsbHid>, v: &VideoArgs) -> Result<(), Failure> 
         frame_hz: v.frame_hz,
         entries: (0..v.patterns).map(entry).collect(),
         leds: LedSetup::default(),
-    })?;
-    print(&format!(
+    })
+    .map_err(failure)?;
+    Ok(format!(
         "{} patterns of {exposure_us} us in each of {} video frames per second\n",
         v.patterns, v.frame_hz
-    ));
-    Ok(())
+    ))
 }
