@@ -21,6 +21,7 @@ pub mod guardian;
 pub mod keys;
 pub mod quantiles;
 pub mod realtime;
+pub mod rounding;
 pub mod signals;
 pub mod so3;
 pub mod stopping;

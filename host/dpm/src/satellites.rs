@@ -35,6 +35,7 @@ pub(crate) fn features() -> String {
         ("alp", cfg!(feature = "alp")),
         ("calibrate", cfg!(feature = "calibrate")),
         ("camera-files", cfg!(feature = "camera-files")),
+        ("compressed", cfg!(feature = "compressed")),
         ("display", cfg!(feature = "display")),
         ("dlpc900", cfg!(feature = "dlpc900")),
         ("lab", cfg!(feature = "lab")),

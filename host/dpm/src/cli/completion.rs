@@ -1,7 +1,7 @@
 //! What a shell offers while a command is typed: keys of the rig file with their values, parameters of a running rig, and what
 //! the command line itself declares.
 
-use clap_complete::engine::CompletionCandidate;
+use clap_complete::engine::{ArgValueCompleter, CompletionCandidate};
 use clap_complete::env::Shells;
 use clap_complete::CompleteEnv;
 use dpm_rig::config::RigConfig;
@@ -15,7 +15,19 @@ const ASKED_BY: &str = "COMPLETE";
 
 /// Answers a shell that asks what may follow, and ends the process; returns at once where none asks.
 pub(super) fn answer() {
-    CompleteEnv::with_factory(super::command).var(ASKED_BY).complete();
+    CompleteEnv::with_factory(|| with_offers(super::command())).var(ASKED_BY).complete();
+}
+
+/// Flags whose values only a rig can offer, by the names of their values.
+fn with_offers(command: clap::Command) -> clap::Command {
+    let named = |arg: &clap::Arg, name: &str| arg.get_value_names().is_some_and(|names| names == [name]);
+    command
+        .mut_args(move |arg| match () {
+            () if named(&arg, "KEY=VALUE") => arg.add(ArgValueCompleter::new(rig_keys)),
+            () if named(&arg, "NAME=VALUE") => arg.add(ArgValueCompleter::new(parameters)),
+            () => arg,
+        })
+        .mut_subcommands(with_offers)
 }
 
 /// Shells that can ask.
@@ -36,7 +48,7 @@ pub(super) fn script(shell: &str) -> io::Result<Vec<u8>> {
 }
 
 /// Keys of the rig file that begin as `typed` does, or, behind the sign =, the values that the key takes.
-pub(super) fn rig_keys(typed: &OsStr) -> Vec<CompletionCandidate> {
+fn rig_keys(typed: &OsStr) -> Vec<CompletionCandidate> {
     let Some(typed) = typed.to_str() else { return Vec::new() };
     offers(typed)
         .into_iter()
@@ -80,7 +92,7 @@ fn first_sentence(text: &str) -> String {
 }
 
 /// Parameters of the running rig that begin as `typed` does.
-pub(super) fn parameters(typed: &OsStr) -> Vec<CompletionCandidate> {
+fn parameters(typed: &OsStr) -> Vec<CompletionCandidate> {
     let Some(typed) = typed.to_str() else { return Vec::new() };
     let told = change(None, &Command::List).unwrap_or_default();
     named_in(&told).filter(|name| name.starts_with(typed)).map(CompletionCandidate::new).collect()

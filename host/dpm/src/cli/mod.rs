@@ -4,6 +4,7 @@
 mod bench;
 #[cfg(feature = "calibrate")]
 mod calibrate;
+#[cfg(feature = "manual")]
 mod completion;
 #[cfg(feature = "display")]
 mod display;
@@ -187,6 +188,7 @@ enum Command {
 pub fn main(commit: &'static str) -> ExitCode {
     dpm_common::commit::set(commit);
     crate::satellites::register();
+    #[cfg(feature = "manual")]
     completion::answer();
     let command = coloured(command());
     let parsed = command.try_get_matches().and_then(|m| Cli::from_arg_matches(&m));

@@ -1,10 +1,8 @@
 //! `dpm record OUT --rig RIG.toml`: records a rig's tracker into a file until the time is over, a signal arrives or
 //! the disk is full.
 
-use super::completion::rig_keys;
 use super::rig_args::RigArgs;
 use super::watch::print;
-use clap_complete::engine::ArgValueCompleter;
 use dpm_common::clock::{Clock, MonotonicClock};
 use dpm_common::signals;
 use dpm_device::tracker::record::Recorder;
@@ -34,7 +32,7 @@ pub(crate) struct RecordArgs {
     #[arg(long, value_name = "S", value_parser = seconds)]
     seconds: Option<f64>,
     /// Set a key of the rig file, for example tracker.server=192.168.1.10; may be given several times
-    #[arg(long = "set", value_name = "KEY=VALUE", add = ArgValueCompleter::new(rig_keys))]
+    #[arg(long = "set", value_name = "KEY=VALUE")]
     set: Vec<String>,
 }
 

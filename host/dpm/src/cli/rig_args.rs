@@ -1,7 +1,5 @@
 //! The flags of every command that takes a rig, and how they become a checked [`RigConfig`].
 
-use super::completion::rig_keys;
-use clap_complete::engine::ArgValueCompleter;
 use dpm_rig::config::{Overrides, Purpose, RigConfig};
 use dpm_rig::control::set_rig_name;
 use dpm_rig::failure::{Failure, FailureKind};
@@ -43,7 +41,7 @@ pub(crate) struct RigArgs {
     pub out: Option<PathBuf>,
 
     /// Set a key of the rig file, for example render.spp=4; may be given several times
-    #[arg(long = "set", value_name = "KEY=VALUE", add = ArgValueCompleter::new(rig_keys))]
+    #[arg(long = "set", value_name = "KEY=VALUE")]
     pub set: Vec<String>,
 }
 

@@ -1,8 +1,6 @@
 //! `dpm set`: shows the parameters of a running rig, changes them, takes changes back and saves them.
 
-use super::completion::parameters;
 use super::watch::print;
-use clap_complete::engine::ArgValueCompleter;
 use dpm_rig::control::change::{change, ChangeError};
 use dpm_rig::failure::{Failure, FailureKind};
 use dpm_rig::parameters::Command;
@@ -11,7 +9,7 @@ use dpm_rig::parameters::Command;
 #[derive(clap::Args, Clone, Debug)]
 pub(crate) struct SetArgs {
     /// Parameters and their values, for example exposure=1.5 or body.bunny=2,0,0,0,0,0.5; without any all are shown
-    #[arg(value_name = "NAME=VALUE", add = ArgValueCompleter::new(parameters))]
+    #[arg(value_name = "NAME=VALUE")]
     changes: Vec<String>,
     /// Take the last change back; comes before all others
     #[arg(long)]

@@ -9,8 +9,8 @@ use serde_json::{json, Map, Value};
 
 use super::flatten::VISIBILITY;
 use super::json::{label, shorten};
-use super::ktx2_image::{BASISU, WEBP};
 use super::spec_gloss;
+use super::texture_image::{BASISU, WEBP};
 
 type Object = Map<String, Value>;
 

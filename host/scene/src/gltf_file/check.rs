@@ -9,7 +9,7 @@ use super::accessor::{Component, Data};
 use super::compressed;
 use super::instancing::{self, read_instances, Instances};
 use super::json::{shorten, Item};
-use super::ktx2_image;
+use super::texture_image;
 
 /// Extensions that this program understands, or may ignore without a wrong picture.
 const UNDERSTOOD: [&str; 25] = [
@@ -34,8 +34,8 @@ const UNDERSTOOD: [&str; 25] = [
     "KHR_mesh_quantization",
     super::flatten::VISIBILITY,
     super::spec_gloss::NAME,
-    ktx2_image::BASISU,
-    ktx2_image::WEBP,
+    texture_image::BASISU,
+    texture_image::WEBP,
     "KHR_texture_transform",
     "KHR_xmp_json_ld",
 ];

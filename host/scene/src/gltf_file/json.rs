@@ -126,6 +126,7 @@ impl<'a> Item<'a> {
     }
 
     /// The object as JSON text.
+    #[cfg(feature = "compressed")]
     pub(super) fn to_json(&self) -> String {
         serde_json::to_string(self.map).unwrap_or_default()
     }

@@ -14,12 +14,12 @@ mod deform;
 mod flatten;
 mod instancing;
 mod json;
-mod ktx2_image;
 mod lobes;
 mod look;
 mod picture;
 mod primitive;
 mod spec_gloss;
+mod texture_image;
 mod vertex_paint;
 
 use std::collections::HashMap;
@@ -93,7 +93,7 @@ pub(super) fn read(
     let root = Item::new(&tree, "document".into())?;
     let (mut buffers, of_others) = container::load_buffers(&root, binary, folder.as_ref(), limits)?;
     compressed::decompress(&mut tree, &mut buffers, limits, cancel)?;
-    ktx2_image::make_plain(&mut tree, limits)?;
+    texture_image::make_plain(&mut tree, limits)?;
     let root = Item::new(&tree, "document".into())?;
     let all_bytes = bytes.len() + buffers.iter().map(Vec::len).sum::<usize>();
     // Of a document that was made from another file, that file counts.

@@ -3,16 +3,20 @@
 
 use std::io::Cursor;
 
+use dpm_common::rounding::Rounder;
+#[cfg(feature = "compressed")]
+use dpm_ktx2::{Ktx2Error, Texels};
 use image::{ImageFormat, ImageReader};
 
 use super::super::limits::{largest_piece, of_header, of_picture};
 use super::super::{Limits, SceneError};
 use super::bmp;
 use super::json::Item;
-use super::ktx2_image;
-use super::ktx2_image::numbers::Rounder;
 use crate::jpeg_picture::Frame;
 use crate::tiff_picture::{is_tiff, Tiff};
+
+/// The first bytes of every file in KTX2.
+const KTX2_MAGIC: [u8; 12] = *b"\xabKTX 20\xbb\r\n\x1a\n";
 
 /// Texels along the sides of a picture, each above 0.
 #[derive(Clone, Copy)]
@@ -80,8 +84,8 @@ pub(super) fn decode(
     texels_so_far: u64,
     limits: &Limits,
 ) -> Result<Picture, SceneError> {
-    if ktx2_image::is_ktx2(bytes) {
-        return ktx2_image::decode(item, bytes, texels_so_far, limits);
+    if bytes.starts_with(&KTX2_MAGIC) {
+        return ktx2(item, bytes, texels_so_far, limits);
     }
     let format = format_of(item, bytes, name)?;
     let room = Room::of(item, bytes, texels_so_far, limits)?;
@@ -99,6 +103,33 @@ pub(super) fn decode(
         return picture;
     }
     of_image(item, bytes, format, &room, limits)
+}
+
+/// A picture in KTX2, level 0.
+#[cfg(feature = "compressed")]
+fn ktx2(item: &Item, bytes: &[u8], texels_so_far: u64, limits: &Limits) -> Result<Picture, SceneError> {
+    let failed = |e: Ktx2Error| match e {
+        Ktx2Error::Damaged(why) => item.error(why),
+        Ktx2Error::Unsupported { what, remedy } => {
+            SceneError::unsupported(format!("{}: {what}", item.name), remedy)
+        }
+    };
+    let image = dpm_ktx2::Image::open(bytes).map_err(failed)?;
+    let [width, height] = image.sides();
+    let size = Size { width, height };
+    check_size(item, size, texels_so_far, limits)?;
+    check_decoded(item, bytes, 4 * size.texels() as u64, limits)?;
+    let Texels { texels, srgb, red_green_only, cut_off } = image.texels().map_err(failed)?;
+    Ok(Picture { size, texels, srgb, red_green_only, cut_off, stored: None, notes: vec![] })
+}
+
+#[cfg(not(feature = "compressed"))]
+fn ktx2(item: &Item, _: &[u8], _: u64, _: &Limits) -> Result<Picture, SceneError> {
+    let remedy = "build it with the feature `compressed`, or export PNG or JPEG textures";
+    Err(SceneError::unsupported(
+        format!("{}: an image in KTX2, without which this program was built", item.name),
+        remedy,
+    ))
 }
 
 /// A picture by the decoders of `image`.
@@ -298,7 +329,7 @@ fn format_of(item: &Item, bytes: &[u8], name: &str) -> Result<ImageFormat, Scene
 
 /// Checks format and size of a picture that is decoded later.
 pub(super) fn check(item: &Item, bytes: &[u8], name: &str, limits: &Limits) -> Result<(), SceneError> {
-    if ktx2_image::is_ktx2(bytes) {
+    if bytes.starts_with(&KTX2_MAGIC) {
         return Ok(());
     }
     let format = format_of(item, bytes, name)?;

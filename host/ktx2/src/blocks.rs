@@ -3,21 +3,21 @@
 
 use ktx2::Format;
 
-use super::super::super::SceneError;
-use super::numbers::{raised, Rounder};
-use super::{etc, Content};
+use super::numbers::raised;
+use super::{etc, Content, Ktx2Error};
+use dpm_common::rounding::Rounder;
 
 /// Texels along each side of a block.
 const SIDE: usize = 4;
 
 /// The texels of a block, row by row from the top.
-pub(super) type Square = [[u8; 4]; SIDE * SIDE];
+pub(crate) type Square = [[u8; 4]; SIDE * SIDE];
 
 /// The texels of a block. A channel that is not stored is 0, and alpha is 1.
 type Decode = fn(&[u8], &mut Rounder) -> Square;
 
 /// A format of blocks.
-pub(super) struct Block {
+pub(crate) struct Block {
     /// Bytes of a block.
     bytes: usize,
     decode: Decode,
@@ -26,13 +26,13 @@ pub(super) struct Block {
 }
 
 /// True for ASTC of low dynamic range in flat blocks: the formats 157 to 184 of Vulkan.
-pub(super) fn is_astc(format: Format) -> bool {
+pub(crate) fn is_astc(format: Format) -> bool {
     (Format::ASTC_4x4_UNORM_BLOCK..=Format::ASTC_12x12_SRGB_BLOCK).contains(&format)
 }
 
 impl Block {
     /// The format of blocks with this name.
-    pub(super) fn of(format: Format) -> Option<Self> {
+    pub(crate) fn of(format: Format) -> Option<Self> {
         let (bytes, channels, decode): (_, _, Decode) = match format {
             Format::BC1_RGB_UNORM_BLOCK | Format::BC1_RGB_SRGB_BLOCK => {
                 (8, 3, |b, _| opaque(bcdec_rs::bc1, b))
@@ -74,11 +74,7 @@ impl Block {
     }
 
     /// Every texel, row by row from the top. Blocks at the right and at the bottom may reach beyond the picture.
-    pub(super) fn texels(
-        &self,
-        content: &Content,
-        rounder: &mut Rounder,
-    ) -> Result<Vec<[u8; 4]>, SceneError> {
+    pub(crate) fn texels(&self, content: &Content, rounder: &mut Rounder) -> Result<Vec<[u8; 4]>, Ktx2Error> {
         let (width, height) = (content.size.width as usize, content.size.height as usize);
         let across = width.div_ceil(SIDE);
         let stored = content.bytes(across * height.div_ceil(SIDE) * self.bytes)?;

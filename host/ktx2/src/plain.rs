@@ -2,12 +2,12 @@
 
 use ktx2::Format;
 
-use super::super::super::SceneError;
-use super::numbers::{Number, Rounder};
-use super::Content;
+use super::numbers::Number;
+use super::{Content, Ktx2Error};
+use dpm_common::rounding::Rounder;
 
 /// What a texel consists of.
-pub(super) struct Layout {
+pub(crate) struct Layout {
     /// How each of its channels is stored.
     number: Number,
     /// Channels, 1 to 4, beginning with red.
@@ -18,7 +18,7 @@ pub(super) struct Layout {
 
 impl Layout {
     /// The layout of a format whose channels are numbers of the same kind, and stand for fractions of 1.
-    pub(super) fn of(format: Format) -> Option<Self> {
+    pub(crate) fn of(format: Format) -> Option<Self> {
         use Number::{Half, Single, Snorm16, Snorm8, Unorm16, Unorm8};
         let (number, channels) = match format {
             Format::R8_UNORM | Format::R8_SRGB => (Unorm8, 1),
@@ -55,11 +55,7 @@ impl Layout {
     }
 
     /// Every texel, row by row from the top. A channel that is not stored is 0, and alpha is 1.
-    pub(super) fn texels(
-        &self,
-        content: &Content,
-        rounder: &mut Rounder,
-    ) -> Result<Vec<[u8; 4]>, SceneError> {
+    pub(crate) fn texels(&self, content: &Content, rounder: &mut Rounder) -> Result<Vec<[u8; 4]>, Ktx2Error> {
         let bytes = self.number.bytes();
         let stored = content.bytes(content.size.texels() * self.channels * bytes)?;
         let texel = |stored: &[u8]| {

@@ -7,8 +7,7 @@
 use basisu::{DecodeFlags, TargetFormat, Transcoder};
 use ktx2::{ColorModel, Format, Header, Index, LevelIndex, SupercompressionScheme};
 
-use super::super::super::SceneError;
-use super::Content;
+use super::{damaged, unsupported, Content, Ktx2Error};
 
 /// Bytes of a block of UASTC and of ASTC.
 const BLOCK_BYTES: usize = 16;
@@ -20,31 +19,29 @@ const DIFFERENCE: u32 = 2;
 /// The content of a channel, as the data format descriptor numbers them.
 mod channel {
     /// Red, green and blue; also the only sample of ASTC.
-    pub(super) const RGB: u8 = 0;
+    pub(crate) const RGB: u8 = 0;
     /// UASTC: red, green, blue and alpha.
-    pub(super) const RGBA: u8 = 3;
+    pub(crate) const RGBA: u8 = 3;
     /// ETC1S: red alone, stored as grey.
-    pub(super) const ETC1S_RED: u8 = 3;
+    pub(crate) const ETC1S_RED: u8 = 3;
     /// UASTC: red alone, stored as grey.
-    pub(super) const UASTC_RED: u8 = 4;
+    pub(crate) const UASTC_RED: u8 = 4;
     /// ETC1S: alpha in a picture of its own.
-    pub(super) const ALPHA: u8 = 15;
+    pub(crate) const ALPHA: u8 = 15;
 }
 
 /// The texels of ETC1S, which BasisLZ always compresses further.
-pub(super) fn etc1s(content: &Content) -> Result<Vec<[u8; 4]>, SceneError> {
+pub(crate) fn etc1s(content: &Content) -> Result<Vec<[u8; 4]>, Ktx2Error> {
     let alpha = match content.file.descriptor.channels[..] {
         [channel::RGB | channel::ETC1S_RED] => false,
         [channel::RGB, channel::ALPHA] => true,
-        _ => return Err(content.unsupported("of two channels, or of unknown ones")),
+        _ => return Err(unsupported("of two channels, or of unknown ones")),
     };
     if content.file.header.supercompression_scheme != Some(SupercompressionScheme::BasisLZ) {
-        return Err(content
-            .item
-            .error("holds ETC1S without BasisLZ, which its format forbids: export it again"));
+        return Err(damaged("holds ETC1S without BasisLZ, which its format forbids: export it again"));
     }
     let global = single_image(content, alpha).ok_or_else(|| {
-        content.item.error("points outside of its own data: it is cut off or damaged, export it again")
+        damaged("points outside of its own data: it is cut off or damaged, export it again")
     })?;
     let channels: &[u8] = if alpha { &[channel::RGB, channel::ALPHA] } else { &[channel::RGB] };
     let parts = Parts { format: None, model: ColorModel::ETC1S, block: [4, 4], channels, global };
@@ -52,11 +49,11 @@ pub(super) fn etc1s(content: &Content) -> Result<Vec<[u8; 4]>, SceneError> {
 }
 
 /// The texels of UASTC.
-pub(super) fn uastc(content: &Content) -> Result<Vec<[u8; 4]>, SceneError> {
+pub(crate) fn uastc(content: &Content) -> Result<Vec<[u8; 4]>, Ktx2Error> {
     let channel = match content.file.descriptor.channels[..] {
         [channel::RGB | channel::UASTC_RED] => channel::RGB,
         [channel::RGBA] => channel::RGBA,
-        _ => return Err(content.unsupported("of two channels, or of unknown ones")),
+        _ => return Err(unsupported("of two channels, or of unknown ones")),
     };
     let channels = &[channel];
     let parts = Parts { format: None, model: ColorModel::UASTC, block: [4, 4], channels, global: vec![] };
@@ -64,7 +61,7 @@ pub(super) fn uastc(content: &Content) -> Result<Vec<[u8; 4]>, SceneError> {
 }
 
 /// The texels of ASTC of low dynamic range. `format` is one of those that [`super::blocks::is_astc`] knows.
-pub(super) fn astc(content: &Content, format: Format) -> Result<Vec<[u8; 4]>, SceneError> {
+pub(crate) fn astc(content: &Content, format: Format) -> Result<Vec<[u8; 4]>, Ktx2Error> {
     let block = content.file.descriptor.block;
     let channels = &[channel::RGBA];
     let parts = Parts { format: Some(format), model: ColorModel::ASTC, block, channels, global: vec![] };
@@ -161,9 +158,9 @@ impl Parts<'_> {
 }
 
 /// Decodes `data` as the level of a file with these parts.
-fn transcode(content: &Content, parts: &Parts, data: &[u8]) -> Result<Vec<[u8; 4]>, SceneError> {
+fn transcode(content: &Content, parts: &Parts, data: &[u8]) -> Result<Vec<[u8; 4]>, Ktx2Error> {
     // What the decoder calls the error says no more: it gives the same one for all damage.
-    let failed = |_| content.item.error("cannot be decoded: its data is damaged, export it again");
+    let failed = |_| damaged("cannot be decoded: its data is damaged, export it again");
     let file = parts.file(content, data);
     let texture = Transcoder::new(&file).map_err(failed)?;
     let mut texels = vec![[0; 4]; content.size.texels()];

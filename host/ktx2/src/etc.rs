@@ -5,7 +5,8 @@
 use std::array;
 
 use super::blocks::Square;
-use super::numbers::{raised, Rounder};
+use super::numbers::raised;
+use dpm_common::rounding::Rounder;
 
 /// What the table of a half adds to its colour: the smaller and the greater step.
 const STEPS: [[i32; 2]; 8] = [[2, 8], [5, 17], [9, 29], [13, 42], [18, 60], [24, 80], [33, 106], [47, 183]];
@@ -34,17 +35,17 @@ const MODIFIERS: [[i32; 8]; 16] = [
 ];
 
 /// A block of ETC2 without alpha.
-pub(super) fn rgb8(block: &[u8]) -> Square {
+pub(crate) fn rgb8(block: &[u8]) -> Square {
     Bits::of(block).colours(false)
 }
 
 /// A block of ETC2 whose texels are opaque or transparent.
-pub(super) fn rgb8a1(block: &[u8]) -> Square {
+pub(crate) fn rgb8a1(block: &[u8]) -> Square {
     Bits::of(block).colours(true)
 }
 
 /// A block of ETC2 with alpha in EAC before it.
-pub(super) fn rgba8(block: &[u8]) -> Square {
+pub(crate) fn rgba8(block: &[u8]) -> Square {
     let eac = Eac::of(block);
     let mut texels = Bits::of(&block[8..]).colours(false);
     for (texel, modifier) in texels.iter_mut().zip(eac.modifiers) {
@@ -54,12 +55,12 @@ pub(super) fn rgba8(block: &[u8]) -> Square {
 }
 
 /// A block of EAC with red of 11 bits.
-pub(super) fn r11(block: &[u8], signed: bool, rounder: &mut Rounder) -> Square {
+pub(crate) fn r11(block: &[u8], signed: bool, rounder: &mut Rounder) -> Square {
     Eac::of(block).numbers(signed).map(|red| [rounder.byte(red), 0, 0, 255])
 }
 
 /// A block of EAC with red and green of 11 bits.
-pub(super) fn rg11(block: &[u8], signed: bool, rounder: &mut Rounder) -> Square {
+pub(crate) fn rg11(block: &[u8], signed: bool, rounder: &mut Rounder) -> Square {
     let [red, green] = [Eac::of(block), Eac::of(&block[8..])].map(|eac| eac.numbers(signed));
     array::from_fn(|i| [rounder.byte(red[i]), rounder.byte(green[i]), 0, 255])
 }

@@ -4,7 +4,7 @@ use half::f16;
 
 /// How a channel is stored, always with its low byte first.
 #[derive(Clone, Copy)]
-pub(super) enum Number {
+pub(crate) enum Number {
     /// 8 bits for 0 to 1.
     Unorm8,
     /// 8 bits for -1 to 1.
@@ -21,7 +21,7 @@ pub(super) enum Number {
 
 impl Number {
     /// Bytes of a number.
-    pub(super) fn bytes(self) -> usize {
+    pub(crate) fn bytes(self) -> usize {
         match self {
             Self::Unorm8 | Self::Snorm8 => 1,
             Self::Unorm16 | Self::Snorm16 | Self::Half => 2,
@@ -30,7 +30,7 @@ impl Number {
     }
 
     /// The number at the start of `stored`, which holds it whole. A texture holds 0 to 1.
-    pub(super) fn read(self, stored: &[u8]) -> f32 {
+    pub(crate) fn read(self, stored: &[u8]) -> f32 {
         let two = || [stored[0], stored[1]];
         match self {
             Self::Unorm8 => f32::from(stored[0]) / 255.0,
@@ -46,29 +46,14 @@ impl Number {
 /// A number of -1 to 1 as one of 0 to 1, which is how glTF stores directions.
 ///
 /// Images with a sign hold directions: a colour has none. The least of their numbers stands for -1, as does the next.
-pub(super) fn raised(number: f32) -> f32 {
+pub(crate) fn raised(number: f32) -> f32 {
     number.max(-1.0) * 0.5 + 0.5
-}
-
-/// Rounds numbers to 8 bits, and notices those that a texture cannot hold.
-#[derive(Default)]
-pub(in super::super) struct Rounder {
-    /// A number was none, or lay outside of 0 to 1.
-    pub cut_off: bool,
-}
-
-impl Rounder {
-    /// The nearest of the 256 values from 0 to 1. What lies beyond them is cut off, and what is no number becomes 0.
-    pub(in super::super) fn byte(&mut self, number: f32) -> u8 {
-        self.cut_off |= !(0.0..=1.0).contains(&number);
-        // The conversion ends at 0 and 255, and makes 0 of what is no number.
-        (number * 255.0 + 0.5) as u8
-    }
 }
 
 #[cfg(test)]
 mod tests {
-    use super::{Number, Rounder};
+    use super::Number;
+    use dpm_common::rounding::Rounder;
 
     #[test]
     fn every_number_of_eight_and_of_sixteen_bits_becomes_the_nearest_byte() {

@@ -7,7 +7,7 @@ use ktx2::dfd::DataFormatFlags;
 use ktx2::{ColorModel, Header, KeyValueDataIterator, LevelIndex, TransferFunction};
 
 /// What a file says of its texels: the basic block of its data format descriptor.
-pub(super) struct Descriptor {
+pub(crate) struct Descriptor {
     /// How channels make a colour.
     pub model: Option<ColorModel>,
     /// How numbers stand for light.
@@ -21,7 +21,7 @@ pub(super) struct Descriptor {
 }
 
 /// A KTX2 file whose parts are all there.
-pub(super) struct File<'a> {
+pub(crate) struct File<'a> {
     /// Format, size and shape.
     pub header: Header,
     /// What the texels mean.
@@ -35,7 +35,7 @@ pub(super) struct File<'a> {
 
 impl<'a> File<'a> {
     /// The parts of a file; nothing if it is cut off, or if an offset points out of it.
-    pub(super) fn of(bytes: &'a [u8]) -> Option<Self> {
+    pub(crate) fn of(bytes: &'a [u8]) -> Option<Self> {
         let header = Header::from_bytes(bytes.first_chunk()?).ok()?;
         let levels = (header.level_count.max(1) as usize).checked_mul(LevelIndex::LENGTH)?;
         let index = bytes.get(Header::LENGTH..)?.get(..levels)?;
@@ -55,7 +55,7 @@ impl<'a> File<'a> {
     }
 
     /// A note by the program that wrote the file, without the zero at its end.
-    pub(super) fn note(&self, key: &str) -> Option<String> {
+    pub(crate) fn note(&self, key: &str) -> Option<String> {
         let (_, value) = KeyValueDataIterator::new(self.notes).find(|(name, _)| *name == key)?;
         Some(String::from_utf8_lossy(value).trim_end_matches('\0').to_owned())
     }

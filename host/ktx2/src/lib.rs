@@ -1,4 +1,4 @@
-//! Decodes images in KTX2, the container of the extension KHR_texture_basisu, to texels of 8-bit RGBA.
+//! Decodes images in KTX2, the container of glTF's extension KHR_texture_basisu, to texels of 8-bit RGBA.
 //!
 //! The extension allows what Basis Universal has compressed: ETC1S and UASTC ([`basis`]). Files by others also hold
 //! blocks as graphics cards take them ([`blocks`], [`etc`]) and plain texels ([`plain`]). Mipmaps are left out: level 0
@@ -8,27 +8,17 @@ mod basis;
 mod blocks;
 mod container;
 mod etc;
-pub(super) mod numbers;
+mod numbers;
 mod plain;
 
 use std::borrow::Cow;
 use std::io::Read;
 
 use container::File;
+use dpm_common::rounding::Rounder;
 use flate2::bufread::ZlibDecoder;
 use ktx2::{ColorModel, Format, Header, SupercompressionScheme, TransferFunction};
-use numbers::Rounder;
 use ruzstd::decoding::FrameDecoder;
-use serde_json::{json, Value};
-
-use super::super::{Limits, SceneError};
-use super::json::{shorten, Item};
-use super::picture::{check_decoded, check_size, Picture, Size};
-
-/// The extension, at textures.
-pub(super) const BASISU: &str = "KHR_texture_basisu";
-/// The extension by which a texture names an image in WebP.
-pub(super) const WEBP: &str = "EXT_texture_webp";
 
 /// What to do about an image that cannot be shown.
 const REMEDY: &str = "encode it as ETC1S or UASTC, or export PNG or JPEG textures";
@@ -43,81 +33,118 @@ const MOST_FROM_A_BYTE_OF_ZLIB: usize = 4 * 258;
 /// allow that much by the format's own advice.
 const WINDOW_FOR_ALL: u64 = 8 << 20;
 
-/// Rewrites every texture with the extension as a plain one that shows the extension's image, also where there is
-/// another image for programs that do not know the extension.
-///
-/// # Errors
-/// Lists that are none, or are longer than the limits allow.
-pub(super) fn make_plain(tree: &mut Value, limits: &Limits) -> Result<(), SceneError> {
-    let root = Item::new(tree, "document".into())?;
-    let images = root.list("images", "image", limits.objects)?.len();
-    let mut sources = vec![];
-    for (i, texture) in root.list("textures", "texture", limits.objects)?.iter().enumerate() {
-        if let Some(extension) = texture.extension(BASISU)? {
-            if let Some(source) = extension.index("source", images, "image")? {
-                sources.push((i, source));
-            }
-        } else if let Some(extension) = texture.extension(WEBP)?.filter(|_| texture.get("source").is_none()) {
-            // An image for all programs is taken where there is one.
-            sources.extend(extension.index("source", images, "image")?.map(|source| (i, source)));
+/// Why an image cannot be shown, as the end of a sentence that begins with its name.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub enum Ktx2Error {
+    /// The file contradicts its format.
+    Damaged(String),
+    /// The image is of a kind that is not shown here.
+    Unsupported {
+        /// What it is.
+        what: String,
+        /// What to do.
+        remedy: &'static str,
+    },
+}
+
+fn damaged(why: impl Into<String>) -> Ktx2Error {
+    Ktx2Error::Damaged(why.into())
+}
+
+/// The texels of an image.
+#[derive(Clone, Debug)]
+pub struct Texels {
+    /// Red, green, blue and alpha, row by row from the top.
+    pub texels: Vec<[u8; 4]>,
+    /// Whether the numbers are encoded as in sRGB, if the file says it.
+    pub srgb: Option<bool>,
+    /// Only red and green are stored, in their own places.
+    pub red_green_only: bool,
+    /// Some numbers lie beyond those of a texture.
+    pub cut_off: bool,
+}
+
+/// An image of one flat picture.
+pub struct Image<'a> {
+    file: File<'a>,
+}
+
+impl<'a> Image<'a> {
+    /// Reads the head of `bytes`. No memory is taken.
+    ///
+    /// # Errors
+    /// A file that is cut off or damaged, or holds something else than one flat picture.
+    pub fn open(bytes: &'a [u8]) -> Result<Self, Ktx2Error> {
+        let file = File::of(bytes)
+            .ok_or_else(|| damaged("is a KTX2 image that is cut off or damaged: export it again"))?;
+        check_shape(&file.header)?;
+        Ok(Self { file })
+    }
+
+    /// Texels in a row, and rows.
+    pub fn sides(&self) -> [u32; 2] {
+        [self.file.header.pixel_width, self.file.header.pixel_height]
+    }
+
+    /// The texels of level 0. They take four bytes each, and what the file stores may take as much again: check
+    /// [`Self::sides`] first.
+    ///
+    /// # Errors
+    /// An image that contradicts its format or is of a format that is not known here.
+    pub fn texels(&self) -> Result<Texels, Ktx2Error> {
+        let file = &self.file;
+        check_meaning(file)?;
+        let [width, height] = self.sides();
+        let content = Content { file, size: Size { width, height } };
+        let mut stored = match (file.header.format, file.descriptor.model) {
+            (None, Some(ColorModel::ETC1S)) => StoredTexels::of_bytes(basis::etc1s(&content)?),
+            (None, Some(ColorModel::UASTC)) => StoredTexels::of_bytes(basis::uastc(&content)?),
+            (None, model) => return Err(unsupported(format!("of the colour model {model:?}"))),
+            (Some(format), _) => StoredTexels::of(&content, format)?,
+        };
+        let order = file.note("KTXswizzle");
+        if let Some(order) = order.as_deref().filter(|order| *order != "rgba") {
+            swizzle(order, &mut stored.texels)?;
         }
+        let as_stored = matches!(order.as_deref(), None | Some("rgba" | "rg01"));
+        let srgb = match file.descriptor.transfer {
+            Some(TransferFunction::SRGB) => Some(true),
+            Some(TransferFunction::Linear) => Some(false),
+            _ => None,
+        };
+        Ok(Texels {
+            texels: stored.texels,
+            srgb,
+            red_green_only: stored.channels == 2 && as_stored,
+            cut_off: stored.cut_off,
+        })
     }
-    for (texture, source) in sources {
-        tree["textures"][texture]["source"] = json!(source);
-    }
-    Ok(())
 }
 
-/// True if `bytes` begin as KTX2 does.
-pub(super) fn is_ktx2(bytes: &[u8]) -> bool {
-    bytes.starts_with(&ktx2::MAGIC)
+fn unsupported(what: impl AsRef<str>) -> Ktx2Error {
+    Ktx2Error::Unsupported { what: format!("a KTX2 image {}", what.as_ref()), remedy: REMEDY }
 }
 
-/// The texels of level 0 of a KTX2 image. `texels_so_far` counts those of the scene's other textures.
-///
-/// # Errors
-/// An image that contradicts its format, is beyond the limits, or holds something else than one flat picture of a
-/// format that is known here. The text names `item` and what to do.
-pub(super) fn decode(
-    item: &Item,
-    bytes: &[u8],
-    texels_so_far: u64,
-    limits: &Limits,
-) -> Result<Picture, SceneError> {
-    let file = File::of(bytes)
-        .ok_or_else(|| item.error("is a KTX2 image that is cut off or damaged: export it again"))?;
-    let header = file.header;
-    check_shape(item, &header)?;
-    let size = Size { width: header.pixel_width, height: header.pixel_height };
-    check_size(item, size, texels_so_far, limits)?;
-    check_decoded(item, bytes, 4 * size.texels() as u64, limits)?;
-    check_meaning(item, &file)?;
-    let content = Content { item, file: &file, size };
-    let mut stored = match (header.format, file.descriptor.model) {
-        (None, Some(ColorModel::ETC1S)) => StoredTexels::of_bytes(basis::etc1s(&content)?),
-        (None, Some(ColorModel::UASTC)) => StoredTexels::of_bytes(basis::uastc(&content)?),
-        (None, model) => return Err(content.unsupported(&format!("of the colour model {model:?}"))),
-        (Some(format), _) => StoredTexels::of(&content, format)?,
-    };
-    let order = file.note("KTXswizzle");
-    if let Some(order) = order.as_deref().filter(|order| *order != "rgba") {
-        swizzle(item, order, &mut stored.texels)?;
+/// Texels along the sides of a picture, each above 0.
+#[derive(Clone, Copy)]
+struct Size {
+    width: u32,
+    height: u32,
+}
+
+impl Size {
+    fn texels(self) -> usize {
+        self.width as usize * self.height as usize
     }
-    let as_stored = matches!(order.as_deref(), None | Some("rgba" | "rg01"));
-    let srgb = match file.descriptor.transfer {
-        Some(TransferFunction::SRGB) => Some(true),
-        Some(TransferFunction::Linear) => Some(false),
-        _ => None,
-    };
-    Ok(Picture {
-        size,
-        texels: stored.texels,
-        srgb,
-        red_green_only: stored.channels == 2 && as_stored,
-        cut_off: stored.cut_off,
-        stored: None,
-        notes: vec![],
-    })
+}
+
+/// At most 60 characters of a text by others, without control characters, for a message.
+fn shorten(text: &str) -> String {
+    let mut out: String = text.chars().take(60).map(|c| if c.is_control() { '?' } else { c }).collect();
+    if text.chars().nth(60).is_some() {
+        out.push_str("...");
+    }
+    out
 }
 
 /// What an image stores, as texels.
@@ -136,7 +163,7 @@ impl StoredTexels {
     }
 
     /// The texels of a format that Vulkan has a name for.
-    fn of(content: &Content, format: Format) -> Result<Self, SceneError> {
+    fn of(content: &Content, format: Format) -> Result<Self, Ktx2Error> {
         let mut rounder = Rounder::default();
         let (texels, channels) = if let Some(layout) = plain::Layout::of(format) {
             (layout.texels(content, &mut rounder)?, layout.channels)
@@ -145,45 +172,45 @@ impl StoredTexels {
         } else if blocks::is_astc(format) {
             (basis::astc(content, format)?, 4)
         } else {
-            return Err(content.unsupported(&format!("in {format:?}")));
+            return Err(unsupported(format!("in {format:?}")));
         };
         Ok(Self { texels, channels, cut_off: rounder.cut_off })
     }
 }
 
 /// Refuses what is not one flat picture.
-fn check_shape(item: &Item, header: &Header) -> Result<(), SceneError> {
+fn check_shape(header: &Header) -> Result<(), Ktx2Error> {
     let flat = header.pixel_height > 0 && header.pixel_depth == 0;
     if flat && header.layer_count <= 1 && header.face_count == 1 {
         return Ok(());
     }
-    Err(SceneError::unsupported(
-        format!("{}: a KTX2 image that is a volume, an array or a cube map", item.name),
-        "export one flat picture",
-    ))
+    Err(Ktx2Error::Unsupported {
+        what: "a KTX2 image that is a volume, an array or a cube map".into(),
+        remedy: "export one flat picture",
+    })
 }
 
 /// Refuses what glTF forbids and what would change the picture: another orientation, and colours that are multiplied by
 /// alpha.
-fn check_meaning(item: &Item, file: &File) -> Result<(), SceneError> {
+fn check_meaning(file: &File) -> Result<(), Ktx2Error> {
     if let Some(orientation) = file.note("KTXorientation").filter(|o| o != "rd") {
-        return Err(item.error(format!(
+        return Err(damaged(format!(
             "says that its KTXorientation is '{}'; glTF allows only 'rd': export it again",
             shorten(&orientation)
         )));
     }
     if file.descriptor.premultiplied {
-        return Err(item.error("holds colours multiplied by alpha: export it with straight alpha"));
+        return Err(damaged("holds colours multiplied by alpha: export it with straight alpha"));
     }
     Ok(())
 }
 
 /// Puts the channels where the image's KTXswizzle wants them. glTF forbids one, but encoders leave 'rrr1' at grey images.
-fn swizzle(item: &Item, order: &str, texels: &mut [[u8; 4]]) -> Result<(), SceneError> {
+fn swizzle(order: &str, texels: &mut [[u8; 4]]) -> Result<(), Ktx2Error> {
     // The channels of a texel, and behind them the constants.
     let sources: Option<Vec<usize>> = order.chars().map(|c| "rgba01".find(c)).collect();
     let Some(&[r, g, b, a]) = sources.as_deref().and_then(<[usize]>::as_array) else {
-        return Err(item.error(format!(
+        return Err(damaged(format!(
             "says that its KTXswizzle is '{}', which is none: export it again",
             shorten(order)
         )));
@@ -197,20 +224,15 @@ fn swizzle(item: &Item, order: &str, texels: &mut [[u8; 4]]) -> Result<(), Scene
 
 /// Level 0 of an image, and what errors call it.
 struct Content<'a> {
-    item: &'a Item<'a>,
     file: &'a File<'a>,
     size: Size,
 }
 
 impl Content<'_> {
-    fn unsupported(&self, what: &str) -> SceneError {
-        SceneError::unsupported(format!("{}: a KTX2 image {what}", self.item.name), REMEDY)
-    }
-
     /// The first `needed` bytes of the level, without supercompression.
-    fn bytes(&self, needed: usize) -> Result<Cow<'_, [u8]>, SceneError> {
+    fn bytes(&self, needed: usize) -> Result<Cow<'_, [u8]>, Ktx2Error> {
         let cut_off = |there: usize| {
-            self.item.error(format!(
+            damaged(format!(
                 "holds {there} bytes of texels, but its size asks for {needed}: the data is cut off"
             ))
         };
@@ -226,7 +248,7 @@ impl Content<'_> {
                 decoder.set_max_window_size((needed as u64).next_power_of_two().max(WINDOW_FOR_ALL));
                 let length = decoder
                     .decode_all(data, &mut plain)
-                    .map_err(|e| self.item.error(format!("cannot be decompressed: {e}")))?;
+                    .map_err(|e| damaged(format!("cannot be decompressed: {e}")))?;
                 if length < needed {
                     return Err(cut_off(length));
                 }
@@ -238,22 +260,22 @@ impl Content<'_> {
                 }
                 self.inflated(data, needed).map(Cow::Owned)
             }
-            Some(other) => Err(self.unsupported(&format!("with supercompression {other:?}"))),
+            Some(other) => Err(unsupported(format!("with supercompression {other:?}"))),
         }
     }
 
     /// A ZLIB stream of `needed` bytes and no more.
-    fn inflated(&self, data: &[u8], needed: usize) -> Result<Vec<u8>, SceneError> {
-        let failed = |e: std::io::Error| self.item.error(format!("cannot be decompressed: {e}"));
+    fn inflated(&self, data: &[u8], needed: usize) -> Result<Vec<u8>, Ktx2Error> {
+        let failed = |e: std::io::Error| damaged(format!("cannot be decompressed: {e}"));
         let mut decoder = ZlibDecoder::new(data);
         let mut plain = vec![0; needed];
         decoder.read_exact(&mut plain).map_err(failed)?;
         // Only the end of the stream tells whether its sum is right.
         match decoder.read(&mut [0]).map_err(failed)? {
             0 => Ok(plain),
-            _ => Err(self
-                .item
-                .error(format!("holds more than the {needed} bytes of texels of its size: export it again"))),
+            _ => Err(damaged(format!(
+                "holds more than the {needed} bytes of texels of its size: export it again"
+            ))),
         }
     }
 }
