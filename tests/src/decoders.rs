@@ -2,7 +2,7 @@
 //! all bytes. The fuzz targets in `fuzz/` and the test over the committed seeds call the same entries.
 
 use crate::conversations::{gaze, link, sensor, trackers, usb};
-use dpm_camera_files::{self as camera_files, Form, LengthUnit, LensKind, ReadOptions, StorageError};
+use dpm_camera_files::{self as camera_files, LengthUnit, LensKind, ReadOptions, StorageError, StorageForm};
 use dpm_device::clock_map::{ClockMap, ExchangeOutcome};
 use dpm_device::cobs::{encode, encoded_bytes, Deframer};
 use dpm_device::link::crc32c;
@@ -19,7 +19,7 @@ use dpm_rig::config::{Overrides, RigConfig};
 use dpm_rig::control::osc::decode as osc;
 use dpm_rig::control::{server, status_file, ClientRequest};
 use dpm_rig::order::Order;
-use dpm_rig::parameters::command::{Command, MAX_LINE};
+use dpm_rig::parameters::command::{ParameterCommand, MAX_LINE};
 use dpm_rig::standing;
 use dpm_rig::trackers::kinds;
 use hil_mock::faults::FaultPlan;
@@ -313,7 +313,7 @@ pub fn calibration(bytes: &[u8]) {
         };
         let camera = stored.camera;
         assert!(camera.world_from_projector.is_finite() && camera.fx > 0.0 && camera.fy > 0.0);
-        for form in [Form::Xml, Form::Yaml, Form::Json] {
+        for form in [StorageForm::Xml, StorageForm::Yaml, StorageForm::Json] {
             let text = camera_files::export(&camera, form);
             let again = camera_files::read(text.as_bytes(), &ReadOptions { lens: LensKind::Auto, ..options });
             use StorageError::{Matrix, Missing, Syntax, UnknownForm};
@@ -394,7 +394,7 @@ pub fn control_words(bytes: &[u8]) {
             bytes[..bytes.len().min(MAX_LINE)].split_inclusive(|b| *b == b'\n').next().unwrap_or_default();
         // A word is read by pieces, and what came with its line feed is part of it.
         if let Some(ClientRequest::Parameters(command)) = &order {
-            let again = Command::parse(&command.line());
+            let again = ParameterCommand::parse(&command.line());
             assert!(
                 matches!(&again, Ok(Some(back)) if format!("{back:?}") == format!("{command:?}")),
                 "{again:?}"

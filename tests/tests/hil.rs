@@ -18,7 +18,7 @@ use dpm_device::transport::LinkDevice;
 use dpm_dlpc900::driver::{Dlpc900, Dlpc900Error, PortError};
 use dpm_dlpc900::image::PlaneOrder;
 use dpm_dlpc900::lut::Dmd;
-use dpm_dlpc900::sequence::{LedSetup, Pattern, Repeat, SequenceBuilder};
+use dpm_dlpc900::sequence::{BitPattern, LedSetup, Repeat, SequenceBuilder};
 use dpm_dlpc900::usb::{list, UsbHid};
 use hil_mock::dlpc900::{Dlpc900Model, Options};
 use hil_mock::projector::usb::UsbProjector;
@@ -86,7 +86,7 @@ fn dlpc900_patterns_cross_the_kernel_and_the_hid_driver_is_detached() {
         .map(|p| (0..raster.plane_bytes()).map(|i| ((i / 16 * (p + 3)) >> 3) as u8).collect())
         .collect();
     let mut s = SequenceBuilder::new(Dmd::Dlp5500);
-    planes.iter().for_each(|p| s.push(&Pattern::white(vec![p], 1000)));
+    planes.iter().for_each(|p| s.push(&BitPattern::white(vec![p], 1000)));
     let s = s.finish(Repeat::Forever, PlaneOrder::default(), None).expect("a sequence");
     let start = Instant::now();
     d.upload(&s, LedSetup::default(), &mut |_| ()).expect("uploaded");

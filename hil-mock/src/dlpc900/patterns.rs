@@ -3,7 +3,7 @@
 use std::collections::BTreeMap;
 
 use dpm_dlpc900::image::{extract_plane, ImageDecoder, ImageHeader, PlaneOrder, HEADER_BYTES};
-use dpm_dlpc900::lut::{check_entry, step_us, validate, DisplayMode, Dmd, Limits, LutEntry, MAX_IMAGES};
+use dpm_dlpc900::lut::{check_entry, step_us, validate, DisplayMode, Dmd, LutEntry, TableLimits, MAX_IMAGES};
 
 /// An error code of the controller and the reason.
 pub(super) type Refusal = (u8, String);
@@ -79,7 +79,7 @@ impl Patterns {
         if place >= self.dmd.max_entries() {
             return refuse(15, format!("entry {place} of at most {}", self.dmd.max_entries()));
         }
-        let limits = Limits { dmd: self.dmd, images: MAX_IMAGES, frame_us: None };
+        let limits = TableLimits { dmd: self.dmd, images: MAX_IMAGES, frame_us: None };
         if let Err(rule) = check_entry(place, &e, &limits) {
             return refuse(rule.error_code(), format!("LUT entry {place}: {rule}"));
         }
@@ -105,7 +105,7 @@ impl Patterns {
         }
         let images = if mode == DisplayMode::VideoPattern { 1 } else { MAX_IMAGES };
         // Patterns that do not fit a frame are not refused: the sequencer aborts when it runs.
-        let limits = Limits { dmd: self.dmd, images, frame_us: None };
+        let limits = TableLimits { dmd: self.dmd, images, frame_us: None };
         if let Err(e) = validate(&table, &limits) {
             return refuse(e.rule.error_code(), e);
         }

@@ -4,7 +4,7 @@ use super::*;
 use dpm_dlpc900::command::Command;
 use dpm_dlpc900::driver::{Dlpc900, Dlpc900Error, HidPort, PortError};
 use dpm_dlpc900::image::{encode, Compression};
-use dpm_dlpc900::sequence::{LedSetup, Pattern, PatternSequence, Repeat, SequenceBuilder};
+use dpm_dlpc900::sequence::{BitPattern, LedSetup, PatternSequence, Repeat, SequenceBuilder};
 use dpm_dlpc900::video::{Receiver, VideoPatterns};
 use proptest::prelude::*;
 use std::sync::{Arc, Mutex};
@@ -229,7 +229,7 @@ fn sequence(
     compression: Option<Compression>,
 ) -> PatternSequence {
     let mut b = SequenceBuilder::new(dmd);
-    planes.iter().for_each(|p| b.push(&Pattern::white(vec![p], 1000)));
+    planes.iter().for_each(|p| b.push(&BitPattern::white(vec![p], 1000)));
     b.finish(repeat, PlaneOrder::default(), compression).unwrap()
 }
 
@@ -285,7 +285,7 @@ fn every_bits_place_in_the_pixel_is_an_option_on_both_sides() {
     ] {
         let (model, mut d) = driver(Options { plane_order: theirs, ..small() });
         let mut b = SequenceBuilder::new(dmd);
-        planes.iter().for_each(|p| b.push(&Pattern::white(vec![p], 1000)));
+        planes.iter().for_each(|p| b.push(&BitPattern::white(vec![p], 1000)));
         let s = b.finish(Repeat::Forever, ours, Some(Compression::Erle)).unwrap();
         d.upload(&s, LedSetup::default(), &mut |_| ()).unwrap();
         let m = model.lock().unwrap();

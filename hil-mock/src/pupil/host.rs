@@ -3,7 +3,7 @@
 use super::messages::{Message, PupilConfig, FAULTS};
 use crate::faults::FaultKind;
 use dpm_device::time::{HostClock, HostTime};
-use dpm_pupil::zmtp::{put_message, put_words, Event, Peer, SocketKind};
+use dpm_pupil::zmtp::{put_message, put_words, Event, SocketKind, ZmtpPeer};
 use std::io::{self, ErrorKind, Read, Write};
 use std::net::{Ipv4Addr, SocketAddr, SocketAddrV4, TcpListener, TcpStream};
 use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
@@ -99,7 +99,7 @@ impl Drop for PupilHost {
 /// A connection.
 struct Client {
     stream: TcpStream,
-    peer: Peer,
+    peer: ZmtpPeer,
     out: Vec<u8>,
     topics: Vec<Vec<u8>>,
 }
@@ -125,7 +125,7 @@ impl Door {
             let is_ready = stream.set_nonblocking(true).and_then(|()| stream.set_nodelay(true)).is_ok();
             if is_ready && !is_away && self.clients.len() < MOST_CLIENTS {
                 let mut out = Vec::new();
-                let peer = Peer::new(self.kind, &mut out);
+                let peer = ZmtpPeer::new(self.kind, &mut out);
                 self.clients.push(Client { stream, peer, out, topics: Vec::new() });
             }
         }

@@ -2,7 +2,7 @@
 
 use super::say;
 use dpm_device::time::HostTime;
-use hil_mock::hand::{Hand, Order, REACH_NS};
+use hil_mock::hand::{Hand, HandOrder, REACH_NS};
 use hil_mock::projector::Shown;
 use hil_mock::sensor_wand::ProjectorOptics;
 use std::io::{BufRead, Read};
@@ -23,7 +23,7 @@ const HELP: &str =
 /// A line.
 #[derive(Clone, Debug, PartialEq)]
 enum Line {
-    To(Order),
+    To(HandOrder),
     /// The tip to a point of a body's space.
     Touch(String, [f64; 3]),
     /// The tip into the middle of the light, at the depth of a point of the world or of a body's space.
@@ -52,10 +52,10 @@ fn line_of(text: &str) -> Option<Line> {
         all?.try_into().ok()
     };
     match order {
-        "wander" if words.is_empty() => Some(Line::To(Order::Wander)),
-        "visit" => Some(Line::To(Order::Visit { rest_ns: rest_ns(&words)? })),
-        "tip" => Some(Line::To(Order::Tip(place(&words)?))),
-        "pivot" => Some(Line::To(Order::Pivot(place(&words)?))),
+        "wander" if words.is_empty() => Some(Line::To(HandOrder::Wander)),
+        "visit" => Some(Line::To(HandOrder::Visit { rest_ns: rest_ns(&words)? })),
+        "tip" => Some(Line::To(HandOrder::Tip(place(&words)?))),
+        "pivot" => Some(Line::To(HandOrder::Pivot(place(&words)?))),
         "dot" if words.len() == 3 => Some(Line::Dot(None, place(&words)?)),
         "touch" | "dot" => {
             // A body's name may have blanks.
@@ -119,10 +119,10 @@ impl Orders {
                     // No sample that was taken may lie behind the order, and other threads take them, too.
                     self.hand.tell(now.plus_ns(LEAD_NS).0, order);
                     let told = match order {
-                        Order::Wander => "the wand wanders".to_owned(),
-                        Order::Visit { .. } => "the wand rests at one place after another".to_owned(),
-                        Order::Tip([x, y, z]) => format!("the tip is at {x:.5} {y:.5} {z:.5}"),
-                        Order::Pivot([x, y, z]) => {
+                        HandOrder::Wander => "the wand wanders".to_owned(),
+                        HandOrder::Visit { .. } => "the wand rests at one place after another".to_owned(),
+                        HandOrder::Tip([x, y, z]) => format!("the tip is at {x:.5} {y:.5} {z:.5}"),
+                        HandOrder::Pivot([x, y, z]) => {
                             format!("the wand turns about its tip at {x:.5} {y:.5} {z:.5}")
                         }
                     };
@@ -133,16 +133,16 @@ impl Orders {
         }
     }
 
-    fn order_of(&self, line: &Line) -> Result<Order, String> {
+    fn order_of(&self, line: &Line) -> Result<HandOrder, String> {
         match line {
             Line::To(order) => Ok(*order),
-            Line::Touch(name, at) => self.in_world(name, at).map(Order::Tip),
+            Line::Touch(name, at) => self.in_world(name, at).map(HandOrder::Tip),
             Line::Dot(name, near) => {
                 let near = name.as_ref().map_or(Ok(*near), |name| self.in_world(name, near))?;
                 let dark = || "there is no light on the raster".to_owned();
                 let middle =
                     self.newest.as_ref().and_then(|s| middle_of_light(s, self.width)).ok_or_else(dark)?;
-                self.optics.lit_near(middle, near).map(Order::Tip).ok_or_else(|| {
+                self.optics.lit_near(middle, near).map(HandOrder::Tip).ok_or_else(|| {
                     format!(
                         "the light at pixel ({:.1}, {:.1}) falls on no point near there",
                         middle[0], middle[1]
@@ -182,11 +182,11 @@ mod tests {
 
     #[test]
     fn lines_are_orders_and_others_are_none() {
-        assert_eq!(line_of("wander\n"), Some(Line::To(Order::Wander)));
-        assert_eq!(line_of(" tip 1 -2 0.5 "), Some(Line::To(Order::Tip([1.0, -2.0, 0.5]))));
-        assert_eq!(line_of("visit"), Some(Line::To(Order::Visit { rest_ns: 2_000_000_000 })));
-        assert_eq!(line_of("visit 3.5"), Some(Line::To(Order::Visit { rest_ns: 3_500_000_000 })));
-        assert_eq!(line_of("pivot 0 0 0"), Some(Line::To(Order::Pivot([0.0; 3]))));
+        assert_eq!(line_of("wander\n"), Some(Line::To(HandOrder::Wander)));
+        assert_eq!(line_of(" tip 1 -2 0.5 "), Some(Line::To(HandOrder::Tip([1.0, -2.0, 0.5]))));
+        assert_eq!(line_of("visit"), Some(Line::To(HandOrder::Visit { rest_ns: 2_000_000_000 })));
+        assert_eq!(line_of("visit 3.5"), Some(Line::To(HandOrder::Visit { rest_ns: 3_500_000_000 })));
+        assert_eq!(line_of("pivot 0 0 0"), Some(Line::To(HandOrder::Pivot([0.0; 3]))));
         assert_eq!(line_of("dot 0 0 1e-1"), Some(Line::Dot(None, [0.0, 0.0, 0.1])));
         assert_eq!(line_of("dot box 0 0 1"), Some(Line::Dot(Some("box".into()), [0.0, 0.0, 1.0])));
         assert_eq!(line_of("touch left foot 0 1 0"), Some(Line::Touch("left foot".into(), [0.0, 1.0, 0.0])));

@@ -7,7 +7,7 @@ use std::time::Duration;
 use super::abi;
 use super::error::AlpError;
 use super::library::Library;
-use super::timing::{FrameTiming, Misfit, Part, Weights};
+use super::timing::{FrameTiming, Misfit, SequencePart, Weights};
 use dpm_device::planes::{PlaneSchedule, Raster};
 use dpm_device::time::{FrameRate, HostTime};
 
@@ -78,7 +78,7 @@ impl Temperatures {
 
 /// How far the queue has come.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub struct Progress {
+pub struct QueueProgress {
     /// Nothing is shown.
     pub is_idle: bool,
     /// Sequences that wait.
@@ -95,7 +95,7 @@ pub struct Progress {
 
 /// How frames are shown.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub struct Showing {
+pub struct ShowMode {
     /// The planes of a frame.
     pub schedule: PlaneSchedule,
     /// How long each is lit.
@@ -281,8 +281,8 @@ impl Alp {
     }
 
     /// The times of frames that are shown like this.
-    fn fit(&self, showing: &Showing) -> Result<FrameTiming, AlpError> {
-        let Showing { schedule, weights, rate, .. } = showing;
+    fn fit(&self, showing: &ShowMode) -> Result<FrameTiming, AlpError> {
+        let ShowMode { schedule, weights, rate, .. } = showing;
         let AlpFacts { shortest_us, longest_us, .. } = self.facts;
         let misfit = match FrameTiming::new(schedule, *weights, *rate, shortest_us, longest_us) {
             Ok(timing) => return Ok(timing),
@@ -324,7 +324,7 @@ impl Alp {
     ///
     /// # Errors
     /// With the figures.
-    pub fn check(&self, showing: &Showing) -> Result<(), AlpError> {
+    pub fn check(&self, showing: &ShowMode) -> Result<(), AlpError> {
         let timing = self.fit(showing)?;
         let device = || self.name.clone();
         let parts = timing.parts.len();
@@ -345,7 +345,7 @@ impl Alp {
     ///
     /// # Errors
     /// As [`Alp::check`], and a device that refuses a call.
-    pub fn prepare(&mut self, showing: &Showing) -> Result<(), AlpError> {
+    pub fn prepare(&mut self, showing: &ShowMode) -> Result<(), AlpError> {
         self.free_frames();
         self.check(showing)?;
         let timing = self.fit(showing)?;
@@ -355,7 +355,7 @@ impl Alp {
         let runs = self.runs as i32;
         for _ in 0..showing.frames {
             self.frames.push(Vec::with_capacity(timing.parts.len()));
-            for Part { planes, picture_us, .. } in &timing.parts {
+            for SequencePart { planes, picture_us, .. } in &timing.parts {
                 let sequence = self.allocate(planes + usize::from(is_one))?;
                 self.frames.last_mut().expect("just pushed").push(sequence);
                 self.set_picture_time(sequence, *picture_us)?;
@@ -368,7 +368,7 @@ impl Alp {
         }
         // A frame and its dark picture are at most as many entries as these; nothing is allocated while frames are shown.
         self.started.reserve(4 * showing.frames * (timing.parts.len() + 1));
-        let time_of = |part: &Part| {
+        let time_of = |part: &SequencePart| {
             let pictures = part.planes as i64 + i64::from(is_one);
             pictures * i64::from(part.picture_us) * i64::from(if is_one { self.runs } else { 1 })
         };
@@ -431,7 +431,7 @@ impl Alp {
     ///
     /// # Errors
     /// With the figures.
-    pub fn check_cable(&self, showing: &Showing, bytes_per_s: f64) -> Result<(), AlpError> {
+    pub fn check_cable(&self, showing: &ShowMode, bytes_per_s: f64) -> Result<(), AlpError> {
         let frame_bytes = (self.facts.raster.plane_bytes() * showing.schedule.len()) as f64;
         let (hz, planes) = (showing.rate.hz(), showing.schedule.len());
         if frame_bytes * hz <= bytes_per_s {
@@ -449,7 +449,7 @@ impl Alp {
 
     /// The shortest share of a plane in a frame's time that the panel can show in this way, nanoseconds: what a frame needs at least,
     /// divided by its planes.
-    pub fn shortest_share_ns(&self, showing: &Showing) -> u32 {
+    pub fn shortest_share_ns(&self, showing: &ShowMode) -> u32 {
         let AlpFacts { shortest_us, longest_us, .. } = self.facts;
         let any = FrameRate::new(100_000_000, 1).expect("not zero");
         match FrameTiming::new(&showing.schedule, showing.weights, any, shortest_us, longest_us) {
@@ -513,7 +513,7 @@ impl Alp {
     }
 
     /// Time until the present run and all that waits are over, microseconds.
-    fn left_us(&self, progress: &Progress) -> i64 {
+    fn left_us(&self, progress: &QueueProgress) -> i64 {
         let present = i64::from(progress.pictures_left) * i64::from(progress.picture_us);
         let waiting = self.started.iter().rev().take(progress.waiting as usize);
         present + waiting.map(|started| started.us).sum::<i64>()
@@ -534,7 +534,7 @@ impl Alp {
     ///
     /// # Errors
     /// The device is gone.
-    pub fn progress(&mut self) -> Result<Progress, AlpError> {
+    pub fn progress(&mut self) -> Result<QueueProgress, AlpError> {
         let raw = self.library.proj_progress(self.id, abi::PROJ_PROGRESS);
         let raw = self.called("AlpProjInquireEx(ALP_PROJ_PROGRESS)", raw)?;
         let is_idle = raw.flags & abi::FLAG_QUEUE_IDLE != 0;
@@ -544,7 +544,7 @@ impl Alp {
         let over = self.started.len().saturating_sub(left);
         self.started.drain(..over);
         let pictures_done = raw.pictures_of_run.saturating_sub(raw.pictures);
-        Ok(Progress {
+        Ok(QueueProgress {
             is_idle,
             waiting,
             queue_id: raw.queue_id,

@@ -13,7 +13,7 @@ mod projector;
 mod timing;
 mod transport;
 
-pub use driver::{Alp, AlpFacts, Pause, Progress, Showing, Temperatures, MAX_RUNS};
+pub use driver::{Alp, AlpFacts, Pause, QueueProgress, ShowMode, Temperatures, MAX_RUNS};
 pub use error::AlpError;
 pub use projector::{AlpCounts, AlpProjector, MEMORY_SPARE};
 pub use timing::Weights;

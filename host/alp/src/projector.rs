@@ -5,7 +5,7 @@
 //! by then is lit in a later slot, and the firmware tells so. Light ends when the firmware says so, and by itself when this process dies:
 //! every sequence is finite.
 
-use super::driver::{Alp, Showing, Temperatures};
+use super::driver::{Alp, ShowMode, Temperatures};
 use super::error::AlpError;
 use dpm_device::light::LightKind;
 use dpm_device::link::faults;
@@ -53,7 +53,7 @@ pub struct AlpProjector {
     firmware: ProjectorFirmware,
     alp: Alp,
     /// How frames are shown; order and rate are those of the session.
-    showing: Showing,
+    showing: ShowMode,
     /// The session that the memory was prepared for.
     prepared: Option<(u32, PlaneSchedule, FrameRate)>,
     memory: Vec<Memory>,
@@ -78,7 +78,7 @@ impl AlpProjector {
     /// What panel, memory or queue cannot do.
     pub fn new(
         alp: Alp,
-        showing: Showing,
+        showing: ShowMode,
         max_celsius: Option<f64>,
         power_on_at: HostTime,
     ) -> Result<Self, AlpError> {
@@ -174,7 +174,7 @@ impl AlpProjector {
         if before.is_some_and(|(_, s, r)| (s, r) == (schedule, rate)) && self.alp.frames() > 0 {
             return Ok(());
         }
-        self.showing = Showing { schedule, rate, ..self.showing };
+        self.showing = ShowMode { schedule, rate, ..self.showing };
         self.alp.prepare(&self.showing)
     }
 

@@ -19,7 +19,7 @@ const SPARE: f64 = 2e-4;
 
 /// One sequence of a frame.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(super) struct Part {
+pub(super) struct SequencePart {
     /// Number of its first plane in the frame.
     pub(super) first: usize,
     /// Its planes.
@@ -31,7 +31,7 @@ pub(super) struct Part {
 /// The sequences of a frame, and the picture time of the dark picture behind them.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub(super) struct FrameTiming {
-    pub(super) parts: Vec<Part>,
+    pub(super) parts: Vec<SequencePart>,
     pub(super) dark_us: i32,
 }
 
@@ -82,10 +82,11 @@ impl FrameTiming {
         Ok(match weights {
             Weights::Equal => {
                 let picture_us = unit_us as i32;
-                Self { parts: vec![Part { first: 0, planes: n, picture_us }], dark_us: picture_us }
+                Self { parts: vec![SequencePart { first: 0, planes: n, picture_us }], dark_us: picture_us }
             }
             Weights::Binary => {
-                let part = |(first, bit): (usize, u8)| Part { first, planes: 1, picture_us: of(bit) as i32 };
+                let part =
+                    |(first, bit): (usize, u8)| SequencePart { first, planes: 1, picture_us: of(bit) as i32 };
                 let parts = schedule.planes().iter().map(|p| p.bit).enumerate().map(part).collect();
                 Self { parts, dark_us: shortest_us }
             }

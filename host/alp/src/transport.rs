@@ -9,7 +9,7 @@ use std::time::{Duration, Instant};
 use crossbeam::channel::{bounded, Receiver, RecvTimeoutError};
 use dpm_handoff::wake::WaitPolicy;
 
-use super::driver::{Alp, AlpFacts, Showing};
+use super::driver::{Alp, AlpFacts, ShowMode};
 use super::error::AlpError;
 use super::projector::{AlpProjector, MEMORY_SPARE};
 use dpm_device::link::Packet;
@@ -40,7 +40,7 @@ pub struct AlpSettings {
     /// The mirrors that the rig file names.
     pub raster: Raster,
     /// How frames are shown.
-    pub showing: Showing,
+    pub showing: ShowMode,
     /// Temperature above which it goes dark; what the device recommends, if left out.
     pub max_celsius: Option<f64>,
     /// Bytes on the wire of the largest frame.

@@ -4,7 +4,7 @@
 use super::dialogue::Dialogue;
 use super::lines::Lines;
 use super::poses::Poses;
-use dpm_calibration::body::{tip_in_body, wander, Session, Surface, Touch};
+use dpm_calibration::body::{tip_in_body, wander, Touch, TouchSession, TriangleTree};
 use dpm_calibration::file::{BodySection, Pose};
 use dpm_calibration::trajectory::{TimedPose, Trajectory};
 use dpm_common::clock::MonotonicClock;
@@ -99,7 +99,7 @@ pub fn calibrate(
         std::thread::sleep(Duration::from_secs_f64(ways.wander_s));
         let triangles = triangles_of(&bodies);
         let tips = tips_in_body(&poses.take(), tip);
-        let found = wander(&Surface::new(triangles), &tips, ways.tip_radius_m, &place.0 .0)
+        let found = wander(&TriangleTree::new(triangles), &tips, ways.tip_radius_m, &place.0 .0)
             .map_err(|e| Failure::new(FailureKind::BadInput, e))?;
         place = ((found.mesh_to_body, found.residual_m), format!("{} points of a wandering tip", found.used));
         told += &format!(
@@ -133,7 +133,7 @@ fn touch(
     dialogue: &Dialogue,
 ) -> Result<((DAffine3, f64), usize), Failure> {
     let named = outermost(points);
-    let mut session = Session::new(named.iter().map(|(_, p)| *p).collect());
+    let mut session = TouchSession::new(named.iter().map(|(_, p)| *p).collect());
     for line in touches.lines() {
         let [mesh, body] = [0, 3].map(|i| DVec3::from_slice(&line[i..i + 3]));
         session.add(Touch { mesh, body });

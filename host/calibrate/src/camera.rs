@@ -11,7 +11,7 @@ use std::time::{Duration, Instant};
 
 /// What is looked for.
 #[derive(Clone, Copy, Debug)]
-pub struct Task {
+pub struct CameraTask {
     /// The board.
     pub board: TagBoard,
     /// Columns and rows of the pictures.
@@ -43,7 +43,7 @@ const SILENCE: Duration = Duration::from_secs(5);
 /// The camera fails (exit code 3), sends pictures of another size, or the views make no camera (2).
 pub fn calibrate(
     source: &mut dyn PictureSource,
-    task: &Task,
+    task: &CameraTask,
     tell: &mut dyn FnMut(&str),
 ) -> Result<CameraFit, Failure> {
     tell(
@@ -56,7 +56,7 @@ pub fn calibrate(
 
 fn take(
     source: &mut dyn PictureSource,
-    task: &Task,
+    task: &CameraTask,
     tell: &mut dyn FnMut(&str),
 ) -> Result<Vec<BoardPicture>, Failure> {
     let (begin, mut heard) = (Instant::now(), Instant::now());
@@ -96,7 +96,7 @@ fn take(
 }
 
 /// What the views so far would give.
-fn outlook(taken: &[BoardPicture], task: &Task) -> String {
+fn outlook(taken: &[BoardPicture], task: &CameraTask) -> String {
     if taken.len() < LEAST_VIEWS {
         return String::new();
     }
@@ -108,7 +108,10 @@ fn outlook(taken: &[BoardPicture], task: &Task) -> String {
 }
 
 /// The views as they are, and once more with edges that are looked for along the lens's own bends.
-fn solved(taken: &[BoardPicture], task: &Task) -> Result<CameraFit, dpm_calibration::board::BoardRefusal> {
+fn solved(
+    taken: &[BoardPicture],
+    task: &CameraTask,
+) -> Result<CameraFit, dpm_calibration::board::BoardRefusal> {
     let views: Vec<BoardView> = taken.iter().map(|t| t.view.clone()).collect();
     let mut fit = solve(task.raster, &views)?;
     for _ in 0..2 {
@@ -119,7 +122,7 @@ fn solved(taken: &[BoardPicture], task: &Task) -> Result<CameraFit, dpm_calibrat
     Ok(fit)
 }
 
-fn again(taken: &BoardPicture, task: &Task, camera: &ProjectorCamera) -> BoardView {
+fn again(taken: &BoardPicture, task: &CameraTask, camera: &ProjectorCamera) -> BoardView {
     let Ok(image) = image_of(&taken.picture, task.raster) else { return taken.view.clone() };
     let mut tags = Vec::new();
     TagDetector::new().detect(&image, Some(camera), &mut tags);

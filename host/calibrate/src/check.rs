@@ -4,8 +4,8 @@ use super::aim::Aim;
 use super::body::{carried, index_of, triangles_of};
 use super::dialogue::Dialogue;
 use super::poses::{held, still, Poses};
-use dpm_calibration::body::Surface;
-use dpm_calibration::check::{spread, CheckSummary, Fault, Offset, Reading, Summary, SurfacePoint};
+use dpm_calibration::body::TriangleTree;
+use dpm_calibration::check::{spread, CheckSummary, Fault, MeshPoint, Offset, PointReading, Summary};
 use dpm_calibration::file::{CalibrationFile, CheckSection};
 use dpm_calibration::trajectory::TimedPose;
 use dpm_rig::config::RigConfig;
@@ -30,9 +30,9 @@ pub struct Target {
     /// Where the mesh is in the body.
     pub mesh_to_body: DAffine3,
     /// Points that may be chosen.
-    pub candidates: Vec<SurfacePoint>,
+    pub candidates: Vec<MeshPoint>,
     /// What hides them.
-    pub surface: Surface,
+    pub surface: TriangleTree,
 }
 
 impl Target {
@@ -64,10 +64,10 @@ impl Target {
             let normal = (t[1] - t[0]).cross(t[2] - t[0]).normalize_or_zero();
             let middle = (t[0] + t[1] + t[2]) / 3.0;
             // Corners are what a tip can find again.
-            [t[0], t[1], t[2], middle].map(|position| SurfacePoint { position, normal })
+            [t[0], t[1], t[2], middle].map(|position| MeshPoint { position, normal })
         };
         let candidates = triangles.iter().flat_map(points).collect();
-        Self { name, camera, mesh_to_body, candidates, surface: Surface::new(triangles) }
+        Self { name, camera, mesh_to_body, candidates, surface: TriangleTree::new(triangles) }
     }
 }
 
@@ -159,18 +159,18 @@ pub fn measure(
     let mut offsets = Vec::new();
     for (i, point) in points.iter().enumerate() {
         match measure_point(bench, target, tip, (i, points.len()), point)? {
-            Answer::Measured(offset) => {
+            PointAnswer::Measured(offset) => {
                 bench.tell(&told_of_point(&offset));
                 offsets.push(offset);
             }
-            Answer::Skipped => {}
-            Answer::Done => break,
+            PointAnswer::Skipped => {}
+            PointAnswer::Done => break,
         }
     }
     Ok(offsets)
 }
 
-enum Answer {
+enum PointAnswer {
     Measured(Offset),
     Skipped,
     Done,
@@ -181,8 +181,8 @@ fn measure_point(
     target: &Target,
     tip: DVec3,
     (i, count): (usize, usize),
-    point: &SurfacePoint,
-) -> Result<Answer, Failure> {
+    point: &MeshPoint,
+) -> Result<PointAnswer, Failure> {
     let [x, y, z] = point.position.to_array();
     let mut mesh = place(bench, target)?;
     let mut in_light: Option<(DVec3, DVec2)> = None;
@@ -191,7 +191,7 @@ fn measure_point(
         let normal = mesh.transform_vector3(point.normal);
         let Some(pixel) = target.camera.project(at).and_then(|p| whole(&target.camera, p)) else {
             bench.tell("the body has moved out of the light; this point is left out");
-            return Ok(Answer::Skipped);
+            return Ok(PointAnswer::Skipped);
         };
         bench.light(pixel);
         let question = match in_light {
@@ -202,8 +202,8 @@ fn measure_point(
             Some(_) => "now touch this point of the body:".to_owned(),
         };
         let touched = match (bench.ask(&question)?.as_str(), in_light) {
-            ("d" | "D", _) => return Ok(Answer::Done),
-            ("s" | "S", None) => return Ok(Answer::Skipped),
+            ("d" | "D", _) => return Ok(PointAnswer::Done),
+            ("s" | "S", None) => return Ok(PointAnswer::Skipped),
             ("s" | "S", Some(_)) => None,
             ("", _) => match tip_and_mesh(bench, target, tip) {
                 Ok((place, now)) if now.transform_point3(point.position).distance(at) <= MOVED_M => {
@@ -230,8 +230,10 @@ fn measure_point(
             (None, Some(place)) => in_light = Some((place, centre)),
             (None, None) => {}
             (Some((in_light, lit)), touched) => {
-                let reading = Reading { point: at, normal, lit, in_light, touched };
-                return Ok(Offset::of(&target.camera, &reading).map_or(Answer::Skipped, Answer::Measured));
+                let reading = PointReading { point: at, normal, lit, in_light, touched };
+                return Ok(
+                    Offset::of(&target.camera, &reading).map_or(PointAnswer::Skipped, PointAnswer::Measured)
+                );
             }
         }
     }

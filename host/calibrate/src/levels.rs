@@ -5,8 +5,8 @@
 
 use super::recorder::TimedBlock;
 use super::showing::Showing;
-use dpm_calibration::light::{steady, Channels, Next, Session, Steady};
-use dpm_calibration::sensor::Block;
+use dpm_calibration::light::{steady, Channels, Next, ResponseSession, Steady};
+use dpm_calibration::sensor::SampleBlock;
 use dpm_device::link::{breaks_limit, mean_luminance, FULL_LUMINANCE};
 use dpm_device::planes::{Channel, PlaneSchedule, Raster};
 use dpm_device::time::FrameRate;
@@ -32,7 +32,7 @@ const MOST_DRIFT: f64 = 0.03;
 
 /// How a level is shown.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Field {
+pub enum LevelField {
     /// On the whole raster, for as long as a limit of flashes a second demands; `None` for no limit.
     Full(Option<u8>),
     /// On every other one of 8 x 6 tiles, and its complement on those between, so that the light of the whole picture never
@@ -52,7 +52,7 @@ const MOST_DARK: f64 = 0.25;
 
 /// What a step shows: the code of each of red, green and blue.
 #[derive(Clone, Copy, Debug, PartialEq)]
-struct Step {
+struct LevelStep {
     what: Next,
     code: u32,
 }
@@ -60,12 +60,12 @@ struct Step {
 /// The order of the levels.
 #[derive(Clone, Debug)]
 pub struct Levels {
-    steps: Vec<Step>,
+    steps: Vec<LevelStep>,
     hold: u64,
     channels: usize,
     schedule: PlaneSchedule,
     rate: FrameRate,
-    field: Field,
+    field: LevelField,
     mean: f64,
 }
 
@@ -74,7 +74,12 @@ impl Levels {
     ///
     /// # Errors
     /// Planes of which no level can be measured, or a limit that no hold keeps; one sentence.
-    pub fn new(schedule: &PlaneSchedule, rate: FrameRate, field: Field, codes: u32) -> Result<Self, String> {
+    pub fn new(
+        schedule: &PlaneSchedule,
+        rate: FrameRate,
+        field: LevelField,
+        codes: u32,
+    ) -> Result<Self, String> {
         let has = |channel| schedule.planes().iter().any(|p| p.channel == channel);
         let colours = [Channel::Red, Channel::Green, Channel::Blue].map(has);
         let channels = match (has(Channel::White), colours) {
@@ -86,12 +91,12 @@ impl Levels {
                     .into(),
             ),
         };
-        let mut levels = vec![Step { what: Next::Black, code: 0 }];
+        let mut levels = vec![LevelStep { what: Next::Black, code: 0 }];
         for channel in 0..channels {
             levels.extend((1..=codes).rev().map(|i| {
                 let value = (255 * i + codes / 2) / codes;
                 let code = if channels == 1 { value * 0x01_0101 } else { value << (8 * channel) };
-                Step { what: Next::Code { channel, code: f64::from(value) / 255.0 }, code }
+                LevelStep { what: Next::Code { channel, code: f64::from(value) / 255.0 }, code }
             }));
         }
         Self::of(levels, channels, schedule, rate, field)
@@ -102,8 +107,8 @@ impl Levels {
     /// # Errors
     /// As [`Levels::new`].
     pub fn two(schedule: &PlaneSchedule, rate: FrameRate) -> Result<Self, String> {
-        let field = Field::Tiles { is_exchanged: false };
-        Self::of(vec![Step { what: Next::Black, code: 0 }], 1, schedule, rate, field)
+        let field = LevelField::Tiles { is_exchanged: false };
+        Self::of(vec![LevelStep { what: Next::Black, code: 0 }], 1, schedule, rate, field)
     }
 
     /// Whether the sensor lies on a tile of the complement, from samples of [`Levels::two`].
@@ -114,7 +119,7 @@ impl Levels {
         &self,
         showing: &Showing,
         samples: &[TimedBlock],
-        room: Room,
+        room: LampLight,
     ) -> Result<bool, String> {
         let mut levels = [None; 2];
         for (run, frames) in by_run(self, showing, samples) {
@@ -137,28 +142,28 @@ impl Levels {
     }
 
     fn of(
-        levels: Vec<Step>,
+        levels: Vec<LevelStep>,
         channels: usize,
         schedule: &PlaneSchedule,
         rate: FrameRate,
-        field: Field,
+        field: LevelField,
     ) -> Result<Self, String> {
-        let reference = Step { what: Next::White, code: WHITE };
-        let steps: Vec<Step> = levels.into_iter().flat_map(|level| [reference, level]).collect();
+        let reference = LevelStep { what: Next::White, code: WHITE };
+        let steps: Vec<LevelStep> = levels.into_iter().flat_map(|level| [reference, level]).collect();
         let whole = |code: u32| match field {
-            Field::Full(_) => luminance(schedule, code),
+            LevelField::Full(_) => luminance(schedule, code),
             // Both kinds of tiles cover the same part of the raster, but for a row or a column of pixels.
-            Field::Tiles { .. } => (luminance(schedule, code) + luminance(schedule, WHITE - code)) / 2,
+            LevelField::Tiles { .. } => (luminance(schedule, code) + luminance(schedule, WHITE - code)) / 2,
         };
         let light: Vec<u32> = steps.iter().map(|s| whole(s.code)).collect();
         let mean = light.iter().map(|l| f64::from(*l)).sum::<f64>()
             / (light.len().max(1) as f64 * f64::from(FULL_LUMINANCE));
         let slots = |s: f64| (s * rate.hz()).ceil() as u64;
         let mut hold = slots(HOLD_S).max(HOLD_FRAMES);
-        if let Field::Tiles { .. } = field {
+        if let LevelField::Tiles { .. } = field {
             hold += 2 * slots(TILES_MARGIN_S);
         }
-        if let Field::Full(Some(limit)) = field {
+        if let LevelField::Full(Some(limit)) = field {
             while flashes_too_often(&light, schedule, hold, (rate, limit)) {
                 hold += hold / 10;
                 if hold > slots(LONGEST_HOLD_S).max(2 * HOLD_FRAMES) {
@@ -178,15 +183,15 @@ impl Levels {
     /// # Errors
     /// As [`Levels::new`].
     pub fn missing(&self, readings: &Readings) -> Result<Option<Self>, String> {
-        let lacks = |s: &&Step| !readings.of.contains_key(&s.code);
-        let levels: Vec<Step> = self.levels().filter(lacks).copied().collect();
+        let lacks = |s: &&LevelStep| !readings.of.contains_key(&s.code);
+        let levels: Vec<LevelStep> = self.levels().filter(lacks).copied().collect();
         if levels.is_empty() {
             return Ok(None);
         }
         Self::of(levels, self.channels, &self.schedule, self.rate, self.field).map(Some)
     }
 
-    fn levels(&self) -> impl Iterator<Item = &Step> {
+    fn levels(&self) -> impl Iterator<Item = &LevelStep> {
         self.steps.iter().skip(1).step_by(2)
     }
 
@@ -198,8 +203,8 @@ impl Levels {
     /// Longest time for which all mirrors are lit, seconds.
     pub fn full_white_s(&self) -> f64 {
         match self.field {
-            Field::Full(_) => self.hold_s(),
-            Field::Tiles { .. } => 0.0,
+            LevelField::Full(_) => self.hold_s(),
+            LevelField::Tiles { .. } => 0.0,
         }
     }
 
@@ -236,7 +241,7 @@ impl PatternSource for Levels {
     fn draw(&self, picture: u64, canvas: &mut Canvas<'_>) {
         let code = self.steps[picture as usize % self.steps.len()].code;
         let raster = canvas.raster();
-        let Field::Tiles { is_exchanged } = self.field else {
+        let LevelField::Tiles { is_exchanged } = self.field else {
             return canvas.codes(|codes| codes.fill(code));
         };
         let complement = WHITE - code;
@@ -270,7 +275,7 @@ fn flashes_too_often(light: &[u32], schedule: &PlaneSchedule, hold: u64, limit: 
 
 /// Frequency of the lamps, and the light without the projector.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub struct Room {
+pub struct LampLight {
     /// Twice that of the mains, hertz.
     pub flicker_hz: f64,
     /// The light.
@@ -296,7 +301,7 @@ impl Readings {
         levels: &Levels,
         showing: &Showing,
         samples: &[TimedBlock],
-        room: Room,
+        room: LampLight,
     ) -> Result<(), String> {
         let mut readings = BTreeMap::new();
         for (run, frames) in by_run(levels, showing, samples) {
@@ -349,7 +354,7 @@ impl Readings {
     ///
     /// # Errors
     /// What the readings lack, or why they are no levels of a projector; one sentence with what to do.
-    pub fn solve(&self, levels: &Levels, room: Room) -> Result<Channels, String> {
+    pub fn solve(&self, levels: &Levels, room: LampLight) -> Result<Channels, String> {
         let missed = levels.levels().filter(|s| !self.of.contains_key(&s.code)).count();
         let Some(white) = self.white.filter(|_| missed == 0) else {
             return Err(format!(
@@ -358,7 +363,7 @@ impl Readings {
                 levels.count()
             ));
         };
-        let mut session = Session::new(levels.channels);
+        let mut session = ResponseSession::new(levels.channels);
         let all = [(Next::Ambient, room.ambient), (Next::White, white)];
         for (what, reading) in all.iter().chain(self.of.values()) {
             session.add(*what, *reading).map_err(|e| e.to_string())?;
@@ -369,11 +374,11 @@ impl Readings {
 
 /// The mean level of each lit frame that was sampled whole, by run. Planes come and go far faster than lamps flicker, so
 /// whole frames only are looked at.
-fn by_run(levels: &Levels, showing: &Showing, samples: &[TimedBlock]) -> BTreeMap<u64, Vec<Block>> {
+fn by_run(levels: &Levels, showing: &Showing, samples: &[TimedBlock]) -> BTreeMap<u64, Vec<SampleBlock>> {
     let timing = &showing.timing;
     let margin_s = match levels.field {
-        Field::Full(_) => MARGIN_S,
-        Field::Tiles { .. } => TILES_MARGIN_S,
+        LevelField::Full(_) => MARGIN_S,
+        LevelField::Tiles { .. } => TILES_MARGIN_S,
     };
     let margin = (margin_s * levels.rate.hz()).ceil().max(2.0) as u64;
     let is_inside = |slot: &u64| {
@@ -403,10 +408,11 @@ fn by_run(levels: &Levels, showing: &Showing, samples: &[TimedBlock]) -> BTreeMa
             }
         }
     }
-    let mut runs: BTreeMap<u64, Vec<Block>> = BTreeMap::new();
+    let mut runs: BTreeMap<u64, Vec<SampleBlock>> = BTreeMap::new();
     for (slot, (time, integral)) in sums.into_iter().filter(|(_, (time, _))| *time >= LEAST_SAMPLED) {
         let start_ns = timing.instant(slot, 0.0).0;
-        let block = Block { start_ns, interval_ns: timing.frame_ns, levels: vec![(integral / time) as f32] };
+        let block =
+            SampleBlock { start_ns, interval_ns: timing.frame_ns, levels: vec![(integral / time) as f32] };
         runs.entry(levels.run_of(slot)).or_default().push(block);
     }
     runs

@@ -20,7 +20,7 @@ fn rate() -> FrameRate {
 }
 
 fn rgb(codes: u32) -> Levels {
-    Levels::new(&PlaneSchedule::rgb24(), rate(), Field::Full(Some(3)), codes).unwrap()
+    Levels::new(&PlaneSchedule::rgb24(), rate(), LevelField::Full(Some(3)), codes).unwrap()
 }
 
 /// The code value of each pixel, from the planes.
@@ -73,22 +73,27 @@ fn planes_without_channels_are_refused_by_name() {
     use dpm_device::planes::PlaneSpec;
     let spec = |channel| PlaneSpec { channel, bit: 7 };
     let mixed = PlaneSchedule::new(&[spec(Channel::Red), spec(Channel::White)]).unwrap();
-    assert!(Levels::new(&mixed, rate(), Field::Full(None), 4).unwrap_err().contains("neither red"));
-    assert_eq!(Levels::new(&PlaneSchedule::mono8(), rate(), Field::Full(None), 4).unwrap().channels, 1);
+    assert!(Levels::new(&mixed, rate(), LevelField::Full(None), 4).unwrap_err().contains("neither red"));
+    assert_eq!(Levels::new(&PlaneSchedule::mono8(), rate(), LevelField::Full(None), 4).unwrap().channels, 1);
 }
 
 /// What the mock's sensor samples while the levels are shown once and a bit, from a slot that begins anywhere.
-struct Bench {
+struct LevelsBench {
     levels: Levels,
     showing: Showing,
     lit: Vec<(u64, HostTime)>,
     samples: Vec<TimedBlock>,
-    room: Room,
+    room: LampLight,
     config: SensorWandConfig,
 }
 
 /// One pass alone.
-fn solve(levels: &Levels, showing: &Showing, samples: &[TimedBlock], room: Room) -> Result<Channels, String> {
+fn solve(
+    levels: &Levels,
+    showing: &Showing,
+    samples: &[TimedBlock],
+    room: LampLight,
+) -> Result<Channels, String> {
     let mut readings = Readings::default();
     readings.add(levels, showing, samples, room)?;
     readings.solve(levels, room)
@@ -96,12 +101,12 @@ fn solve(levels: &Levels, showing: &Showing, samples: &[TimedBlock], room: Room)
 
 const SENSOR_MINUS_HOST_NS: i64 = 77_000_000_000;
 
-fn block_of(sample: SensorSample, scale: f64) -> Block {
+fn block_of(sample: SensorSample, scale: f64) -> SampleBlock {
     // The light of the room, a twentieth of 4095, does not fade.
     let room = 0.05 * 4095.0;
     let level = (room + (f64::from(sample.level) - room) * scale) as f32;
     let start_ns = sample.ticks as i64 * 1000 + SENSOR_MINUS_HOST_NS;
-    Block { start_ns, interval_ns: 1e4, levels: vec![level] }
+    SampleBlock { start_ns, interval_ns: 1e4, levels: vec![level] }
 }
 
 fn bench_config() -> SensorWandConfig {
@@ -117,12 +122,12 @@ fn bench_config() -> SensorWandConfig {
 }
 
 /// `fades` is a share of the projector's light that is lost from the beginning to the end.
-fn bench(codes: u32, fades: f64) -> Bench {
+fn bench(codes: u32, fades: f64) -> LevelsBench {
     show(rgb(codes), &bench_config(), |share| 1.0 - fades * share)
 }
 
 /// Shows levels once. `scale` is the projector's light by the share of the time that has passed.
-fn show(levels: Levels, config: &SensorWandConfig, scale: impl Fn(f64) -> f64) -> Bench {
+fn show(levels: Levels, config: &SensorWandConfig, scale: impl Fn(f64) -> f64) -> LevelsBench {
     let config = config.clone();
     let raster = Raster::new(64, 48).unwrap();
     let motion = Motion::still(Pose::IDENTITY).unwrap();
@@ -172,7 +177,7 @@ fn show(levels: Levels, config: &SensorWandConfig, scale: impl Fn(f64) -> f64) -
     let timed = |block| TimedBlock { block, sensor_minus_host_ns: Some(SENSOR_MINUS_HOST_NS) };
     let samples = blocks.drain(dark..).map(timed).collect();
     let showing = Showing::of(&lit, rate()).unwrap();
-    Bench { levels, showing, lit, samples, room: Room { flicker_hz: 100.0, ambient }, config }
+    LevelsBench { levels, showing, lit, samples, room: LampLight { flicker_hz: 100.0, ambient }, config }
 }
 
 /// Light of a code over that of 255, in closed form.
@@ -187,7 +192,7 @@ fn truth(config: &SensorWandConfig, code: u32) -> f64 {
 #[test]
 fn curves_are_those_of_the_mock() {
     let bench = bench(8, 0.0);
-    let Bench { levels, showing, lit, samples, room, config } = &bench;
+    let LevelsBench { levels, showing, lit, samples, room, config } = &bench;
     let got = solve(levels, showing, samples, *room).unwrap();
     for (channel, colour) in config.colours.into_iter().enumerate() {
         assert!((got.intensity[channel] - colour).abs() < 3e-3, "{:?}", got.intensity);
@@ -261,7 +266,7 @@ mod breadth {
         assert!(probe(&at(0.0, 0.0)).unwrap_err().contains("neighbouring tiles"));
         let (one, other) = (at(-0.043, 0.043), at(0.043, 0.043));
         assert_eq!([probe(&one), probe(&other)], [Ok(true), Ok(false)]);
-        let levels = Levels::new(&schedule, rate(), Field::Tiles { is_exchanged: true }, 4).unwrap();
+        let levels = Levels::new(&schedule, rate(), LevelField::Tiles { is_exchanged: true }, 4).unwrap();
         let source = Arc::new(levels.clone());
         let raster = Raster::new(64, 48).unwrap();
         let mut painter = PatternPainter::new(source, raster);
@@ -270,7 +275,7 @@ mod breadth {
             painter.draw(Kernel::Scalar, picture, &mut planes);
             assert_eq!(mean_luminance(raster, &schedule, planes.bytes()), FULL_LUMINANCE / 2, "{picture}");
         }
-        let Bench { levels, showing, samples, room, config, .. } = &show(levels, &one, |_| 1.0);
+        let LevelsBench { levels, showing, samples, room, config, .. } = &show(levels, &one, |_| 1.0);
         let got = solve(levels, showing, samples, *room).unwrap();
         for (channel, colour) in config.colours.into_iter().enumerate() {
             assert!((got.intensity[channel] - colour).abs() < 3e-3, "{:?}", got.intensity);
@@ -285,7 +290,7 @@ mod breadth {
         let schedule = PlaneSchedule::rgb24();
         let mut holds = Vec::new();
         for limit in [None, Some(3), Some(2), Some(1)] {
-            let levels = Levels::new(&schedule, rate(), Field::Full(limit), CODES).unwrap();
+            let levels = Levels::new(&schedule, rate(), LevelField::Full(limit), CODES).unwrap();
             holds.push(levels.hold);
             let Some(limit) = limit else { continue };
             // The averages of the limiter begin at other slots than the levels.

@@ -2,14 +2,14 @@
 //! sweep of it.
 
 use super::dialogue::Dialogue;
-use super::levels::{Field, Levels, Readings, Room};
-use super::pace::{Light, Pace, PaceResult, MOST_INTERRUPTIONS, SPOILT};
+use super::levels::{LampLight, LevelField, Levels, Readings};
+use super::pace::{FrameCounter, PaceResult, RunLook, MOST_INTERRUPTIONS, SPOILT};
 use super::parts::Parts;
 use super::recorder::{wait_until_up, while_stamped, Port, Recorder, TimedBlock};
 use super::showing::Showing;
 use dpm_calibration::file::LightSection;
 use dpm_calibration::light::{flat_field, steady, Channels, FlatField, LightModel, Steady};
-use dpm_calibration::sensor::{Block, Brightness};
+use dpm_calibration::sensor::{Brightness, SampleBlock};
 use dpm_common::clock::MonotonicClock;
 use dpm_common::files::write_atomically;
 use dpm_device::regular_file;
@@ -34,7 +34,7 @@ fn refused(error: impl std::fmt::Display) -> Failure {
 
 /// What has been read so far, so that a measurement may go on at another rate.
 #[derive(Clone, Debug, Default)]
-pub struct Progress {
+pub struct ReadingProgress {
     readings: Readings,
     ambient: Option<Steady>,
     /// Among tiles: whether the sensor lies on one of the complement.
@@ -64,7 +64,7 @@ pub struct Ways {
 pub fn measure(
     config: &RigConfig,
     ways: &Ways,
-    progress: &mut Progress,
+    progress: &mut ReadingProgress,
     monitor: &Arc<RunMonitor>,
 ) -> Result<PaceResult<Option<Channels>>, Failure> {
     let flicker_hz = ways.flicker_hz;
@@ -89,10 +89,10 @@ pub fn measure(
     let seconds = levels.seconds();
     let read = || {
         wait_until_up(monitor)?;
-        if let Some(carried_hz) = Pace::of(config, monitor).try_out()? {
+        if let Some(carried_hz) = FrameCounter::of(config, monitor).try_out()? {
             return Ok(PaceResult::TooFast { carried_hz });
         }
-        watch(&levels, &recorder, &dialogue, (Pace::of(config, monitor), monitor))
+        watch(&levels, &recorder, &dialogue, (FrameCounter::of(config, monitor), monitor))
     };
     let (watched, lights) = while_stamped(config, levels.clone(), (clock, seconds), monitor, read)?;
     watched.and_then(|(samples, is_interrupted)| {
@@ -106,7 +106,7 @@ pub fn measure(
             return Ok(None);
         }
         let showing = Showing::of(&lights, config.projector.frame_rate)?;
-        let room = Room { flicker_hz, ambient };
+        let room = LampLight { flicker_hz, ambient };
         if ways.in_tiles && progress.is_on_complement.is_none() {
             let is_on = levels.is_on_complement(&showing, &samples, room).map_err(refused)?;
             progress.is_on_complement = Some(is_on);
@@ -141,7 +141,7 @@ fn room_light(
     dialogue.ask("Press Enter to begin.")?;
     recorder.take();
     std::thread::sleep(DARK);
-    let dark: Vec<Block> = recorder.take().0.into_iter().map(|timed| timed.block).collect();
+    let dark: Vec<SampleBlock> = recorder.take().0.into_iter().map(|timed| timed.block).collect();
     steady(&dark, flicker_hz).map_err(refused)
 }
 
@@ -151,9 +151,11 @@ fn levels_of(config: &RigConfig, ways: &Ways, is_on_complement: Option<bool>) ->
     let limit = u8::try_from(safety.flashes_per_second.min(255)).ok().filter(|&n| n > 0);
     let (schedule, rate) = (projector.schedule(), projector.frame_rate);
     let levels = match (ways.in_tiles, is_on_complement) {
-        (false, _) => Levels::new(&schedule, rate, Field::Full(limit), ways.codes),
+        (false, _) => Levels::new(&schedule, rate, LevelField::Full(limit), ways.codes),
         (true, None) => Levels::two(&schedule, rate),
-        (true, Some(is_exchanged)) => Levels::new(&schedule, rate, Field::Tiles { is_exchanged }, ways.codes),
+        (true, Some(is_exchanged)) => {
+            Levels::new(&schedule, rate, LevelField::Tiles { is_exchanged }, ways.codes)
+        }
     };
     let levels = levels.map_err(refused)?;
     let limits = &safety.limits;
@@ -181,7 +183,7 @@ fn watch(
     levels: &Levels,
     recorder: &Recorder,
     dialogue: &Dialogue,
-    (mut pace, monitor): (Pace<'_>, &RunMonitor),
+    (mut pace, monitor): (FrameCounter<'_>, &RunMonitor),
 ) -> Result<PaceResult<(Vec<TimedBlock>, bool)>, Failure> {
     recorder.take();
     let (begin, mut told) = (Instant::now(), 0);
@@ -194,9 +196,9 @@ fn watch(
         std::thread::sleep(Duration::from_millis(50));
         let before = begin.elapsed();
         match pace.look()? {
-            Light::Enough => {}
-            Light::TooFew(carried_hz) => return Ok(PaceResult::TooFast { carried_hz }),
-            Light::Interrupted => {
+            RunLook::Enough => {}
+            RunLook::TooFew(carried_hz) => return Ok(PaceResult::TooFast { carried_hz }),
+            RunLook::Interrupted => {
                 parts.spoil(before.saturating_sub(SPOILT), begin.elapsed());
                 return Ok(PaceResult::Done((all(parts), true)));
             }

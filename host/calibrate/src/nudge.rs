@@ -3,7 +3,7 @@
 use super::body::{carried, index_of, triangles_of};
 use super::outline::{Outlines, MOST_POINTS};
 use super::poses::Poses;
-use dpm_calibration::nudge::{Nudges, Order, TURN_DEG};
+use dpm_calibration::nudge::{NudgeOrder, Nudges, TURN_DEG};
 use dpm_calibration::outline::Outline;
 use dpm_calibration::trajectory::TimedPose;
 use dpm_rig::failure::{Failure, FailureKind};
@@ -25,13 +25,13 @@ struct NudgeView {
 }
 
 /// Bodies whose outlines are shown, and the projector that shows them.
-pub struct Stage {
+pub struct OutlineStage {
     moved: NudgeTarget,
     camera: ProjectorCamera,
     bodies: Vec<NudgeView>,
 }
 
-impl Stage {
+impl OutlineStage {
     /// Shows the bodies `names`, or, if there are none, all of the rig.
     ///
     /// # Errors
@@ -110,7 +110,7 @@ impl Stage {
 /// # Errors
 /// The input ended, or the result cannot be written.
 pub fn nudge(
-    stage: &Stage,
+    stage: &OutlineStage,
     (poses, outlines): (&Poses, &Outlines),
     nudges: &mut Nudges,
     ask: impl FnMut(&str) -> Result<String, Failure>,
@@ -155,7 +155,7 @@ fn converse(
     loop {
         let line = ask(&format!("{told}{}:", told_of(nudges)))?;
         told.clear();
-        let orders = match Order::of_line(&line) {
+        let orders = match NudgeOrder::of_line(&line) {
             Ok(orders) => orders,
             Err(letter) => {
                 told = format!(
@@ -166,15 +166,15 @@ fn converse(
         };
         for order in orders {
             match order {
-                Order::Move(along) => nudges.shift(along),
-                Order::Turn(about) => nudges.turn(about),
-                Order::Undo if nudges.undo() => {}
-                Order::Undo => told = "nothing to take back\n".into(),
-                Order::Save => {
+                NudgeOrder::Move(along) => nudges.shift(along),
+                NudgeOrder::Turn(about) => nudges.turn(about),
+                NudgeOrder::Undo if nudges.undo() => {}
+                NudgeOrder::Undo => told = "nothing to take back\n".into(),
+                NudgeOrder::Save => {
                     told = save(&nudges.now())? + "\n";
                     saved = Some(nudges.now());
                 }
-                Order::Quit => {
+                NudgeOrder::Quit => {
                     let end = match saved {
                         Some(s) if s == nudges.now() => "what is shown was written",
                         Some(_) => "what was moved after the last w is not written",

@@ -15,10 +15,10 @@ const REACH: u32 = 1;
 /// until three more have come.
 pub struct Outlines {
     newest: AtomicU64,
-    kept: Vec<Picture>,
+    kept: Vec<OutlinePoints>,
 }
 
-struct Picture {
+struct OutlinePoints {
     count: AtomicU64,
     /// The row in the upper half, the column in the lower.
     points: Vec<AtomicU32>,
@@ -27,13 +27,13 @@ struct Picture {
 impl Default for Outlines {
     fn default() -> Self {
         let points = || (0..MOST_POINTS).map(|_| AtomicU32::new(0)).collect();
-        let kept = (0..KEPT).map(|_| Picture { count: AtomicU64::new(0), points: points() }).collect();
+        let kept = (0..KEPT).map(|_| OutlinePoints { count: AtomicU64::new(0), points: points() }).collect();
         Self { newest: AtomicU64::new(0), kept }
     }
 }
 
 impl Outlines {
-    fn picture(&self, number: u64) -> Option<&Picture> {
+    fn picture(&self, number: u64) -> Option<&OutlinePoints> {
         self.kept.get((number % KEPT) as usize)
     }
 

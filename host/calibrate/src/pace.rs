@@ -53,7 +53,7 @@ impl<T> PaceResult<T> {
 
 /// What a look at a run shows.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub enum Light {
+pub enum RunLook {
     /// Enough frames arrive.
     Enough,
     /// Only so many frames a second arrive.
@@ -63,14 +63,14 @@ pub enum Light {
 }
 
 /// Counts the frames of a run while it goes on.
-pub struct Pace<'a> {
+pub struct FrameCounter<'a> {
     monitor: &'a RunMonitor,
     rate: FrameRate,
     seen: VecDeque<(Instant, u64)>,
     interruptions: u32,
 }
 
-impl<'a> Pace<'a> {
+impl<'a> FrameCounter<'a> {
     /// Of the run of `config` that `monitor` watches, from now on.
     pub fn of(config: &RigConfig, monitor: &'a RunMonitor) -> Self {
         Self { monitor, rate: config.projector.frame_rate, seen: VecDeque::new(), interruptions: 0 }
@@ -80,15 +80,15 @@ impl<'a> Pace<'a> {
     ///
     /// # Errors
     /// The projector is dark and stays so, or goes dark again and again (exit code 3).
-    pub fn look(&mut self) -> Result<Light, Failure> {
+    pub fn look(&mut self) -> Result<RunLook, Failure> {
         let (now, lit) = (Instant::now(), self.monitor.counts().frames_lit);
         match self.monitor.projector() {
             ProjectorHealth::Up | ProjectorHealth::Stopped => {
-                Ok(self.count(now, lit).map_or(Light::Enough, Light::TooFew))
+                Ok(self.count(now, lit).map_or(RunLook::Enough, RunLook::TooFew))
             }
             // The link was lost and comes up again, with slots that begin elsewhere.
             ProjectorHealth::Connecting | ProjectorHealth::Lost => {
-                Ok(Light::TooFew(self.carried_hz(now, lit)))
+                Ok(RunLook::TooFew(self.carried_hz(now, lit)))
             }
             ProjectorHealth::Faulted(mask) if mask != 0 && mask & !faults::PASSING == 0 => {
                 self.wait_for_return(mask)
@@ -98,7 +98,7 @@ impl<'a> Pace<'a> {
     }
 
     /// Waits until the light is back after the passing faults `mask`.
-    fn wait_for_return(&mut self, mask: u32) -> Result<Light, Failure> {
+    fn wait_for_return(&mut self, mask: u32) -> Result<RunLook, Failure> {
         self.interruptions += 1;
         let why = faults::names(mask);
         if self.interruptions > MOST_INTERRUPTIONS {
@@ -121,7 +121,7 @@ impl<'a> Pace<'a> {
         }
         // The frames that are missing since are those of the fault.
         self.seen.clear();
-        Ok(Light::Interrupted)
+        Ok(RunLook::Interrupted)
     }
 
     /// Frames a second since the oldest look that is remembered.
@@ -145,16 +145,16 @@ impl<'a> Pace<'a> {
     /// Watches the first seconds of light. Frames a second, if they are too few.
     ///
     /// # Errors
-    /// As [`Pace::look`].
+    /// As [`FrameCounter::look`].
     pub fn try_out(&mut self) -> Result<Option<f64>, Failure> {
         let mut begin = Instant::now();
         let mut last = None;
         while begin.elapsed() < LOOK_BACK + LOOK_BACK / 4 && !self.monitor.stop_requested() {
             std::thread::sleep(Duration::from_millis(50));
             last = match self.look()? {
-                Light::Enough => None,
-                Light::TooFew(carried_hz) => Some(carried_hz),
-                Light::Interrupted => {
+                RunLook::Enough => None,
+                RunLook::TooFew(carried_hz) => Some(carried_hz),
+                RunLook::Interrupted => {
                     begin = Instant::now();
                     None
                 }
@@ -210,7 +210,7 @@ mod tests {
         let monitor = RunMonitor::default();
         let rate = FrameRate::new(60, 1).unwrap();
         let begin = Instant::now();
-        let mut pace = Pace { monitor: &monitor, rate, seen: VecDeque::new(), interruptions: 0 };
+        let mut pace = FrameCounter { monitor: &monitor, rate, seen: VecDeque::new(), interruptions: 0 };
         let mut at = |ms: u64, lit: u64| pace.count(begin + Duration::from_millis(ms), lit);
         let hz = 30.0;
         for ms in (0..=3000).step_by(50) {
@@ -253,10 +253,10 @@ mod tests {
     fn light_that_comes_back_by_itself_is_awaited_and_other_darkness_is_not() {
         use ProjectorHealth::{Black, Faulted, Up};
         let (config, monitor) = (RigConfig::default(), RunMonitor::default());
-        let mut pace = Pace::of(&config, &monitor);
+        let mut pace = FrameCounter::of(&config, &monitor);
         for round in 0..=MOST_INTERRUPTIONS {
             monitor.set_projector(Up);
-            assert_eq!(pace.look().unwrap(), Light::Enough);
+            assert_eq!(pace.look().unwrap(), RunLook::Enough);
             assert_eq!(pace.seen.len(), 1, "what was counted before the fault is forgotten");
             monitor.set_projector(Faulted(faults::WATCHDOG));
             let looked = std::thread::scope(|scope| {
@@ -267,7 +267,9 @@ mod tests {
                 pace.look()
             });
             match looked {
-                Ok(light) => assert!(light == Light::Interrupted && round < MOST_INTERRUPTIONS, "{light:?}"),
+                Ok(light) => {
+                    assert!(light == RunLook::Interrupted && round < MOST_INTERRUPTIONS, "{light:?}")
+                }
                 Err(told) => assert!(
                     round == MOST_INTERRUPTIONS && told.message.contains("4 times (watchdog)"),
                     "{round}: {told}"
@@ -276,12 +278,16 @@ mod tests {
         }
         for health in [Black, Faulted(faults::WATCHDOG | faults::LAMP), Faulted(0)] {
             monitor.set_projector(health);
-            let told = Pace::of(&config, &monitor).look().unwrap_err();
+            let told = FrameCounter::of(&config, &monitor).look().unwrap_err();
             assert!(told.message.starts_with("the light went off: "), "{told}");
         }
         // Whoever stops the measurement does not wait for the light.
         monitor.set_projector(Faulted(faults::CHECKSUM_STORM));
         monitor.request_stop();
-        assert!(Pace::of(&config, &monitor).look().unwrap_err().message.contains("did not come back"));
+        assert!(FrameCounter::of(&config, &monitor)
+            .look()
+            .unwrap_err()
+            .message
+            .contains("did not come back"));
     }
 }

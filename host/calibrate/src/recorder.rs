@@ -1,7 +1,7 @@
 //! The light sensor while the projector shows something: its samples on the host's clock, and when frames were lit.
 
 use super::shown::while_shown;
-use dpm_calibration::sensor::Block;
+use dpm_calibration::sensor::SampleBlock;
 use dpm_common::clock::{Clock, MonotonicClock};
 use dpm_device::sensor::client::{SensorClient, SensorConfig};
 use dpm_device::time::HostTime;
@@ -45,7 +45,7 @@ pub struct Recorder {
 #[derive(Clone, Debug, PartialEq)]
 pub struct TimedBlock {
     /// The samples, on the sensor's clock.
-    pub block: Block,
+    pub block: SampleBlock,
     /// The sensor's clock less the host's when it came, nanoseconds; `None` before the clock was mapped.
     pub sensor_minus_host_ns: Option<i64>,
 }
@@ -90,7 +90,7 @@ impl Recorder {
                 let mut shared = to.lock().unwrap_or_else(PoisonError::into_inner);
                 for (head, levels) in fresh.drain(..) {
                     // The gain does not change while this runs.
-                    let Some(block) = Block::from_wire(&head, &levels, ticks_per_second, 1.0) else {
+                    let Some(block) = SampleBlock::from_wire(&head, &levels, ticks_per_second, 1.0) else {
                         continue;
                     };
                     if let Some(at) = client.sampled_at(&head, 0) {

@@ -3,7 +3,7 @@
 
 use super::codes::{CodeSource, InverseSource};
 use super::dialogue::Dialogue;
-use super::pace::{Light, Pace, PaceResult, SPOILT};
+use super::pace::{FrameCounter, PaceResult, RunLook, SPOILT};
 use super::parts::Parts;
 use super::poses::Poses;
 use super::recorder::{wait_until_up, while_stamped, Port, Recorder, TimedBlock};
@@ -13,9 +13,9 @@ use dpm_calibration::model::ProjectorModel;
 use dpm_calibration::pivot::trace;
 use dpm_calibration::projector::{LensTerms, PlaceHint, Priors, Volume};
 use dpm_calibration::sensor::{
-    decode, decode_pairs, places_rested, solve, solve_latency, solve_latency_of_pairs, solve_pairs, Block,
-    Code, Coverage, DecodedPairs, Decoding, FrameLight, InverseCode, Latency, Mapped, SensorError, Settings,
-    Solution, Timing, FEWEST_PLACES,
+    decode, decode_pairs, places_rested, solve, solve_latency, solve_latency_of_pairs, solve_pairs, Code,
+    Coverage, DecodedPairs, Decoding, FrameLight, InverseCode, Latency, Mapped, SampleBlock, SensorError,
+    Settings, Solution, Timing, FEWEST_PLACES,
 };
 use dpm_calibration::trajectory::{TimedPose, Trajectory};
 use dpm_common::clock::MonotonicClock;
@@ -31,7 +31,7 @@ use std::time::{Duration, Instant};
 
 /// What is measured with.
 #[derive(Clone, Debug)]
-pub struct Setup {
+pub struct SensorSetup {
     /// The sensor.
     pub port: Port,
     /// Name of the wand in the tracking software.
@@ -70,7 +70,7 @@ const LEAST_FRAMES: f64 = 700.0;
 const CARRIED_FOR_PAIRS: f64 = 0.95;
 
 /// What was recorded, ready for a solver.
-struct Sweep {
+struct RecordedSweep {
     seen: SeenCode,
     path: Trajectory,
     settings: Settings,
@@ -140,7 +140,7 @@ impl Rests {
 /// A device fails (exit code 3), or what was recorded does not determine the projector (2, with what to do).
 pub fn calibrate(
     config: &RigConfig,
-    setup: &Setup,
+    setup: &SensorSetup,
     tip: (DVec3, f64),
     monitor: &Arc<RunMonitor>,
 ) -> Result<PaceResult<Solution>, Failure> {
@@ -170,7 +170,7 @@ pub fn calibrate(
 /// As [`calibrate`].
 pub fn latency(
     config: &RigConfig,
-    setup: &Setup,
+    setup: &SensorSetup,
     tip: (DVec3, f64),
     model: &ProjectorModel,
     monitor: &Arc<RunMonitor>,
@@ -192,10 +192,10 @@ fn refused(error: impl std::fmt::Display) -> Failure {
 
 fn sweep(
     config: &RigConfig,
-    setup: &Setup,
+    setup: &SensorSetup,
     (tip, tip_sigma_m): (DVec3, f64),
     monitor: &Arc<RunMonitor>,
-) -> Result<PaceResult<Sweep>, Failure> {
+) -> Result<PaceResult<RecordedSweep>, Failure> {
     let raster = config.projector.raster();
     if !config.projector.is_lit_without_gap() {
         return Err(refused(
@@ -235,7 +235,7 @@ fn sweep(
             let settings = settings(showing.timing, &recording.poses)?;
             let rests = Rests { places: places_rested(&recording.poses, tip, hold_s) };
             let seen = SeenCode::Frames(code.clone(), decoded, rests);
-            Ok(Sweep { seen, path: Trajectory::new(&recording.poses), settings, clipped })
+            Ok(RecordedSweep { seen, path: Trajectory::new(&recording.poses), settings, clipped })
         });
     }
     let code = Code::new(raster).map_err(refused)?;
@@ -244,12 +244,12 @@ fn sweep(
     record(config, setup, (source, guide), monitor)?.and_then(|(recording, showing)| {
         let (offset_ns, timing) = (recording.sensor_minus_host_ns, showing.timing);
         let shown = |slot| showing.made_for(slot);
-        let blocks: Vec<Block> = recording.blocks.into_iter().map(|timed| timed.block).collect();
+        let blocks: Vec<SampleBlock> = recording.blocks.into_iter().map(|timed| timed.block).collect();
         let clipped = recording.clipped;
         let decoded = decode(&code, &timing, &blocks, offset_ns, &shown).map_err(|e| clipped.refused(e))?;
         let settings = settings(timing, &recording.poses)?;
         let seen = SeenCode::Planes(Box::new(code.clone()), decoded);
-        Ok(Sweep { seen, path: Trajectory::new(&recording.poses), settings, clipped })
+        Ok(RecordedSweep { seen, path: Trajectory::new(&recording.poses), settings, clipped })
     })
 }
 
@@ -262,7 +262,7 @@ fn plane_light(config: &RigConfig) -> Option<Vec<f64>> {
 
 fn record(
     config: &RigConfig,
-    setup: &Setup,
+    setup: &SensorSetup,
     (source, guide): (Arc<dyn PatternSource>, Guide),
     monitor: &Arc<RunMonitor>,
 ) -> Result<PaceResult<(Recording, Showing)>, Failure> {
@@ -280,7 +280,7 @@ fn record(
     let moved = || {
         wait_until_up(monitor)?;
         recorder.wait_until_mapped(monitor)?;
-        if let Some(carried_hz) = Pace::of(config, monitor).try_out()? {
+        if let Some(carried_hz) = FrameCounter::of(config, monitor).try_out()? {
             return Ok(PaceResult::TooFast { carried_hz });
         }
         if is_again {
@@ -292,7 +292,7 @@ fn record(
         }
         poses.take();
         recorder.take();
-        let pace = Pace::of(config, monitor);
+        let pace = FrameCounter::of(config, monitor);
         let sweeping = Sweeping { poses: &poses, recorder: &recorder, dialogue: &dialogue };
         sweeping.follow((seconds, 1e9 / rate.hz()), guide, pace, monitor)?.and_then(
             |(blocks, clipped, poses)| {
@@ -360,7 +360,7 @@ impl Guide {
     fn next(&mut self, frame_ns: f64, fresh: &[TimedBlock], poses: &[TimedPose]) -> String {
         match self {
             Self::Coverage(coverage) => {
-                let fresh: Vec<Block> = fresh.iter().map(|timed| timed.block.clone()).collect();
+                let fresh: Vec<SampleBlock> = fresh.iter().map(|timed| timed.block.clone()).collect();
                 match coverage.add(frame_ns, &fresh) {
                     Ok(_) => coverage.advice(),
                     Err(why) => why.to_string(),
@@ -389,7 +389,7 @@ impl Sweeping<'_> {
         &self,
         (seconds, frame_ns): (f64, f64),
         mut guide: Guide,
-        mut pace: Pace<'_>,
+        mut pace: FrameCounter<'_>,
         monitor: &RunMonitor,
     ) -> Result<PaceResult<Collected>, Failure> {
         let begin = Instant::now();
@@ -402,9 +402,9 @@ impl Sweeping<'_> {
             std::thread::sleep(Duration::from_millis(50));
             let before = begin.elapsed();
             match pace.look()? {
-                Light::Enough => {}
-                Light::TooFew(carried_hz) => return Ok(PaceResult::TooFast { carried_hz }),
-                Light::Interrupted => {
+                RunLook::Enough => {}
+                RunLook::TooFew(carried_hz) => return Ok(PaceResult::TooFast { carried_hz }),
+                RunLook::Interrupted => {
                     self.recorder.take();
                     let again = parts.spoil(before.saturating_sub(SPOILT), begin.elapsed());
                     self.dialogue.tell(&format!(

@@ -22,7 +22,7 @@ use std::time::{Duration, Instant};
 
 /// What is looked for.
 #[derive(Clone)]
-pub struct Task {
+pub struct ViewTask {
     /// The clock on which pictures are stamped.
     pub clock: Arc<dyn HostClock>,
     /// The printed board, if it may be in view.
@@ -68,7 +68,7 @@ impl PatternSource for ViewSource {
 pub fn calibrate(
     config: &RigConfig,
     (view, eye): (&mut CameraView, &ProjectorCamera),
-    task: &Task,
+    task: &ViewTask,
     monitor: &Arc<RunMonitor>,
     tell: &mut dyn FnMut(&str),
 ) -> Result<ViewFit, Failure> {
@@ -92,7 +92,7 @@ pub fn calibrate(
 fn take(
     source: &ViewSource,
     view: &mut CameraView,
-    task: &Task,
+    task: &ViewTask,
     monitor: &RunMonitor,
 ) -> Result<Vec<Vec<u8>>, Failure> {
     let begin = Instant::now();
@@ -117,7 +117,7 @@ fn is_steady(a: &[u8], b: &[u8]) -> bool {
 }
 
 /// The first picture whose exposure began so long after now, and in which as much light fell as in the one before.
-fn picture_after(view: &mut CameraView, task: &Task, monitor: &RunMonitor) -> Result<Vec<u8>, Failure> {
+fn picture_after(view: &mut CameraView, task: &ViewTask, monitor: &RunMonitor) -> Result<Vec<u8>, Failure> {
     let told = Instant::now();
     let from = task.clock.now().plus_ns(task.settle.as_nanos() as i64);
     let (w, h) = (view.raster.width() as usize, view.raster.height() as usize);

@@ -5,7 +5,7 @@
 //! projector's fault. A point that is elsewhere than the rig has it is the body's fault. Their difference is the error of
 //! the light.
 
-use crate::body::Surface;
+use crate::body::TriangleTree;
 use dpm_scene::geometry::projector::ProjectorCamera;
 use glam::{DAffine3, DMat2, DVec2, DVec3};
 
@@ -20,7 +20,7 @@ const FEWEST: usize = 3;
 
 /// A point of a mesh.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub struct SurfacePoint {
+pub struct MeshPoint {
     /// In the mesh's frame, metres.
     pub position: DVec3,
     /// Unit normal, outwards, in the mesh's frame.
@@ -30,26 +30,26 @@ pub struct SurfacePoint {
 /// Chooses up to `count` of `candidates`, each as far as possible from the others, that face the projector, lie on its
 /// raster and are not hidden by `surface`.
 pub fn spread(
-    candidates: &[SurfacePoint],
-    surface: &Surface,
+    candidates: &[MeshPoint],
+    surface: &TriangleTree,
     camera: &ProjectorCamera,
     world_from_mesh: &DAffine3,
     count: usize,
-) -> Vec<SurfacePoint> {
+) -> Vec<MeshPoint> {
     let lens = world_from_mesh.inverse().transform_point3(camera.position());
     let size = DVec2::new(f64::from(camera.raster.width()), f64::from(camera.raster.height()));
-    let is_lit = |p: &&SurfacePoint| {
+    let is_lit = |p: &&MeshPoint| {
         let pixel = camera.project(world_from_mesh.transform_point3(p.position));
         let inside = pixel.is_some_and(|at| {
             at.cmpge(DVec2::splat(MARGIN_PX)).all() && at.cmple(size - DVec2::splat(MARGIN_PX)).all()
         });
         inside && (lens - p.position).normalize_or_zero().dot(p.normal) >= FACING
     };
-    let mut left: Vec<SurfacePoint> = candidates.iter().filter(is_lit).copied().collect();
+    let mut left: Vec<MeshPoint> = candidates.iter().filter(is_lit).copied().collect();
     let middle = left.iter().map(|p| p.position).sum::<DVec3>() / left.len().max(1) as f64;
     let mut gaps: Vec<f64> = left.iter().map(|p| p.position.distance(middle)).collect();
     let clear_m = CLEAR * surface.extent_m();
-    let mut chosen: Vec<SurfacePoint> = Vec::new();
+    let mut chosen: Vec<MeshPoint> = Vec::new();
     while chosen.len() < count {
         let far = (0..left.len()).max_by(|a, b| gaps[*a].total_cmp(&gaps[*b]));
         let Some(far) = far.filter(|i| chosen.is_empty() || gaps[*i] > clear_m) else { break };
@@ -70,7 +70,7 @@ pub fn spread(
 
 /// What was measured at a point. Places are in the world, metres; positions on the raster are in pixels.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub struct Reading {
+pub struct PointReading {
     /// Where the rig has the point.
     pub point: DVec3,
     /// Unit normal of the surface there.
@@ -100,7 +100,7 @@ pub struct Offset {
 
 impl Offset {
     /// From a measurement; `None` where a place is beside or behind the projector, or the surface is seen from its edge.
-    pub fn of(camera: &ProjectorCamera, reading: &Reading) -> Option<Self> {
+    pub fn of(camera: &ProjectorCamera, reading: &PointReading) -> Option<Self> {
         let meant = camera.project(reading.point)?;
         let projector = camera.project(reading.in_light)? - reading.lit;
         let body = match reading.touched {

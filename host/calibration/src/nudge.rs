@@ -10,7 +10,7 @@ const MOST_KEPT: usize = 10_000;
 
 /// One letter of the operator.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub enum Order {
+pub enum NudgeOrder {
     /// By one step along this unit vector.
     Move(DVec3),
     /// By [`TURN_DEG`] about this unit vector.
@@ -23,7 +23,7 @@ pub enum Order {
     Quit,
 }
 
-impl Order {
+impl NudgeOrder {
     /// Of a letter.
     pub fn of(letter: char) -> Option<Self> {
         Some(match letter {
@@ -127,12 +127,12 @@ mod tests {
     }
 
     fn type_in(nudges: &mut Nudges, line: &str) {
-        for order in Order::of_line(line).unwrap() {
+        for order in NudgeOrder::of_line(line).unwrap() {
             match order {
-                Order::Move(along) => nudges.shift(along),
-                Order::Turn(about) => nudges.turn(about),
-                Order::Undo => assert!(nudges.undo()),
-                Order::Save | Order::Quit => panic!("{order:?}"),
+                NudgeOrder::Move(along) => nudges.shift(along),
+                NudgeOrder::Turn(about) => nudges.turn(about),
+                NudgeOrder::Undo => assert!(nudges.undo()),
+                NudgeOrder::Save | NudgeOrder::Quit => panic!("{order:?}"),
             }
         }
     }
@@ -196,7 +196,7 @@ mod tests {
 
     #[test]
     fn a_line_with_a_wrong_letter_does_nothing() {
-        assert_eq!(Order::of_line("xx7w"), Err('7'));
-        assert_eq!(Order::of_line(" w q"), Ok(vec![Order::Save, Order::Quit]));
+        assert_eq!(NudgeOrder::of_line("xx7w"), Err('7'));
+        assert_eq!(NudgeOrder::of_line(" w q"), Ok(vec![NudgeOrder::Save, NudgeOrder::Quit]));
     }
 }

@@ -1,6 +1,6 @@
 //! The edges by which an eye knows a body: its outline as the projector sees it, and its sharp edges.
 
-use crate::body::Surface;
+use crate::body::TriangleTree;
 use dpm_scene::geometry::projector::ProjectorCamera;
 use glam::{DAffine3, DVec3};
 use std::collections::HashMap;
@@ -28,7 +28,7 @@ struct Edge {
 
 /// A mesh as edges.
 pub struct Outline {
-    surface: Surface,
+    surface: TriangleTree,
     edges: Vec<Edge>,
     middle: DVec3,
 }
@@ -63,7 +63,7 @@ impl Outline {
         let low = triangles.iter().flatten().fold(DVec3::INFINITY, |a, p| a.min(*p));
         let high = triangles.iter().flatten().fold(DVec3::NEG_INFINITY, |a, p| a.max(*p));
         let middle = if low.is_finite() && high.is_finite() { 0.5 * (low + high) } else { DVec3::ZERO };
-        Self { surface: Surface::new(triangles.iter().copied()), edges, middle }
+        Self { surface: TriangleTree::new(triangles.iter().copied()), edges, middle }
     }
 
     /// Middle of the box around the mesh, in its frame.

@@ -5,9 +5,9 @@
 
 mod lens;
 
-use super::entries::{joined, Entries, Entry, Matrix};
-use super::names::{meaning, Owner, Role};
-use super::{pose, rotation, Frame, Intrinsics, Purpose, ReadOptions, StorageError, StoredCalibration};
+use super::entries::{joined, Entries, FileEntry, Matrix};
+use super::names::{meaning, EntryOwner, Role};
+use super::{pose, rotation, Intrinsics, PoseFrame, Purpose, ReadOptions, StorageError, StoredCalibration};
 use dpm_device::planes::Raster;
 use dpm_scene::geometry::projector::ProjectorCamera;
 use glam::{DAffine3, DMat3, DVec3};
@@ -29,10 +29,10 @@ const MOST_DEVICES: usize = 64;
 struct NamedEntry<'a> {
     section: &'a str,
     name: &'a str,
-    owner: Owner,
+    owner: EntryOwner,
     role: Role,
     from_camera: bool,
-    entry: &'a Entry,
+    entry: &'a FileEntry,
 }
 
 impl NamedEntry<'_> {
@@ -42,7 +42,7 @@ impl NamedEntry<'_> {
 
     /// The matrix or list, whose numbers are finite.
     fn matrix(&self) -> Result<&Matrix, StorageError> {
-        let Entry::Matrix(matrix) = self.entry else {
+        let FileEntry::Matrix(matrix) = self.entry else {
             return Err(StorageError::value(&self.path(), "is no matrix and no list of numbers"));
         };
         match matrix.data.iter().position(|v| !v.is_finite()) {
@@ -56,7 +56,7 @@ impl NamedEntry<'_> {
 #[derive(Clone, Debug, PartialEq)]
 struct Device<'a> {
     section: &'a str,
-    owner: Owner,
+    owner: EntryOwner,
     label: String,
 }
 
@@ -70,18 +70,18 @@ fn known(all: &Entries) -> Vec<NamedEntry<'_>> {
         }
         for (name, entry) in inside {
             let Some((owner, role, from_camera)) = meaning(name) else { continue };
-            let digit = || Owner::Other(name.chars().filter(char::is_ascii_digit).collect());
+            let digit = || EntryOwner::Other(name.chars().filter(char::is_ascii_digit).collect());
             let (owner, role) = match (entry, role) {
                 // "K1" and "k1" may be the first device's matrices, or numbers of a lens.
-                (Entry::Matrix(m), Role::Coefficient(_)) => match (m.rows, m.columns) {
+                (FileEntry::Matrix(m), Role::Coefficient(_)) => match (m.rows, m.columns) {
                     (3, 3) => (digit(), Role::Intrinsics),
                     (3, 4) => (owner, Role::ByProduct),
                     _ => (digit(), Role::Distortion),
                 },
                 // A matrix F is fundamental, a number is not.
-                (Entry::Number(_), Role::ByProduct) if name.len() == 1 => continue,
+                (FileEntry::Number(_), Role::ByProduct) if name.len() == 1 => continue,
                 (
-                    Entry::Text(_),
+                    FileEntry::Text(_),
                     Role::Intrinsics | Role::Distortion | Role::Rotation | Role::Translation,
                 ) => continue,
                 _ => (owner, role),
@@ -96,8 +96,8 @@ fn devices<'a>(known: &[NamedEntry<'a>]) -> Vec<Device<'a>> {
     let mut out: Vec<Device> = Vec::new();
     for k in known {
         let is_one = match k.role {
-            Role::Intrinsics => matches!(k.entry, Entry::Matrix(_)),
-            Role::Intrinsic(0) => matches!(k.entry, Entry::Number(_)),
+            Role::Intrinsics => matches!(k.entry, FileEntry::Matrix(_)),
+            Role::Intrinsic(0) => matches!(k.entry, FileEntry::Number(_)),
             _ => false,
         };
         // Intrinsics in a section of their own belong to the section around it.
@@ -110,8 +110,8 @@ fn devices<'a>(known: &[NamedEntry<'a>]) -> Vec<Device<'a>> {
             continue;
         }
         let label = match (&k.owner, section) {
-            (Owner::Own, "") => k.name.to_owned(),
-            (Owner::Own, section) => section.to_owned(),
+            (EntryOwner::Own, "") => k.name.to_owned(),
+            (EntryOwner::Own, section) => section.to_owned(),
             (owner, section) => joined(section, owner.label()),
         };
         out.push(Device { section, owner: k.owner.clone(), label });
@@ -152,14 +152,14 @@ fn choose<'a>(
             ))
         });
     }
-    let of = |owner: Owner| devices.iter().filter(move |d| d.owner == owner);
+    let of = |owner: EntryOwner| devices.iter().filter(move |d| d.owner == owner);
     match devices {
         [] => Err(StorageError::Missing {
             part: "intrinsics",
             names: "camera_matrix, cameraMatrix, K, mtx, proj_int, proj_K, Kp, intrinsics, fx",
             has: all.matrices(),
         }),
-        [only] if only.owner == Owner::Camera => Err(StorageError::Refused(format!(
+        [only] if only.owner == EntryOwner::Camera => Err(StorageError::Refused(format!(
             "its only intrinsics are a camera's ({}), and the projector's are missing; if this is the projector, set \
              projector.calibration_device = {:?}",
             only.label, only.label
@@ -178,7 +178,7 @@ fn choose<'a>(
         }
         [first, rest @ ..] => {
             let is_one_section = rest.iter().all(|d| d.section == first.section);
-            let mut projectors = of(Owner::Projector);
+            let mut projectors = of(EntryOwner::Projector);
             match (projectors.next(), projectors.next()) {
                 (Some(projector), None) if is_one_section => Ok(projector.clone()),
                 _ => Err(ask(devices.len())),
@@ -188,14 +188,14 @@ fn choose<'a>(
 }
 
 /// The parts of one device.
-struct Parts<'a, 'k> {
+struct DeviceParts<'a, 'k> {
     device: &'k Device<'a>,
     /// Whether the section has the intrinsics of another device too, so that entries without an owner are of both.
     is_shared: bool,
     scope: Vec<&'k NamedEntry<'a>>,
 }
 
-impl<'a, 'k> Parts<'a, 'k> {
+impl<'a, 'k> DeviceParts<'a, 'k> {
     fn of(device: &'k Device<'a>, devices: &[Device], known: &'k [NamedEntry<'a>]) -> Self {
         let base = device.section;
         let inside = |section: &str, of: &str| {
@@ -205,12 +205,12 @@ impl<'a, 'k> Parts<'a, 'k> {
             let nearest = devices.iter().filter(|d| inside(section, d.section));
             nearest.max_by_key(|d| d.section.len()).is_some_and(|d| d.section != base)
         };
-        let has_camera = devices.iter().any(|d| d.section == base && d.owner == Owner::Camera);
+        let has_camera = devices.iter().any(|d| d.section == base && d.owner == EntryOwner::Camera);
         let is_mine = |k: &NamedEntry| {
             let is_owner = match &k.owner {
-                Owner::Own => true,
+                EntryOwner::Own => true,
                 // Beside one device without a name, "camera_rotation" is that of this device.
-                Owner::Camera if !has_camera && device.owner == Owner::Own => true,
+                EntryOwner::Camera if !has_camera && device.owner == EntryOwner::Own => true,
                 owner => *owner == device.owner,
             };
             let is_here = inside(k.section, base) && !is_others(k.section);
@@ -240,7 +240,7 @@ impl<'a, 'k> Parts<'a, 'k> {
 
     fn number(&self, role: Role) -> Option<(&'k NamedEntry<'a>, f64)> {
         self.own(role).find_map(|k| match k.entry {
-            Entry::Number(v) => Some((k, *v)),
+            FileEntry::Number(v) => Some((k, *v)),
             _ => None,
         })
     }
@@ -291,9 +291,9 @@ fn intrinsics_of(k: &NamedEntry) -> Result<[f64; 4], StorageError> {
     Ok([fx, fy, cx, cy])
 }
 
-fn intrinsics(parts: &Parts, used: &mut UseNotes) -> Result<(String, Intrinsics), StorageError> {
+fn intrinsics(parts: &DeviceParts, used: &mut UseNotes) -> Result<(String, Intrinsics), StorageError> {
     let mut first: Option<(&NamedEntry, [f64; 4])> = None;
-    for k in parts.own(Role::Intrinsics).filter(|k| matches!(k.entry, Entry::Matrix(_))) {
+    for k in parts.own(Role::Intrinsics).filter(|k| matches!(k.entry, FileEntry::Matrix(_))) {
         let values = intrinsics_of(k)?;
         match &first {
             None => first = Some((k, values)),
@@ -376,12 +376,12 @@ struct PoseEntries<'k, 'a> {
 }
 
 fn told_pose<'k, 'a>(
-    parts: &Parts<'a, 'k>,
+    parts: &DeviceParts<'a, 'k>,
     used: &mut UseNotes,
 ) -> Result<Option<PoseEntries<'k, 'a>>, StorageError> {
     let mut told: Vec<PoseEntries> = Vec::new();
     for role in [Role::Pose, Role::Placement] {
-        for k in parts.with(role).filter(|k| matches!(k.entry, Entry::Matrix(_))) {
+        for k in parts.with(role).filter(|k| matches!(k.entry, FileEntry::Matrix(_))) {
             let (r, t) = rigid(k)?;
             let (rotation, translation) = match role {
                 Role::Placement => (r.transpose(), -(r.transpose() * t)),
@@ -393,7 +393,7 @@ fn told_pose<'k, 'a>(
     }
     let is_near = |a: DMat3, b: DMat3| (a - b).to_cols_array().iter().all(|v| v.abs() < 2e-3);
     let mut turn: Option<(&NamedEntry, DMat3)> = None;
-    for k in parts.with(Role::Rotation).filter(|k| matches!(k.entry, Entry::Matrix(_))) {
+    for k in parts.with(Role::Rotation).filter(|k| matches!(k.entry, FileEntry::Matrix(_))) {
         let r = rotation_of(k)?;
         if let Some((other, first)) = turn.filter(|(_, first)| !is_near(*first, r)) {
             // The device's own word counts before one without an owner.
@@ -407,7 +407,7 @@ fn told_pose<'k, 'a>(
         turn = turn.or(Some((k, r)));
     }
     let mut shift: Option<(&NamedEntry, DVec3)> = None;
-    for k in parts.with(Role::Translation).filter(|k| matches!(k.entry, Entry::Matrix(_))) {
+    for k in parts.with(Role::Translation).filter(|k| matches!(k.entry, FileEntry::Matrix(_))) {
         let t = k.matrix()?;
         if t.data.len() != 3 {
             return Err(StorageError::value(&k.path(), format!("has {} numbers, not 3", t.data.len())));
@@ -440,12 +440,12 @@ fn told_pose<'k, 'a>(
     Ok(Some(first))
 }
 
-fn missing(parts: &Parts, part: &'static str) -> StorageError {
+fn missing(parts: &DeviceParts, part: &'static str) -> StorageError {
     let names = match part {
         "translation" => "T, translation, translationVector, tvec, or a 4 x 4 matrix extrinsics",
         _ => "R, rotation, roration, rotationVector, rvec, or a 4 x 4 matrix extrinsics",
     };
-    let matrices = parts.scope.iter().filter(|k| matches!(k.entry, Entry::Matrix(_)));
+    let matrices = parts.scope.iter().filter(|k| matches!(k.entry, FileEntry::Matrix(_)));
     let has: Vec<String> = matrices.take(24).map(|k| k.path()).collect();
     StorageError::Missing {
         part,
@@ -455,7 +455,7 @@ fn missing(parts: &Parts, part: &'static str) -> StorageError {
 }
 
 /// Why there is no pose, with what to do.
-fn no_pose(all: &Entries, parts: &Parts) -> StorageError {
+fn no_pose(all: &Entries, parts: &DeviceParts) -> StorageError {
     let views = VIEWS.iter().find(|v| all.sections.values().any(|s| s.contains_key(**v)));
     if let Some(views) = views {
         let what = "holds the poses of a board in many views, and not the projector's in the world; add rvec and tvec, which \
@@ -470,7 +470,7 @@ fn no_pose(all: &Entries, parts: &Parts) -> StorageError {
     missing(parts, "rotation")
 }
 
-fn image_size(parts: &Parts, used: &mut UseNotes) -> Result<Option<(u32, u32)>, StorageError> {
+fn image_size(parts: &DeviceParts, used: &mut UseNotes) -> Result<Option<(u32, u32)>, StorageError> {
     let mut sizes: Vec<(&NamedEntry, f64, f64)> = Vec::new();
     if let (Some((k, w)), Some((l, h))) = (parts.number(Role::Width), parts.number(Role::Height)) {
         used.paths.extend([k.path(), l.path()]);
@@ -478,7 +478,7 @@ fn image_size(parts: &Parts, used: &mut UseNotes) -> Result<Option<(u32, u32)>, 
     }
     for role in [Role::Size, Role::Shape] {
         for k in parts.own(role) {
-            let Entry::Matrix(m) = k.entry else { continue };
+            let FileEntry::Matrix(m) = k.entry else { continue };
             let [a, b] = match m.data[..] {
                 [a, b] | [a, b, _] => [a, b],
                 _ => continue,
@@ -504,11 +504,11 @@ fn unread(
     all: &Entries,
     known: &[NamedEntry],
     devices: &[Device],
-    parts: &Parts,
+    parts: &DeviceParts,
     used: &UseNotes,
 ) -> Vec<String> {
     let chosen = parts.device;
-    let is_others = |section: &str, owner: &Owner| {
+    let is_others = |section: &str, owner: &EntryOwner| {
         let of = |d: &Device| {
             let is_in = section.strip_prefix(d.section).is_some_and(|s| s.is_empty() || s.starts_with('/'));
             d != chosen
@@ -524,7 +524,7 @@ fn unread(
         for (name, entry) in inside {
             let path = joined(section, name);
             let hit = by_name.get(&(section.as_str(), name.as_str()));
-            let owner = hit.map_or(Owner::Own, |k| k.owner.clone());
+            let owner = hit.map_or(EntryOwner::Own, |k| k.owner.clone());
             if let Some(label) = is_others(section, &owner) {
                 let told = format!("the device {label}");
                 if !out.contains(&told) {
@@ -535,7 +535,7 @@ fn unread(
             // Lists of texts name things and measure nothing.
             let is_known = hit.is_some_and(|k| k.role == Role::ByProduct)
                 || VIEWS.contains(&name.as_str())
-                || *entry == Entry::Other && section.is_empty();
+                || *entry == FileEntry::Other && section.is_empty();
             if !is_known && !used.paths.contains(&path) {
                 out.push(path);
             }
@@ -551,12 +551,12 @@ fn unread(
 }
 
 /// Whose frame the pose is told in.
-fn frame(told: &PoseEntries, parts: &Parts, devices: &[Device], known: &[NamedEntry]) -> Frame {
+fn frame(told: &PoseEntries, parts: &DeviceParts, devices: &[Device], known: &[NamedEntry]) -> PoseFrame {
     if let Some(k) = told.by.iter().find(|k| k.from_camera) {
-        return Frame::Camera { name: k.path() };
+        return PoseFrame::Camera { name: k.path() };
     }
     // Beside the intrinsics of another device a pose without an owner leads from that device to this one.
-    let is_between = told.by.iter().all(|k| k.owner == Owner::Own);
+    let is_between = told.by.iter().all(|k| k.owner == EntryOwner::Own);
     let mut others = devices.iter().filter(|d| *d != parts.device);
     let other = others.clone().find(|d| d.section == parts.device.section || !is_within(told, parts));
     if let Some(other) = other.filter(|_| is_between && (parts.is_shared || !is_within(told, parts))) {
@@ -564,23 +564,23 @@ fn frame(told: &PoseEntries, parts: &Parts, devices: &[Device], known: &[NamedEn
             k.section == other.section && k.owner == other.owner && k.role == Role::Intrinsics
         };
         let name = known.iter().find(is_its);
-        return Frame::Camera { name: name.map_or(other.label.clone(), NamedEntry::path) };
+        return PoseFrame::Camera { name: name.map_or(other.label.clone(), NamedEntry::path) };
     }
     let is_origin = |d: &&Device| {
-        let theirs = Parts::of(d, devices, known);
+        let theirs = DeviceParts::of(d, devices, known);
         told_pose(&theirs, &mut UseNotes::default()).ok().flatten().is_some_and(|t| {
             t.translation == DVec3::ZERO
                 && (t.rotation - DMat3::IDENTITY).to_cols_array().iter().all(|v| *v == 0.0)
         })
     };
     match others.find(is_origin) {
-        Some(origin) => Frame::WorldOfCamera { name: origin.label.clone() },
-        None => Frame::World,
+        Some(origin) => PoseFrame::WorldOfCamera { name: origin.label.clone() },
+        None => PoseFrame::World,
     }
 }
 
 /// Whether the pose stands in the device's own section.
-fn is_within(told: &PoseEntries, parts: &Parts) -> bool {
+fn is_within(told: &PoseEntries, parts: &DeviceParts) -> bool {
     told.by.iter().all(|k| k.section.starts_with(parts.device.section) || parts.device.section.is_empty())
 }
 
@@ -588,10 +588,10 @@ fn is_within(told: &PoseEntries, parts: &Parts) -> bool {
 fn placed<'k, 'a>(
     all: &Entries,
     device: &Device,
-    parts: &Parts<'k, 'a>,
+    parts: &DeviceParts<'k, 'a>,
     used: &mut UseNotes,
 ) -> Result<PoseEntries<'k, 'a>, StorageError> {
-    if matches!(&device.owner, Owner::Other(label) if label == "1")
+    if matches!(&device.owner, EntryOwner::Other(label) if label == "1")
         && parts.own(Role::Rotation).next().is_none()
     {
         let shared = parts.with(Role::Rotation).next();
@@ -624,7 +624,7 @@ pub(super) fn read(
         )));
     }
     let device = choose(all, &devices, options.device)?;
-    let parts = Parts::of(&device, &devices, &known);
+    let parts = DeviceParts::of(&device, &devices, &known);
     let mut used = UseNotes::default();
     // Two models have an xi: the word for the model comes first.
     let fisheye = is_fisheye(&parts, options.lens, &mut used)?;
@@ -651,7 +651,7 @@ pub(super) fn read(
     }
     let k_at = k.at(size, options.raster)?;
     let (place, frame) = match purpose {
-        Purpose::Lens => (DAffine3::IDENTITY, Frame::World),
+        Purpose::Lens => (DAffine3::IDENTITY, PoseFrame::World),
         Purpose::Place => {
             let told = placed(all, &device, &parts, &mut used)?;
             let place = pose(told.rotation, told.translation * options.unit.metres());

@@ -131,7 +131,7 @@ fn every_dialect_gives_the_same_projector() {
         let stored = read(text.as_bytes(), &options(LengthUnit::Metre));
         let stored = stored.unwrap_or_else(|e| panic!("{name}: {e}\n{text}"));
         check(&stored, [-0.05, 0.02], name);
-        assert!(stored.unread.is_empty() && stored.frame == Frame::World, "{name}: {stored:?}");
+        assert!(stored.unread.is_empty() && stored.frame == PoseFrame::World, "{name}: {stored:?}");
     }
 }
 
@@ -163,8 +163,8 @@ fn dialects_project_as_opencv_does() {
         }
         let got = got.unwrap_or_else(|e| panic!("{file}: {e}"));
         let is_as_told = match (&got.frame, frame) {
-            (Frame::World, "world") | (Frame::Camera { .. }, "camera") => true,
-            (Frame::WorldOfCamera { .. }, told) => told == "world of camera",
+            (PoseFrame::World, "world") | (PoseFrame::Camera { .. }, "camera") => true,
+            (PoseFrame::WorldOfCamera { .. }, told) => told == "world of camera",
             _ => false,
         };
         assert!(is_as_told, "{file}: {:?}", got.frame);
@@ -196,7 +196,7 @@ fn several_devices_are_a_question_whose_answer_is_the_projector() {
         );
         let stored = read(&bytes, &ReadOptions { device: Some(answer), ..options(unit) }).unwrap();
         check(&stored, lens, name);
-        assert!(matches!(stored.frame, Frame::WorldOfCamera { .. }), "{:?}", stored.frame);
+        assert!(matches!(stored.frame, PoseFrame::WorldOfCamera { .. }), "{:?}", stored.frame);
         assert!(stored
             .unread
             .iter()
@@ -215,7 +215,7 @@ fn several_devices_are_a_question_whose_answer_is_the_projector() {
     let stereo = format!("%YAML:1.0\n{stereo}{}{}", matrix("R", (3, 3), R), matrix("T", (3, 1), T));
     let told = |device| read(stereo.as_bytes(), &ReadOptions { device, ..options(LengthUnit::Metre) });
     assert!(told(None).unwrap_err().to_string().contains("2 devices"));
-    assert!(matches!(told(Some("2")).unwrap().frame, Frame::Camera { .. }));
+    assert!(matches!(told(Some("2")).unwrap().frame, PoseFrame::Camera { .. }));
     assert!(told(Some("1")).unwrap_err().to_string().contains("device 1"));
 }
 
@@ -223,7 +223,7 @@ fn several_devices_are_a_question_whose_answer_is_the_projector() {
 fn the_files_by_other_programs_are_read_or_refused_with_advice() {
     let slstudio = read(&case("c04-slstudio-names.xml"), &options(LengthUnit::Millimetre)).unwrap();
     check(&slstudio, [-0.05, 0.02], "slstudio");
-    assert!(matches!(slstudio.frame, Frame::Camera { .. }) && slstudio.unread == ["the device camera"]);
+    assert!(matches!(slstudio.frame, PoseFrame::Camera { .. }) && slstudio.unread == ["the device camera"]);
     let metre = |name: &str| read(&case(name), &options(LengthUnit::Metre));
     check(&metre("c05-kalibr.yaml").unwrap(), [-0.05, 0.02], "kalibr");
     check(&metre("c08-pose-4x4.yml").unwrap(), [0.0; 2], "4 x 4");

@@ -17,7 +17,7 @@ pub struct Matrix {
 
 /// What stands under a name.
 #[derive(Clone, Debug, PartialEq)]
-pub enum Entry {
+pub enum FileEntry {
     /// A matrix, a list of numbers (one row), or a list of equally long lists.
     Matrix(Matrix),
     /// A number.
@@ -33,7 +33,7 @@ pub enum Entry {
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Entries {
     /// Sections with their entries.
-    pub sections: BTreeMap<String, BTreeMap<String, Entry>>,
+    pub sections: BTreeMap<String, BTreeMap<String, FileEntry>>,
     /// Paths of entries that stand in the file twice with different values, of which the first counts.
     pub repeated: Vec<String>,
 }
@@ -43,7 +43,7 @@ const SHOWN: usize = 24;
 
 impl Entries {
     /// Adds what stands under a name. The nameless members of a sequence are passed over.
-    pub(super) fn add(&mut self, section: &str, name: &str, entry: Entry) {
+    pub(super) fn add(&mut self, section: &str, name: &str, entry: FileEntry) {
         if matches!(name, "" | "_") {
             return;
         }
@@ -65,30 +65,30 @@ impl Entries {
     /// The numbers of a matrix that stands alone in its section, which are no entry any more.
     pub(super) fn take_matrix(&mut self, section: &str, name: &str) -> Option<Vec<f64>> {
         let inside = self.sections.get(section)?;
-        let (1, Some(Entry::Matrix(matrix))) = (inside.len(), inside.get(name)) else { return None };
+        let (1, Some(FileEntry::Matrix(matrix))) = (inside.len(), inside.get(name)) else { return None };
         let data = matrix.data.clone();
         self.sections.remove(section);
         Some(data)
     }
 
     /// A list of lists of numbers; rows of different lengths are no matrix.
-    pub(super) fn list(rows: Vec<Vec<f64>>) -> Entry {
+    pub(super) fn list(rows: Vec<Vec<f64>>) -> FileEntry {
         let columns = rows.first().map_or(0, Vec::len);
         match rows.iter().all(|r| r.len() == columns) {
-            true => Entry::Matrix(Matrix { rows: rows.len(), columns, data: rows.concat() }),
-            false => Entry::Other,
+            true => FileEntry::Matrix(Matrix { rows: rows.len(), columns, data: rows.concat() }),
+            false => FileEntry::Other,
         }
     }
 
     /// A number, or a text if it is none.
-    pub(super) fn word(word: &str) -> Entry {
-        number(word).map_or_else(|| Entry::Text(word.trim_matches(['"', '\'']).into()), Entry::Number)
+    pub(super) fn word(word: &str) -> FileEntry {
+        number(word).map_or_else(|| FileEntry::Text(word.trim_matches(['"', '\'']).into()), FileEntry::Number)
     }
 
     /// The paths of all matrices, for a message.
     pub(super) fn matrices(&self) -> String {
         let all = self.sections.iter().flat_map(|(section, inside)| {
-            let matrices = inside.iter().filter(|(_, entry)| matches!(entry, Entry::Matrix(_)));
+            let matrices = inside.iter().filter(|(_, entry)| matches!(entry, FileEntry::Matrix(_)));
             matrices.map(move |(name, _)| joined(section, name))
         });
         let names: Vec<String> = all.take(SHOWN).collect();
@@ -131,14 +131,14 @@ pub(super) fn number(word: &str) -> Option<f64> {
 
 /// The parts of a matrix as they are met.
 #[derive(Clone, Copy, Debug, Default)]
-pub(super) struct Parts<'a> {
+pub(super) struct MatrixParts<'a> {
     pub rows: Option<&'a str>,
     pub columns: Option<&'a str>,
     /// Type of the elements, for example `d` or `2f`.
     pub kind: Option<&'a str>,
 }
 
-impl Parts<'_> {
+impl MatrixParts<'_> {
     /// The matrix of these parts and the numbers in `data`, which are separated by white space or commas.
     pub(super) fn matrix(self, name: &str, data: &str) -> Result<Matrix, StorageError> {
         let mut numbers = Vec::new();

@@ -8,7 +8,7 @@ use std::path::Path;
 
 /// A form of OpenCV's `FileStorage`.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Form {
+pub enum StorageForm {
     /// XML.
     Xml,
     /// YAML, as OpenCV writes it.
@@ -17,7 +17,7 @@ pub enum Form {
     Json,
 }
 
-impl Form {
+impl StorageForm {
     /// The form that OpenCV itself chooses for a file of this name: by the extensions xml, yml, yaml and json.
     pub fn of(path: &Path) -> Option<Self> {
         match path.extension()?.to_str()?.to_ascii_lowercase().as_str() {
@@ -30,12 +30,12 @@ impl Form {
 }
 
 /// What is written under a name.
-enum Value {
+enum StoredValue {
     Whole(u32),
     Matrix { rows: usize, columns: usize, data: Vec<f64> },
 }
 
-impl Value {
+impl StoredValue {
     fn column(data: Vec<f64>) -> Self {
         Self::Matrix { rows: data.len(), columns: 1, data }
     }
@@ -46,28 +46,28 @@ impl Value {
 ///
 /// Numbers are written with all their digits. OpenCV puts pixel centres at whole numbers, so the principal point is half
 /// a pixel less than in [`ProjectorCamera`].
-pub fn export(camera: &ProjectorCamera, form: Form) -> String {
+pub fn export(camera: &ProjectorCamera, form: StorageForm) -> String {
     let values = values(camera);
     let mut out = String::new();
     for (i, (name, value)) in values.iter().enumerate() {
         let comma = if i + 1 < values.len() { "," } else { "" };
         // Writing to a string cannot fail.
         let _ = match (form, value) {
-            (Form::Xml, Value::Whole(n)) => writeln!(out, "<{name}>{n}</{name}>"),
-            (Form::Yaml, Value::Whole(n)) => writeln!(out, "{name}: {n}"),
-            (Form::Json, Value::Whole(n)) => writeln!(out, "    \"{name}\": {n}{comma}"),
-            (Form::Xml, Value::Matrix { rows, columns, data }) => writeln!(
+            (StorageForm::Xml, StoredValue::Whole(n)) => writeln!(out, "<{name}>{n}</{name}>"),
+            (StorageForm::Yaml, StoredValue::Whole(n)) => writeln!(out, "{name}: {n}"),
+            (StorageForm::Json, StoredValue::Whole(n)) => writeln!(out, "    \"{name}\": {n}{comma}"),
+            (StorageForm::Xml, StoredValue::Matrix { rows, columns, data }) => writeln!(
                 out,
                 "<{name} type_id=\"opencv-matrix\">\n  <rows>{rows}</rows>\n  <cols>{columns}</cols>\n  <dt>d</dt>\n  \
                  <data>\n    {}</data></{name}>",
                 lines(data, " ", 4)
             ),
-            (Form::Yaml, Value::Matrix { rows, columns, data }) => writeln!(
+            (StorageForm::Yaml, StoredValue::Matrix { rows, columns, data }) => writeln!(
                 out,
                 "{name}: !!opencv-matrix\n   rows: {rows}\n   cols: {columns}\n   dt: d\n   data: [ {} ]",
                 lines(data, ", ", 7)
             ),
-            (Form::Json, Value::Matrix { rows, columns, data }) => writeln!(
+            (StorageForm::Json, StoredValue::Matrix { rows, columns, data }) => writeln!(
                 out,
                 "    \"{name}\": {{\n        \"type_id\": \"opencv-matrix\",\n        \"rows\": {rows},\n        \
                  \"cols\": {columns},\n        \"dt\": \"d\",\n        \"data\": [ {} ]\n    }}{comma}",
@@ -76,9 +76,9 @@ pub fn export(camera: &ProjectorCamera, form: Form) -> String {
         };
     }
     match form {
-        Form::Xml => format!("<?xml version=\"1.0\"?>\n<opencv_storage>\n{out}</opencv_storage>\n"),
-        Form::Yaml => format!("%YAML:1.0\n---\n{out}"),
-        Form::Json => format!("{{\n{out}}}\n"),
+        StorageForm::Xml => format!("<?xml version=\"1.0\"?>\n<opencv_storage>\n{out}</opencv_storage>\n"),
+        StorageForm::Yaml => format!("%YAML:1.0\n---\n{out}"),
+        StorageForm::Json => format!("{{\n{out}}}\n"),
     }
 }
 
@@ -98,30 +98,30 @@ fn lines(data: &[f64], between: &str, indent: usize) -> String {
     out
 }
 
-fn values(camera: &ProjectorCamera) -> Vec<(&'static str, Value)> {
+fn values(camera: &ProjectorCamera) -> Vec<(&'static str, StoredValue)> {
     let k = vec![camera.fx, 0.0, camera.cx - 0.5, 0.0, camera.fy, camera.cy - 0.5, 0.0, 0.0, 1.0];
     let mut values = vec![
-        ("image_width", Value::Whole(camera.raster.width())),
-        ("image_height", Value::Whole(camera.raster.height())),
-        ("camera_matrix", Value::Matrix { rows: 3, columns: 3, data: k }),
+        ("image_width", StoredValue::Whole(camera.raster.width())),
+        ("image_height", StoredValue::Whole(camera.raster.height())),
+        ("camera_matrix", StoredValue::Matrix { rows: 3, columns: 3, data: k }),
     ];
     match camera.lens.model() {
         LensModel::Pinhole => {}
         LensModel::Brown(c) => {
             let used = c.iter().rposition(|v| *v != 0.0).map_or(0, |i| i + 1);
             let count = [4, 5, 8, 12, 14].into_iter().find(|n| *n >= used).unwrap_or(14);
-            values.push(("distortion_coefficients", Value::column(c[..count].to_vec())));
+            values.push(("distortion_coefficients", StoredValue::column(c[..count].to_vec())));
         }
         LensModel::Fisheye(k) => {
-            values.push(("distortion_coefficients", Value::column(k.to_vec())));
-            values.push(("fisheye_model", Value::Whole(1)));
+            values.push(("distortion_coefficients", StoredValue::column(k.to_vec())));
+            values.push(("fisheye_model", StoredValue::Whole(1)));
         }
     }
     let pose = camera.world_from_projector;
     let flip = DMat3::from_diagonal(DVec3::new(1.0, -1.0, -1.0));
     let turned = flip * pose.matrix3.transpose();
     let vector = dpm_common::so3::so3_log(DQuat::from_mat3(&turned).normalize());
-    values.push(("rvec", Value::column(vector.to_array().into())));
-    values.push(("tvec", Value::column((-(turned * pose.translation)).to_array().into())));
+    values.push(("rvec", StoredValue::column(vector.to_array().into())));
+    values.push(("tvec", StoredValue::column((-(turned * pose.translation)).to_array().into())));
     values
 }

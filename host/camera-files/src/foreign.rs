@@ -1,6 +1,6 @@
 //! Forms and lenses of other programs that are not read, each with what to give instead.
 
-use super::entries::{Entries, Entry, Matrix};
+use super::entries::{Entries, FileEntry, Matrix};
 use super::names::plain;
 use super::{rotation, StorageError};
 use glam::{DMat3, DVec3};
@@ -72,7 +72,7 @@ pub(super) fn explained(error: StorageError, all: &Entries) -> StorageError {
         return error;
     }
     let names = || {
-        let of = |(section, inside): (&'_ String, &'_ std::collections::BTreeMap<String, Entry>)| {
+        let of = |(section, inside): (&'_ String, &'_ std::collections::BTreeMap<String, FileEntry>)| {
             let path = section.split('/').map(str::to_owned);
             path.chain(inside.keys().cloned()).collect::<Vec<_>>()
         };
@@ -129,14 +129,14 @@ pub(super) fn refused_model(path: &str, word: &str, what: &str) -> StorageError 
 
 /// A rigid transformation of a chain.
 #[derive(Clone, Copy)]
-struct Link {
+struct ChainLink {
     turn: DMat3,
     shift: DVec3,
 }
 
-impl Link {
-    fn of(entry: Option<&Entry>) -> Option<Self> {
-        let Some(Entry::Matrix(m)) = entry else { return None };
+impl ChainLink {
+    fn of(entry: Option<&FileEntry>) -> Option<Self> {
+        let Some(FileEntry::Matrix(m)) = entry else { return None };
         if m.columns != 4 || !(3..=4).contains(&m.rows) || m.data.iter().any(|v| !v.is_finite()) {
             return None;
         }
@@ -150,11 +150,11 @@ impl Link {
         Self { turn: self.turn * first.turn, shift: self.turn * first.shift + self.shift }
     }
 
-    fn entry(self) -> Entry {
+    fn entry(self) -> FileEntry {
         let (r, t) = (self.turn.transpose().to_cols_array(), self.shift);
         let data =
             vec![r[0], r[1], r[2], t.x, r[3], r[4], r[5], t.y, r[6], r[7], r[8], t.z, 0.0, 0.0, 0.0, 1.0];
-        Entry::Matrix(Matrix { rows: 4, columns: 4, data })
+        FileEntry::Matrix(Matrix { rows: 4, columns: 4, data })
     }
 }
 
@@ -169,12 +169,12 @@ const FROM_UNIT: &str = "T_cam_imu";
 /// # Errors
 /// A camera with both places, which contradict each other.
 pub(super) fn join_chain(all: &mut Entries) -> Result<(), StorageError> {
-    let (mut from_unit, mut from_first): (Option<Link>, Option<Link>) = (None, None);
+    let (mut from_unit, mut from_first): (Option<ChainLink>, Option<ChainLink>) = (None, None);
     for number in 0.. {
         let section = format!("cam{number}");
         let Some(inside) = all.sections.get_mut(&section) else { break };
-        let step = Link::of(inside.get(FROM_BEFORE));
-        let own = Link::of(inside.get(FROM_UNIT));
+        let step = ChainLink::of(inside.get(FROM_BEFORE));
+        let own = ChainLink::of(inside.get(FROM_UNIT));
         let by_chain = from_unit.zip(step).map(|(before, step)| step.after(before));
         if let Some((own, chained)) = own.zip(by_chain) {
             let turned = (own.turn - chained.turn).to_cols_array().iter().any(|v| v.abs() > 2e-3);
@@ -184,7 +184,7 @@ pub(super) fn join_chain(all: &mut Entries) -> Result<(), StorageError> {
             }
         }
         from_first = match number {
-            0 => step.is_none().then_some(Link { turn: DMat3::IDENTITY, shift: DVec3::ZERO }),
+            0 => step.is_none().then_some(ChainLink { turn: DMat3::IDENTITY, shift: DVec3::ZERO }),
             _ => from_first.zip(step).map(|(before, step)| step.after(before)),
         };
         from_unit = own.or(by_chain);

@@ -1,17 +1,17 @@
 //! Reads OpenCV's JSON, which is not quite JSON: it has comments, `.Nan` and `.Inf`.
 
-use super::entries::{inner, number, Entries, Entry, Parts};
+use super::entries::{inner, number, Entries, FileEntry, MatrixParts};
 use super::StorageError;
 
 /// Deepest nesting that is read.
 const DEEPEST: usize = 64;
 
-enum Value<'a> {
+enum JsonValue<'a> {
     /// A number, `true`, `null`, `.Nan`: whatever has no quotes.
     Word(&'a str),
     Text(String),
-    List(Vec<Value<'a>>),
-    Map(Vec<(String, Value<'a>)>),
+    List(Vec<JsonValue<'a>>),
+    Map(Vec<(String, JsonValue<'a>)>),
 }
 
 struct Parser<'a> {
@@ -62,13 +62,13 @@ impl<'a> Parser<'a> {
         }
     }
 
-    fn value(&mut self, depth: usize) -> Result<Value<'a>, StorageError> {
+    fn value(&mut self, depth: usize) -> Result<JsonValue<'a>, StorageError> {
         if depth == DEEPEST {
             return self.wrong(format!("values are nested more than {DEEPEST} deep"));
         }
         match self.peek() {
             None => self.wrong("the text ends within a value"),
-            Some('"') => Ok(Value::Text(self.string()?)),
+            Some('"') => Ok(JsonValue::Text(self.string()?)),
             Some('[') => {
                 self.at += 1;
                 let mut list = Vec::new();
@@ -78,7 +78,7 @@ impl<'a> Parser<'a> {
                     go = self.more(']')?;
                 }
                 self.expect(']')?;
-                Ok(Value::List(list))
+                Ok(JsonValue::List(list))
             }
             Some('{') => {
                 self.at += 1;
@@ -91,7 +91,7 @@ impl<'a> Parser<'a> {
                     go = self.more('}')?;
                 }
                 self.expect('}')?;
-                Ok(Value::Map(map))
+                Ok(JsonValue::Map(map))
             }
             Some(_) => {
                 let rest = self.rest();
@@ -101,7 +101,7 @@ impl<'a> Parser<'a> {
                     return self.wrong("a value is missing");
                 }
                 self.at += length;
-                Ok(Value::Word(&rest[..length]))
+                Ok(JsonValue::Word(&rest[..length]))
             }
         }
     }
@@ -163,24 +163,24 @@ pub(super) fn entries(text: &str) -> Result<Entries, StorageError> {
     Ok(found)
 }
 
-fn add(found: &mut Entries, section: &str, name: &str, value: &Value) -> Result<(), StorageError> {
+fn add(found: &mut Entries, section: &str, name: &str, value: &JsonValue) -> Result<(), StorageError> {
     match value {
-        Value::Word(word) => found.add(section, name, Entries::word(word)),
-        Value::Text(text) => found.add(section, name, Entry::Text(text.clone())),
-        Value::List(list) => match rows(list) {
+        JsonValue::Word(word) => found.add(section, name, Entries::word(word)),
+        JsonValue::Text(text) => found.add(section, name, FileEntry::Text(text.clone())),
+        JsonValue::List(list) => match rows(list) {
             Some(rows) => found.add(section, name, Entries::list(rows)),
             None => {
                 let inside = inner(section, name)?;
                 for (i, value) in list.iter().enumerate() {
                     match value {
-                        Value::Map(_) | Value::List(_) => add(found, &inside, &i.to_string(), value)?,
-                        Value::Word(_) | Value::Text(_) => found.add(section, name, Entry::Other),
+                        JsonValue::Map(_) | JsonValue::List(_) => add(found, &inside, &i.to_string(), value)?,
+                        JsonValue::Word(_) | JsonValue::Text(_) => found.add(section, name, FileEntry::Other),
                     }
                 }
             }
         },
-        Value::Map(map) => match matrix(name, map)? {
-            Some(matrix) => found.add(section, name, Entry::Matrix(matrix)),
+        JsonValue::Map(map) => match matrix(name, map)? {
+            Some(matrix) => found.add(section, name, FileEntry::Matrix(matrix)),
             None => {
                 let inside = inner(section, name)?;
                 map.iter().try_for_each(|(key, v)| add(found, &inside, key, v))?;
@@ -191,19 +191,19 @@ fn add(found: &mut Entries, section: &str, name: &str, value: &Value) -> Result<
 }
 
 /// The matrix that a map describes, if it describes one.
-fn matrix(name: &str, map: &[(String, Value)]) -> Result<Option<super::Matrix>, StorageError> {
+fn matrix(name: &str, map: &[(String, JsonValue)]) -> Result<Option<super::Matrix>, StorageError> {
     let get = |key: &str| map.iter().find(|(k, _)| k == key).map(|(_, v)| v);
     let word = |key: &str| match get(key) {
-        Some(Value::Word(word)) => Some(*word),
-        Some(Value::Text(text)) => Some(text.as_str()),
+        Some(JsonValue::Word(word)) => Some(*word),
+        Some(JsonValue::Text(text)) => Some(text.as_str()),
         _ => None,
     };
     let tagged = word("type_id") == Some("opencv-matrix");
     if !tagged && (get("rows").is_none() || get("cols").is_none() || get("data").is_none()) {
         return Ok(None);
     }
-    let parts = Parts { rows: word("rows"), columns: word("cols"), kind: word("dt") };
-    let Some(Value::List(data)) = get("data") else {
+    let parts = MatrixParts { rows: word("rows"), columns: word("cols"), kind: word("dt") };
+    let Some(JsonValue::List(data)) = get("data") else {
         return Err(StorageError::matrix(
             name,
             if get("data").is_some() { "data is not a list" } else { "no data" },
@@ -212,7 +212,7 @@ fn matrix(name: &str, map: &[(String, Value)]) -> Result<Option<super::Matrix>, 
     let mut numbers = Vec::with_capacity(data.len());
     for value in data {
         match value {
-            Value::Word(word) => match number(word) {
+            JsonValue::Word(word) => match number(word) {
                 Some(value) => numbers.push(value),
                 None => return Err(StorageError::matrix(name, format!("{word:?} is not a number"))),
             },
@@ -223,11 +223,11 @@ fn matrix(name: &str, map: &[(String, Value)]) -> Result<Option<super::Matrix>, 
 }
 
 /// The numbers of a list, or of a list of lists; `None` if it holds anything else.
-fn rows(list: &[Value]) -> Option<Vec<Vec<f64>>> {
-    let word = |v: &Value| if let Value::Word(w) = v { number(w) } else { None };
+fn rows(list: &[JsonValue]) -> Option<Vec<Vec<f64>>> {
+    let word = |v: &JsonValue| if let JsonValue::Word(w) = v { number(w) } else { None };
     if let Some(row) = list.iter().map(word).collect::<Option<Vec<f64>>>() {
         return Some(vec![row]);
     }
-    let row = |v: &Value| if let Value::List(l) = v { l.iter().map(word).collect() } else { None };
+    let row = |v: &JsonValue| if let JsonValue::List(l) = v { l.iter().map(word).collect() } else { None };
     list.iter().map(row).collect()
 }

@@ -20,8 +20,8 @@ mod dialect_tests;
 #[cfg(test)]
 mod tests;
 
-pub use entries::{Entries, Entry, Matrix};
-pub use export::{export, Form};
+pub use entries::{Entries, FileEntry, Matrix};
+pub use export::{export, StorageForm};
 
 use dpm_device::planes::Raster;
 use dpm_scene::geometry::lens::LensError;
@@ -81,7 +81,7 @@ pub struct ReadOptions<'a> {
 
 /// In what the pose of a file's projector is told.
 #[derive(Clone, Debug, PartialEq, Eq)]
-pub enum Frame {
+pub enum PoseFrame {
     /// In the world of whoever calibrated.
     World,
     /// In the frame of the camera that calibrated it: +X right, +Y down, looking along +Z.
@@ -103,7 +103,7 @@ pub struct StoredCalibration {
     /// The projector with its lens, at [`ReadOptions::raster`], in [`Self::frame`], metres.
     pub camera: ProjectorCamera,
     /// The frame of its pose.
-    pub frame: Frame,
+    pub frame: PoseFrame,
     /// Columns and rows of the raster that the file names, if it names one.
     pub image_size: Option<(u32, u32)>,
     /// Names under which the parts were found, for the operator.
@@ -257,7 +257,7 @@ pub fn read(bytes: &[u8], options: &ReadOptions) -> Result<StoredCalibration, St
 /// As [`read`], but a file without a pose is as good as one with it.
 pub fn read_lens(bytes: &[u8], options: &ReadOptions) -> Result<StoredCalibration, StorageError> {
     let mut stored = read_for(bytes, options, Purpose::Lens)?;
-    (stored.camera.world_from_projector, stored.frame) = (DAffine3::IDENTITY, Frame::World);
+    (stored.camera.world_from_projector, stored.frame) = (DAffine3::IDENTITY, PoseFrame::World);
     Ok(stored)
 }
 

@@ -12,7 +12,9 @@
 //! The other profiles tell the view of the picture that is to be warped, and not the projector's.
 
 use super::xml::Document;
-use super::{pose, rotation, Frame, Intrinsics, LengthUnit, ReadOptions, StorageError, StoredCalibration};
+use super::{
+    pose, rotation, Intrinsics, LengthUnit, PoseFrame, ReadOptions, StorageError, StoredCalibration,
+};
 use dpm_device::planes::Raster;
 use dpm_scene::geometry::projector::ProjectorCamera;
 use glam::{DMat3, DVec3};
@@ -53,7 +55,7 @@ pub(super) fn read(text: &str, options: &ReadOptions) -> Result<StoredCalibratio
     let Intrinsics { fx, fy, cx, cy } = intrinsics;
     Ok(StoredCalibration {
         camera: ProjectorCamera::new(options.raster, pose, fx, fy, cx, cy)?,
-        frame: Frame::World,
+        frame: PoseFrame::World,
         image_size: Some(size),
         found: vec![format!("region: {}", region.id)],
         unread,

@@ -6,7 +6,7 @@
 
 /// Whose an entry is, by its name alone.
 #[derive(Clone, Debug, PartialEq, Eq, PartialOrd, Ord)]
-pub(super) enum Owner {
+pub(super) enum EntryOwner {
     /// That of the section's only device.
     Own,
     /// A projector's.
@@ -17,7 +17,7 @@ pub(super) enum Owner {
     Other(String),
 }
 
-impl Owner {
+impl EntryOwner {
     /// Its name for a message and for `calibration_device`.
     pub(super) fn label(&self) -> &str {
         match self {
@@ -69,14 +69,14 @@ pub(super) enum Role {
 }
 
 /// What a name means; `None` if it is unknown.
-pub(super) fn meaning(name: &str) -> Option<(Owner, Role, bool)> {
+pub(super) fn meaning(name: &str) -> Option<(EntryOwner, Role, bool)> {
     let exact = EXACT.iter().find(|(known, ..)| *known == name);
     if let Some((_, owner, role, from_camera)) = exact {
         return Some((owner.clone(), *role, *from_camera));
     }
     let plain = plain(name);
     if let Some(role) = role(&plain) {
-        return Some((Owner::Own, role, false));
+        return Some((EntryOwner::Own, role, false));
     }
     let (owner, rest) = owner(&plain)?;
     Some((owner, role(rest)?, false))
@@ -88,41 +88,41 @@ pub(super) fn plain(name: &str) -> String {
 }
 
 /// Names whose case or meaning is their dialect's own. The last column: the pose leads from a camera to the projector.
-const EXACT: &[(&str, Owner, Role, bool)] = &[
-    ("roration", Owner::Own, Role::Rotation, true),
-    ("R_cp", Owner::Own, Role::Rotation, true),
-    ("T_cp", Owner::Own, Role::Translation, true),
-    ("cam_proj_rotation", Owner::Own, Role::Rotation, true),
-    ("cam_proj_translation", Owner::Own, Role::Translation, true),
-    ("Kc", Owner::Camera, Role::Intrinsics, false),
-    ("kc", Owner::Camera, Role::Distortion, false),
-    ("Kp", Owner::Projector, Role::Intrinsics, false),
-    ("kp", Owner::Projector, Role::Distortion, false),
-    ("Rp", Owner::Projector, Role::Rotation, true),
-    ("Tp", Owner::Projector, Role::Translation, true),
-    ("screenResX", Owner::Projector, Role::Width, false),
-    ("screenResY", Owner::Projector, Role::Height, false),
-    ("frameWidth", Owner::Camera, Role::Width, false),
-    ("frameHeight", Owner::Camera, Role::Height, false),
-    ("T_cn_cnm1", Owner::Own, Role::Pose, true),
-    ("img_shape", Owner::Camera, Role::Shape, false),
+const EXACT: &[(&str, EntryOwner, Role, bool)] = &[
+    ("roration", EntryOwner::Own, Role::Rotation, true),
+    ("R_cp", EntryOwner::Own, Role::Rotation, true),
+    ("T_cp", EntryOwner::Own, Role::Translation, true),
+    ("cam_proj_rotation", EntryOwner::Own, Role::Rotation, true),
+    ("cam_proj_translation", EntryOwner::Own, Role::Translation, true),
+    ("Kc", EntryOwner::Camera, Role::Intrinsics, false),
+    ("kc", EntryOwner::Camera, Role::Distortion, false),
+    ("Kp", EntryOwner::Projector, Role::Intrinsics, false),
+    ("kp", EntryOwner::Projector, Role::Distortion, false),
+    ("Rp", EntryOwner::Projector, Role::Rotation, true),
+    ("Tp", EntryOwner::Projector, Role::Translation, true),
+    ("screenResX", EntryOwner::Projector, Role::Width, false),
+    ("screenResY", EntryOwner::Projector, Role::Height, false),
+    ("frameWidth", EntryOwner::Camera, Role::Width, false),
+    ("frameHeight", EntryOwner::Camera, Role::Height, false),
+    ("T_cn_cnm1", EntryOwner::Own, Role::Pose, true),
+    ("img_shape", EntryOwner::Camera, Role::Shape, false),
 ];
 
 /// Words before and behind which a name names its device.
-fn owner(plain: &str) -> Option<(Owner, &str)> {
-    const DEVICES: [(&str, Owner); 5] = [
-        ("projector", Owner::Projector),
-        ("proj", Owner::Projector),
-        ("prj", Owner::Projector),
-        ("camera", Owner::Camera),
-        ("cam", Owner::Camera),
+fn owner(plain: &str) -> Option<(EntryOwner, &str)> {
+    const DEVICES: [(&str, EntryOwner); 5] = [
+        ("projector", EntryOwner::Projector),
+        ("proj", EntryOwner::Projector),
+        ("prj", EntryOwner::Projector),
+        ("camera", EntryOwner::Camera),
+        ("cam", EntryOwner::Camera),
     ];
     for (word, device) in DEVICES {
         if let Some(rest) = plain.strip_prefix(word) {
             let number = rest.len() - rest.trim_start_matches(|c: char| c.is_ascii_digit()).len();
             // "cameraMatrix1" is the matrix of device 1, and "cam1K" the K of camera 1.
             if number > 0 && role(&rest[number..]).is_some() {
-                return Some((Owner::Other(plain[..word.len() + number].into()), &rest[number..]));
+                return Some((EntryOwner::Other(plain[..word.len() + number].into()), &rest[number..]));
             }
             if role(rest).is_some() {
                 return Some((device, rest));
@@ -135,14 +135,14 @@ fn owner(plain: &str) -> Option<(Owner, &str)> {
     for side in ["left", "right"] {
         let rest = plain.strip_prefix(side).or_else(|| plain.strip_suffix(side));
         if let Some(rest) = rest.filter(|rest| role(rest).is_some()) {
-            return Some((Owner::Other(side.into()), rest));
+            return Some((EntryOwner::Other(side.into()), rest));
         }
     }
     let rest = plain.trim_end_matches(|c: char| c.is_ascii_digit());
     let is_numbered = rest.len() < plain.len() && role(rest).is_some();
     // R1, P1 and Q are of a stereo rectification, and not a pose.
     let is_pose = matches!(rest, "r" | "p");
-    (is_numbered && !is_pose).then(|| (Owner::Other(plain[rest.len()..].into()), rest))
+    (is_numbered && !is_pose).then(|| (EntryOwner::Other(plain[rest.len()..].into()), rest))
 }
 
 /// Names without their devices', in lower case and of letters and digits alone, by what they mean.

@@ -70,7 +70,7 @@ fn files_of_opencv_project_as_opencv_does() {
         assert!(golden.len() > 200);
         for form in ["xml", "yml", "json"] {
             let stored = read_text(&made_by_opencv(&format!("{model}.{form}")), LengthUnit::Metre).unwrap();
-            assert_eq!((stored.image_size, &stored.frame), (Some((1024, 768)), &Frame::World));
+            assert_eq!((stored.image_size, &stored.frame), (Some((1024, 768)), &PoseFrame::World));
             assert!(stored.unread.is_empty(), "{:?}", stored.unread);
             for (world, pixel) in &golden {
                 let got = stored.camera.project(*world).unwrap();
@@ -107,10 +107,10 @@ fn a_file_for_another_raster_of_the_same_shape_is_scaled_and_one_of_another_shap
 fn what_is_exported_is_read_back_in_every_form() {
     for model in MODELS {
         let first = read_text(&made_by_opencv(&format!("{model}.xml")), LengthUnit::Metre).unwrap().camera;
-        for form in [Form::Xml, Form::Yaml, Form::Json] {
+        for form in [StorageForm::Xml, StorageForm::Yaml, StorageForm::Json] {
             let text = export(&first, form);
             let back = read_text(&text, LengthUnit::Metre).unwrap();
-            assert!(back.unread.is_empty() && back.frame == Frame::World);
+            assert!(back.unread.is_empty() && back.frame == PoseFrame::World);
             let b = back.camera;
             assert_eq!(b.lens.model(), first.lens.model(), "{text}");
             let apart = DVec4::new(b.fx - first.fx, b.fy - first.fy, b.cx - first.cx, b.cy - first.cy);
@@ -128,19 +128,21 @@ fn what_is_exported_is_read_back_in_every_form() {
 fn an_export_keeps_its_bytes() {
     for model in MODELS {
         let camera = read_text(&made_by_opencv(&format!("{model}.xml")), LengthUnit::Metre).unwrap().camera;
-        for (form, extension) in [(Form::Xml, "xml"), (Form::Yaml, "yml"), (Form::Json, "json")] {
+        for (form, extension) in
+            [(StorageForm::Xml, "xml"), (StorageForm::Yaml, "yml"), (StorageForm::Json, "json")]
+        {
             let path = folder().join(format!("exported/{model}.{extension}"));
             let text = export(&camera, form);
             if std::env::var_os("DPM_UPDATE_EXPORTS").is_some() {
                 std::fs::create_dir_all(path.parent().unwrap()).unwrap();
                 std::fs::write(&path, &text).unwrap();
             }
-            assert_eq!(Form::of(&path), Some(form));
+            assert_eq!(StorageForm::of(&path), Some(form));
             assert_eq!(std::fs::read_to_string(&path).unwrap(), text, "{}", path.display());
         }
     }
-    assert_eq!(Form::of(Path::new("a.YAML")), Some(Form::Yaml));
-    assert_eq!(Form::of(Path::new("a.txt")), None);
+    assert_eq!(StorageForm::of(Path::new("a.YAML")), Some(StorageForm::Yaml));
+    assert_eq!(StorageForm::of(Path::new("a.txt")), None);
 }
 
 #[test]
@@ -204,7 +206,7 @@ fn a_file_of_procam_calibration_is_in_its_cameras_frame() {
         matrix("translation", 3, 1, "39. -278. -61."),
     ];
     let stored = read_text(&storage(&inside.concat()), LengthUnit::Millimetre).unwrap();
-    assert_eq!(stored.frame, Frame::Camera { name: "roration".into() });
+    assert_eq!(stored.frame, PoseFrame::Camera { name: "roration".into() });
     assert!(stored.unread == ["the device camera"] && stored.image_size.is_none(), "{stored:?}");
     // The camera's picture is not the projector's raster, and its lens is not the projector's.
     assert!(matches!(stored.camera.lens.model(), LensModel::Brown(c) if c[0] == -0.09));
@@ -219,7 +221,7 @@ fn a_file_of_procam_calibration_is_in_its_cameras_frame() {
     // With another spelling the camera's intrinsics still show whose frame it is.
     let spelled = storage(&inside.concat().replace("roration", "rotation"));
     let frame = read_text(&spelled, LengthUnit::Millimetre).unwrap().frame;
-    assert_eq!(frame, Frame::Camera { name: "cam_int".into() });
+    assert_eq!(frame, PoseFrame::Camera { name: "cam_int".into() });
 }
 
 /// The entries that mapamok writes: `cv::Size` and `cv::Point2d` are lists, and the rotation is told three times.
@@ -242,7 +244,7 @@ fn a_file_of_mapamok_is_read() {
     ]
     .concat();
     let stored = read_text(&text, LengthUnit::Metre).unwrap();
-    assert_eq!((stored.image_size, stored.frame), (Some((1024, 768)), Frame::World));
+    assert_eq!((stored.image_size, stored.frame), (Some((1024, 768)), PoseFrame::World));
     assert!(stored.unread.is_empty(), "{:?}", stored.unread);
     let pixel = stored.camera.project(DVec3::new(0.5, 0.2, 2.0)).unwrap();
     let want = DVec2::new(512.0 - 1200.0 * 0.1 / 2.3, 384.0 + 1100.0 * 0.7 / 2.3);
@@ -400,7 +402,7 @@ fn a_region_of_mpcdi_looks_where_its_angles_say() {
         read(text.as_bytes(), &ReadOptions { raster, region, ..options(LengthUnit::Metre) })
     };
     let stored = at(MPCDI, None).unwrap();
-    assert_eq!((stored.image_size, &stored.frame), (Some((1400, 1050)), &Frame::World));
+    assert_eq!((stored.image_size, &stored.frame), (Some((1400, 1050)), &PoseFrame::World));
     assert!(stored.unread.is_empty());
     let c = stored.camera;
     assert!((c.position() - DVec3::new(1.0, -1.0, -0.5)).length() < 1e-12);

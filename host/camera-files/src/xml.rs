@@ -1,7 +1,7 @@
 //! A small reader of XML: the elements of a text with their attributes and texts. No entities are fetched, no document
 //! type is followed, and the depth is bounded.
 
-use super::entries::{inner, Entries, Entry, Parts};
+use super::entries::{inner, Entries, FileEntry, MatrixParts};
 use super::StorageError;
 
 /// Deepest nesting that is read.
@@ -9,7 +9,7 @@ const DEEPEST: usize = 64;
 
 /// One element.
 #[derive(Debug)]
-pub(super) struct Element<'a> {
+pub(super) struct XmlElement<'a> {
     pub name: &'a str,
     attributes: &'a str,
     /// Its own text, without that of its children.
@@ -25,7 +25,7 @@ pub(super) struct Element<'a> {
 /// All elements of a text, in the order in which they start.
 #[derive(Debug)]
 pub(super) struct Document<'a> {
-    pub elements: Vec<Element<'a>>,
+    pub elements: Vec<XmlElement<'a>>,
 }
 
 impl<'a> Document<'a> {
@@ -53,7 +53,7 @@ impl<'a> Document<'a> {
 
     /// Splits a text into elements.
     pub(super) fn parse(text: &'a str) -> Result<Self, StorageError> {
-        let mut elements: Vec<Element<'a>> = Vec::new();
+        let mut elements: Vec<XmlElement<'a>> = Vec::new();
         let mut open: Vec<usize> = Vec::new();
         let mut rest = text;
         loop {
@@ -86,7 +86,7 @@ impl<'a> Document<'a> {
                 let (parent, index) = (open.last().copied(), elements.len());
                 let is_matrix = attribute(attributes, "type_id").is_some_and(|kind| kind == "opencv-matrix");
                 let (text, children) = (String::new(), Vec::new());
-                elements.push(Element { name, attributes, text, children, parent, is_matrix });
+                elements.push(XmlElement { name, attributes, text, children, parent, is_matrix });
                 if let Some(i) = parent {
                     elements[i].children.push(index);
                 }
@@ -129,9 +129,9 @@ impl<'a> Document<'a> {
             }
             if element.is_matrix {
                 let text = |name| self.child_text(i, name);
-                let parts = Parts { rows: text("rows"), columns: text("cols"), kind: text("dt") };
+                let parts = MatrixParts { rows: text("rows"), columns: text("cols"), kind: text("dt") };
                 let data = text("data").ok_or_else(|| StorageError::matrix(element.name, "no data"))?;
-                found.add(&section, &name, Entry::Matrix(parts.matrix(element.name, data)?));
+                found.add(&section, &name, FileEntry::Matrix(parts.matrix(element.name, data)?));
                 continue;
             }
             let words: Vec<&str> = element.text.split_whitespace().collect();

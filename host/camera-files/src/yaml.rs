@@ -5,7 +5,7 @@
 //! words by name in nested sections. Files without the tag `!!opencv-matrix` (ROS writes such), lists of lists line by line
 //! (kalibr and PyYAML) and maps in braces are read as well.
 
-use super::entries::{inner, number, Entries, Entry, Parts};
+use super::entries::{inner, number, Entries, FileEntry, MatrixParts};
 use super::{json, StorageError};
 
 /// Deepest nesting that is read.
@@ -18,7 +18,7 @@ struct Open<'a> {
     /// Section that the name stands in.
     section: String,
     tagged: bool,
-    parts: Parts<'a>,
+    parts: MatrixParts<'a>,
     /// Members of a sequence whose lines follow, and what they are.
     sequence: Sequence,
 }
@@ -54,9 +54,9 @@ impl Sequence {
         }
     }
 
-    fn entry(self) -> Entry {
+    fn entry(self) -> FileEntry {
         if self.other {
-            return Entry::Other;
+            return FileEntry::Other;
         }
         Entries::list(self.rows)
     }
@@ -207,8 +207,8 @@ impl<'a> Open<'a> {
                 let list = list.strip_prefix('[').ok_or_else(|| error("data does not start with ["))?;
                 let end = list.find(']').ok_or_else(|| error("data does not end with ]"))?;
                 let matrix = self.parts.matrix(self.name, &list[..end])?;
-                found.add(&self.section, self.name, Entry::Matrix(matrix));
-                (self.tagged, self.parts) = (false, Parts::default());
+                found.add(&self.section, self.name, FileEntry::Matrix(matrix));
+                (self.tagged, self.parts) = (false, MatrixParts::default());
                 return Ok(Some(rest.len() - list.len() + end + 1));
             }
             _ => return Ok(None),
@@ -235,12 +235,12 @@ fn take_named<'a>(
             return Err(StorageError::Syntax { form: "YAML", line, what });
         }
         let tagged = !item.value.is_empty();
-        let (parts, sequence) = (Parts::default(), Sequence::default());
+        let (parts, sequence) = (MatrixParts::default(), Sequence::default());
         open.push(Open { indent: item.inner, name: key, section, tagged, parts, sequence });
     } else if item.value.starts_with('[') {
         let length =
             list_length(rest).ok_or_else(|| StorageError::matrix(key, "the list does not end with ]"))?;
-        found.add(&section, key, rows(&rest[..length]).map_or(Entry::Other, Entries::list));
+        found.add(&section, key, rows(&rest[..length]).map_or(FileEntry::Other, Entries::list));
         return Ok(length);
     } else if item.value.starts_with('{') {
         return json::add_map(found, &section, key, rest);
@@ -256,8 +256,8 @@ fn close<'a>(open: &mut Vec<Open<'a>>, found: &mut Entries) -> Result<(), Storag
     let Some(Open { name, section, tagged, parts, sequence, .. }) = open.pop() else { return Ok(()) };
     if let Some(around) = open.last_mut().filter(|o| name == "data" && o.parts.rows.is_some()) {
         let matrix = around.parts.matrix_of(around.name, sequence.rows.concat())?;
-        found.add(&around.section, around.name, Entry::Matrix(matrix));
-        (around.tagged, around.parts) = (false, Parts::default());
+        found.add(&around.section, around.name, FileEntry::Matrix(matrix));
+        (around.tagged, around.parts) = (false, MatrixParts::default());
         return Ok(());
     }
     if tagged {
@@ -270,7 +270,7 @@ fn close<'a>(open: &mut Vec<Open<'a>>, found: &mut Entries) -> Result<(), Storag
     let inside = inner(&section, name)?;
     // PyYAML sorts the keys, so that the numbers stand before the rows.
     if let (Some(_), Some(_), Some(data)) = (parts.rows, parts.columns, found.take_matrix(&inside, "data")) {
-        found.add(&section, name, Entry::Matrix(parts.matrix_of(name, data)?));
+        found.add(&section, name, FileEntry::Matrix(parts.matrix_of(name, data)?));
         return Ok(());
     }
     // A section that counts rows and columns without being a matrix.

@@ -94,9 +94,9 @@ fn is_dirty(top: &Path) -> bool {
 mod tests {
     use super::*;
 
-    struct Folder(PathBuf);
+    struct GitFolder(PathBuf);
 
-    impl Folder {
+    impl GitFolder {
         fn new(name: &str) -> Self {
             let path = std::env::temp_dir().join(format!("dpm-commit-{name}-{}", std::process::id()));
             std::fs::create_dir_all(&path).unwrap();
@@ -114,7 +114,7 @@ mod tests {
         }
     }
 
-    impl Drop for Folder {
+    impl Drop for GitFolder {
         fn drop(&mut self) {
             let _ = std::fs::remove_dir_all(&self.0);
         }
@@ -122,7 +122,7 @@ mod tests {
 
     #[test]
     fn the_commit_is_found_on_a_branch_loose_or_packed_in_a_linked_tree_or_detached() {
-        let root = Folder::new("heads");
+        let root = GitFolder::new("heads");
         let [a, b, c] = ["a", "b", "c"].map(|d| d.repeat(40));
         root.write("main/.git/HEAD", "ref: refs/heads/main\n");
         let packed = format!("# pack-refs\n{b} refs/heads/other\n{a} refs/heads/main\n");
@@ -142,11 +142,11 @@ mod tests {
 
     #[test]
     fn every_file_that_a_commit_changes_is_watched() {
-        let root = Folder::new("watched");
+        let root = GitFolder::new("watched");
         root.write(".git/HEAD", "ref: refs/heads/main\n");
         root.write(".git/packed-refs", &format!("{} refs/heads/main\n", "a".repeat(40)));
         root.write(".git/logs/HEAD", "");
-        let watched = |root: &Folder| {
+        let watched = |root: &GitFolder| {
             let read = head(&root.0).unwrap().1;
             let names = read.iter().map(|p| p.strip_prefix(&root.0).unwrap().to_str().unwrap().to_owned());
             names.collect::<Vec<_>>()
@@ -158,7 +158,7 @@ mod tests {
 
     #[test]
     fn an_archive_unpacked_in_another_projects_tree_has_no_commit() {
-        let root = Folder::new("archive");
+        let root = GitFolder::new("archive");
         root.write(".git/HEAD", &"a".repeat(40));
         root.write("unpacked/Cargo.toml", "");
         let unknown = FolderCommit { text: "unknown".into(), read: Vec::new() };
@@ -170,7 +170,7 @@ mod tests {
 
     #[test]
     fn a_changed_tracked_file_marks_the_commit_and_others_do_not() {
-        let root = Folder::new("dirty");
+        let root = GitFolder::new("dirty");
         let git = |arguments: &[&str]| {
             let identity =
                 ["-c", "user.name=n", "-c", "user.email=e@example.org", "-c", "commit.gpgsign=false"];

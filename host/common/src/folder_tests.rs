@@ -2,9 +2,9 @@ use super::*;
 use std::os::unix::fs::{chown, symlink, PermissionsExt};
 
 /// An empty folder that is removed after the test.
-struct Place(PathBuf);
+struct EmptyFolder(PathBuf);
 
-impl Place {
+impl EmptyFolder {
     fn new(name: &str) -> Self {
         let path = std::env::temp_dir().join(format!("dpm-folder-{}-{name}", std::process::id()));
         let _ = fs::remove_dir_all(&path);
@@ -13,7 +13,7 @@ impl Place {
     }
 }
 
-impl Drop for Place {
+impl Drop for EmptyFolder {
     fn drop(&mut self) {
         let _ = fs::remove_dir_all(&self.0);
     }
@@ -24,7 +24,7 @@ const NOBODY: u32 = 65534;
 /// Found in use, R7: a folder that somebody else made, or can write to, is refused whatever it contains.
 #[test]
 fn r7_only_a_folder_of_our_own_is_used() {
-    let place = Place::new("whose");
+    let place = EmptyFolder::new("whose");
     let dir = place.0.join("dpm-0");
     let made = Folder::make(&dir, Owner::Own).unwrap();
     assert_eq!(fs::metadata(&dir).unwrap().permissions().mode() & 0o777, 0o700);
@@ -55,7 +55,7 @@ fn r7_only_a_folder_of_our_own_is_used() {
 /// Found in use, R7: a link, a second name, a FIFO or a file of another user in place of a lock file is not written to.
 #[test]
 fn r7_files_that_others_planted_are_refused_untouched() {
-    let place = Place::new("planted");
+    let place = EmptyFolder::new("planted");
     let folder = Folder::make(&place.0.join("ours"), Owner::Own).unwrap();
     let at = |name: &str| folder.path().join(name);
     let victim = place.0.join("victim");
@@ -87,7 +87,7 @@ fn r7_files_that_others_planted_are_refused_untouched() {
 
 #[test]
 fn a_file_is_replaced_whole_read_with_a_limit_and_removed() {
-    let place = Place::new("files");
+    let place = EmptyFolder::new("files");
     let folder = Folder::make(&place.0.join("ours"), Owner::Own).unwrap();
     assert!(folder.read("a", 10).unwrap_err().is_missing());
     folder.remove("a").unwrap();
@@ -113,7 +113,7 @@ fn a_file_is_replaced_whole_read_with_a_limit_and_removed() {
 /// Found in use, R4: an order needs no room where its bytes were allocated before.
 #[test]
 fn a_file_is_written_over_and_renamed_in_its_own_blocks() {
-    let place = Place::new("over");
+    let place = EmptyFolder::new("over");
     let folder = Folder::make(&place.0.join("ours"), Owner::Own).unwrap();
     let number = |name: &str| fs::metadata(folder.path().join(name)).unwrap().ino();
     folder.replace("reserve", b"00000000").unwrap();

@@ -93,7 +93,7 @@ fn checked(result: libc::c_int) -> io::Result<()> {
 /// The process at the other end of a socket, as the kernel reports it: for a client, the listener; for a server, the
 /// one that connected.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub struct Peer {
+pub struct SocketPeer {
     /// Process; 0 if it is not visible from here (another PID namespace).
     pub pid: i32,
     /// User.
@@ -104,7 +104,7 @@ pub struct Peer {
 ///
 /// # Errors
 /// Those of getsockopt(2).
-pub fn peer(stream: &UnixStream) -> io::Result<Peer> {
+pub fn peer(stream: &UnixStream) -> io::Result<SocketPeer> {
     let mut told = libc::ucred { pid: 0, uid: 0, gid: 0 };
     let mut size = size_of::<libc::ucred>() as libc::socklen_t;
     // SAFETY: the place is as large as `size` says, and both outlive the call.
@@ -117,7 +117,7 @@ pub fn peer(stream: &UnixStream) -> io::Result<Peer> {
             &raw mut size,
         )
     })?;
-    Ok(Peer { pid: told.pid, uid: told.uid })
+    Ok(SocketPeer { pid: told.pid, uid: told.uid })
 }
 
 /// Sends `signal` to a process.
@@ -174,7 +174,7 @@ mod tests {
     #[test]
     fn both_ends_of_a_socket_are_this_process() {
         let (a, b) = UnixStream::pair().unwrap();
-        let here = Peer { pid: std::process::id() as i32, uid: user() };
+        let here = SocketPeer { pid: std::process::id() as i32, uid: user() };
         assert_eq!((peer(&a).unwrap(), peer(&b).unwrap()), (here, here));
         // Groups, all processes and "not visible" do not name one process.
         for pid in [0, -1, i32::MIN] {

@@ -22,9 +22,9 @@ use drm::control::{
 };
 use drm::{ClientCapability, Device, DriverCapability};
 
-use crate::kms::{Connector, Domain, Kms, Owner, Property, Setup};
+use crate::kms::{Connector, Domain, Kms, Property, PropertyOwner, ScanOutSetup};
 use crate::mode::Timing;
-use crate::scan_out::{DisplayError, Flip, Picture, Pixels, ScanOut};
+use crate::scan_out::{DisplayError, Flip, PictureBuffer, Pixels, ScanOut};
 
 mod find;
 mod guard;
@@ -43,18 +43,18 @@ const STEP: Duration = Duration::from_millis(1);
 
 /// The descriptor of a graphics card, with the kernel's calls of the crate drm.
 #[derive(Debug)]
-pub struct Node(pub OwnedFd);
+pub struct CardDescriptor(pub OwnedFd);
 
-impl AsFd for Node {
+impl AsFd for CardDescriptor {
     fn as_fd(&self) -> BorrowedFd<'_> {
         self.0.as_fd()
     }
 }
 
-impl Device for Node {}
-impl ControlDevice for Node {}
+impl Device for CardDescriptor {}
+impl ControlDevice for CardDescriptor {}
 
-impl Node {
+impl CardDescriptor {
     /// The numbers and names of the connectors that this descriptor sees.
     fn connector_names(&self) -> Vec<(u32, String)> {
         let Ok(resources) = self.resource_handles() else { return Vec::new() };
@@ -85,7 +85,7 @@ struct Memory {
 }
 
 /// What is scanned out.
-struct Output {
+struct ScanOutput {
     route: Route,
     /// Black, and the two for frames.
     pictures: [Memory; 3],
@@ -96,9 +96,9 @@ struct Output {
 
 /// A graphics card, or the part of it that its owner has lent.
 pub struct Card {
-    node: Node,
+    node: CardDescriptor,
     path: PathBuf,
-    output: Option<Output>,
+    output: Option<ScanOutput>,
     /// Who lent it.
     lender: Option<String>,
 }
@@ -148,7 +148,7 @@ impl Card {
                 io::ErrorKind::PermissionDenied => DisplayError::Denied(name.clone()),
                 _ => DisplayError::Call { doing: "open the graphics card", source: e },
             })?;
-        Self::of(Node(file.into()), path.into(), None)
+        Self::of(CardDescriptor(file.into()), path.into(), None)
     }
 
     /// Takes the lease `descriptor`, which `lender` has given: a card with one connector and what drives it. It is given
@@ -166,7 +166,7 @@ impl Card {
         };
         prepare().map_err(|e| call("use the lease")(e.into()))?;
         let path = path_of(&descriptor);
-        Self::of(Node(descriptor), path, Some(lender))
+        Self::of(CardDescriptor(descriptor), path, Some(lender))
     }
 
     /// False if this card is a lease that its owner has taken back.
@@ -180,7 +180,7 @@ impl Card {
     }
 
     /// A card by its descriptor, which sees everything that atomic mode setting needs from now on.
-    fn of(node: Node, path: PathBuf, lender: Option<String>) -> Result<Self, DisplayError> {
+    fn of(node: CardDescriptor, path: PathBuf, lender: Option<String>) -> Result<Self, DisplayError> {
         let name = path.display().to_string();
         let unsuitable = |what: &str| DisplayError::Unsuitable { card: name.clone(), what: what.into() };
         let atomic = node.set_client_capability(ClientCapability::UniversalPlanes, true);
@@ -244,7 +244,7 @@ impl Card {
         })
     }
 
-    fn properties<T: ResourceHandle>(&self, object: T, owner: Owner, out: &mut Vec<Property>) {
+    fn properties<T: ResourceHandle>(&self, object: T, owner: PropertyOwner, out: &mut Vec<Property>) {
         let Ok(all) = self.node.get_properties(object) else { return };
         let (handles, values) = all.as_props_and_values();
         for (handle, value) in handles.iter().zip(values) {
@@ -293,7 +293,7 @@ impl Card {
     fn request(
         &self,
         route: Route,
-        setup: &Setup,
+        setup: &ScanOutSetup,
         mode_blob: u64,
         black: framebuffer::Handle,
     ) -> Result<AtomicModeReq, DisplayError> {
@@ -320,9 +320,9 @@ impl Card {
         }
         for (owner, name, value) in &setup.properties {
             match owner {
-                Owner::Connector => self.set(&mut request, route.connector, name, *value)?,
-                Owner::Crtc => self.set(&mut request, route.crtc, name, *value)?,
-                Owner::Plane => self.set(&mut request, route.plane, name, *value)?,
+                PropertyOwner::Connector => self.set(&mut request, route.connector, name, *value)?,
+                PropertyOwner::Crtc => self.set(&mut request, route.crtc, name, *value)?,
+                PropertyOwner::Plane => self.set(&mut request, route.plane, name, *value)?,
             }
         }
         // Nothing else may lie over the picture: cursors and overlays of whoever was here before.
@@ -422,10 +422,10 @@ impl Kms for Card {
                 continue;
             }
             let mut properties = Vec::new();
-            self.properties(*handle, Owner::Connector, &mut properties);
+            self.properties(*handle, PropertyOwner::Connector, &mut properties);
             if let Some(route) = self.route(&info)? {
-                self.properties(route.crtc, Owner::Crtc, &mut properties);
-                self.properties(route.plane, Owner::Plane, &mut properties);
+                self.properties(route.crtc, PropertyOwner::Crtc, &mut properties);
+                self.properties(route.plane, PropertyOwner::Plane, &mut properties);
             }
             all.push(Connector {
                 name: info.to_string(),
@@ -438,7 +438,7 @@ impl Kms for Card {
         Ok(all)
     }
 
-    fn start(&mut self, setup: &Setup) -> Result<(), DisplayError> {
+    fn start(&mut self, setup: &ScanOutSetup) -> Result<(), DisplayError> {
         self.release();
         let info = self.find(&setup.connector)?;
         let route = self.route(&info)?.ok_or_else(|| DisplayError::Unsuitable {
@@ -458,7 +458,7 @@ impl Kms for Card {
         let black = pictures[0].framebuffer;
         let class = self.path.file_name().map(|card| card.to_string_lossy().into_owned()).unwrap_or_default();
         let status = File::open(format!("/sys/class/drm/{class}-{}/status", setup.connector)).ok();
-        self.output = Some(Output { route, pictures, mode_blob, status });
+        self.output = Some(ScanOutput { route, pictures, mode_blob, status });
         let request = self.request(route, setup, mode_blob, black)?;
         let test = AtomicCommitFlags::TEST_ONLY | AtomicCommitFlags::ALLOW_MODESET;
         self.node
@@ -483,11 +483,11 @@ impl ScanOut for Card {
         Pixels { bytes: &mut memory.map, pitch }
     }
 
-    fn flip(&mut self, picture: Picture) -> Result<(), DisplayError> {
+    fn flip(&mut self, picture: PictureBuffer) -> Result<(), DisplayError> {
         let output = self.output.as_ref().ok_or(DisplayError::Gone)?;
         let index = match picture {
-            Picture::Black => 0,
-            Picture::Frame(frame) => 1 + frame,
+            PictureBuffer::Black => 0,
+            PictureBuffer::Frame(frame) => 1 + frame,
         };
         self.show(output.route.crtc, output.pictures[index].framebuffer, PageFlipFlags::EVENT)
     }

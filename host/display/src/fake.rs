@@ -10,9 +10,9 @@ use dpm_device::rng::Draws;
 use dpm_device::time::HostClock;
 use dpm_handoff::path::Lock;
 
-use crate::kms::{Connector, Domain, Kms, Owner, Property, Setup};
+use crate::kms::{Connector, Domain, Kms, Property, PropertyOwner, ScanOutSetup};
 use crate::mode::Timing;
-use crate::scan_out::{DisplayError, Flip, Picture, Pixels, ScanOut};
+use crate::scan_out::{DisplayError, Flip, PictureBuffer, Pixels, ScanOut};
 
 /// One scanned frame.
 #[derive(Clone, Debug, PartialEq, Eq)]
@@ -47,7 +47,7 @@ pub struct FakeState {
     /// The start is refused.
     pub refuses: bool,
     /// What was started last.
-    pub setup: Option<Setup>,
+    pub setup: Option<ScanOutSetup>,
     /// Everything that was scanned out, oldest first.
     pub scanned: Vec<ScanFrame>,
     /// A picture was written to while it was scanned out or waited.
@@ -78,8 +78,8 @@ pub struct FakeKms {
     started_ns: i64,
     /// The next blank, counted from the start.
     next: u64,
-    front: Picture,
-    waiting: Option<Picture>,
+    front: PictureBuffer,
+    waiting: Option<PictureBuffer>,
     taken: Vec<Flip>,
 }
 
@@ -95,11 +95,16 @@ pub fn display(modes: &[Timing]) -> FakeState {
     let words =
         |all: &[&str]| Domain::Words(all.iter().zip(0..).map(|(w, n)| ((*w).to_owned(), n)).collect());
     let properties = vec![
-        property(Owner::Connector, "max bpc", Domain::Range(8, 16), 16),
-        property(Owner::Connector, "Broadcast RGB", words(&["Automatic", "Full", "Limited 16:235"]), 0),
-        property(Owner::Connector, "dithering mode", words(&["auto", "off", "on"]), 0),
-        property(Owner::Crtc, "GAMMA_LUT", Domain::Blob, 55),
-        property(Owner::Crtc, "VRR_ENABLED", Domain::Range(0, 1), 1),
+        property(PropertyOwner::Connector, "max bpc", Domain::Range(8, 16), 16),
+        property(
+            PropertyOwner::Connector,
+            "Broadcast RGB",
+            words(&["Automatic", "Full", "Limited 16:235"]),
+            0,
+        ),
+        property(PropertyOwner::Connector, "dithering mode", words(&["auto", "off", "on"]), 0),
+        property(PropertyOwner::Crtc, "GAMMA_LUT", Domain::Blob, 55),
+        property(PropertyOwner::Crtc, "VRR_ENABLED", Domain::Range(0, 1), 1),
     ];
     let connector = |name: &str, is_connected| Connector {
         name: name.into(),
@@ -137,7 +142,7 @@ impl FakeKms {
             timing: None,
             started_ns: 0,
             next: 0,
-            front: Picture::Black,
+            front: PictureBuffer::Black,
             waiting: None,
             taken: Vec::new(),
         }
@@ -175,8 +180,8 @@ impl FakeKms {
             }
             let width = 4 * timing.size().0 as usize;
             let pixels = match self.front {
-                Picture::Black => Vec::new(),
-                Picture::Frame(frame) => {
+                PictureBuffer::Black => Vec::new(),
+                PictureBuffer::Frame(frame) => {
                     let rows = self.buffers[frame].chunks_exact(self.pitch);
                     rows.flat_map(|row| row[..width].iter().copied()).collect()
                 }
@@ -209,7 +214,7 @@ impl Kms for FakeKms {
         }))
     }
 
-    fn start(&mut self, setup: &Setup) -> Result<(), DisplayError> {
+    fn start(&mut self, setup: &ScanOutSetup) -> Result<(), DisplayError> {
         if self.with(|s| !s.is_plugged) {
             return Err(DisplayError::Gone);
         }
@@ -221,7 +226,7 @@ impl Kms for FakeKms {
         self.pitch = 4 * width as usize + PADDING;
         self.buffers = [0, 1].map(|_| vec![0; self.pitch * height as usize]);
         (self.timing, self.started_ns, self.next) = (Some(setup.timing), self.clock.now().0, 0);
-        (self.front, self.waiting) = (Picture::Black, None);
+        (self.front, self.waiting) = (PictureBuffer::Black, None);
         self.taken.clear();
         self.with(|s| {
             s.setup = Some(setup.clone());
@@ -235,13 +240,13 @@ impl Kms for FakeKms {
 impl ScanOut for FakeKms {
     fn pixels(&mut self, frame: usize) -> Pixels<'_> {
         self.scan();
-        if [Some(self.front), self.waiting].contains(&Some(Picture::Frame(frame))) {
+        if [Some(self.front), self.waiting].contains(&Some(PictureBuffer::Frame(frame))) {
             self.with(|s| s.torn += 1);
         }
         Pixels { bytes: &mut self.buffers[frame], pitch: self.pitch }
     }
 
-    fn flip(&mut self, picture: Picture) -> Result<(), DisplayError> {
+    fn flip(&mut self, picture: PictureBuffer) -> Result<(), DisplayError> {
         self.scan();
         if self.with(|s| !s.is_plugged) {
             return Err(DisplayError::Gone);
@@ -271,7 +276,7 @@ impl ScanOut for FakeKms {
 
     fn blacken(&mut self) {
         self.scan();
-        (self.front, self.waiting) = (Picture::Black, None);
+        (self.front, self.waiting) = (PictureBuffer::Black, None);
         self.with(|s| s.is_black = true);
     }
 

@@ -6,7 +6,7 @@ use crate::scan_out::{DisplayError, ScanOut};
 
 /// Which object a property belongs to.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Owner {
+pub enum PropertyOwner {
     /// The connector.
     Connector,
     /// What scans out.
@@ -32,7 +32,7 @@ pub enum Domain {
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Property {
     /// Whose it is.
-    pub owner: Owner,
+    pub owner: PropertyOwner,
     /// The kernel's name.
     pub name: String,
     /// What it takes.
@@ -60,13 +60,13 @@ pub struct Connector {
 
 /// What is set when scan-out starts.
 #[derive(Clone, Debug, PartialEq, Eq)]
-pub struct Setup {
+pub struct ScanOutSetup {
     /// The connector's name.
     pub connector: String,
     /// The mode.
     pub timing: Timing,
     /// Properties with their values.
-    pub properties: Vec<(Owner, String, u64)>,
+    pub properties: Vec<(PropertyOwner, String, u64)>,
 }
 
 /// Mode setting: what shows pictures once it is started.
@@ -85,7 +85,7 @@ pub trait Kms: ScanOut {
     ///
     /// # Errors
     /// The kernel refuses; then nothing has changed.
-    fn start(&mut self, setup: &Setup) -> Result<(), DisplayError>;
+    fn start(&mut self, setup: &ScanOutSetup) -> Result<(), DisplayError>;
 
     /// Who has lent the display, if it is lent.
     fn lender(&self) -> Option<&str> {

@@ -73,7 +73,7 @@ impl Lender {
 
 /// Why a desktop did not lend a display.
 #[derive(Clone, Debug, PartialEq, Eq)]
-pub struct Refusal {
+pub struct LeaseRefusal {
     /// What is wrong, and what to do.
     pub what: String,
     /// Somebody else may have it on lease, and give it back soon.
@@ -81,7 +81,7 @@ pub struct Refusal {
 }
 
 #[cfg(any(feature = "wayland", feature = "x11"))]
-impl Refusal {
+impl LeaseRefusal {
     fn new(what: impl Into<String>) -> Self {
         Self { what: what.into(), is_lent: false }
     }
@@ -99,7 +99,7 @@ pub struct Lease {
 
 /// What an opener has on lease, and from whom.
 #[derive(Default)]
-struct Held {
+struct HeldLease {
     lease: Option<Lease>,
     /// Who has lent it once.
     lender: Option<Lender>,
@@ -112,7 +112,7 @@ pub fn opener(
     connector: Option<String>,
     access: Access,
 ) -> impl Fn() -> Result<Box<dyn Kms>, DisplayError> + Send + Sync {
-    let held = Lock::new(Held::default());
+    let held = Lock::new(HeldLease::default());
     move || {
         // Nothing is left half-done by a call that panicked.
         let mut held = held.lock().unwrap_or_else(std::sync::PoisonError::into_inner);
@@ -159,7 +159,7 @@ pub fn look(
 
 /// The card that `held` has on lease, or a new lease.
 fn lent(
-    held: &mut Held,
+    held: &mut HeldLease,
     lender: Lender,
     card: Option<&Path>,
     connector: Option<&str>,
@@ -175,7 +175,7 @@ fn lent(
     }
     let lease = ask(lender, connector)?;
     let card = taken(&lease, card)?;
-    *held = Held { lease: Some(lease), lender: Some(lender) };
+    *held = HeldLease { lease: Some(lease), lender: Some(lender) };
     Ok(Box::new(card))
 }
 
@@ -200,7 +200,7 @@ fn taken(lease: &Lease, wanted: Option<&Path>) -> Result<Card, DisplayError> {
 /// How a desktop is called in messages, and how it is asked.
 struct Desktop {
     name: fn() -> String,
-    lease: fn(Option<&str>, String, Instant) -> Result<Lease, Refusal>,
+    lease: fn(Option<&str>, String, Instant) -> Result<Lease, LeaseRefusal>,
 }
 
 /// The desktops that this program can ask.

@@ -15,7 +15,7 @@ use dpm_handoff::path::Lock;
 
 use crate::encoding::PixelMap;
 use crate::pacer::{NoPace, Pacer, LEARNED, MOST_LEARNED};
-use crate::scan_out::{DisplayError, Flip, Picture, ScanOut};
+use crate::scan_out::{DisplayError, Flip, PictureBuffer, ScanOut};
 
 /// A picture that was not taken for this long means that the display gives no blanks any more, nanoseconds.
 const LOST_AFTER_NS: i64 = 500_000_000;
@@ -51,7 +51,7 @@ impl DisplayCounts {
 /// A picture on its way.
 #[derive(Clone, Copy, Debug)]
 struct InFlight {
-    picture: Picture,
+    picture: PictureBuffer,
     /// The blank from which on it should be shown; `None` while the blanks are learned.
     for_blank: Option<u64>,
     since: HostTime,
@@ -73,7 +73,7 @@ pub struct PanelSettings {
 }
 
 /// A projector whose panel is a display.
-pub struct Panel<S: ScanOut> {
+pub struct DisplayPanel<S: ScanOut> {
     out: S,
     firmware: ProjectorFirmware,
     map: PixelMap,
@@ -91,7 +91,7 @@ pub struct Panel<S: ScanOut> {
     /// The kernel did not take the picture of the newest slot.
     is_refused: bool,
     /// What is scanned out.
-    front: Picture,
+    front: PictureBuffer,
     /// Which frame of the firmware each of the two pictures holds.
     holds: [Option<u64>; 2],
     look_at: HostTime,
@@ -100,7 +100,7 @@ pub struct Panel<S: ScanOut> {
     is_lost: bool,
 }
 
-impl<S: ScanOut> Panel<S> {
+impl<S: ScanOut> DisplayPanel<S> {
     /// The panel in front of `out`, which shows black. `clock` is the rig's. It allocates everything here.
     pub fn new(out: S, settings: PanelSettings, serial: u64, clock: &dyn HostClock) -> Self {
         let PanelSettings { raster, planes, map, rate, lead_ns } = settings;
@@ -135,7 +135,7 @@ impl<S: ScanOut> Panel<S> {
             next: 0,
             in_flight: None,
             is_refused: false,
-            front: Picture::Black,
+            front: PictureBuffer::Black,
             holds: [None; 2],
             look_at: now,
             connector_at: now,
@@ -288,7 +288,7 @@ impl<S: ScanOut> Panel<S> {
                 Err(e) => return self.lose(e.to_string()),
             }
         }
-        self.hand_over(now, Picture::Black, None);
+        self.hand_over(now, PictureBuffer::Black, None);
     }
 
     /// Chooses the pictures of all slots that have begun. Only that of the newest can still be shown.
@@ -316,20 +316,20 @@ impl<S: ScanOut> Panel<S> {
     }
 
     /// The picture that the firmware lights now, written if it is not there yet.
-    fn picture(&mut self) -> Picture {
-        let Some(frame) = self.firmware.lit_generation() else { return Picture::Black };
+    fn picture(&mut self) -> PictureBuffer {
+        let Some(frame) = self.firmware.lit_generation() else { return PictureBuffer::Black };
         if let Some(there) = self.holds.iter().position(|held| *held == Some(frame)) {
-            return Picture::Frame(there);
+            return PictureBuffer::Frame(there);
         }
-        let back = usize::from(self.front == Picture::Frame(0));
-        let Some(planes) = self.firmware.lit_planes() else { return Picture::Black };
+        let back = usize::from(self.front == PictureBuffer::Frame(0));
+        let Some(planes) = self.firmware.lit_planes() else { return PictureBuffer::Black };
         let pixels = self.out.pixels(back);
         self.map.write(self.raster, planes, pixels.bytes, pixels.pitch);
         self.holds[back] = Some(frame);
-        Picture::Frame(back)
+        PictureBuffer::Frame(back)
     }
 
-    fn hand_over(&mut self, now: HostTime, picture: Picture, for_blank: Option<u64>) {
+    fn hand_over(&mut self, now: HostTime, picture: PictureBuffer, for_blank: Option<u64>) {
         match self.out.flip(picture) {
             Ok(()) => {
                 self.in_flight = Some(InFlight { picture, for_blank, since: now });
@@ -353,7 +353,7 @@ impl<S: ScanOut> Panel<S> {
     }
 }
 
-impl<S: ScanOut> LinkDevice for Panel<S> {
+impl<S: ScanOut> LinkDevice for DisplayPanel<S> {
     fn receive(&mut self, now: HostTime, lane: Lane, bytes: &[u8]) {
         self.advance(now);
         if self.pacer.is_some() && !self.is_lost {
@@ -381,7 +381,7 @@ impl<S: ScanOut> LinkDevice for Panel<S> {
 }
 
 /// Black on every way out of the thread, a panic's too.
-impl<S: ScanOut> Drop for Panel<S> {
+impl<S: ScanOut> Drop for DisplayPanel<S> {
     fn drop(&mut self) {
         self.out.blacken();
         if let Ok(mut lost) = self.counts.lost.lock() {

@@ -9,7 +9,7 @@ use dpm_device::transport::TransportError;
 
 /// One of the three pictures in the display's memory.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Picture {
+pub enum PictureBuffer {
     /// The one that is black and stays black.
     Black,
     /// One of the two that frames are written to, 0 or 1.
@@ -110,7 +110,7 @@ pub trait ScanOut: Send {
     ///
     /// # Errors
     /// [`DisplayError::Busy`] while another has not been taken; or the display is gone.
-    fn flip(&mut self, picture: Picture) -> Result<(), DisplayError>;
+    fn flip(&mut self, picture: PictureBuffer) -> Result<(), DisplayError>;
 
     /// Passes the pictures that were taken since the last call to `sink`. Never waits.
     fn flips(&mut self, sink: &mut dyn FnMut(Flip));
@@ -133,7 +133,7 @@ impl<S: ScanOut + ?Sized> ScanOut for Box<S> {
     fn pixels(&mut self, frame: usize) -> Pixels<'_> {
         (**self).pixels(frame)
     }
-    fn flip(&mut self, picture: Picture) -> Result<(), DisplayError> {
+    fn flip(&mut self, picture: PictureBuffer) -> Result<(), DisplayError> {
         (**self).flip(picture)
     }
     fn flips(&mut self, sink: &mut dyn FnMut(Flip)) {

@@ -4,7 +4,7 @@ use dpm_device::planes::{PlaneSchedule, Raster};
 use dpm_device::time::FrameRate;
 
 use crate::encoding::{Encoding, PixelMap};
-use crate::kms::{Connector, Domain, Owner, Property, Setup};
+use crate::kms::{Connector, Domain, Property, PropertyOwner, ScanOutSetup};
 use crate::mode::{written, ModeWish, Timing};
 use crate::panel::PanelSettings;
 
@@ -37,7 +37,7 @@ pub struct DisplaySettings {
 #[derive(Clone, Debug)]
 pub struct Plan {
     /// What the kernel is told.
-    pub setup: Setup,
+    pub setup: ScanOutSetup,
     /// What the panel has to know.
     pub panel: PanelSettings,
     /// What the operator should know.
@@ -46,7 +46,7 @@ pub struct Plan {
 
 /// A property that must have one value, and by which of several words a driver calls it.
 struct Wish {
-    owner: Owner,
+    owner: PropertyOwner,
     name: &'static str,
     value: Wishes,
     /// Bits are lost on a physical connector without it.
@@ -61,8 +61,8 @@ enum Wishes {
 /// What keeps the bits of a pixel exact: eight bits for each colour, full range, RGB, no dithering, no tables, no variable
 /// refresh. Names are the kernel's; each driver has some of them.
 const WISHES: [Wish; 16] = {
-    use Owner::{Connector as C, Crtc, Plane};
-    const fn wish(owner: Owner, name: &'static str, value: Wishes, is_needed: bool) -> Wish {
+    use PropertyOwner::{Connector as C, Crtc, Plane};
+    const fn wish(owner: PropertyOwner, name: &'static str, value: Wishes, is_needed: bool) -> Wish {
         Wish { owner, name, value, is_needed }
     }
     [
@@ -88,19 +88,19 @@ const WISHES: [Wish; 16] = {
 /// Why a display cannot be used as the rig file says.
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
 #[error("{0}")]
-pub struct Refusal(pub String);
+pub struct SetUpRefusal(pub String);
 
-fn refuse<T>(text: impl Into<String>) -> Result<T, Refusal> {
-    Err(Refusal(text.into()))
+fn refuse<T>(text: impl Into<String>) -> Result<T, SetUpRefusal> {
+    Err(SetUpRefusal(text.into()))
 }
 
 /// Chooses connector, mode and properties.
 ///
 /// # Errors
 /// Everything that would show other bits than were packed, at another rate, or nothing: named, with what to write instead.
-pub fn plan(connectors: &[Connector], settings: &DisplaySettings) -> Result<Plan, Refusal> {
+pub fn plan(connectors: &[Connector], settings: &DisplaySettings) -> Result<Plan, SetUpRefusal> {
     let connector = connector(connectors, settings.connector.as_deref())?;
-    let named = |what: String| Refusal(format!("{}: projector.backend.mode: {what}", connector.name));
+    let named = |what: String| SetUpRefusal(format!("{}: projector.backend.mode: {what}", connector.name));
     let timing = settings.mode.choose(&connector.modes).map_err(named)?;
     check_timing(&timing, settings)?;
     let Some(map) = PixelMap::new(settings.encoding, &settings.schedule) else {
@@ -125,12 +125,12 @@ pub fn plan(connectors: &[Connector], settings: &DisplaySettings) -> Result<Plan
     }
     let mut warnings = Vec::new();
     let properties = properties(connector, settings, &mut warnings)?;
-    let setup = Setup { connector: connector.name.clone(), timing, properties };
+    let setup = ScanOutSetup { connector: connector.name.clone(), timing, properties };
     let (raster, planes) = (settings.raster, settings.schedule.len());
     Ok(Plan { setup, panel: PanelSettings { raster, planes, map, rate: settings.rate, lead_ns }, warnings })
 }
 
-fn connector<'a>(all: &'a [Connector], wish: Option<&str>) -> Result<&'a Connector, Refusal> {
+fn connector<'a>(all: &'a [Connector], wish: Option<&str>) -> Result<&'a Connector, SetUpRefusal> {
     let names = |only_connected: bool| {
         let named: Vec<&str> =
             all.iter().filter(|c| c.is_connected || !only_connected).map(|c| c.name.as_str()).collect();
@@ -173,7 +173,7 @@ fn or_none(names: String) -> String {
     }
 }
 
-fn check_timing(timing: &Timing, settings: &DisplaySettings) -> Result<(), Refusal> {
+fn check_timing(timing: &Timing, settings: &DisplaySettings) -> Result<(), SetUpRefusal> {
     let (width, height) = timing.size();
     let raster = settings.raster;
     if (width, height) != (raster.width(), raster.height()) {
@@ -221,7 +221,7 @@ fn properties(
     connector: &Connector,
     settings: &DisplaySettings,
     warnings: &mut Vec<String>,
-) -> Result<Vec<(Owner, String, u64)>, Refusal> {
+) -> Result<Vec<(PropertyOwner, String, u64)>, SetUpRefusal> {
     let mut set = Vec::new();
     let mut lacking = Vec::new();
     for wish in &WISHES {

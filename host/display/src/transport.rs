@@ -19,7 +19,7 @@ use dpm_handoff::wake::WaitPolicy;
 
 use crate::kms::Kms;
 use crate::lease::{self, Access};
-use crate::panel::{DisplayCounts, Panel, PanelSettings};
+use crate::panel::{DisplayCounts, DisplayPanel, PanelSettings};
 use crate::scan_out::{DisplayError, ScanOut};
 use crate::set_up::{plan, DisplaySettings};
 
@@ -31,7 +31,7 @@ const REST_NS: i64 = 100_000_000;
 const END_WITHIN: Duration = Duration::from_millis(500);
 
 /// What shows pictures and shows black now, and what a panel must know of it.
-pub struct Showing {
+pub struct PanelOutput {
     /// What shows pictures.
     pub out: Box<dyn ScanOut>,
     /// What the panel has to know.
@@ -43,7 +43,7 @@ pub struct Showing {
 }
 
 /// Opens a display, sets it up, and shows black. It may take seconds.
-pub type Opener = Arc<dyn Fn() -> Result<Showing, TransportError> + Send + Sync>;
+pub type Opener = Arc<dyn Fn() -> Result<PanelOutput, TransportError> + Send + Sync>;
 
 /// The opener of a display on a graphics card that `card` opens, set up as `settings` say.
 pub fn on_card(
@@ -60,7 +60,7 @@ pub fn on_card(
         kms.start(&plan.setup).map_err(failed)?;
         let lent = kms.lender().map(|lender| format!(", lent by {lender}")).unwrap_or_default();
         let name = format!("display {} ({}){lent}", plan.setup.connector, plan.setup.timing);
-        Ok(Showing { out: kms, panel: plan.panel, name, warnings: plan.warnings })
+        Ok(PanelOutput { out: kms, panel: plan.panel, name, warnings: plan.warnings })
     })
 }
 
@@ -95,12 +95,12 @@ pub fn set_guardian(command: Vec<OsString>) {
 
 /// A display that shows black, with its guardian.
 struct OpenDisplay {
-    shown: Showing,
+    shown: PanelOutput,
     guardian: Option<Guardian>,
 }
 
 /// The thread of a panel, and the cable to it.
-struct Line {
+struct PanelThread {
     host: HostEnd,
     counts: Arc<DisplayCounts>,
     thread: JoinHandle<()>,
@@ -115,7 +115,7 @@ pub struct DisplayTransport {
     name: String,
     clock: Option<Arc<dyn HostClock>>,
     opened: Option<OpenDisplay>,
-    line: Option<Line>,
+    line: Option<PanelThread>,
     opening: Option<Receiver<Result<OpenDisplay, TransportError>>>,
     warnings: Vec<String>,
 }
@@ -179,7 +179,7 @@ impl DisplayTransport {
         let plane_bytes = packet_bytes(shown.panel.raster.plane_bytes());
         let frame_bytes = plane_bytes * shown.panel.planes + packet_bytes(COMMIT_BYTES);
         let (host, device) = threaded(frame_bytes, CABLE_BUFFERS, self.policy);
-        let panel = Panel::new(shown.out, shown.panel, 0, clock.as_ref());
+        let panel = DisplayPanel::new(shown.out, shown.panel, 0, clock.as_ref());
         let counts = panel.counts();
         let (clock, priority) = (clock.clone(), self.priority);
         let thread = std::thread::Builder::new().name("dpm-display".into()).spawn(move || {
@@ -189,7 +189,7 @@ impl DisplayTransport {
         });
         // Without a thread the cable has no far end, and the link says so.
         if let Ok(thread) = thread {
-            self.line = Some(Line { host, counts, thread, guardian });
+            self.line = Some(PanelThread { host, counts, thread, guardian });
         }
     }
 
@@ -204,7 +204,7 @@ impl DisplayTransport {
 
     /// Ends the thread, which shows black on its way out.
     fn end(&mut self) {
-        let Some(Line { host, thread, guardian, .. }) = self.line.take() else { return };
+        let Some(PanelThread { host, thread, guardian, .. }) = self.line.take() else { return };
         drop(host);
         let limit = Instant::now() + END_WITHIN;
         while !thread.is_finished() && Instant::now() < limit {
@@ -220,7 +220,7 @@ impl DisplayTransport {
 }
 
 /// Runs `panel` until the host's end of `cable` is dropped or the display is lost. Every way out is black.
-fn serve(mut panel: Panel<Box<dyn ScanOut>>, mut cable: DeviceEnd, clock: &dyn HostClock) {
+fn serve(mut panel: DisplayPanel<Box<dyn ScanOut>>, mut cable: DeviceEnd, clock: &dyn HostClock) {
     while cable.serve(|| clock.now(), &mut panel) && !panel.is_lost() {
         panel.advance(clock.now());
         let limit = clock.now().plus_ns(REST_NS);

@@ -13,7 +13,7 @@ use dpm_device::planes::{PlaneSchedule, Raster};
 use dpm_device::time::FrameRate;
 
 #[cfg(feature = "x11")]
-pub use x11::{look, opener, Window};
+pub use x11::{look, opener, X11Window};
 
 /// What a rig file says of its window.
 #[derive(Clone, Debug)]

@@ -2,7 +2,7 @@
 
 use crate::feed;
 use crate::keys::{check_panel, guardian_of, Dlpc900Panel, VideoInput, NO_WATCHDOG, WORD};
-use dpm_common::keys::read::{contradict, refuse, shown, Any, NotEmpty, Reader, Within};
+use dpm_common::keys::read::{contradict, refuse, shown, Any, KeyReader, NotEmpty, Within};
 use dpm_common::keys::rows::Section;
 use dpm_common::section;
 use dpm_device::planes::{Parts, PlaneSchedule};
@@ -81,7 +81,7 @@ fn refused(key: &str, why: String) -> TransportError {
 }
 
 impl Controller for BehindConfig {
-    fn check(&self, parts: Parts, frames: &FrameKeys, reader: &mut Reader) {
+    fn check(&self, parts: Parts, frames: &FrameKeys, reader: &mut KeyReader) {
         check_panel(frames, "display", "projector.backend.dlpc900.panel", self.panel, reader);
         if let Err(why) = self.exposure_us(parts, frames.rate) {
             refuse(

@@ -86,8 +86,8 @@ struct UploadArgs {
     #[arg(long)]
     repeat: Option<u32>,
     /// Which bytes of a pixel contain planes 0-7, 8-15, 16-23; matters for more than 8 planes per image
-    #[arg(long, value_enum, default_value_t = Order::Descending)]
-    plane_order: Order,
+    #[arg(long, value_enum, default_value_t = PlaneOrderArg::Descending)]
+    plane_order: PlaneOrderArg,
     /// How images are coded
     #[arg(long, value_enum, default_value_t = Coding::Smallest)]
     compression: Coding,
@@ -135,7 +135,7 @@ impl Leds {
 }
 
 #[derive(Clone, Copy, Debug, ValueEnum)]
-enum Order {
+enum PlaneOrderArg {
     /// 16-23, 8-15, 0-7, as usual in open programs
     Descending,
     /// 16-23, 0-7, 8-15, as in TI's program
@@ -278,8 +278,8 @@ fn execute_upload(d: &mut Dlpc900<UsbHid>, u: &UploadArgs) -> Result<String, Fai
         wait_trigger: u.wait_trigger,
         repeat: u.repeat.map_or(Repeat::Forever, Repeat::Passes),
         order: match u.plane_order {
-            Order::Descending => PlaneOrder::Descending,
-            Order::BlueGreenRed => PlaneOrder::BlueGreenRed,
+            PlaneOrderArg::Descending => PlaneOrder::Descending,
+            PlaneOrderArg::BlueGreenRed => PlaneOrder::BlueGreenRed,
         },
         compression: match u.compression {
             Coding::Smallest => None,

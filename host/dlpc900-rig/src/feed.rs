@@ -13,7 +13,7 @@ use dpm_device::transport::TransportError;
 use dpm_dlpc900::driver::{Dlpc900, Dlpc900Error, HidPort, StopAsked};
 use dpm_dlpc900::video::VideoPatterns;
 
-use dpm_display::scan_out::{DisplayError, Flip, Picture, Pixels, ScanOut};
+use dpm_display::scan_out::{DisplayError, Flip, PictureBuffer, Pixels, ScanOut};
 use dpm_display::transport::Opener;
 
 /// How often the controller is asked for its state.
@@ -59,8 +59,10 @@ pub fn behind<P: HidPort + Send + 'static>(
             return Err(failed(e));
         }
         shown.name = format!("{} behind {}", found.name(), shown.name);
-        shown.out =
-            Box::new(ControllerFeed { out: shown.out, watch: Watch::start(controller).map_err(no_thread)? });
+        shown.out = Box::new(ControllerFeed {
+            out: shown.out,
+            watch: ControllerWatch::start(controller).map_err(no_thread)?,
+        });
         Ok(shown)
     })
 }
@@ -77,14 +79,14 @@ fn rest<P: HidPort>(controller: &mut Dlpc900<P>) {
 }
 
 /// The thread that asks the controller for its state, and puts it to rest at the end.
-struct Watch {
+struct ControllerWatch {
     is_over: Arc<AtomicBool>,
     /// Why the controller shows nothing any more; `None` inside for a controller that is gone.
     lost: Arc<OnceLock<Option<String>>>,
     thread: Option<JoinHandle<()>>,
 }
 
-impl Watch {
+impl ControllerWatch {
     fn start<P: HidPort + Send + 'static>(mut controller: Dlpc900<P>) -> std::io::Result<Self> {
         let (is_over, lost) = (Arc::new(AtomicBool::new(false)), Arc::new(OnceLock::new()));
         let (over, why) = (is_over.clone(), lost.clone());
@@ -106,7 +108,7 @@ impl Watch {
     }
 }
 
-impl Drop for Watch {
+impl Drop for ControllerWatch {
     fn drop(&mut self) {
         self.is_over.store(true, Ordering::Release);
         let Some(thread) = self.thread.take() else { return };
@@ -154,7 +156,7 @@ fn look_until<P: HidPort>(controller: &mut Dlpc900<P>, over: &AtomicBool) -> Opt
 /// A display in front of a controller.
 struct ControllerFeed {
     // Dropped first: the controller rests while the display still shows black.
-    watch: Watch,
+    watch: ControllerWatch,
     out: Box<dyn ScanOut>,
 }
 
@@ -162,7 +164,7 @@ impl ScanOut for ControllerFeed {
     fn pixels(&mut self, frame: usize) -> Pixels<'_> {
         self.out.pixels(frame)
     }
-    fn flip(&mut self, picture: Picture) -> Result<(), DisplayError> {
+    fn flip(&mut self, picture: PictureBuffer) -> Result<(), DisplayError> {
         self.out.flip(picture)
     }
     fn flips(&mut self, sink: &mut dyn FnMut(Flip)) {

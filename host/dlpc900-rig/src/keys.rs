@@ -1,13 +1,14 @@
 //! `projector.backend.kind = "dlpc900"`: a TI DLPC900 whose frames are loaded before they are shown.
 
-use dpm_common::keys::read::{contradict, shown, Any, NotEmpty, Reader, Within};
+use dpm_common::keys::read::{contradict, shown, Any, KeyReader, NotEmpty, Within};
 use dpm_common::{section, words};
 use dpm_dlpc900::driver::Dlpc900;
 use dpm_dlpc900::lut::Dmd;
 use dpm_dlpc900::usb::{describe, UsbHid, UsbPlace, PRODUCT, VENDOR};
 use dpm_dlpc900::video::Receiver;
 use dpm_rig::projectors::{
-    DeviceName, FrameKeys, LitTime, Look, PlaneTiming, PlaneWeights, ProjectorKeys, ProjectorKind, SlotClock,
+    DeviceLook, DeviceName, FrameKeys, LitTime, PlaneTiming, PlaneWeights, ProjectorKeys, ProjectorKind,
+    SlotClock,
 };
 
 /// What an operator of a DLPC900 must know.
@@ -112,7 +113,7 @@ impl ProjectorKeys for Dlpc900Config {
         DeviceName { named: self.device.clone(), is_lasting: false, ..DeviceName::of(KIND.name) }
     }
 
-    fn check(&self, frames: &FrameKeys, reader: &mut Reader) {
+    fn check(&self, frames: &FrameKeys, reader: &mut KeyReader) {
         check_panel(frames, WORD, "projector.backend.panel", self.panel, reader);
         let backend = || ("projector.backend.kind", format!("{WORD:?}"));
         if frames.weights == PlaneWeights::Equal {
@@ -153,7 +154,7 @@ impl ProjectorKeys for Dlpc900Config {
         Some(guardian_of(self.device.as_deref()))
     }
 
-    fn examine(&self, _: bool) -> Option<Result<Look, String>> {
+    fn examine(&self, _: bool) -> Option<Result<DeviceLook, String>> {
         Some(examined(self.device.as_deref()))
     }
 }
@@ -164,7 +165,7 @@ pub(crate) fn guardian_of(device: Option<&str>) -> Vec<String> {
     [WORD, "guard"].into_iter().chain(place).map(str::to_owned).collect()
 }
 
-fn examined(device: Option<&str>) -> Result<Look, String> {
+fn examined(device: Option<&str>) -> Result<DeviceLook, String> {
     let place =
         device.map(|text| text.parse::<UsbPlace>().map_err(|e| format!("{text}: {e}"))).transpose()?;
     let named = |e: String| format!("{}: {e}", describe(place));
@@ -172,7 +173,7 @@ fn examined(device: Option<&str>) -> Result<Look, String> {
     let mut controller = Dlpc900::new(port).map_err(|e| named(e.to_string()))?;
     let status = controller.status().map_err(|e| named(e.to_string()))?;
     let lines: Vec<String> = status.to_string().lines().map(|l| l.trim().to_owned()).collect();
-    Ok(Look { found: lines.join("; "), is_doubtful: false, remedy: String::new() })
+    Ok(DeviceLook { found: lines.join("; "), is_doubtful: false, remedy: String::new() })
 }
 
 /// A controller's panel has as many mirrors as the projector, of kind `kind`.
@@ -181,7 +182,7 @@ pub(crate) fn check_panel(
     kind: &str,
     key: &str,
     panel: Dlpc900Panel,
-    reader: &mut Reader,
+    reader: &mut KeyReader,
 ) {
     let raster = panel.dmd().raster();
     if frames.size != [raster.width(), raster.height()] {

@@ -7,7 +7,7 @@ use super::run::{check_panel, opener, present, Dlpc900Report, Show};
 use dpm_device::planes::Channel;
 use dpm_dlpc900::image::PlaneOrder;
 use dpm_dlpc900::lut::{led, Dmd};
-use dpm_dlpc900::sequence::{Pattern as Plates, PatternSequence, Repeat, SequenceBuilder};
+use dpm_dlpc900::sequence::{BitPattern as Plates, PatternSequence, Repeat, SequenceBuilder};
 use dpm_dlpc900::usb::UsbPlace;
 use dpm_rig::config::RigConfig;
 use dpm_rig::failure::{Failure, FailureKind};

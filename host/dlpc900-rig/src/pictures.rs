@@ -4,7 +4,7 @@ use dpm_device::planes::Raster;
 use dpm_device::regular_file;
 use dpm_dlpc900::image::{Compression, PlaneOrder};
 use dpm_dlpc900::lut::Dmd;
-use dpm_dlpc900::sequence::{Pattern, PatternSequence, Repeat, SequenceBuilder, SequenceError};
+use dpm_dlpc900::sequence::{BitPattern, PatternSequence, Repeat, SequenceBuilder, SequenceError};
 use image::ImageFormat;
 use std::path::{Path, PathBuf};
 
@@ -121,7 +121,7 @@ pub(crate) fn sequence_of(
     let shortest = dmd.min_exposure_us(show.depth).unwrap_or(105);
     let mut builder = SequenceBuilder::new(dmd);
     for planes in &all {
-        builder.push(&Pattern {
+        builder.push(&BitPattern {
             planes: planes.iter().map(Vec::as_slice).collect(),
             exposure_us: show.exposure_us.unwrap_or(shortest),
             dark_us: show.dark_us,

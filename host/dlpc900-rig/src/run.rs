@@ -16,7 +16,7 @@ use dpm_device::planes::{Channel, PlaneSchedule};
 use dpm_dlpc900::driver::{Dlpc900, Dlpc900Error, HidPort, PortError};
 use dpm_dlpc900::image::PlaneOrder;
 use dpm_dlpc900::lut::{led, Dmd, LutEntry, IMAGE_PLANES, MAX_IMAGES};
-use dpm_dlpc900::sequence::{LedSetup, Pattern, PatternSequence, Repeat, SequenceBuilder, SequenceError};
+use dpm_dlpc900::sequence::{BitPattern, LedSetup, PatternSequence, Repeat, SequenceBuilder, SequenceError};
 use dpm_dlpc900::usb::{self, UsbHid, UsbPlace};
 use dpm_dlpc900::video::{share_us, VideoPatterns};
 use dpm_render::pack::{pack, BitPlaneFrame, Kernel};
@@ -151,7 +151,7 @@ pub(crate) fn preload(
     let mut builder = SequenceBuilder::new(dmd);
     for frame in frames {
         for (channel, bits) in &shown {
-            builder.push(&Pattern {
+            builder.push(&BitPattern {
                 planes: bits.iter().map(|&k| frame.plane(k)).collect(),
                 exposure_us,
                 dark_us: share - exposure_us,
@@ -368,7 +368,7 @@ pub(crate) fn present<P: HidPort>(
             .spawn_scoped(scope, || word.make_dark_when_told(monitor))
             .map_err(|e| Failure::new(FailureKind::Device, format!("cannot start a thread: {e}")));
         let result = spawned.and_then(|_| {
-            let mut watch = Watch {
+            let mut watch = ShowWatch {
                 d: &mut d,
                 open,
                 show,
@@ -400,7 +400,7 @@ pub(crate) fn present<P: HidPort>(
 }
 
 /// A show on a controller: what was ordered, whether light is allowed, whether the controller is there.
-struct Watch<'a, P: HidPort> {
+struct ShowWatch<'a, P: HidPort> {
     d: &'a mut Dlpc900<P>,
     open: &'a mut dyn FnMut() -> Result<Dlpc900<P>, Dlpc900Error>,
     show: &'a Show,
@@ -420,7 +420,7 @@ struct Watch<'a, P: HidPort> {
     looked: Stopwatch,
 }
 
-impl<P: HidPort> Watch<'_, P> {
+impl<P: HidPort> ShowWatch<'_, P> {
     /// Shows until `seconds` are over or a stop is asked for.
     fn run(&mut self, seconds: Option<f64>) -> Result<(), Failure> {
         self.wait_for_interlock()?;

@@ -256,7 +256,7 @@ impl LutEntry {
 
 /// A rule that a pattern table must keep.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Rule {
+pub enum LutRule {
     /// The table has no entry.
     Empty,
     /// More entries than the controller holds.
@@ -320,7 +320,7 @@ pub enum Rule {
     },
 }
 
-impl Rule {
+impl LutRule {
     /// The controller's error code (0x0100) for a table that breaks the rule.
     pub const fn error_code(self) -> u8 {
         match self {
@@ -334,7 +334,7 @@ impl Rule {
     }
 }
 
-impl core::fmt::Display for Rule {
+impl core::fmt::Display for LutRule {
     fn fmt(&self, f: &mut core::fmt::Formatter<'_>) -> core::fmt::Result {
         match self {
             Self::Empty => write!(f, "a sequence needs at least one pattern"),
@@ -375,7 +375,7 @@ pub struct LutError {
     /// Which entry, counted from 0.
     pub entry: usize,
     /// Which rule.
-    pub rule: Rule,
+    pub rule: LutRule,
 }
 
 impl core::fmt::Display for LutError {
@@ -388,7 +388,7 @@ impl core::error::Error for LutError {}
 
 /// The limits for a table.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub struct Limits {
+pub struct TableLimits {
     /// The DMD.
     pub dmd: Dmd,
     /// Images that the entries may name.
@@ -398,56 +398,56 @@ pub struct Limits {
 }
 
 /// The rule that one entry breaks, if any; `place` is its position in the table.
-pub fn check_entry(place: usize, e: &LutEntry, limits: &Limits) -> Result<(), Rule> {
+pub fn check_entry(place: usize, e: &LutEntry, limits: &TableLimits) -> Result<(), LutRule> {
     if usize::from(e.index) != place {
-        return Err(Rule::Index { found: e.index });
+        return Err(LutRule::Index { found: e.index });
     }
     let shows = matches!(e.depth, 1..=8) || limits.dmd.min_exposure_us(e.depth).is_some();
     if !shows {
-        return Err(Rule::Depth { depth: e.depth });
+        return Err(LutRule::Depth { depth: e.depth });
     }
     for time_us in [e.exposure_us, e.dark_us] {
         if time_us > MAX_TIME_US {
-            return Err(Rule::TimeTooLong { time_us });
+            return Err(LutRule::TimeTooLong { time_us });
         }
     }
     if let Some(least_us) = limits.dmd.min_exposure_us(e.depth) {
         if e.exposure_us < least_us {
-            return Err(Rule::ExposureTooShort { exposure_us: e.exposure_us, depth: e.depth, least_us });
+            return Err(LutRule::ExposureTooShort { exposure_us: e.exposure_us, depth: e.depth, least_us });
         }
     } else if e.exposure_us == 0 {
-        return Err(Rule::ExposureTooShort { exposure_us: 0, depth: e.depth, least_us: 1 });
+        return Err(LutRule::ExposureTooShort { exposure_us: 0, depth: e.depth, least_us: 1 });
     }
     if u32::from(e.bit) + u32::from(e.depth) > IMAGE_PLANES as u32 {
-        return Err(Rule::BitPosition { bit: e.bit, depth: e.depth });
+        return Err(LutRule::BitPosition { bit: e.bit, depth: e.depth });
     }
     if usize::from(e.image) >= limits.images {
-        return Err(Rule::Image { image: e.image, images: limits.images });
+        return Err(LutRule::Image { image: e.image, images: limits.images });
     }
     Ok(())
 }
 
 /// Checks a whole table; the error names the first entry that breaks a rule.
-pub fn validate(entries: &[LutEntry], limits: &Limits) -> Result<(), LutError> {
+pub fn validate(entries: &[LutEntry], limits: &TableLimits) -> Result<(), LutError> {
     let fail = |entry, rule| Err(LutError { entry, rule });
     if entries.is_empty() {
-        return fail(0, Rule::Empty);
+        return fail(0, LutRule::Empty);
     }
     let most = limits.dmd.max_entries();
     if entries.len() > most {
-        return fail(most, Rule::TooManyEntries { entries: entries.len(), most });
+        return fail(most, LutRule::TooManyEntries { entries: entries.len(), most });
     }
     let (mut planes, mut sum_us) = (0u32, 0u64);
     for (place, e) in entries.iter().enumerate() {
         check_entry(place, e, limits).map_err(|rule| LutError { entry: place, rule })?;
         planes += u32::from(e.depth);
         if planes > limits.dmd.max_planes() {
-            return fail(place, Rule::Memory { planes, most: limits.dmd.max_planes() });
+            return fail(place, LutRule::Memory { planes, most: limits.dmd.max_planes() });
         }
         sum_us += u64::from(e.exposure_us) + u64::from(e.dark_us);
         if let Some(frame_us) = limits.frame_us {
             if sum_us > frame_us {
-                return fail(place, Rule::FrameTooShort { sum_us, frame_us });
+                return fail(place, LutRule::FrameTooShort { sum_us, frame_us });
             }
         }
     }
@@ -468,7 +468,7 @@ mod tests {
     use super::*;
     use proptest::prelude::*;
 
-    const LIMITS: Limits = Limits { dmd: Dmd::Dlp6500, images: 2, frame_us: None };
+    const LIMITS: TableLimits = TableLimits { dmd: Dmd::Dlp6500, images: 2, frame_us: None };
 
     /// The two entries of TI's on-the-fly example (programmer's guide, revision J).
     #[test]
@@ -501,25 +501,25 @@ mod tests {
     fn every_rule_is_named_with_its_entry() {
         let good: Vec<_> = (0..3).map(|i| LutEntry::one_bit(i, 0, i as u8, 105)).collect();
         type Spoil = fn(&mut LutEntry);
-        let cases: [(Spoil, Rule, u8); 8] = [
-            (|e| e.index = 7, Rule::Index { found: 7 }, 16),
-            (|e| e.depth = 9, Rule::Depth { depth: 9 }, 10),
+        let cases: [(Spoil, LutRule, u8); 8] = [
+            (|e| e.index = 7, LutRule::Index { found: 7 }, 16),
+            (|e| e.depth = 9, LutRule::Depth { depth: 9 }, 10),
             (
                 |e| e.exposure_us = 104,
-                Rule::ExposureTooShort { exposure_us: 104, depth: 1, least_us: 105 },
+                LutRule::ExposureTooShort { exposure_us: 104, depth: 1, least_us: 105 },
                 14,
             ),
             (
                 |e| (e.depth, e.exposure_us) = (8, 4045),
-                Rule::ExposureTooShort { exposure_us: 4045, depth: 8, least_us: 4046 },
+                LutRule::ExposureTooShort { exposure_us: 4045, depth: 8, least_us: 4046 },
                 14,
             ),
-            (|e| e.dark_us = 1 << 24, Rule::TimeTooLong { time_us: 1 << 24 }, 12),
-            (|e| e.bit = 24, Rule::BitPosition { bit: 24, depth: 1 }, 10),
-            (|e| e.image = 2, Rule::Image { image: 2, images: 2 }, 17),
+            (|e| e.dark_us = 1 << 24, LutRule::TimeTooLong { time_us: 1 << 24 }, 12),
+            (|e| e.bit = 24, LutRule::BitPosition { bit: 24, depth: 1 }, 10),
+            (|e| e.image = 2, LutRule::Image { image: 2, images: 2 }, 17),
             (
                 |e| (e.bit, e.depth, e.exposure_us) = (23, 2, 9999),
-                Rule::BitPosition { bit: 23, depth: 2 },
+                LutRule::BitPosition { bit: 23, depth: 2 },
                 10,
             ),
         ];
@@ -530,17 +530,17 @@ mod tests {
             assert_eq!(rule.error_code(), code);
             assert!(LutError { entry: 1, rule }.to_string().starts_with("LUT entry 1: "));
         }
-        assert_eq!(validate(&[], &LIMITS).unwrap_err().rule, Rule::Empty);
+        assert_eq!(validate(&[], &LIMITS).unwrap_err().rule, LutRule::Empty);
         let many: Vec<_> = (0..401).map(|i| LutEntry::one_bit(i, 0, 0, 105)).collect();
-        let rule = Rule::TooManyEntries { entries: 401, most: 400 };
+        let rule = LutRule::TooManyEntries { entries: 401, most: 400 };
         assert_eq!(validate(&many, &LIMITS), Err(LutError { entry: 400, rule }));
         let deep: Vec<_> =
             (0..51).map(|i| LutEntry { depth: 8, ..LutEntry::one_bit(i, 0, 0, 5000) }).collect();
-        let rule = Rule::Memory { planes: 408, most: 400 };
+        let rule = LutRule::Memory { planes: 408, most: 400 };
         assert_eq!(validate(&deep, &LIMITS), Err(LutError { entry: 50, rule }));
-        let video = Limits { frame_us: Some(8333), ..LIMITS };
+        let video = TableLimits { frame_us: Some(8333), ..LIMITS };
         let long: Vec<_> = (0..24).map(|i| LutEntry::one_bit(i, 0, i as u8, 348)).collect();
-        let rule = Rule::FrameTooShort { sum_us: 8352, frame_us: 8333 };
+        let rule = LutRule::FrameTooShort { sum_us: 8352, frame_us: 8333 };
         assert_eq!(validate(&long, &video), Err(LutError { entry: 23, rule }));
     }
 

@@ -9,7 +9,9 @@ use std::time::Duration;
 
 use super::command::Opcode;
 use super::image::{encode, Compression, EncodedImage, ImageError, PlaneOrder};
-use super::lut::{led, validate, DisplayMode, Dmd, Limits, LutEntry, LutError, IMAGE_PLANES, MAX_IMAGES};
+use super::lut::{
+    led, validate, DisplayMode, Dmd, LutEntry, LutError, TableLimits, IMAGE_PLANES, MAX_IMAGES,
+};
 
 /// Least time in the 50/50 exercise before it may be left.
 pub const IDLE_LEAST: Duration = Duration::from_secs(3);
@@ -153,7 +155,7 @@ pub enum SequenceError {
 
 /// One pattern and how it is shown. `planes` are its bits, least significant first, each in the project's plane layout.
 #[derive(Clone, Debug)]
-pub struct Pattern<'a> {
+pub struct BitPattern<'a> {
     /// Bits, least significant first; 1 to 8 (16 on a DLP500YX).
     pub planes: Vec<&'a [u8]>,
     /// Time lit, microseconds.
@@ -168,7 +170,7 @@ pub struct Pattern<'a> {
     pub no_trigger_out2: bool,
 }
 
-impl<'a> Pattern<'a> {
+impl<'a> BitPattern<'a> {
     /// White, no dark time, no triggers in, triggers out.
     pub fn white(planes: Vec<&'a [u8]>, exposure_us: u32) -> Self {
         let leds = led::WHITE;
@@ -191,7 +193,7 @@ impl<'a> SequenceBuilder<'a> {
     }
 
     /// Appends a pattern. Its planes are adjacent in one image; rules are checked when the sequence is finished.
-    pub fn push(&mut self, pattern: &Pattern<'a>) {
+    pub fn push(&mut self, pattern: &BitPattern<'a>) {
         let depth = pattern.planes.len();
         let fits = self.images.last().is_some_and(|i| i.len() + depth <= IMAGE_PLANES);
         if !fits {
@@ -222,7 +224,7 @@ impl<'a> SequenceBuilder<'a> {
         compression: Option<Compression>,
     ) -> Result<PatternSequence, SequenceError> {
         let Self { dmd, entries, images } = self;
-        validate(&entries, &Limits { dmd, images: images.len(), frame_us: None })?;
+        validate(&entries, &TableLimits { dmd, images: images.len(), frame_us: None })?;
         if images.len() > MAX_IMAGES {
             return Err(SequenceError::TooManyImages { images: images.len() });
         }
@@ -355,7 +357,7 @@ impl PatternSequence {
         for e in &mut entries {
             (e.exposure_us, e.dark_us) = times(e);
         }
-        validate(&entries, &Limits { dmd: self.dmd, images: self.images.len(), frame_us: None })?;
+        validate(&entries, &TableLimits { dmd: self.dmd, images: self.images.len(), frame_us: None })?;
         self.entries = entries;
         Ok(())
     }
@@ -441,7 +443,7 @@ mod tests {
     fn sequence(dmd: Dmd, patterns: usize, depth: usize) -> PatternSequence {
         let plane = vec![0x0f; dmd.raster().plane_bytes()];
         let mut b = SequenceBuilder::new(dmd);
-        (0..patterns).for_each(|_| b.push(&Pattern::white(vec![&plane[..]; depth], 5000)));
+        (0..patterns).for_each(|_| b.push(&BitPattern::white(vec![&plane[..]; depth], 5000)));
         b.finish(Repeat::Passes(3), PlaneOrder::default(), Some(Compression::Erle)).unwrap()
     }
 
@@ -484,7 +486,7 @@ mod tests {
         assert_eq!(bytes[4..8], [0x00, 0x05, 0x40, 0x06]);
         let mut nine = SequenceBuilder::new(Dmd::Dlp6500);
         let plane = vec![0; Dmd::Dlp6500.raster().plane_bytes()];
-        nine.push(&Pattern::white(vec![&plane[..]; 9], 9000));
+        nine.push(&BitPattern::white(vec![&plane[..]; 9], 9000));
         let err = nine.finish(Repeat::Forever, PlaneOrder::default(), None).unwrap_err();
         assert_eq!(err.to_string(), "LUT entry 0: this DMD shows no 9-bit patterns");
     }

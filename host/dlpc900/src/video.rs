@@ -9,7 +9,7 @@ use std::fmt;
 use std::time::Duration;
 
 use super::command::Opcode;
-use super::lut::{led, validate, DisplayMode, Dmd, Limits, LutEntry, LutError};
+use super::lut::{led, validate, DisplayMode, Dmd, LutEntry, LutError, TableLimits};
 use super::sequence::{stop, switch_mode, table, write, LedSetup, Step, Version, LEDS_OFF};
 use dpm_device::planes::{Channel, PlaneSchedule, PlaneSpec};
 use dpm_device::time::FrameRate;
@@ -211,7 +211,7 @@ impl VideoPatterns {
     /// An entry that breaks a rule of the table.
     pub fn dark_steps(&self, firmware: Version) -> Result<Vec<Step<'static>>, LutError> {
         let frame_us = Some(1_000_000 / u64::from(self.frame_hz.clamp(1, 120)));
-        validate(&self.entries, &Limits { dmd: self.dmd, images: 1, frame_us })?;
+        validate(&self.entries, &TableLimits { dmd: self.dmd, images: 1, frame_us })?;
         let mut steps = stop();
         steps.push(write(Opcode::LED_ENABLE, &[LEDS_OFF]));
         steps.push(write(Opcode::RECEIVER, &[self.receiver as u8]));

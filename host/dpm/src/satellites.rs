@@ -6,7 +6,7 @@ use dpm_rig::failure::Failure;
 
 /// Commands of satellites.
 #[derive(Debug, Subcommand)]
-pub(crate) enum Command {
+pub(crate) enum SatelliteCommand {
     /// Control a DLPC900 projector (LightCrafter 6500 / 9000): status, patterns, rest
     #[cfg(feature = "dlpc900")]
     Dlpc900(dpm_dlpc900_rig::command::Dlpc900Args),
@@ -22,10 +22,10 @@ pub fn register() {
 ///
 /// # Errors
 /// Those of the command.
-pub(crate) fn execute(command: &Command) -> Result<String, Failure> {
+pub(crate) fn execute(command: &SatelliteCommand) -> Result<String, Failure> {
     match *command {
         #[cfg(feature = "dlpc900")]
-        Command::Dlpc900(ref args) => dpm_dlpc900_rig::command::execute(args),
+        SatelliteCommand::Dlpc900(ref args) => dpm_dlpc900_rig::command::execute(args),
     }
 }
 

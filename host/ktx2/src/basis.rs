@@ -7,7 +7,7 @@
 use basisu::{DecodeFlags, TargetFormat, Transcoder};
 use ktx2::{ColorModel, Format, Header, Index, LevelIndex, SupercompressionScheme};
 
-use super::{damaged, unsupported, Content, Ktx2Error};
+use super::{damaged, unsupported, Ktx2Error, LevelContent};
 
 /// Bytes of a block of UASTC and of ASTC.
 const BLOCK_BYTES: usize = 16;
@@ -31,7 +31,7 @@ mod channel {
 }
 
 /// The texels of ETC1S, which BasisLZ always compresses further.
-pub(crate) fn etc1s(content: &Content) -> Result<Vec<[u8; 4]>, Ktx2Error> {
+pub(crate) fn etc1s(content: &LevelContent) -> Result<Vec<[u8; 4]>, Ktx2Error> {
     let alpha = match content.file.descriptor.channels[..] {
         [channel::RGB | channel::ETC1S_RED] => false,
         [channel::RGB, channel::ALPHA] => true,
@@ -44,38 +44,39 @@ pub(crate) fn etc1s(content: &Content) -> Result<Vec<[u8; 4]>, Ktx2Error> {
         damaged("points outside of its own data: it is cut off or damaged, export it again")
     })?;
     let channels: &[u8] = if alpha { &[channel::RGB, channel::ALPHA] } else { &[channel::RGB] };
-    let parts = Parts { format: None, model: ColorModel::ETC1S, block: [4, 4], channels, global };
+    let parts = LevelParts { format: None, model: ColorModel::ETC1S, block: [4, 4], channels, global };
     transcode(content, &parts, content.file.level)
 }
 
 /// The texels of UASTC.
-pub(crate) fn uastc(content: &Content) -> Result<Vec<[u8; 4]>, Ktx2Error> {
+pub(crate) fn uastc(content: &LevelContent) -> Result<Vec<[u8; 4]>, Ktx2Error> {
     let channel = match content.file.descriptor.channels[..] {
         [channel::RGB | channel::UASTC_RED] => channel::RGB,
         [channel::RGBA] => channel::RGBA,
         _ => return Err(unsupported("of two channels, or of unknown ones")),
     };
     let channels = &[channel];
-    let parts = Parts { format: None, model: ColorModel::UASTC, block: [4, 4], channels, global: vec![] };
+    let parts =
+        LevelParts { format: None, model: ColorModel::UASTC, block: [4, 4], channels, global: vec![] };
     transcode(content, &parts, &content.bytes(blocks(content, [4, 4]) * BLOCK_BYTES)?)
 }
 
 /// The texels of ASTC of low dynamic range. `format` is one of those that [`super::blocks::is_astc`] knows.
-pub(crate) fn astc(content: &Content, format: Format) -> Result<Vec<[u8; 4]>, Ktx2Error> {
+pub(crate) fn astc(content: &LevelContent, format: Format) -> Result<Vec<[u8; 4]>, Ktx2Error> {
     let block = content.file.descriptor.block;
     let channels = &[channel::RGBA];
-    let parts = Parts { format: Some(format), model: ColorModel::ASTC, block, channels, global: vec![] };
+    let parts = LevelParts { format: Some(format), model: ColorModel::ASTC, block, channels, global: vec![] };
     transcode(content, &parts, &content.bytes(blocks(content, block) * BLOCK_BYTES)?)
 }
 
 /// The number of blocks that cover the picture.
-fn blocks(content: &Content, [width, height]: [u32; 2]) -> usize {
+fn blocks(content: &LevelContent, [width, height]: [u32; 2]) -> usize {
     let across = content.size.width.div_ceil(width) as usize;
     across * content.size.height.div_ceil(height) as usize
 }
 
 /// The global data of ETC1S with the image of level 0 as the only one; nothing if it is not all there.
-fn single_image(content: &Content, alpha: bool) -> Option<Vec<u8>> {
+fn single_image(content: &LevelContent, alpha: bool) -> Option<Vec<u8>> {
     let header = content.file.header;
     let images = header.level_count.max(1) as usize;
     let global = content.file.global;
@@ -97,7 +98,7 @@ fn single_image(content: &Content, alpha: bool) -> Option<Vec<u8>> {
 }
 
 /// What the file for the decoder says of its only level.
-struct Parts<'a> {
+struct LevelParts<'a> {
     format: Option<Format>,
     model: ColorModel,
     /// Texels along the sides of a block, 1 to 256.
@@ -108,9 +109,9 @@ struct Parts<'a> {
     global: Vec<u8>,
 }
 
-impl Parts<'_> {
+impl LevelParts<'_> {
     /// A KTX2 file of the picture's size with `data` as its only level.
-    fn file(&self, content: &Content, data: &[u8]) -> Vec<u8> {
+    fn file(&self, content: &LevelContent, data: &[u8]) -> Vec<u8> {
         let descriptor = self.descriptor();
         let descriptor_at = Header::LENGTH + LevelIndex::LENGTH;
         let global_at = descriptor_at + descriptor.len();
@@ -158,7 +159,7 @@ impl Parts<'_> {
 }
 
 /// Decodes `data` as the level of a file with these parts.
-fn transcode(content: &Content, parts: &Parts, data: &[u8]) -> Result<Vec<[u8; 4]>, Ktx2Error> {
+fn transcode(content: &LevelContent, parts: &LevelParts, data: &[u8]) -> Result<Vec<[u8; 4]>, Ktx2Error> {
     // What the decoder calls the error says no more: it gives the same one for all damage.
     let failed = |_| damaged("cannot be decoded: its data is damaged, export it again");
     let file = parts.file(content, data);

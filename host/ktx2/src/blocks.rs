@@ -4,7 +4,7 @@
 use ktx2::Format;
 
 use super::numbers::raised;
-use super::{etc, Content, Ktx2Error};
+use super::{etc, Ktx2Error, LevelContent};
 use dpm_common::rounding::Rounder;
 
 /// Texels along each side of a block.
@@ -17,7 +17,7 @@ pub(crate) type Square = [[u8; 4]; SIDE * SIDE];
 type Decode = fn(&[u8], &mut Rounder) -> Square;
 
 /// A format of blocks.
-pub(crate) struct Block {
+pub(crate) struct BlockFormat {
     /// Bytes of a block.
     bytes: usize,
     decode: Decode,
@@ -30,7 +30,7 @@ pub(crate) fn is_astc(format: Format) -> bool {
     (Format::ASTC_4x4_UNORM_BLOCK..=Format::ASTC_12x12_SRGB_BLOCK).contains(&format)
 }
 
-impl Block {
+impl BlockFormat {
     /// The format of blocks with this name.
     pub(crate) fn of(format: Format) -> Option<Self> {
         let (bytes, channels, decode): (_, _, Decode) = match format {
@@ -74,7 +74,11 @@ impl Block {
     }
 
     /// Every texel, row by row from the top. Blocks at the right and at the bottom may reach beyond the picture.
-    pub(crate) fn texels(&self, content: &Content, rounder: &mut Rounder) -> Result<Vec<[u8; 4]>, Ktx2Error> {
+    pub(crate) fn texels(
+        &self,
+        content: &LevelContent,
+        rounder: &mut Rounder,
+    ) -> Result<Vec<[u8; 4]>, Ktx2Error> {
         let (width, height) = (content.size.width as usize, content.size.height as usize);
         let across = width.div_ceil(SIDE);
         let stored = content.bytes(across * height.div_ceil(SIDE) * self.bytes)?;

@@ -95,7 +95,7 @@ impl<'a> Image<'a> {
         let file = &self.file;
         check_meaning(file)?;
         let [width, height] = self.sides();
-        let content = Content { file, size: Size { width, height } };
+        let content = LevelContent { file, size: Size { width, height } };
         let mut stored = match (file.header.format, file.descriptor.model) {
             (None, Some(ColorModel::ETC1S)) => StoredTexels::of_bytes(basis::etc1s(&content)?),
             (None, Some(ColorModel::UASTC)) => StoredTexels::of_bytes(basis::uastc(&content)?),
@@ -163,11 +163,11 @@ impl StoredTexels {
     }
 
     /// The texels of a format that Vulkan has a name for.
-    fn of(content: &Content, format: Format) -> Result<Self, Ktx2Error> {
+    fn of(content: &LevelContent, format: Format) -> Result<Self, Ktx2Error> {
         let mut rounder = Rounder::default();
-        let (texels, channels) = if let Some(layout) = plain::Layout::of(format) {
+        let (texels, channels) = if let Some(layout) = plain::TexelLayout::of(format) {
             (layout.texels(content, &mut rounder)?, layout.channels)
-        } else if let Some(block) = blocks::Block::of(format) {
+        } else if let Some(block) = blocks::BlockFormat::of(format) {
             (block.texels(content, &mut rounder)?, block.channels)
         } else if blocks::is_astc(format) {
             (basis::astc(content, format)?, 4)
@@ -223,12 +223,12 @@ fn swizzle(order: &str, texels: &mut [[u8; 4]]) -> Result<(), Ktx2Error> {
 }
 
 /// Level 0 of an image, and what errors call it.
-struct Content<'a> {
+struct LevelContent<'a> {
     file: &'a File<'a>,
     size: Size,
 }
 
-impl Content<'_> {
+impl LevelContent<'_> {
     /// The first `needed` bytes of the level, without supercompression.
     fn bytes(&self, needed: usize) -> Result<Cow<'_, [u8]>, Ktx2Error> {
         let cut_off = |there: usize| {

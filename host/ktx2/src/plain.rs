@@ -3,11 +3,11 @@
 use ktx2::Format;
 
 use super::numbers::Number;
-use super::{Content, Ktx2Error};
+use super::{Ktx2Error, LevelContent};
 use dpm_common::rounding::Rounder;
 
 /// What a texel consists of.
-pub(crate) struct Layout {
+pub(crate) struct TexelLayout {
     /// How each of its channels is stored.
     number: Number,
     /// Channels, 1 to 4, beginning with red.
@@ -16,7 +16,7 @@ pub(crate) struct Layout {
     swapped: bool,
 }
 
-impl Layout {
+impl TexelLayout {
     /// The layout of a format whose channels are numbers of the same kind, and stand for fractions of 1.
     pub(crate) fn of(format: Format) -> Option<Self> {
         use Number::{Half, Single, Snorm16, Snorm8, Unorm16, Unorm8};
@@ -55,7 +55,11 @@ impl Layout {
     }
 
     /// Every texel, row by row from the top. A channel that is not stored is 0, and alpha is 1.
-    pub(crate) fn texels(&self, content: &Content, rounder: &mut Rounder) -> Result<Vec<[u8; 4]>, Ktx2Error> {
+    pub(crate) fn texels(
+        &self,
+        content: &LevelContent,
+        rounder: &mut Rounder,
+    ) -> Result<Vec<[u8; 4]>, Ktx2Error> {
         let bytes = self.number.bytes();
         let stored = content.bytes(content.size.texels() * self.channels * bytes)?;
         let texel = |stored: &[u8]| {

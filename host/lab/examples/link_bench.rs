@@ -8,7 +8,7 @@ use dpm_device::planes::Raster;
 use dpm_device::time::{DeviceTicks, HostTime};
 use dpm_device::transport::inproc::Direct;
 use dpm_device::transport::{Lane, SendError, Transport, TransportError};
-use dpm_lab::link_test::Content;
+use dpm_lab::link_test::TestFrames;
 use dpm_mock::projector::{MockConfig, MockProjector};
 use dpm_render::gpu::{Gpu, GpuOptions};
 use dpm_rig::config::{Overrides, RigConfig};
@@ -46,7 +46,7 @@ impl Transport for Apart {
 }
 
 /// Median and least milliseconds of the host's part of a frame, the device's, and bytes a frame.
-fn time(settings: LinkSettings, content: &Content, frames: u64) -> (f64, f64, f64, f64) {
+fn time(settings: LinkSettings, content: &TestFrames, frames: u64) -> (f64, f64, f64, f64) {
     let setup = MockConfig { events_kept: 0, ..MockConfig::new(settings.raster) };
     let bytes = projector::frame_bytes(settings.raster, settings.schedule.len());
     let mut medium = Apart {
@@ -105,7 +105,7 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
     let raster = Raster::new(1024, 768).ok_or("raster")?;
     let rig = Rig::build(&config, Some(raster))?;
     let gpu = Gpu::open(&GpuOptions::default())?;
-    let contents = [Content::rendered(&rig, &gpu, 8, &|| false)?, Content::prepared(&rig, 8)];
+    let contents = [TestFrames::rendered(&rig, &gpu, 8, &|| false)?, TestFrames::prepared(&rig, 8)];
     println!("content   codecs        host ms  least   device   bytes/frame");
     for content in &contents {
         for (name, codecs) in [

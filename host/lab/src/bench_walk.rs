@@ -4,7 +4,7 @@ use super::sequence::{draw, poses_at};
 use super::stamp::Stamp;
 use dpm_common::realtime::os::thread_cpu_ns;
 use dpm_render::gpu::{Gpu, GpuError, GpuOptions};
-use dpm_render::walker::{Kernel, Ray};
+use dpm_render::walker::{Ray, WalkKernel};
 use dpm_render::{RenderError, Renderer, RendererSettings, Tracing};
 use dpm_rig::pipeline::renderer_settings;
 use dpm_rig::rig::Rig;
@@ -101,7 +101,7 @@ fn rates_of(
         WalkRate { kernel, kind, rays: rays.len(), rays_per_s, hit, differ }
     };
     let mut rates = Vec::new();
-    for &kernel in Kernel::available() {
+    for &kernel in WalkKernel::available() {
         let (mut hits, mut best) = (vec![NO_HIT; rays.len()], i64::MAX);
         for _ in 0..RUNS {
             let begin = thread_cpu_ns();

@@ -73,7 +73,7 @@ pub struct FrameWork {
 
 /// A GPU by what its maker says of it, and by what was assumed.
 #[derive(Clone, Copy, Debug)]
-pub(crate) struct Card {
+pub(crate) struct GpuCard {
     name: &'static str,
     /// Schedulers, each of which issues an instruction for 32 lanes in a clock.
     schedulers: f64,
@@ -92,8 +92,8 @@ pub(crate) struct Card {
 }
 
 /// The chip that was measured stands last.
-const CARDS: [Card; 4] = [
-    Card {
+const CARDS: [GpuCard; 4] = [
+    GpuCard {
         name: "RTX 4090",
         schedulers: 128.0 * 4.0,
         clock_hz: 2.52e9,
@@ -103,7 +103,7 @@ const CARDS: [Card; 4] = [
         assumed_rays_per_s: [3e9, 4e9],
         width: 32,
     },
-    Card {
+    GpuCard {
         name: "RX 7900 XTX",
         schedulers: 96.0 * 2.0,
         clock_hz: 2.4e9,
@@ -113,7 +113,7 @@ const CARDS: [Card; 4] = [
         assumed_rays_per_s: [1.5e9, 2e9],
         width: 64,
     },
-    Card {
+    GpuCard {
         name: "RTX 4060 laptop",
         schedulers: 24.0 * 4.0,
         clock_hz: 1.92e9,
@@ -123,7 +123,7 @@ const CARDS: [Card; 4] = [
         assumed_rays_per_s: [0.5e9, 0.7e9],
         width: 32,
     },
-    Card {
+    GpuCard {
         name: "H200",
         schedulers: 132.0 * 4.0,
         clock_hz: 1.98e9,
@@ -187,7 +187,7 @@ pub(crate) fn instructions_a_ray(walked: f64, rays_a_path: f64) -> f64 {
     (steps + SHADING_INSTRUCTIONS) * (1.0 + missing * (WITHOUT_LIGHT_RAYS - 1.0))
 }
 
-impl Card {
+impl GpuCard {
     /// The chip of the H100 and the H200, whose clocks and schedulers are the same.
     #[cfg(test)]
     pub(crate) fn measured_chip() -> Self {
@@ -209,7 +209,7 @@ impl Card {
 }
 
 /// `None` for a method that traced nothing.
-fn on(card: &Card, (method, rays, work): CountedFrame<'_>) -> Option<Modelled> {
+fn on(card: &GpuCard, (method, rays, work): CountedFrame<'_>) -> Option<Modelled> {
     let lanes = work.lanes.iter().find(|lanes| lanes.width == card.width)?;
     let rays_of_paths = work.path_rays as f64;
     let walked = 1.0 - work.proven_rays as f64 / rays_of_paths.max(1.0);

@@ -73,12 +73,12 @@ pub struct LinkWay {
 }
 
 /// Frames to send, over and over, there and back so that neighbours stay neighbours.
-pub struct Content {
+pub struct TestFrames {
     name: &'static str,
     frames: Vec<BitPlaneFrame>,
 }
 
-impl Content {
+impl TestFrames {
     /// `count` successive pictures of the rig's scene, at least one; fewer when `stop` says so.
     ///
     /// # Errors
@@ -262,7 +262,7 @@ pub fn judge_projector(
 /// The projector is missing, refuses or goes away.
 pub fn link_test(
     rig: &Rig,
-    content: &Content,
+    content: &TestFrames,
     seconds: f64,
     stop: &dyn Fn() -> bool,
 ) -> Result<LinkTestReport, Failure> {
@@ -307,7 +307,7 @@ fn way(
     compaction: String,
     transport: &mut dyn Transport,
     clock: MonotonicClock,
-    content: &Content,
+    content: &TestFrames,
     seconds: f64,
     stop: &dyn Fn() -> bool,
 ) -> Result<LinkWay, Failure> {
@@ -483,7 +483,7 @@ mod tests {
             f.bytes_mut().fill(v);
             f
         });
-        let content = Content { name: "prepared", frames: frames.collect() };
+        let content = TestFrames { name: "prepared", frames: frames.collect() };
         let shown: Vec<u8> = (0..9)
             .map(|n| {
                 let mut planes = [0; 8];
@@ -492,7 +492,7 @@ mod tests {
             })
             .collect();
         assert_eq!(shown, [1, 2, 3, 2, 1, 2, 3, 2, 1]);
-        let one = Content { frames: content.frames[..1].to_vec(), ..content };
+        let one = TestFrames { frames: content.frames[..1].to_vec(), ..content };
         let mut planes = [0; 8];
         one.fill(77, &mut planes);
         assert_eq!(planes, [1; 8]);

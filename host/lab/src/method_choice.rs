@@ -13,7 +13,7 @@ use dpm_render::gpu::Gpu;
 use dpm_render::method::Method;
 use dpm_render::RenderError;
 use dpm_rig::config::{Pace, RenderMethod};
-use dpm_rig::method_choice::{device_of, key, Candidate, MethodChoice};
+use dpm_rig::method_choice::{device_of, key, MethodCandidate, MethodChoice};
 use dpm_rig::rig::{Rig, RigError};
 use std::path::Path;
 use std::sync::Arc;
@@ -97,13 +97,13 @@ pub fn choose(
         }
     }
     let (points, mean) = (seen.points, seen.light / seen.points);
-    let mut candidates: Vec<Candidate> = CANDIDATES
+    let mut candidates: Vec<MethodCandidate> = CANDIDATES
         .iter()
         .zip(&trials)
         .zip(&seen.squares)
         .map(|((which, (spp, time_to_dpm)), sum)| {
             let relative = |square: f64| (square / points).max(0.0).sqrt() / mean;
-            Candidate {
+            MethodCandidate {
                 method: which.word().to_owned(),
                 spp: *spp,
                 time_to_dpm: *time_to_dpm,
@@ -232,13 +232,13 @@ fn errors(
 }
 
 /// The candidate with the least error, or `dpm` where that is about as good.
-fn best_of(candidates: &[Candidate]) -> usize {
+fn best_of(candidates: &[MethodCandidate]) -> usize {
     let least = (0..candidates.len()).min_by(|a, b| candidates[*a].error.total_cmp(&candidates[*b].error));
     least.filter(|best| candidates[*best].error < TIE * candidates[0].error).unwrap_or(0)
 }
 
 /// What a run of the candidate is given.
-fn chosen(rig: &Rig, candidate: &Candidate, which: RenderMethod) -> MethodChoice {
+fn chosen(rig: &Rig, candidate: &MethodCandidate, which: RenderMethod) -> MethodChoice {
     let render = &rig.config.render;
     let mut choice = MethodChoice {
         key: String::new(),
@@ -268,8 +268,8 @@ fn chosen(rig: &Rig, candidate: &Candidate, which: RenderMethod) -> MethodChoice
 mod tests {
     use super::*;
 
-    fn candidate(method: &str, error: f64) -> Candidate {
-        Candidate { method: method.into(), spp: 2.0, time_to_dpm: 1.0, error, runs: [error; 2] }
+    fn candidate(method: &str, error: f64) -> MethodCandidate {
+        MethodCandidate { method: method.into(), spp: 2.0, time_to_dpm: 1.0, error, runs: [error; 2] }
     }
 
     #[test]

@@ -131,7 +131,7 @@ impl FaultKind {
 
 /// When a fault is active, nanoseconds after the mock's start.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub struct Window {
+pub struct FaultWindow {
     /// First instant.
     pub start_ns: i64,
     /// Length; 0 means the one item at or after the start.
@@ -140,7 +140,7 @@ pub struct Window {
     pub period_ns: i64,
 }
 
-impl Window {
+impl FaultWindow {
     /// Start of the window that contains `t_ns`, if one does. A window of length 0 contains its start only.
     pub fn containing(&self, t_ns: i64) -> Option<i64> {
         let since = t_ns.checked_sub(self.start_ns).filter(|s| *s >= 0)?;
@@ -171,7 +171,7 @@ pub struct Fault {
     /// Probability, metres or nanoseconds, according to the kind; 1 for kinds without amount.
     pub amount: f64,
     /// When; `None` means always.
-    pub window: Option<Window>,
+    pub window: Option<FaultWindow>,
 }
 
 impl Fault {
@@ -377,7 +377,7 @@ fn parse_fault(token: &str) -> Result<Fault, FaultError> {
     }
 }
 
-fn parse_window(token: &str, text: &str) -> Result<Window, FaultError> {
+fn parse_window(token: &str, text: &str) -> Result<FaultWindow, FaultError> {
     let wrong = |rule| FaultError::Window { token: token.to_owned(), rule };
     let duration = |t: &str| {
         parse_duration(t.trim())
@@ -391,7 +391,7 @@ fn parse_window(token: &str, text: &str) -> Result<Window, FaultError> {
         Some((start, length)) => (start, duration(length)?),
         None => (text, 0),
     };
-    let window = Window { start_ns: duration(start)?, length_ns, period_ns };
+    let window = FaultWindow { start_ns: duration(start)?, length_ns, period_ns };
     if text.contains('+') && length_ns == 0 {
         return Err(wrong("the length must be above 0"));
     }
@@ -462,7 +462,7 @@ mod tests {
         let p = plan(" loss=0.01, drop-out@1.5s+20ms/2s ,jump=3@1.5s, slow=2ms,invalid,Reset@3s");
         assert_eq!(p.faults().len(), 6);
         assert_eq!(p.faults()[0], Fault { kind: FaultKind::Loss, amount: 0.01, window: None });
-        let w = Window { start_ns: 1_500_000_000, length_ns: 20_000_000, period_ns: 2_000_000_000 };
+        let w = FaultWindow { start_ns: 1_500_000_000, length_ns: 20_000_000, period_ns: 2_000_000_000 };
         assert_eq!(p.faults()[1].window, Some(w));
         assert_eq!(p.faults()[3].amount, 2e6);
         assert_eq!(p.faults()[4].amount, 1.0);

@@ -27,7 +27,7 @@ const VISITED_M: [[f64; 3]; 2] = [[0.0, 0.0, 0.12], [0.4, 0.3, 0.3]];
 
 /// What a hand may be told.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub enum Order {
+pub enum HandOrder {
     /// Move as before the first order.
     Wander,
     /// Hold the tip at a point of the world, metres.
@@ -55,7 +55,7 @@ struct Stretch {
     since_ns: i64,
     /// Where it was then; it leaves from there.
     from: Pose,
-    order: Order,
+    order: HandOrder,
     /// Counts the orders.
     number: u32,
 }
@@ -67,7 +67,7 @@ impl Hand {
     }
 
     /// Takes an order at `now_ns`, which no pose that was asked for may lie behind.
-    pub fn tell(&self, now_ns: i64, order: Order) {
+    pub fn tell(&self, now_ns: i64, order: HandOrder) {
         let from = self.pose_at(now_ns);
         let mut stretches = self.stretches.write().unwrap_or_else(PoisonError::into_inner);
         let number = stretches.back().map_or(0, |s| s.number.wrapping_add(1));
@@ -96,10 +96,10 @@ impl Hand {
     /// Where an order alone would have the wand.
     fn doing(&self, stretch: &Stretch, t_ns: i64) -> Pose {
         let (place, turn) = match stretch.order {
-            Order::Wander => return self.wander.pose_at(t_ns),
-            Order::Visit { rest_ns } => return self.visiting(t_ns - stretch.since_ns, rest_ns),
-            Order::Tip(place) => (place, tilt(TILT_RAD, stretch.number)),
-            Order::Pivot(place) => {
+            HandOrder::Wander => return self.wander.pose_at(t_ns),
+            HandOrder::Visit { rest_ns } => return self.visiting(t_ns - stretch.since_ns, rest_ns),
+            HandOrder::Tip(place) => (place, tilt(TILT_RAD, stretch.number)),
+            HandOrder::Pivot(place) => {
                 let seconds = 1e-9 * (t_ns - stretch.since_ns) as f64;
                 let [a, b] = PIVOT_HZ.map(|hz| libm::sin(std::f64::consts::TAU * hz * seconds));
                 (place, from_rotation_vector([PIVOT_RAD * a, PIVOT_RAD * b, 0.4 * PIVOT_RAD * a * b]))
@@ -195,10 +195,10 @@ mod tests {
         let ms = 1_000_000;
         assert_eq!(hand.pose_at(123 * ms), wander.pose_at(123 * ms));
         let (point, pivot) = ([0.2, -0.1, 0.3], [-0.1, 0.2, 0.0]);
-        hand.tell(1_000 * ms, Order::Tip(point));
-        hand.tell(3_000 * ms, Order::Pivot(pivot));
-        hand.tell(9_000 * ms, Order::Tip(pivot));
-        hand.tell(11_000 * ms, Order::Wander);
+        hand.tell(1_000 * ms, HandOrder::Tip(point));
+        hand.tell(3_000 * ms, HandOrder::Pivot(pivot));
+        hand.tell(9_000 * ms, HandOrder::Tip(pivot));
+        hand.tell(11_000 * ms, HandOrder::Wander);
         // What was before an order stays as it was.
         assert_eq!(hand.pose_at(900 * ms), wander.pose_at(900 * ms));
         for t in [1_600, 2_300, 2_999] {
@@ -223,7 +223,7 @@ mod tests {
     #[test]
     fn places_are_visited_near_and_far_and_rested_at() {
         let hand = Hand::new(Motion::still(Pose::IDENTITY).unwrap(), TIP);
-        hand.tell(0, Order::Visit { rest_ns: 2_000_000_000 });
+        hand.tell(0, HandOrder::Visit { rest_ns: 2_000_000_000 });
         let tip = |ms: i64| tip_of(&hand.pose_at(ms * 1_000_000));
         let mut places: Vec<[f64; 3]> = Vec::new();
         for number in 0..20 {
@@ -244,8 +244,8 @@ mod tests {
     #[test]
     fn two_touches_of_a_point_are_at_different_angles() {
         let hand = Hand::new(Motion::still(Pose::IDENTITY).unwrap(), TIP);
-        hand.tell(0, Order::Tip([0.0; 3]));
-        hand.tell(2 * REACH_NS, Order::Tip([0.0; 3]));
+        hand.tell(0, HandOrder::Tip([0.0; 3]));
+        hand.tell(2 * REACH_NS, HandOrder::Tip([0.0; 3]));
         let (a, b) = (hand.pose_at(REACH_NS), hand.pose_at(4 * REACH_NS));
         assert!(apart(tip_of(&a), tip_of(&b)) < 1e-12 && apart(a.position_m, b.position_m) > 0.01);
     }

@@ -72,12 +72,12 @@ pub struct Twist {
 #[derive(Clone, Debug, PartialEq)]
 pub struct Motion {
     rest: Pose,
-    parts: Vec<Part>,
+    parts: Vec<ElementaryMotion>,
 }
 
 /// One elementary motion with its period in whole nanoseconds.
 #[derive(Clone, Debug, PartialEq)]
-enum Part {
+enum ElementaryMotion {
     /// Through poses relative to the rest pose, so many nanoseconds apart; at rest before the first and after the last.
     Path { poses: Arc<[Pose]>, step_ns: i64 },
     /// Two straight stretches of twice `half_stretch_ns`, joined by turns of `turn_ns`, with a rest of `rest_ns` in the
@@ -130,7 +130,7 @@ impl Motion {
             return Err(MotionError::RestPose(*pose));
         }
         let is_path = poses.len() >= 4 && step_ns > 0;
-        let path = Part::Path { poses: poses.into(), step_ns };
+        let path = ElementaryMotion::Path { poses: poses.into(), step_ns };
         Ok(Self { rest, parts: if is_path { vec![path] } else { Vec::new() } })
     }
 
@@ -162,7 +162,7 @@ impl Motion {
     }
 }
 
-fn add_part(spec: &MotionSpec, rest: &Pose, parts: &mut Vec<Part>) -> Result<(), MotionError> {
+fn add_part(spec: &MotionSpec, rest: &Pose, parts: &mut Vec<ElementaryMotion>) -> Result<(), MotionError> {
     match *spec {
         MotionSpec::Still {} => {}
         MotionSpec::Translate { direction, speed_m_s, amplitude_m, acceleration_m_s2, rest_s } => {
@@ -173,7 +173,11 @@ fn add_part(spec: &MotionSpec, rest: &Pose, parts: &mut Vec<Part>) -> Result<(),
             let speed = positive("peak_speed_m_s", peak_speed_m_s)?;
             let acceleration = positive("peak_acceleration_m_s2", peak_acceleration_m_s2)?;
             let period_ns = whole_period(core::f64::consts::TAU * speed / acceleration)?;
-            parts.push(Part::Wave { direction, amplitude: speed * speed / acceleration, period_ns });
+            parts.push(ElementaryMotion::Wave {
+                direction,
+                amplitude: speed * speed / acceleration,
+                period_ns,
+            });
         }
         MotionSpec::Rotate { axis, rate_rad_s, pivot_offset_m } => {
             if pivot_offset_m.iter().any(|c| !c.is_finite()) {
@@ -187,7 +191,7 @@ fn add_part(spec: &MotionSpec, rest: &Pose, parts: &mut Vec<Part>) -> Result<(),
             let acceleration = positive("peak_acceleration_rad_s2", peak_acceleration_rad_s2)?;
             let period_ns = whole_period(core::f64::consts::TAU * rate / acceleration)?;
             let amplitude = rate * rate / acceleration;
-            parts.push(Part::Sway { axis, amplitude, pivot: rest.position_m, period_ns });
+            parts.push(ElementaryMotion::Sway { axis, amplitude, pivot: rest.position_m, period_ns });
         }
         MotionSpec::Screw { axis, rate_rad_s, speed_m_s, amplitude_m, acceleration_m_s2 } => {
             turn(axis, rate_rad_s, rest.position_m, parts)?;
@@ -205,7 +209,7 @@ fn line(
     acceleration: f64,
     rest_s: f64,
     field: &'static str,
-) -> Result<Part, MotionError> {
+) -> Result<ElementaryMotion, MotionError> {
     let direction = unit3(field, direction)?;
     let speed = positive("speed_m_s", speed)?;
     let amplitude = positive("amplitude_m", amplitude)?;
@@ -230,37 +234,48 @@ fn line(
     // than 1 nm per m/s.
     let turn_ns = ((turn_s * 1e9).round() as i64).max(2);
     let half_stretch_ns = (stretch_s * 0.5e9).round() as i64;
-    Ok(Part::Line { direction, speed, half_stretch_ns, turn_ns, rest_ns: (rest_s * 1e9).round() as i64 })
+    Ok(ElementaryMotion::Line {
+        direction,
+        speed,
+        half_stretch_ns,
+        turn_ns,
+        rest_ns: (rest_s * 1e9).round() as i64,
+    })
 }
 
-fn turn(axis: [f64; 3], rate: f64, pivot: [f64; 3], parts: &mut Vec<Part>) -> Result<(), MotionError> {
+fn turn(
+    axis: [f64; 3],
+    rate: f64,
+    pivot: [f64; 3],
+    parts: &mut Vec<ElementaryMotion>,
+) -> Result<(), MotionError> {
     let axis = unit3("axis", axis)?;
     if !rate.is_finite() || rate.abs() > 1e5 {
         return Err(MotionError::OutOfRange { field: "rate_rad_s", value: rate, rule: "within +-1e5" });
     }
     if rate != 0.0 {
         let period_ns = whole_period(core::f64::consts::TAU / rate.abs())?;
-        parts.push(Part::Turn { axis, sense: rate.signum(), pivot, period_ns });
+        parts.push(ElementaryMotion::Turn { axis, sense: rate.signum(), pivot, period_ns });
     }
     Ok(())
 }
 
-impl Part {
+impl ElementaryMotion {
     /// Applies this part to `pose` and `twist`, the state after the previous parts.
     fn apply(&self, t_ns: i64, pose: &mut Pose, twist: &mut Twist) {
         match *self {
-            Part::Path { ref poses, step_ns } => along(poses, step_ns, t_ns, pose, twist),
-            Part::Line { direction, speed, half_stretch_ns, turn_ns, rest_ns } => {
+            ElementaryMotion::Path { ref poses, step_ns } => along(poses, step_ns, t_ns, pose, twist),
+            ElementaryMotion::Line { direction, speed, half_stretch_ns, turn_ns, rest_ns } => {
                 let (s, v) = line_at(t_ns, speed, half_stretch_ns, turn_ns, rest_ns);
                 pose.position_m = add(pose.position_m, scale(direction, s));
                 twist.linear_m_s = add(twist.linear_m_s, scale(direction, v));
             }
-            Part::Wave { direction, amplitude, period_ns } => {
+            ElementaryMotion::Wave { direction, amplitude, period_ns } => {
                 let (sin, cos, omega) = phase(t_ns, period_ns);
                 pose.position_m = add(pose.position_m, scale(direction, amplitude * sin));
                 twist.linear_m_s = add(twist.linear_m_s, scale(direction, amplitude * omega * cos));
             }
-            Part::Turn { axis, sense, pivot, period_ns } => {
+            ElementaryMotion::Turn { axis, sense, pivot, period_ns } => {
                 let fraction = t_ns.rem_euclid(period_ns) as f64 / period_ns as f64;
                 let omega = core::f64::consts::TAU / (period_ns as f64 * 1e-9);
                 rotate_about(
@@ -272,7 +287,7 @@ impl Part {
                     twist,
                 );
             }
-            Part::Sway { axis, amplitude, pivot, period_ns } => {
+            ElementaryMotion::Sway { axis, amplitude, pivot, period_ns } => {
                 let (sin, cos, omega) = phase(t_ns, period_ns);
                 rotate_about(axis, amplitude * sin, amplitude * omega * cos, pivot, pose, twist);
             }

@@ -109,7 +109,7 @@ pub enum NatNetServerError {
 pub const NATNET_FAULTS: [FaultKind; 16] = FaultKind::ALL;
 
 #[derive(Clone, Copy)]
-struct Client {
+struct NatNetPeer {
     address: SocketAddrV4,
     version: Version,
     connected_at: HostTime,
@@ -123,7 +123,7 @@ pub struct NatNetServer {
     config: NatNetServerConfig,
     source: SampleSource,
     markers: [[f32; 3]; 4],
-    clients: Vec<Client>,
+    clients: Vec<NatNetPeer>,
     queue: ReportQueue,
     due: Vec<u64>,
     bodies: Vec<RigidBody>,
@@ -302,7 +302,13 @@ impl NatNetServer {
         if let Some(client) = self.clients.iter_mut().find(|c| c.address == address) {
             client.version = version;
         } else if self.clients.len() < Self::MAX_CLIENTS {
-            self.clients.push(Client { address, version, connected_at: now, heard_at: now, is_told: false });
+            self.clients.push(NatNetPeer {
+                address,
+                version,
+                connected_at: now,
+                heard_at: now,
+                is_told: false,
+            });
         }
         version
     }
@@ -383,7 +389,7 @@ impl NatNetServer {
 
     fn send_report(&mut self, k: u64, now: HostTime, send: &mut dyn FnMut(&[u8], SocketAddrV4)) {
         self.frames_sent += 1;
-        let waits = |c: &Client| !c.is_told && now.ns_since(c.connected_at) < Self::GRACE_NS;
+        let waits = |c: &NatNetPeer| !c.is_told && now.ns_since(c.connected_at) < Self::GRACE_NS;
         if matches!(self.config.streaming, Streaming::Unicast(_)) && self.clients.iter().all(waits) {
             return;
         }

@@ -19,7 +19,7 @@ pub struct VrpnHost {
     thread: Option<JoinHandle<io::Result<()>>>,
 }
 
-struct Client {
+struct VrpnPeer {
     stream: TcpStream,
     connection: VrpnConnection,
     out: Vec<u8>,
@@ -101,7 +101,7 @@ struct Server {
     clock: Arc<dyn HostClock>,
     /// Wall clock minus host clock, fixed at the start so that stamps keep the source's exact spacing.
     wall_offset_ns: i64,
-    clients: Vec<Client>,
+    clients: Vec<VrpnPeer>,
     last: HostTime,
 }
 
@@ -175,13 +175,13 @@ impl Server {
         if is_ready && self.clients.len() < VrpnHost::MAX_CLIENTS {
             let mut out = Vec::new();
             let connection = VrpnConnection::new(&self.names, &mut out);
-            self.clients.push(Client { stream, connection, out, since: now });
+            self.clients.push(VrpnPeer { stream, connection, out, since: now });
         }
     }
 }
 
 /// Reads the client's input; false if it is gone or sends invalid data.
-fn read(client: &mut Client, names: &VrpnNames, wall_us: u64) -> bool {
+fn read(client: &mut VrpnPeer, names: &VrpnNames, wall_us: u64) -> bool {
     let mut buffer = [0; 4096];
     for _ in 0..4 {
         match client.stream.read(&mut buffer) {
@@ -198,7 +198,7 @@ fn read(client: &mut Client, names: &VrpnNames, wall_us: u64) -> bool {
 }
 
 /// Sends waiting bytes; false if the client is gone or reads too slowly.
-fn write(client: &mut Client) -> bool {
+fn write(client: &mut VrpnPeer) -> bool {
     while !client.out.is_empty() {
         match client.stream.write(&client.out) {
             Ok(0) => return false,

@@ -17,7 +17,7 @@ pub trait Guide: Send + Sync + fmt::Debug {
     fn ports(&self) -> Vec<String>;
 
     /// What is being done; `None` where the page shows commands and gives none.
-    fn session(&self) -> Option<Session>;
+    fn session(&self) -> Option<StepSession>;
 
     /// Does what the operator asks for. It may read and write files.
     ///
@@ -52,7 +52,7 @@ pub enum Act {
 
 /// A step that is being done, or that was done last.
 #[derive(Clone, Debug, Default, PartialEq, Eq, serde::Serialize)]
-pub struct Session {
+pub struct StepSession {
     /// The step's name; `None` before the first one.
     pub step: Option<String>,
     /// The index of its way.
@@ -76,7 +76,7 @@ pub(crate) struct CalibrationView {
     steps: Steps,
     /// Device files that may be a light sensor.
     ports: Vec<String>,
-    session: Option<Session>,
+    session: Option<StepSession>,
 }
 
 /// What there is to tell, where a rig `runs` or not; `None` if reading it failed in a way that nobody foresaw.

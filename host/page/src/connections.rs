@@ -65,14 +65,14 @@ impl Connection {
 
 /// A connection's task.
 #[derive(Debug)]
-struct Place {
+struct ConnectionSlot {
     connection: Arc<Connection>,
     task: AbortHandle,
 }
 
 /// All connections, oldest first.
 #[derive(Debug, Default)]
-pub(crate) struct Connections(Vec<Place>);
+pub(crate) struct Connections(Vec<ConnectionSlot>);
 
 impl Connections {
     /// Ends those that stand still, and makes room for one more. False if every place is taken by an order.
@@ -106,7 +106,7 @@ impl Connections {
 
     /// Takes a place; call [`Connections::make_room`] before.
     pub(crate) fn take(&mut self, connection: Arc<Connection>, task: AbortHandle) {
-        self.0.push(Place { connection, task });
+        self.0.push(ConnectionSlot { connection, task });
     }
 }
 

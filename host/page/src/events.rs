@@ -4,7 +4,7 @@
 use crate::room;
 use crate::shared::Viewer;
 use crate::site::Site;
-use crate::state::State;
+use crate::state::RigState;
 use base64::prelude::{Engine, BASE64_STANDARD};
 use dpm_rig::telemetry::live::LiveSnapshot;
 use hyper::body::Bytes;
@@ -74,7 +74,7 @@ impl Events {
             text += "retry: 500\n\n";
         }
         if self.ticks.is_multiple_of(STATE_EVERY) {
-            let state = State::of(&shared);
+            let state = RigState::of(&shared);
             self.event(&mut text, "state", &state.now);
             let is_new = state.figures.as_ref().map(Arc::as_ptr) != self.figures.as_ref().map(Arc::as_ptr);
             if is_new || self.ticks == 0 {

@@ -21,15 +21,15 @@ const FETCH_DEST: HeaderName = HeaderName::from_static("sec-fetch-dest");
 
 /// What a request is refused for.
 #[derive(Clone, Debug, PartialEq, Eq)]
-pub(crate) struct Refusal {
+pub(crate) struct RequestRefusal {
     /// The HTTP status.
     pub status: u16,
     /// What to tell.
     pub told: String,
 }
 
-fn refused(status: u16, told: impl Into<String>) -> Refusal {
-    Refusal { status, told: told.into() }
+fn refused(status: u16, told: impl Into<String>) -> RequestRefusal {
+    RequestRefusal { status, told: told.into() }
 }
 
 /// The names under which the page may be asked for.
@@ -64,7 +64,7 @@ impl Guard {
     }
 
     /// Any request: it was sent to this page by name, and not by another site.
-    pub(crate) fn check(&self, headers: &HeaderMap) -> Result<(), Refusal> {
+    pub(crate) fn check(&self, headers: &HeaderMap) -> Result<(), RequestRefusal> {
         let named = single(headers, &HOST).filter(|host| self.is_mine(host));
         let Some(host) = named else {
             let names = self.hosts.join(", ");
@@ -100,12 +100,15 @@ impl Guard {
     }
 
     /// A new challenge for a page that wants to ask for something.
-    pub(crate) fn challenge(&self) -> Result<String, Refusal> {
+    pub(crate) fn challenge(&self) -> Result<String, RequestRefusal> {
         self.prover()?.challenge().ok_or_else(|| refused(503, "the operating system gave no random bytes"))
     }
 
     /// A request that does something: it is signed by the secret over a challenge of this process, and has no body.
-    pub(crate) fn check_order<B: hyper::body::Body>(&self, request: &Request<B>) -> Result<(), Refusal> {
+    pub(crate) fn check_order<B: hyper::body::Body>(
+        &self,
+        request: &Request<B>,
+    ) -> Result<(), RequestRefusal> {
         let prover = self.prover()?;
         let told = single(request.headers(), &ORDER);
         let told = match (told, request.headers().contains_key(ORDER)) {
@@ -139,7 +142,7 @@ impl Guard {
         Some(self.prover.as_ref()?.sign_event(number, count, name, data))
     }
 
-    fn prover(&self) -> Result<&Prover, Refusal> {
+    fn prover(&self) -> Result<&Prover, RequestRefusal> {
         self.prover.as_ref().ok_or_else(|| {
             refused(503, "this page gives no orders, because it has no token; use `dpm black`")
         })

@@ -2,7 +2,7 @@
 //!
 //! Counters are those of the report of a run, and are taken from one snapshot, so they agree with each other.
 
-use crate::state::State;
+use crate::state::RigState;
 use dpm_rig::control::rig_name;
 use dpm_rig::gaze::GazeReport;
 use dpm_rig::order::Order;
@@ -70,7 +70,7 @@ families! {
 }
 
 /// The text: every metric with its help and type.
-pub(crate) fn text(state: &State) -> String {
+pub(crate) fn text(state: &RigState) -> String {
     let mut out = Out { text: String::with_capacity(16 << 10), family: "" };
     rig(&mut out, state);
     match &state.figures {
@@ -92,7 +92,7 @@ pub(crate) fn text(state: &State) -> String {
     out.text
 }
 
-fn rig(out: &mut Out, state: &State) {
+fn rig(out: &mut Out, state: &RigState) {
     let now = &state.now;
     let report = state.figures.as_ref().map(|f| &f.report);
     let labels = [
@@ -157,7 +157,7 @@ fn gaze(out: &mut Out, told: Option<&GazeReport>) {
 }
 
 /// What is known of a run without a collector, or before its first figures.
-fn counted(out: &mut Out, state: &State) {
+fn counted(out: &mut Out, state: &RigState) {
     let c = &state.now.counts;
     out.family(PLANNED).value(&[], c.frames_planned as f64);
     frames(out, [c.frames_lit, c.frames_dark, c.frames_dropped, c.frames_withheld, c.frames_unrecorded]);
@@ -172,7 +172,7 @@ fn frames(out: &mut Out, counts: [u64; 5]) {
     }
 }
 
-fn run(out: &mut Out, state: &State, figures: &LiveSnapshot) {
+fn run(out: &mut Out, state: &RigState, figures: &LiveSnapshot) {
     let r = &figures.report;
     out.family(PLANNED).value(&[], figures.planned as f64);
     frames(out, [r.frames_lit, r.frames_dark, r.frames_dropped, r.frames_withheld, r.frames_unrecorded]);

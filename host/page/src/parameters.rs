@@ -4,7 +4,7 @@
 use crate::query::part;
 use crate::shared::RunView;
 use dpm_rig::control::parameters;
-use dpm_rig::parameters::{ChangeRefusal, Command};
+use dpm_rig::parameters::{ChangeRefusal, ParameterCommand};
 use std::time::{Duration, Instant};
 
 /// How often to look whether a change is in use.
@@ -20,27 +20,30 @@ pub(crate) struct ChangeAnswer {
 }
 
 /// The command that a path below `/api/parameters/` and its query mean; `None` if there is none at this path.
-pub(crate) fn asked(word: &str, query: &str) -> Option<Result<Command, ChangeRefusal>> {
+pub(crate) fn asked(word: &str, query: &str) -> Option<Result<ParameterCommand, ChangeRefusal>> {
     match word {
-        "undo" => Some(Ok(Command::Undo)),
-        "save" => Some(Ok(Command::Save)),
+        "undo" => Some(Ok(ParameterCommand::Undo)),
+        "save" => Some(Ok(ParameterCommand::Save)),
         "set" => Some(change(query)),
         _ => None,
     }
 }
 
 /// `name=NAME&value=NUMBERS`, percent-encoded.
-fn change(query: &str) -> Result<Command, ChangeRefusal> {
+fn change(query: &str) -> Result<ParameterCommand, ChangeRefusal> {
     let wrong = || ChangeRefusal::Syntax("write ?name=exposure&value=1.5".into());
     let part = |key: &str| part(query, key).ok_or_else(wrong);
-    Command::parse_change(&format!("{}={}", part("name")?, part("value")?))
+    ParameterCommand::parse_change(&format!("{}={}", part("name")?, part("value")?))
 }
 
 /// Gives `command` and waits for its result, for two seconds at most.
 ///
 /// # Errors
 /// It was refused.
-pub(crate) async fn give(command: &Command, shared: &RunView) -> Result<ChangeAnswer, ChangeRefusal> {
+pub(crate) async fn give(
+    command: &ParameterCommand,
+    shared: &RunView,
+) -> Result<ChangeAnswer, ChangeRefusal> {
     let begin = Instant::now();
     let sent = parameters::give(&shared.monitor, command, "page")?;
     loop {
@@ -58,15 +61,16 @@ mod tests {
 
     #[test]
     fn a_query_names_a_parameter_whatever_its_letters() {
-        let set =
-            |name: &str, numbers: &[f64]| Ok(Command::Set { name: name.into(), numbers: numbers.into() });
+        let set = |name: &str, numbers: &[f64]| {
+            Ok(ParameterCommand::Set { name: name.into(), numbers: numbers.into() })
+        };
         assert_eq!(asked("set", "name=exposure&value=1.5"), Some(set("exposure", &[1.5])));
         assert_eq!(
             asked("set", "value=1%2C-2,3&name=body.my%20h%C3%A4re"),
             Some(set("body.my häre", &[1.0, -2.0, 3.0]))
         );
         assert_eq!(asked("set", "name=gaze&value="), Some(set("gaze", &[])));
-        assert_eq!(asked("undo", ""), Some(Ok(Command::Undo)));
+        assert_eq!(asked("undo", ""), Some(Ok(ParameterCommand::Undo)));
         assert_eq!(asked("arm", ""), None);
         for bad in [
             "",

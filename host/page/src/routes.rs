@@ -3,7 +3,7 @@
 use crate::calibration::{self, Guide};
 use crate::connections::{Connection, Doing};
 use crate::events::Events;
-use crate::guard::{Refusal, PROOF};
+use crate::guard::{RequestRefusal, PROOF};
 use crate::metrics;
 use crate::orders;
 use crate::parameters;
@@ -12,7 +12,7 @@ use crate::query::part;
 use crate::rigs::Rigs;
 use crate::shared::RunView;
 use crate::site::{Serves, Site};
-use crate::state::State;
+use crate::state::RigState;
 use base64::prelude::{Engine, BASE64_STANDARD};
 use dpm_device::regular_file;
 use dpm_rig::order::Order;
@@ -45,14 +45,14 @@ const MAX_FLIGHT_BYTES: u64 = 1 << 20;
 const FRESH_WITHIN: Duration = Duration::from_millis(60);
 
 /// The body of an answer.
-pub(crate) enum Answer {
+pub(crate) enum HttpBody {
     /// All of it.
     Whole(Option<Bytes>),
     /// The rig's events, without end.
     Events(Box<Events>),
 }
 
-impl Body for Answer {
+impl Body for HttpBody {
     type Data = Bytes;
     type Error = Infallible;
 
@@ -78,22 +78,22 @@ impl Body for Answer {
     }
 }
 
-fn whole(status: StatusCode, kind: &'static str, text: impl Into<Bytes>) -> Response<Answer> {
-    let mut response = Response::new(Answer::Whole(Some(text.into())));
+fn whole(status: StatusCode, kind: &'static str, text: impl Into<Bytes>) -> Response<HttpBody> {
+    let mut response = Response::new(HttpBody::Whole(Some(text.into())));
     *response.status_mut() = status;
     response.headers_mut().insert(header::CONTENT_TYPE, HeaderValue::from_static(kind));
     response
 }
 
-fn plain(status: StatusCode, text: impl Into<String>) -> Response<Answer> {
+fn plain(status: StatusCode, text: impl Into<String>) -> Response<HttpBody> {
     whole(status, "text/plain; charset=utf-8", text.into() + "\n")
 }
 
-fn json(status: StatusCode, value: &impl serde::Serialize) -> Response<Answer> {
+fn json(status: StatusCode, value: &impl serde::Serialize) -> Response<HttpBody> {
     whole(status, "application/json", serde_json::to_string(value).unwrap_or_default())
 }
 
-fn refusal(refused: Refusal) -> Response<Answer> {
+fn refusal(refused: RequestRefusal) -> Response<HttpBody> {
     plain(StatusCode::from_u16(refused.status).unwrap_or(StatusCode::FORBIDDEN), refused.told)
 }
 
@@ -105,7 +105,7 @@ pub(crate) async fn answer(
     request: Request<Incoming>,
     connection: Arc<Connection>,
     site: Arc<Site>,
-) -> Result<Response<Answer>, Infallible> {
+) -> Result<Response<HttpBody>, Infallible> {
     connection.now_does(Doing::Asks);
     let mut response = match site.door.guard.check(request.headers()) {
         Err(refused) => {
@@ -114,13 +114,13 @@ pub(crate) async fn answer(
         }
         Ok(()) => route(&request, &connection, &site).await,
     };
-    if let Answer::Whole(Some(body)) = response.body() {
+    if let HttpBody::Whole(Some(body)) = response.body() {
         let proof = site.door.guard.proof(&request, response.status().as_u16(), body);
         if let Some(proof) = proof.and_then(|proof| HeaderValue::from_str(&proof).ok()) {
             response.headers_mut().insert(PROOF, proof);
         }
     }
-    if !matches!(response.body(), Answer::Events(_)) {
+    if !matches!(response.body(), HttpBody::Events(_)) {
         connection.now_does(Doing::Nothing);
     }
     // No answer needs the body of its request. One that has a body ends the connection, so that nobody has to read it.
@@ -144,7 +144,7 @@ async fn route(
     request: &Request<Incoming>,
     connection: &Arc<Connection>,
     site: &Arc<Site>,
-) -> Response<Answer> {
+) -> Response<HttpBody> {
     let path = request.uri().path();
     if let (Some(word), Some(run)) = (path.strip_prefix("/api/orders/"), site.serves.run()) {
         return order(request, word, connection, (site, run)).await;
@@ -170,7 +170,7 @@ async fn of_rig(
     connection: &Arc<Connection>,
     site: &Arc<Site>,
     (guide, run): (&Arc<dyn Guide>, Option<&Arc<RunView>>),
-) -> Response<Answer> {
+) -> Response<HttpBody> {
     let path = request.uri().path();
     if let (Some(word), Some(run)) = (path.strip_prefix("/api/parameters/"), run) {
         return change(request, word, (site, run)).await;
@@ -198,7 +198,7 @@ async fn of_rig(
 }
 
 /// What there is of several rigs.
-fn of_rigs(request: &Request<Incoming>, rigs: &Rigs) -> Response<Answer> {
+fn of_rigs(request: &Request<Incoming>, rigs: &Rigs) -> Response<HttpBody> {
     if request.method() != Method::GET {
         return plain(StatusCode::METHOD_NOT_ALLOWED, "only GET; orders are given on the rigs' own pages");
     }
@@ -214,7 +214,7 @@ async fn of_run(
     request: &Request<Incoming>,
     connection: &Arc<Connection>,
     (site, shared): (&Arc<Site>, &Arc<RunView>),
-) -> Response<Answer> {
+) -> Response<HttpBody> {
     let path = request.uri().path();
     match path {
         "/" => page(PAGE),
@@ -241,7 +241,7 @@ async fn of_run(
         "/api/events" => match shared.viewer() {
             Some(viewer) => {
                 connection.now_does(Doing::Views);
-                let mut response = Response::new(Answer::Events(Box::new(Events::new(
+                let mut response = Response::new(HttpBody::Events(Box::new(Events::new(
                     viewer,
                     number_of(request).map(|number| (site.clone(), number)),
                 ))));
@@ -271,7 +271,7 @@ async fn order(
     word: &str,
     connection: &Arc<Connection>,
     (site, shared): (&Site, &Arc<RunView>),
-) -> Response<Answer> {
+) -> Response<HttpBody> {
     if let Err(refused) = site.door.guard.check_order(request) {
         tokio::time::sleep(site.door.pace()).await;
         return refusal(refused);
@@ -292,7 +292,7 @@ async fn change(
     request: &Request<Incoming>,
     word: &str,
     (site, shared): (&Site, &Arc<RunView>),
-) -> Response<Answer> {
+) -> Response<HttpBody> {
     if let Err(refused) = site.door.guard.check_order(request) {
         return refusal(refused);
     }
@@ -317,7 +317,7 @@ async fn calibrate(
     request: &Request<Incoming>,
     word: &str,
     (site, guide): (&Site, &Arc<dyn Guide>),
-) -> Response<Answer> {
+) -> Response<HttpBody> {
     if let Err(refused) = site.door.guard.check_order(request) {
         return refusal(refused);
     }
@@ -332,7 +332,7 @@ async fn calibrate(
 }
 
 /// The page of the flight recorder about a flight.
-async fn flight(path: &str, shared: &Arc<RunView>) -> Response<Answer> {
+async fn flight(path: &str, shared: &Arc<RunView>) -> Response<HttpBody> {
     let number = path.rsplit('/').next().and_then(|number| number.parse().ok());
     let rig = shared.monitor.live().rig().filter(|rig| rig.config.output.flight_recorder);
     let Some(file) = rig.zip(number).and_then(|(rig, number)| page_path(&rig.config.output.dir, number))
@@ -348,7 +348,7 @@ async fn flight(path: &str, shared: &Arc<RunView>) -> Response<Answer> {
 }
 
 /// The state with figures that were made for this request, if they come at once.
-async fn fresh(shared: &Arc<RunView>) -> State {
+async fn fresh(shared: &Arc<RunView>) -> RigState {
     let live = shared.monitor.live();
     let before = live.snapshot();
     live.look();
@@ -361,11 +361,11 @@ async fn fresh(shared: &Arc<RunView>) -> State {
         }
         tokio::time::sleep(Duration::from_millis(2)).await;
     }
-    State::of(shared)
+    RigState::of(shared)
 }
 
 /// A page of this program, which loads nothing and runs nothing but what stands in it.
-fn page(text: &str) -> Response<Answer> {
+fn page(text: &str) -> Response<HttpBody> {
     let mut bytes = [0u8; 16];
     if getrandom::fill(&mut bytes).is_err() {
         return plain(StatusCode::SERVICE_UNAVAILABLE, "the operating system gave no random bytes");

@@ -3,12 +3,12 @@
 use crate::calibration::Guide;
 use crate::connections::{Connection, Connections};
 use crate::guard::Guard;
-use crate::pictures::Pictures;
+use crate::pictures::PictureThread;
 use crate::rigs::Rigs;
 use crate::routes;
 use crate::shared::RunView;
 use crate::site::{Door, Serves, Site};
-use crate::stream::Stream;
+use crate::stream::WatchedSocket;
 use crate::token::Token;
 use dpm_common::realtime::os::give_way;
 use dpm_rig::control::orders::Orders;
@@ -107,7 +107,7 @@ impl Page {
     ) -> Result<Self, PageError> {
         let guard = settings.guard();
         Self::start(settings.address, guard, || {
-            let pictures = Pictures::start(monitor.clone()).map_err(PageError::Thread)?;
+            let pictures = PictureThread::start(monitor.clone()).map_err(PageError::Thread)?;
             Ok(Serves::Run(Arc::new(RunView::new(monitor, orders, notes, pictures)), settings.guide))
         })
     }
@@ -224,7 +224,7 @@ async fn take_connections(listener: std::net::TcpListener, site: Arc<Site>) {
 
 async fn serve(stream: TcpStream, connection: Arc<Connection>, site: Arc<Site>) {
     let _ = stream.set_nodelay(true);
-    let io = Stream::new(stream, connection.clone());
+    let io = WatchedSocket::new(stream, connection.clone());
     let service = service_fn(|request| routes::answer(request, connection.clone(), site.clone()));
     // An error is the client's: it went away, or sent no HTTP.
     let _ = http1::Builder::new()

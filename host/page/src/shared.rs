@@ -1,7 +1,7 @@
 //! The run that a page shows, and how many may follow it.
 
 use crate::connections::VIEWERS;
-use crate::pictures::Pictures;
+use crate::pictures::PictureThread;
 use dpm_rig::control::orders::Orders;
 use dpm_rig::telemetry::monitor::RunMonitor;
 use dpm_rig::telemetry::notes::Notes;
@@ -14,7 +14,7 @@ pub(crate) struct RunView {
     pub(crate) monitor: Arc<RunMonitor>,
     pub(crate) orders: Arc<Orders>,
     pub(crate) notes: Arc<Notes>,
-    pub(crate) pictures: Pictures,
+    pub(crate) pictures: PictureThread,
     pub(crate) began: Instant,
     /// The shapes of [`crate::room`], once somebody has asked for them.
     pub(crate) room: OnceLock<serde_json::Value>,
@@ -26,7 +26,7 @@ impl RunView {
         monitor: Arc<RunMonitor>,
         orders: Arc<Orders>,
         notes: Arc<Notes>,
-        pictures: Pictures,
+        pictures: PictureThread,
     ) -> Self {
         Self {
             monitor,
@@ -73,7 +73,7 @@ mod tests {
         let identity = Identity::of(&backend("mock").unwrap());
         let (file, _, _) = OrderFile::open(None, identity);
         let orders = Arc::new(Orders::start(monitor.clone(), file, false, None).unwrap());
-        let pictures = Pictures::start(monitor.clone()).unwrap();
+        let pictures = PictureThread::start(monitor.clone()).unwrap();
         let shared = Arc::new(RunView::new(monitor, orders, Arc::default(), pictures));
         let all: Vec<_> = (0..VIEWERS).map(|_| shared.viewer().unwrap()).collect();
         assert!(shared.viewer().is_none() && shared.viewers() == VIEWERS);

@@ -20,7 +20,7 @@ pub(crate) struct Now {
     pub pid: u32,
     /// Seconds since the page began.
     pub up_s: f64,
-    pub light: Light,
+    pub light: LightNow,
     /// The order that stands and is kept over restarts.
     pub standing: Option<&'static str>,
     /// On what light depends, and whether it is permitted.
@@ -36,7 +36,7 @@ pub(crate) struct Now {
 
 /// The state of the light.
 #[derive(Clone, Debug, serde::Serialize)]
-pub(crate) struct Light {
+pub(crate) struct LightNow {
     /// One of the six words of [`LightState::WORDS`], and the same as programs write it.
     pub word: &'static str,
     pub state: String,
@@ -46,7 +46,7 @@ pub(crate) struct Light {
     pub is_lit: bool,
 }
 
-impl Light {
+impl LightNow {
     fn of(monitor: &RunMonitor) -> Self {
         let state = monitor.light();
         let word = state.word();
@@ -55,7 +55,7 @@ impl Light {
 }
 
 /// The state at one moment.
-pub(crate) struct State {
+pub(crate) struct RigState {
     pub now: Now,
     /// Per tracked body: its name, and why it has no light.
     pub bodies: Vec<(String, Option<DarkCause>)>,
@@ -79,13 +79,13 @@ pub(crate) struct StateJson<'a> {
     pub figures: Value,
 }
 
-impl State {
+impl RigState {
     pub(crate) fn of(shared: &RunView) -> Self {
         let monitor = &shared.monitor;
         let now = Now {
             pid: std::process::id(),
             up_s: (shared.began.elapsed().as_secs_f64() * 1e3).round() / 1e3,
-            light: Light::of(monitor),
+            light: LightNow::of(monitor),
             standing: shared.orders.kept().map(|order| order.word()),
             interlock: monitor.interlock().map(|i| (i.what().to_owned(), i.is_closed())),
             tracker: monitor.tracker().map(str::to_owned),

@@ -9,18 +9,18 @@ use std::task::{ready, Context, Poll};
 use tokio::net::TcpStream;
 
 /// A socket as the HTTP library wants it, which notes when bytes move.
-pub(crate) struct Stream {
+pub(crate) struct WatchedSocket {
     stream: TcpStream,
     connection: Arc<Connection>,
 }
 
-impl Stream {
+impl WatchedSocket {
     pub(crate) fn new(stream: TcpStream, connection: Arc<Connection>) -> Self {
         Self { stream, connection }
     }
 }
 
-impl Read for Stream {
+impl Read for WatchedSocket {
     fn poll_read(
         self: Pin<&mut Self>,
         cx: &mut Context<'_>,
@@ -43,7 +43,7 @@ impl Read for Stream {
     }
 }
 
-impl Write for Stream {
+impl Write for WatchedSocket {
     fn poll_write(self: Pin<&mut Self>, cx: &mut Context<'_>, bytes: &[u8]) -> Poll<io::Result<usize>> {
         loop {
             ready!(self.stream.poll_write_ready(cx))?;

@@ -15,7 +15,7 @@ const RESOLUTION: f64 = 2e-3;
 
 /// What became of a figure.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Verdict {
+pub enum FigureChange {
     /// Lower by more than noise.
     Better,
     /// Higher by more than noise.
@@ -26,7 +26,7 @@ pub enum Verdict {
     Unknown,
 }
 
-impl Verdict {
+impl FigureChange {
     /// As printed.
     pub(crate) const fn word(self) -> &'static str {
         match self {
@@ -50,14 +50,14 @@ pub struct Comparison {
     /// Half-width of the interval of the difference, ms or %, at 99.9 %, of missed slots at 99 %; `None` when unknown.
     pub noise: Option<f64>,
     /// What that means.
-    pub verdict: Verdict,
+    pub verdict: FigureChange,
     /// A figure that must not get worse.
     pub gate: bool,
 }
 
 /// The gates that got worse, by name; a comparison without any passes.
 pub fn failed_gates(rows: &[Comparison]) -> Vec<&str> {
-    rows.iter().filter(|r| r.gate && r.verdict == Verdict::Worse).map(|r| r.figure.as_str()).collect()
+    rows.iter().filter(|r| r.gate && r.verdict == FigureChange::Worse).map(|r| r.figure.as_str()).collect()
 }
 
 /// Compares every interval's median and 99th percentile, and the shares of missed slots and late frames. Figures that only one report has
@@ -113,12 +113,12 @@ pub fn compare(before: &ProfileReport, after: &ProfileReport) -> (Vec<Comparison
 fn judge(figure: String, before: f64, after: f64, noise: Option<f64>) -> Comparison {
     let difference = after - before;
     let verdict = match noise {
-        None => Verdict::Unknown,
+        None => FigureChange::Unknown,
         Some(noise) if difference.abs() <= noise.max(RESOLUTION * before.abs().max(after.abs())) => {
-            Verdict::Same
+            FigureChange::Same
         }
-        Some(_) if difference < 0.0 => Verdict::Better,
-        Some(_) => Verdict::Worse,
+        Some(_) if difference < 0.0 => FigureChange::Better,
+        Some(_) => FigureChange::Worse,
     };
     Comparison { figure, before, after, noise, verdict, gate: false }
 }
@@ -221,11 +221,11 @@ fn student_t(freedom: f64, level: usize) -> f64 {
 /// A table of all figures, gates first, then worst news first.
 pub fn to_table(rows: &[Comparison], notes: &[String]) -> String {
     let mut sorted: Vec<&Comparison> = rows.iter().collect();
-    let rank = |v: Verdict| match v {
-        Verdict::Worse => 0,
-        Verdict::Better => 1,
-        Verdict::Unknown => 2,
-        Verdict::Same => 3,
+    let rank = |v: FigureChange| match v {
+        FigureChange::Worse => 0,
+        FigureChange::Better => 1,
+        FigureChange::Unknown => 2,
+        FigureChange::Same => 3,
     };
     // Gates first, whatever became of them.
     sorted.sort_by_key(|r| (!r.gate, rank(r.verdict)));
@@ -289,7 +289,7 @@ mod tests {
         }
     }
 
-    fn verdict(a: &ProfileReport, b: &ProfileReport, figure: &str) -> Verdict {
+    fn verdict(a: &ProfileReport, b: &ProfileReport, figure: &str) -> FigureChange {
         compare(a, b).0.into_iter().find(|c| c.figure == figure).unwrap().verdict
     }
 
@@ -301,9 +301,9 @@ mod tests {
             let a = report(1.0, 0.05, 10, 2 * seed);
             let same = report(1.0, 0.05, 10, 2 * seed + 1);
             let slower = report(1.1, 0.05, 10, 2 * seed + 1);
-            alarms += usize::from(verdict(&a, &same, "render p50") != Verdict::Same);
-            missed += usize::from(verdict(&a, &slower, "render p50") != Verdict::Worse);
-            assert_ne!(verdict(&slower, &a, "render p50"), Verdict::Worse);
+            alarms += usize::from(verdict(&a, &same, "render p50") != FigureChange::Same);
+            missed += usize::from(verdict(&a, &slower, "render p50") != FigureChange::Worse);
+            assert_ne!(verdict(&slower, &a, "render p50"), FigureChange::Worse);
         }
         assert!(alarms <= 5, "{alarms} false alarms in 1000");
         assert!(missed <= 100, "{missed} changes of 10 % missed in 1000");
@@ -354,10 +354,10 @@ mod tests {
         assert_eq!(failed_gates(&rows), ["missed slots, %"]);
         let missed = rows.iter().find(|r| r.figure == "missed slots, %").unwrap();
         assert!((missed.before - 0.370).abs() < 1e-3 && (missed.after - 0.676).abs() < 1e-3, "{missed:?}");
-        assert_eq!(verdict(&fifo, &hogs, "late frames, %"), Verdict::Same);
+        assert_eq!(verdict(&fifo, &hogs, "late frames, %"), FigureChange::Same);
         assert!(to_table(&rows, &notes).lines().nth(1).unwrap().contains("WORSE (gate)"));
         // The other way round it got better, which fails nothing.
-        assert_eq!(verdict(&hogs, &fifo, "missed slots, %"), Verdict::Better);
+        assert_eq!(verdict(&hogs, &fifo, "missed slots, %"), FigureChange::Better);
         assert!(failed_gates(&compare(&hogs, &fifo).0).is_empty());
         // With batches of independent misses, the same.
         let (mut a, mut b) = (fifo, hogs);
@@ -366,7 +366,10 @@ mod tests {
         assert_eq!(failed_gates(&compare(&a, &b).0), ["missed slots, %"]);
         // A report of an older program, which tells of no slots, is no pass and no failure, but told.
         let (rows, notes) = compare(&ProfileReport { frames_lit: 100, ..Default::default() }, &b);
-        assert_eq!(rows.iter().find(|r| r.figure == "missed slots, %").unwrap().verdict, Verdict::Unknown);
+        assert_eq!(
+            rows.iter().find(|r| r.figure == "missed slots, %").unwrap().verdict,
+            FigureChange::Unknown
+        );
         assert!(notes.iter().any(|n| n.contains("the first report tells of no slots")), "{notes:?}");
     }
 
@@ -380,8 +383,8 @@ mod tests {
                 let a = run(20_000, 0.004, burst, 3 * seed);
                 let same = run(20_000, 0.004, burst, 3 * seed + 1);
                 let more = run(20_000, 0.004 * worse, burst, 3 * seed + 2);
-                alarms += usize::from(verdict(&a, &same, "missed slots, %") != Verdict::Same);
-                found += usize::from(verdict(&a, &more, "missed slots, %") == Verdict::Worse);
+                alarms += usize::from(verdict(&a, &same, "missed slots, %") != FigureChange::Same);
+                found += usize::from(verdict(&a, &more, "missed slots, %") == FigureChange::Worse);
             }
             assert!(alarms <= 10, "bursts of {burst}: {alarms} false alarms in 200");
             assert!(found >= 180, "bursts of {burst}: {found} of 200 found");
@@ -391,16 +394,16 @@ mod tests {
     #[test]
     fn no_batches_no_verdict_and_resolution_is_no_news() {
         let (a, b) = (report(1.0, 0.0, 0, 1), report(1.001, 0.0, 0, 2));
-        assert_eq!(verdict(&a, &b, "render p50"), Verdict::Same, "0.1 % is the histogram's resolution");
-        assert_eq!(verdict(&a, &report(1.01, 0.0, 0, 2), "render p50"), Verdict::Worse);
-        assert_eq!(verdict(&a, &b, "render p99"), Verdict::Unknown);
+        assert_eq!(verdict(&a, &b, "render p50"), FigureChange::Same, "0.1 % is the histogram's resolution");
+        assert_eq!(verdict(&a, &report(1.01, 0.0, 0, 2), "render p50"), FigureChange::Worse);
+        assert_eq!(verdict(&a, &b, "render p99"), FigureChange::Unknown);
         assert_eq!(
             verdict(&report(1.0, 0.0, 3, 1), &report(1.0, 0.0, 9, 1), "late frames, %"),
-            Verdict::Same
+            FigureChange::Same
         );
         assert_eq!(
             verdict(&report(1.0, 0.0, 3, 1), &report(1.0, 0.0, 90, 1), "late frames, %"),
-            Verdict::Worse
+            FigureChange::Worse
         );
     }
 

@@ -2,7 +2,7 @@
 //! hears gaze from there. It connects while it is polled, and again after every loss. Every wait has an end.
 
 use crate::gaze::{decode, NoGaze, FARTHEST_S};
-use crate::zmtp::{put_subscription, put_words, Event, Message, Peer, SocketKind, ZmtpError};
+use crate::zmtp::{put_subscription, put_words, Event, Message, SocketKind, ZmtpError, ZmtpPeer};
 use dpm_common::unix::wait_readable;
 use dpm_device::clock_map::{ClockMap, ExchangeOutcome};
 use dpm_device::time::{DeviceTicks, HostClock, HostTime};
@@ -126,19 +126,19 @@ impl Question {
 }
 
 /// A TCP connection and its end of ZMTP.
-struct Line {
+struct ZmtpConnection {
     stream: TcpStream,
-    peer: Peer,
+    peer: ZmtpPeer,
     out: Vec<u8>,
     since: HostTime,
 }
 
-impl Line {
+impl ZmtpConnection {
     fn open(address: SocketAddr, kind: SocketKind, now: HostTime) -> Result<Self, Loss> {
         let stream = TcpStream::connect_timeout(&address, CONNECT_WITHIN).map_err(Loss::Unreachable)?;
         stream.set_nodelay(true).and_then(|()| stream.set_nonblocking(true)).map_err(Loss::Broken)?;
         let mut out = Vec::new();
-        let peer = Peer::new(kind, &mut out);
+        let peer = ZmtpPeer::new(kind, &mut out);
         Ok(Self { stream, peer, out, since: now })
     }
 
@@ -183,8 +183,8 @@ pub struct PupilClient {
     settings: PupilSettings,
     clock: Arc<dyn HostClock>,
     ears: Ears,
-    remote: Option<Line>,
-    data: Option<Line>,
+    remote: Option<ZmtpConnection>,
+    data: Option<ZmtpConnection>,
     asking: Asking,
     bytes: Vec<u8>,
     ready: Vec<bool>,
@@ -325,7 +325,7 @@ impl PupilClient {
     fn work(&mut self, now: HostTime, limit: Duration, sink: &mut dyn FnMut(&GazeAt)) -> Result<(), Loss> {
         if self.remote.is_none() {
             self.asking = Asking { waiting: None, asked: 0, next_at: now };
-            self.remote = Some(Line::open(self.settings.address, SocketKind::Req, now)?);
+            self.remote = Some(ZmtpConnection::open(self.settings.address, SocketKind::Req, now)?);
         }
         self.ask()?;
         self.check_patience(now)?;
@@ -363,7 +363,7 @@ impl PupilClient {
             self.asking.waiting = Some((question, now));
         }
         remote.send()?;
-        self.data.as_mut().map_or(Ok(()), Line::send)
+        self.data.as_mut().map_or(Ok(()), ZmtpConnection::send)
     }
 
     fn check_patience(&self, now: HostTime) -> Result<(), Loss> {
@@ -396,7 +396,7 @@ impl PupilClient {
                     return refused(text);
                 };
                 let address = SocketAddr::new(self.settings.address.ip(), port);
-                self.data = Some(Line::open(address, SocketKind::Sub, now)?);
+                self.data = Some(ZmtpConnection::open(address, SocketKind::Sub, now)?);
                 self.asking.next_at = now;
             }
             Question::Clock => {

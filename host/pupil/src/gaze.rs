@@ -5,7 +5,7 @@
 //! `gaze_normal_3d`, or `eye_centers_3d` and `gaze_normals_3d` by the number of the eye. Lengths are millimetres; x points
 //! to the right of the picture, y down and z forward. The 2D method of Pupil gives none of them.
 
-use crate::msgpack::{BadMsgpack, Element, Reader};
+use crate::msgpack::{BadMsgpack, Element, ElementDecoder};
 
 /// Longest distance between the eye and what it looks at, metres; farther is as far.
 const FARTHEST_M: f64 = 100.0;
@@ -78,7 +78,7 @@ impl Mean {
 /// # Errors
 /// It is none, or has numbers that make no sense.
 pub fn decode(payload: &[u8]) -> Result<Gaze, NoGaze> {
-    let mut reader = Reader::new(payload);
+    let mut reader = ElementDecoder::new(payload);
     let mut found = Fields::default();
     for _ in 0..reader.map()? {
         match reader.head()? {
@@ -94,7 +94,7 @@ pub fn decode(payload: &[u8]) -> Result<Gaze, NoGaze> {
     sample(&found)
 }
 
-fn read_value(key: &[u8], reader: &mut Reader<'_>, found: &mut Fields) -> Result<(), NoGaze> {
+fn read_value(key: &[u8], reader: &mut ElementDecoder<'_>, found: &mut Fields) -> Result<(), NoGaze> {
     match key {
         b"timestamp" => found.at_s = Some(reader.f64()?),
         b"confidence" => found.confidence = Some(reader.f64()?),
@@ -109,7 +109,7 @@ fn read_value(key: &[u8], reader: &mut Reader<'_>, found: &mut Fields) -> Result
 }
 
 /// A map from the number of an eye, as a number or a text, to a vector.
-fn read_eyes(reader: &mut Reader<'_>, mean: &mut Mean) -> Result<(), NoGaze> {
+fn read_eyes(reader: &mut ElementDecoder<'_>, mean: &mut Mean) -> Result<(), NoGaze> {
     let count = reader.map()?;
     if count > 2 {
         return Err(NoGaze::Impossible);

@@ -11,7 +11,7 @@ pub struct BadMsgpack;
 
 /// Reads elements one after the other.
 #[derive(Clone, Copy, Debug)]
-pub struct Reader<'a> {
+pub struct ElementDecoder<'a> {
     rest: &'a [u8],
 }
 
@@ -32,7 +32,7 @@ pub enum Element<'a> {
     Map(u32),
 }
 
-impl<'a> Reader<'a> {
+impl<'a> ElementDecoder<'a> {
     /// Reads `bytes` from their begin.
     pub fn new(bytes: &'a [u8]) -> Self {
         Self { rest: bytes }
@@ -113,7 +113,7 @@ impl<'a> Reader<'a> {
     /// Passes over the next element with all that it contains.
     ///
     /// # Errors
-    /// As [`Reader::head`].
+    /// As [`ElementDecoder::head`].
     pub fn skip(&mut self) -> Result<(), BadMsgpack> {
         let mut open = 1u64;
         while open > 0 {
@@ -130,7 +130,7 @@ impl<'a> Reader<'a> {
     /// The next element, which is a number.
     ///
     /// # Errors
-    /// As [`Reader::head`], or it is none.
+    /// As [`ElementDecoder::head`], or it is none.
     pub fn f64(&mut self) -> Result<f64, BadMsgpack> {
         match self.head()? {
             Element::Number(number) => Ok(number),
@@ -141,7 +141,7 @@ impl<'a> Reader<'a> {
     /// The next element, which is an array of three finite numbers.
     ///
     /// # Errors
-    /// As [`Reader::head`], or it is none.
+    /// As [`ElementDecoder::head`], or it is none.
     pub fn vector(&mut self) -> Result<[f64; 3], BadMsgpack> {
         if self.head()? != Element::Array(3) {
             return Err(BadMsgpack);
@@ -153,7 +153,7 @@ impl<'a> Reader<'a> {
     /// The next element, which is a map: how many pairs follow.
     ///
     /// # Errors
-    /// As [`Reader::head`], or it is none.
+    /// As [`ElementDecoder::head`], or it is none.
     pub fn map(&mut self) -> Result<u32, BadMsgpack> {
         match self.head()? {
             Element::Map(count) => Ok(count),

@@ -2,9 +2,9 @@
 
 use crate::client::{Ears, GazeAt};
 use crate::gaze::{decode, NoGaze};
-use crate::msgpack::{put_f64, put_map, put_small, put_text, put_vector, Reader};
+use crate::msgpack::{put_f64, put_map, put_small, put_text, put_vector, ElementDecoder};
 use crate::zmtp::{
-    put_message, put_subscription, put_words, Event, Peer, SocketKind, ZmtpError, MOST_PART, MOST_PARTS,
+    put_message, put_subscription, put_words, Event, SocketKind, ZmtpError, ZmtpPeer, MOST_PART, MOST_PARTS,
 };
 use dpm_device::time::HostTime;
 use proptest::prelude::*;
@@ -39,7 +39,7 @@ fn told(heard: &Event<'_>) -> String {
 /// What an end hears of `bytes`, pushed in pieces of `piece`, with its error, and what it answers.
 fn hear(kind: SocketKind, bytes: &[u8], piece: usize) -> (Vec<String>, Option<ZmtpError>, Vec<u8>) {
     let (mut first, mut out, mut heard) = (Vec::new(), Vec::new(), Vec::new());
-    let mut peer = Peer::new(kind, &mut first);
+    let mut peer = ZmtpPeer::new(kind, &mut first);
     let mut error = None;
     for chunk in bytes.chunks(piece.max(1)) {
         if let Err(e) = peer.push(chunk, &mut out, &mut |h| heard.push(told(&h))) {
@@ -54,7 +54,7 @@ fn hear(kind: SocketKind, bytes: &[u8], piece: usize) -> (Vec<String>, Option<Zm
 fn an_end_begins_with_the_bytes_of_the_specification() {
     for (kind, word) in [(SocketKind::Req, "REQ"), (SocketKind::Sub, "SUB"), (SocketKind::Pub, "PUB")] {
         let mut out = Vec::new();
-        Peer::new(kind, &mut out);
+        ZmtpPeer::new(kind, &mut out);
         assert_eq!(out, [&GREETING[..], &ready(word)].concat());
     }
     // The longest that begins so: flags 4, 25 bytes.
@@ -204,7 +204,7 @@ fn every_form_of_msgpack_is_read() {
         (&[0xcb, 0xbf, 0xf0, 0, 0, 0, 0, 0, 0], -1.0),
     ];
     for (bytes, number) in numbers {
-        assert_eq!(Reader::new(bytes).f64(), Ok(number));
+        assert_eq!(ElementDecoder::new(bytes).f64(), Ok(number));
     }
     let passed: [&[u8]; 10] = [
         &[0xc0],
@@ -219,13 +219,13 @@ fn every_form_of_msgpack_is_read() {
         &[0xdd, 0, 0, 0, 0],
     ];
     for bytes in passed {
-        let mut reader = Reader::new(bytes);
+        let mut reader = ElementDecoder::new(bytes);
         assert!(reader.skip().is_ok() && reader.is_at_end(), "{bytes:?}");
-        assert!(Reader::new(&bytes[..bytes.len() - 1]).skip().is_err(), "{bytes:?} is cut");
+        assert!(ElementDecoder::new(&bytes[..bytes.len() - 1]).skip().is_err(), "{bytes:?} is cut");
     }
     // Depth and counts that no memory would hold end with the bytes.
-    assert!(Reader::new(&[0x91; 100_000]).skip().is_err());
-    assert!(Reader::new(&[0xdf, 0xff, 0xff, 0xff, 0xff, 0, 0]).skip().is_err());
+    assert!(ElementDecoder::new(&[0x91; 100_000]).skip().is_err());
+    assert!(ElementDecoder::new(&[0xdf, 0xff, 0xff, 0xff, 0xff, 0, 0]).skip().is_err());
 }
 
 /// Pupil's clock stands 1.7e9 s ahead and runs 100 ppm fast: instants are found again within the shortest round trip,

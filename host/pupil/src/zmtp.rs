@@ -114,7 +114,7 @@ pub enum Event<'a> {
 }
 
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-enum Stage {
+enum ConnectionPhase {
     Greeting,
     Handshake,
     Traffic,
@@ -122,9 +122,9 @@ enum Stage {
 
 /// One end of a connection.
 #[derive(Debug)]
-pub struct Peer {
+pub struct ZmtpPeer {
     kind: SocketKind,
-    stage: Stage,
+    stage: ConnectionPhase,
     /// What has come and is not yet whole.
     held: Vec<u8>,
     message: Vec<u8>,
@@ -138,7 +138,7 @@ struct FrameHeader {
     length: usize,
 }
 
-impl Peer {
+impl ZmtpPeer {
     /// An end of kind `kind`. Puts its greeting and READY into `out`.
     pub fn new(kind: SocketKind, out: &mut Vec<u8>) -> Self {
         let mut greeting = [0; GREETING_BYTES];
@@ -150,12 +150,18 @@ impl Peer {
         let mut ready = b"\x05READY\x0bSocket-Type\0\0\0\x03".to_vec();
         ready.extend_from_slice(kind.word().as_bytes());
         put_frame(COMMAND, &ready, out);
-        Self { kind, stage: Stage::Greeting, held: Vec::new(), message: Vec::new(), ends: Vec::new() }
+        Self {
+            kind,
+            stage: ConnectionPhase::Greeting,
+            held: Vec::new(),
+            message: Vec::new(),
+            ends: Vec::new(),
+        }
     }
 
     /// True once both ends have said READY.
     pub fn is_ready(&self) -> bool {
-        self.stage == Stage::Traffic
+        self.stage == ConnectionPhase::Traffic
     }
 
     /// Takes bytes as they come; answers go into `out`. What is heard does not depend on how the bytes are split.
@@ -190,7 +196,7 @@ impl Peer {
         out: &mut Vec<u8>,
         heard: &mut dyn FnMut(Event<'_>),
     ) -> Result<usize, ZmtpError> {
-        if self.stage == Stage::Greeting {
+        if self.stage == ConnectionPhase::Greeting {
             return self.greeting(held);
         }
         let Some(head) = self.head(held)? else { return Ok(0) };
@@ -220,7 +226,7 @@ impl Peer {
         if greeting[12..32] != mechanism {
             return Err(ZmtpError::Mechanism);
         }
-        self.stage = Stage::Handshake;
+        self.stage = ConnectionPhase::Handshake;
         Ok(GREETING_BYTES)
     }
 
@@ -264,13 +270,13 @@ impl Peer {
                 let why: String = String::from_utf8_lossy(why).chars().filter(|c| !c.is_control()).collect();
                 Err(ZmtpError::Refused(why))
             }
-            (b"READY", Stage::Handshake) => {
+            (b"READY", ConnectionPhase::Handshake) => {
                 self.check_kind(rest)?;
-                self.stage = Stage::Traffic;
+                self.stage = ConnectionPhase::Traffic;
                 heard(Event::Ready);
                 Ok(())
             }
-            (_, Stage::Handshake) | (b"READY", _) => Err(ZmtpError::Malformed),
+            (_, ConnectionPhase::Handshake) | (b"READY", _) => Err(ZmtpError::Malformed),
             (b"SUBSCRIBE" | b"CANCEL", _) if self.kind == SocketKind::Pub => {
                 heard(Event::Topic(name == b"SUBSCRIBE", rest));
                 Ok(())
@@ -303,7 +309,7 @@ impl Peer {
     }
 
     fn part(&mut self, body: &[u8], more: bool, heard: &mut dyn FnMut(Event<'_>)) -> Result<(), ZmtpError> {
-        if self.stage != Stage::Traffic {
+        if self.stage != ConnectionPhase::Traffic {
             return Err(ZmtpError::Malformed);
         }
         if self.ends.len() == MOST_PARTS || self.message.len() + body.len() > MOST_MESSAGE {

@@ -1,6 +1,6 @@
 //! Laws of rehearsals. Each is runs of whole rigs.
 
-use super::stage::Case;
+use super::stage::RehearsalCase;
 use super::*;
 use dpm_device::rng::Draws;
 use dpm_rig::config::{Overrides, Purpose};
@@ -18,9 +18,9 @@ fn keys(keys: &[&str]) -> Vec<String> {
     keys.iter().map(|key| (*key).to_owned()).collect()
 }
 
-const SHORT: Extent = Extent { seeds: 2, seconds: 2.0, only_rig: true, pictures: false };
+const SHORT: RehearsalExtent = RehearsalExtent { seeds: 2, seconds: 2.0, only_rig: true, pictures: false };
 
-fn rehearsed(config: &RigConfig, extent: Extent) -> RehearsalReport {
+fn rehearsed(config: &RigConfig, extent: RehearsalExtent) -> RehearsalReport {
     rehearse(config, extent, &mut |_| ()).unwrap_or_else(|e| panic!("{e}"))
 }
 
@@ -73,7 +73,7 @@ fn every_error_shows_and_goes_where_it_is_switched_off() {
 /// lenses and soft ones, and by exposures that blur and that do not.
 #[test]
 fn painted_pictures_agree_with_drawn_corners() {
-    let extent = Extent { seeds: 1, pictures: true, ..SHORT };
+    let extent = RehearsalExtent { seeds: 1, pictures: true, ..SHORT };
     for (exposure_us, softness_px) in [(2000, 0.5), (200, 0.5), (200, 0.0), (4000, 1.0)] {
         let set =
             [format!("tracker.exposure_us={exposure_us}"), format!("rehearsal.softness_px={softness_px:?}")];
@@ -141,7 +141,7 @@ fn drawn(seed: u64, is_camera: bool) -> Vec<String> {
 
 /// The ratios of run and closed form, of drawn rigs.
 fn ratios(seeds: std::ops::Range<u64>) -> Vec<f64> {
-    let extent = Extent { seeds: 5, seconds: 4.0, ..SHORT };
+    let extent = RehearsalExtent { seeds: 5, seconds: 4.0, ..SHORT };
     let ratio = |seed: u64| {
         let is_camera = seed.is_multiple_of(2);
         let set = drawn(seed, is_camera);
@@ -166,9 +166,14 @@ fn rows_that_change_nothing_are_left_out() {
     let camera = rig("budget.toml", &[]);
     let mock = rig("demo.toml", &[]);
     let idle = |config: &RigConfig| {
-        let stage = Stage::new(config).unwrap_or_else(|e| panic!("{e}"));
-        let own =
-            Case { config: config.clone(), rate_hz: 120, exposure_us: 2000, is_prompt: false, paints: false };
+        let stage = RehearsalStage::new(config).unwrap_or_else(|e| panic!("{e}"));
+        let own = RehearsalCase {
+            config: config.clone(),
+            rate_hz: 120,
+            exposure_us: 2000,
+            is_prompt: false,
+            paints: false,
+        };
         let rows = SUSPECTS.iter().chain(&PARTS);
         let idle = rows.filter(|(_, change)| is_idle(&stage, &own, *change)).map(|(name, _)| *name);
         idle.collect::<Vec<_>>()

@@ -12,13 +12,13 @@ mod stage;
 mod tracker;
 mod truth;
 
-pub use report::{CaseReport, Percentiles, RehearsalReport};
+pub use report::{CaseReport, RehearsalReport, RehearsedPercentiles};
 
 use dpm_device::time::FrameRate;
 use dpm_rig::config::{ProjectorBackend, RigConfig};
 use dpm_rig::failure::Failure;
 use report::PicturesReport;
-use stage::{Case, LightFall, Stage};
+use stage::{LightFall, RehearsalCase, RehearsalStage};
 
 /// Time of each run after the filters have settled, seconds, if nothing else is asked for.
 pub const SECONDS: f64 = 6.0;
@@ -33,7 +33,7 @@ const NOTICED_S: f64 = 3.87e-3;
 
 /// How much a rehearsal does.
 #[derive(Clone, Copy, Debug)]
-pub struct Extent {
+pub struct RehearsalExtent {
     /// Truths of each row, at least 1.
     pub seeds: u64,
     /// Time of each run, seconds, above 0.
@@ -44,14 +44,14 @@ pub struct Extent {
     pub pictures: bool,
 }
 
-impl Default for Extent {
+impl Default for RehearsalExtent {
     fn default() -> Self {
         Self { seeds: SEEDS, seconds: SECONDS, only_rig: false, pictures: true }
     }
 }
 
 /// What is other in a row.
-type Change = fn(&mut Case);
+type Change = fn(&mut RehearsalCase);
 
 /// What may be at fault, switched off one at a time.
 const SUSPECTS: [(&str, Change); 7] = [
@@ -104,14 +104,14 @@ const PARTS: [(&str, Change); 10] = [
 ];
 
 /// Another frame rate; the projector's own delay goes with the length of a frame by `delays`.
-fn set_rate(case: &mut Case, rate: u32, delays: f64) {
+fn set_rate(case: &mut RehearsalCase, rate: u32, delays: f64) {
     let projector = &mut case.config.projector;
     projector.frame_rate = FrameRate::new(rate, 1).expect("above 0");
     projector.latency_us = (f64::from(projector.latency_us) * delays) as u32;
 }
 
 /// No stage takes longer than this, microseconds.
-fn render_within(case: &mut Case, most_us: u32) {
+fn render_within(case: &mut RehearsalCase, most_us: u32) {
     let costs = &mut case.config.real_time.stage_costs_us;
     for cost in [&mut costs.track, &mut costs.plan, &mut costs.render, &mut costs.pack, &mut costs.send] {
         *cost = (*cost).min(most_us);
@@ -124,14 +124,14 @@ fn render_within(case: &mut Case, most_us: u32) {
 /// The rig cannot be built, nothing of its kind can be rehearsed (exit code 2), or no light fell (1).
 pub fn rehearse(
     config: &RigConfig,
-    extent: Extent,
+    extent: RehearsalExtent,
     tell: &mut dyn FnMut(&str),
 ) -> Result<RehearsalReport, Failure> {
-    let mut stage = Stage::new(config)?;
+    let mut stage = RehearsalStage::new(config)?;
     let rate_hz = config.tracker.rate_hz().unwrap_or(100);
     let exposure_us = config.tracker.exposure_us().unwrap_or(EXPOSURE_US);
-    let own = Case { config: config.clone(), rate_hz, exposure_us, is_prompt: false, paints: false };
-    let row = |stage: &mut Stage, name: &str, change: Option<Change>| {
+    let own = RehearsalCase { config: config.clone(), rate_hz, exposure_us, is_prompt: false, paints: false };
+    let row = |stage: &mut RehearsalStage, name: &str, change: Option<Change>| {
         let mut case = own.clone();
         change.into_iter().for_each(|change| change(&mut case));
         let fallen = runs(stage, &case, extent)?;
@@ -160,8 +160,8 @@ pub fn rehearse(
 }
 
 /// A row in which nothing that counts is other, as a camera's exposure of a tracker that has none, or a projector is slower.
-fn is_idle(stage: &Stage, own: &Case, change: Change) -> bool {
-    let told = |case: &Case| {
+fn is_idle(stage: &RehearsalStage, own: &RehearsalCase, change: Change) -> bool {
+    let told = |case: &RehearsalCase| {
         let mut case = case.clone();
         let r = &mut case.config.rehearsal;
         let is_mock = case.config.tracker.errors().is_some();
@@ -188,11 +188,15 @@ fn is_idle(stage: &Stage, own: &Case, change: Change) -> bool {
     };
     let mut other = own.clone();
     change(&mut other);
-    let rate = |case: &Case| case.config.projector.frame_rate.hz();
+    let rate = |case: &RehearsalCase| case.config.projector.frame_rate.hz();
     told(&other) == told(own) || rate(&other) < rate(own)
 }
 
-fn runs(stage: &mut Stage, case: &Case, extent: Extent) -> Result<LightFall, Failure> {
+fn runs(
+    stage: &mut RehearsalStage,
+    case: &RehearsalCase,
+    extent: RehearsalExtent,
+) -> Result<LightFall, Failure> {
     let mut all = LightFall::default();
     for seed in 1..=extent.seeds.max(1) {
         all.add(stage.run(case, seed, extent.seconds)?);
@@ -201,18 +205,18 @@ fn runs(stage: &mut Stage, case: &Case, extent: Extent) -> Result<LightFall, Fai
 }
 
 /// The same short run by drawn corners and by painted pictures; `None` where there is no camera or the mock has no such lens.
-fn pictures(stage: &mut Stage, own: &Case) -> Result<Option<PicturesReport>, Failure> {
+fn pictures(stage: &mut RehearsalStage, own: &RehearsalCase) -> Result<Option<PicturesReport>, Failure> {
     let Some((eye, _)) = &stage.camera else { return Ok(None) };
     if tracker::optics(eye).is_none() {
         return Ok(None);
     }
-    let painted = stage.run(&Case { paints: true, ..own.clone() }, 1, PICTURES_S)?;
+    let painted = stage.run(&RehearsalCase { paints: true, ..own.clone() }, 1, PICTURES_S)?;
     let drawn = stage.run(own, 1, PICTURES_S)?;
     let count = f64::from(own.rate_hz) * (PICTURES_S + 1e-9 * stage::SETTLE_NS as f64);
     Ok(Some(PicturesReport {
         pictures: count as u64,
-        painted_mm: Percentiles::of(&painted.mm),
-        drawn_mm: Percentiles::of(&drawn.mm),
+        painted_mm: RehearsedPercentiles::of(&painted.mm),
+        drawn_mm: RehearsedPercentiles::of(&drawn.mm),
     }))
 }
 

@@ -7,7 +7,7 @@
 //! whose forecast of the next sample errs least, as in `dpm-tracking`. Turns that begin at once surprise every filter: light
 //! is off by what the acceleration does from the turn to the first light that can follow.
 
-use super::stage::{Case, Stage};
+use super::stage::{RehearsalCase, RehearsalStage};
 use dpm_rig::config::RehearsedMotion;
 use dpm_scene::geometry::projector::ProjectorCamera;
 use glam::{DMat3, DVec3};
@@ -117,13 +117,13 @@ fn reach(h: f64) -> [f64; 2] {
 }
 
 /// A filter and the motion that it follows.
-struct Follower {
+struct MotionFollower {
     noise: DMat3,
     /// Of each swing: mean square amplitude, frequency, and the filter's answer.
     swings: Vec<(f64, f64, [DVec3; 2])>,
 }
 
-impl Follower {
+impl MotionFollower {
     fn new(filter: &SteadyFilter, swings: &[[f64; 2]]) -> Self {
         let answered = |[w, power]: &[f64; 2]| (*power, *w, filter.answer(*w));
         Self { noise: filter.noise(), swings: swings.iter().map(answered).collect() }
@@ -164,14 +164,14 @@ fn transition(h: f64) -> DMat3 {
 }
 
 /// Noise of a sample where the light falls, along an axis of the picture, and along an axis in space on average, metres.
-struct Noise {
+struct SampleNoise {
     across: f64,
     turns: f64,
     mean: f64,
 }
 
 /// The 99th percentile of registration to be expected of `case`, millimetres.
-pub(super) fn p99_mm(stage: &Stage, case: &Case) -> f64 {
+pub(super) fn p99_mm(stage: &RehearsalStage, case: &RehearsalCase) -> f64 {
     let rehearsal = &case.config.rehearsal;
     let noise = noise_of(stage, case);
     let step_s = 1.0 / f64::from(case.rate_hz.max(1));
@@ -190,9 +190,9 @@ pub(super) fn p99_mm(stage: &Stage, case: &Case) -> f64 {
     let expected = case.config.prediction.acceleration;
     let rung =
         |i: i32| SteadyFilter::new(step_s, r, JERK * (expected * f64::from(i - RUNGS / 2).exp2()).powi(2));
-    let followers = (0..RUNGS).map(|i| Follower::new(&rung(i), &swings));
+    let followers = (0..RUNGS).map(|i| MotionFollower::new(&rung(i), &swings));
     let judged_s = step_s * (4e-3 / step_s).ceil().max(1.0);
-    let judged = |follower: &Follower| {
+    let judged = |follower: &MotionFollower| {
         let [motion, gain] = follower.error(judged_s, [0.0; 2]);
         motion + 3.0 * r * gain
     };
@@ -224,7 +224,7 @@ pub(super) fn p99_mm(stage: &Stage, case: &Case) -> f64 {
 }
 
 /// Variance along an axis of what does not change in a run: calibrations, places of meshes, and time that is not known; m2.
-fn fixed(stage: &Stage, case: &Case) -> f64 {
+fn fixed(stage: &RehearsalStage, case: &RehearsalCase) -> f64 {
     let rehearsal = &case.config.rehearsal;
     let at = |px: f64, distance: f64, f: f64| (AXIS_BY_P99 * px * distance / f).powi(2);
     let projector = at(rehearsal.projector_px, stage.distance, stage.projector.fx);
@@ -235,13 +235,13 @@ fn fixed(stage: &Stage, case: &Case) -> f64 {
     projector + camera + late + rehearsal.body_m.powi(2)
 }
 
-fn noise_of(stage: &Stage, case: &Case) -> Noise {
+fn noise_of(stage: &RehearsalStage, case: &RehearsalCase) -> SampleNoise {
     let arm = stage.points.iter().flatten().map(|p| p.length_squared()).sum::<f64>();
     let arm = (arm / stage.points.iter().map(Vec::len).sum::<usize>().max(1) as f64).sqrt();
     let Some((eye, markings)) = &stage.camera else {
-        let errors = Stage::errors(case);
+        let errors = RehearsalStage::errors(case);
         let turns = errors.rotation_rad * arm * (2.0f64 / 3.0).sqrt();
-        return Noise { across: errors.position_m, turns, mean: errors.position_m };
+        return SampleNoise { across: errors.position_m, turns, mean: errors.position_m };
     };
     // The points of a body lie about their middle; n of them are seen.
     let rehearsal = &case.config.rehearsal;
@@ -266,7 +266,7 @@ fn noise_of(stage: &Stage, case: &Case) -> Noise {
     let towards = |eye: &ProjectorCamera| (stage.middle - eye.position()).normalize_or_zero();
     let beside = towards(eye).cross(towards(&stage.projector)).length();
     let across = (across * across + 0.5 * (depth * beside).powi(2)).sqrt();
-    Noise { across, turns: turn * arm, mean }
+    SampleNoise { across, turns: turn * arm, mean }
 }
 
 #[cfg(test)]
@@ -291,7 +291,7 @@ mod tests {
             }
         }
         let swings = [[w, 0.5]];
-        let [mean, _] = Follower::new(&filter, &swings).error(h, [30.0, 0.7]);
+        let [mean, _] = MotionFollower::new(&filter, &swings).error(h, [30.0, 0.7]);
         let amplitude = (2.0 * mean).sqrt();
         assert!((worst / amplitude - 1.0).abs() < 0.02, "{worst} {amplitude}");
         assert!(((squares / n) / (0.5 * amplitude * amplitude) - 1.0).abs() < 0.02);
@@ -311,7 +311,7 @@ mod tests {
             x += filter.gains * (draws.normal(i) - x.x);
             squares += forecast(h, [0.0; 2]).dot(x).powi(2);
         }
-        let [_, gain] = Follower::new(&filter, &[]).error(h, [0.0; 2]);
+        let [_, gain] = MotionFollower::new(&filter, &[]).error(h, [0.0; 2]);
         let ratio = squares / n as f64 / gain;
         assert!((ratio - 1.0).abs() < 0.05, "{ratio}");
     }
@@ -320,7 +320,7 @@ mod tests {
     #[test]
     fn shares_err_least() {
         let filter = SteadyFilter::new(1.0 / 120.0, 1e-8, 8.0 * 25.0);
-        let follower = Follower::new(&filter, &[[10.0, 1e-3], [6.0, 4e-4]]);
+        let follower = MotionFollower::new(&filter, &[[10.0, 1e-3], [6.0, 4e-4]]);
         let of = |shares| {
             let [motion, gain] = follower.error(LEARNED_S, shares);
             motion + 3e-8 * gain

@@ -1,7 +1,7 @@
 //! The report of a rehearsal, for programs and for people.
 
-use super::stage::{Case, LightFall, Stage};
-use super::{Extent, NOTICED_S};
+use super::stage::{LightFall, RehearsalCase, RehearsalStage};
+use super::{RehearsalExtent, NOTICED_S};
 use dpm_rig::config::RigConfig;
 use serde::Serialize;
 use std::fmt::Write;
@@ -9,13 +9,13 @@ use std::fmt::Write;
 /// Percentiles of a distribution.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Serialize)]
 #[allow(missing_docs)] // named after what they are
-pub struct Percentiles {
+pub struct RehearsedPercentiles {
     pub p50: f64,
     pub p95: f64,
     pub p99: f64,
 }
 
-impl Percentiles {
+impl RehearsedPercentiles {
     /// Of `values` in any order; all 0 without any.
     pub(super) fn of(values: &[f64]) -> Self {
         let mut sorted = values.to_vec();
@@ -34,29 +34,29 @@ pub struct CaseReport {
     /// What is other in it.
     pub name: String,
     /// Registration, millimetres across the light.
-    pub mm: Percentiles,
+    pub mm: RehearsedPercentiles,
     /// The same, pixels of the projector.
-    pub px: Percentiles,
+    pub px: RehearsedPercentiles,
     /// From motion to the centre of its light, milliseconds.
-    pub motion_to_light_ms: Percentiles,
+    pub motion_to_light_ms: RehearsedPercentiles,
     /// The 99th percentile of registration by the closed form, millimetres.
     pub predicted_p99_mm: f64,
     /// Share of the bodies in frames that stayed dark.
     pub dark_share: f64,
     /// Registration if bodies were drawn where they were measured, without prediction, millimetres.
-    pub unpredicted_mm: Percentiles,
+    pub unpredicted_mm: RehearsedPercentiles,
 }
 
 impl CaseReport {
     pub(super) fn new(name: &str, predicted_p99_mm: f64, fallen: &LightFall) -> Self {
         Self {
             name: name.to_owned(),
-            mm: Percentiles::of(&fallen.mm),
-            px: Percentiles::of(&fallen.px),
-            motion_to_light_ms: Percentiles::of(&fallen.late_ms),
+            mm: RehearsedPercentiles::of(&fallen.mm),
+            px: RehearsedPercentiles::of(&fallen.px),
+            motion_to_light_ms: RehearsedPercentiles::of(&fallen.late_ms),
             predicted_p99_mm,
             dark_share: fallen.dark as f64 / fallen.bodies.max(1) as f64,
-            unpredicted_mm: Percentiles::of(&fallen.held_mm),
+            unpredicted_mm: RehearsedPercentiles::of(&fallen.held_mm),
         }
     }
 }
@@ -67,9 +67,9 @@ pub struct PicturesReport {
     /// Pictures that were painted and looked at.
     pub pictures: u64,
     /// Registration in them, millimetres.
-    pub painted_mm: Percentiles,
+    pub painted_mm: RehearsedPercentiles,
     /// The same by drawn corners, millimetres.
-    pub drawn_mm: Percentiles,
+    pub drawn_mm: RehearsedPercentiles,
 }
 
 /// What a rig can be expected to do.
@@ -102,9 +102,9 @@ pub struct RehearsalReport {
 impl RehearsalReport {
     pub(super) fn new(
         config: &RigConfig,
-        own: &Case,
-        extent: Extent,
-        stage: &Stage,
+        own: &RehearsalCase,
+        extent: RehearsalExtent,
+        stage: &RehearsalStage,
         rig: CaseReport,
     ) -> Self {
         let rehearsal = &config.rehearsal;

@@ -3,7 +3,7 @@
 
 use super::projector;
 use super::tracker::{config_of, is_in_view, CameraPart, Player, TrackerPart};
-use super::truth::Truth;
+use super::truth::RehearsalTruth;
 use dpm_camera::{Markings, TagPlace};
 use dpm_device::planes::Raster;
 use dpm_mock::motion::Motion;
@@ -30,7 +30,7 @@ const LIT_NOTHING: &str = "the rehearsal lit nothing";
 
 /// The parts of a rig in one run.
 #[derive(Clone, Debug)]
-pub(super) struct Case {
+pub(super) struct RehearsalCase {
     /// The rig's own configuration, with what is other in this run.
     pub config: RigConfig,
     /// Samples of the tracker a second.
@@ -44,7 +44,7 @@ pub(super) struct Case {
 }
 
 /// What is known of a rig, whatever its parts can do.
-pub(super) struct Stage {
+pub(super) struct RehearsalStage {
     /// The projector, as the rig has it, at its full raster.
     pub projector: ProjectorCamera,
     /// Camera and markings as the rig has them; `None` for a tracker without one.
@@ -114,7 +114,7 @@ fn check(config: &RigConfig) -> Result<(), Failure> {
     Ok(())
 }
 
-impl Stage {
+impl RehearsalStage {
     /// What is known of the rig of `config`.
     ///
     /// # Errors
@@ -185,7 +185,7 @@ impl Stage {
     }
 
     /// From the latch of a frame's poses to the centre of its light in `case`, nanoseconds.
-    pub(super) fn latch_to_light_ns(&self, case: &Case) -> i64 {
+    pub(super) fn latch_to_light_ns(&self, case: &RehearsalCase) -> i64 {
         let config = &case.config;
         let costs = &config.real_time.stage_costs_us;
         let backend = projector::played(&config.projector.backend, case.is_prompt);
@@ -195,13 +195,13 @@ impl Stage {
     }
 
     /// From the middle of an exposure to the finished sample, nanoseconds.
-    pub(super) fn delivery_ns(&self, case: &Case) -> i64 {
+    pub(super) fn delivery_ns(&self, case: &RehearsalCase) -> i64 {
         let [exposure, delivery] = delivery_of(case, self.camera.is_some());
         exposure / 2 + delivery
     }
 
     /// The noise of a tracker that reports poses.
-    pub(super) fn errors(case: &Case) -> SampleErrors {
+    pub(super) fn errors(case: &RehearsalCase) -> SampleErrors {
         let rehearsal = &case.config.rehearsal;
         let written = SampleErrors {
             position_m: rehearsal.noise_m,
@@ -215,8 +215,13 @@ impl Stage {
     ///
     /// # Errors
     /// The engine refuses the rig.
-    pub(super) fn run(&mut self, case: &Case, seed: u64, seconds: f64) -> Result<LightFall, Failure> {
-        let truth = Truth::new(seed);
+    pub(super) fn run(
+        &mut self,
+        case: &RehearsalCase,
+        seed: u64,
+        seconds: f64,
+    ) -> Result<LightFall, Failure> {
+        let truth = RehearsalTruth::new(seed);
         let rehearsal = case.config.rehearsal.clone();
         let mut config = quiet(&case.config);
         let player = self.player(case, truth);
@@ -267,7 +272,7 @@ impl Stage {
         Ok(fallen)
     }
 
-    fn player(&self, case: &Case, truth: Truth) -> Player {
+    fn player(&self, case: &RehearsalCase, truth: RehearsalTruth) -> Player {
         let rehearsal = &case.config.rehearsal;
         let off = |count: usize| (0..count).map(|body| truth.off_body(body, rehearsal)).collect();
         match &self.camera {
@@ -320,7 +325,7 @@ impl Stage {
 }
 
 /// Exposure, and the time from its end to the sample, nanoseconds.
-fn delivery_of(case: &Case, is_camera: bool) -> [i64; 2] {
+fn delivery_of(case: &RehearsalCase, is_camera: bool) -> [i64; 2] {
     let rehearsal = &case.config.rehearsal;
     let written = rehearsal.delivery_us.map(|us| i64::from(us) * 1000);
     if is_camera {
@@ -328,7 +333,7 @@ fn delivery_of(case: &Case, is_camera: bool) -> [i64; 2] {
         [i64::from(case.exposure_us) * 1000, written.unwrap_or(period_ns)]
     } else {
         let errors = case.config.tracker.errors();
-        [0, errors.map(|e| e.delivery_ns).or(written).unwrap_or(Stage::errors(case).delivery_ns)]
+        [0, errors.map(|e| e.delivery_ns).or(written).unwrap_or(RehearsalStage::errors(case).delivery_ns)]
     }
 }
 

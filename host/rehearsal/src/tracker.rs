@@ -4,7 +4,7 @@
 //! of the mock camera; the detector, the solver and the covariance are those of `tracker.kind = "camera"`. Every other tracker
 //! is played by the mock, with its noise. Samples are functions of seed and number; polling only delivers them.
 
-use super::truth::Truth;
+use super::truth::RehearsalTruth;
 use dpm_camera::{
     sample_of, BodyFinder, FinderSetup, Markings, Picture, Sightings, SpotSighting, TagPlace, TagSighting,
 };
@@ -75,7 +75,7 @@ pub(super) struct TrackerPart {
     pub late_ns: i64,
     /// What the rig takes off every stamp, nanoseconds.
     pub corrected_ns: i64,
-    pub truth: Truth,
+    pub truth: RehearsalTruth,
 }
 
 /// `[tracker]` with these keys.
@@ -118,7 +118,7 @@ impl TrackerKeys for TrackerPart {
 
     fn open(&self, place: TrackerPlace) -> Result<Box<dyn Tracker>, SourceError> {
         let source: Box<dyn Source> = match &self.player {
-            Player::Camera(camera) => Box::new(View::new(self, camera, place.motions)?),
+            Player::Camera(camera) => Box::new(RehearsedCamera::new(self, camera, place.motions)?),
             Player::Poses(errors, off) => Box::new(Reports::new(self, errors, off, place.motions)?),
         };
         let gate = SampleGate::new(place.bodies.len());
@@ -239,7 +239,7 @@ impl Source for Reports {
 }
 
 /// A camera.
-struct View {
+struct RehearsedCamera {
     keys: TrackerPart,
     camera: CameraPart,
     motions: Vec<Motion>,
@@ -253,7 +253,7 @@ struct View {
     spots: Vec<SpotSighting>,
 }
 
-impl View {
+impl RehearsedCamera {
     fn new(keys: &TrackerPart, camera: &CameraPart, motions: Vec<Motion>) -> Result<Self, SourceError> {
         let setup = FinderSetup {
             camera: camera.believed,
@@ -327,7 +327,7 @@ impl View {
     }
 }
 
-impl Source for View {
+impl Source for RehearsedCamera {
     fn arrives_at(&self, k: u64) -> HostTime {
         HostTime(self.begin_ns(k) + self.camera.exposure_ns + self.keys.delivery_ns)
     }

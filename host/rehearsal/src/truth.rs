@@ -16,11 +16,11 @@ const ASTRAY: f64 = 0.08;
 
 /// The draws of a seed.
 #[derive(Clone, Copy, Debug)]
-pub(super) struct Truth {
+pub(super) struct RehearsalTruth {
     draws: Draws,
 }
 
-impl Truth {
+impl RehearsalTruth {
     pub(super) fn new(seed: u64) -> Self {
         Self { draws: Draws::new(seed).stream(0x7265_6865) }
     }
@@ -151,12 +151,12 @@ mod tests {
         let believed = camera();
         for seed in 0..20 {
             for px in [0.0, 0.1, 3.0] {
-                let truth = Truth::new(seed).eye(&believed, px, 1.2, 0);
+                let truth = RehearsalTruth::new(seed).eye(&believed, px, 1.2, 0);
                 let off = p99_px(&believed, &truth, 1.2);
                 assert!((off - px).abs() <= 0.05 * px + 1e-9, "seed {seed}: {off} for {px}");
             }
         }
-        let [a, b] = [0, 1].map(|seed| Truth::new(seed).eye(&believed, 1.0, 1.2, 0));
+        let [a, b] = [0, 1].map(|seed| RehearsalTruth::new(seed).eye(&believed, 1.0, 1.2, 0));
         assert!(a != b);
     }
 
@@ -168,7 +168,7 @@ mod tests {
         for motion in [RehearsedMotion::Swing, RehearsedMotion::Hand, RehearsedMotion::Turns] {
             let rehearsal = RehearsalConfig { motion, ..RehearsalConfig::default() };
             for seed in 0..4 {
-                let spec = Truth::new(seed).motion(0, &rehearsal, DVec3::X, DVec3::Y);
+                let spec = RehearsalTruth::new(seed).motion(0, &rehearsal, DVec3::X, DVec3::Y);
                 let motion = Motion::new(&spec, Pose::IDENTITY).unwrap();
                 let place = |i: i64| DVec3::from_array(motion.pose_at(i * 1_000_000).position_m);
                 let (mut speed, mut turning, n) = (0.0, 0.0, 60_000);

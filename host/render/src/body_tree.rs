@@ -20,7 +20,7 @@ pub(crate) struct BodyTree {
     /// Its leaves. Those of a node stand together.
     leaves: Vec<Leaf>,
     /// Each node before the two below it. The first is the root.
-    nodes: Vec<Node>,
+    nodes: Vec<BodyTreeNode>,
     /// Nodes whose leaves are still to be split: the node, and its first leaf.
     open: Vec<(u16, u16)>,
     /// Nodes that are still to be written: the node, and its place.
@@ -39,7 +39,7 @@ struct Leaf {
 
 /// A node of the tree.
 #[derive(Clone, Copy, Debug)]
-struct Node {
+struct BodyTreeNode {
     bounds: Box3,
     /// As [`BodyNode::body`].
     body: u32,
@@ -176,10 +176,10 @@ impl BodyTree {
 }
 
 /// The node over these leaves. What is below it is not yet known.
-fn node_of(leaves: &[Leaf]) -> Node {
+fn node_of(leaves: &[Leaf]) -> BodyTreeNode {
     let flags = leaves.iter().fold(0, |all, leaf| all | leaf.body & 0xff00);
     let body = if let [one] = leaves { one.body } else { flags | BODY_NODE_INNER };
-    Node { bounds: union_of(leaves), body, count: leaves.len() as u16, below: 0, axis: 0 }
+    BodyTreeNode { bounds: union_of(leaves), body, count: leaves.len() as u16, below: 0, axis: 0 }
 }
 
 /// Sorts the leaves of a node to the two sides of the best place along the widest axis. Returns that axis, and how many lie on the lower side.

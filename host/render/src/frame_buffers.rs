@@ -10,7 +10,7 @@ use super::read_back::{Guide, Surface};
 use super::scene_data::{BodyData, SceneData};
 use super::scene_gpu::{self, table_buffer, Geometry, SceneGpu};
 use super::settings::{Output, RendererSettings};
-use crate::gpu::{Buffer, FrameTree, Gpu, GpuError, MemoryKind, Place};
+use crate::gpu::{Buffer, FrameTree, Gpu, GpuError, MemoryKind, MemoryPlace};
 use crate::pack;
 use dpm_shaders::structs::{
     in_blocks, BodyNode, Counters, Filtered, Frame, Instance, Mover, Schedule, TextureInfo, PART_BLOCK,
@@ -134,7 +134,7 @@ impl FrameBuffers {
     pub(super) fn new(
         gpu: &Arc<Gpu>,
         settings: &RendererSettings,
-        (data, reading, apart): (&SceneData, Reading, Option<apart::Layout>),
+        (data, reading, apart): (&SceneData, Reading, Option<apart::QueueLayout>),
         (tiles, panel_tiles): (usize, usize),
         body_tree: BodyTree,
         live: Option<&LiveTextures>,
@@ -275,7 +275,7 @@ impl FrameBuffers {
     }
 
     /// Where each buffer lies: those of the shaders' bindings, and those that the host reads.
-    pub(super) fn places(&self) -> Vec<(&'static str, Place)> {
+    pub(super) fn places(&self) -> Vec<(&'static str, MemoryPlace)> {
         let of_shaders = [
             ("frame uniforms", &self.frame.device),
             ("instances", &self.instances.device),

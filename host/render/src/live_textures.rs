@@ -36,7 +36,7 @@ pub(super) struct LiveTextures {
     frames: u64,
     ended: u64,
     /// The texture of the last piece, with its state before.
-    before: Option<(usize, State)>,
+    before: Option<(usize, TextureState)>,
 }
 
 /// One of them.
@@ -47,12 +47,12 @@ struct ReadTexture {
     number: u64,
     /// The last frame that reads each place.
     read_by: [u64; PLACES],
-    state: State,
+    state: TextureState,
 }
 
 /// What a texture shows.
 #[derive(Clone, Copy)]
-struct State {
+struct TextureState {
     /// The place that is shown.
     shown: usize,
     /// The place that a picture is copied to, and how many of its texels are there.
@@ -142,7 +142,7 @@ impl LiveTextures {
 impl ReadTexture {
     fn new(texture: &LiveTexture) -> Self {
         let reader = texture.pictures.follow();
-        let state = State { shown: 0, copying: None };
+        let state = TextureState { shown: 0, copying: None };
         Self { texture: texture.clone(), reader, number: 0, read_by: [0; PLACES], state }
     }
 
@@ -174,9 +174,9 @@ impl ReadTexture {
     fn copied(&mut self, texels: usize) {
         let Some((place, done)) = self.state.copying else { return };
         self.state = if done + texels < self.texture.len {
-            State { copying: Some((place, done + texels)), ..self.state }
+            TextureState { copying: Some((place, done + texels)), ..self.state }
         } else {
-            State { shown: place, copying: None }
+            TextureState { shown: place, copying: None }
         };
     }
 }

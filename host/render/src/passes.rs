@@ -29,18 +29,18 @@ pub(super) struct Pass {
 /// The shader of a pass.
 pub(super) enum Code {
     /// Every method runs this one.
-    OfAll(Kernel),
+    OfAll(PassKernel),
     /// Method `dpm` has its own.
     ByMethod {
         /// The shader of method `dpm`.
-        dpm: Kernel,
+        dpm: PassKernel,
         /// The shader of the methods of others.
-        others: Kernel,
+        others: PassKernel,
     },
 }
 
 /// A shader with the buffers that it uses.
-pub(super) struct Kernel {
+pub(super) struct PassKernel {
     /// The shader that reads in this way.
     pub shader: fn(Reading) -> Shader,
     /// Buffers, or their parts, that an earlier pass of this frame, or the frame before, has written and that this shader reads. Inputs that no pass writes
@@ -73,13 +73,13 @@ pub(super) const TABLE: [Pass; 16] = [
     Pass {
         name: "primary",
         code: Code::ByMethod {
-            dpm: Kernel {
+            dpm: PassKernel {
                 shader: |reading| shaders::PRIMARY.reading(reading),
                 reads: &["B_COUNTERS", "B_FORMER.tag"],
                 writes: &["B_SURFACES.hit", "B_SURFACES.inside", "B_COUNTERS", "B_GUIDES.tint"],
                 seldom: &["B_GUIDES.sight"],
             },
-            others: Kernel {
+            others: PassKernel {
                 shader: |reading| shaders::PRIMARY.reading(reading),
                 reads: &["B_COUNTERS"],
                 writes: &["B_SURFACES.hit", "B_SURFACES.inside", "B_COUNTERS", "B_GUIDES.sight"],
@@ -95,7 +95,7 @@ pub(super) const TABLE: [Pass; 16] = [
     Pass {
         name: "reproject",
         code: Code::ByMethod {
-            dpm: Kernel {
+            dpm: PassKernel {
                 shader: |reading| shaders::REPROJECT_POINT.reading(reading),
                 reads: &[
                     "B_SURFACES.hit",
@@ -121,7 +121,7 @@ pub(super) const TABLE: [Pass; 16] = [
                 ],
                 seldom: &[],
             },
-            others: Kernel {
+            others: PassKernel {
                 shader: |reading| shaders::REPROJECT_BILINEAR.reading(reading),
                 reads: &[
                     "B_SURFACES.hit",
@@ -149,7 +149,7 @@ pub(super) const TABLE: [Pass; 16] = [
     },
     Pass {
         name: "rate map",
-        code: Code::OfAll(Kernel {
+        code: Code::OfAll(PassKernel {
             shader: |reading| shaders::RATE_MAP.reading(reading),
             reads: &["B_SURFACES.hit", "B_GUIDES.sight", "B_HISTORY.light"],
             writes: &["B_RATES"],
@@ -164,13 +164,13 @@ pub(super) const TABLE: [Pass; 16] = [
     Pass {
         name: "schedule",
         code: Code::ByMethod {
-            dpm: Kernel {
+            dpm: PassKernel {
                 shader: |reading| shaders::SCHEDULE_BUDGET.reading(reading),
                 reads: &["B_GUIDES.demand", "B_SCHEDULE"],
                 writes: &["B_GUIDES.demand", "B_SCHEDULE", "B_WORK"],
                 seldom: &["B_SURFACES.hit", "B_RADIANCE"],
             },
-            others: Kernel {
+            others: PassKernel {
                 shader: |reading| shaders::SCHEDULE_BLOCKS.reading(reading),
                 reads: &["B_SURFACES.hit", "B_GUIDES.sight", "B_RATES", "B_SCHEDULE"],
                 writes: &["B_RADIANCE", "B_SCHEDULE", "B_WORK"],
@@ -186,7 +186,7 @@ pub(super) const TABLE: [Pass; 16] = [
     Pass {
         name: "trace",
         code: Code::ByMethod {
-            dpm: Kernel {
+            dpm: PassKernel {
                 shader: |reading| shaders::TRACE.reading(reading),
                 reads: &[
                     "B_SURFACES.hit",
@@ -200,7 +200,7 @@ pub(super) const TABLE: [Pass; 16] = [
                 writes: &["B_RADIANCE", "B_COUNTERS", "B_GUIDES.demand"],
                 seldom: &[],
             },
-            others: Kernel {
+            others: PassKernel {
                 shader: |reading| shaders::TRACE.reading(reading),
                 reads: &["B_SURFACES.hit", "B_SURFACES.inside", "B_COUNTERS", "B_SCHEDULE", "B_WORK"],
                 writes: &["B_RADIANCE", "B_COUNTERS"],
@@ -216,7 +216,7 @@ pub(super) const TABLE: [Pass; 16] = [
     Pass {
         name: "accumulate",
         code: Code::ByMethod {
-            dpm: Kernel {
+            dpm: PassKernel {
                 shader: |reading| shaders::ACCUMULATE_SAMPLES.reading(reading),
                 reads: &[
                     "B_RADIANCE",
@@ -229,7 +229,7 @@ pub(super) const TABLE: [Pass; 16] = [
                 writes: &["B_HISTORY.light", "B_HISTORY.noise", "B_FILTERED"],
                 seldom: &[],
             },
-            others: Kernel {
+            others: PassKernel {
                 shader: |reading| shaders::ACCUMULATE_FRAMES.reading(reading),
                 reads: &["B_SURFACES.hit", "B_RADIANCE", "B_GUIDES.sight", "B_HISTORY.light", "B_RATES"],
                 writes: &["B_HISTORY.light", "B_FILTERED"],
@@ -246,7 +246,7 @@ pub(super) const TABLE: [Pass; 16] = [
         // By method dpm with the pass `compensate` at its end.
         name: "spatial",
         code: Code::ByMethod {
-            dpm: Kernel {
+            dpm: PassKernel {
                 shader: |reading| shaders::SPATIAL_REGRESSION.reading(reading),
                 reads: &[
                     "B_SURFACES.hit",
@@ -260,7 +260,7 @@ pub(super) const TABLE: [Pass; 16] = [
                 writes: &["B_CODES", "B_COUNTERS"],
                 seldom: &["B_SHOWN"],
             },
-            others: Kernel {
+            others: PassKernel {
                 shader: |reading| shaders::SPATIAL_DISK.reading(reading),
                 reads: &["B_SURFACES.hit", "B_GUIDES.sight", "B_HISTORY.place", "B_FILTERED"],
                 writes: &["B_SHOWN"],
@@ -275,7 +275,7 @@ pub(super) const TABLE: [Pass; 16] = [
     },
     Pass {
         name: "compensate",
-        code: Code::OfAll(Kernel {
+        code: Code::OfAll(PassKernel {
             shader: |reading| shaders::COMPENSATE.reading(reading),
             reads: &["B_SURFACES.hit", "B_SURFACES.inside", "B_COUNTERS", "B_SHOWN"],
             writes: &["B_CODES", "B_COUNTERS"],
@@ -292,13 +292,13 @@ pub(super) const TABLE: [Pass; 16] = [
         // than the panel has.
         name: "prepare",
         code: Code::ByMethod {
-            dpm: Kernel {
+            dpm: PassKernel {
                 shader: |reading| shaders::PREPARE.reading(reading),
                 reads: &["B_SURFACES.hit", "B_SURFACES.inside", "B_GUIDES.tint", "B_SHOWN"],
                 writes: &["B_COARSE_LIGHT"],
                 seldom: &[],
             },
-            others: Kernel {
+            others: PassKernel {
                 shader: |reading| shaders::PREPARE.reading(reading),
                 reads: &["B_SURFACES.hit", "B_SURFACES.inside", "B_SHOWN"],
                 writes: &["B_COARSE_LIGHT"],
@@ -313,7 +313,7 @@ pub(super) const TABLE: [Pass; 16] = [
     },
     Pass {
         name: "enlarge",
-        code: Code::OfAll(Kernel {
+        code: Code::OfAll(PassKernel {
             shader: |reading| shaders::ENLARGE.reading(reading),
             reads: &["B_COARSE_SURFACES.hit", "B_COARSE_LIGHT", "B_COUNTERS", "B_SCHEDULE"],
             writes: &["B_SURFACES.hit", "B_SURFACES.inside", "B_CODES", "B_COUNTERS", "B_SCHEDULE", "B_WORK"],
@@ -327,7 +327,7 @@ pub(super) const TABLE: [Pass; 16] = [
     },
     Pass {
         name: "edges",
-        code: Code::OfAll(Kernel {
+        code: Code::OfAll(PassKernel {
             shader: |reading| shaders::EDGES.reading(reading),
             reads: &["B_COARSE_SURFACES.hit", "B_COARSE_LIGHT", "B_COUNTERS", "B_SCHEDULE", "B_WORK"],
             writes: &["B_SURFACES.hit", "B_SURFACES.inside", "B_CODES", "B_COUNTERS"],
@@ -341,7 +341,7 @@ pub(super) const TABLE: [Pass; 16] = [
     },
     Pass {
         name: "halftone",
-        code: Code::OfAll(Kernel {
+        code: Code::OfAll(PassKernel {
             shader: |reading| shaders::HALFTONE.reading(reading),
             reads: &["B_SURFACES.hit", "B_CODES"],
             writes: &["B_CODES"],
@@ -355,7 +355,7 @@ pub(super) const TABLE: [Pass; 16] = [
     },
     Pass {
         name: "motion",
-        code: Code::OfAll(Kernel {
+        code: Code::OfAll(PassKernel {
             shader: |reading| shaders::MOTION.reading(reading),
             reads: &["B_SURFACES.hit", "B_CODES"],
             writes: &["B_MOTION"],
@@ -370,7 +370,7 @@ pub(super) const TABLE: [Pass; 16] = [
     Pass {
         // The pass `halftone` for planes whose highest bit is split, of which the pass `motion` keeps the code values.
         name: "cut",
-        code: Code::OfAll(Kernel {
+        code: Code::OfAll(PassKernel {
             shader: |reading| shaders::HALFTONE.reading(reading),
             reads: &["B_SURFACES.hit", "B_CODES"],
             writes: &["B_CODES"],
@@ -384,7 +384,7 @@ pub(super) const TABLE: [Pass; 16] = [
     },
     Pass {
         name: "warp",
-        code: Code::OfAll(Kernel {
+        code: Code::OfAll(PassKernel {
             shader: |reading| shaders::WARP.reading(reading),
             reads: &["B_MOTION"],
             writes: &["B_CODES"],
@@ -398,7 +398,7 @@ pub(super) const TABLE: [Pass; 16] = [
     },
     Pass {
         name: "pack",
-        code: Code::OfAll(Kernel {
+        code: Code::OfAll(PassKernel {
             shader: |_| shaders::PACK,
             reads: &["B_CODES"],
             writes: &["B_PLANES"],
@@ -434,7 +434,7 @@ pub const PASSES: &[&str] = &{
 
 impl Code {
     /// What method `dpm` runs, or the methods of others.
-    fn kernel(&self, is_dpm: bool) -> &Kernel {
+    fn kernel(&self, is_dpm: bool) -> &PassKernel {
         match self {
             Self::OfAll(kernel) => kernel,
             Self::ByMethod { dpm, others } => {

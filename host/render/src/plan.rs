@@ -42,7 +42,7 @@ pub(super) struct Pipelines {
     /// One for each row of [`TABLE`]; `None`: the method does not need the pass.
     pub each: Vec<Option<ComputePipeline>>,
     /// The parts of passes between which the host walks rays, and where everything lies; `None`: it does not.
-    pub apart: Option<(ApartPipelines, apart::Layout)>,
+    pub apart: Option<(ApartPipelines, apart::QueueLayout)>,
 }
 
 /// Workgroups of the pass `trace` for each multiprocessor or compute unit, so that the device is busy to the end: about three times what it holds at
@@ -174,13 +174,17 @@ impl RendererPlan {
     }
 
     /// Where everything lies if the host walks the rays; else why it does not.
-    pub(super) fn layout_apart(&self, gpu: &Gpu, reading: Reading) -> Result<apart::Layout, &'static str> {
+    pub(super) fn layout_apart(
+        &self,
+        gpu: &Gpu,
+        reading: Reading,
+    ) -> Result<apart::QueueLayout, &'static str> {
         let needs = self.needs();
         if let Some(reason) = apart::refusal(gpu, reading, &self.settings, &self.data, &needs) {
             return Err(reason);
         }
         let most = gpu.max_buffer_bytes();
-        apart::Layout::new(&self.settings.on_traced(), needs.absorption, needs.emissive, most)
+        apart::QueueLayout::new(&self.settings.on_traced(), needs.absorption, needs.emissive, most)
             .ok_or("paths have no rays, or more than there is room for")
     }
 

@@ -1,6 +1,6 @@
 //! One frame on the GPU, from surfaces over radiance to code values. `Renderer::create_slot` records the passes in their order.
 
-use super::apart::{ApartLists, Crew, Side};
+use super::apart::{ApartLists, Side, WalkCrew};
 use super::body_tree::BodyTree;
 use super::fill;
 use super::frame_buffers::{FrameBuffers, Pixels};
@@ -19,7 +19,8 @@ use super::slot::{FrameSlot, Sets};
 use super::tiles::TileList;
 use super::warp::Movers;
 use crate::gpu::{
-    submit_frame, BindingSet, CommandList, FrameFence, Gpu, GpuError, Order, Orders, Overlap, Recorder, Relay,
+    submit_frame, BindingSet, CommandList, FrameFence, FrameOrder, Gpu, GpuError, Orders, Overlap, Recorder,
+    Relay,
 };
 use crate::pack;
 use bytemuck::Zeroable;
@@ -197,7 +198,7 @@ impl Renderer {
         let walks_tree = plan.walks_body_tree(reading);
         let nodes = BodyTree::new(if walks_tree { data.bodies.len() } else { 0 }).most_nodes();
         let walks = prepared.pipelines.apart.is_some() && overlap.is_none();
-        let crew = walks.then(|| Crew::new(gpu, &data, nodes)).transpose()?;
+        let crew = walks.then(|| WalkCrew::new(gpu, &data, nodes)).transpose()?;
         Ok(Self {
             resources: Arc::new(Resources {
                 crew: crew.filter(|crew| !crew.is_empty()),
@@ -574,7 +575,7 @@ impl Renderer {
     fn submit_lists(
         &self,
         slot: &mut FrameSlot,
-        (has_piece, order): (bool, Order),
+        (has_piece, order): (bool, FrameOrder),
         (budget_spp, spp, pixels): (f32, u32, u64),
         body_nodes: u32,
     ) -> Result<(), GpuError> {

@@ -1,6 +1,6 @@
 //! What submissions read.
 
-use super::apart::Crew;
+use super::apart::WalkCrew;
 use super::memory::SharedBuffers;
 use super::plan::Pipelines;
 use super::scene_gpu::SceneGpu;
@@ -11,7 +11,7 @@ use std::sync::Arc;
 /// dropped.
 pub(super) struct Resources {
     /// Walks the rays of frames, if the host does that.
-    pub(super) crew: Option<Crew>,
+    pub(super) crew: Option<WalkCrew>,
     // Dropped before the buffers that they use.
     pub(super) pipelines: Arc<Pipelines>,
     pub(super) shared: SharedBuffers,

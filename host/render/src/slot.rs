@@ -6,7 +6,7 @@ use super::passes::{FIRST_PASSES, PASSES};
 use super::read_back::{elements, Guide, History, Surface};
 use super::resources::Resources;
 use super::tiles::{TileList, TILE};
-use crate::gpu::{BindingSet, CommandList, FrameFence, GpuError, Place};
+use crate::gpu::{BindingSet, CommandList, FrameFence, GpuError, MemoryPlace};
 use crate::walker::Ray;
 use dpm_device::planes::Raster;
 use dpm_shaders::structs::{part, BodyNode, Counters, HistoryLight, Instance, Moved, Schedule, WorkItem};
@@ -134,7 +134,7 @@ impl FrameSlot {
     }
 
     /// Where its buffers lie: by name those that the shaders use, then those "of the host", which it reads.
-    pub fn places(&self) -> Vec<(&'static str, Place)> {
+    pub fn places(&self) -> Vec<(&'static str, MemoryPlace)> {
         self.buffers.places()
     }
 

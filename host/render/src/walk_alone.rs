@@ -2,7 +2,7 @@
 
 use super::frame_buffers::Pixels;
 use super::renderer::Renderer;
-use super::walker::{Kernel, Ray, WalkScene};
+use super::walker::{Ray, WalkKernel, WalkScene};
 use crate::gpu::{BindingSet, Buffer, CommandList, FrameFence, GpuError, MemoryKind};
 use bytemuck::{cast_slice, Zeroable};
 use dpm_shaders::structs::{self as gpu_structs, BodyNode, Frame, Instance, TRACE_LANES};
@@ -73,7 +73,7 @@ impl Renderer {
     /// The same by a kernel of the processor, on the calling thread.
     pub fn walk_on_host(
         &self,
-        kernel: Kernel,
+        kernel: WalkKernel,
         rays: &[Ray],
         (bodies, nodes): (&[Instance], &[BodyNode]),
         hits: &mut [u32],

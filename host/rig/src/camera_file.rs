@@ -29,7 +29,7 @@ pub(crate) fn calibrated_camera(
     warnings: &mut Vec<String>,
 ) -> Result<ProjectorCamera, CameraFileError> {
     use crate::config::{CalibrationLens, CalibrationUnit};
-    use dpm_camera_files::{self as camera_files, Frame, LengthUnit, LensKind, ReadOptions};
+    use dpm_camera_files::{self as camera_files, LengthUnit, LensKind, PoseFrame, ReadOptions};
     let wrong = |message: String| CameraFileError {
         key: "projector.calibration",
         path: path.display().to_string(),
@@ -59,8 +59,8 @@ pub(crate) fn calibrated_camera(
     warnings.extend(stored.notes.iter().map(told));
     let place = p.calibration_camera.as_ref().map(|pose| pose.to_affine());
     let camera = match (&stored.frame, place) {
-        (Frame::World, None) => stored.camera,
-        (Frame::WorldOfCamera { name }, None) => {
+        (PoseFrame::World, None) => stored.camera,
+        (PoseFrame::WorldOfCamera { name }, None) => {
             warnings.push(told(&format!(
                 "the origin of its world is {name:?}; if the tracker's is another, set projector.calibration_camera to the \
                  camera's pose in the tracker's world"
@@ -68,14 +68,14 @@ pub(crate) fn calibrated_camera(
             stored.camera
         }
         // A quaternion of length zero was refused when the configuration was read.
-        (Frame::Camera { .. } | Frame::WorldOfCamera { .. }, Some(place)) => stored.seen_from(place.unwrap_or_default()),
-        (Frame::Camera { name }, None) => {
+        (PoseFrame::Camera { .. } | PoseFrame::WorldOfCamera { .. }, Some(place)) => stored.seen_from(place.unwrap_or_default()),
+        (PoseFrame::Camera { name }, None) => {
             return Err(wrong(format!(
                 "its origin is the camera that calibrated it ({name:?} shows that), so the projector's place in the world is \
                  unknown; set projector.calibration_camera to the camera's pose in the world"
             )))
         }
-        (Frame::World, Some(_)) => {
+        (PoseFrame::World, Some(_)) => {
             return Err(wrong(
                 "projector.calibration_camera is set, but the file tells the projector's place in its own world and not in a \
                  camera's frame; remove projector.calibration_camera"

@@ -25,7 +25,7 @@ const MOST_SAMPLES: u32 = 4096;
 
 /// What a method showed in the time of a frame of method `dpm`.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
-pub struct Candidate {
+pub struct MethodCandidate {
     /// Its name.
     pub method: String,
     /// Samples of a pixel with which its frames took that time.
@@ -56,7 +56,7 @@ pub struct MethodChoice {
     /// Commit of the program that measured.
     pub commit: String,
     /// All that were measured, best first.
-    pub candidates: Vec<Candidate>,
+    pub candidates: Vec<MethodCandidate>,
 }
 
 /// Why a file of a choice is not used.

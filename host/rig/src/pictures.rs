@@ -32,7 +32,7 @@ pub struct Pictures {
 }
 
 /// Frames of light with the poses of the scene's bodies at the centre of each frame's light.
-struct Window<'a> {
+struct LightWindow<'a> {
     frames: Vec<(&'a LightFrame, Vec<DAffine3>)>,
     /// The centre of the last frame's light.
     at_ns: i64,
@@ -42,13 +42,13 @@ struct Window<'a> {
 
 /// The frames of `light` whose poses are known. With the mock tracker they are the true poses. With a real tracker
 /// they are the poses that each frame was drawn for: measured, then predicted.
-fn window<'a>(rig: &Rig, light: &'a [LightFrame], records: &[FrameRecord]) -> Window<'a> {
+fn window<'a>(rig: &Rig, light: &'a [LightFrame], records: &[FrameRecord]) -> LightWindow<'a> {
     let drawn_for = |f: &LightFrame| {
         let record = records.iter().find(|r| r.id.0 as u32 == f.frame)?;
         Some(record.tracked_poses.clone())
     };
     let poses = |f: &LightFrame| true_poses_at_centre(rig, f.first_photon_at).or_else(|| drawn_for(f));
-    let mut window = Window { frames: Vec::new(), at_ns: 0, tracked: Vec::new() };
+    let mut window = LightWindow { frames: Vec::new(), at_ns: 0, tracked: Vec::new() };
     for frame in light {
         let Some(tracked) = poses(frame) else { continue };
         let mut all = Vec::new();
@@ -194,7 +194,7 @@ fn viewer_camera(rig: &Rig, eye: DVec3, poses: &[DAffine3]) -> Option<ProjectorC
 }
 
 /// The surface point that a picture pixel shows at the last instant.
-struct SurfacePoint {
+struct PicturePoint {
     /// Body of the scene.
     body: usize,
     position: DVec3,
@@ -209,8 +209,8 @@ fn integrate(
     camera: &ProjectorCamera,
     other: DVec3,
     poses: &[DAffine3],
-    window: &Window<'_>,
-    shade: impl Fn(&SurfacePoint, Vec3) -> Vec3,
+    window: &LightWindow<'_>,
+    shade: impl Fn(&PicturePoint, Vec3) -> Vec3,
 ) -> Result<Vec<Vec3>, GpuError> {
     let mut slot = renderer.create_slot(true)?;
     let inputs =
@@ -231,7 +231,7 @@ fn integrate(
         let in_body = poses[body].inverse().transform_point3(position);
         let normal =
             poses[body].transform_vector3(renderer.shading_normal(surface).as_dvec3()).normalize_or_zero();
-        let seen = SurfacePoint { body, position, normal, uv: renderer.texture_coordinates(surface) };
+        let seen = PicturePoint { body, position, normal, uv: renderer.texture_coordinates(surface) };
         let mut sum = Vec3::ZERO;
         for (frame, all) in &window.frames {
             if let Some(p) = rig.camera.project(all[body].transform_point3(in_body)) {

@@ -9,13 +9,13 @@ use dpm_render::gpu::{Gpu, GpuOptions};
 use dpm_render::least_memory_bytes;
 
 /// Something that a rig needs.
-pub struct Part {
+pub struct RigNeed {
     /// Its name.
     pub name: &'static str,
     look: fn(&RigConfig) -> Result<(), Failure>,
 }
 
-impl Part {
+impl RigNeed {
     /// Looks whether the rig of `config` has it; milliseconds.
     ///
     /// # Errors
@@ -26,19 +26,19 @@ impl Part {
 }
 
 /// The projector.
-pub const PROJECTOR: Part = Part {
+pub const PROJECTOR: RigNeed = RigNeed {
     name: "projector",
     look: |config| projector::look(config).map_err(|e| Failure::new(FailureKind::Device, e)),
 };
 
 /// The GPU.
-pub const GPU: Part = Part {
+pub const GPU: RigNeed = RigNeed {
     name: "GPU",
     look: |config| Gpu::look(&gpu_options(config)).map_err(|e| Failure::new(FailureKind::NoGpu, e)),
 };
 
 /// All parts; first what a person plugs in.
-pub const PARTS: [Part; 2] = [PROJECTOR, GPU];
+pub const PARTS: [RigNeed; 2] = [PROJECTOR, GPU];
 
 /// Looks at all parts.
 ///

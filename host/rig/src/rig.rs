@@ -9,7 +9,7 @@ use crate::config::{
     TracksUse, MAX_TRACKED,
 };
 use crate::drive::{albedo_of, drive, DriveError, MAX_PICTURE_BYTES};
-use crate::gaze::Aim;
+use crate::gaze::GazeAim;
 use crate::mock::{Motion, MotionError, MotionSpec};
 use dpm_calibration_file::CalibrationFile;
 use dpm_device::planes::{PlaneSchedule, Raster};
@@ -694,10 +694,10 @@ fn observer(config: &RigConfig, bodies: &[RigBody], worn: &[RigBody]) -> Result<
         carrier,
         eye_offset: DVec3::from_array(c.eye_offset),
         gaze: match c.gaze.aim() {
-            Aim::Point(point) => Gaze::Point(point),
-            Aim::Body(key, name) => Gaze::Body(find(key, &name)?),
-            Aim::Ahead => Gaze::Straight,
-            Aim::Measured => Gaze::Measured,
+            GazeAim::Point(point) => Gaze::Point(point),
+            GazeAim::Body(key, name) => Gaze::Body(find(key, &name)?),
+            GazeAim::Ahead => Gaze::Straight,
+            GazeAim::Measured => Gaze::Measured,
         },
         gaze_hold_ns: i64::from(c.gaze_hold_ms) * 1_000_000,
         gaze_widen_deg_per_s: c.gaze_widen_deg_per_s,

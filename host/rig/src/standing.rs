@@ -24,7 +24,7 @@ use dpm_common::folder::{Folder, FolderError, Owner};
 use dpm_common::unix::{user, user_name};
 use identity::Match;
 use others::Others;
-use port::Port;
+use port::SerialDevice;
 use std::fmt;
 use std::io;
 use std::net::IpAddr;
@@ -93,7 +93,7 @@ impl fmt::Display for By {
 
 /// Content of the file.
 #[derive(Debug, serde::Serialize, serde::Deserialize)]
-struct Content {
+struct OrderFileContent {
     version: u32,
     order: String,
     at: String,
@@ -102,7 +102,7 @@ struct Content {
     projector: String,
     /// The port behind the projector.
     #[serde(default)]
-    port: Option<Port>,
+    port: Option<SerialDevice>,
     /// The serial number that the projector gave in HELLO, in hexadecimal digits.
     #[serde(default)]
     serial: Option<String>,
@@ -111,8 +111,8 @@ struct Content {
     lifted: Vec<String>,
 }
 
-impl Content {
-    fn new(order: Order, by: &str, projector: &str, port: Option<Port>) -> Self {
+impl OrderFileContent {
+    fn new(order: Order, by: &str, projector: &str, port: Option<SerialDevice>) -> Self {
         let cut = |text: &str| text.chars().take(MAX_NAME).collect();
         Self {
             version: VERSION,
@@ -385,7 +385,8 @@ impl OrderFile {
         };
         let (identity, device) = (&self.identity, self.device());
         let (name, unnamed) = (identity.order_name(device), identity.order_name(None));
-        let mut content = Content::new(order, &by.to_string(), identity.what(), identity.port().cloned());
+        let mut content =
+            OrderFileContent::new(order, &by.to_string(), identity.what(), identity.port().cloned());
         content.serial = device.map(|serial| format!("{serial:016x}"));
         if by == By::SerialNumber {
             self.remember_who(&mut content);
@@ -410,11 +411,11 @@ impl OrderFile {
     }
 
     /// An order that is given again, because its projector is here, keeps its time and who gave it.
-    fn remember_who(&self, again: &mut Content) {
+    fn remember_who(&self, again: &mut OrderFileContent) {
         let Some(folder) = &self.folder else { return };
         let all = all_told(Some(&**folder), self.others.as_ref()).unwrap_or_default();
         let mut same = all.into_iter().filter_map(|order| order.content);
-        if let Some(Content { at, by, .. }) =
+        if let Some(OrderFileContent { at, by, .. }) =
             same.find(|content| content.serial == again.serial && content.order == again.order)
         {
             (again.at, again.by) = (at, by);
@@ -435,8 +436,9 @@ impl OrderFile {
             // for this port, and given again where that one says HELLO.
             let is_named = device.is_none() && content.as_ref().is_some_and(|c| c.serial.is_some());
             if !is_same || !is_own || is_named {
-                let mut content = content
-                    .unwrap_or_else(|| Content::new(Order::Safe, &stands.told, "an unknown projector", None));
+                let mut content = content.unwrap_or_else(|| {
+                    OrderFileContent::new(Order::Safe, &stands.told, "an unknown projector", None)
+                });
                 let serial = content.serial().filter(|serial| Some(*serial) == device);
                 content.version = VERSION;
                 content.lifted.extend(serial.map(by_serial));
@@ -470,7 +472,7 @@ fn is_whole(bytes: Vec<u8>) -> bool {
 /// name in the folder, as long as that of an order.
 fn reserve(folder: &dyn StateFolder, identity: &Identity) -> Result<(), FolderError> {
     let longest = "x".repeat(MAX_NAME);
-    let content = Content::new(Order::Safe, &longest, &longest, identity.port().cloned());
+    let content = OrderFileContent::new(Order::Safe, &longest, &longest, identity.port().cloned());
     let (reserve, trial) = (identity.stem() + RESERVE, identity.stem() + ".trial");
     let bytes = content
         .to_bytes()
@@ -490,7 +492,7 @@ struct StandingOrder {
     is_own: bool,
     stands: Stands,
     /// `None` for a damaged file.
-    content: Option<Content>,
+    content: Option<OrderFileContent>,
 }
 
 impl StandingOrder {
@@ -556,13 +558,13 @@ fn holding(
         let by_name = identity.is_meant_by(Others::name_of(&told.name), projector, port);
         // A serial number proves that it is the same one. That it is another one, with a name that this one may have, is
         // for a person to say by ARM, which then lifts the order for this one alone.
-        let meant = match content.and_then(Content::serial).zip(device) {
+        let meant = match content.and_then(OrderFileContent::serial).zip(device) {
             Some((then, now)) if then == now => Match::Same,
             Some(_) if by_name == Match::Same => Match::Doubtful,
             _ => by_name,
         };
         let is_same = meant == Match::Same;
-        let armed = match content.and_then(Content::serial).zip(device) {
+        let armed = match content.and_then(OrderFileContent::serial).zip(device) {
             Some((then, now)) if then == now => by_serial(now),
             _ => identity.instance(),
         };
@@ -661,9 +663,10 @@ fn clean(text: &str) -> String {
 }
 
 /// Reads the content of a file. `path` is its name in messages.
-fn stands_in(bytes: Result<Vec<u8>, String>, path: &str) -> (Stands, Option<Content>) {
+fn stands_in(bytes: Result<Vec<u8>, String>, path: &str) -> (Stands, Option<OrderFileContent>) {
     let parsed = bytes.and_then(|bytes| {
-        let content: Content = serde_json::from_slice(&bytes).map_err(|e| format!("damaged: {e}"))?;
+        let content: OrderFileContent =
+            serde_json::from_slice(&bytes).map_err(|e| format!("damaged: {e}"))?;
         if !(1..=VERSION).contains(&content.version) {
             return Err(format!("version {} is not known", content.version));
         }

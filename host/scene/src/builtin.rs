@@ -8,7 +8,7 @@
 
 use glam::{DAffine3, DVec3, Quat, Vec2, Vec3};
 
-use super::polygonise::{surface_nets, Surface};
+use super::polygonise::{surface_nets, PolygonSurface};
 use super::procedural::{bronze_textures, glaze_textures};
 use super::{Body, Environment, Material, Scene, TextureRef, TriangleMesh};
 
@@ -144,7 +144,7 @@ fn lamp() -> Body {
 
 /// Assigns cylindrical texture coordinates about Y (one tile every `tile_height` metres), and closes the seam by
 /// splitting vertices.
-fn textured_mesh(surface: Surface, tile_height: f32, material: impl Fn(Vec3) -> u32) -> TriangleMesh {
+fn textured_mesh(surface: PolygonSurface, tile_height: f32, material: impl Fn(Vec3) -> u32) -> TriangleMesh {
     let turn = |p: Vec3| p.x.atan2(p.z) / std::f32::consts::TAU + 0.5;
     let mut mesh = TriangleMesh {
         uvs: surface

@@ -9,7 +9,7 @@ use std::ops::Range;
 use glam::{Affine3A, DAffine3, DQuat, DVec3, Mat3A, Vec3, Vec3A, Vec4};
 
 use crate::mesh::MAX_COORDINATE_M;
-use crate::part_motion::Track;
+use crate::part_motion::ValueTrack;
 use crate::TriangleMesh;
 
 /// Instants at which its bounds are looked for: so many vertices together, and never fewer or more than these.
@@ -44,26 +44,26 @@ pub(crate) struct SkeletonNode {
     /// The one above it; `None`: the body.
     pub above: Option<usize>,
     /// Where it lies there.
-    pub place: Place,
+    pub place: NodePlace,
 }
 
 /// Where a node lies in the one above it.
 #[derive(Clone, Debug)]
-pub(crate) enum Place {
+pub(crate) enum NodePlace {
     /// It does not move.
     Fixed(DAffine3),
     /// As key frames say.
     Moving {
         /// Metres, or units of the node above.
-        translation: Track<DVec3>,
+        translation: ValueTrack<DVec3>,
         /// Unit quaternions.
-        rotation: Track<DQuat>,
+        rotation: ValueTrack<DQuat>,
         /// Along the node's axes.
-        scale: Track<DVec3>,
+        scale: ValueTrack<DVec3>,
     },
 }
 
-impl Place {
+impl NodePlace {
     fn at(&self, t: f64) -> DAffine3 {
         match self {
             Self::Fixed(map) => *map,
@@ -78,7 +78,7 @@ impl Place {
 #[derive(Clone, Debug)]
 pub(crate) struct MorphTarget {
     /// How much of it counts.
-    pub weight: Track<f64>,
+    pub weight: ValueTrack<f64>,
     /// The vertices that it moves: what it adds to position, normal and tangent.
     pub moves: Vec<(u32, [Vec3; 3])>,
 }

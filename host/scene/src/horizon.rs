@@ -47,7 +47,7 @@ pub fn horizons(triangles: &[[Vec3; 3]]) -> Vec<Horizon> {
     if count == 0 || looks < FEWEST_LOOKS {
         return vec![CLOSED; count];
     }
-    let body = Body::new(triangles, looks);
+    let body = HorizonBody::new(triangles, looks);
     let mut out = vec![CLOSED; count];
     let threads = std::thread::available_parallelism().map_or(1, usize::from).min(count.div_ceil(1000));
     std::thread::scope(|scope| {
@@ -134,7 +134,7 @@ struct Seat {
     high: Vec3A,
 }
 
-struct Body {
+struct HorizonBody {
     tree: Bvh2,
     triangles: Vec<[Vec3A; 3]>,
     /// Lengths that are lost in the rounding of positions.
@@ -142,7 +142,7 @@ struct Body {
     looks: usize,
 }
 
-impl Body {
+impl HorizonBody {
     fn new(triangles: &[[Vec3; 3]], looks: usize) -> Self {
         let triangles: Vec<[Vec3A; 3]> = triangles.iter().map(|t| t.map(Vec3A::from)).collect();
         let extent = triangles.iter().flatten().fold(Vec3A::ZERO, |all, p| all.max(p.abs())).max_element();

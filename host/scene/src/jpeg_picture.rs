@@ -10,11 +10,11 @@ const MOST_SCANS: usize = 100;
 
 /// Whether a JPEG is of a kind that `zune-jpeg`, and with it `image`, misreads or panics at. The marks before its data are read.
 pub fn is_odd_jpeg(bytes: &[u8]) -> bool {
-    Frame::read(bytes, 1).is_some_and(|frame| frame.is_odd())
+    JpegFrame::read(bytes, 1).is_some_and(|frame| frame.is_odd())
 }
 
 /// What the header of a JPEG says.
-pub(crate) struct Frame {
+pub(crate) struct JpegFrame {
     /// 0 and 1: sequential, 2: progressive, 3: without loss.
     kind: u8,
     /// Texels in a row and rows.
@@ -25,7 +25,7 @@ pub(crate) struct Frame {
     scans: Vec<usize>,
 }
 
-impl Frame {
+impl JpegFrame {
     /// Reads the marks of a file; `None` where they make no picture.
     pub(crate) fn of(bytes: &[u8]) -> Option<Self> {
         Self::read(bytes, usize::MAX)
@@ -179,15 +179,15 @@ mod tests {
         ];
         for (kind, colours, scans, odd) in cases {
             let bytes = file(kind, colours, scans);
-            let frame = Frame::of(&bytes).unwrap();
+            let frame = JpegFrame::of(&bytes).unwrap();
             assert_eq!(is_odd_jpeg(&bytes), odd);
             assert_eq!((frame.is_odd(), frame.sides), (odd, [9, 5]), "{kind} {colours:?} {scans:?}");
             assert!(frame.has_scan() && frame.scans.len() == scans.len());
             // No part of it makes the reader of marks fall.
-            (0..bytes.len()).for_each(|end| drop(Frame::of(&bytes[..end])));
+            (0..bytes.len()).for_each(|end| drop(JpegFrame::of(&bytes[..end])));
         }
-        assert!(!Frame::of(&file(0, usual, &[])).unwrap().has_scan());
-        let told = Frame::of(&file(0, usual, &[&[1u8][..]; 9]))
+        assert!(!JpegFrame::of(&file(0, usual, &[])).unwrap().has_scan());
+        let told = JpegFrame::of(&file(0, usual, &[&[1u8][..]; 9]))
             .unwrap()
             .decode(&[], [9, 5], 1 << 20, false)
             .unwrap_err();

@@ -11,7 +11,7 @@ use glam::{DAffine3, DQuat, DVec3};
 #[derive(Clone, Debug, PartialEq)]
 pub struct PartMotion {
     /// From the carrier to the part; parts on parts share them.
-    links: Vec<Arc<Link>>,
+    links: Vec<Arc<PartLink>>,
     /// Seconds of the file's time in a round.
     length_s: f64,
     /// Nanoseconds that a round lasts, above 0.
@@ -20,7 +20,7 @@ pub struct PartMotion {
 
 /// One of the places whose product is that of a part.
 #[derive(Clone, Debug, PartialEq)]
-pub(crate) enum Link {
+pub(crate) enum PartLink {
     /// It does not move.
     Fixed(DAffine3),
     /// A node with key frames.
@@ -31,14 +31,14 @@ pub(crate) enum Link {
 #[derive(Clone, Debug, PartialEq)]
 pub(crate) struct NodeMotion {
     /// Metres.
-    pub translation: Track<DVec3>,
+    pub translation: ValueTrack<DVec3>,
     /// Unit quaternions.
-    pub rotation: Track<DQuat>,
+    pub rotation: ValueTrack<DQuat>,
 }
 
 /// A value over time.
 #[derive(Clone, Debug, PartialEq)]
-pub(crate) enum Track<T> {
+pub(crate) enum ValueTrack<T> {
     /// It does not change.
     Constant(T),
     /// It follows key frames.
@@ -183,7 +183,7 @@ impl<T: Keyed> Keys<T> {
     }
 }
 
-impl<T: Keyed> Track<T> {
+impl<T: Keyed> ValueTrack<T> {
     /// The value at `t` seconds.
     pub(crate) fn at(&self, t: f64) -> T {
         match self {
@@ -207,7 +207,7 @@ const BETWEEN_KEYS: usize = 8;
 
 impl PartMotion {
     /// The product of `links`, of whose key frames a round has `length_s` seconds and lasts `period_ns`.
-    pub(crate) fn new(links: Vec<Arc<Link>>, length_s: f64, period_ns: i64) -> Self {
+    pub(crate) fn new(links: Vec<Arc<PartLink>>, length_s: f64, period_ns: i64) -> Self {
         Self { links, length_s, period_ns: period_ns.max(1) }
     }
 
@@ -218,8 +218,8 @@ impl PartMotion {
         self.links.iter().fold(DAffine3::IDENTITY, |place, link| {
             place
                 * match &**link {
-                    Link::Fixed(map) => *map,
-                    Link::Node(node) => {
+                    PartLink::Fixed(map) => *map,
+                    PartLink::Node(node) => {
                         DAffine3::from_rotation_translation(node.rotation.at(t), node.translation.at(t))
                     }
                 }
@@ -229,8 +229,8 @@ impl PartMotion {
     /// Instants of a round that show where the part goes: its key frames and some between them, at most 4,097.
     pub fn instants(&self) -> Vec<i64> {
         let nodes = self.links.iter().filter_map(|link| match &**link {
-            Link::Fixed(_) => None,
-            Link::Node(node) => Some(node),
+            PartLink::Fixed(_) => None,
+            PartLink::Node(node) => Some(node),
         });
         let mut keys: Vec<f64> = nodes
             .flat_map(|node| node.translation.times().iter().chain(node.rotation.times()))
@@ -324,18 +324,19 @@ mod tests {
         use std::f64::consts::PI;
         let turn = |times: &[f64], angles: &[f64]| {
             let values = angles.iter().map(|a| DQuat::from_rotation_z(*a)).collect();
-            Track::Keys(keys(times, values, Interpolation::Linear))
+            ValueTrack::Keys(keys(times, values, Interpolation::Linear))
         };
         let arm = NodeMotion {
-            translation: Track::Constant(DVec3::ZERO),
+            translation: ValueTrack::Constant(DVec3::ZERO),
             rotation: turn(&[0.0, 1.0, 2.0], &[0.0, 0.5 * PI, PI]),
         };
         let wheel = NodeMotion {
-            translation: Track::Constant(DVec3::X),
+            translation: ValueTrack::Constant(DVec3::X),
             rotation: turn(&[0.0, 2.0], &[0.0, -0.5 * PI]),
         };
         let above = DAffine3::from_translation(DVec3::new(0.0, 0.0, 5.0));
-        let links = [Link::Fixed(above), Link::Node(arm), Link::Node(wheel)].map(Arc::new).to_vec();
+        let links =
+            [PartLink::Fixed(above), PartLink::Node(arm), PartLink::Node(wheel)].map(Arc::new).to_vec();
         // Played at twice the file's speed.
         let motion = PartMotion::new(links, 2.0, 1_000_000_000);
         let place = motion.at(500_000_000);
@@ -357,10 +358,10 @@ mod tests {
         let times: Vec<f64> = (0..100_000).map(f64::from).collect();
         let values = times.iter().map(|t| DVec3::new(*t, 0.0, 0.0)).collect();
         let node = NodeMotion {
-            translation: Track::Keys(keys(&times, values, Interpolation::Linear)),
-            rotation: Track::Constant(DQuat::IDENTITY),
+            translation: ValueTrack::Keys(keys(&times, values, Interpolation::Linear)),
+            rotation: ValueTrack::Constant(DQuat::IDENTITY),
         };
-        let motion = PartMotion::new(vec![Arc::new(Link::Node(node))], 99_999.0, 99_999_000_000_000);
+        let motion = PartMotion::new(vec![Arc::new(PartLink::Node(node))], 99_999.0, 99_999_000_000_000);
         let n = motion.instants().len();
         assert!((2_000..=MOST_INSTANTS + BETWEEN_KEYS + 1).contains(&n), "{n}");
     }

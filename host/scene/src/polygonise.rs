@@ -4,7 +4,7 @@
 use glam::{UVec3, Vec3};
 
 /// Vertices, their outward unit normals, and faces counter-clockwise seen from outside.
-pub(crate) struct Surface {
+pub(crate) struct PolygonSurface {
     /// On the surface within a small fraction of a cell.
     pub positions: Vec<Vec3>,
     /// Unit gradients of the field.
@@ -18,12 +18,12 @@ pub(crate) struct Surface {
 ///
 /// The surface must not touch the box. The result is closed: every edge belongs to two triangles, except where the surface
 /// passes twice through a cell, where four may meet.
-pub(crate) fn surface_nets(field: &dyn Fn(Vec3) -> f32, min: Vec3, max: Vec3, cell: f32) -> Surface {
+pub(crate) fn surface_nets(field: &dyn Fn(Vec3) -> f32, min: Vec3, max: Vec3, cell: f32) -> PolygonSurface {
     let samples = ((max - min) / cell).ceil().as_uvec3() + UVec3::ONE;
     let [nx, ny, nz] = samples.to_array();
     let value = sample_near_surface(field, min, samples, cell);
     let grid = Grid { min, cell, samples: [nx, ny, nz], value };
-    let mut surface = Surface { positions: vec![], normals: vec![], triangles: vec![] };
+    let mut surface = PolygonSurface { positions: vec![], normals: vec![], triangles: vec![] };
     let mut vertex_of_cell = vec![u32::MAX; grid.value.len()];
     for z in 0..nz - 1 {
         for y in 0..ny - 1 {
@@ -173,7 +173,7 @@ fn mean_crossing(value: impl Fn(u32, u32, u32) -> f32) -> Option<Vec3> {
 }
 
 /// Splits a quad along its shorter diagonal.
-fn push_quad(surface: &mut Surface, [a, b, c, d]: [u32; 4]) {
+fn push_quad(surface: &mut PolygonSurface, [a, b, c, d]: [u32; 4]) {
     let p = |i: u32| surface.positions[i as usize];
     let faces = if p(a).distance_squared(p(c)) <= p(b).distance_squared(p(d)) {
         [[a, b, c], [a, c, d]]

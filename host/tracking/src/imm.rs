@@ -356,12 +356,12 @@ pub struct ImmConfig {
 }
 
 impl ImmConfig {
-    fn step(&self, h: f64) -> Step {
+    fn step(&self, h: f64) -> BankStep {
         let among = std::array::from_fn(|i| {
             let stays = libm::exp(-h / self.dwell_s[i]);
             std::array::from_fn(|j| if i == j { stays } else { (1.0 - stays) * self.leave_to[i][j] })
         });
-        Step {
+        BankStep {
             among,
             forgotten: self.leave_to[RECALLED],
             unrecalled: libm::exp(-h / self.recall_after_s),
@@ -407,7 +407,7 @@ pub fn models_for(acceleration: f64) -> ImmConfig {
 }
 
 /// What all axes of a bank have in common when it advances by one step.
-struct Step {
+struct BankStep {
     /// Share of mode `i` that is in mode `j` afterwards, if nothing but the models decides.
     among: [[f64; MODES]; MODES],
     /// Where [`RECALLED`] goes when nothing is recalled any more.
@@ -418,7 +418,7 @@ struct Step {
     noises: [Covariance; MODES],
 }
 
-impl Step {
+impl BankStep {
     /// Share of mode `i` that is in mode `j` afterwards.
     fn share(&self, i: usize, j: usize, recalls: bool) -> f64 {
         match (i == RECALLED, recalls) {
@@ -498,7 +498,7 @@ impl AxisBank {
     }
 
     /// Mixes the modes and propagates all of them by `step`.
-    fn advance(&mut self, config: &ImmConfig, step: &Step, recalled: Option<RecalledAxis>) {
+    fn advance(&mut self, config: &ImmConfig, step: &BankStep, recalled: Option<RecalledAxis>) {
         let possible = self.possible(recalled.is_some());
         let mut moved = self.modes;
         let mut foretold = [0.0; MODES];

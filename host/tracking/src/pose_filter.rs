@@ -232,21 +232,21 @@ pub struct PoseFilter {
     rotation_recall: Recall<Rotations>,
     counters: PoseFilterCounters,
     last_nis: Option<[f64; 2]>,
-    rate: Rate,
+    rate: SampleRate,
 }
 
 /// The measured time between two samples of a tracker. The rig file's value may be wrong. And only the rate
 /// distinguishes a tracker at 30 Hz, whose samples are all "late" by the standard of one at 500 Hz, from a tracker that
 /// loses most of its samples.
 #[derive(Clone, Copy, Debug, Default)]
-struct Rate {
+struct SampleRate {
     newest: Option<HostTime>,
     intervals: [i64; INTERVALS],
     filled: usize,
     next: usize,
 }
 
-impl Rate {
+impl SampleRate {
     fn push(&mut self, at: HostTime) {
         let interval = self.newest.map_or(0, |newest| at.ns_since(newest));
         if self.newest.is_none() || interval > 0 {
@@ -285,7 +285,7 @@ impl PoseFilter {
             rotation_recall: Recall::new(),
             counters: PoseFilterCounters::default(),
             last_nis: None,
-            rate: Rate::default(),
+            rate: SampleRate::default(),
         }
     }
 

@@ -8,7 +8,7 @@ use dpm_common::realtime::{enter_frame_path, ThreadRights};
 use dpm_device::planes::Raster;
 use dpm_device::time::HostTime;
 use dpm_render::gpu::{validation_messages, CommandList, Gpu, GpuOptions};
-use dpm_render::gpu::{Buffer, MemoryKind, Place};
+use dpm_render::gpu::{Buffer, MemoryKind, MemoryPlace};
 use dpm_render::{Output, Renderer, RendererSettings};
 use dpm_rig::config::{Overrides, RenderMethod, RigConfig};
 use dpm_rig::frame::FrameTimeline;
@@ -76,8 +76,8 @@ fn silent(what: &str) -> Result<(), String> {
 }
 
 /// What is wrong with the places of a slot's buffers on a GPU with memory of its own.
-pub fn misplaced(places: &[(&str, Place)]) -> Vec<String> {
-    let wrong = |(name, place): &(&str, Place)| {
+pub fn misplaced(places: &[(&str, MemoryPlace)]) -> Vec<String> {
+    let wrong = |(name, place): &(&str, MemoryPlace)| {
         let fault = match name.ends_with(" of the host") {
             true if !place.host_visible => "the host cannot read it",
             true if !place.host_cached => "the host reads it without its caches",

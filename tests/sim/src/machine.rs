@@ -12,7 +12,7 @@ use dpm_device::tracker::serial::client::{SerialTracker, SerialTrackerConfig};
 use dpm_device::tracker::vrpn::client::{VrpnClient, VrpnConfig};
 use dpm_device::tracker::{BodyKey, Tracker};
 use dpm_render::gpu::{GpuError, MemoryPool};
-use dpm_rig::pipeline::stepped::{GpuWork, Machine, Part, SentFrame, Takes};
+use dpm_rig::pipeline::stepped::{GpuWork, Machine, RunPart, SentFrame, Takes};
 use glam::DAffine3;
 use std::collections::VecDeque;
 use std::net::Ipv4Addr;
@@ -151,7 +151,7 @@ pub fn hash(planes: &[u8]) -> u64 {
 pub struct Beneath {
     dice: Dice,
     /// Traps by stage.
-    pub traps: Vec<(Part, Trap)>,
+    pub traps: Vec<(RunPart, Trap)>,
     /// Traps of the GPU's next frames.
     pub gpu_traps: VecDeque<GpuTrap>,
     /// Traps of the GPU's next openings.
@@ -206,13 +206,13 @@ impl Beneath {
     }
 
     /// How much longer a step of `part` takes that works on `frame`, where a queue can stand.
-    fn crowded_ns(&mut self, part: Part, frame: u64, now: HostTime) -> i64 {
+    fn crowded_ns(&mut self, part: RunPart, frame: u64, now: HostTime) -> i64 {
         match part {
-            Part::Plan => self.newest[0] = frame,
-            Part::Link if frame > 0 => self.newest[1] = frame,
+            RunPart::Plan => self.newest[0] = frame,
+            RunPart::Link if frame > 0 => self.newest[1] = frame,
             _ => {}
         }
-        let (Some(queue), Part::Pack | Part::Link) = (self.queue, part) else { return 0 };
+        let (Some(queue), RunPart::Pack | RunPart::Link) = (self.queue, part) else { return 0 };
         if frame == 0 {
             return 0;
         }
@@ -250,17 +250,17 @@ fn device() -> Arc<str> {
 }
 
 impl Machine for SimMachine {
-    fn takes(&mut self, part: Part, frame: u64, now: HostTime) -> Takes {
+    fn takes(&mut self, part: RunPart, frame: u64, now: HostTime) -> Takes {
         let mut beneath = lock(&self.beneath);
         let quantiles = match part {
-            Part::Tracking => TRACKING_US,
-            Part::Plan => PLAN_US,
-            Part::Pack => PACK_US,
-            Part::Link => LINK_US,
-            Part::Collector => COLLECTOR_US,
+            RunPart::Tracking => TRACKING_US,
+            RunPart::Plan => PLAN_US,
+            RunPart::Pack => PACK_US,
+            RunPart::Link => LINK_US,
+            RunPart::Collector => COLLECTOR_US,
         };
         let load_milli = beneath.load_milli;
-        let late_ns = if part == Part::Link { beneath.link_late_ns } else { 0 };
+        let late_ns = if part == RunPart::Link { beneath.link_late_ns } else { 0 };
         let crowded_ns = beneath.crowded_ns(part, frame, now);
         let ns = drawn(&mut beneath.dice, quantiles) * load_milli / 1000 + late_ns + crowded_ns;
         beneath.slowed += u64::from(load_milli != 1000);

@@ -16,7 +16,7 @@ use dpm_device::time::HostTime;
 use dpm_device::transport::{Lane, LinkDevice, SendError, Transport, TransportError};
 use dpm_rig::order::Order;
 use dpm_rig::pipeline::projector::link_settings;
-use dpm_rig::pipeline::stepped::Part;
+use dpm_rig::pipeline::stepped::RunPart;
 use dpm_rig::telemetry::monitor::ProjectorHealth;
 
 /// A transport that keeps what is sent: the words of a second host.
@@ -46,7 +46,8 @@ impl Transport for Words {
 const GPU_FOUND_NS: i64 = 4_000 * MS;
 /// The same for a frame of the next crew: the time in which that crew is made, and two seconds.
 const GPU_AGAIN_NS: i64 = 3_000 * MS;
-const STAGES: [Part; 5] = [Part::Tracking, Part::Plan, Part::Pack, Part::Link, Part::Collector];
+const STAGES: [RunPart; 5] =
+    [RunPart::Tracking, RunPart::Plan, RunPart::Pack, RunPart::Link, RunPart::Collector];
 
 impl World {
     /// A fault of `kind` strikes; `seed` decides its details.
@@ -410,13 +411,13 @@ impl World {
         self.lasts(kind, lasts_ns, Undo::Traps);
     }
 
-    fn trap(&mut self, part: Part, trap: Trap) {
+    fn trap(&mut self, part: RunPart, trap: Trap) {
         // The collector may be busy for five seconds; the frame path reports fifty times a second. Two seconds are left to a link
         // that hangs to go on, before the run ends.
         let found_ns = match part {
-            Part::Collector => 5_300 * MS,
-            Part::Link => 2_300 * MS,
-            Part::Tracking | Part::Plan | Part::Pack => 300 * MS,
+            RunPart::Collector => 5_300 * MS,
+            RunPart::Link => 2_300 * MS,
+            RunPart::Tracking | RunPart::Plan | RunPart::Pack => 300 * MS,
         };
         if trap == Trap::Hangs {
             self.laws.hidden_until(self.awake_at() + found_ns);

@@ -21,7 +21,7 @@ use dpm_rig::config::{Overrides, Restart, RigConfig};
 use dpm_rig::control::osc::decode::OscRequest;
 use dpm_rig::control::osc::Doorkeeper;
 use dpm_rig::order::Order;
-use dpm_rig::pipeline::stepped::Part;
+use dpm_rig::pipeline::stepped::RunPart;
 use dpm_rig::rig::Rig;
 use dpm_rig::telemetry::monitor::ProjectorHealth;
 use dpm_rig::telemetry::projector::ProjectorReport;
@@ -1101,7 +1101,7 @@ impl World {
     }
 
     /// The next step of `part` meets `trap`.
-    pub fn set_trap(&self, part: Part, trap: Trap) {
+    pub fn set_trap(&self, part: RunPart, trap: Trap) {
         lock(&self.beneath).traps.push((part, trap));
     }
 

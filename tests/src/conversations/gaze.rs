@@ -2,7 +2,7 @@
 
 use dpm_device::time::HostTime;
 use dpm_pupil::client::{Ears, GazeAt};
-use dpm_pupil::zmtp::{Event, Peer, SocketKind, MOST_MESSAGE, MOST_PARTS};
+use dpm_pupil::zmtp::{Event, SocketKind, ZmtpPeer, MOST_MESSAGE, MOST_PARTS};
 
 const MS: i64 = 1_000_000;
 const KINDS: [(SocketKind, &[u8]); 4] = [
@@ -17,7 +17,7 @@ type Told = (Vec<Vec<u8>>, Option<String>, Vec<u8>);
 
 fn hear(kind: SocketKind, bytes: &[u8], piece: usize) -> Told {
     let (mut told, mut out) = (Vec::new(), Vec::new());
-    let mut peer = Peer::new(kind, &mut Vec::new());
+    let mut peer = ZmtpPeer::new(kind, &mut Vec::new());
     for chunk in bytes.chunks(piece) {
         let result = peer.push(chunk, &mut out, &mut |event| {
             told.push(match event {

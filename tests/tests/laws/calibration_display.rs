@@ -1,10 +1,10 @@
 //! Calibration of a projector that holds a picture for a whole frame, as displays do: the code whose pictures are followed
 //! by their inverse, against the mock's photodiode.
 
-use dpm_calibration::projector::{predict, PlaceHint, Priors, Refusal, Volume};
+use dpm_calibration::projector::{predict, PlaceHint, PointsRefusal, Priors, Volume};
 use dpm_calibration::sensor::{
-    decode_pairs, solve_latency_of_pairs, solve_pairs, Block, DecodeError, DecodedPairs, FrameLight,
-    InverseCode, Mapped, SensorError, Settings, Solution, Timing,
+    decode_pairs, solve_latency_of_pairs, solve_pairs, DecodeError, DecodedPairs, FrameLight, InverseCode,
+    Mapped, SampleBlock, SensorError, Settings, Solution, Timing,
 };
 use dpm_calibration::trajectory::{TimedPose, Trajectory};
 use dpm_common::so3::so3_exp;
@@ -14,7 +14,7 @@ use dpm_device::pose::Pose;
 use dpm_device::rng::Draws;
 use dpm_device::time::{DeviceTicks, HostTime};
 use glam::{DQuat, DVec2, DVec3};
-use hil_mock::hand::{Hand, Order};
+use hil_mock::hand::{Hand, HandOrder};
 use hil_mock::motion::Motion;
 use hil_mock::projector::Shown;
 use hil_mock::sensor_wand::{ProjectorOptics, SensorWand, SensorWandConfig};
@@ -130,7 +130,7 @@ impl Rig {
             let truly = wand.sampled_at_ns(part[0].number) as i64;
             let echo_ns = (50e3 * Draws::new(self.seed).stream(3).normal(part[0].number)) as i64;
             let interval_ns = 1e9 / f64::from(SAMPLES);
-            blocks.push((Block { start_ns, interval_ns, levels }, start_ns - truly + echo_ns));
+            blocks.push((SampleBlock { start_ns, interval_ns, levels }, start_ns - truly + echo_ns));
         }
         (blocks, self.poses(hand, seconds))
     }
@@ -221,7 +221,7 @@ fn visiting() -> Arc<Hand> {
 
 fn visiting_since(ns: i64) -> Arc<Hand> {
     let hand = Hand::new(Motion::still(Pose::IDENTITY).unwrap(), TIP);
-    hand.tell(ns, Order::Visit { rest_ns: 2_000_000_000 });
+    hand.tell(ns, HandOrder::Visit { rest_ns: 2_000_000_000 });
     Arc::new(hand)
 }
 
@@ -318,7 +318,7 @@ mod breadth {
         let rig = Rig { lost: 0.12, ..Rig::new(128, 96, 41.0, 3) };
         let code = InverseCode::new(rig.raster);
         let hand = Hand::new(Motion::still(Pose::IDENTITY).unwrap(), TIP);
-        hand.tell(0, Order::Visit { rest_ns: 1_400_000_000 });
+        hand.tell(0, HandOrder::Visit { rest_ns: 1_400_000_000 });
         let (blocks, _) = rig.record(&code, &Arc::new(hand), 42.0);
         let decoded = decoded(&rig, &code, &blocks).unwrap();
         println!("{:.1} % agree, lag {:.3} ms", decoded.identity_percent, 1e-6 * decoded.lag_ns);
@@ -421,7 +421,7 @@ mod breadth {
                 match told {
                     Ok((p99, predicted)) => assert!(p99 < predicted, "{p99} px, predicted {predicted} px"),
                     Err(SensorError::Changed { after_s, .. }) => assert!((6.0..36.0).contains(&after_s)),
-                    Err(SensorError::Projector(Refusal::Moved { .. } | Refusal::LensFolds)) => (),
+                    Err(SensorError::Projector(PointsRefusal::Moved { .. } | PointsRefusal::LensFolds)) => (),
                     Err(other) => panic!("{other}"),
                 }
             }
@@ -465,7 +465,7 @@ mod breadth {
         }
         let dark: Vec<Mapped> = blocks
             .iter()
-            .map(|(b, offset)| (Block { levels: vec![0.25; b.levels.len()], ..b.clone() }, *offset))
+            .map(|(b, offset)| (SampleBlock { levels: vec![0.25; b.levels.len()], ..b.clone() }, *offset))
             .collect();
         assert_eq!(decoded(&rig, &code, &dark).unwrap_err(), DecodeError::NoLight);
         assert_eq!(decoded(&rig, &code, &[]).unwrap_err(), DecodeError::NoSamples);

@@ -22,7 +22,7 @@ use dpm_device::tracker::serial::wire::SerialMessage;
 use dpm_device::tracker::vrpn::wire as vrpn;
 use dpm_dlpc900::command::{Command, Opcode};
 use dpm_dlpc900::image::{self, Compression, PlaneOrder};
-use dpm_pupil::zmtp::{put_message, put_subscription, put_words, Peer, SocketKind};
+use dpm_pupil::zmtp::{put_message, put_subscription, put_words, SocketKind, ZmtpPeer};
 use dpm_tests::decoders::ALL;
 use hil_mock::pupil::messages::PupilConfig;
 use hil_mock::usbip::wire as usbip;
@@ -212,7 +212,7 @@ fn gaze() -> Vec<(&'static str, &'static str, Vec<u8>)> {
     put_subscription(b"gaze", &mut wants);
     wants.extend_from_slice(b"\x04\x0e\x09SUBSCRIBEgaze\x04\x09\x04PING\0\x64hi");
     let mut greets = vec![0];
-    Peer::new(SocketKind::Pub, &mut greets);
+    ZmtpPeer::new(SocketKind::Pub, &mut greets);
     vec![
         ("pupil_stream", "data", data),
         ("pupil_stream", "asks", asks),

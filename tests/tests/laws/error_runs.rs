@@ -5,7 +5,9 @@ use dpm_device::planes::Raster;
 use dpm_lab::error::export::FrameIndex;
 use dpm_lab::error::plan::Setting;
 use dpm_lab::error::reference::Reference;
-use dpm_lab::error::runs::{is_other, ErrorOptions, ErrorRuns, Extent, AT_EQUAL_TIME, EYE_FRAMES, RACES};
+use dpm_lab::error::runs::{
+    is_other, ErrorOptions, ErrorRuns, SequenceExtent, AT_EQUAL_TIME, EYE_FRAMES, RACES,
+};
 use dpm_lab::error::seen::{measure, measure_beside, SeenGroup, SeenRow};
 use dpm_lab::sequence::{eye_mean, rmse, Span, Theatre};
 use dpm_render::gpu::Gpu;
@@ -88,7 +90,7 @@ mod breadth {
     #[test]
     fn what_people_notice_moves_with_what_is_wrong() {
         let cache = std::env::temp_dir().join(format!("dpm-seen-{}", std::process::id()));
-        let extent = Extent { warm_up: 8, kept: 48, reference_spp: 256 };
+        let extent = SequenceExtent { warm_up: 8, kept: 48, reference_spp: 256 };
         let runs = |settings: &[&str]| {
             let (rig, gpu) = stage(settings);
             let cache = cache.clone();
@@ -126,7 +128,7 @@ mod breadth {
     fn a_group_is_measured_at_equal_rays_and_tells_bias_from_noise() {
         let (rig, gpu) = stage(&[]);
         let cache = std::env::temp_dir().join(format!("dpm-error-{}", std::process::id()));
-        let extent = Extent { warm_up: 8, kept: 48, reference_spp: 16 };
+        let extent = SequenceExtent { warm_up: 8, kept: 48, reference_spp: 16 };
         let options = ErrorOptions { extent, ablation: false, seeds: 4, window: None, cache: cache.clone() };
         let runs = ErrorRuns::new(rig, gpu, Setting::plain(false, 4.0), options);
         let mut drawn = Vec::new();

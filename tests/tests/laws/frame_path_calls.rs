@@ -7,7 +7,7 @@
 use crate::frame_law;
 use dpm_handoff::path::{self, Lock, Place};
 use dpm_rig::control::parameters;
-use dpm_rig::parameters::Command;
+use dpm_rig::parameters::ParameterCommand;
 use dpm_rig::pipeline::{run_prepared, RunOptions};
 use dpm_rig::telemetry::monitor::RunMonitor;
 use dpm_tests::rigs::demo_rig;
@@ -87,7 +87,8 @@ fn draw_a_slider(monitor: &Arc<RunMonitor>, is_over: &AtomicBool) -> u64 {
         }
         let numbers = vec![1.0 + f64::from(k % 100) * 1e-2];
         // Refused until the first frame is planned.
-        let _ = parameters::give(monitor, &Command::Set { name: "exposure".into(), numbers }, "test");
+        let _ =
+            parameters::give(monitor, &ParameterCommand::Set { name: "exposure".into(), numbers }, "test");
         std::thread::sleep(Duration::from_millis(3));
     }
     monitor.parameters().shown().map_or(0, |shown| shown.used)

@@ -1,6 +1,6 @@
 //! Rays find bodies in a tree where there are many (`host/render/src/body_tree.rs`). That changes the time that they take, and no pixel.
 
-use dpm_lab::stability::gpu_shot::{Picture, Shot};
+use dpm_lab::stability::gpu_shot::{Shot, ShotPicture};
 use dpm_render::gpu::Gpu;
 use dpm_render::scene_data::Keep;
 use dpm_render::{FrameInputs, Renderer, Surface, PASSES};
@@ -43,7 +43,7 @@ fn asked_each() -> Keep {
 }
 
 /// Surfaces as numbers that are equal only when they are the same to the bit.
-fn surface_bits(picture: &Picture) -> Vec<[u32; 4]> {
+fn surface_bits(picture: &ShotPicture) -> Vec<[u32; 4]> {
     let of = |s: &Surface| {
         let [u, v] = s.barycentric.map(f32::to_bits);
         [s.id, u, v, s.distance.to_bits()]

@@ -2,7 +2,7 @@
 //! which there is no case.
 
 use dpm_lab::stability::gpu::cases;
-use dpm_lab::stability::gpu_shot::{Picture, Shot};
+use dpm_lab::stability::gpu_shot::{Shot, ShotPicture};
 use dpm_lab::stability::{StabilityReport, SEED};
 use dpm_render::gpu::{Gpu, GpuOptions};
 use dpm_scene::shapes::*;
@@ -85,7 +85,7 @@ fn a_lost_body_gets_no_light_but_its_reflection_stays() {
         let shot = Shot { eye: Some(eye), spp: 4, ..Shot::new(&scene, camera) };
         let there = shot.draw(gpu);
         let lost = Shot { lost: vec![true], ..shot }.draw(gpu);
-        let on_ball = |p: &Picture| {
+        let on_ball = |p: &ShotPicture| {
             (0..p.surfaces.len()).filter(|&i| p.hit(i) && p.surfaces[i].id >> 24 == body as u32).count()
         };
         assert!(on_ball(&there) > 50);

@@ -2,7 +2,9 @@
 //! as an eye sees their light that follows the body.
 
 use dpm_device::planes::{PlaneSchedule, Raster};
-use dpm_lab::error::planes::{centre_of, middle_of, Card, CardMotion, Panel, Pattern, PlanesRow, MOTIONS};
+use dpm_lab::error::planes::{
+    centre_of, middle_of, CardMotion, CardPanel, CardPattern, PlanesRow, TestCard, MOTIONS,
+};
 use dpm_lab::stability::gpu_shot::Shot;
 use dpm_render::gpu::Gpu;
 use dpm_render::pack::Halftone;
@@ -331,7 +333,7 @@ fn silhouettes_are_those_of_the_instant() {
 #[test]
 fn an_eye_that_follows_sees_noise_sharp_and_one_that_rests_loses_nothing_by_the_warp() {
     with_gpu(|gpu| {
-        let card = Card::new(gpu, Pattern::Noise).unwrap();
+        let card = TestCard::new(gpu, CardPattern::Noise).unwrap();
         let [falling, passing] = check_texture(&card, 0.25, 0.01);
         // Why this order is the default.
         assert!(passing.follows.centre < 0.7 * falling.follows.centre, "{passing:?}");
@@ -350,7 +352,7 @@ mod breadth {
     #[test]
     fn an_eye_that_follows_sees_patches_sharp_and_one_that_rests_loses_nothing_by_the_warp() {
         with_gpu(|gpu| {
-            check_texture(&Card::new(gpu, Pattern::Patches).unwrap(), 0.25, 0.01);
+            check_texture(&TestCard::new(gpu, CardPattern::Patches).unwrap(), 0.25, 0.01);
         });
     }
 
@@ -359,7 +361,7 @@ mod breadth {
     #[test]
     fn noise_that_turns_or_rests_and_noise_drawn_anew_are_as_the_warp_says() {
         with_gpu(|gpu| {
-            let card = Card::new(gpu, Pattern::Noise).unwrap();
+            let card = TestCard::new(gpu, CardPattern::Noise).unwrap();
             let [falling, passing] = check_texture(&card, 0.25, 0.01);
             for row in [&falling, &passing] {
                 check_beside_drawn_anew(&card, row, 2.0);
@@ -378,11 +380,11 @@ mod breadth {
     fn planes_whose_highest_bit_is_split_add_up_where_bodies_move() {
         with_gpu(|gpu| {
             for (pattern, follows, rests) in
-                [(Pattern::Noise, 0.0085, 0.011), (Pattern::Patches, 0.0085, 0.011)]
+                [(CardPattern::Noise, 0.0085, 0.011), (CardPattern::Patches, 0.0085, 0.011)]
             {
-                let card = Card::new(gpu, pattern).unwrap();
+                let card = TestCard::new(gpu, pattern).unwrap();
                 let [rest, moves] = ["at rest", "1 m/s"].map(|name| {
-                    let row = card.measure(motion_named(name), &Panel::of_split()).unwrap();
+                    let row = card.measure(motion_named(name), &CardPanel::of_split()).unwrap();
                     println!("{row:?}");
                     row
                 });
@@ -397,7 +399,7 @@ mod breadth {
     #[test]
     fn patches_drawn_anew_are_less_than_twice_as_sharp_as_warped_ones() {
         with_gpu(|gpu| {
-            let card = Card::new(gpu, Pattern::Patches).unwrap();
+            let card = TestCard::new(gpu, CardPattern::Patches).unwrap();
             let passing = measured(&card, "1 m/s", BitOrder::default().0);
             check_beside_drawn_anew(&card, &passing, 1.8);
         });
@@ -408,8 +410,8 @@ fn motion_named(name: &str) -> &'static CardMotion {
     MOTIONS.iter().find(|motion| motion.name == name).expect("in the table")
 }
 
-fn measured(card: &Card, motion: &str, order: [u8; 8]) -> PlanesRow {
-    let row = card.measure(motion_named(motion), &Panel::of_bits(order)).unwrap();
+fn measured(card: &TestCard, motion: &str, order: [u8; 8]) -> PlanesRow {
+    let row = card.measure(motion_named(motion), &CardPanel::of_bits(order)).unwrap();
     println!("{row:?}");
     row
 }
@@ -417,7 +419,7 @@ fn measured(card: &Card, motion: &str, order: [u8; 8]) -> PlanesRow {
 /// Measures a card at 1 m/s with the bits from the highest down and in the default order, in this sequence. An eye that
 /// follows may err by `share` of what it erred by before planes were aimed at the centre of their light, and before they
 /// followed; one that rests by `rests_at_most`.
-fn check_texture(card: &Card, share: f64, rests_at_most: f64) -> [PlanesRow; 2] {
+fn check_texture(card: &TestCard, share: f64, rests_at_most: f64) -> [PlanesRow; 2] {
     let [falling, passing] =
         [[7, 6, 5, 4, 3, 2, 1, 0], BitOrder::default().0].map(|order| measured(card, "1 m/s", order));
     let before = falling.follows.middle;
@@ -433,9 +435,9 @@ fn check_texture(card: &Card, share: f64, rests_at_most: f64) -> [PlanesRow; 2] 
 
 /// Compares what was measured at 1 m/s with planes that are drawn by themselves for their own instants. An eye that follows
 /// may err `times` as much.
-fn check_beside_drawn_anew(card: &Card, warped: &PlanesRow, times: f64) {
+fn check_beside_drawn_anew(card: &TestCard, warped: &PlanesRow, times: f64) {
     let order: Vec<u8> = warped.planes.split(' ').map(|bit| bit.parse().expect("a bit")).collect();
-    let panel = Panel::of_bits(order.try_into().expect("eight bits"));
+    let panel = CardPanel::of_bits(order.try_into().expect("eight bits"));
     let [follows, rests] = card.measure_drawn_anew(motion_named("1 m/s"), &panel).unwrap();
     println!(
         "{}: drawn anew, an eye that follows errs by {follows:.4}, one that rests by {rests:.4}",
@@ -485,8 +487,8 @@ fn rough_places_are_marked() {
 #[test]
 fn an_eye_that_follows_sees_the_patterns_of_a_dlpc900_sharp() {
     with_gpu(|gpu| {
-        let card = Card::new(gpu, Pattern::Noise).unwrap();
-        let panel = Panel::of_binary24();
+        let card = TestCard::new(gpu, CardPattern::Noise).unwrap();
+        let panel = CardPanel::of_binary24();
         // Two frames of nine levels leave 0.029 of a card at rest. With mirrors that each begin at a part of their own it is
         // 0.044 at 1 m/s.
         for (name, most) in [("at rest", 0.032), ("1 m/s", 0.035)] {

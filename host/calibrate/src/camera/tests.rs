@@ -44,7 +44,7 @@ const SIZE: [u32; 2] = [640, 400];
 
 fn calibrated(optics: &CameraOptics, hold: &BoardHold) -> Result<CameraFit, Failure> {
     let raster = Raster::new(SIZE[0], SIZE[1]).unwrap();
-    let task = Task { board: hold.board, raster, views: 24, time: Duration::from_secs(600) };
+    let task = CameraTask { board: hold.board, raster, views: 24, time: Duration::from_secs(600) };
     calibrate(&mut PaintedSource::new(optics, hold), &task, &mut |_| ())
 }
 

@@ -15,7 +15,7 @@ fn camera() -> ProjectorCamera {
 }
 
 /// A plate of 20 cm, in a body whose frame is turned.
-fn stage(moved: NudgeTarget) -> (Stage, TimedPose) {
+fn stage(moved: NudgeTarget) -> (OutlineStage, TimedPose) {
     let [a, b] = [DVec3::new(-0.1, -0.1, 0.0), DVec3::new(0.1, -0.1, 0.0)];
     let [c, d] = [DVec3::new(0.1, 0.1, 0.0), DVec3::new(-0.1, 0.1, 0.0)];
     let rotation = DQuat::from_rotation_y(0.4);
@@ -25,10 +25,10 @@ fn stage(moved: NudgeTarget) -> (Stage, TimedPose) {
         mesh_to_body: DAffine3::from_quat(rotation.inverse()),
         outline: Outline::new(&[[a, b, c], [a, c, d]]),
     };
-    (Stage { moved, camera: camera(), bodies: vec![body] }, pose)
+    (OutlineStage { moved, camera: camera(), bodies: vec![body] }, pose)
 }
 
-fn middle(stage: &Stage, now: DAffine3, pose: TimedPose) -> DVec2 {
+fn middle(stage: &OutlineStage, now: DAffine3, pose: TimedPose) -> DVec2 {
     let mut pixels = Vec::new();
     stage.draw(now, &[Some(pose)], &mut pixels);
     assert!(pixels.len() > 100);

@@ -21,7 +21,7 @@ const EXPECTED: f64 = 10.0;
 
 /// What is solved for: the camera about the board in each view, all with one inside, and the shape of the board.
 #[derive(Clone, Debug)]
-pub(super) struct State {
+pub(super) struct BoardUnknowns {
     pub models: Vec<ProjectorModel>,
     /// How far the board rises by x^2, x y and y^2 where x and y are 1, metres, and by how much it is wider than high.
     pub board: [f64; SHAPE],
@@ -30,14 +30,14 @@ pub(super) struct State {
 }
 
 /// Where least squares ended.
-pub(super) struct Fit {
-    pub state: State,
+pub(super) struct BoardFit {
+    pub state: BoardUnknowns,
     /// By the residuals, in the order of the unknowns.
     pub covariance: Vec<Vec<f64>>,
     pub converged: bool,
 }
 
-impl State {
+impl BoardUnknowns {
     /// A point of the board in its own space, and its derivatives by the board's numbers.
     fn place(&self, p: &BoardPoint) -> (DVec3, [DVec3; SHAPE]) {
         let (u, v) = (p.place.x / self.half, p.place.y / self.half);
@@ -127,8 +127,8 @@ impl State {
 }
 
 /// Fits, from a start. `None` if the start puts points behind the camera.
-pub(super) fn fit(start: State, views: &[BoardView], priors: &Priors) -> Option<Fit> {
-    let cost = |s: &State| s.whole_cost(views, priors);
+pub(super) fn fit(start: BoardUnknowns, views: &[BoardView], priors: &Priors) -> Option<BoardFit> {
+    let cost = |s: &BoardUnknowns| s.whole_cost(views, priors);
     let found = descend(start, 100, |s| s.whole(views, priors), cost, |s, d| s.step(d))?;
     let mut covariance = inverse_spd(&found.equations.matrix())?;
     let n = covariance.len();
@@ -142,10 +142,10 @@ pub(super) fn fit(start: State, views: &[BoardView], priors: &Priors) -> Option<
             *value = if is_free(i) && is_free(j) { *value * inflate } else { 0.0 };
         }
     }
-    Some(Fit { state: found.state, covariance, converged: found.converged })
+    Some(BoardFit { state: found.state, covariance, converged: found.converged })
 }
 
-impl State {
+impl BoardUnknowns {
     fn whole_cost(&self, views: &[BoardView], priors: &Priors) -> f64 {
         // What is expected counts little beside thousands of points, but a step must not be judged without it.
         let mut own = Equations::new(self.unknowns());
@@ -157,7 +157,7 @@ impl State {
     }
 }
 
-impl Fit {
+impl BoardFit {
     /// Root mean square residual of each view along one axis, pixels.
     pub(super) fn deviations(&self, views: &[BoardView]) -> Vec<f64> {
         let square = |model: &ProjectorModel, p: &BoardPoint| {

@@ -17,7 +17,7 @@ pub(crate) use start::{off_plane_px, pose_of_plane};
 use crate::model::{ProjectorModel, INTRINSICS, PARAMETERS};
 use crate::projector::{predict, LightError, Priors};
 use dpm_device::planes::Raster;
-use fit::{Fit, State};
+use fit::{BoardFit, BoardUnknowns};
 use glam::{DMat3, DVec2, DVec3};
 
 /// A point of the board in a picture.
@@ -113,7 +113,8 @@ pub fn solve(raster: Raster, views: &[BoardView]) -> Result<CameraFit, BoardRefu
         if kept.len() < LEAST_VIEWS {
             return Err(BoardRefusal::TooFew { have: kept.len(), need: LEAST_VIEWS });
         }
-        state = State { models: kept.iter().map(|i| fitted.state.models[*i]).collect(), ..fitted.state };
+        state =
+            BoardUnknowns { models: kept.iter().map(|i| fitted.state.models[*i]).collect(), ..fitted.state };
         used = kept.into_iter().map(|i| used[i]).collect();
     }
 }
@@ -145,7 +146,7 @@ fn size_of(raster: Raster) -> DVec2 {
 fn judge(
     raster: Raster,
     views: &[BoardView],
-    fitted: &Fit,
+    fitted: &BoardFit,
     left_out: Vec<usize>,
 ) -> Result<CameraFit, BoardRefusal> {
     let rms_px = fitted.rms_px(views);

@@ -1,6 +1,6 @@
 //! Where least squares begin: a homography for each view, the focal length from all of them, then the poses.
 
-use super::fit::State;
+use super::fit::BoardUnknowns;
 use super::{size_of, BoardPoint, BoardView};
 use crate::dense::svd;
 use crate::model::{ProjectorModel, LENS};
@@ -11,7 +11,7 @@ use glam::{DMat3, DVec2, DVec3};
 const USUAL: [f64; 4] = [0.5, 0.8, 1.3, 2.5];
 
 /// The start; `None` if a view is no picture of a plane, or nothing gives a focal length.
-pub(super) fn start(raster: Raster, views: &[BoardView]) -> Option<State> {
+pub(super) fn start(raster: Raster, views: &[BoardView]) -> Option<BoardUnknowns> {
     let (centre, width) = (0.5 * size_of(raster), f64::from(raster.width()));
     let homographies: Option<Vec<DMat3>> = views.iter().map(|v| homography(v, centre, width)).collect();
     let homographies = homographies?;
@@ -20,12 +20,12 @@ pub(super) fn start(raster: Raster, views: &[BoardView]) -> Option<State> {
     let states = tried.filter_map(|f| {
         let models: Option<Vec<ProjectorModel>> =
             homographies.iter().map(|h| model(h, f, centre, width)).collect();
-        let state = State { models: models?, board: [0.0; 4], half: half_of(views) };
+        let state = BoardUnknowns { models: models?, board: [0.0; 4], half: half_of(views) };
         let cost = state.cost(views);
         cost.is_finite().then_some((cost, state))
     });
     // The first one is that of the homographies, if there is one.
-    let states: Vec<(f64, State)> = states.collect();
+    let states: Vec<(f64, BoardUnknowns)> = states.collect();
     let best = states.iter().enumerate().min_by(|a, b| a.1 .0.total_cmp(&b.1 .0))?.0;
     states.into_iter().nth(best).map(|s| s.1)
 }

@@ -18,12 +18,12 @@ struct Flaws {
 
 const NONE: Flaws = Flaws { noise_px: 0.1, bend_m: 0.0, stretch: 0.0, tilt: 0.7, reach: 0.9 };
 
-struct Scene {
+struct BoardScene {
     raster: Raster,
     truth: ProjectorModel,
 }
 
-fn drawn(draws: Draws) -> Scene {
+fn drawn(draws: Draws) -> BoardScene {
     let sizes = [(640, 480), (1280, 800), (1920, 1080), (1456, 1088)];
     let (w, h) = sizes[(draws.bits(0) % 4) as usize];
     let raster = Raster::new(w, h).unwrap();
@@ -40,10 +40,10 @@ fn drawn(draws: Draws) -> Scene {
         translation: DVec3::ZERO,
         origin: DVec3::ZERO,
     };
-    Scene { raster, truth }
+    BoardScene { raster, truth }
 }
 
-impl Scene {
+impl BoardScene {
     fn view(&self, draws: Draws, flaws: Flaws) -> BoardView {
         let board = TagBoard::SMALL;
         let size = size_of(self.raster);

@@ -1,5 +1,5 @@
 //! The place of a mesh in its tracked body's frame, T_BM: from points of the mesh that the wand's tip touched
-//! ([`Session`]), and from a tip that wandered over its surface ([`wander()`]).
+//! ([`TouchSession`]), and from a tip that wandered over its surface ([`wander()`]).
 //!
 //! Everything is measured in the body's frame: the tip in the world, brought back by the pose of the body at the same
 //! instant. So the body may move meanwhile.
@@ -8,8 +8,8 @@ mod nearest;
 mod touch;
 mod wander;
 
-pub use nearest::Surface;
-pub use touch::{tip_in_body, Contact, Session, Touch, TouchError, TouchFit};
+pub use nearest::TriangleTree;
+pub use touch::{tip_in_body, Contact, Touch, TouchError, TouchFit, TouchSession};
 pub use wander::{wander, WanderError, WanderFit};
 
 #[cfg(test)]

@@ -4,7 +4,7 @@ use glam::DVec3;
 
 /// Triangles in a tree.
 #[derive(Clone, Debug)]
-pub struct Surface {
+pub struct TriangleTree {
     triangles: Vec<[DVec3; 3]>,
     nodes: Vec<Node>,
 }
@@ -29,7 +29,7 @@ pub(super) struct Nearest {
 
 const LEAF: usize = 4;
 
-impl Surface {
+impl TriangleTree {
     /// From triangles in the mesh's frame, metres. Those without an area, or with coordinates that are no numbers, are
     /// left out.
     pub fn new(triangles: impl IntoIterator<Item = [DVec3; 3]>) -> Self {

@@ -31,7 +31,7 @@ fn touches(truth: &DAffine3, n: u64, sigma: f64, seed: u64) -> Vec<Touch> {
 }
 
 fn solve(touches: &[Touch]) -> Result<TouchFit, TouchError> {
-    let mut session = Session::default();
+    let mut session = TouchSession::default();
     touches.iter().for_each(|t| session.add(*t));
     session.solve()
 }
@@ -121,13 +121,13 @@ fn a_tip_is_averaged_over_a_moving_body_and_one_that_slides_is_refused() {
 #[test]
 fn the_next_point_is_far_from_all_that_were_touched() {
     let corners: Vec<DVec3> = touches(&DAffine3::IDENTITY, 8, 0.0, 0).iter().map(|t| t.mesh).collect();
-    let mut session = Session::new(corners.clone());
+    let mut session = TouchSession::new(corners.clone());
     for _ in 0..4 {
         let mesh = session.next_point().unwrap();
         session.add(Touch { mesh, body: mesh });
     }
     session.solve().unwrap();
-    assert_eq!(Session::default().next_point(), None);
+    assert_eq!(TouchSession::default().next_point(), None);
 }
 
 /// Triangles of a grid over two parameters from 0 to 1.
@@ -172,7 +172,7 @@ fn a_wandering_tip_places_a_surface_within_fifty_micrometres() {
         let (points, truth) = wandered(&triangles, 1.5e-4, seed);
         let roughly = truth
             * DAffine3::from_rotation_translation(so3_exp(DVec3::new(0.03, -0.02, 0.03)), DVec3::splat(2e-3));
-        let got = wander(&Surface::new(triangles), &points, 0.0, &roughly).unwrap();
+        let got = wander(&TriangleTree::new(triangles), &points, 0.0, &roughly).unwrap();
         for at in [DVec3::ZERO, DVec3::X * 0.1, DVec3::Y * 0.1] {
             assert!(
                 off(&got.mesh_to_body, &truth, at) < 5e-5,
@@ -196,7 +196,7 @@ fn surfaces_that_slide_along_themselves_are_refused_by_name() {
     let cylinder = grid(40, |u, v| DVec3::new(0.08 * (tau * u).cos(), 0.2 * v, 0.08 * (tau * u).sin()));
     for (triangles, name) in [(sphere, "a sphere"), (plane, "a plane"), (cylinder, "a cylinder")] {
         let (points, truth) = wandered(&triangles, 1e-4, 1);
-        let got = wander(&Surface::new(triangles), &points, 0.0, &truth);
+        let got = wander(&TriangleTree::new(triangles), &points, 0.0, &truth);
         assert!(
             matches!(got, Err(WanderError::Undetermined { shape, .. }) if shape == name),
             "{name}: {got:?}"
@@ -208,10 +208,13 @@ fn surfaces_that_slide_along_themselves_are_refused_by_name() {
 fn nonsense_is_refused_by_name() {
     let triangles = grid(40, bumpy);
     let (points, truth) = wandered(&triangles, 1e-4, 1);
-    let surface = Surface::new(triangles);
+    let surface = TriangleTree::new(triangles);
     assert_eq!(wander(&surface, &points[..10], 0.0, &truth), Err(WanderError::TooFew(10)));
-    assert_eq!(wander(&Surface::new([]), &points, 0.0, &truth), Err(WanderError::NoSurface));
-    assert_eq!(wander(&Surface::new([[DVec3::NAN; 3]]), &points, 0.0, &truth), Err(WanderError::NoSurface));
+    assert_eq!(wander(&TriangleTree::new([]), &points, 0.0, &truth), Err(WanderError::NoSurface));
+    assert_eq!(
+        wander(&TriangleTree::new([[DVec3::NAN; 3]]), &points, 0.0, &truth),
+        Err(WanderError::NoSurface)
+    );
     let far = truth * DAffine3::from_translation(DVec3::splat(0.3));
     let other: Vec<DVec3> = points.iter().map(|p| *p * 1.5).collect();
     let got = wander(&surface, &other, 0.0, &far);
@@ -225,7 +228,7 @@ fn nonsense_is_refused_by_name() {
 #[test]
 fn the_tree_finds_the_nearest_point() {
     let triangles = grid(12, bumpy);
-    let surface = Surface::new(triangles.clone());
+    let surface = TriangleTree::new(triangles.clone());
     let d = Draws::new(2);
     for i in 0..50 {
         let p = DVec3::from_array(d.normal3(i)) * 0.1;

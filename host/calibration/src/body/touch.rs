@@ -127,13 +127,13 @@ pub enum TouchError {
 
 /// Touched points, one by one.
 #[derive(Clone, Debug, Default)]
-pub struct Session {
+pub struct TouchSession {
     touches: Vec<Touch>,
     /// Corners of the mesh's box and such: points that could be touched.
     candidates: Vec<DVec3>,
 }
 
-impl Session {
+impl TouchSession {
     /// A session that will suggest points among `candidates`, vertices of the mesh.
     pub fn new(candidates: Vec<DVec3>) -> Self {
         Self { touches: Vec::new(), candidates }

@@ -1,7 +1,7 @@
 //! A tip that wandered over a surface into the place of the surface: every point is moved towards the plane of the
 //! nearest triangle (\[Chen92\]), and the worst tenth is left out, since a tip leaves the surface now and then.
 
-use super::nearest::Surface;
+use super::nearest::TriangleTree;
 use crate::dense::{solve_spd, svd};
 use dpm_common::so3::so3_exp;
 use glam::{DAffine3, DMat3, DVec3};
@@ -64,7 +64,7 @@ const LEAST_SEEN: f64 = 2e-3;
 /// # Errors
 /// Each reason of [`WanderError`].
 pub fn wander(
-    surface: &Surface,
+    surface: &TriangleTree,
     points: &[DVec3],
     tip_radius_m: f64,
     start: &DAffine3,
@@ -81,7 +81,7 @@ pub fn wander(
     let mut motion = start.inverse();
     let mut last = f64::INFINITY;
     for round in 0..60 {
-        let step = Step::of(surface, points, tip_radius_m, &motion);
+        let step = RoundEquations::of(surface, points, tip_radius_m, &motion);
         if round == 0 || round % 10 == 9 {
             step.check_shape()?;
         }
@@ -100,7 +100,7 @@ pub fn wander(
         }
         last = step.rms;
     }
-    let step = Step::of(surface, points, tip_radius_m, &motion);
+    let step = RoundEquations::of(surface, points, tip_radius_m, &motion);
     step.check_shape()?;
     if step.rms > MOST_RESIDUAL_M {
         return Err(WanderError::DoesNotFit { residual_mm: 1e3 * step.rms });
@@ -122,7 +122,7 @@ fn rigid(m: &DAffine3) -> DAffine3 {
 }
 
 /// The equations of one round.
-struct Step {
+struct RoundEquations {
     square: Vec<Vec<f64>>,
     right: Vec<f64>,
     /// Middle of the points, and their root mean square distance from it: turns are measured in metres at that lever.
@@ -134,8 +134,8 @@ struct Step {
     normals: [f64; 3],
 }
 
-impl Step {
-    fn of(surface: &Surface, points: &[DVec3], radius: f64, motion: &DAffine3) -> Self {
+impl RoundEquations {
+    fn of(surface: &TriangleTree, points: &[DVec3], radius: f64, motion: &DAffine3) -> Self {
         let placed: Vec<DVec3> = points.iter().map(|p| motion.transform_point3(*p)).collect();
         let mut pairs: Vec<(DVec3, DVec3, f64)> = placed
             .iter()

@@ -25,7 +25,7 @@ fn offsets(rig: &ProjectorCamera, truth: &ProjectorCamera, shift: DVec3, touches
         .map(|i| {
             let point = DVec3::new(0.1 * f64::from(i % 3 - 1), 0.1 * f64::from(i / 3 - 1), 0.0);
             let lit = rig.project(point).unwrap().floor() + 0.5;
-            let reading = Reading {
+            let reading = PointReading {
                 point,
                 normal: DVec3::Z,
                 lit,
@@ -91,7 +91,7 @@ fn a_turned_body_scatters_about_no_shift() {
             let point = DVec3::new(0.1 * f64::from(i % 3 - 1), 0.1 * f64::from(i / 3 - 1), 0.0);
             let lit = c.project(point).unwrap();
             let reading =
-                Reading { point, normal: DVec3::Z, lit, in_light: point, touched: Some(turn * point) };
+                PointReading { point, normal: DVec3::Z, lit, in_light: point, touched: Some(turn * point) };
             Offset::of(&c, &reading).unwrap()
         })
         .collect();
@@ -126,16 +126,16 @@ fn cube() -> Vec<[DVec3; 3]> {
     triangles
 }
 
-fn points_of(triangles: &[[DVec3; 3]]) -> Vec<SurfacePoint> {
+fn points_of(triangles: &[[DVec3; 3]]) -> Vec<MeshPoint> {
     let normal = |t: &[DVec3; 3]| (t[1] - t[0]).cross(t[2] - t[0]).normalize();
-    triangles.iter().flat_map(|t| t.map(|position| SurfacePoint { position, normal: normal(t) })).collect()
+    triangles.iter().flat_map(|t| t.map(|position| MeshPoint { position, normal: normal(t) })).collect()
 }
 
 #[test]
 fn points_are_seen_and_far_apart() {
     let (c, place) = (camera(), DAffine3::from_rotation_y(0.2));
     let triangles = cube();
-    let surface = Surface::new(triangles.clone());
+    let surface = TriangleTree::new(triangles.clone());
     let chosen = spread(&points_of(&triangles), &surface, &c, &place, 4);
     // The face towards the projector has four corners, and they are all that faces it.
     assert_eq!(chosen.len(), 4);
@@ -148,7 +148,7 @@ fn points_are_seen_and_far_apart() {
     assert_eq!(spread(&points_of(&triangles), &surface, &c, &place, 50).len(), 4);
     // A wall before the box hides it; a body behind the projector has no point.
     let wall = [DVec3::new(-1., -1., 0.5), DVec3::new(1., -1., 0.5), DVec3::new(0., 2., 0.5)];
-    let hidden = Surface::new(triangles.iter().copied().chain([wall]));
+    let hidden = TriangleTree::new(triangles.iter().copied().chain([wall]));
     assert!(spread(&points_of(&triangles), &hidden, &c, &place, 4).is_empty());
     let behind = DAffine3::from_translation(DVec3::new(0.0, 0.0, 9.0));
     assert!(spread(&points_of(&triangles), &surface, &c, &behind, 4).is_empty());
@@ -160,7 +160,7 @@ fn hiding_agrees_with_each_triangle_on_its_own() {
     let at = |i: u64| DVec3::from_array(draws.normal3(i));
     let triangles: Vec<[DVec3; 3]> =
         (0..60).map(|i| [at(i), at(i) + 0.3 * at(i + 100), at(i) + 0.3 * at(i + 200)]).collect();
-    let surface = Surface::new(triangles.clone());
+    let surface = TriangleTree::new(triangles.clone());
     let mut hidden = 0;
     for i in 0..400 {
         let (from, to) = (3.0 * at(1000 + i), at(2000 + i));

@@ -2,7 +2,7 @@
 //!
 //! Light at a pixel is `flat(pixel) * (black + (1 - black) * sum of intensity * curve(code) over channels)`, over full
 //! white in the middle of the raster at the same distance. [`steady()`] takes the flicker of lamps out of samples,
-//! [`Session`] makes curves of readings at one place, [`flat_field`] a field of the brightness along a sweep.
+//! [`ResponseSession`] makes curves of readings at one place, [`flat_field`] a field of the brightness along a sweep.
 
 mod flat;
 mod response;
@@ -10,7 +10,7 @@ mod steady;
 
 pub use dpm_calibration_file::light::{Channels, FlatField, LightModel, CURVE_POINTS};
 pub use flat::{flat_field, FlatError};
-pub use response::{LightError, Next, Session};
+pub use response::{LightError, Next, ResponseSession};
 pub use steady::{steady, Steady, SteadyError};
 
 #[cfg(test)]

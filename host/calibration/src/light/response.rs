@@ -86,14 +86,14 @@ pub enum Next {
 
 /// Readings in progress, at one place.
 #[derive(Clone, Debug)]
-pub struct Session {
+pub struct ResponseSession {
     channels: Vec<Vec<(f64, Steady)>>,
     ambient: Option<Steady>,
     black: Option<Steady>,
     white: Option<Steady>,
 }
 
-impl Session {
+impl ResponseSession {
     /// For a projector of some channels.
     pub fn new(channels: usize) -> Self {
         Self { channels: vec![Vec::new(); channels], ambient: None, black: None, white: None }

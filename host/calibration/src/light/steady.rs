@@ -1,7 +1,7 @@
 //! Samples at one place into their mean without the flicker of lamps.
 
 use crate::dense::{inverse_diagonal, solve_spd};
-use crate::sensor::Block;
+use crate::sensor::SampleBlock;
 use std::f64::consts::TAU;
 use thiserror::Error;
 
@@ -52,7 +52,7 @@ const MOST_CHANGE: f64 = 0.02;
 ///
 /// # Errors
 /// Each reason of [`SteadyError`].
-pub fn steady(blocks: &[Block], flicker_hz: f64) -> Result<Steady, SteadyError> {
+pub fn steady(blocks: &[SampleBlock], flicker_hz: f64) -> Result<Steady, SteadyError> {
     let base_ns = blocks.iter().map(|b| b.start_ns).min().unwrap_or(0);
     let samples = || {
         blocks.iter().flat_map(|b| {

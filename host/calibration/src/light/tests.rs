@@ -1,13 +1,13 @@
 //! Laws, against a drawn truth.
 
 use super::*;
-use crate::sensor::{Block, Brightness};
+use crate::sensor::{Brightness, SampleBlock};
 use dpm_device::planes::Raster;
 use dpm_device::rng::Draws;
 use glam::{DVec2, DVec3};
 
-fn block(n: usize, level: impl Fn(usize) -> f64) -> [Block; 1] {
-    [Block { start_ns: 77, interval_ns: 1e4, levels: (0..n).map(|i| level(i) as f32).collect() }]
+fn block(n: usize, level: impl Fn(usize) -> f64) -> [SampleBlock; 1] {
+    [SampleBlock { start_ns: 77, interval_ns: 1e4, levels: (0..n).map(|i| level(i) as f32).collect() }]
 }
 
 #[test]
@@ -38,8 +38,8 @@ fn truth(channel: usize, code: f64) -> f64 {
 }
 
 /// Reads all that the session asks for.
-fn read(noise: f64, seed: u64, level: impl Fn(Next) -> f64) -> Session {
-    let mut session = Session::new(3);
+fn read(noise: f64, seed: u64, level: impl Fn(Next) -> f64) -> ResponseSession {
+    let mut session = ResponseSession::new(3);
     let mut i = 0;
     while let Some(next) = session.next_reading() {
         i += 1;
@@ -99,8 +99,8 @@ fn bad_readings_are_refused_by_name() {
     let dead = |n: Next| if matches!(n, Next::Code { channel: 0, .. }) { 0.052 } else { light(n) };
     assert!(matches!(solve(&dead, 1e-5), LightError::NoLight { channel: 0, .. }));
     assert!(matches!(solve(&light, 5e-3), LightError::Uncertain { .. }));
-    assert!(matches!(Session::new(3).solve(), Err(LightError::Missing(_))));
-    let mut session = Session::new(3);
+    assert!(matches!(ResponseSession::new(3).solve(), Err(LightError::Missing(_))));
+    let mut session = ResponseSession::new(3);
     let reading = Steady { level: 1.0, sigma: 0.0, flicker: 0.0 };
     for (channel, code) in [(3, 0.5), (0, 1.5), (0, f64::NAN)] {
         assert!(matches!(session.add(Next::Code { channel, code }, reading), Err(LightError::NoCode { .. })));

@@ -2,7 +2,7 @@
 //!
 //! [`Session`] collects pairs one by one, says where the next one would help most, and solves: direct linear transform,
 //! random samples against wrong pairs, then least squares over lens and pose with Huber's loss and with priors on what
-//! a dozen pairs cannot determine. Data that would give a wrong projector are refused by name ([`Refusal`]).
+//! a dozen pairs cannot determine. Data that would give a wrong projector are refused by name ([`PointsRefusal`]).
 
 mod fit;
 mod refusal;
@@ -13,7 +13,7 @@ pub use dpm_calibration_file::LightError;
 pub(crate) use fit::spread_of;
 use fit::{fit, Fit};
 pub use fit::{LensTerms, Priors};
-pub use refusal::Refusal;
+pub use refusal::PointsRefusal;
 pub(crate) use solve::{check_result, check_terms, look_for_motion, moved_px};
 pub use solve::{relocate, solve, ProjectorFit};
 pub(crate) use uncertainty::{percentile, predict_share, variance};
@@ -121,8 +121,8 @@ impl Session {
     /// Solves from all points so far.
     ///
     /// # Errors
-    /// Each reason of [`Refusal`].
-    pub fn solve(&self) -> Result<ProjectorFit, Refusal> {
+    /// Each reason of [`PointsRefusal`].
+    pub fn solve(&self) -> Result<ProjectorFit, PointsRefusal> {
         solve(self.raster, &self.sights, &self.options, &self.volume)
     }
 

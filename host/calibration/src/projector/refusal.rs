@@ -5,7 +5,7 @@ use thiserror::Error;
 
 /// Why points are refused.
 #[derive(Clone, Debug, PartialEq, Error)]
-pub enum Refusal {
+pub enum PointsRefusal {
     /// Too few points.
     #[error("projector: {have} points are too few, {need} are needed, at two distances at least")]
     TooFew {
@@ -122,7 +122,7 @@ pub enum Refusal {
     },
 }
 
-impl From<CalibrationError> for Refusal {
+impl From<CalibrationError> for PointsRefusal {
     fn from(e: CalibrationError) -> Self {
         match e {
             CalibrationError::TooFew(have) => Self::TooFew { have, need: 6 },
@@ -154,7 +154,7 @@ const UNITS: [(f64, &str); 8] = [
 const USUAL_M: [f64; 2] = [0.15, 30.0];
 
 /// Judges the distance of the projector from the points.
-pub(super) fn check_distance(distance_m: f64, told_m: Option<f64>) -> Result<(), Refusal> {
+pub(super) fn check_distance(distance_m: f64, told_m: Option<f64>) -> Result<(), PointsRefusal> {
     let nearest = |expected: f64| {
         let off = |f: f64| (distance_m / expected / f).ln().abs();
         UNITS.into_iter().min_by(|a, b| off(a.0).total_cmp(&off(b.0))).map(|u| (u, off(u.0)))
@@ -162,27 +162,27 @@ pub(super) fn check_distance(distance_m: f64, told_m: Option<f64>) -> Result<(),
     match told_m {
         Some(expected_m) if (distance_m / expected_m).ln().abs() > 0.5 => match nearest(expected_m) {
             Some(((factor, hint), off)) if off < 0.35 => {
-                Err(Refusal::WrongUnit { distance_m, expected_m, factor, hint })
+                Err(PointsRefusal::WrongUnit { distance_m, expected_m, factor, hint })
             }
-            _ => Err(Refusal::WrongDistance { distance_m, expected_m }),
+            _ => Err(PointsRefusal::WrongDistance { distance_m, expected_m }),
         },
         None if !(USUAL_M[0]..=USUAL_M[1]).contains(&distance_m) => {
             let expected_m = 1.5;
             let ((factor, hint), _) = nearest(expected_m).unwrap_or((UNITS[0], 0.0));
-            Err(Refusal::WrongUnit { distance_m, expected_m, factor, hint })
+            Err(PointsRefusal::WrongUnit { distance_m, expected_m, factor, hint })
         }
         _ => Ok(()),
     }
 }
 
 /// Judges which way up the picture is.
-pub(super) fn check_up(found: glam::DVec3, told: Option<glam::DVec3>) -> Result<(), Refusal> {
+pub(super) fn check_up(found: glam::DVec3, told: Option<glam::DVec3>) -> Result<(), PointsRefusal> {
     let name = |v: glam::DVec3| ["X", "Y", "Z"][v.abs().max_position()];
     match told.and_then(|t| t.try_normalize()) {
         Some(told)
             if found.dot(told).abs() < std::f64::consts::FRAC_1_SQRT_2 && name(found) != name(told) =>
         {
-            Err(Refusal::AxesExchanged { found: name(found), expected: name(told) })
+            Err(PointsRefusal::AxesExchanged { found: name(found), expected: name(told) })
         }
         _ => Ok(()),
     }

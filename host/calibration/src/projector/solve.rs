@@ -3,7 +3,9 @@
 use super::fit::{Task, OFFSET};
 use super::refusal::{check_distance, check_up};
 use super::uncertainty::{percentile, predict, Volume};
-use super::{fit, middle, misses, spread_of, Fit, LensTerms, Options, PlaceHint, Priors, Refusal, Sight};
+use super::{
+    fit, middle, misses, spread_of, Fit, LensTerms, Options, PlaceHint, PointsRefusal, Priors, Sight,
+};
 use crate::model::{ProjectorModel, INTRINSICS};
 use crate::pinhole::{calibrate, CalibrationError, CalibrationOptions, Pair};
 use dpm_calibration_file::LightError;
@@ -44,17 +46,17 @@ const LEAST_DEPTH: f64 = 0.10;
 /// Finds the projector that lights the given points by the given pixels.
 ///
 /// # Errors
-/// Each reason of [`Refusal`].
+/// Each reason of [`PointsRefusal`].
 pub fn solve(
     raster: Raster,
     sights: &[Sight],
     options: &Options,
     volume: &Volume,
-) -> Result<ProjectorFit, Refusal> {
+) -> Result<ProjectorFit, PointsRefusal> {
     check_numbers(raster, sights, 6)?;
     let [_, second, third] = spread_of(sights);
     if third < THINNEST * second {
-        return Err(Refusal::Planar { off_plane_mm: 1e3 * third });
+        return Err(PointsRefusal::Planar { off_plane_mm: 1e3 * third });
     }
     let moving = sights.iter().filter(|s| s.velocity.length() > MOVING_M_S).count() >= 6;
     let task = Task { priors: &options.priors, focal: true, offset: moving, sigma_px: options.aim_px };
@@ -64,10 +66,10 @@ pub fn solve(
             // What agrees in a mirror and not outside it is a mirror image.
             let mirror = |s: &Sight| Sight { world: s.world * DVec3::new(-1.0, 1.0, 1.0), ..*s };
             if start(raster, &sights.iter().map(mirror).collect::<Vec<_>>(), options).is_ok() {
-                return Err(Refusal::Mirrored);
+                return Err(PointsRefusal::Mirrored);
             }
             return Err(look_for_motion(raster, sights, options)
-                .unwrap_or(Refusal::NoConsensus { inliers, points: pairs }));
+                .unwrap_or(PointsRefusal::NoConsensus { inliers, points: pairs }));
         }
         Err(e) => return Err(e.into()),
     };
@@ -98,13 +100,13 @@ pub(crate) fn check_terms(
     simple: Option<ProjectorModel>,
     predicted: &LightError,
     volume: &Volume,
-) -> Result<(), Refusal> {
+) -> Result<(), PointsRefusal> {
     let Some(simple) = simple else { return Ok(()) };
     let moved_px = moved_px(raster, model, &simple, volume);
     if moved_px > predicted.p99_px {
         return Ok(());
     }
-    Err(Refusal::LensUndetermined { moved_px, p99_px: predicted.p99_px })
+    Err(PointsRefusal::LensUndetermined { moved_px, p99_px: predicted.p99_px })
 }
 
 /// How far apart two models light the points of a volume: the 99th percentile, pixels.
@@ -122,21 +124,21 @@ pub(crate) fn moved_px(
 /// Finds the place of a projector whose lens is known, after a bump: from five points or more.
 ///
 /// # Errors
-/// Each reason of [`Refusal`].
+/// Each reason of [`PointsRefusal`].
 pub fn relocate(
     raster: Raster,
     before: &ProjectorModel,
     sights: &[Sight],
     options: &Options,
     volume: &Volume,
-) -> Result<ProjectorFit, Refusal> {
+) -> Result<ProjectorFit, PointsRefusal> {
     check_numbers(raster, sights, 5)?;
     let priors = Priors::held(before);
     let task = Task { priors: &priors, focal: false, offset: false, sigma_px: options.aim_px };
     let all = vec![true; sights.len()];
     let (fitted, inliers) = fit_inliers(before, sights, all, &task)?;
     if fitted.rms_px > 5.0 * options.aim_px.max(0.3) {
-        return Err(Refusal::NoConsensus {
+        return Err(PointsRefusal::NoConsensus {
             inliers: inliers.iter().filter(|i| **i).count(),
             points: sights.len(),
         });
@@ -151,19 +153,19 @@ pub fn relocate(
     Ok(solved)
 }
 
-fn check_numbers(raster: Raster, sights: &[Sight], need: usize) -> Result<(), Refusal> {
+fn check_numbers(raster: Raster, sights: &[Sight], need: usize) -> Result<(), PointsRefusal> {
     let finite = |s: &Sight| s.world.is_finite() && s.pixel.is_finite() && s.velocity.is_finite();
     if let Some(bad) = sights.iter().position(|s| !finite(s)) {
-        return Err(Refusal::NotFinite(bad));
+        return Err(PointsRefusal::NotFinite(bad));
     }
     let size = DVec2::new(f64::from(raster.width()), f64::from(raster.height()));
     // The tip may be aimed at by a line that leaves the raster, but not by much.
     let near = |p: DVec2| p.cmpge(-0.1 * size).all() && p.cmple(1.1 * size).all();
     if let Some(bad) = sights.iter().position(|s| !near(s.pixel)) {
-        return Err(Refusal::OutsideRaster(bad));
+        return Err(PointsRefusal::OutsideRaster(bad));
     }
     if sights.len() < need {
-        return Err(Refusal::TooFew { have: sights.len(), need });
+        return Err(PointsRefusal::TooFew { have: sights.len(), need });
     }
     Ok(())
 }
@@ -191,7 +193,7 @@ fn near_brown(
     sights: &[Sight],
     consensus: Vec<bool>,
     task: &Task,
-) -> Result<(ProjectorModel, Vec<bool>), Refusal> {
+) -> Result<(ProjectorModel, Vec<bool>), PointsRefusal> {
     let priors = task.priors.with_lens(LensTerms::Brown);
     let mut model = *start;
     let mut inliers = consensus;
@@ -215,8 +217,8 @@ fn fit_inliers(
     sights: &[Sight],
     mut inliers: Vec<bool>,
     task: &Task,
-) -> Result<(Fit, Vec<bool>), Refusal> {
-    let failed = Refusal::NotConverged { rms_px: f64::INFINITY };
+) -> Result<(Fit, Vec<bool>), PointsRefusal> {
+    let failed = PointsRefusal::NotConverged { rms_px: f64::INFINITY };
     let mut best = fit(start, &chosen(sights, &inliers), task).ok_or(failed.clone())?;
     for _ in 0..3 {
         let off = misses(&best.model, best.offset_s, sights);
@@ -231,13 +233,13 @@ fn fit_inliers(
         best = fit(&best.model, &chosen(sights, &inliers), task).ok_or(failed.clone())?;
     }
     if !best.converged {
-        return Err(Refusal::NotConverged { rms_px: best.rms_px });
+        return Err(PointsRefusal::NotConverged { rms_px: best.rms_px });
     }
     Ok((best, inliers))
 }
 
 /// Whether the points before some instant agree with each other, those after it too, but not both together.
-pub(crate) fn look_for_motion(raster: Raster, sights: &[Sight], options: &Options) -> Option<Refusal> {
+pub(crate) fn look_for_motion(raster: Raster, sights: &[Sight], options: &Options) -> Option<PointsRefusal> {
     let n = sights.len();
     let accept = 3.0 * options.aim_px.max(0.3);
     let splits = (6..n.saturating_sub(3)).step_by((n / 40).max(1));
@@ -258,7 +260,7 @@ pub(crate) fn look_for_motion(raster: Raster, sights: &[Sight], options: &Option
         Some((worst, at, a.model, b.model))
     });
     let (worst, at, a, b) = tried.min_by(|a, b| a.0.total_cmp(&b.0))?;
-    (worst < accept).then(|| Refusal::Moved {
+    (worst < accept).then(|| PointsRefusal::Moved {
         last_before: at - 1,
         moved_mm: 1e3 * (a.position() - b.position()).length(),
         turned_deg: turn_between(&a, &b),
@@ -277,12 +279,12 @@ fn judge(
     options: &Options,
     volume: &Volume,
     moving: bool,
-) -> Result<ProjectorFit, Refusal> {
+) -> Result<ProjectorFit, PointsRefusal> {
     let model = &fitted.model;
     let depths: Vec<f64> = chosen(sights, &inliers).iter().map(|s| model.local(s.world).z).collect();
     let (mean, range) = check_result(model, &depths, &options.known)?;
     if fitted.offset_s.abs() > MOST_OFFSET_S {
-        return Err(Refusal::TimeShifted { offset_ms: 1e3 * fitted.offset_s });
+        return Err(PointsRefusal::TimeShifted { offset_ms: 1e3 * fitted.offset_s });
     }
     let mut solved = judge_uncertainty(raster, sights, fitted, inliers, options, volume)?;
     if moving {
@@ -306,12 +308,12 @@ pub(crate) fn check_result(
     model: &ProjectorModel,
     depths: &[f64],
     known: &PlaceHint,
-) -> Result<(f64, f64), Refusal> {
+) -> Result<(f64, f64), PointsRefusal> {
     let mean = depths.iter().sum::<f64>() / depths.len().max(1) as f64;
     let range = percentile(depths.to_vec(), 1.0) - percentile(depths.to_vec(), 0.0);
     check_distance(mean, known.distance_m)?;
     if range < LEAST_DEPTH * mean {
-        return Err(Refusal::OneDepth { share: 100.0 * range / mean });
+        return Err(PointsRefusal::OneDepth { share: 100.0 * range / mean });
     }
     check_up(model.world_from_projector().matrix3.y_axis, known.up)?;
     Ok((mean, range))
@@ -324,9 +326,9 @@ fn judge_uncertainty(
     inliers: Vec<bool>,
     options: &Options,
     volume: &Volume,
-) -> Result<ProjectorFit, Refusal> {
+) -> Result<ProjectorFit, PointsRefusal> {
     if fitted.model.camera(raster).is_err() {
-        return Err(Refusal::LensFolds);
+        return Err(PointsRefusal::LensFolds);
     }
     // The residuals of few points say little of the noise: what is expected counts as ten more of them.
     let used = inliers.iter().filter(|i| **i).count() as f64;
@@ -339,7 +341,13 @@ fn judge_uncertainty(
     let predicted = predict(&fitted.model, &covariance, &volume.points(&fitted.model, raster));
     if predicted.p99_px > MOST_UNCERTAIN_PX {
         let DVec3 { x, y, z } = predicted.worst;
-        return Err(Refusal::Uncertain { p99_px: predicted.p99_px, most_px: MOST_UNCERTAIN_PX, x, y, z });
+        return Err(PointsRefusal::Uncertain {
+            p99_px: predicted.p99_px,
+            most_px: MOST_UNCERTAIN_PX,
+            x,
+            y,
+            z,
+        });
     }
     let mut notes = Vec::new();
     let wrong: Vec<String> =

@@ -65,7 +65,7 @@ fn p99_in_hull(got: &ProjectorModel, truth: &ProjectorModel, sights: &[Sight]) -
     uncertainty::percentile(errors.collect(), 0.99)
 }
 
-fn solved(sights: &[Sight]) -> Result<ProjectorFit, Refusal> {
+fn solved(sights: &[Sight]) -> Result<ProjectorFit, PointsRefusal> {
     solve(raster(), sights, &Options::by_hand(raster()), &volume())
 }
 
@@ -125,7 +125,7 @@ fn five_points_find_a_bumped_projector_again() {
         assert!(error < 1.2, "{seed}: {error}");
         assert_eq!(got.model.lens, before.lens);
         let four = relocate(raster(), &before, &sights[..4], &options, &volume());
-        assert_eq!(four.unwrap_err(), Refusal::TooFew { have: 4, need: 5 });
+        assert_eq!(four.unwrap_err(), PointsRefusal::TooFew { have: 4, need: 5 });
     }
 }
 
@@ -139,7 +139,7 @@ fn planar_points_and_points_at_one_depth_are_refused_by_name() {
     let planar = place(&|i| {
         DVec3::new(0.4 * d.unit(3 * i) - 0.2, 0.3 * d.unit(3 * i + 1) - 0.15, 2e-3 * d.unit(3 * i + 2))
     });
-    assert!(matches!(solved(&planar), Err(Refusal::Planar { off_plane_mm }) if off_plane_mm < 1.0));
+    assert!(matches!(solved(&planar), Err(PointsRefusal::Planar { off_plane_mm }) if off_plane_mm < 1.0));
     let back = truth.world_from_projector();
     // In the projector's own space: 40 mm of depth at more than a metre.
     let local = |i: u64| {
@@ -152,12 +152,12 @@ fn planar_points_and_points_at_one_depth_are_refused_by_name() {
         .collect();
     let got = solved(&flat);
     assert!(
-        matches!(got, Err(Refusal::OneDepth { share }) if share < 5.0)
-            || matches!(got, Err(Refusal::Planar { .. })),
+        matches!(got, Err(PointsRefusal::OneDepth { share }) if share < 5.0)
+            || matches!(got, Err(PointsRefusal::Planar { .. })),
         "{got:?}"
     );
     let same = vec![planar[0]; 12];
-    assert!(matches!(solved(&same), Err(Refusal::Planar { .. })));
+    assert!(matches!(solved(&same), Err(PointsRefusal::Planar { .. })));
 }
 
 #[test]
@@ -178,7 +178,7 @@ fn one_depth_that_is_no_plane_is_refused_by_name() {
         .map(|p| Sight::at_rest(p, truth.project(p).unwrap()))
         .collect();
     let got = solved(&sights);
-    assert!(matches!(got, Err(Refusal::OneDepth { .. })), "{got:?}");
+    assert!(matches!(got, Err(PointsRefusal::OneDepth { .. })), "{got:?}");
 }
 
 #[test]
@@ -187,11 +187,11 @@ fn a_mirror_image_is_refused_by_name() {
     for axis in 0..3 {
         let mut mirrored = sights.clone();
         mirrored.iter_mut().for_each(|s| s.world[axis] = -s.world[axis]);
-        assert_eq!(solved(&mirrored).unwrap_err(), Refusal::Mirrored, "axis {axis}");
+        assert_eq!(solved(&mirrored).unwrap_err(), PointsRefusal::Mirrored, "axis {axis}");
     }
     let mut picture = sights;
     picture.iter_mut().for_each(|s| s.pixel.x = 1024.0 - s.pixel.x);
-    assert_eq!(solved(&picture).unwrap_err(), Refusal::Mirrored);
+    assert_eq!(solved(&picture).unwrap_err(), PointsRefusal::Mirrored);
 }
 
 #[test]
@@ -206,13 +206,13 @@ fn a_wrong_unit_is_refused_by_name() {
         scaled.iter_mut().for_each(|s| s.world *= factor);
         let of = Volume { low: volume().low * factor, high: volume().high * factor };
         let got = solve(raster(), &scaled, &options, &of).unwrap_err();
-        assert!(matches!(got, Refusal::WrongUnit { factor: f, .. } if f == factor), "{factor}: {got}");
+        assert!(matches!(got, PointsRefusal::WrongUnit { factor: f, .. } if f == factor), "{factor}: {got}");
     }
     // Without a tape measure the coarse ones are seen.
     for factor in [1000.0, 0.01] {
         let mut scaled = sights.clone();
         scaled.iter_mut().for_each(|s| s.world *= factor);
-        assert!(matches!(solved(&scaled), Err(Refusal::WrongUnit { .. })), "{factor}");
+        assert!(matches!(solved(&scaled), Err(PointsRefusal::WrongUnit { .. })), "{factor}");
     }
 }
 
@@ -225,7 +225,7 @@ fn a_world_with_another_axis_up_is_refused_by_name() {
     let mut z_up = sights.clone();
     z_up.iter_mut().for_each(|s| s.world = DVec3::new(s.world.x, -s.world.z, s.world.y));
     let got = solve(raster(), &z_up, &options, &volume()).unwrap_err();
-    assert_eq!(got, Refusal::AxesExchanged { found: "Z", expected: "Y" });
+    assert_eq!(got, PointsRefusal::AxesExchanged { found: "Z", expected: "Y" });
     // A projector that hangs upside down is none of that.
     let mut hanging = sights;
     hanging.iter_mut().for_each(|s| s.world = DVec3::new(-s.world.x, -s.world.y, s.world.z));
@@ -248,19 +248,19 @@ fn a_shift_in_time_is_corrected_or_refused() {
     let [offset, deviation] = got.offset_s.unwrap();
     assert!((offset - 6e-3).abs() < 5.0 * deviation && deviation < 5e-4, "{offset} {deviation}");
     assert!(got.notes.iter().any(|n| n.contains("time-shifted")), "{:?}", got.notes);
-    assert!(matches!(solved(&shifted(0.04)), Err(Refusal::TimeShifted { .. })));
+    assert!(matches!(solved(&shifted(0.04)), Err(PointsRefusal::TimeShifted { .. })));
 }
 
 #[test]
 fn numbers_that_are_none_and_pixels_outside_are_refused() {
     let sights = aimed(&truth(13), 12, 0.3, 13);
-    assert_eq!(solved(&sights[..5]).unwrap_err(), Refusal::TooFew { have: 5, need: 6 });
+    assert_eq!(solved(&sights[..5]).unwrap_err(), PointsRefusal::TooFew { have: 5, need: 6 });
     let mut bad = sights.clone();
     bad[3].world.x = f64::INFINITY;
-    assert_eq!(solved(&bad).unwrap_err(), Refusal::NotFinite(3));
+    assert_eq!(solved(&bad).unwrap_err(), PointsRefusal::NotFinite(3));
     let mut bad = sights;
     bad[2].pixel.x = 5000.0;
-    assert_eq!(solved(&bad).unwrap_err(), Refusal::OutsideRaster(2));
+    assert_eq!(solved(&bad).unwrap_err(), PointsRefusal::OutsideRaster(2));
 }
 
 #[test]
@@ -289,7 +289,7 @@ fn wide() -> ProjectorModel {
     ProjectorModel::from_camera(&camera, lens, DVec3::ZERO)
 }
 
-fn with_lens(terms: LensTerms, sights: &[Sight]) -> Result<ProjectorFit, Refusal> {
+fn with_lens(terms: LensTerms, sights: &[Sight]) -> Result<ProjectorFit, PointsRefusal> {
     let priors = Priors::many_points(raster()).with_lens(terms);
     let options = Options { priors, aim_px: 0.1, ..Options::by_hand(raster()) };
     solve(raster(), sights, &options, &Volume { low: DVec3::splat(-0.2), high: DVec3::splat(0.2) })
@@ -309,7 +309,7 @@ fn a_tilted_lens_needs_terms_that_a_narrow_one_does_not_tell() {
     let narrow = super::tests::truth(1);
     for terms in [LensTerms::Rational, LensTerms::ThinPrism] {
         let told = with_lens(terms, &aimed(&narrow, 400, 0.05, 1)).unwrap_err();
-        assert!(matches!(told, Refusal::LensUndetermined { .. }), "{told}");
+        assert!(matches!(told, PointsRefusal::LensUndetermined { .. }), "{told}");
         assert!(told.to_string().contains("--lens"), "{told}");
     }
 }
@@ -324,7 +324,9 @@ mod breadth {
             let mut sights = aimed(&truth(12), 30, 0.3, 12);
             sights[first..].iter_mut().for_each(|s| s.world.x += shift);
             let got = solved(&sights);
-            let Err(Refusal::Moved { last_before, moved_mm, .. }) = got else { panic!("{shift}: {got:?}") };
+            let Err(PointsRefusal::Moved { last_before, moved_mm, .. }) = got else {
+                panic!("{shift}: {got:?}")
+            };
             assert!(last_before.abs_diff(first - 1) <= 3, "{last_before} {first}");
             assert!(moved_mm > 500.0 * shift && moved_mm < 4000.0 * shift + 10.0, "{shift}: {moved_mm}");
         }

@@ -7,7 +7,7 @@ use crate::body::{self, tip_in_body, Touch, TouchFit};
 use crate::light::{self, flat_field, steady, LightModel, Next, Steady};
 use crate::pivot::Pivot;
 use crate::projector::{PlaceHint, Priors};
-use crate::sensor::{decode, solve, Block, Code, Settings, Solution, Timing};
+use crate::sensor::{decode, solve, Code, SampleBlock, Settings, Solution, Timing};
 use crate::trajectory::{TimedPose, Trajectory};
 use dpm_common::so3::so3_exp;
 use dpm_device::rng::Sampler;
@@ -83,7 +83,7 @@ fn touch(
     };
     let place = DAffine3::from_rotation_translation(turn(1.5), DVec3::new(0.05, -0.05, 0.02));
     let (place_of_body, turn_of_body) = (place.translation, DQuat::from_mat3(&place.matrix3));
-    let mut session = body::Session::default();
+    let mut session = body::TouchSession::default();
     for corner in 0..8u32 {
         let half =
             DVec3::new(f64::from(corner & 1), f64::from(corner >> 1 & 1), f64::from(corner >> 2)) - 0.5;
@@ -110,7 +110,7 @@ fn measure_light(truth: &Truth, sensor: &Solution, seed: u64) -> Result<LightMod
     let mut s = Sampler::new(seed, 0x1194);
     let pixel = DVec2::new(530.0, 370.0);
     let full = truth.flat(pixel) * (UNIT_DISTANCE_M / 1.1f64).powi(2);
-    let mut session = light::Session::new(3);
+    let mut session = light::ResponseSession::new(3);
     while let Some(next) = session.next_reading() {
         let of_codes = match next {
             Next::Ambient => 0.0,
@@ -135,6 +135,6 @@ fn reading(truth: &Truth, level: f64, s: &mut Sampler) -> Result<Steady, String>
         level + truth.ambient[0] * flicker + 0.01 * normal(s)
     };
     let levels = (0..(READING_S * 1e5) as usize).map(sample).map(|v| v as f32).collect();
-    let block = Block { start_ns: 0, interval_ns: 1e4, levels };
+    let block = SampleBlock { start_ns: 0, interval_ns: 1e4, levels };
     steady(&[block], 100.0).map_err(|e| e.to_string())
 }

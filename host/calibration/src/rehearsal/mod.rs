@@ -45,7 +45,7 @@ pub struct Draw {
 
 /// Median and 99th percentile.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize)]
-pub struct Percentiles {
+pub struct MedianAndTail {
     /// Median.
     pub p50: f64,
     /// 99th percentile.
@@ -65,10 +65,10 @@ pub struct Rehearsal {
     /// Truths that were drawn.
     pub draws: usize,
     /// Error of the light over all points of all draws, pixels of 1024 x 768.
-    pub error_px: Percentiles,
+    pub error_px: MedianAndTail,
     /// The same on bodies that move at 1 m/s in any direction, if their poses are predicted without error: what
     /// calibration adds to prediction.
-    pub moving_px: Percentiles,
+    pub moving_px: MedianAndTail,
     /// Error of the latency, microseconds.
     pub latency_error_us: Largest,
     /// Error of a level over the channel's full light.
@@ -135,7 +135,7 @@ impl Rehearsal {
     pub fn of(draws: &[Draw], bias: Bias) -> Self {
         let of = |errors: &dyn Fn(&Draw) -> &[f64]| {
             let all: Vec<f64> = draws.iter().flat_map(|d| errors(d).iter().copied()).collect();
-            Percentiles { p50: percentile(all.clone(), 0.5), p99: percentile(all, 0.99) }
+            MedianAndTail { p50: percentile(all.clone(), 0.5), p99: percentile(all, 0.99) }
         };
         let largest = |f: &dyn Fn(&Draw) -> f64| Largest { max: draws.iter().map(f).fold(0.0, f64::max) };
         let median = |f: &dyn Fn(&Draw) -> f64| percentile(draws.iter().map(f).collect(), 0.5);

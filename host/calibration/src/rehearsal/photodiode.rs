@@ -4,7 +4,7 @@
 //! The decoder knows nothing of this: it fits discs over stripes.
 
 use super::truth::{Hand, Truth};
-use crate::sensor::{Block, Code, Timing, PLANES};
+use crate::sensor::{Code, SampleBlock, Timing, PLANES};
 use dpm_device::rng::Sampler;
 use glam::{DVec2, DVec3};
 use std::f64::consts::TAU;
@@ -33,7 +33,7 @@ pub(super) fn record(
     hand: &Hand,
     [from_s, to_s]: [f64; 2],
     seed: u64,
-) -> Vec<Block> {
+) -> Vec<SampleBlock> {
     let middle = 0.5 * (truth.volume.low + truth.volume.high);
     let mut sampler = Sampler::new(seed, 0x9107);
     let covered = covered(from_s, to_s, &mut sampler);
@@ -114,7 +114,7 @@ fn sample(
     plane_ns: f64,
     covered: &[[f64; 2]],
     sampler: &mut Sampler,
-) -> Vec<Block> {
+) -> Vec<SampleBlock> {
     let count = (light.len() as f64 * plane_ns * (1.0 + truth.sensor_drift) / INTERVAL_NS) as usize;
     let to_sensor = |host_ns: f64| host_ns * (1.0 + truth.sensor_drift) + truth.sensor_offset_ns as f64;
     let first_ns = to_sensor(start_ns).ceil();
@@ -138,7 +138,7 @@ fn sample(
         });
         let levels = levels.collect();
         let start = first_ns + begin as f64 * INTERVAL_NS;
-        blocks.push(Block { start_ns: start as i64, interval_ns: INTERVAL_NS, levels });
+        blocks.push(SampleBlock { start_ns: start as i64, interval_ns: INTERVAL_NS, levels });
     }
     blocks
 }

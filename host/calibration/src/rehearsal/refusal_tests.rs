@@ -3,19 +3,20 @@
 use super::photodiode::record;
 use super::tracker::Tracker;
 use super::truth::{Bias, Hand, Truth};
-use crate::projector::{moved_px, PlaceHint, Priors, Refusal};
+use crate::projector::{moved_px, PlaceHint, PointsRefusal, Priors};
 use crate::sensor::{
-    decode, solve, Block, Code, Coverage, Decoding, Role, SensorError, Settings, Solution, Timing, PLANES,
+    decode, solve, Code, Coverage, Decoding, Role, SampleBlock, SensorError, Settings, Solution, Timing,
+    PLANES,
 };
 use crate::trajectory::{TimedPose, Trajectory};
 use glam::{DQuat, DVec2, DVec3};
 
 const TIMING: Timing = Timing { frame_zero_ns: 1_000_000_123, frame_ns: 1_055_966.2 };
 
-struct Sweep {
+struct DrawnSweep {
     truth: Truth,
     code: Code,
-    blocks: Vec<Block>,
+    blocks: Vec<SampleBlock>,
     decoded: Decoding,
     poses: Vec<TimedPose>,
 }
@@ -33,7 +34,7 @@ fn settings(truth: &Truth) -> Settings {
     }
 }
 
-fn sweep(seed: u64, seconds: f64) -> Sweep {
+fn sweep(seed: u64, seconds: f64) -> DrawnSweep {
     let truth = Truth::draw(seed);
     let code = Code::new(truth.raster).unwrap();
     let hand = Hand::sweeping(&truth.volume, seed);
@@ -41,10 +42,10 @@ fn sweep(seed: u64, seconds: f64) -> Sweep {
     let poses = tracker.wand(&hand, truth.tip, DVec3::ZERO, 38.0, 42.0 + seconds);
     let blocks = record(&truth, &code, &TIMING, &hand, [40.0, 40.0 + seconds], seed);
     let decoded = decode(&code, &TIMING, &blocks, truth.sensor_offset_ns, &|slot| slot).unwrap();
-    Sweep { truth, code, blocks, decoded, poses }
+    DrawnSweep { truth, code, blocks, decoded, poses }
 }
 
-impl Sweep {
+impl DrawnSweep {
     /// Solves from poses that were changed.
     fn with(&self, change: impl Fn(usize, &mut TimedPose)) -> Result<Solution, SensorError> {
         self.with_tip(self.truth.tip, change)
@@ -70,7 +71,7 @@ fn a_sweep_says_what_it_has_not_seen() {
     assert!(coverage.share() < 0.85, "{coverage:?}");
     assert!(coverage.advice().contains("near and far"), "{}", coverage.advice());
     // The emptiest cell is indeed one that hardly any frame has seen.
-    let near = |f: &crate::sensor::Frame| {
+    let near = |f: &crate::sensor::SensorFrame| {
         let seconds = 1e-9 * (TIMING.instant(f.number, 12.0).0 as f64);
         let tip = Hand::sweeping(&short.truth.volume, 6).at(seconds).0;
         short
@@ -123,24 +124,27 @@ mod breadth {
             p.position.x = -p.position.x;
             p.rotation = DQuat::from_xyzw(p.rotation.x, -p.rotation.y, -p.rotation.z, p.rotation.w);
         });
-        assert_eq!(mirrored.unwrap_err(), SensorError::Projector(Refusal::Mirrored));
+        assert_eq!(mirrored.unwrap_err(), SensorError::Projector(PointsRefusal::Mirrored));
         let z_up = sweep.with(|_, p| {
             let turn = DQuat::from_rotation_x(std::f64::consts::FRAC_PI_2);
             (p.position, p.rotation) = (turn * p.position, turn * p.rotation);
         });
         assert_eq!(
             z_up.unwrap_err(),
-            SensorError::Projector(Refusal::AxesExchanged { found: "Z", expected: "Y" })
+            SensorError::Projector(PointsRefusal::AxesExchanged { found: "Z", expected: "Y" })
         );
         let late = sweep.with(|_, p| p.stamp_ns += 300_000_000).unwrap_err();
         assert!(matches!(late, SensorError::LatencyAtBound { ms } if (250.0..350.0).contains(&ms)), "{late}");
         let half = sweep.poses.len() / 2;
         let moved = sweep.with(|i, p| p.position.x += if i > half { 0.02 } else { 0.0 }).unwrap_err();
-        assert!(matches!(moved, SensorError::Projector(Refusal::Moved { .. })), "{moved}");
+        assert!(matches!(moved, SensorError::Projector(PointsRefusal::Moved { .. })), "{moved}");
         let flat = sweep.with(|_, p| p.position.z = 0.0).unwrap_err();
         assert!(matches!(flat, SensorError::Projector(_) | SensorError::DoesNotFit { .. }), "{flat}");
         let unit = sweep.with_tip(1000.0 * sweep.truth.tip, |_, p| p.position *= 1000.0).unwrap_err();
-        assert!(matches!(unit, SensorError::Projector(Refusal::WrongUnit { factor: 1000.0, .. })), "{unit}");
+        assert!(
+            matches!(unit, SensorError::Projector(PointsRefusal::WrongUnit { factor: 1000.0, .. })),
+            "{unit}"
+        );
         let gone = sweep.with(|_, p| p.stamp_ns += 1_000_000_000_000).unwrap_err();
         assert!(matches!(gone, SensorError::TooFew { frames: 0, .. }), "{gone}");
     }
@@ -162,7 +166,9 @@ mod breadth {
                         // Twice, because after a step no projector is near the light of both parts.
                         assert!(off < 2.0 * predicted && moved_mm < 3.0, "{seed}: {moved_mm} mm, {off} px");
                     }
-                    Err(SensorError::Changed { .. } | SensorError::Projector(Refusal::Moved { .. })) => {
+                    Err(
+                        SensorError::Changed { .. } | SensorError::Projector(PointsRefusal::Moved { .. }),
+                    ) => {
                         assert!(moved_mm > 0.0);
                     }
                     Err(other) => panic!("{seed}, {moved_mm} mm: {other}"),

@@ -2,7 +2,7 @@
 
 use super::code::{Code, PLANES};
 use super::decode::{frames_seen, DecodeError};
-use super::lock::Block;
+use super::lock::SampleBlock;
 use super::start::pixel_of;
 use glam::DVec2;
 
@@ -29,7 +29,7 @@ impl Coverage {
     ///
     /// # Errors
     /// Why no frames are seen in the samples.
-    pub fn add(&mut self, frame_ns: f64, blocks: &[Block]) -> Result<usize, DecodeError> {
+    pub fn add(&mut self, frame_ns: f64, blocks: &[SampleBlock]) -> Result<usize, DecodeError> {
         let frames = frames_seen(frame_ns / PLANES as f64, blocks)?;
         let cell = self.cell();
         for frame in &frames {

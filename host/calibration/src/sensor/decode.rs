@@ -1,13 +1,13 @@
 //! Samples into frames: the number of each frame, and the level of each of its planes.
 
 use super::code::{Code, IDENTITY_PERIOD, PLANES};
-use super::lock::{lock, Block, Lock};
+use super::lock::{lock, Lock, SampleBlock};
 use super::Timing;
 use thiserror::Error;
 
 /// A frame as the sensor saw it.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub struct Frame {
+pub struct SensorFrame {
     /// Its number.
     pub number: u64,
     /// Mean level of each plane, in the sensor's unit.
@@ -18,7 +18,7 @@ pub struct Frame {
     pub on: [f32; 2],
 }
 
-impl Frame {
+impl SensorFrame {
     /// The reference levels (off, on) during a plane.
     pub fn references(&self, plane: usize) -> (f64, f64) {
         let last = PLANES as f64 - 1.5;
@@ -40,7 +40,7 @@ impl Frame {
 #[derive(Clone, Debug)]
 pub struct Decoding {
     /// Frames that are whole and lit, in order.
-    pub frames: Vec<Frame>,
+    pub frames: Vec<SensorFrame>,
     /// Frames during which the sensor was covered, outside the picture, or moved out of it.
     pub dropped: usize,
     /// How the planes were found.
@@ -115,7 +115,7 @@ const AGREE: f64 = 0.2;
 pub fn decode(
     code: &Code,
     timing: &Timing,
-    blocks: &[Block],
+    blocks: &[SampleBlock],
     sensor_minus_host_ns: i64,
     shown: &dyn Fn(u64) -> u64,
 ) -> Result<Decoding, DecodeError> {
@@ -132,7 +132,7 @@ struct PlaneTimes {
     start: usize,
 }
 
-fn seen(plane_ns: f64, blocks: &[Block]) -> Result<PlaneTimes, DecodeError> {
+fn seen(plane_ns: f64, blocks: &[SampleBlock]) -> Result<PlaneTimes, DecodeError> {
     if let Some(bad) = blocks.iter().position(|b| !b.levels.iter().all(|l| l.is_finite())) {
         return Err(DecodeError::NotFinite(bad));
     }
@@ -156,17 +156,17 @@ fn seen(plane_ns: f64, blocks: &[Block]) -> Result<PlaneTimes, DecodeError> {
 ///
 /// # Errors
 /// As [`decode`], but for the identity.
-pub(super) fn frames_seen(plane_ns: f64, blocks: &[Block]) -> Result<Vec<Frame>, DecodeError> {
+pub(super) fn frames_seen(plane_ns: f64, blocks: &[SampleBlock]) -> Result<Vec<SensorFrame>, DecodeError> {
     let PlaneTimes { planes, start, .. } = seen(plane_ns, blocks)?;
     Ok(frames_from(&planes, start))
 }
 
 /// Averages the samples inside each plane, away from its borders.
-fn average(blocks: &[Block], lock: &Lock, interval_ns: f64) -> Result<Planes, DecodeError> {
+fn average(blocks: &[SampleBlock], lock: &Lock, interval_ns: f64) -> Result<Planes, DecodeError> {
     // A sample whose own duration reaches over a border mixes two planes; the rise of the electronics comes after it.
     let guard = 0.5 * interval_ns / lock.plane_ns;
     let (low, high) = (guard + 0.06, 1.0 - guard + 0.02);
-    let position = |b: &Block, i: usize| (b.at(i, lock.base_ns) - lock.border_ns) / lock.plane_ns;
+    let position = |b: &SampleBlock, i: usize| (b.at(i, lock.base_ns) - lock.border_ns) / lock.plane_ns;
     let filled = || blocks.iter().filter(|b| !b.levels.is_empty());
     let first = filled().map(|b| position(b, 0)).fold(f64::INFINITY, f64::min).floor() as i64;
     let last = filled().map(|b| position(b, b.levels.len() - 1)).fold(0.0, f64::max) as i64;
@@ -194,10 +194,10 @@ fn average(blocks: &[Block], lock: &Lock, interval_ns: f64) -> Result<Planes, De
 }
 
 /// The levels of a frame that begins at a plane: `None` where planes are missing, or its references disagree.
-fn frame_at(planes: &Planes, begin: usize, least_contrast: f64) -> Option<Frame> {
+fn frame_at(planes: &Planes, begin: usize, least_contrast: f64) -> Option<SensorFrame> {
     let levels: [f32; PLANES] = planes.levels.get(begin..begin + PLANES)?.try_into().ok()?;
     let (a, b) = (levels[PLANES - 2], levels[PLANES - 1]);
-    let frame = Frame { number: 0, levels, off: [levels[0], a.min(b)], on: [levels[1], a.max(b)] };
+    let frame = SensorFrame { number: 0, levels, off: [levels[0], a.min(b)], on: [levels[1], a.max(b)] };
     let contrast = frame.contrast();
     let near = |v: [f32; 2]| f64::from((v[1] - v[0]).abs()) <= AGREE * contrast;
     let inside = (2..PLANES - 2).all(|p| {
@@ -245,10 +245,11 @@ fn usual_contrast(planes: &Planes) -> f64 {
 }
 
 /// All frames from `start`; each with its place in the recording instead of its number.
-fn frames_from(planes: &Planes, start: usize) -> Vec<Frame> {
+fn frames_from(planes: &Planes, start: usize) -> Vec<SensorFrame> {
     let least = LEAST_CONTRAST * usual_contrast(planes);
     let count = planes.levels.len().saturating_sub(start) / PLANES;
-    let at = |i: usize| frame_at(planes, start + i * PLANES, least).map(|f| Frame { number: i as u64, ..f });
+    let at =
+        |i: usize| frame_at(planes, start + i * PLANES, least).map(|f| SensorFrame { number: i as u64, ..f });
     (0..count).filter_map(at).collect()
 }
 
@@ -259,10 +260,10 @@ fn number(
     lock: &Lock,
     planes: &Planes,
     start: usize,
-    mut frames: Vec<Frame>,
+    mut frames: Vec<SensorFrame>,
     sensor_minus_host_ns: i64,
 ) -> Result<Decoding, DecodeError> {
-    let bit = |f: &Frame| f.levels[PLANES - 2] > f.levels[PLANES - 1];
+    let bit = |f: &SensorFrame| f.levels[PLANES - 2] > f.levels[PLANES - 1];
     let told: Vec<(usize, bool)> = frames.iter().take(1000).map(|f| (f.number as usize, bit(f))).collect();
     let n = told.len();
     let Some(span) = told.last().map(|(i, _)| i + 1) else {
@@ -305,7 +306,7 @@ fn number(
 }
 
 /// Deviation of a plane over the contrast, from the two references of darkness in each frame.
-fn noise(frames: &[Frame]) -> f64 {
-    let square = |f: &Frame| (f64::from(f.off[1] - f.off[0]) / f.contrast()).powi(2);
+fn noise(frames: &[SensorFrame]) -> f64 {
+    let square = |f: &SensorFrame| (f64::from(f.off[1] - f.off[0]) / f.contrast()).powi(2);
     (0.5 * frames.iter().map(square).sum::<f64>() / frames.len().max(1) as f64).sqrt()
 }

@@ -13,14 +13,15 @@ use super::code::{Code, PLANES};
 use super::decode::Decoding;
 use super::lens::finish_told;
 use super::problem::{
-    Fix, FrameFix, Limits, Measured, Planes, Problem, State, Tally, LATENCY, TIP, UNKNOWNS,
+    Fix, FrameFix, LatencyLimits, Measured, Planes, SensorProblem, SensorUnknowns, Tally, LATENCY, TIP,
+    UNKNOWNS,
 };
 use super::start::{prepare, start, thin, why_no_fit};
 use super::Timing;
 use crate::dense::inverse_spd;
 use crate::least_squares::{descend, Equations};
 use crate::model::ProjectorModel;
-use crate::projector::{check_result, predict, LightError, PlaceHint, Priors, Refusal, Volume};
+use crate::projector::{check_result, predict, LightError, PlaceHint, PointsRefusal, Priors, Volume};
 use crate::trajectory::Trajectory;
 use dpm_device::planes::Raster;
 use glam::{DMat3, DVec2, DVec3};
@@ -108,7 +109,7 @@ pub enum SensorError {
     },
     /// The points do not make a projector.
     #[error(transparent)]
-    Projector(#[from] Refusal),
+    Projector(#[from] PointsRefusal),
     /// The wand was not held still often enough.
     #[error("sensor: at {places} places the wand was held still until every stripe had been seen, {need} are needed: rest for two seconds at each of twenty places, near and far, and go slowly from one to the next")]
     TooFewPlaces {
@@ -175,7 +176,7 @@ pub fn solve(
     settings: &Settings,
 ) -> Result<Solution, SensorError> {
     let planes = planes_of(code, decoded, settings);
-    let problem = Problem::new(code.raster(), (path, settings), false);
+    let problem = SensorProblem::new(code.raster(), (path, settings), false);
     let seen = enough(prepare(&planes, decoded, path, settings), settings)?;
     let fixes: Vec<Fix> = seen.iter().map(|s| s.fix).collect();
     let start = start(&problem, &fixes)?;
@@ -202,14 +203,14 @@ pub(super) fn enough<'a>(
     Ok(seen)
 }
 
-impl<'a> Problem<'a> {
+impl<'a> SensorProblem<'a> {
     /// `is_held`: lens and pose stay what they are.
     pub(super) fn new(
         raster: Raster,
         (path, settings): (&'a Trajectory, &'a Settings),
         is_held: bool,
     ) -> Self {
-        let limits = Limits { latency_s: MOST_LATENCY_S, latency_sigma_us: MOST_LATENCY_SIGMA_US };
+        let limits = LatencyLimits { latency_s: MOST_LATENCY_S, latency_sigma_us: MOST_LATENCY_SIGMA_US };
         let inside = settings.priors.free();
         let free = std::array::from_fn(|i| !is_held && inside.get(i).copied().unwrap_or(true));
         Self { raster, limits, path, settings, tip_sigma: settings.tip_sigma_m.max(1e-4), free }
@@ -246,7 +247,7 @@ impl Scores {
 
 /// A state with its equations, and the root mean square of the levels' residuals.
 pub(super) struct FitState {
-    pub state: State,
+    pub state: SensorUnknowns,
     pub equations: Equations,
     pub rms_level: f64,
 }
@@ -263,8 +264,8 @@ pub(super) const FINEST: [(f64, bool); 4] = [(8.0, false), (3.0, false), (0.0, f
 
 /// Fits the levels: wide stripes first, since a start that is wrong by a stripe would lock to the wrong one.
 pub(super) fn refine<M: Measured>(
-    problem: &Problem,
-    start: State,
+    problem: &SensorProblem,
+    start: SensorUnknowns,
     seen: &[M],
     stages: &[(f64, bool)],
 ) -> Result<FitState, SensorError> {
@@ -272,16 +273,16 @@ pub(super) fn refine<M: Measured>(
     let every: Vec<&M> = seen.iter().collect();
     let mut state = start;
     let mut sigma = 0.15;
-    let failed = Refusal::NotConverged { rms_px: f64::INFINITY };
+    let failed = PointsRefusal::NotConverged { rms_px: f64::INFINITY };
     let mut last = None;
     for (finest, all) in stages {
         let (frames, how) = (if *all { &every } else { &few }, (sigma, *finest));
         let found = descend(
             state,
             30,
-            |s: &State| problem.of_levels(s, frames, how),
-            |s: &State| problem.cost_of_levels(s, frames, how),
-            |s: &State, d: &[f64]| s.step(d),
+            |s: &SensorUnknowns| problem.of_levels(s, frames, how),
+            |s: &SensorUnknowns| problem.cost_of_levels(s, frames, how),
+            |s: &SensorUnknowns, d: &[f64]| s.step(d),
         )
         .ok_or(failed.clone())?;
         state = found.state;
@@ -306,7 +307,7 @@ struct Evidence {
 }
 
 impl Evidence {
-    fn of<M: Measured>(problem: &Problem, fitted: &FitState, seen: &[M]) -> Self {
+    fn of<M: Measured>(problem: &SensorProblem, fitted: &FitState, seen: &[M]) -> Self {
         let (state, mut told) = (&fitted.state, Self::default());
         let position = state.model.position();
         for one in seen {
@@ -333,7 +334,7 @@ impl Evidence {
 /// A fit into what is told of it; `fixes` tell why, where the levels do not fit. Whether its lens can be inverted over the
 /// raster is not asked here.
 pub(super) fn finish<M: Measured>(
-    problem: &Problem,
+    problem: &SensorProblem,
     fitted: &FitState,
     (seen, fixes): (&[M], &[Fix]),
 ) -> Result<Solution, SensorError> {
@@ -344,7 +345,7 @@ pub(super) fn finish<M: Measured>(
         return Err(why_no_fit(problem, fixes, state, rms_px));
     }
     check_result(&state.model, &depths, &settings.known)?;
-    let unsettled = Refusal::NotConverged { rms_px };
+    let unsettled = PointsRefusal::NotConverged { rms_px };
     let inverse = inverse_spd(&fitted.equations.matrix()).ok_or(unsettled.clone())?;
     let covariance = sandwich(&inverse, &problem.expected(state), &scores.by_block).ok_or(unsettled)?;
     if state.latency_s.abs() > 0.9 * problem.limits.latency_s {

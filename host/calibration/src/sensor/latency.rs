@@ -3,7 +3,7 @@
 use super::code::Code;
 use super::decode::Decoding;
 use super::fit::{enough, planes_of, refine, sandwich, FitState, Scores, SensorError, Settings, FINEST};
-use super::problem::{Fix, Measured, Moment, Problem, State, LATENCY};
+use super::problem::{Fix, Measured, Moment, SensorProblem, SensorUnknowns, LATENCY};
 use super::start::{from_bits, prepare, MOST_START_PX};
 use crate::dense::inverse_spd;
 use crate::model::ProjectorModel;
@@ -42,7 +42,7 @@ pub fn solve_latency(
     model: &ProjectorModel,
 ) -> Result<Latency, SensorError> {
     let planes = planes_of(code, decoded, settings);
-    let problem = Problem::new(code.raster(), (path, settings), true);
+    let problem = SensorProblem::new(code.raster(), (path, settings), true);
     let seen = enough(prepare(&planes, decoded, path, settings), settings)?;
     let fixes: Vec<Fix> = seen.iter().map(|s| s.fix).collect();
     let start = start(&problem, &fixes, model)?;
@@ -51,7 +51,11 @@ pub fn solve_latency(
 }
 
 /// Tip and latency from the pixels of the bits, good to a pixel.
-fn start(problem: &Problem, seen: &[Fix], model: &ProjectorModel) -> Result<State, SensorError> {
+fn start(
+    problem: &SensorProblem,
+    seen: &[Fix],
+    model: &ProjectorModel,
+) -> Result<SensorUnknowns, SensorError> {
     let (state, px) = from_bits(problem, seen, *model)?;
     // Written so that no sighting at all, which is NaN, is refused too.
     if px <= MOST_START_PX {
@@ -60,19 +64,24 @@ fn start(problem: &Problem, seen: &[Fix], model: &ProjectorModel) -> Result<Stat
     Err(bound(problem, &state).unwrap_or(SensorError::OtherProjector { px }))
 }
 
-fn bound(problem: &Problem, state: &State) -> Option<SensorError> {
+fn bound(problem: &SensorProblem, state: &SensorUnknowns) -> Option<SensorError> {
     let is_at = state.latency_s.abs() > 0.9 * problem.limits.latency_s;
     is_at.then_some(SensorError::LatencyAtBound { ms: 1e3 * state.latency_s })
 }
 
 /// The median distance between where two states see the tip, pixels.
-fn apart<'a>(problem: &Problem, a: &State, b: &State, moments: impl Iterator<Item = &'a Moment>) -> f64 {
+fn apart<'a>(
+    problem: &SensorProblem,
+    a: &SensorUnknowns,
+    b: &SensorUnknowns,
+    moments: impl Iterator<Item = &'a Moment>,
+) -> f64 {
     let one = |at: &Moment| Some((problem.sight(a, at)?.pixel - problem.sight(b, at)?.pixel).length());
     percentile(moments.filter_map(one).collect(), 0.5)
 }
 
 pub(super) fn finish<M: Measured>(
-    problem: &Problem,
+    problem: &SensorProblem,
     fitted: &FitState,
     seen: &[M],
 ) -> Result<Latency, SensorError> {
@@ -94,7 +103,7 @@ pub(super) fn finish<M: Measured>(
     let before = problem.settings.tip;
     if (state.tip - before).abs().max_element() > MOST_TIP_SIGMAS * problem.tip_sigma {
         let moments = seen.iter().map(M::moment);
-        let px = apart(problem, state, &State { tip: before, ..*state }, moments);
+        let px = apart(problem, state, &SensorUnknowns { tip: before, ..*state }, moments);
         return Err(SensorError::OtherProjector { px });
     }
     let short = SensorError::TooFew { frames, need: 2 * frames, seconds: 5.0 };

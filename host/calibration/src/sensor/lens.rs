@@ -2,9 +2,9 @@
 //! the raster's border, the lens there is expected to be a usual one.
 
 use super::fit::{finish, refine, FitState, SensorError, Settings, Solution};
-use super::problem::{Fix, Measured, Problem, State};
+use super::problem::{Fix, Measured, SensorProblem, SensorUnknowns};
 use crate::model::ProjectorModel;
-use crate::projector::{check_terms, moved_px, predict, LensTerms, Refusal};
+use crate::projector::{check_terms, moved_px, predict, LensTerms, PointsRefusal};
 use glam::DVec2;
 
 /// A lens is open if the light in the raster's corners is uncertain by more than this share of the raster's width.
@@ -15,7 +15,7 @@ const MOST_OPEN: f64 = 0.01;
 /// # Errors
 /// Each reason of [`SensorError`].
 pub(super) fn finish_told<M: Measured>(
-    problem: &Problem,
+    problem: &SensorProblem,
     fitted: &FitState,
     (seen, fixes): (&[M], &[Fix]),
     stages: &[(f64, bool)],
@@ -39,9 +39,9 @@ pub(super) fn finish_told<M: Measured>(
 
 /// The same with a usual lens, if this puts the light where the solution does, within what that is uncertain by.
 fn usual<M: Measured>(
-    problem: &Problem,
+    problem: &SensorProblem,
     solution: &Solution,
-    begun: State,
+    begun: SensorUnknowns,
     (seen, fixes): (&[M], &[Fix]),
     stages: &[(f64, bool)],
 ) -> Option<Solution> {
@@ -56,12 +56,12 @@ fn usual<M: Measured>(
     Some(Solution { is_lens_open: true, ..usual })
 }
 
-fn check_folds(problem: &Problem, solution: &Solution) -> Result<(), SensorError> {
-    solution.model.camera(problem.raster).map(|_| ()).map_err(|_| Refusal::LensFolds.into())
+fn check_folds(problem: &SensorProblem, solution: &Solution) -> Result<(), SensorError> {
+    solution.model.camera(problem.raster).map(|_| ()).map_err(|_| PointsRefusal::LensFolds.into())
 }
 
 /// Whether the data leave the lens near the raster's border open: it folds there, or its light may be anywhere.
-fn is_open(problem: &Problem, solution: &Solution) -> bool {
+fn is_open(problem: &SensorProblem, solution: &Solution) -> bool {
     let Ok(camera) = solution.model.camera(problem.raster) else { return true };
     let size = DVec2::new(f64::from(problem.raster.width()), f64::from(problem.raster.height()));
     let volume = problem.settings.volume;
@@ -76,18 +76,21 @@ fn is_open(problem: &Problem, solution: &Solution) -> bool {
 }
 
 /// The problem with other settings.
-fn with<'a>(problem: &Problem<'a>, settings: &'a Settings) -> Problem<'a> {
-    Problem { limits: problem.limits, ..Problem::new(problem.raster, (problem.path, settings), false) }
+fn with<'a>(problem: &SensorProblem<'a>, settings: &'a Settings) -> SensorProblem<'a> {
+    SensorProblem {
+        limits: problem.limits,
+        ..SensorProblem::new(problem.raster, (problem.path, settings), false)
+    }
 }
 
 /// A fit that begins again without distortion.
 fn refit<M: Measured>(
-    problem: &Problem,
-    mut begun: State,
+    problem: &SensorProblem,
+    mut begun: SensorUnknowns,
     seen: &[M],
     stages: &[(f64, bool)],
 ) -> Result<FitState, SensorError> {
-    let pinhole = begun.model.pinhole(problem.raster).map_err(|_| Refusal::LensFolds)?;
+    let pinhole = begun.model.pinhole(problem.raster).map_err(|_| PointsRefusal::LensFolds)?;
     begun.model = ProjectorModel::from_camera(&pinhole, [0.0; 5], begun.model.origin);
     refine(problem, begun, seen, stages)
 }

@@ -10,7 +10,7 @@ use std::f64::consts::TAU;
 
 /// Consecutive samples of the sensor.
 #[derive(Clone, Debug, PartialEq)]
-pub struct Block {
+pub struct SampleBlock {
     /// Instant of the middle of the first sample by the sensor's clock.
     pub start_ns: i64,
     /// Distance of two samples by the sensor's clock.
@@ -19,7 +19,7 @@ pub struct Block {
     pub levels: Vec<f32>,
 }
 
-impl Block {
+impl SampleBlock {
     /// From a block of the serial protocol. `ticks_per_second` is that of the sensor's HELLO; levels of different gain
     /// settings are brought to one unit by `gain`. `None` for a clock that cannot be.
     pub fn from_wire(head: &BlockHead, levels: &[u16], ticks_per_second: u32, gain: f64) -> Option<Self> {
@@ -62,7 +62,7 @@ const LEAST_QUALITY: f64 = 0.5;
 
 /// Sums of a window: changes as a vector at their phase, their total, and the mean instant.
 #[derive(Clone, Copy, Default)]
-struct Window {
+struct LockWindow {
     cos: f64,
     sin: f64,
     total: f64,
@@ -70,7 +70,7 @@ struct Window {
 }
 
 /// Finds the borders. `plane_ns` is the length of a plane by the host's clock.
-pub(super) fn lock(blocks: &[Block], plane_ns: f64) -> Result<Lock, DecodeError> {
+pub(super) fn lock(blocks: &[SampleBlock], plane_ns: f64) -> Result<Lock, DecodeError> {
     let base_ns = blocks.iter().map(|b| b.start_ns).min().ok_or(DecodeError::NoSamples)?;
     let windows = windows(blocks, base_ns, plane_ns);
     let total: f64 = windows.iter().map(|w| w.total).sum();
@@ -121,10 +121,10 @@ pub(super) fn lock(blocks: &[Block], plane_ns: f64) -> Result<Lock, DecodeError>
     })
 }
 
-fn windows(blocks: &[Block], base_ns: i64, plane_ns: f64) -> Vec<Window> {
-    let mut windows: Vec<Window> = Vec::new();
-    let mut current = (-1.0, Window::default());
-    let close = |all: &mut Vec<Window>, mut w: Window| {
+fn windows(blocks: &[SampleBlock], base_ns: i64, plane_ns: f64) -> Vec<LockWindow> {
+    let mut windows: Vec<LockWindow> = Vec::new();
+    let mut current = (-1.0, LockWindow::default());
+    let close = |all: &mut Vec<LockWindow>, mut w: LockWindow| {
         if w.total > 0.0 {
             w.moment_ns /= w.total;
             all.push(w);
@@ -137,7 +137,7 @@ fn windows(blocks: &[Block], base_ns: i64, plane_ns: f64) -> Vec<Window> {
             let number = (at / WINDOW_NS).floor();
             if number != current.0 {
                 close(&mut windows, current.1);
-                current = (number, Window::default());
+                current = (number, LockWindow::default());
             }
             if !change.is_finite() {
                 continue;

@@ -20,14 +20,14 @@ mod stripes;
 
 pub use code::{Code, CodeError, Role, PLANES};
 pub use coverage::Coverage;
-pub use decode::{decode, DecodeError, Decoding, Frame};
+pub use decode::{decode, DecodeError, Decoding, SensorFrame};
 pub use fit::{solve, Brightness, SensorError, Settings, Solution};
 pub use inverse::{
     decode_pairs, places_rested, solve_latency_of_pairs, solve_pairs, DecodedPairs, FrameLight, InverseCode,
     Mapped, Pair, Stripe, FEWEST_PLACES,
 };
 pub use latency::{solve_latency, Latency};
-pub use lock::{Block, Lock};
+pub use lock::{Lock, SampleBlock};
 
 /// When the projector shows which frame, by the host's clock. All planes of a frame are equally long, and no pause
 /// divides frames.

@@ -62,8 +62,8 @@ pub(super) trait Measured {
     /// left out. Its equations are added to `all`.
     fn tally(
         &self,
-        problem: &Problem,
-        state: &State,
+        problem: &SensorProblem,
+        state: &SensorUnknowns,
         sigma: f64,
         finest: f64,
         all: Option<&mut Equations>,
@@ -85,7 +85,7 @@ pub(super) struct Tally {
 }
 
 #[derive(Clone, Copy, Debug)]
-pub(super) struct State {
+pub(super) struct SensorUnknowns {
     pub model: ProjectorModel,
     pub tip: DVec3,
     pub latency_s: f64,
@@ -94,7 +94,7 @@ pub(super) struct State {
     pub radius_m: f64,
 }
 
-impl State {
+impl SensorUnknowns {
     pub(super) fn step(&self, d: &[f64]) -> Self {
         Self {
             model: self.model.step(d),
@@ -119,16 +119,16 @@ pub(super) struct Sighting {
 
 /// What a latency may be.
 #[derive(Clone, Copy)]
-pub(super) struct Limits {
+pub(super) struct LatencyLimits {
     /// Beyond this an offset is no latency, seconds.
     pub latency_s: f64,
     /// Beyond this standard deviation the motion does not show it, microseconds.
     pub latency_sigma_us: f64,
 }
 
-pub(super) struct Problem<'a> {
+pub(super) struct SensorProblem<'a> {
     pub raster: Raster,
-    pub limits: Limits,
+    pub limits: LatencyLimits,
     pub path: &'a Trajectory,
     pub settings: &'a Settings,
     pub tip_sigma: f64,
@@ -136,8 +136,8 @@ pub(super) struct Problem<'a> {
     pub free: [bool; PARAMETERS],
 }
 
-impl Problem<'_> {
-    pub(super) fn sight(&self, s: &State, at: &Moment) -> Option<Sighting> {
+impl SensorProblem<'_> {
+    pub(super) fn sight(&self, s: &SensorUnknowns, at: &Moment) -> Option<Sighting> {
         let shift = 1e9 * (s.latency_s + s.drift * at.from_middle_s) + at.instant.1;
         let pose = self.path.at(at.instant.0.saturating_add(shift.floor() as i64), shift - shift.floor())?;
         let lever = pose.rotation * s.tip;
@@ -159,7 +159,7 @@ impl Problem<'_> {
         Some(Sighting { pixel: seen.pixel, velocity: moving, radius: s.radius_m * scale, rows })
     }
 
-    pub(super) fn expect(&self, s: &State, all: &mut Equations) {
+    pub(super) fn expect(&self, s: &SensorUnknowns, all: &mut Equations) {
         if self.free[0] {
             self.settings.priors.apply(&s.model, all);
         }
@@ -172,7 +172,7 @@ impl Problem<'_> {
     }
 
     /// The equations of what is expected alone.
-    pub(super) fn expected(&self, s: &State) -> Equations {
+    pub(super) fn expected(&self, s: &SensorUnknowns) -> Equations {
         let mut all = Equations::new(UNKNOWNS);
         self.expect(s, &mut all);
         all
@@ -185,7 +185,7 @@ impl Problem<'_> {
     }
 
     /// Equations from the pixels of the bits.
-    pub(super) fn of_bits(&self, s: &State, fixes: &[Fix], sigma_px: f64) -> Option<Equations> {
+    pub(super) fn of_bits(&self, s: &SensorUnknowns, fixes: &[Fix], sigma_px: f64) -> Option<Equations> {
         let mut all = Equations::new(UNKNOWNS);
         for seen in fixes {
             let Some(at) = self.sight(s, &seen.moment) else { continue };
@@ -199,7 +199,12 @@ impl Problem<'_> {
     }
 
     /// Equations from levels.
-    pub(super) fn of_levels<M: Measured>(&self, s: &State, all: &[M], how: (f64, f64)) -> Option<Equations> {
+    pub(super) fn of_levels<M: Measured>(
+        &self,
+        s: &SensorUnknowns,
+        all: &[M],
+        how: (f64, f64),
+    ) -> Option<Equations> {
         let mut equations = Equations::new(UNKNOWNS);
         for one in all {
             if let Some(tally) = one.tally(self, s, how.0, how.1, Some(&mut equations)) {
@@ -211,7 +216,7 @@ impl Problem<'_> {
     }
 
     /// Their cost alone.
-    pub(super) fn cost_of_levels<M: Measured>(&self, s: &State, all: &[M], how: (f64, f64)) -> f64 {
+    pub(super) fn cost_of_levels<M: Measured>(&self, s: &SensorUnknowns, all: &[M], how: (f64, f64)) -> f64 {
         let losses = all.iter().filter_map(|m| Some(m.tally(self, s, how.0, how.1, None)?.loss));
         losses.sum::<f64>() + self.expected(s).cost
     }
@@ -228,8 +233,8 @@ impl<M: Measured> Measured for &M {
 
     fn tally(
         &self,
-        problem: &Problem,
-        state: &State,
+        problem: &SensorProblem,
+        state: &SensorUnknowns,
         sigma: f64,
         finest: f64,
         all: Option<&mut Equations>,
@@ -249,8 +254,8 @@ impl Measured for FrameFix<'_> {
 
     fn tally(
         &self,
-        problem: &Problem,
-        state: &State,
+        problem: &SensorProblem,
+        state: &SensorUnknowns,
         sigma: f64,
         finest: f64,
         all: Option<&mut Equations>,

@@ -1,13 +1,13 @@
 //! Frames into a state from which the levels can be fitted: pixels from the bits, a pinhole, then tip and latency.
 
 use super::code::{Code, Role, PLANES};
-use super::decode::{Decoding, Frame};
+use super::decode::{Decoding, SensorFrame};
 use super::fit::{SensorError, Settings, MOST_LATENCY_S};
-use super::problem::{Fix, FrameFix, Moment, Planes, Problem, State};
+use super::problem::{Fix, FrameFix, Moment, Planes, SensorProblem, SensorUnknowns};
 use crate::least_squares::descend;
 use crate::model::ProjectorModel;
 use crate::pinhole::{calibrate, CalibrationError, CalibrationOptions, Pair};
-use crate::projector::{look_for_motion, percentile, spread_of, Options, Refusal, Sight};
+use crate::projector::{look_for_motion, percentile, spread_of, Options, PointsRefusal, Sight};
 use crate::trajectory::Trajectory;
 use dpm_device::planes::Raster;
 use glam::{DVec2, DVec3};
@@ -24,7 +24,7 @@ pub(super) fn prepare<'a>(
 ) -> Vec<FrameFix<'a>> {
     let Some((first, last)) = path.span_ns() else { return Vec::new() };
     let middle_ns = first / 2 + last / 2;
-    let seen = |frame: &Frame| {
+    let seen = |frame: &SensorFrame| {
         let instant = settings.timing.instant(frame.number, (PLANES / 2) as f64);
         let levels = over_contrast(frame);
         let pixel = pixel_of_bits(planes.code, &levels);
@@ -53,7 +53,7 @@ pub(super) fn is_inside(raster: Raster, pixel: DVec2) -> bool {
 }
 
 /// Levels of the planes, 0 for darkness and 1 for full light.
-fn over_contrast(frame: &Frame) -> [f64; PLANES] {
+fn over_contrast(frame: &SensorFrame) -> [f64; PLANES] {
     std::array::from_fn(|plane| {
         let (off, on) = frame.references(plane);
         (f64::from(frame.levels[plane]) - off) / (on - off)
@@ -61,7 +61,7 @@ fn over_contrast(frame: &Frame) -> [f64; PLANES] {
 }
 
 /// The pixel that the bits of a frame name, good to a few.
-pub(super) fn pixel_of(code: &Code, frame: &Frame) -> DVec2 {
+pub(super) fn pixel_of(code: &Code, frame: &SensorFrame) -> DVec2 {
     pixel_of_bits(code, &over_contrast(frame))
 }
 
@@ -88,7 +88,7 @@ pub(super) fn thin<T>(seen: &[T], most: usize) -> impl Iterator<Item = &T> {
 }
 
 /// Points of the wand and the pixels of their bits, for poses that are stamped `offset_ns` later than the light.
-fn sights(problem: &Problem, seen: &[Fix], most: usize, offset_ns: i64) -> Vec<Sight> {
+fn sights(problem: &SensorProblem, seen: &[Fix], most: usize, offset_ns: i64) -> Vec<Sight> {
     let place = |s: &Fix| {
         let pose = problem.path.at(s.moment.instant.0.saturating_add(offset_ns), 0.0)?;
         Some(pose.position + pose.rotation * problem.settings.tip)
@@ -101,12 +101,12 @@ fn pairs(sights: &[Sight]) -> Vec<Pair> {
 }
 
 /// A pinhole from the pixels of the bits, with the tip of the pivot and no latency.
-fn pinhole(problem: &Problem, seen: &[Fix]) -> Result<ProjectorModel, SensorError> {
+fn pinhole(problem: &SensorProblem, seen: &[Fix]) -> Result<ProjectorModel, SensorError> {
     let raster = problem.raster;
     let sights = sights(problem, seen, 120, 0);
     let [_, second, third] = spread_of(&sights);
     if third < 0.05 * second {
-        return Err(Refusal::Planar { off_plane_mm: 1e3 * third }.into());
+        return Err(PointsRefusal::Planar { off_plane_mm: 1e3 * third }.into());
     }
     let pairs = pairs(&sights);
     // A latency of 8 ms is a dozen pixels at a metre a second.
@@ -121,19 +121,19 @@ fn pinhole(problem: &Problem, seen: &[Fix]) -> Result<ProjectorModel, SensorErro
 }
 
 /// Why pairs have no consensus: a mirror, a motion between them, or clocks that are far apart.
-fn why_no_pinhole(problem: &Problem, seen: &[Fix], pairs: &[Pair], e: CalibrationError) -> SensorError {
+fn why_no_pinhole(problem: &SensorProblem, seen: &[Fix], pairs: &[Pair], e: CalibrationError) -> SensorError {
     let raster = problem.raster;
     let options = CalibrationOptions { inlier_px: Some(0.03 * f64::from(raster.width())), seed: 1 };
     let mirrored: Vec<Pair> =
         pairs.iter().map(|p| Pair { world: p.world * DVec3::new(-1.0, 1.0, 1.0), ..*p }).collect();
     if e == CalibrationError::Mirrored || calibrate(raster, &mirrored, &options).is_ok() {
-        return Refusal::Mirrored.into();
+        return PointsRefusal::Mirrored.into();
     }
-    late(problem, seen).unwrap_or_else(|| Refusal::from(e).into())
+    late(problem, seen).unwrap_or_else(|| PointsRefusal::from(e).into())
 }
 
 /// Whether poses that are some tens of milliseconds off, up to a second, explain the data.
-fn late(problem: &Problem, seen: &[Fix]) -> Option<SensorError> {
+fn late(problem: &SensorProblem, seen: &[Fix]) -> Option<SensorError> {
     let raster = problem.raster;
     let all = CalibrationOptions { inlier_px: None, seed: 1 };
     let rms = |ms: i64| {
@@ -149,7 +149,12 @@ fn late(problem: &Problem, seen: &[Fix]) -> Option<SensorError> {
 }
 
 /// Why levels do not fit: something moved during the sweep, or a reason that is not known.
-pub(super) fn why_no_fit(problem: &Problem, seen: &[Fix], state: &State, px: f64) -> SensorError {
+pub(super) fn why_no_fit(
+    problem: &SensorProblem,
+    seen: &[Fix],
+    state: &SensorUnknowns,
+    px: f64,
+) -> SensorError {
     let sights = sights(problem, seen, 80, (1e9 * state.latency_s) as i64);
     let raster = problem.raster;
     let options = Options { aim_px: 1.0, ..Options::by_hand(raster) };
@@ -160,7 +165,7 @@ pub(super) fn why_no_fit(problem: &Problem, seen: &[Fix], state: &State, px: f64
 }
 
 /// A state that is good to a pixel: from the pixels of the bits, with tip and latency free.
-pub(super) fn start(problem: &Problem, seen: &[Fix]) -> Result<State, SensorError> {
+pub(super) fn start(problem: &SensorProblem, seen: &[Fix]) -> Result<SensorUnknowns, SensorError> {
     let (state, px) = from_bits(problem, seen, pinhole(problem, seen)?)?;
     if px > MOST_START_PX {
         return Err(why_no_fit(problem, seen, &state, px));
@@ -176,26 +181,26 @@ pub(super) const MOST_START_PX: f64 = 6.0;
 /// Fits the pixels of the bits from a model, the tip of the pivot and no latency. Gives the state and the median distance
 /// that is left, pixels.
 pub(super) fn from_bits(
-    problem: &Problem,
+    problem: &SensorProblem,
     seen: &[Fix],
     model: ProjectorModel,
-) -> Result<(State, f64), SensorError> {
+) -> Result<(SensorUnknowns, f64), SensorError> {
     let settings = problem.settings;
     let radius_m = 0.5 * settings.aperture_m;
-    let mut state = State { model, tip: settings.tip, latency_s: 0.0, drift: 0.0, radius_m };
+    let mut state = SensorUnknowns { model, tip: settings.tip, latency_s: 0.0, drift: 0.0, radius_m };
     let few: Vec<Fix> = thin(seen, FEW).copied().collect();
     for sigma_px in [6.0, 1.5] {
-        let equations = |s: &State| problem.of_bits(s, &few, sigma_px);
-        let cost = |s: &State| equations(s).map_or(f64::INFINITY, |e| e.cost);
-        let found = descend(state, 40, equations, cost, |s: &State, d: &[f64]| s.step(d));
-        state = found.ok_or(Refusal::NotConverged { rms_px: f64::INFINITY })?.state;
+        let equations = |s: &SensorUnknowns| problem.of_bits(s, &few, sigma_px);
+        let cost = |s: &SensorUnknowns| equations(s).map_or(f64::INFINITY, |e| e.cost);
+        let found = descend(state, 40, equations, cost, |s: &SensorUnknowns, d: &[f64]| s.step(d));
+        state = found.ok_or(PointsRefusal::NotConverged { rms_px: f64::INFINITY })?.state;
     }
     let px = miss(problem, &state, &few);
     Ok((state, px))
 }
 
 /// The median distance between the pixels of the bits and where a state sees them.
-pub(super) fn miss(problem: &Problem, state: &State, seen: &[Fix]) -> f64 {
+pub(super) fn miss(problem: &SensorProblem, state: &SensorUnknowns, seen: &[Fix]) -> f64 {
     let one = |s: &Fix| problem.sight(state, &s.moment).map(|at| (at.pixel - s.pixel).length());
     percentile(seen.iter().filter_map(one).collect(), 0.5)
 }

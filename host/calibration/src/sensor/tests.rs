@@ -59,9 +59,9 @@ fn samples_that_show_no_code_are_refused_by_name() {
     let code = code(1024, 768);
     let timing = Timing { frame_zero_ns: 0, frame_ns: 1_056_000.0 };
     let block = |level: &dyn Fn(usize) -> f32| {
-        [Block { start_ns: 0, interval_ns: 1e4, levels: (0..300_000).map(level).collect() }]
+        [SampleBlock { start_ns: 0, interval_ns: 1e4, levels: (0..300_000).map(level).collect() }]
     };
-    let get = |blocks: &[Block]| decode(&code, &timing, blocks, 0, &|slot| slot).unwrap_err();
+    let get = |blocks: &[SampleBlock]| decode(&code, &timing, blocks, 0, &|slot| slot).unwrap_err();
     assert_eq!(get(&[]), DecodeError::NoSamples);
     assert_eq!(get(&block(&|_| 0.7)), DecodeError::NoLight);
     assert_eq!(get(&block(&|i| if i == 9 { f32::NAN } else { 0.0 })), DecodeError::NotFinite(0));
@@ -71,11 +71,11 @@ fn samples_that_show_no_code_are_refused_by_name() {
     // Light that goes on and off with the planes, but carries no code.
     let blink = get(&block(&|i| f32::from(u8::from(((i as f64 * 1e4 / 44_000.0) as u64).is_multiple_of(2)))));
     assert!(matches!(blink, DecodeError::NoFrames { .. }), "{blink}");
-    let slow = [Block { start_ns: 0, interval_ns: 4e4, levels: vec![0.0; 1000] }];
+    let slow = [SampleBlock { start_ns: 0, interval_ns: 4e4, levels: vec![0.0; 1000] }];
     assert!(matches!(get(&slow), DecodeError::TooSlow { .. }));
     let bad = [
-        Block { start_ns: i64::MIN, interval_ns: 1e4, levels: vec![0.0, 1.0] },
-        Block { start_ns: i64::MAX, interval_ns: 1e4, levels: vec![0.0, 1.0, 0.0] },
+        SampleBlock { start_ns: i64::MIN, interval_ns: 1e4, levels: vec![0.0, 1.0] },
+        SampleBlock { start_ns: i64::MAX, interval_ns: 1e4, levels: vec![0.0, 1.0, 0.0] },
     ];
     decode(&code, &timing, &bad, 0, &|slot| slot).unwrap_err();
 }
@@ -92,12 +92,12 @@ fn a_block_of_the_wire_keeps_its_instants_and_its_unit() {
         cut_below: false,
         cut_above: false,
     };
-    let block = Block::from_wire(&head, &[0, 100, 4095], 48_000_000, 2.0).unwrap();
+    let block = SampleBlock::from_wire(&head, &[0, 100, 4095], 48_000_000, 2.0).unwrap();
     assert_eq!((block.start_ns, block.levels.as_slice()), (3_600_000_000_000, &[0.0f32, 50.0, 2047.5][..]));
     let (ticks, rest) = head.ticks_of(2);
     let ns = (ticks as f64 + f64::from(rest) / f64::from(PERIOD_ONE)) / 48e6 * 1e9;
     assert!((block.at(2, 0) - ns).abs() < 1e-3);
-    assert!(Block::from_wire(&head, &[1], 0, 1.0).is_none());
-    assert!(Block::from_wire(&head, &[1], 48_000_000, 0.0).is_none());
-    assert!(Block::from_wire(&BlockHead { first: u64::MAX, ..head }, &[1], 1, 1.0).is_none());
+    assert!(SampleBlock::from_wire(&head, &[1], 0, 1.0).is_none());
+    assert!(SampleBlock::from_wire(&head, &[1], 48_000_000, 0.0).is_none());
+    assert!(SampleBlock::from_wire(&BlockHead { first: u64::MAX, ..head }, &[1], 1, 1.0).is_none());
 }

@@ -22,15 +22,15 @@ const STEPS: usize = 6;
 
 /// What is solved for.
 #[derive(Clone, Debug)]
-pub(super) struct State {
+pub(super) struct ViewUnknowns {
     pub model: ProjectorModel,
     /// By how far each body lies from where it was seen: shift and turn.
     pub bodies: Vec<[f64; POSE]>,
 }
 
 /// Where least squares ended.
-pub(super) struct Fit {
-    pub state: State,
+pub(super) struct SolvedView {
+    pub state: ViewUnknowns,
     /// By the residuals, in the order of the unknowns.
     pub covariance: Vec<Vec<f64>>,
     pub rms_px: f64,
@@ -44,7 +44,7 @@ struct End {
     by_body: Option<(usize, [DVec3; POSE])>,
 }
 
-impl State {
+impl ViewUnknowns {
     /// Where a ray ends: on its plane, or nearest to what its pixel lights.
     pub(super) fn end(&self, view: &CodedView, ray: &CodedRay) -> Option<DVec3> {
         self.ended(view, ray, false).map(|e| e.point)
@@ -143,7 +143,7 @@ impl State {
 }
 
 /// What does not change while it is solved.
-struct Problem<'a> {
+struct ViewProblem<'a> {
     view: &'a CodedView,
     priors: &'a Priors,
     /// The inverse of each body's covariance.
@@ -152,8 +152,8 @@ struct Problem<'a> {
     lost: f64,
 }
 
-impl Problem<'_> {
-    fn equations(&self, state: &State, with_slopes: bool) -> Option<Equations> {
+impl ViewProblem<'_> {
+    fn equations(&self, state: &ViewUnknowns, with_slopes: bool) -> Option<Equations> {
         let n = state.unknowns();
         let free = self.priors.free();
         let mut all = Equations::new(n);
@@ -195,7 +195,7 @@ impl Problem<'_> {
     }
 
     /// What is expected of lens and bodies.
-    fn expect(&self, state: &State, all: &mut Equations) {
+    fn expect(&self, state: &ViewUnknowns, all: &mut Equations) {
         self.priors.apply(&state.model, all);
         let held = self.priors.free().into_iter().enumerate().filter(|(_, free)| !*free);
         held.for_each(|(i, _)| all.expect(i, 0.0, 1.0));
@@ -239,22 +239,22 @@ impl<'a> Solver<'a> {
         Some(Self { view, some, priors, weights: weights?, lost: huber(40.0, KNEE).1 })
     }
 
-    fn problem<'b>(&'b self, view: &'b CodedView) -> Problem<'b> {
-        Problem { view, priors: self.priors, weights: &self.weights, lost: self.lost }
+    fn problem<'b>(&'b self, view: &'b CodedView) -> ViewProblem<'b> {
+        ViewProblem { view, priors: self.priors, weights: &self.weights, lost: self.lost }
     }
 
     /// Where a start leads by a part of the rays, and the cost there; `None` if it leads nowhere.
-    pub(super) fn near(&self, start: State) -> Option<(f64, State)> {
+    pub(super) fn near(&self, start: ViewUnknowns) -> Option<(f64, ViewUnknowns)> {
         let found = descended(&self.problem(&self.some), start, 60)?;
         let cost = found.equations.cost;
         (cost < 0.3 * self.lost * self.some.rays.len() as f64).then_some((cost, found.state))
     }
 
     /// Fits, leaves out what is far off, and fits again.
-    pub(super) fn fit(&self, near: State) -> Option<Fit> {
+    pub(super) fn fit(&self, near: ViewUnknowns) -> Option<SolvedView> {
         let view = self.view;
         let first = descended(&self.problem(view), near, 40)?;
-        let off = |state: &State, ray: &CodedRay| {
+        let off = |state: &ViewUnknowns, ray: &CodedRay| {
             let end = state.ended(view, ray, false)?;
             state.residual(view, ray, &end).map(DVec2::length)
         };
@@ -268,12 +268,12 @@ impl<'a> Solver<'a> {
     }
 }
 
-fn descended(problem: &Problem<'_>, start: State, steps: usize) -> Option<Descent<State>> {
-    let cost = |s: &State| problem.equations(s, false).map_or(f64::INFINITY, |e| e.cost);
+fn descended(problem: &ViewProblem<'_>, start: ViewUnknowns, steps: usize) -> Option<Descent<ViewUnknowns>> {
+    let cost = |s: &ViewUnknowns| problem.equations(s, false).map_or(f64::INFINITY, |e| e.cost);
     descend(start, steps, |s| problem.equations(s, true), cost, |s, d| s.step(d))
 }
 
-fn finish(state: State, converged: bool, problem: &Problem<'_>) -> Option<Fit> {
+fn finish(state: ViewUnknowns, converged: bool, problem: &ViewProblem<'_>) -> Option<SolvedView> {
     let view = problem.view;
     let equations = problem.equations(&state, true)?;
     let matrix = equations.matrix();
@@ -297,14 +297,14 @@ fn finish(state: State, converged: bool, problem: &Problem<'_>) -> Option<Fit> {
         .enumerate()
         .map(|(i, row)| row.iter().enumerate().map(|(j, v)| held(i, j, *v)).collect())
         .collect();
-    Some(Fit { state, covariance, rms_px: (px / f64::max(count, 1.0)).sqrt(), converged })
+    Some(SolvedView { state, covariance, rms_px: (px / f64::max(count, 1.0)).sqrt(), converged })
 }
 
 /// The inverse of the equations with the rays' part divided by how much larger residuals are than expected. What is
 /// expected of lens and bodies does not depend on them.
 fn covariance(
-    problem: &Problem<'_>,
-    state: &State,
+    problem: &ViewProblem<'_>,
+    state: &ViewUnknowns,
     matrix: &[Vec<f64>],
     inflate: f64,
 ) -> Option<Vec<Vec<f64>>> {

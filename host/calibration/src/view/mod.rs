@@ -24,7 +24,7 @@ use crate::projector::{percentile, predict_share, Priors};
 use dpm_calibration_file::LightError;
 use dpm_device::planes::Raster;
 use dpm_scene::geometry::projector::ProjectorCamera;
-use fit::State;
+use fit::ViewUnknowns;
 use glam::{DAffine3, DVec2, DVec3};
 
 /// A pixel of the camera and what lights it.
@@ -128,8 +128,8 @@ pub fn solve(raster: Raster, view: &CodedView) -> Result<ViewFit, ViewRefusal> {
     judge(raster, view, found)
 }
 
-fn judge(raster: Raster, view: &CodedView, found: fit::Fit) -> Result<ViewFit, ViewRefusal> {
-    let State { model, .. } = &found.state;
+fn judge(raster: Raster, view: &CodedView, found: fit::SolvedView) -> Result<ViewFit, ViewRefusal> {
+    let ViewUnknowns { model, .. } = &found.state;
     let points: Vec<DVec3> = view.rays.iter().filter_map(|r| found.state.end(view, r)).collect();
     let Ok(camera) = model.camera(raster) else { return Err(ViewRefusal::LensFolds) };
     let covariance: Vec<Vec<f64>> =

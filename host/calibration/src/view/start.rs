@@ -1,6 +1,6 @@
 //! Where least squares begin: the printed plane that is lit most gives the pose for each of some focal lengths and axes.
 
-use super::fit::State;
+use super::fit::ViewUnknowns;
 use super::{CodedRay, CodedView};
 use crate::board::{pose_of_plane, BoardPoint};
 use dpm_device::planes::Raster;
@@ -11,7 +11,7 @@ const FOCALS: [f64; 6] = [0.5, 0.8, 1.2, 1.7, 2.5, 4.0];
 const CENTRES: [f64; 3] = [0.5, 1.0, 0.0];
 
 /// The starts, none if no plane shows four rays.
-pub(super) fn starts(raster: Raster, view: &CodedView) -> Vec<State> {
+pub(super) fn starts(raster: Raster, view: &CodedView) -> Vec<ViewUnknowns> {
     let count = |plane: usize| view.rays.iter().filter(|r| r.plane == Some(plane)).count();
     let Some(plane) = (0..view.planes.len()).max_by_key(|p| count(*p)) else { return Vec::new() };
     let world_from_plane = place(view, plane);
@@ -36,7 +36,7 @@ pub(super) fn starts(raster: Raster, view: &CodedView) -> Vec<State> {
             let mut model = about;
             model.rotation = about.rotation * world.transpose();
             model.origin = world_from_plane.translation;
-            Some(State { model, bodies: bodies.clone() })
+            Some(ViewUnknowns { model, bodies: bodies.clone() })
         })
         .collect()
 }

@@ -5,7 +5,7 @@ use dpm_common::so3::so3_exp;
 use dpm_device::rng::Draws;
 use glam::{DMat3, DQuat};
 
-struct Scene {
+struct ViewScene {
     raster: Raster,
     truth: ProjectorModel,
     view: CodedView,
@@ -22,7 +22,7 @@ struct Setup {
 const USUAL: Setup = Setup { noise_px: 0.1, is_flat: false, tags: true };
 
 /// The wall is z = 0; the camera stands about the origin's front.
-fn drawn(draws: Draws, setup: Setup) -> Scene {
+fn drawn(draws: Draws, setup: Setup) -> ViewScene {
     let aside = |i: u64| 2.0 * draws.unit(i) - 1.0;
     let (w, h) = [(1024, 768), (1920, 1080), (1280, 800)][(draws.bits(0) % 3) as usize];
     let raster = Raster::new(w, h).unwrap();
@@ -109,10 +109,10 @@ fn drawn(draws: Draws, setup: Setup) -> Scene {
     }
     let bodies = vec![KnownBody { world_from_body: seen, covariance }];
     let planes = vec![KnownPlane { body: 0, body_from_plane: DAffine3::IDENTITY }];
-    Scene { raster, truth, view: CodedView { eye, rays, bodies, planes } }
+    ViewScene { raster, truth, view: CodedView { eye, rays, bodies, planes } }
 }
 
-impl Scene {
+impl ViewScene {
     /// The error of the light all over the raster, 1.4 to 2.2 m away: 99th percentile, pixels.
     fn error_px(&self, fit: &ViewFit) -> f64 {
         let truth = self.truth.camera(self.raster).unwrap();

@@ -1,24 +1,24 @@
 //! The lens of a device: which model its file names, and the coefficients in OpenCV's order.
 
-use super::super::entries::{joined, Entries, Entry};
+use super::super::entries::{joined, Entries, FileEntry};
 use super::super::foreign::{model, refused_model, OMNIDIRECTIONAL};
 use super::super::names::{meaning, plain, Role};
 use super::super::{LensKind, StorageError};
-use super::{contradiction, Device, NamedEntry, Parts, UseNotes};
+use super::{contradiction, Device, DeviceParts, NamedEntry, UseNotes};
 use dpm_scene::geometry::lens::Lens;
 
 /// Whether a coefficient of the lens is other than 0.
-fn bends(parts: &Parts) -> bool {
-    let of = |k: &NamedEntry| matches!(k.entry, Entry::Matrix(m) if m.data.iter().any(|v| *v != 0.0));
+fn bends(parts: &DeviceParts) -> bool {
+    let of = |k: &NamedEntry| matches!(k.entry, FileEntry::Matrix(m) if m.data.iter().any(|v| *v != 0.0));
     parts.own(Role::Distortion).any(of)
 }
 
 /// Refuses a lens that needs more than OpenCV's models have.
-pub(super) fn check_mirror(parts: &Parts) -> Result<(), StorageError> {
+pub(super) fn check_mirror(parts: &DeviceParts) -> Result<(), StorageError> {
     for k in parts.own(Role::Mirror) {
         let xi = match k.entry {
-            Entry::Number(xi) => *xi,
-            Entry::Matrix(m) => m.data.first().copied().unwrap_or(0.0),
+            FileEntry::Number(xi) => *xi,
+            FileEntry::Matrix(m) => m.data.first().copied().unwrap_or(0.0),
             _ => 0.0,
         };
         if xi != 0.0 {
@@ -36,7 +36,7 @@ pub(super) fn check_mirror(parts: &Parts) -> Result<(), StorageError> {
 }
 
 /// Whether the file says that its lens is a fisheye's; `None` if it says nothing.
-fn says_fisheye(parts: &Parts, used: &mut UseNotes) -> Result<Option<(String, bool)>, StorageError> {
+fn says_fisheye(parts: &DeviceParts, used: &mut UseNotes) -> Result<Option<(String, bool)>, StorageError> {
     let mut said: Option<(String, bool)> = None;
     for k in parts.with(Role::LensModel) {
         let name = plain(k.name);
@@ -55,8 +55,8 @@ fn says_fisheye(parts: &Parts, used: &mut UseNotes) -> Result<Option<(String, bo
             NAMES.get(code as usize).filter(|_| code >= 0.0).map(|word| word.to_string())
         };
         let word = match k.entry {
-            Entry::Number(code) if is_vague => of_realsense(*code),
-            Entry::Text(word) => Some(word.to_ascii_lowercase().replace("distortion.", "")),
+            FileEntry::Number(code) if is_vague => of_realsense(*code),
+            FileEntry::Text(word) => Some(word.to_ascii_lowercase().replace("distortion.", "")),
             _ => None,
         };
         let lens = word.as_deref().and_then(|word| Some((word, model(word)?)));
@@ -64,7 +64,7 @@ fn says_fisheye(parts: &Parts, used: &mut UseNotes) -> Result<Option<(String, bo
             return Err(refused_model(&k.path(), word, what));
         }
         let fisheye = match (k.entry, word.as_deref()) {
-            (Entry::Number(flag), None) if !is_vague => Some(*flag != 0.0),
+            (FileEntry::Number(flag), None) if !is_vague => Some(*flag != 0.0),
             (_, Some(word)) => match word {
                 "fisheye" | "equidistant" | "equi" | "kannala_brandt" | "kannalabrandt8" | "kannala brandt4" | "kb4"
                 | "true" => Some(true),
@@ -113,9 +113,9 @@ pub(super) fn check_unused_lens(
     let sections = all.sections.iter().filter(|(section, _)| devices.len() == 1 && is_lens(section));
     for (section, inside) in sections {
         let is_used = inside.keys().any(|name| used.paths.contains(&joined(section, name)));
-        let bends = |entry: &Entry| match entry {
-            Entry::Number(v) => *v != 0.0,
-            Entry::Matrix(m) => m.data.iter().any(|v| *v != 0.0),
+        let bends = |entry: &FileEntry| match entry {
+            FileEntry::Number(v) => *v != 0.0,
+            FileEntry::Matrix(m) => m.data.iter().any(|v| *v != 0.0),
             _ => false,
         };
         if let Some((name, _)) = inside.iter().find(|(_, entry)| !is_used && bends(entry)) {
@@ -127,7 +127,11 @@ pub(super) fn check_unused_lens(
 }
 
 /// Whether the lens is a fisheye's, by the rig file and by the file itself.
-pub(super) fn is_fisheye(parts: &Parts, kind: LensKind, used: &mut UseNotes) -> Result<bool, StorageError> {
+pub(super) fn is_fisheye(
+    parts: &DeviceParts,
+    kind: LensKind,
+    used: &mut UseNotes,
+) -> Result<bool, StorageError> {
     Ok(match (kind, says_fisheye(parts, used)?) {
         (LensKind::Fisheye, Some((name, false))) => {
             let what =
@@ -140,12 +144,12 @@ pub(super) fn is_fisheye(parts: &Parts, kind: LensKind, used: &mut UseNotes) -> 
 }
 
 /// The lens, by the coefficients in OpenCV's order.
-pub(super) fn lens(parts: &Parts, fisheye: bool, used: &mut UseNotes) -> Result<Lens, StorageError> {
+pub(super) fn lens(parts: &DeviceParts, fisheye: bool, used: &mut UseNotes) -> Result<Lens, StorageError> {
     let mut first: Option<(String, Vec<f64>)> = None;
     let mut from: Option<&NamedEntry> = None;
     for k in parts.own(Role::Distortion) {
         let data = match k.entry {
-            Entry::Number(_) => continue,
+            FileEntry::Number(_) => continue,
             _ => &k.matrix()?.data,
         };
         match (&first, from) {

@@ -33,7 +33,7 @@ macro_rules! section {
 
             fn read_keys(
                 table: &std::collections::BTreeMap<String, $crate::keys::source::Entry>,
-                reader: &mut $crate::keys::read::Reader,
+                reader: &mut $crate::keys::read::KeyReader,
                 section: &str,
             ) -> Self {
                 #[allow(unused_imports)]
@@ -93,8 +93,8 @@ macro_rules! section {
                 "a table".into()
             }
             fn read(
-                node: &$crate::keys::source::Node,
-                reader: &mut $crate::keys::read::Reader,
+                node: &$crate::keys::source::SourceNode,
+                reader: &mut $crate::keys::read::KeyReader,
                 key: &str,
             ) -> Option<Self> {
                 let table = reader.table(node, key)?;
@@ -135,8 +135,8 @@ macro_rules! words {
                 [$( concat!("\"", $word, "\"") ),+].join(" | ")
             }
             fn read(
-                node: &$crate::keys::source::Node,
-                reader: &mut $crate::keys::read::Reader,
+                node: &$crate::keys::source::SourceNode,
+                reader: &mut $crate::keys::read::KeyReader,
                 key: &str,
             ) -> Option<Self> {
                 match &node.value {
@@ -194,8 +194,8 @@ macro_rules! kinds {
                 "a table".into()
             }
             fn read(
-                node: &$crate::keys::source::Node,
-                reader: &mut $crate::keys::read::Reader,
+                node: &$crate::keys::source::SourceNode,
+                reader: &mut $crate::keys::read::KeyReader,
                 key: &str,
             ) -> Option<Self> {
                 use $crate::keys::rows::{read_kind, Section};

@@ -1,14 +1,14 @@
 //! A frame rate as the value of a key: a whole number, or a fraction in quotes.
 
-use super::read::{ConfigValue, Limit, Reader, Within};
-use super::source::{Node, Value};
+use super::read::{ConfigValue, KeyReader, Limit, Within};
+use super::source::{SourceNode, Value};
 use dpm_device::time::FrameRate;
 
 /// A bound on [`FrameRate`]: numerator and denominator.
 #[derive(Clone, Copy)]
-pub struct Rate(pub u32, pub u32);
+pub struct RateBound(pub u32, pub u32);
 
-impl Limit<FrameRate> for Within<Rate> {
+impl Limit<FrameRate> for Within<RateBound> {
     fn allows(&self, rate: &FrameRate) -> bool {
         let at_least =
             |a: (u32, u32), b: (u32, u32)| u64::from(a.0) * u64::from(b.1) >= u64::from(b.0) * u64::from(a.1);
@@ -25,7 +25,7 @@ impl ConfigValue for FrameRate {
         "a whole number or a fraction in quotes".into()
     }
 
-    fn read(node: &Node, reader: &mut Reader, key: &str) -> Option<Self> {
+    fn read(node: &SourceNode, reader: &mut KeyReader, key: &str) -> Option<Self> {
         let parsed = match &node.value {
             Value::Integer(i) => u32::try_from(*i).ok().and_then(|n| FrameRate::new(n, 1)),
             Value::String(s) => {

@@ -12,4 +12,4 @@ pub mod rows;
 pub mod source;
 
 pub use error::{ConfigError, ConfigErrors, Origin};
-pub use frame_rate::Rate;
+pub use frame_rate::RateBound;

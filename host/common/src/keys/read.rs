@@ -4,20 +4,20 @@
 //! Errors are collected, so that one run reports everything that is wrong with a file.
 
 use super::error::{ConfigError, Origin};
-use super::source::{Entry, Node, Value};
+use super::source::{Entry, SourceNode, Value};
 use std::collections::BTreeMap;
 use std::fmt::Display;
 use std::path::PathBuf;
 
 /// Collects errors and remembers where every key was written.
 #[derive(Debug, Default)]
-pub struct Reader {
+pub struct KeyReader {
     /// What is wrong so far.
     pub errors: Vec<ConfigError>,
     written: BTreeMap<String, Origin>,
 }
 
-impl Reader {
+impl KeyReader {
     /// Adds an error about `key`, written at `origin`.
     pub fn refuse(
         &mut self,
@@ -59,7 +59,7 @@ impl Reader {
     }
 
     /// The entries of a table, or an error and `None`.
-    pub fn table<'n>(&mut self, node: &'n Node, key: &str) -> Option<&'n BTreeMap<String, Entry>> {
+    pub fn table<'n>(&mut self, node: &'n SourceNode, key: &str) -> Option<&'n BTreeMap<String, Entry>> {
         match &node.value {
             Value::Table(table) => Some(table),
             other => {
@@ -87,7 +87,7 @@ impl Reader {
 /// Refuses several keys that contradict each other, at the first of them that was written. The message names all of
 /// them with their values, so that nobody must guess which other key is involved. `problem` itself names the keys
 /// with an empty value.
-pub fn contradict(reader: &mut Reader, keys: &[(&str, String)], problem: &str, remedy: String) {
+pub fn contradict(reader: &mut KeyReader, keys: &[(&str, String)], problem: &str, remedy: String) {
     let at = keys.iter().position(|(key, _)| reader.is_written(key)).unwrap_or(0);
     let (key, value) = &keys[at];
     let others = keys.iter().enumerate().filter(|(i, _)| *i != at);
@@ -102,7 +102,7 @@ pub fn shown(value: impl ConfigValue) -> String {
 }
 
 /// Refuses at the first of `keys` that was written.
-pub fn refuse(reader: &mut Reader, keys: &[&str], problem: String, remedy: String) {
+pub fn refuse(reader: &mut KeyReader, keys: &[&str], problem: String, remedy: String) {
     let key = keys.iter().find(|k| reader.is_written(k)).unwrap_or(&keys[0]);
     let origin = reader.origin_of(key);
     reader.refuse(&origin, key, problem, remedy);
@@ -161,7 +161,7 @@ pub trait ConfigValue: Sized {
     /// The type as text.
     fn kind() -> String;
     /// Reads a value. On failure adds errors and returns `None`.
-    fn read(node: &Node, reader: &mut Reader, key: &str) -> Option<Self>;
+    fn read(node: &SourceNode, reader: &mut KeyReader, key: &str) -> Option<Self>;
     /// The value as written in the file.
     fn show(&self) -> String;
     /// Keys below this one, for tables.
@@ -260,7 +260,7 @@ where
     }
 }
 
-fn wrong_kind<T: ConfigValue>(node: &Node, reader: &mut Reader, key: &str) -> Option<T> {
+fn wrong_kind<T: ConfigValue>(node: &SourceNode, reader: &mut KeyReader, key: &str) -> Option<T> {
     reader.refuse(
         &node.origin,
         key,
@@ -290,7 +290,7 @@ impl ConfigValue for bool {
     fn kind() -> String {
         "a boolean".into()
     }
-    fn read(node: &Node, reader: &mut Reader, key: &str) -> Option<Self> {
+    fn read(node: &SourceNode, reader: &mut KeyReader, key: &str) -> Option<Self> {
         match node.value {
             Value::Bool(b) => Some(b),
             _ => wrong_kind(node, reader, key),
@@ -305,7 +305,7 @@ impl ConfigValue for f64 {
     fn kind() -> String {
         "a number".into()
     }
-    fn read(node: &Node, reader: &mut Reader, key: &str) -> Option<Self> {
+    fn read(node: &SourceNode, reader: &mut KeyReader, key: &str) -> Option<Self> {
         match node.value {
             Value::Float(f) if f.is_finite() => Some(f),
             Value::Float(_) => {
@@ -327,7 +327,7 @@ macro_rules! integer_value {
             fn kind() -> String {
                 "a whole number".into()
             }
-            fn read(node: &Node, reader: &mut Reader, key: &str) -> Option<Self> {
+            fn read(node: &SourceNode, reader: &mut KeyReader, key: &str) -> Option<Self> {
                 match node.value {
                     Value::Integer(i) => match <$t>::try_from(i) {
                         Ok(v) => Some(v),
@@ -352,7 +352,7 @@ impl ConfigValue for String {
     fn kind() -> String {
         "a string".into()
     }
-    fn read(node: &Node, reader: &mut Reader, key: &str) -> Option<Self> {
+    fn read(node: &SourceNode, reader: &mut KeyReader, key: &str) -> Option<Self> {
         match &node.value {
             Value::String(s) => Some(s.clone()),
             _ => wrong_kind(node, reader, key),
@@ -367,7 +367,7 @@ impl ConfigValue for PathBuf {
     fn kind() -> String {
         "a path".into()
     }
-    fn read(node: &Node, reader: &mut Reader, key: &str) -> Option<Self> {
+    fn read(node: &SourceNode, reader: &mut KeyReader, key: &str) -> Option<Self> {
         match &node.value {
             Value::String(s) if s.contains('\0') => {
                 reader.refuse(&node.origin, key, "contains a NUL character", "");
@@ -386,7 +386,7 @@ impl<T: ConfigValue> ConfigValue for Option<T> {
     fn kind() -> String {
         format!("{}, optional", T::kind())
     }
-    fn read(node: &Node, reader: &mut Reader, key: &str) -> Option<Self> {
+    fn read(node: &SourceNode, reader: &mut KeyReader, key: &str) -> Option<Self> {
         T::read(node, reader, key).map(Some)
     }
     fn show(&self) -> String {
@@ -401,7 +401,7 @@ impl<T: ConfigValue, const N: usize> ConfigValue for [T; N] {
     fn kind() -> String {
         format!("an array of {N}, each {}", T::kind())
     }
-    fn read(node: &Node, reader: &mut Reader, key: &str) -> Option<Self> {
+    fn read(node: &SourceNode, reader: &mut KeyReader, key: &str) -> Option<Self> {
         let Value::Array(items) = &node.value else { return wrong_kind(node, reader, key) };
         if items.len() != N {
             let problem = format!("has {} elements, must have {N}", items.len());
@@ -424,7 +424,7 @@ impl<T: ConfigValue> ConfigValue for Vec<T> {
     fn kind() -> String {
         format!("a list, each {}", T::kind())
     }
-    fn read(node: &Node, reader: &mut Reader, key: &str) -> Option<Self> {
+    fn read(node: &SourceNode, reader: &mut KeyReader, key: &str) -> Option<Self> {
         let Value::Array(items) = &node.value else { return wrong_kind(node, reader, key) };
         if items.len() > 1024 {
             let problem = format!("has {} elements, must have at most 1024", items.len());

@@ -1,7 +1,7 @@
 //! Kinds of which a program can have more: rows of a table, each with keys of its own. `kind` in the rig file names a row.
 
-use super::read::{join, ConfigValue, KeyDoc, Reader};
-use super::source::{Entry, Node, Value};
+use super::read::{join, ConfigValue, KeyDoc, KeyReader};
+use super::source::{Entry, SourceNode, Value};
 use std::any::Any;
 use std::collections::BTreeMap;
 use std::fmt::{self, Debug};
@@ -14,7 +14,7 @@ pub trait Section: Clone + Debug + Default + PartialEq + Send + Sync + 'static {
     const KEYS: &'static [&'static str];
 
     /// The defaults, replaced by the keys that are present. Ignores `kind` and keys of other sections.
-    fn read_keys(table: &BTreeMap<String, Entry>, reader: &mut Reader, section: &str) -> Self;
+    fn read_keys(table: &BTreeMap<String, Entry>, reader: &mut KeyReader, section: &str) -> Self;
 
     /// The section's keys for the manual.
     fn document(section: &str, out: &mut Vec<KeyDoc>);
@@ -64,8 +64,8 @@ impl KindWord {
 pub fn read_kind<'n>(
     kinds: &[KindWord],
     default: &str,
-    node: &'n Node,
-    reader: &mut Reader,
+    node: &'n SourceNode,
+    reader: &mut KeyReader,
     key: &str,
 ) -> Option<(usize, &'n BTreeMap<String, Entry>)> {
     let table = reader.table(node, key)?;
@@ -178,7 +178,8 @@ pub trait Row: Sized + Sync + 'static {
     fn is_mock(&self) -> bool;
 
     /// Reads its keys.
-    fn read(&self, table: &BTreeMap<String, Entry>, reader: &mut Reader, section: &str) -> Arc<Self::Keys>;
+    fn read(&self, table: &BTreeMap<String, Entry>, reader: &mut KeyReader, section: &str)
+        -> Arc<Self::Keys>;
 }
 
 /// A table of the rig file that names a kind: the row, and the values of its keys, to which it dereferences.
@@ -190,7 +191,7 @@ pub struct OfKind<R: Row> {
 impl<R: Row> OfKind<R> {
     /// `kind` with its defaults.
     pub fn plain(kind: &'static R) -> Self {
-        Self { kind, keys: kind.read(&BTreeMap::new(), &mut Reader::default(), "") }
+        Self { kind, keys: kind.read(&BTreeMap::new(), &mut KeyReader::default(), "") }
     }
 
     /// `kind` with `keys`, which are its own.
@@ -262,7 +263,7 @@ impl<R: Row> ConfigValue for OfKind<R> {
         "a table".into()
     }
 
-    fn read(node: &Node, reader: &mut Reader, key: &str) -> Option<Self> {
+    fn read(node: &SourceNode, reader: &mut KeyReader, key: &str) -> Option<Self> {
         let (kinds, words, default) = words::<R>();
         let (index, table) = read_kind(&words, default, node, reader, key)?;
         let kind = kinds[index];

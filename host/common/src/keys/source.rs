@@ -11,7 +11,7 @@ pub const VARIABLE_PREFIX: &str = "DPM_SET_";
 
 /// A value and where it was written.
 #[derive(Clone, Debug)]
-pub struct Node {
+pub struct SourceNode {
     /// The value.
     pub value: Value,
     /// Where it was written.
@@ -30,7 +30,7 @@ pub enum Value {
     /// Text in quotes.
     String(String),
     /// Values in square brackets.
-    Array(Vec<Node>),
+    Array(Vec<SourceNode>),
     /// Keys with values.
     Table(BTreeMap<String, Entry>),
     /// Dates, and integers beyond 64 bits. No key accepts them.
@@ -43,7 +43,7 @@ pub struct Entry {
     /// Where the key was written.
     pub key_origin: Origin,
     /// Its value.
-    pub node: Node,
+    pub node: SourceNode,
 }
 
 impl Value {
@@ -83,7 +83,7 @@ impl<'a> Lines<'a> {
 }
 
 /// Parses TOML. Every syntax error becomes one entry of `errors`; what could be read is returned.
-pub fn parse(file: &str, text: &str, errors: &mut Vec<ConfigError>) -> Node {
+pub fn parse(file: &str, text: &str, errors: &mut Vec<ConfigError>) -> SourceNode {
     let lines = Lines::new(file, text);
     let (table, problems) = DeTable::parse_recoverable(text);
     for problem in problems {
@@ -94,13 +94,14 @@ pub fn parse(file: &str, text: &str, errors: &mut Vec<ConfigError>) -> Node {
             remedy: String::new(),
         });
     }
-    Node { value: table_value(table.get_ref(), &lines), origin: lines.origin(0) }
+    SourceNode { value: table_value(table.get_ref(), &lines), origin: lines.origin(0) }
 }
 
 fn table_value(table: &DeTable<'_>, lines: &Lines<'_>) -> Value {
     let mut out = BTreeMap::new();
     for (key, value) in table {
-        let node = Node { value: value_of(value.get_ref(), lines), origin: lines.origin(value.span().start) };
+        let node =
+            SourceNode { value: value_of(value.get_ref(), lines), origin: lines.origin(value.span().start) };
         let entry = Entry { key_origin: lines.origin(key.span().start), node };
         out.insert(key.get_ref().to_string(), entry);
     }
@@ -118,7 +119,10 @@ fn value_of(value: &DeValue<'_>, lines: &Lines<'_>) -> Value {
         DeValue::Array(items) => Value::Array(
             items
                 .iter()
-                .map(|v| Node { value: value_of(v.get_ref(), lines), origin: lines.origin(v.span().start) })
+                .map(|v| SourceNode {
+                    value: value_of(v.get_ref(), lines),
+                    origin: lines.origin(v.span().start),
+                })
                 .collect(),
         ),
         DeValue::Table(table) => table_value(table, lines),
@@ -127,7 +131,13 @@ fn value_of(value: &DeValue<'_>, lines: &Lines<'_>) -> Value {
 
 /// Sets one key of the tree. `path` contains the parts of the dotted key; a numeric part is an index into an array. A
 /// text that is not a TOML value counts as a string, so that `render.method=paper` needs no quotes.
-pub fn set(root: &mut Node, path: &[String], text: &str, origin: &Origin, errors: &mut Vec<ConfigError>) {
+pub fn set(
+    root: &mut SourceNode,
+    path: &[String],
+    text: &str,
+    origin: &Origin,
+    errors: &mut Vec<ConfigError>,
+) {
     let mut refuse = |problem: String, remedy: &str| {
         errors.push(ConfigError {
             origin: origin.clone(),
@@ -146,7 +156,7 @@ pub fn set(root: &mut Node, path: &[String], text: &str, origin: &Origin, errors
             Value::Table(table) => {
                 let fresh = || Entry {
                     key_origin: origin.clone(),
-                    node: Node { value: Value::Table(BTreeMap::new()), origin: origin.clone() },
+                    node: SourceNode { value: Value::Table(BTreeMap::new()), origin: origin.clone() },
                 };
                 &mut table.entry(part.clone()).or_insert_with(fresh).node
             }
@@ -168,7 +178,7 @@ pub fn set(root: &mut Node, path: &[String], text: &str, origin: &Origin, errors
             }
         };
     }
-    *at = Node { value: value_from_flag(text, origin), origin: origin.clone() };
+    *at = SourceNode { value: value_from_flag(text, origin), origin: origin.clone() };
 }
 
 fn value_from_flag(text: &str, origin: &Origin) -> Value {
@@ -189,7 +199,7 @@ fn value_from_flag(text: &str, origin: &Origin) -> Value {
 }
 
 /// Everything in a flag's value has the origin of the flag.
-fn stamp(node: &mut Node, origin: &Origin) {
+fn stamp(node: &mut SourceNode, origin: &Origin) {
     node.origin = origin.clone();
     match &mut node.value {
         Value::Array(items) => items.iter_mut().for_each(|n| stamp(n, origin)),
@@ -208,7 +218,7 @@ pub fn variable_path(name: &str) -> Option<Vec<String>> {
     Some(rest.split("__").map(str::to_lowercase).collect())
 }
 
-impl Node {
+impl SourceNode {
     /// The same value in the `toml` crate's type; `None` for values that no key accepts.
     pub fn to_toml(&self) -> Option<toml::Value> {
         Some(match &self.value {

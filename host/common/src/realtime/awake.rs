@@ -4,7 +4,7 @@
 //! its frame is due, or is woken by the stage before it, waits for that. The kernel never chooses a sleep that takes longer to come back from
 //! than the shortest time that any open `/dev/cpu_dma_latency` holds.
 
-use super::Refusal;
+use super::RightRefusal;
 use std::fs::{File, OpenOptions};
 use std::io::{self, Write};
 use std::path::Path;
@@ -32,16 +32,16 @@ impl CoresAwake {
     ///
     /// # Errors
     /// The kernel has the device and does not let this user write to it.
-    pub fn hold() -> Result<Option<Self>, Refusal> {
+    pub fn hold() -> Result<Option<Self>, RightRefusal> {
         Self::hold_below(Path::new("/"))
     }
 
-    fn hold_below(root: &Path) -> Result<Option<Self>, Refusal> {
+    fn hold_below(root: &Path) -> Result<Option<Self>, RightRefusal> {
         let request = |mut file: File| file.write_all(&latency_us(root).to_ne_bytes()).map(|()| file);
         match OpenOptions::new().write(true).open(root.join(DEVICE)).and_then(request) {
             Ok(held) => Ok(Some(Self { _held: held })),
             Err(e) if e.kind() == io::ErrorKind::NotFound => Ok(None),
-            Err(e) => Err(Refusal {
+            Err(e) => Err(RightRefusal {
                 what: "keeping idle cores awake".into(),
                 reason: format!("/{DEVICE}: {e}"),
                 remedy: "install packaging/60-dpm.rules and add this user to the group dpm (`sudo usermod -aG dpm USER`), or set \

@@ -1,7 +1,7 @@
 //! What the operating system grants to the frame path: priority, cores, locked memory, short sleeps, cores that wake
 //! at once; and how reliably it does.
 //!
-//! Every right is requested, and none is required. A refusal is one [`Refusal`] with the limit to set, which the
+//! Every right is requested, and none is required. A refusal is one [`RightRefusal`] with the limit to set, which the
 //! caller shows once; the rig continues to run. [`os`] requests for threads and memory, [`awake`] for idle cores,
 //! [`standstill`] measures when the machine itself stood still, and [`starvation`] for how long threads waited for a core.
 
@@ -27,7 +27,7 @@ pub struct ThreadRights {
 /// A right that the kernel did not grant.
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
 #[error("{what} was refused ({reason}): {remedy}")]
-pub struct Refusal {
+pub struct RightRefusal {
     /// What was requested.
     pub what: String,
     /// The kernel's reason.
@@ -44,7 +44,7 @@ pub struct Grant {
     /// Core it is bound to.
     pub core: Option<u32>,
     /// What was refused.
-    pub refusals: Vec<Refusal>,
+    pub refusals: Vec<RightRefusal>,
 }
 
 /// Requests `rights` for the calling thread. Call once at the start of the thread: it allocates and makes system

@@ -1,7 +1,7 @@
 //! The system calls behind [`super`], for Linux only. On other systems every right is refused with a reason.
 #![allow(unsafe_code)]
 
-use super::Refusal;
+use super::RightRefusal;
 #[cfg(target_os = "linux")]
 use std::io::Error;
 
@@ -10,8 +10,8 @@ const LIMITS_FILE: &str = "/etc/security/limits.d/99-dpm-limits.conf";
 
 /// `reason` is read first of all: whoever looks for a remedy makes system calls that overwrite it.
 #[cfg(target_os = "linux")]
-fn refusal(reason: Error, what: String, remedy: String) -> Refusal {
-    Refusal { what, reason: reason.to_string(), remedy }
+fn refusal(reason: Error, what: String, remedy: String) -> RightRefusal {
+    RightRefusal { what, reason: reason.to_string(), remedy }
 }
 
 #[cfg(target_os = "linux")]
@@ -27,7 +27,7 @@ pub fn usable_cores() -> usize {
 /// Puts the calling thread under SCHED_FIFO with a priority from 1 to 99. Threads that it creates later start under
 /// the normal scheduler, so that helpers do not inherit real-time rights by accident.
 #[cfg(target_os = "linux")]
-pub fn set_fifo_priority(priority: u32) -> Result<(), Refusal> {
+pub fn set_fifo_priority(priority: u32) -> Result<(), RightRefusal> {
     let wanted = priority.clamp(1, 99);
     // SAFETY: sched_param is plain integers, for which all zero bits are valid (musl has more fields than glibc).
     let mut param: libc::sched_param = unsafe { std::mem::zeroed() };
@@ -77,11 +77,11 @@ pub(crate) fn real_time_priority() -> u32 {
 
 /// Binds the calling thread to one core.
 #[cfg(target_os = "linux")]
-pub(crate) fn pin_to_core(core: u32) -> Result<(), Refusal> {
+pub(crate) fn pin_to_core(core: u32) -> Result<(), RightRefusal> {
     let what = format!("core {core}");
     let limit = libc::CPU_SETSIZE as u32;
     if core >= limit {
-        return Err(Refusal {
+        return Err(RightRefusal {
             what,
             reason: format!("the kernel's set holds {limit} cores"),
             remedy: "set real_time.affinity to cores that exist".into(),
@@ -115,7 +115,7 @@ fn allowed_cores() -> String {
 
 /// Keeps all pages of the process resident, including those mapped later, so that no page fault delays a frame.
 #[cfg(target_os = "linux")]
-pub fn lock_memory() -> Result<(), Refusal> {
+pub fn lock_memory() -> Result<(), RightRefusal> {
     // With a finite limit MCL_FUTURE would make later allocations fail instead of this call, far from the cause.
     // SAFETY: `limit` is two integers and written during the call only.
     let limit = unsafe {
@@ -128,7 +128,7 @@ pub fn lock_memory() -> Result<(), Refusal> {
     };
     // SAFETY: takes no pointers.
     if limit != libc::RLIM_INFINITY && unsafe { libc::geteuid() } != 0 {
-        return Err(Refusal {
+        return Err(RightRefusal {
             what: "locking memory".into(),
             reason: format!("the limit is {} KiB", limit / 1024),
             remedy: remedy(),
@@ -151,7 +151,7 @@ pub fn unlock_memory() {
 /// Sets the timer slack: sleeps of the calling thread end at most this many nanoseconds late through the kernel's
 /// batching of timers.
 #[cfg(target_os = "linux")]
-pub fn set_timer_slack_ns(slack_ns: u64) -> Result<(), Refusal> {
+pub fn set_timer_slack_ns(slack_ns: u64) -> Result<(), RightRefusal> {
     // SAFETY: PR_SET_TIMERSLACK takes one integer.
     if unsafe { libc::prctl(libc::PR_SET_TIMERSLACK, slack_ns as libc::c_ulong, 0, 0, 0) } == 0 {
         return Ok(());
@@ -182,7 +182,7 @@ struct SchedAttr {
 /// its niceness. A thread that needs little time at once then comes before threads that need much. Needs no right.
 /// Kernels before 6.12 have one slice for all threads and ignore the request silently.
 #[cfg(target_os = "linux")]
-pub(crate) fn set_slice_ns(slice_ns: u64) -> Result<(), Refusal> {
+pub(crate) fn set_slice_ns(slice_ns: u64) -> Result<(), RightRefusal> {
     let size = std::mem::size_of::<SchedAttr>() as u32;
     let mut attr = SchedAttr::default();
     // SAFETY: pid 0 is the calling thread; `attr` has the `size` bytes that the kernel may write and outlives the calls.
@@ -337,10 +337,10 @@ pub fn thread_cpu_ns() -> i64 {
 
 #[cfg(not(target_os = "linux"))]
 mod elsewhere {
-    use super::Refusal;
+    use super::RightRefusal;
 
-    fn not_here(what: &str) -> Refusal {
-        Refusal {
+    fn not_here(what: &str) -> RightRefusal {
+        RightRefusal {
             what: what.into(),
             reason: "not implemented for this system".into(),
             remedy: "run on Linux, or set it to off in [real_time]".into(),
@@ -348,7 +348,7 @@ mod elsewhere {
     }
 
     /// Refused.
-    pub fn set_fifo_priority(_priority: u32) -> Result<(), Refusal> {
+    pub fn set_fifo_priority(_priority: u32) -> Result<(), RightRefusal> {
         Err(not_here("real-time priority"))
     }
     /// Always the normal scheduler.
@@ -356,21 +356,21 @@ mod elsewhere {
         0
     }
     /// Refused.
-    pub(crate) fn pin_to_core(_core: u32) -> Result<(), Refusal> {
+    pub(crate) fn pin_to_core(_core: u32) -> Result<(), RightRefusal> {
         Err(not_here("binding to a core"))
     }
     /// Refused.
-    pub fn lock_memory() -> Result<(), Refusal> {
+    pub fn lock_memory() -> Result<(), RightRefusal> {
         Err(not_here("locking memory"))
     }
     /// Nothing to undo.
     pub fn unlock_memory() {}
     /// Refused.
-    pub fn set_timer_slack_ns(_slack_ns: u64) -> Result<(), Refusal> {
+    pub fn set_timer_slack_ns(_slack_ns: u64) -> Result<(), RightRefusal> {
         Err(not_here("a shorter timer slack"))
     }
     /// Refused.
-    pub(crate) fn set_slice_ns(_slice_ns: u64) -> Result<(), Refusal> {
+    pub(crate) fn set_slice_ns(_slice_ns: u64) -> Result<(), RightRefusal> {
         Err(not_here("a shorter time slice"))
     }
     /// Unknown.

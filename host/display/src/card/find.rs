@@ -7,7 +7,7 @@ use std::path::{Path, PathBuf};
 
 use drm::Device as _;
 
-use super::{Card, Node};
+use super::{Card, CardDescriptor};
 use crate::kms::{Connector, Kms};
 use crate::scan_out::DisplayError;
 
@@ -31,7 +31,7 @@ pub fn cards() -> Vec<PathBuf> {
 pub fn connector_names() -> Vec<(u32, String)> {
     let open = |path: PathBuf| {
         let options = OpenOptions::new().read(true).write(true).custom_flags(libc::O_CLOEXEC).open(path);
-        let node = Node(options.ok()?.into());
+        let node = CardDescriptor(options.ok()?.into());
         // Whoever opens a card that nobody drives drives it, and its owner may be about to return.
         let _ = node.release_master_lock();
         Some(node)
@@ -41,7 +41,7 @@ pub fn connector_names() -> Vec<(u32, String)> {
 
 /// The same of the card behind `descriptor` alone; empty if it is none.
 pub fn connector_names_of(descriptor: OwnedFd) -> Vec<(u32, String)> {
-    Node(descriptor).connector_names()
+    CardDescriptor(descriptor).connector_names()
 }
 
 /// The device file of a card's descriptor.

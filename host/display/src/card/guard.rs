@@ -13,7 +13,7 @@ use std::time::{Duration, Instant};
 use drm::control::{crtc, framebuffer, Device as _, PageFlipFlags};
 use drm::Device as _;
 
-use super::{call, Node, BLACK_PATIENCE, STEP};
+use super::{call, CardDescriptor, BLACK_PATIENCE, STEP};
 use crate::scan_out::DisplayError;
 
 /// Names of the sockets begin so; the connector's name follows.
@@ -28,7 +28,7 @@ const GOES_WITHIN: Duration = Duration::from_secs(2);
 /// # Errors
 /// The kernel does not take the picture: of a lease that was taken back, nothing is left to show.
 pub fn show_black(descriptor: OwnedFd, crtc: u32, black: u32, hold: Duration) -> Result<(), DisplayError> {
-    let node = Node(descriptor);
+    let node = CardDescriptor(descriptor);
     let handle = |n: u32| std::num::NonZeroU32::new(n).ok_or(DisplayError::Gone);
     let (crtc, black) = (crtc::Handle::from(handle(crtc)?), framebuffer::Handle::from(handle(black)?));
     let limit = Instant::now() + BLACK_PATIENCE.saturating_mul(10);
@@ -69,7 +69,7 @@ struct EndRequest {
 }
 
 impl EndRequest {
-    fn of(node: &Node) -> Option<Self> {
+    fn of(node: &CardDescriptor) -> Option<Self> {
         let (_, connector) = node.connector_names().into_iter().next()?;
         Self::at(&runtime_folder()?, &connector)
     }

@@ -6,7 +6,7 @@
 
 /// An output as the X server describes it.
 #[derive(Clone, Debug, PartialEq, Eq)]
-pub struct Output {
+pub struct X11Output {
     /// The server's number of it.
     pub id: u32,
     /// Its name.
@@ -23,9 +23,9 @@ pub struct Output {
 
 /// The output at the kernel's connector `wanted`; `None` if there is none, or if it is not clear which. `kernel`: numbers and
 /// names of connectors, as far as they are known; on machines with several cards, numbers may occur more than once.
-pub fn find<'a>(outputs: &'a [Output], wanted: &str, kernel: &[(u32, String)]) -> Option<&'a Output> {
+pub fn find<'a>(outputs: &'a [X11Output], wanted: &str, kernel: &[(u32, String)]) -> Option<&'a X11Output> {
     let counts_from_0 = outputs.iter().any(|output| output.name.ends_with("-0"));
-    let is_named = |output: &&Output| is_same(wanted, &output.name, counts_from_0);
+    let is_named = |output: &&X11Output| is_same(wanted, &output.name, counts_from_0);
     let ids: Vec<u32> = kernel.iter().filter(|(_, name)| name == wanted).map(|(id, _)| *id).collect();
     let tells = outputs.iter().any(|output| output.connector_id.is_some());
     if !tells || ids.is_empty() {
@@ -71,11 +71,11 @@ fn kinds(kernel: &str) -> Vec<&str> {
 mod tests {
     use super::*;
 
-    fn output(id: u32, name: &str, connector_id: Option<u32>) -> Output {
-        Output { id, name: name.into(), connector_id, is_connected: true, crtc: 0, crtcs: vec![1] }
+    fn output(id: u32, name: &str, connector_id: Option<u32>) -> X11Output {
+        X11Output { id, name: name.into(), connector_id, is_connected: true, crtc: 0, crtcs: vec![1] }
     }
 
-    fn outputs(names: &[&str]) -> Vec<Output> {
+    fn outputs(names: &[&str]) -> Vec<X11Output> {
         names.iter().zip(1..).map(|(name, id)| output(id, name, None)).collect()
     }
 

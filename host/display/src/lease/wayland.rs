@@ -23,24 +23,24 @@ use wayland_protocols::wp::drm_lease::v1::client::wp_drm_lease_request_v1::WpDrm
 use wayland_protocols::wp::drm_lease::v1::client::wp_drm_lease_v1::{self, WpDrmLeaseV1};
 
 use super::socket::{connect_to, left};
-use super::{Lease, Refusal};
+use super::{Lease, LeaseRefusal};
 use crate::card::connector_names_of;
 
 #[cfg(test)]
 mod tests;
 
 /// The socket of the compositor that the environment names.
-fn socket() -> Result<PathBuf, Refusal> {
+fn socket() -> Result<PathBuf, LeaseRefusal> {
     socket_of(std::env::var_os("WAYLAND_DISPLAY"), std::env::var_os("XDG_RUNTIME_DIR"))
 }
 
-fn socket_of(display: Option<OsString>, folder: Option<OsString>) -> Result<PathBuf, Refusal> {
+fn socket_of(display: Option<OsString>, folder: Option<OsString>) -> Result<PathBuf, LeaseRefusal> {
     let path = PathBuf::from(display.unwrap_or_else(|| "wayland-0".into()));
     if path.is_absolute() {
         return Ok(path);
     }
     let unset = || {
-        Refusal::new(
+        LeaseRefusal::new(
             "XDG_RUNTIME_DIR and WAYLAND_DISPLAY name none; set them as in a terminal of the desktop",
         )
     };
@@ -59,9 +59,9 @@ pub(super) fn name() -> String {
 ///
 /// # Errors
 /// Why it lends none, and what to do.
-pub(super) fn lease(connector: Option<&str>, lender: String, until: Instant) -> Result<Lease, Refusal> {
+pub(super) fn lease(connector: Option<&str>, lender: String, until: Instant) -> Result<Lease, LeaseRefusal> {
     let does_not = |e: rustix::io::Errno| {
-        Refusal::new(format!(
+        LeaseRefusal::new(format!(
             "it does not answer ({e}); is the desktop running, and is WAYLAND_DISPLAY its own?"
         ))
     };
@@ -95,7 +95,7 @@ impl Offer {
 }
 
 /// What became of the request.
-enum Answer {
+enum LeaseAnswer {
     Lent(OwnedFd),
     Refused,
 }
@@ -105,7 +105,7 @@ enum Answer {
 struct Answers {
     cards: Vec<Offers>,
     has_listed: bool,
-    answer: Option<Answer>,
+    answer: Option<LeaseAnswer>,
 }
 
 /// Asks the compositor at the other end of `stream`.
@@ -114,9 +114,9 @@ pub(super) fn lease_over(
     connector: Option<&str>,
     lender: String,
     until: Instant,
-) -> Result<Lease, Refusal> {
+) -> Result<Lease, LeaseRefusal> {
     let connection = Connection::from_socket(stream)
-        .map_err(|e| Refusal::new(format!("its socket cannot be used: {e}")))?;
+        .map_err(|e| LeaseRefusal::new(format!("its socket cannot be used: {e}")))?;
     let mut queue = connection.new_event_queue();
     let handle = queue.handle();
     let mut heard = Answers::default();
@@ -124,7 +124,7 @@ pub(super) fn lease_over(
     connection.display().sync(&handle, ());
     until_true(&connection, &mut queue, &mut heard, until, |heard| heard.has_listed)?;
     if heard.cards.is_empty() {
-        return Err(Refusal::new(
+        return Err(LeaseRefusal::new(
             "it does not have the protocol wp_drm_lease_device_v1 (those of wlroots and of KDE do); use a bare console, or a \
              desktop under X11",
         ));
@@ -137,8 +137,8 @@ pub(super) fn lease_over(
     request.request_connector(&wanted);
     let lease = request.submit(&handle, ());
     until_true(&connection, &mut queue, &mut heard, until, |heard| heard.answer.is_some())?;
-    let Some(Answer::Lent(descriptor)) = heard.answer.take() else {
-        return Err(Refusal {
+    let Some(LeaseAnswer::Lent(descriptor)) = heard.answer.take() else {
+        return Err(LeaseRefusal {
             what: format!(
                 "it has refused {name}: another program may have it on lease, or the compositor does not drive the card now \
                  (another console); end that program, or use a bare console"
@@ -152,14 +152,14 @@ pub(super) fn lease_over(
         card.device.iter().for_each(WpDrmLeaseDeviceV1::release);
     }
     let _ = connection.flush();
-    Ok(Lease { descriptor, back: Box::new(Back { connection, lease, _registry: registry }), lender })
+    Ok(Lease { descriptor, back: Box::new(WaylandReturn { connection, lease, _registry: registry }), lender })
 }
 
 /// The offer to ask for, with its card and the kernel's name.
 fn choose(
     cards: &mut [Offers],
     connector: Option<&str>,
-) -> Result<(WpDrmLeaseDeviceV1, WpDrmLeaseConnectorV1, String), Refusal> {
+) -> Result<(WpDrmLeaseDeviceV1, WpDrmLeaseConnectorV1, String), LeaseRefusal> {
     let mut all = Vec::new();
     for card in cards {
         let kernel = card.card.take().map(connector_names_of).unwrap_or_default();
@@ -176,20 +176,20 @@ fn choose(
         let what = "it offers no connector: a compositor keeps those that its desktop may use, and offers those that the kernel \
                     calls non-desktop, as a rule (docs/DISPLAY.md, \"On lease from a desktop\"); or another program has it \
                     on lease. Use a bare console, or a desktop under X11";
-        return Err(Refusal { what: what.into(), is_lent: true });
+        return Err(LeaseRefusal { what: what.into(), is_lent: true });
     }
     let fits = |(.., name): &(_, _, String)| connector.is_none_or(|wanted| wanted == name);
     let mut fitting = all.into_iter().filter(fits);
     match (fitting.next(), fitting.next(), connector) {
         (Some(one), None, _) => Ok(one),
-        (None, _, Some(wanted)) => Err(Refusal {
+        (None, _, Some(wanted)) => Err(LeaseRefusal {
             what: format!(
                 "it does not offer {wanted}, but {names}: its desktop uses it, or another program has it on lease; correct \
                  projector.backend.connector, or use a bare console, or a desktop under X11"
             ),
             is_lent: true,
         }),
-        _ => Err(Refusal::new(format!("it offers {names}; write the projector's as projector.backend.connector"))),
+        _ => Err(LeaseRefusal::new(format!("it offers {names}; write the projector's as projector.backend.connector"))),
     }
 }
 
@@ -200,9 +200,9 @@ fn until_true(
     heard: &mut Answers,
     until: Instant,
     is_enough: impl Fn(&Answers) -> bool,
-) -> Result<(), Refusal> {
+) -> Result<(), LeaseRefusal> {
     let gone = |e: &dyn std::fmt::Display| {
-        Refusal::new(format!("it went away, or does not keep to the protocol: {e}"))
+        LeaseRefusal::new(format!("it went away, or does not keep to the protocol: {e}"))
     };
     loop {
         queue.dispatch_pending(heard).map_err(|e| gone(&e))?;
@@ -215,7 +215,7 @@ fn until_true(
             other => other.map_err(|e| gone(&e))?,
         }
         let Some(reading) = queue.prepare_read() else { continue };
-        let silent = || Refusal::new("it does not answer in time; is it busy, or stopped?");
+        let silent = || LeaseRefusal::new("it does not answer in time; is it busy, or stopped?");
         let left = left(until).ok_or_else(silent)?;
         match poll(&mut [PollFd::from_borrowed_fd(reading.connection_fd(), flags)], Some(&left)) {
             Ok(0) => return Err(silent()),
@@ -230,13 +230,13 @@ fn until_true(
 }
 
 /// Gives the lease back, and keeps the connection until then.
-struct Back {
+struct WaylandReturn {
     connection: Connection,
     lease: WpDrmLeaseV1,
     _registry: WlRegistry,
 }
 
-impl Drop for Back {
+impl Drop for WaylandReturn {
     fn drop(&mut self) {
         self.lease.destroy();
         let _ = self.connection.flush();
@@ -345,8 +345,10 @@ impl Dispatch<WpDrmLeaseV1, ()> for Answers {
         _: &QueueHandle<Self>,
     ) {
         match event {
-            wp_drm_lease_v1::Event::LeaseFd { leased_fd } => heard.answer = Some(Answer::Lent(leased_fd)),
-            wp_drm_lease_v1::Event::Finished => heard.answer = Some(Answer::Refused),
+            wp_drm_lease_v1::Event::LeaseFd { leased_fd } => {
+                heard.answer = Some(LeaseAnswer::Lent(leased_fd))
+            }
+            wp_drm_lease_v1::Event::Finished => heard.answer = Some(LeaseAnswer::Refused),
             _ => {}
         }
     }

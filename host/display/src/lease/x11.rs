@@ -21,9 +21,9 @@ use x11rb::rust_connection::{DefaultStream, PollMode, RustConnection, Stream};
 use x11rb::utils::RawFdContainer;
 use x11rb::x11_utils::TryParse;
 
-use super::names::{find, Output};
+use super::names::{find, X11Output};
 use super::socket::{connect_to, left};
-use super::{Lease, Refusal};
+use super::{Lease, LeaseRefusal};
 use crate::card::connector_names;
 
 #[cfg(test)]
@@ -41,11 +41,11 @@ pub(super) fn name() -> String {
 ///
 /// # Errors
 /// Why it lends none, and what to do.
-pub(super) fn lease(connector: Option<&str>, lender: String, until: Instant) -> Result<Lease, Refusal> {
+pub(super) fn lease(connector: Option<&str>, lender: String, until: Instant) -> Result<Lease, LeaseRefusal> {
     let display = parse_display(None).map_err(|e| {
-        Refusal::new(format!("DISPLAY names none ({e}); set it as in a terminal of the desktop"))
+        LeaseRefusal::new(format!("DISPLAY names none ({e}); set it as in a terminal of the desktop"))
     })?;
-    let mut answer = Err(Refusal::new(
+    let mut answer = Err(LeaseRefusal::new(
         "it runs on another machine, and no display of that one can be lent to this one; log in at this machine",
     ));
     for address in display.connect_instruction() {
@@ -58,7 +58,7 @@ pub(super) fn lease(connector: Option<&str>, lender: String, until: Instant) -> 
     lease_of(answer?, usize::from(display.screen), connector, &connector_names(), lender)
 }
 
-fn connect(path: &str, display: u16, until: Instant) -> Result<Server, Refusal> {
+fn connect(path: &str, display: u16, until: Instant) -> Result<Server, LeaseRefusal> {
     // Servers listen at both of these, if the folder can be written at all.
     let abstract_name = SocketAddrUnix::new_abstract_name(path.as_bytes());
     let addresses = [abstract_name, SocketAddrUnix::new(path)];
@@ -70,7 +70,9 @@ fn connect(path: &str, display: u16, until: Instant) -> Result<Server, Refusal> 
         }
     }
     let does_not = |e: &dyn std::fmt::Display| {
-        Refusal::new(format!("it does not answer ({e}); is the desktop running, and is DISPLAY its own?"))
+        LeaseRefusal::new(format!(
+            "it does not answer ({e}); is the desktop running, and is DISPLAY its own?"
+        ))
     };
     let stream = answer.map_err(|e| does_not(&e))?;
     let (stream, (family, peer)) = DefaultStream::from_unix_stream(stream).map_err(|e| does_not(&e))?;
@@ -132,8 +134,8 @@ impl Stream for BoundedStream {
 }
 
 /// Why the server has not answered as it must.
-fn broken(error: impl Into<ReplyOrIdError>) -> Refusal {
-    Refusal::new(match error.into() {
+fn broken(error: impl Into<ReplyOrIdError>) -> LeaseRefusal {
+    LeaseRefusal::new(match error.into() {
         ReplyOrIdError::X11Error(e) => {
             format!("it refuses {} of RandR: {:?}", e.request_name.unwrap_or("a request"), e.error_kind)
         }
@@ -142,7 +144,7 @@ fn broken(error: impl Into<ReplyOrIdError>) -> Refusal {
 }
 
 /// What the server answers to a request.
-fn answer<R: TryParse>(asked: Result<Cookie<'_, Server, R>, ConnectionError>) -> Result<R, Refusal> {
+fn answer<R: TryParse>(asked: Result<Cookie<'_, Server, R>, ConnectionError>) -> Result<R, LeaseRefusal> {
     asked.map_err(broken)?.reply().map_err(broken)
 }
 
@@ -153,23 +155,24 @@ pub(super) fn lease_of(
     connector: Option<&str>,
     kernel: &[(u32, String)],
     lender: String,
-) -> Result<Lease, Refusal> {
+) -> Result<Lease, LeaseRefusal> {
     let Some(root) = server.setup().roots.get(screen).map(|screen| screen.root) else {
-        return Err(Refusal::new(format!("it has no screen {screen}; correct DISPLAY")));
+        return Err(LeaseRefusal::new(format!("it has no screen {screen}; correct DISPLAY")));
     };
     if server.extension_information(randr::X11_EXTENSION_NAME).map_err(broken)?.is_none() {
-        return Err(Refusal::new("it has no extension RandR; use a bare console, or another server"));
+        return Err(LeaseRefusal::new("it has no extension RandR; use a bare console, or another server"));
     }
     let version = answer(server.randr_query_version(1, 6))?;
     let (major, minor) = (version.major_version, version.minor_version);
     if (major, minor) < (1, 6) {
-        return Err(Refusal::new(format!(
+        return Err(LeaseRefusal::new(format!(
             "it speaks RandR {major}.{minor}, and leases came with 1.6; use a newer server, or a bare console"
         )));
     }
     let resources = answer(server.randr_get_screen_resources_current(root))?;
     let outputs = outputs(&server, &resources)?;
-    let output = choose(&outputs, connector, kernel).map_err(|(what, is_lent)| Refusal { what, is_lent })?;
+    let output =
+        choose(&outputs, connector, kernel).map_err(|(what, is_lent)| LeaseRefusal { what, is_lent })?;
     let mut crtcs = Vec::new();
     for crtc in &output.crtcs {
         let info = answer(server.randr_get_crtc_info(*crtc, resources.config_timestamp))?;
@@ -179,14 +182,14 @@ pub(super) fn lease_of(
     }
     let output = (output.id, output.name.clone());
     let (lid, descriptor) = create(&server, root, &output, &crtcs)?;
-    Ok(Lease { descriptor, back: Box::new(Back { server, lid }), lender })
+    Ok(Lease { descriptor, back: Box::new(X11Return { server, lid }), lender })
 }
 
 /// What the server's outputs are.
 fn outputs(
     server: &Server,
     resources: &randr::GetScreenResourcesCurrentReply,
-) -> Result<Vec<Output>, Refusal> {
+) -> Result<Vec<X11Output>, LeaseRefusal> {
     let property = answer(server.intern_atom(true, b"CONNECTOR_ID"))?.atom;
     let mut all = Vec::new();
     for id in &resources.outputs {
@@ -203,7 +206,7 @@ fn outputs(
                 None
             }
         };
-        all.push(Output {
+        all.push(X11Output {
             id: *id,
             name: String::from_utf8_lossy(&info.name).into_owned(),
             connector_id,
@@ -217,10 +220,10 @@ fn outputs(
 
 /// The output to ask for, or why there is none, and whether somebody may give it back soon.
 fn choose<'a>(
-    outputs: &'a [Output],
+    outputs: &'a [X11Output],
     connector: Option<&str>,
     kernel: &[(u32, String)],
-) -> Result<&'a Output, (String, bool)> {
+) -> Result<&'a X11Output, (String, bool)> {
     let listed = || {
         let names: Vec<&str> = outputs.iter().map(|output| output.name.as_str()).collect();
         if names.is_empty() {
@@ -285,7 +288,7 @@ fn create(
     root: u32,
     (output, name): &(u32, String),
     crtcs: &[u32],
-) -> Result<(u32, OwnedFd), Refusal> {
+) -> Result<(u32, OwnedFd), LeaseRefusal> {
     let mut refused = None;
     for crtc in crtcs {
         let lid = server.generate_id().map_err(broken)?;
@@ -294,10 +297,10 @@ fn create(
             Ok(reply) => return Ok((lid, reply.master_fd)),
             // A CRTC on lease looks like a free one.
             Err(ReplyError::X11Error(e)) if e.error_kind == ErrorKind::Access => {
-                refused = Some(Refusal { what: on_lease(name), is_lent: true });
+                refused = Some(LeaseRefusal { what: on_lease(name), is_lent: true });
             }
             Err(ReplyError::X11Error(e)) => {
-                return Err(Refusal::new(format!(
+                return Err(LeaseRefusal::new(format!(
                     "it cannot lend {name} ({:?}): its driver or the kernel has no leases, or it does not drive the card now \
                      (another console); use a bare console",
                     e.error_kind
@@ -307,19 +310,19 @@ fn create(
         }
     }
     Err(refused.unwrap_or_else(|| {
-        Refusal::new(format!(
+        LeaseRefusal::new(format!(
             "no CRTC is free that can drive {name}: the desktop uses them all; switch another of its displays off"
         ))
     }))
 }
 
 /// Gives the lease back.
-struct Back {
+struct X11Return {
     server: Server,
     lid: u32,
 }
 
-impl Drop for Back {
+impl Drop for X11Return {
     fn drop(&mut self) {
         self.server.stream().wait_until(Instant::now() + BACK_PATIENCE);
         let freed = self.server.randr_free_lease(self.lid, 1).map_err(ReplyError::from);

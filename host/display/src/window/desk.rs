@@ -42,7 +42,7 @@ pub(super) struct Area {
 }
 
 /// A server on which the window can be opened, and how.
-pub(super) struct Desk {
+pub(super) struct WindowServer {
     pub(super) server: RustConnection,
     /// Which of the server's screens.
     pub(super) screen: usize,
@@ -64,7 +64,7 @@ struct Monitor {
     hz: Option<f64>,
 }
 
-impl Desk {
+impl WindowServer {
     /// Looks for the server, its abilities and the monitor.
     ///
     /// # Errors

@@ -16,12 +16,12 @@ use x11rb::protocol::xproto::{self, ConnectionExt as _, Gcontext, ImageFormat, P
 use x11rb::protocol::Event;
 use x11rb::rust_connection::RustConnection;
 
-use super::desk::{self, of_id, Atoms, Desk};
+use super::desk::{self, of_id, Atoms, WindowServer};
 use super::WindowSettings;
 use crate::encoding::{Encoding, PixelMap};
 use crate::panel::PanelSettings;
-use crate::scan_out::{DisplayError, Flip, Picture, Pixels, ScanOut};
-use crate::transport::{Opener, Showing};
+use crate::scan_out::{DisplayError, Flip, PictureBuffer, Pixels, ScanOut};
+use crate::transport::{Opener, PanelOutput};
 
 /// Pictures in the server's memory beside the black one: the two of the panel, and two that the server may still read.
 const PIXMAPS: usize = 4;
@@ -43,10 +43,10 @@ pub fn opener(settings: WindowSettings, on_close: impl Fn() + Send + Sync + 'sta
         }
         let panel = panel_settings(&settings)
             .map_err(|why| TransportError::Unsuitable { device: name.clone(), why })?;
-        let window =
-            Window::open(&settings, is_closed.clone(), on_close.clone()).map_err(|e| e.of(name.clone()))?;
+        let window = X11Window::open(&settings, is_closed.clone(), on_close.clone())
+            .map_err(|e| e.of(name.clone()))?;
         let warnings = window.warnings.clone();
-        Ok(Showing { out: Box::new(window), panel, name, warnings })
+        Ok(PanelOutput { out: Box::new(window), panel, name, warnings })
     })
 }
 
@@ -57,7 +57,7 @@ pub fn opener(settings: WindowSettings, on_close: impl Fn() + Send + Sync + 'sta
 pub fn look(settings: &WindowSettings) -> Result<(), TransportError> {
     let name = name_of(settings);
     panel_settings(settings).map_err(|why| TransportError::Unsuitable { device: name.clone(), why })?;
-    Desk::find(settings).map(drop).map_err(|e| e.of(name))
+    WindowServer::find(settings).map(drop).map_err(|e| e.of(name))
 }
 
 /// The window of `settings` in messages.
@@ -99,7 +99,7 @@ struct StoredPicture {
 
 /// One of the panel's two pictures.
 #[derive(Debug, Default)]
-struct Frame {
+struct WindowPicture {
     pixels: Vec<u8>,
     /// Its pixels were handed out after they were last sent to the server.
     is_changed: bool,
@@ -108,7 +108,7 @@ struct Frame {
 }
 
 /// A window that shows pictures.
-pub struct Window {
+pub struct X11Window {
     server: RustConnection,
     id: xproto::Window,
     atoms: Atoms,
@@ -116,7 +116,7 @@ pub struct Window {
     raster: Raster,
     black: Pixmap,
     stored: [StoredPicture; PIXMAPS],
-    frames: [Frame; 2],
+    frames: [WindowPicture; 2],
     /// The number of the newest picture that was handed over, and whether it was taken.
     newest: (u32, bool),
     /// Stamps that were read and not yet passed on.
@@ -127,13 +127,13 @@ pub struct Window {
     warnings: Vec<String>,
 }
 
-impl Window {
+impl X11Window {
     fn open(
         settings: &WindowSettings,
         is_closed: Arc<AtomicBool>,
         on_close: OnClose,
     ) -> Result<Self, DisplayError> {
-        let Desk { server, screen, area, visual, atoms, warnings } = Desk::find(settings)?;
+        let WindowServer { server, screen, area, visual, atoms, warnings } = WindowServer::find(settings)?;
         let raster = settings.raster;
         let id = desk::create(&server, screen, &area, visual, &atoms, settings).map_err(of_id)?;
         let gc = server.generate_id().map_err(of_id)?;
@@ -151,8 +151,9 @@ impl Window {
         for one in &mut stored {
             one.pixmap = new_pixmap().map_err(of_id)?;
         }
-        let frame = || Frame { pixels: vec![0; 4 * raster.pixel_count()], ..Frame::default() };
-        let frames = [frame(), Frame { stored: 1, ..frame() }];
+        let frame =
+            || WindowPicture { pixels: vec![0; 4 * raster.pixel_count()], ..WindowPicture::default() };
+        let frames = [frame(), WindowPicture { stored: 1, ..frame() }];
         let (newest, taken, is_gone) = ((0, true), Vec::with_capacity(PIXMAPS), false);
         let mut window = Self {
             server,
@@ -304,14 +305,14 @@ fn of_connection(_: ConnectionError) -> DisplayError {
     DisplayError::Gone
 }
 
-impl ScanOut for Window {
+impl ScanOut for X11Window {
     fn pixels(&mut self, frame: usize) -> Pixels<'_> {
         let frame = &mut self.frames[frame];
         frame.is_changed = true;
         Pixels { bytes: &mut frame.pixels, pitch: 4 * self.raster.width() as usize }
     }
 
-    fn flip(&mut self, picture: Picture) -> Result<(), DisplayError> {
+    fn flip(&mut self, picture: PictureBuffer) -> Result<(), DisplayError> {
         self.read();
         if let Some(why) = self.lost() {
             return Err(why);
@@ -320,8 +321,8 @@ impl ScanOut for Window {
             return Err(DisplayError::Busy);
         }
         let pixmap = match picture {
-            Picture::Black => self.black,
-            Picture::Frame(frame) => self.send(frame)?,
+            PictureBuffer::Black => self.black,
+            PictureBuffer::Frame(frame) => self.send(frame)?,
         };
         self.present(pixmap).map_err(of_connection)
     }

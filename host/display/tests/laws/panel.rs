@@ -3,7 +3,7 @@
 
 use std::sync::atomic::Ordering;
 
-use crate::common::{with, Rig};
+use crate::common::{with, DisplayRig};
 use dpm_device::link::{faults, LinkState, Verb};
 use dpm_device::time::{FrameRate, HostTime};
 use dpm_display::encoding::Encoding;
@@ -16,7 +16,7 @@ const BOTH: [Encoding; 2] = [Encoding::Rgb8, Encoding::Planes24];
 #[test]
 fn every_frame_is_scanned_out_bit_for_bit_at_the_blank_of_its_slot() {
     for (encoding, ppm) in [(BOTH[0], 0), (BOTH[1], 90), (BOTH[0], -90)] {
-        let mut rig = Rig::new(encoding, |s| s.ppm = ppm);
+        let mut rig = DisplayRig::new(encoding, |s| s.ppm = ppm);
         rig.stream();
         rig.send(60);
         rig.pass(60_000_000);
@@ -37,7 +37,7 @@ fn every_frame_is_scanned_out_bit_for_bit_at_the_blank_of_its_slot() {
 /// A picture that the display does not take in time is shown one blank later, is told so, and is counted once.
 #[test]
 fn missed_flips_are_counted_exactly_and_told_in_the_slot_that_showed_them() {
-    let mut rig = Rig::new(Encoding::Rgb8, |_| {});
+    let mut rig = DisplayRig::new(Encoding::Rgb8, |_| {});
     rig.stream();
     rig.send(20);
     // Blanks to come at which a waiting picture is not taken: one alone, and two in a row.
@@ -70,7 +70,7 @@ fn missed_flips_are_counted_exactly_and_told_in_the_slot_that_showed_them() {
 }
 
 /// Slots after the last frame, which show it again.
-fn repeated_at_the_end(rig: &Rig) -> u32 {
+fn repeated_at_the_end(rig: &DisplayRig) -> u32 {
     let status = rig.cable.device().firmware().status();
     let last = rig.sent.last().unwrap().1;
     let slots = rig.slot() - last;
@@ -88,7 +88,7 @@ impl<T> Pipe for T {}
 /// A thread that sleeps through blanks shows nothing wrong, and the slots that it slept through are counted.
 #[test]
 fn a_thread_that_is_late_counts_every_slot_that_it_missed() {
-    let mut rig = Rig::new(Encoding::Rgb8, |_| {});
+    let mut rig = DisplayRig::new(Encoding::Rgb8, |_| {});
     rig.stream();
     rig.send(10);
     let before = rig.cable.device().counts().missed.load(Ordering::Relaxed);
@@ -114,7 +114,7 @@ fn a_thread_that_is_late_counts_every_slot_that_it_missed() {
 /// A picture that is told to be taken only after the next slot has begun leaves that slot without a picture: it is counted.
 #[test]
 fn a_slot_that_begins_before_the_picture_on_its_way_is_told_is_counted() {
-    let mut rig = Rig::new(Encoding::Rgb8, |_| {});
+    let mut rig = DisplayRig::new(Encoding::Rgb8, |_| {});
     rig.stream();
     rig.send(10);
     let counts = rig.cable.device().counts();
@@ -137,7 +137,7 @@ fn a_slot_that_begins_before_the_picture_on_its_way_is_told_is_counted() {
 #[test]
 fn light_ends_black() {
     for way in ["order", "silence", "end"] {
-        let mut rig = Rig::new(Encoding::Planes24, |_| {});
+        let mut rig = DisplayRig::new(Encoding::Planes24, |_| {});
         rig.stream();
         rig.send(20);
         assert!(!with(&rig.shared, |s| s.is_black), "{way}");
@@ -161,7 +161,7 @@ fn light_ends_black() {
 /// An end that nobody ordered, a panic's too, is black before the call returns.
 #[test]
 fn a_panel_that_is_dropped_leaves_black() {
-    let mut rig = Rig::new(Encoding::Rgb8, |_| {});
+    let mut rig = DisplayRig::new(Encoding::Rgb8, |_| {});
     rig.stream();
     rig.send(5);
     assert!(!with(&rig.shared, |s| s.is_black));
@@ -176,7 +176,7 @@ fn a_panel_that_is_dropped_leaves_black() {
 /// A pulled cable, blanks that stop, and a driver that does not count end the scan-out, in the dark, with the reason.
 #[test]
 fn a_lost_display_is_told_and_dark() {
-    let mut rig = Rig::new(Encoding::Rgb8, |_| {});
+    let mut rig = DisplayRig::new(Encoding::Rgb8, |_| {});
     rig.stream();
     rig.send(5);
     with(&rig.shared, |s| s.is_plugged = false);
@@ -185,7 +185,7 @@ fn a_lost_display_is_told_and_dark() {
     assert!(panel.is_lost() && panel.counts().lost().unwrap().contains("unplugged"));
     assert!(with(&rig.shared, |s| s.is_black));
 
-    let mut rig = Rig::new(Encoding::Rgb8, |_| {});
+    let mut rig = DisplayRig::new(Encoding::Rgb8, |_| {});
     rig.stream();
     rig.send(5);
     with(&rig.shared, |s| s.is_stuck = true);
@@ -194,13 +194,13 @@ fn a_lost_display_is_told_and_dark() {
     assert!(panel.is_lost() && panel.counts().lost().unwrap().contains("vertical blank"));
     assert!(with(&rig.shared, |s| s.is_black));
 
-    let mut rig = Rig::new(Encoding::Rgb8, |s| s.counts_none = true);
+    let mut rig = DisplayRig::new(Encoding::Rgb8, |s| s.counts_none = true);
     rig.pass(300_000_000);
     let panel = rig.cable.device();
     assert!(panel.is_lost() && panel.counts().lost().unwrap().contains("does not count"));
 
     // Half a percent off is a crystal; five percent is another rate.
-    let mut rig = Rig::new(Encoding::Rgb8, |s| s.ppm = 50_000);
+    let mut rig = DisplayRig::new(Encoding::Rgb8, |s| s.ppm = 50_000);
     rig.pass(1_300_000_000);
     assert!(rig.cable.device().counts().lost().unwrap().contains("variable refresh"));
 }
@@ -212,7 +212,7 @@ fn stamps_that_jitter_are_learned_from_more_blanks() {
     let first: Vec<_> = (0..6u32).map(|k| (k, HostTime(i64::from(k) * 16_666_667))).collect();
     let late = first.iter().map(|(k, at)| (*k, at.plus_ns(if *k == 5 { 5_000_000 } else { 0 })));
     assert!(matches!(Pacer::learn(rate, 0, &late.collect::<Vec<_>>()), Err(NoPace::OtherRate { .. })));
-    let mut rig = Rig::new(Encoding::Rgb8, |s| s.jitter_ns = 5_000_000);
+    let mut rig = DisplayRig::new(Encoding::Rgb8, |s| s.jitter_ns = 5_000_000);
     rig.stream();
     rig.send(30);
     assert!(!rig.cable.device().is_lost());
@@ -222,7 +222,7 @@ fn stamps_that_jitter_are_learned_from_more_blanks() {
 /// blank that showed the frame, whatever the crystal.
 #[test]
 fn stamps_are_those_of_the_blanks() {
-    let mut rig = Rig::new(Encoding::Rgb8, |s| s.ppm = 150);
+    let mut rig = DisplayRig::new(Encoding::Rgb8, |s| s.ppm = 150);
     rig.stream();
     rig.send(100);
     let status = rig.cable.device().firmware().status();

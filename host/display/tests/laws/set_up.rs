@@ -6,7 +6,7 @@ use dpm_device::planes::{PlaneSchedule, Raster};
 use dpm_device::time::FrameRate;
 use dpm_display::encoding::Encoding;
 use dpm_display::fake::display;
-use dpm_display::kms::{Connector, Domain, Owner};
+use dpm_display::kms::{Connector, Domain, PropertyOwner};
 use dpm_display::mode::{ModeWish, Timing};
 use dpm_display::set_up::{plan, DisplaySettings};
 
@@ -30,12 +30,12 @@ fn everything_that_keeps_bits_exact_is_set() {
             .find(|(o, n, _)| (*o, n.as_str()) == (owner, name))
             .map(|(.., value)| *value)
     };
-    assert_eq!(set(Owner::Connector, "max bpc"), Some(8));
-    assert_eq!(set(Owner::Connector, "Broadcast RGB"), Some(1), "Full");
-    assert_eq!(set(Owner::Connector, "dithering mode"), Some(1), "off");
-    assert_eq!(set(Owner::Crtc, "GAMMA_LUT"), Some(0));
-    assert_eq!(set(Owner::Crtc, "VRR_ENABLED"), Some(0));
-    assert_eq!(set(Owner::Crtc, "CTM"), None, "the driver has none");
+    assert_eq!(set(PropertyOwner::Connector, "max bpc"), Some(8));
+    assert_eq!(set(PropertyOwner::Connector, "Broadcast RGB"), Some(1), "Full");
+    assert_eq!(set(PropertyOwner::Connector, "dithering mode"), Some(1), "off");
+    assert_eq!(set(PropertyOwner::Crtc, "GAMMA_LUT"), Some(0));
+    assert_eq!(set(PropertyOwner::Crtc, "VRR_ENABLED"), Some(0));
+    assert_eq!(set(PropertyOwner::Crtc, "CTM"), None, "the driver has none");
     assert!(plan.warnings.is_empty(), "{:?}", plan.warnings);
     // 3 ms, and half of the blank of 6 ms.
     assert_eq!(plan.panel.lead_ns, 6_000_000);

@@ -9,7 +9,7 @@ const FOLDER: &str = "/frames";
 const ENOUGH: usize = 8;
 
 /// A way to send frames, and frames of the demo that were packed for it.
-pub(crate) struct Case {
+pub(crate) struct DemoCase {
     /// The encoding by its word in a rig file, with what is behind the display.
     pub(crate) name: String,
     /// What the bits of a pixel mean.
@@ -24,20 +24,20 @@ pub(crate) struct Case {
 ///
 /// # Panics
 /// There are none, or they are of another raster, or too few, dark or alike: then they could prove nothing.
-pub(crate) fn cases(raster: Raster) -> Vec<Case> {
+pub(crate) fn cases(raster: Raster) -> Vec<DemoCase> {
     let listed =
         std::fs::read_dir(FOLDER).unwrap_or_else(|e| panic!("{FOLDER}: {e}; tests/hil/run makes it"));
     let mut names: Vec<String> =
         listed.map(|entry| entry.unwrap().file_name().to_string_lossy().into_owned()).collect();
     names.sort();
-    let cases: Vec<Case> = names.into_iter().map(|name| case(name, raster)).collect();
+    let cases: Vec<DemoCase> = names.into_iter().map(|name| case(name, raster)).collect();
     for encoding in [Encoding::Rgb8, Encoding::Planes24] {
         assert!(cases.iter().any(|case| case.encoding == encoding), "no frames for {encoding:?}");
     }
     cases
 }
 
-fn case(name: String, raster: Raster) -> Case {
+fn case(name: String, raster: Raster) -> DemoCase {
     let bytes = std::fs::read(format!("{FOLDER}/{name}")).unwrap();
     let end = bytes.iter().position(|b| *b == b'\n').expect("a line that says what it is");
     let head = String::from_utf8_lossy(&bytes[..end]).into_owned();
@@ -57,7 +57,7 @@ fn case(name: String, raster: Raster) -> Case {
     };
     let schedule = schedule.unwrap_or_else(|| panic!("{name}: {head}"));
     let frames = bytes[end + 1..].chunks(raster.plane_bytes() * planes.len()).map(Vec::from).collect();
-    let case = Case { name, encoding, schedule, frames };
+    let case = DemoCase { name, encoding, schedule, frames };
     check(&case, raster);
     case
 }
@@ -75,8 +75,8 @@ fn plane(word: &str) -> PlaneSpec {
     PlaneSpec { channel, bit: bit.parse().expect("the number of a bit") }
 }
 
-fn check(case: &Case, raster: Raster) {
-    let Case { name, schedule, frames, .. } = case;
+fn check(case: &DemoCase, raster: Raster) {
+    let DemoCase { name, schedule, frames, .. } = case;
     let bytes = raster.plane_bytes() * schedule.len();
     assert!(frames.len() >= ENOUGH && frames.iter().all(|f| f.len() == bytes), "{name}: {}", frames.len());
     for (i, frame) in frames.iter().enumerate() {

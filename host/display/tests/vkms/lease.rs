@@ -13,7 +13,7 @@ use std::time::{Duration, Instant};
 
 use dpm_device::time::{HostClock, HostTime};
 use dpm_device::transport::Transport;
-use dpm_display::card::{cards, let_go, Card, Node};
+use dpm_display::card::{cards, let_go, Card, CardDescriptor};
 use dpm_display::encoding::Encoding;
 use dpm_display::lease::{opener, Access, Lender};
 use dpm_display::scan_out::DisplayError;
@@ -29,7 +29,7 @@ use crate::ways_out::{this_program, HOLD};
 
 /// A desktop that shows nothing, and lends its only connector.
 struct Desktop {
-    node: Node,
+    node: CardDescriptor,
     connector: connector::Handle,
     crtc: crtc::Handle,
     plane: plane::Handle,
@@ -43,7 +43,7 @@ struct Desktop {
 impl Desktop {
     /// Drives the card, and listens where the environment says from now on.
     fn start() -> Arc<Self> {
-        let node = Node(File::options().read(true).write(true).open(&cards()[0]).unwrap().into());
+        let node = CardDescriptor(File::options().read(true).write(true).open(&cards()[0]).unwrap().into());
         // The guardian of an earlier test looks from time to time whether the card is taken.
         until("nobody else drives the card", || node.acquire_master_lock().is_ok());
         node.set_client_capability(ClientCapability::UniversalPlanes, true).unwrap();

@@ -11,18 +11,18 @@ use dpm_device::time::{HostClock, HostTime};
 use dpm_device::transport::inproc::Direct;
 use dpm_display::card::open_for;
 use dpm_display::encoding::Encoding;
-use dpm_display::panel::Panel;
+use dpm_display::panel::DisplayPanel;
 use dpm_display::set_up::{plan, DisplaySettings};
 
-use crate::demo::{cases, Case};
+use crate::demo::{cases, DemoCase};
 use crate::oracle;
 use crate::rig::{clock, link_settings, settings, timing, CONNECTOR, PATIENCE};
 use crate::witness::{Disturbance, Witness, WitnessLog};
 
 /// A rig whose thread is the test's: nothing happens but by a call.
-struct Rig {
+struct SteppedRig {
     link: HostLink,
-    cable: Direct<Panel<Witness>>,
+    cable: Direct<DisplayPanel<Witness>>,
     clock: Arc<dyn HostClock>,
     log: WitnessLog,
     /// Planes of the frames, and the pixels that they must become. Frame `id` is number `id - 1`, again and again.
@@ -55,8 +55,8 @@ struct Sample {
     status: Status,
 }
 
-impl Rig {
-    fn open(case: &Case) -> Self {
+impl SteppedRig {
+    fn open(case: &DemoCase) -> Self {
         let settings = DisplaySettings { schedule: case.schedule, ..settings(case.encoding) };
         let raster = settings.raster;
         let clock = clock();
@@ -64,7 +64,7 @@ impl Rig {
         let mut card = open_for(None, Some(CONNECTOR)).expect("vkms");
         let plan = plan(&card.connectors().unwrap(), &settings).expect("it can be used");
         card.start(&plan.setup).expect("it starts");
-        let panel = Panel::new(Witness::new(card, log.clone()), plan.panel, 1, clock.as_ref());
+        let panel = DisplayPanel::new(Witness::new(card, log.clone()), plan.panel, 1, clock.as_ref());
         let mut link = HostLink::new(link_settings(&settings));
         link.connect();
         let pixels = |planes: &[u8]| oracle::pixels(case.encoding, &case.schedule, raster, planes);
@@ -250,7 +250,7 @@ fn judge_flips(sample: &Sample) {
 }
 
 /// What the rig counted between two samples is what the kernel's count of blanks and the pixels say, exactly.
-fn judge(rig: &mut Rig, from: &Sample, to: &Sample) {
+fn judge(rig: &mut SteppedRig, from: &Sample, to: &Sample) {
     judge_flips(to);
     rig.judged.1 += 1;
     if std::mem::take(&mut rig.was_told_late) {
@@ -287,7 +287,7 @@ fn judge(rig: &mut Rig, from: &Sample, to: &Sample) {
 }
 
 /// Every frame of the demo, one by one.
-fn step(rig: &mut Rig) -> Sample {
+fn step(rig: &mut SteppedRig) -> Sample {
     let start = rig.until("the link streams", |rig, _| rig.link.state() == LinkState::Streaming);
     let mut last = start.clone();
     for _ in 0..rig.frames.len() {
@@ -309,7 +309,7 @@ fn step(rig: &mut Rig) -> Sample {
 
 /// The picture of a new frame is `blanks` too late. Nothing is read meanwhile, so that no other flip is missed unless this
 /// machine is late.
-fn stall(rig: &mut Rig, last: &Sample, blanks: u32) -> Sample {
+fn stall(rig: &mut SteppedRig, last: &Sample, blanks: u32) -> Sample {
     rig.log.lock().is_blind = true;
     let last = rig.until("nothing is read", |_, sample| sample.blank > last.blank + 3);
     rig.log.lock().next = Disturbance::Stall(blanks);
@@ -329,7 +329,7 @@ fn stall(rig: &mut Rig, last: &Sample, blanks: u32) -> Sample {
 }
 
 /// The rig's thread sleeps for `blanks` while two frames wait: the first of them is never seen.
-fn sleep(rig: &mut Rig, last: &Sample, blanks: u32) -> Sample {
+fn sleep(rig: &mut SteppedRig, last: &Sample, blanks: u32) -> Sample {
     let limit = Instant::now() + PATIENCE;
     let id = loop {
         rig.turn();
@@ -353,7 +353,7 @@ fn sleep(rig: &mut Rig, last: &Sample, blanks: u32) -> Sample {
 
 /// The kernel refuses a picture because it is busy. Where a blank passes just then, it is busy no longer, and the next frame
 /// tries again.
-fn occupy(rig: &mut Rig, last: &Sample) -> Sample {
+fn occupy(rig: &mut SteppedRig, last: &Sample) -> Sample {
     let before = rig.log.lock().refused;
     let mut sample = last.clone();
     for tried in 1..=20 {
@@ -375,7 +375,7 @@ fn occupy(rig: &mut Rig, last: &Sample) -> Sample {
 }
 
 /// An order to go dark is black at the next blank whose picture was not chosen before, and stays so.
-fn black(rig: &mut Rig, last: &Sample) {
+fn black(rig: &mut SteppedRig, last: &Sample) {
     rig.link.command(rig.clock.now(), Verb::Black, &mut rig.cable).expect("an order");
     let ordered = rig.cable.device_mut().out().reader.blank().wrapping_sub(rig.base.unwrap());
     let sample = rig.until("black by order", |rig, _| rig.shown.last().is_some_and(|(_, f)| f.is_none()));
@@ -394,9 +394,9 @@ pub(crate) fn demo_frames() {
     cases(settings(Encoding::Rgb8).raster).iter().for_each(prove);
 }
 
-fn prove(case: &Case) {
+fn prove(case: &DemoCase) {
     println!("  {}:", case.name);
-    let mut rig = Rig::open(case);
+    let mut rig = SteppedRig::open(case);
     let mut last = step(&mut rig);
     // What is missed does not depend on what the bits of a controller mean.
     let stalls: &[u32] = if case.name.starts_with("dlpc900") { &[2] } else { &[1, 2, 5] };

@@ -18,7 +18,7 @@ use rustix::process::{pidfd_getfd, pidfd_open, Pid, PidfdFlags, PidfdGetfdFlags}
 
 use crate::rig::{open_by, opener, pixels, stream, timing, CONNECTOR, PATIENCE};
 use crate::witness::{witnessed, WitnessLog};
-use crate::writeback::{driven, Reader};
+use crate::writeback::{driven, WritebackReader};
 
 /// How long a guardian of this test keeps a display.
 pub(crate) const HOLD: Duration = Duration::from_secs(20);
@@ -157,7 +157,7 @@ pub(crate) fn killed() {
     assert_eq!(line, "light\n");
     let descriptor = descriptor_of(&run);
     let crtc = driven(&descriptor, timing().size()).expect("the run drives a CRTC");
-    let mut reader = Reader::attach(descriptor, crtc, timing().size());
+    let mut reader = WritebackReader::attach(descriptor, crtc, timing().size());
     let mut read = || {
         std::thread::sleep(BETWEEN_READS);
         reader.read().expect("the run's or the guardian's display")

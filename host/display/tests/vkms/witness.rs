@@ -6,11 +6,11 @@ use std::ffi::OsString;
 use std::os::fd::OwnedFd;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 
-use dpm_display::scan_out::{DisplayError, Flip, Picture, Pixels, ScanOut};
+use dpm_display::scan_out::{DisplayError, Flip, PictureBuffer, Pixels, ScanOut};
 use dpm_display::transport::Opener;
 
 use crate::rig::timing;
-use crate::writeback::Reader;
+use crate::writeback::WritebackReader;
 
 /// A picture that the card took.
 #[derive(Clone, Debug)]
@@ -18,7 +18,7 @@ pub(crate) struct CardPicture {
     /// The kernel's count of the blank from which on it is scanned out, and its stamp.
     pub(crate) flip: Flip,
     /// Which one.
-    pub(crate) picture: Picture,
+    pub(crate) picture: PictureBuffer,
     /// What was composed of it: XRGB8888 with zeros in the unused bytes. `None` where the test reads later.
     pub(crate) pixels: Option<Vec<u8>>,
 }
@@ -50,7 +50,7 @@ pub(crate) struct Log {
     pub(crate) blackened: Vec<Vec<u8>>,
     /// What is to happen next.
     pub(crate) next: Disturbance,
-    front: Option<Picture>,
+    front: Option<PictureBuffer>,
 }
 
 /// The log, shared with the test.
@@ -66,9 +66,9 @@ impl WitnessLog {
 /// The witness.
 pub(crate) struct Witness {
     out: Box<dyn ScanOut>,
-    pub(crate) reader: Reader,
+    pub(crate) reader: WritebackReader,
     log: WitnessLog,
-    waiting: Option<Picture>,
+    waiting: Option<PictureBuffer>,
 }
 
 impl Witness {
@@ -77,7 +77,7 @@ impl Witness {
         let (descriptor, arguments) = out.guarded().expect("a card");
         let at = arguments.iter().position(|a| a == "--crtc").expect("the CRTC is named");
         let crtc = arguments[at + 1].to_string_lossy().parse().expect("by its number");
-        Self { out, reader: Reader::attach(descriptor, crtc, timing().size()), log, waiting: None }
+        Self { out, reader: WritebackReader::attach(descriptor, crtc, timing().size()), log, waiting: None }
     }
 }
 
@@ -96,7 +96,7 @@ impl ScanOut for Witness {
         self.out.pixels(frame)
     }
 
-    fn flip(&mut self, picture: Picture) -> Result<(), DisplayError> {
+    fn flip(&mut self, picture: PictureBuffer) -> Result<(), DisplayError> {
         let is_new = self.log.lock().front != Some(picture);
         let next = if is_new { std::mem::take(&mut self.log.lock().next) } else { Disturbance::None };
         match next {

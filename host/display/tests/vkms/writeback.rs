@@ -6,7 +6,7 @@ use std::io::{self, Write};
 use std::os::fd::OwnedFd;
 use std::time::{Duration, Instant};
 
-use dpm_display::card::Node;
+use dpm_display::card::CardDescriptor;
 use drm::buffer::{Buffer, DrmFourcc};
 use drm::control::atomic::AtomicModeReq;
 use drm::control::connector::Interface;
@@ -23,8 +23,8 @@ use crate::rig::{CRC, PATIENCE};
 const COMPOSER_PATIENCE: Duration = Duration::from_millis(400);
 
 /// Reads back what a CRTC composes.
-pub(crate) struct Reader {
-    node: Node,
+pub(crate) struct WritebackReader {
+    node: CardDescriptor,
     crtc: crtc::Handle,
     connector: connector::Handle,
     buffer: DumbBuffer,
@@ -37,12 +37,12 @@ pub(crate) struct Reader {
     back: AtomicModeReq,
 }
 
-impl Reader {
+impl WritebackReader {
     /// Puts the writeback connector at the CRTC numbered `crtc`, which `descriptor` drives with a mode of `size`, in the place
     /// of the display's: the kernel refuses a CRTC with both. The CRTC, its plane, its mode and its pictures stay, but it is
     /// restarted, so its blanks get another phase.
     pub(crate) fn attach(descriptor: OwnedFd, crtc: u32, size: (u32, u32)) -> Self {
-        let node = Node(descriptor);
+        let node = CardDescriptor(descriptor);
         node.set_client_capability(ClientCapability::WritebackConnectors, true)
             .expect("a driver with writeback");
         let crtc = crtc::Handle::from(std::num::NonZeroU32::new(crtc).expect("a number"));
@@ -135,7 +135,7 @@ impl Reader {
     }
 }
 
-impl Drop for Reader {
+impl Drop for WritebackReader {
     fn drop(&mut self) {
         // Refused where the CRTC is off by now: then nothing is attached to it either.
         let _ = self.commit(AtomicCommitFlags::ALLOW_MODESET, &self.back);
@@ -145,7 +145,7 @@ impl Drop for Reader {
 }
 
 /// A property of an object by its name, and its value.
-fn property<T: ResourceHandle>(node: &Node, object: T, name: &str) -> (property::Handle, u64) {
+fn property<T: ResourceHandle>(node: &CardDescriptor, object: T, name: &str) -> (property::Handle, u64) {
     let all = node.get_properties(object).unwrap();
     let (handles, values) = all.as_props_and_values();
     let is_it = |(handle, _): &(&property::Handle, &u64)| {
@@ -183,7 +183,7 @@ fn wait_for(fence: &OwnedFd) {
 
 /// The number of the CRTC that `descriptor`'s card drives with a mode of `size` now.
 pub(crate) fn driven(descriptor: &OwnedFd, size: (u32, u32)) -> Option<u32> {
-    let node = Node(descriptor.try_clone().unwrap());
+    let node = CardDescriptor(descriptor.try_clone().unwrap());
     let resources = node.resource_handles().unwrap();
     let is_it = |crtc: &&crtc::Handle| {
         let mode = node.get_crtc(**crtc).ok().and_then(|info| info.mode());

@@ -7,7 +7,7 @@ use super::{Compression, ImageError, ImageHeader, HEADER_BYTES};
 enum Expect {
     Control,
     /// High part of a length: what it counts, and its low part.
-    High(Counts, u8),
+    High(RunKind, u8),
     /// The byte after a leading 0.
     Escape,
     CopyLength,
@@ -19,7 +19,7 @@ enum Expect {
 }
 
 #[derive(Clone, Copy, Debug)]
-enum Counts {
+enum RunKind {
     Run,
     Literal,
     Copy,
@@ -120,26 +120,26 @@ impl ImageDecoder {
         let erle = self.compression == Compression::Erle;
         self.expect = match self.expect {
             Expect::Control if b == 0 => Expect::Escape,
-            Expect::Control if erle && b >= 128 => Expect::High(Counts::Run, b),
+            Expect::Control if erle && b >= 128 => Expect::High(RunKind::Run, b),
             Expect::Control => Expect::Run(usize::from(b)),
             Expect::Escape => match (b, erle) {
                 (0, _) => self.end_line(),
                 (1, false) => self.end_image()?,
                 (1, true) => Expect::CopyLength,
-                (b, true) if b >= 128 => Expect::High(Counts::Literal, b),
+                (b, true) if b >= 128 => Expect::High(RunKind::Literal, b),
                 (n, _) => Expect::Literal(usize::from(n)),
             },
             Expect::CopyLength if b == 0 => self.end_image()?,
-            Expect::CopyLength if b >= 128 => Expect::High(Counts::Copy, b),
+            Expect::CopyLength if b >= 128 => Expect::High(RunKind::Copy, b),
             Expect::CopyLength => self.copy(usize::from(b))?,
             Expect::High(what, low) => {
                 let n = usize::from(low & 0x7f) | usize::from(b) << 7;
                 match (what, n) {
                     // A two-byte length may still be small; nothing to repeat means nothing to read.
-                    (Counts::Copy, n) => self.copy(n)?,
-                    (Counts::Literal, 0) => Expect::Control,
-                    (Counts::Literal, n) => Expect::Literal(n),
-                    (Counts::Run, n) => Expect::Run(n),
+                    (RunKind::Copy, n) => self.copy(n)?,
+                    (RunKind::Literal, 0) => Expect::Control,
+                    (RunKind::Literal, n) => Expect::Literal(n),
+                    (RunKind::Run, n) => Expect::Run(n),
                 }
             }
             Expect::Run(n) => match self.pixel(b) {

@@ -6,7 +6,7 @@ use clap_complete::env::Shells;
 use clap_complete::CompleteEnv;
 use dpm_rig::config::RigConfig;
 use dpm_rig::control::change::change;
-use dpm_rig::parameters::Command;
+use dpm_rig::parameters::ParameterCommand;
 use std::ffi::OsStr;
 use std::io;
 
@@ -94,7 +94,7 @@ fn first_sentence(text: &str) -> String {
 /// Parameters of the running rig that begin as `typed` does.
 fn parameters(typed: &OsStr) -> Vec<CompletionCandidate> {
     let Some(typed) = typed.to_str() else { return Vec::new() };
-    let told = change(None, &Command::List).unwrap_or_default();
+    let told = change(None, &ParameterCommand::List).unwrap_or_default();
     named_in(&told).filter(|name| name.starts_with(typed)).map(CompletionCandidate::new).collect()
 }
 

@@ -8,8 +8,8 @@ use dpm_common::files::check_folder;
 use dpm_device::planes::Raster;
 use dpm_lab::error::figure3::Figure3Group;
 use dpm_lab::error::plan::{Setting, Window};
-use dpm_lab::error::planes::{markdown, Card, Panel, Pattern, MOTIONS};
-use dpm_lab::error::runs::{ErrorOptions, Extent, GroupResult};
+use dpm_lab::error::planes::{markdown, CardPanel, CardPattern, TestCard, MOTIONS};
+use dpm_lab::error::runs::{ErrorOptions, GroupResult, SequenceExtent};
 use dpm_lab::error::seen::SeenGroup;
 use dpm_lab::error::table::TableGroup;
 use dpm_render::gpu::Gpu;
@@ -199,11 +199,11 @@ fn planes(follow: f64, json: bool) -> Result<(), Failure> {
     let failed = |e| Failure::from(PipelineError::from(e));
     let gpu = open_gpu(&config)?;
     let orders = [BitOrder::default().0].into_iter().chain(OTHER_ORDERS);
-    let panels = orders.map(|order| Panel::of_bits(order).following(follow));
-    let panels: Vec<Panel> = panels.chain([Panel::of_split(), Panel::of_binary24()]).collect();
+    let panels = orders.map(|order| CardPanel::of_bits(order).following(follow));
+    let panels: Vec<CardPanel> = panels.chain([CardPanel::of_split(), CardPanel::of_binary24()]).collect();
     let mut rows = Vec::new();
-    for pattern in [Pattern::Noise, Pattern::Patches] {
-        let card = Card::new(&gpu, pattern).map_err(failed)?;
+    for pattern in [CardPattern::Noise, CardPattern::Patches] {
+        let card = TestCard::new(&gpu, pattern).map_err(failed)?;
         for panel in &panels {
             let measured = MOTIONS.iter().map(|motion| card.measure(motion, panel));
             rows.extend(measured.collect::<Result<Vec<_>, _>>().map_err(failed)?);
@@ -257,7 +257,7 @@ pub(super) fn chosen<T: Clone>(args: &ErrorArgs, all: &[T]) -> Result<Vec<T>, Fa
 
 pub(super) fn options(args: &ErrorArgs, out: &Path) -> ErrorOptions {
     ErrorOptions {
-        extent: Extent {
+        extent: SequenceExtent {
             warm_up: if args.quick { 48 } else { 96 },
             // 250 ms at 947 fps: 33 ms for the eye at the end, and flicker down to 4 Hz.
             kept: 237,

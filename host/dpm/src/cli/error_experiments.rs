@@ -2,7 +2,7 @@
 
 use super::error::{chosen, folder, list, list_names, options, rig_files, rig_of, stage, ErrorArgs};
 use super::error_files::{known, known_or, report, report_rigs, show};
-use super::progress::Progress;
+use super::progress::WorkProgress;
 use dpm_lab::error::costs::CardCosts;
 use dpm_lab::error::figure3::{self, Figure3Group, SPP};
 use dpm_lab::error::groups::RigGroup;
@@ -10,8 +10,8 @@ use dpm_lab::error::plan::{contenders, Setting};
 use dpm_lab::error::plot::{self, curves, Cost};
 use dpm_lab::error::report::{csv, markdown};
 use dpm_lab::error::runs::{
-    is_other, key_of, ErrorOptions, ErrorRunError, ErrorRuns, Extent, GroupResult, Measured, AT_EQUAL_TIME,
-    EYE_FRAMES, RACES,
+    is_other, key_of, ErrorOptions, ErrorRunError, ErrorRuns, GroupResult, Measured, SequenceExtent,
+    AT_EQUAL_TIME, EYE_FRAMES, RACES,
 };
 use dpm_lab::error::seen::{self, SeenGroup};
 use dpm_lab::error::table::{self, TableGroup};
@@ -33,7 +33,7 @@ pub(super) trait Experiment: Serialize + DeserializeOwned {
     /// What was measured.
     fn setting(&self) -> Setting;
     /// What it came from.
-    fn origin(&self) -> Origin<'_>;
+    fn origin(&self) -> GroupOrigin<'_>;
     /// Names all that the result of a setting depends on.
     fn key(stamp: &Stamp, setting: Setting, options: &ErrorOptions) -> String;
     /// Measures the setting of `runs`, with a picture of what the eye saw where there is one.
@@ -49,7 +49,7 @@ pub(super) trait Experiment: Serialize + DeserializeOwned {
         None
     }
     /// What all sequences of a setting cost but those of its reference.
-    fn cost(setting: Setting, extent: Extent, methods: usize) -> u64 {
+    fn cost(setting: Setting, extent: SequenceExtent, methods: usize) -> u64 {
         cost_of_methods(setting, extent, methods)
     }
     /// The experiment's tables.
@@ -64,13 +64,13 @@ pub(super) trait Experiment: Serialize + DeserializeOwned {
 }
 
 /// What a measured group came from.
-pub(super) struct Origin<'a> {
+pub(super) struct GroupOrigin<'a> {
     /// Hash of all that it depends on.
     pub key: &'a str,
     /// With what it was measured.
     pub stamp: &'a Stamp,
     /// How much was drawn of it, where a group tells.
-    pub extent: Option<Extent>,
+    pub extent: Option<SequenceExtent>,
 }
 
 impl Experiment for GroupResult {
@@ -81,8 +81,8 @@ impl Experiment for GroupResult {
         self.setting()
     }
 
-    fn origin(&self) -> Origin<'_> {
-        Origin { key: &self.key, stamp: &self.stamp, extent: Some(self.extent) }
+    fn origin(&self) -> GroupOrigin<'_> {
+        GroupOrigin { key: &self.key, stamp: &self.stamp, extent: Some(self.extent) }
     }
 
     fn key(stamp: &Stamp, setting: Setting, options: &ErrorOptions) -> String {
@@ -124,7 +124,7 @@ impl Experiment for TableGroup {
         self.setting()
     }
 
-    fn origin(&self) -> Origin<'_> {
+    fn origin(&self) -> GroupOrigin<'_> {
         self.result.origin()
     }
 
@@ -153,8 +153,8 @@ impl Experiment for SeenGroup {
         self.setting()
     }
 
-    fn origin(&self) -> Origin<'_> {
-        Origin { key: &self.key, stamp: &self.stamp, extent: Some(self.extent) }
+    fn origin(&self) -> GroupOrigin<'_> {
+        GroupOrigin { key: &self.key, stamp: &self.stamp, extent: Some(self.extent) }
     }
 
     fn key(stamp: &Stamp, setting: Setting, options: &ErrorOptions) -> String {
@@ -181,8 +181,8 @@ impl Experiment for Figure3Group {
         self.setting()
     }
 
-    fn origin(&self) -> Origin<'_> {
-        Origin { key: &self.key, stamp: &self.stamp, extent: None }
+    fn origin(&self) -> GroupOrigin<'_> {
+        GroupOrigin { key: &self.key, stamp: &self.stamp, extent: None }
     }
 
     fn key(stamp: &Stamp, setting: Setting, options: &ErrorOptions) -> String {
@@ -196,7 +196,7 @@ impl Experiment for Figure3Group {
         Ok((figure3::measure(runs, each)?, None))
     }
 
-    fn cost(setting: Setting, extent: Extent, methods: usize) -> u64 {
+    fn cost(setting: Setting, extent: SequenceExtent, methods: usize) -> u64 {
         2 * SPP.into_iter().map(|spp| cost(&format!("{spp} spp"), setting, extent, methods)).sum::<u64>()
     }
 
@@ -211,7 +211,7 @@ impl Experiment for Figure3Group {
 
 /// What the sequences of this name cost beside others, for the time that is left: sample frames, and as much for each frame as 3 samples
 /// take.
-fn cost(what: &str, setting: Setting, extent: Extent, methods: usize) -> u64 {
+fn cost(what: &str, setting: Setting, extent: SequenceExtent, methods: usize) -> u64 {
     let (frames, eye) = (f64::from(extent.warm_up + extent.kept), EYE_FRAMES as f64);
     let samples = setting.budget.max(1.0);
     let of = match what {
@@ -232,7 +232,7 @@ fn cost(what: &str, setting: Setting, extent: Extent, methods: usize) -> u64 {
 const MOST_RACES: u64 = 1 + RACES as u64;
 
 /// Each method twice, the races, and each of the others twice at equal time, here and on every card.
-fn cost_of_methods(setting: Setting, extent: Extent, methods: usize) -> u64 {
+fn cost_of_methods(setting: Setting, extent: SequenceExtent, methods: usize) -> u64 {
     let of = |what: &str| cost(what, setting, extent, methods);
     let others = contenders(&RenderConfig::default(), false).iter().filter(|c| is_other(c.name)).count();
     let times = (others * (1 + CardCosts::all().len())) as u64;
@@ -309,7 +309,7 @@ fn measure_all<T: Experiment>(args: &ErrorArgs, chosen: &[Setting]) -> Result<Ve
         measured + if args.sequences { methods as u64 * of("", s) + every } else { 0 }
     };
     let totals: Vec<u64> = chosen.iter().enumerate().map(total).collect();
-    let mut progress = Progress::new(&totals);
+    let mut progress = WorkProgress::new(&totals);
     let mut groups: Vec<T> = Vec::new();
     for &setting in chosen {
         let name = setting.name();

@@ -1,7 +1,7 @@
 //! Measured groups of `dpm error` in a folder: found again or measured and kept, joined, and reported. What differs from experiment to
 //! experiment is in `error_experiments.rs`.
 
-use super::error_experiments::{Experiment, Origin};
+use super::error_experiments::{Experiment, GroupOrigin};
 use super::watch::print;
 use dpm_common::files::write_atomically;
 use dpm_device::regular_file;
@@ -164,7 +164,7 @@ fn joined<T: Experiment>(out: &Path) -> Result<Vec<T>, Failure> {
 /// groups share curves. They may come from different devices and commits, which the tables show.
 fn one_experiment<T: Experiment>(out: &Path, sorted: &[T]) -> Result<(), Failure> {
     let what = |g: &T| {
-        let Origin { stamp, extent, .. } = g.origin();
+        let GroupOrigin { stamp, extent, .. } = g.origin();
         (stamp.config_hash.clone(), stamp.raster, stamp.seed, extent)
     };
     let told = |why: &str, a: &T, b: &T| {
@@ -225,7 +225,7 @@ fn write(path: &Path, text: &str) -> Result<(), Failure> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use dpm_lab::error::runs::{ErrorRow, Extent};
+    use dpm_lab::error::runs::{ErrorRow, SequenceExtent};
     use dpm_lab::stamp::Stamp;
 
     fn group(moving: bool, budget: f64, change: impl FnOnce(&mut GroupResult)) -> GroupResult {
@@ -269,7 +269,7 @@ mod tests {
             raster: [8, 6],
             seed: 1,
         };
-        let extent = Extent { warm_up: 1, kept: 2, reference_spp: 3 };
+        let extent = SequenceExtent { warm_up: 1, kept: 2, reference_spp: 3 };
         let key = format!("{moving}{budget}");
         let mut made =
             GroupResult { stamp, key, extent, probes: 1, mean: 1.0, reference_error: 0.0, rows: vec![row] };

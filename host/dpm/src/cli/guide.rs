@@ -2,8 +2,8 @@
 
 use super::doctor::serial_ports;
 use super::session::Runner;
-use dpm_page::calibration::{Act, Guide, Session};
-use dpm_rig::calibration_steps::{calibration_file, About, Step, Steps};
+use dpm_page::calibration::{Act, Guide, StepSession};
+use dpm_rig::calibration_steps::{calibration_file, About, CalibrationStep, Steps};
 use dpm_rig::config::RigConfig;
 use dpm_rig::control::rig_name;
 use std::path::Path;
@@ -44,7 +44,8 @@ impl RigGuide {
     /// What a step has measured that differs from the rig's calibration file.
     fn proposed(&self, trial: &Path) -> Vec<(String, String, String)> {
         let (old, new) = (self.steps(), self.steps_by(Some(trial)));
-        let quality = |step: &Step| step.measured.as_ref().map_or_else(String::new, |m| m.quality.clone());
+        let quality =
+            |step: &CalibrationStep| step.measured.as_ref().map_or_else(String::new, |m| m.quality.clone());
         let pairs = old.steps.iter().zip(&new.steps).filter(|(old, new)| old.measured != new.measured);
         pairs.map(|(old, new)| (new.title.clone(), quality(old), quality(new))).collect()
     }
@@ -55,7 +56,7 @@ impl Guide for RigGuide {
         self.steps_by(None)
     }
 
-    fn session(&self) -> Option<Session> {
+    fn session(&self) -> Option<StepSession> {
         let (mut session, trial) = self.runner.as_ref()?.session();
         if let Some(trial) = trial {
             session.proposed = self.proposed(&trial);

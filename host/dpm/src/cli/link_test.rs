@@ -5,7 +5,7 @@ use super::watch::{print, take_locks};
 use dpm_common::signals;
 use dpm_common::stopping;
 use dpm_lab::conformance::{rules, Extent, Rule};
-use dpm_lab::link_test::{judge_projector, link_test, Content};
+use dpm_lab::link_test::{judge_projector, link_test, TestFrames};
 use dpm_rig::calibration_steps::is_simulated;
 use dpm_rig::config::{PlaneWeights, RigConfig};
 use dpm_rig::failure::{Failure, FailureKind};
@@ -96,9 +96,9 @@ pub(super) fn execute(args: &LinkTestArgs) -> Result<(), Failure> {
     presence::PROJECTOR.look(&config)?;
     let rig = Rig::build(&config, None)?;
     let content = if args.prepared {
-        Content::prepared(&rig, args.count)
+        TestFrames::prepared(&rig, args.count)
     } else {
-        Content::rendered(&rig, &open_gpu(&config)?, args.count, &stop)?
+        TestFrames::rendered(&rig, &open_gpu(&config)?, args.count, &stop)?
     };
     let report = link_test(&rig, &content, f64::from(args.way_seconds), &stop)?;
     print(&if args.json { to_json(&report) + "\n" } else { report.to_table() });

@@ -36,8 +36,8 @@ pub(super) fn open(
         }
     };
     match link(page.address(), token) {
-        Link::Secret(told) => teller.whisper(&told),
-        Link::Open(told) => teller.note(&told),
+        PageLink::Secret(told) => teller.whisper(&told),
+        PageLink::Open(told) => teller.note(&told),
     }
     Some(page)
 }
@@ -49,7 +49,7 @@ pub(super) fn token(port: u16) -> Result<(Token, PathBuf), String> {
 }
 
 /// Where a page is, in words for the operator.
-pub(super) enum Link {
+pub(super) enum PageLink {
     /// With the token: for a terminal.
     Secret(String),
     /// Without it.
@@ -57,16 +57,16 @@ pub(super) enum Link {
 }
 
 /// Tells where the page at `address` is. A log is read by more people than a terminal, so only there the token is told.
-pub(super) fn link(address: SocketAddr, token: Result<(Token, PathBuf), String>) -> Link {
+pub(super) fn link(address: SocketAddr, token: Result<(Token, PathBuf), String>) -> PageLink {
     let link = format!("http://{address}/");
     match token {
         Ok((token, _)) if std::io::stderr().is_terminal() => {
-            Link::Secret(format!("page: {link}#key={}", token.as_str()))
+            PageLink::Secret(format!("page: {link}#key={}", token.as_str()))
         }
-        Ok((_, path)) => Link::Open(format!(
+        Ok((_, path)) => PageLink::Open(format!(
             "page: {link}; for orders, `dpm page {address}` prints a link (the key is in {})",
             path.display()
         )),
-        Err(why) => Link::Open(format!("page: {link}, without orders: {why}")),
+        Err(why) => PageLink::Open(format!("page: {link}, without orders: {why}")),
     }
 }

@@ -72,7 +72,7 @@ use std::process::ExitCode;
 #[command(name = "dpm", version, about = ABOUT, after_help = AFTER_HELP)]
 struct Cli {
     #[command(subcommand)]
-    command: Command,
+    command: CliCommand,
 }
 
 const ABOUT: &str =
@@ -82,7 +82,7 @@ const AFTER_HELP: &str = "Exit codes: 0 ok, 1 a check failed, 2 usage or bad inp
 Every key of the rig file can be set by --set a.b=c or by the environment variable DPM_SET_A__B=c.";
 
 #[derive(Debug, Subcommand)]
-enum Command {
+enum CliCommand {
     /// Run the built-in scene of two moving objects with the mock projector and the mock tracker
     Demo(run::DemoArgs),
     /// Run a rig file
@@ -169,7 +169,7 @@ enum Command {
     #[cfg(feature = "lab")]
     Plan(plan::PlanArgs),
     #[command(flatten)]
-    Satellite(crate::satellites::Command),
+    Satellite(crate::satellites::SatelliteCommand),
     /// List the displays that can serve as projectors, and what to write in a rig file for each mode
     #[cfg(feature = "display")]
     Display(display::DisplayArgs),
@@ -249,49 +249,49 @@ fn negatives_reach_their_checks(command: clap::Command) -> clap::Command {
         .mut_subcommands(negatives_reach_their_checks)
 }
 
-fn dispatch(command: &Command) -> Result<(), Failure> {
+fn dispatch(command: &CliCommand) -> Result<(), Failure> {
     match command {
-        Command::Demo(args) => run::execute_demo(args),
-        Command::Run(args) => run::execute(args),
+        CliCommand::Demo(args) => run::execute_demo(args),
+        CliCommand::Run(args) => run::execute(args),
         #[cfg(feature = "lab")]
-        Command::LinkTest(args) => link_test::execute(args),
-        Command::Black(args) => order::execute(args, Order::Black),
-        Command::Freeze(args) => order::execute(args, Order::Freeze),
-        Command::Safe(args) => order::execute(args, Order::Safe),
-        Command::Arm(args) => order::execute(args, Order::Arm),
-        Command::Set(args) => set::execute(args),
+        CliCommand::LinkTest(args) => link_test::execute(args),
+        CliCommand::Black(args) => order::execute(args, Order::Black),
+        CliCommand::Freeze(args) => order::execute(args, Order::Freeze),
+        CliCommand::Safe(args) => order::execute(args, Order::Safe),
+        CliCommand::Arm(args) => order::execute(args, Order::Arm),
+        CliCommand::Set(args) => set::execute(args),
         #[cfg(feature = "page")]
-        Command::Page(args) => page::execute(args),
+        CliCommand::Page(args) => page::execute(args),
         #[cfg(feature = "page")]
-        Command::Rigs(args) => rigs::execute(args),
-        Command::Pattern(args) => pattern::execute(args),
+        CliCommand::Rigs(args) => rigs::execute(args),
+        CliCommand::Pattern(args) => pattern::execute(args),
         #[cfg(feature = "calibrate")]
-        Command::Calibrate(args) => calibrate::execute(args),
-        Command::Record(args) => record::execute(args),
+        CliCommand::Calibrate(args) => calibrate::execute(args),
+        CliCommand::Record(args) => record::execute(args),
         #[cfg(feature = "lab")]
-        Command::Rehearse(args) => rehearse::execute(args),
-        Command::Profile(args) => profile::execute(args),
-        Command::Doctor(args) => doctor::execute(args),
+        CliCommand::Rehearse(args) => rehearse::execute(args),
+        CliCommand::Profile(args) => profile::execute(args),
+        CliCommand::Doctor(args) => doctor::execute(args),
         #[cfg(feature = "lab")]
-        Command::Stability(args) => stability::execute(args),
+        CliCommand::Stability(args) => stability::execute(args),
         #[cfg(feature = "lab")]
-        Command::Report(args) => report::execute(args),
+        CliCommand::Report(args) => report::execute(args),
         #[cfg(feature = "lab")]
-        Command::Snapshot(args) => snapshot::execute(args),
+        CliCommand::Snapshot(args) => snapshot::execute(args),
         #[cfg(feature = "lab")]
-        Command::Scene(args) => scene::execute(args),
+        CliCommand::Scene(args) => scene::execute(args),
         #[cfg(feature = "lab")]
-        Command::Bench(args) => bench::execute(args),
+        CliCommand::Bench(args) => bench::execute(args),
         #[cfg(feature = "lab")]
-        Command::Error(args) => error::execute(args),
+        CliCommand::Error(args) => error::execute(args),
         #[cfg(feature = "lab")]
-        Command::Plan(args) => plan::execute(args),
-        Command::Satellite(command) => crate::satellites::execute(command).map(|text| watch::print(&text)),
+        CliCommand::Plan(args) => plan::execute(args),
+        CliCommand::Satellite(command) => crate::satellites::execute(command).map(|text| watch::print(&text)),
         #[cfg(feature = "display")]
-        Command::Display(args) => display::execute(args),
+        CliCommand::Display(args) => display::execute(args),
         #[cfg(feature = "manual")]
-        Command::Completions(args) => manual::completions(args),
+        CliCommand::Completions(args) => manual::completions(args),
         #[cfg(feature = "manual")]
-        Command::Man(args) => manual::man(args),
+        CliCommand::Man(args) => manual::man(args),
     }
 }

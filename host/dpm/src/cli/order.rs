@@ -2,7 +2,7 @@
 
 use super::watch::print;
 use dpm_common::unix::{user, user_name};
-use dpm_rig::control::client::{tell, Answer};
+use dpm_rig::control::client::{tell, RigAnswer};
 use dpm_rig::failure::{Failure, FailureKind};
 use dpm_rig::order::Order;
 
@@ -41,8 +41,8 @@ pub(super) fn execute(args: &OrderArgs, order: Order) -> Result<(), Failure> {
     }
 }
 
-fn line(answer: &Answer) -> String {
-    let Answer { pid, uid, rig, text, is_vouched_for, .. } = answer;
+fn line(answer: &RigAnswer) -> String {
+    let RigAnswer { pid, uid, rig, text, is_vouched_for, .. } = answer;
     let rig = if rig.is_empty() { "rig not told" } else { rig };
     let says = if *is_vouched_for { "" } else { "says (unverified): " };
     // The answer of another user's process could contain control characters.

@@ -20,7 +20,7 @@ use std::sync::Arc;
 pub(crate) struct PatternArgs {
     /// What is shown
     #[arg(value_enum)]
-    kind: Kind,
+    kind: PatternKind,
     /// The rig file; only its projector is used, and neither scene nor tracker nor GPU is needed
     #[arg(value_name = "RIG.toml")]
     rig: PathBuf,
@@ -63,7 +63,7 @@ pub(crate) struct PatternArgs {
 }
 
 #[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
-enum Kind {
+enum PatternKind {
     /// A column and a row of pixels that cross at the pixel --at
     Cross,
     /// A disc around the pixel --at
@@ -120,11 +120,11 @@ impl PatternArgs {
 
     /// Refuses flags that the kind would accept and then ignore.
     fn refuse_meaningless(&self) -> Result<(), Failure> {
-        use Kind::*;
+        use PatternKind::*;
         self.flags.refuse("dpm pattern", &["--no-prediction", "--out"])?;
         let sized = [Cross, Dot, Grid, Chessboard, FocusStar];
         let stepping = [GrayColumns, GrayRows, GrayShifted, Phase];
-        let of = |kinds: &[Kind]| kinds.contains(&self.kind);
+        let of = |kinds: &[PatternKind]| kinds.contains(&self.kind);
         let flags: [(&str, bool, bool); 8] = [
             ("--at", self.at.is_some(), of(&[Cross, Dot])),
             ("--size", self.size.is_some(), of(&sized)),
@@ -152,20 +152,20 @@ impl PatternArgs {
         };
         let at = self.at.unwrap_or_default();
         match self.kind {
-            Kind::Cross => Pattern::Cross { at, arm: self.size },
-            Kind::Dot => Pattern::Dot { at, diameter: self.size.unwrap_or(7) },
-            Kind::Grid => Pattern::Grid { pitch: self.size.unwrap_or(64) },
-            Kind::Chessboard => Pattern::Chessboard { square: self.size.unwrap_or(64) },
-            Kind::GrayColumns => Pattern::Gray { axis: Axis::Columns },
-            Kind::GrayRows => Pattern::Gray { axis: Axis::Rows },
-            Kind::GrayShifted => Pattern::Shifted { axis, period: self.period.unwrap_or(16) },
-            Kind::Phase => {
+            PatternKind::Cross => Pattern::Cross { at, arm: self.size },
+            PatternKind::Dot => Pattern::Dot { at, diameter: self.size.unwrap_or(7) },
+            PatternKind::Grid => Pattern::Grid { pitch: self.size.unwrap_or(64) },
+            PatternKind::Chessboard => Pattern::Chessboard { square: self.size.unwrap_or(64) },
+            PatternKind::GrayColumns => Pattern::Gray { axis: Axis::Columns },
+            PatternKind::GrayRows => Pattern::Gray { axis: Axis::Rows },
+            PatternKind::GrayShifted => Pattern::Shifted { axis, period: self.period.unwrap_or(16) },
+            PatternKind::Phase => {
                 Pattern::Phase { axis, period: self.period.unwrap_or(32), shifts: self.shifts.unwrap_or(4) }
             }
-            Kind::Full => Pattern::Full,
-            Kind::Ramp => Pattern::Ramp { axis },
-            Kind::Counter => Pattern::Counter,
-            Kind::FocusStar => Pattern::FocusStar { spokes: self.size.unwrap_or(36) },
+            PatternKind::Full => Pattern::Full,
+            PatternKind::Ramp => Pattern::Ramp { axis },
+            PatternKind::Counter => Pattern::Counter,
+            PatternKind::FocusStar => Pattern::FocusStar { spokes: self.size.unwrap_or(36) },
         }
     }
 

@@ -5,7 +5,7 @@ use std::io::Write;
 use std::time::Instant;
 
 /// Work in parts, each of which has steps. Some parts may turn out to be done already.
-pub(super) struct Progress {
+pub(super) struct WorkProgress {
     bar: ProgressBar,
     /// Position at the end of each part.
     ends: Vec<u64>,
@@ -15,7 +15,7 @@ pub(super) struct Progress {
     started: Instant,
 }
 
-impl Progress {
+impl WorkProgress {
     /// For parts of these costs, in any unit.
     pub(super) fn new(parts: &[u64]) -> Self {
         let sum = |end: &mut u64, part: &u64| {
@@ -59,7 +59,7 @@ impl Progress {
     }
 }
 
-impl Drop for Progress {
+impl Drop for WorkProgress {
     fn drop(&mut self) {
         self.bar.finish_and_clear();
     }

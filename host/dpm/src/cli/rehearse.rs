@@ -2,7 +2,7 @@
 
 use super::rig_args::RigArgs;
 use super::watch::print;
-use dpm_rehearsal::{rehearse, Extent, SECONDS, SEEDS};
+use dpm_rehearsal::{rehearse, RehearsalExtent, SECONDS, SEEDS};
 use dpm_rig::failure::{Failure, FailureKind};
 use dpm_rig::telemetry::report::to_json;
 use std::io::{IsTerminal, Write};
@@ -56,7 +56,8 @@ pub(super) fn execute(args: &RehearseArgs) -> Result<(), Failure> {
     let motion = args.motion.iter().map(|motion| format!("rehearsal.motion={motion}"));
     flags.set.splice(0..0, given.chain(motion).collect::<Vec<_>>());
     let config = flags.rig_at_rest(args.rig.as_deref())?;
-    let extent = Extent { seeds: args.seeds, seconds, only_rig: args.only_rig, pictures: !args.no_pictures };
+    let extent =
+        RehearsalExtent { seeds: args.seeds, seconds, only_rig: args.only_rig, pictures: !args.no_pictures };
     let watches = std::io::stderr().is_terminal();
     let report = rehearse(&config, extent, &mut |what| {
         if watches {

@@ -8,7 +8,7 @@
 use super::os;
 use dpm_calibration_file as file;
 use dpm_common::unix::send_signal;
-use dpm_page::calibration::Session;
+use dpm_page::calibration::StepSession;
 use dpm_rig::calibration_steps::SENSOR;
 use dpm_rig::results::TRIAL;
 use std::fs;
@@ -31,7 +31,7 @@ const LOOK: Duration = Duration::from_millis(50);
 /// What the threads of a step share.
 #[derive(Debug, Default)]
 struct StepState {
-    session: Session,
+    session: StepSession,
     /// The input and the number of the step's process, while it runs.
     process: Option<(ChildStdin, i32)>,
     /// When the step was asked to end.
@@ -82,7 +82,7 @@ impl Runner {
     }
 
     /// What is being done, and the file with what was measured, if it waits for a decision.
-    pub(super) fn session(&self) -> (Session, Option<PathBuf>) {
+    pub(super) fn session(&self) -> (StepSession, Option<PathBuf>) {
         let session = held(&self.shared).session.clone();
         let is_open = !session.is_running && self.is_open();
         (session, is_open.then(|| self.trial()))
@@ -109,7 +109,8 @@ impl Runner {
         let arguments = self.arguments(words, sensor, gain)?;
         self.prepare().map_err(|e| format!("{}: {e}", self.trial().display()))?;
         *shared = StepState::default();
-        shared.session = Session { step: Some(step.into()), way, is_running: true, ..Session::default() };
+        shared.session =
+            StepSession { step: Some(step.into()), way, is_running: true, ..StepSession::default() };
         drop(shared);
         let (started, heard) = channel();
         let shared = Arc::clone(&self.shared);
@@ -120,7 +121,7 @@ impl Runner {
             Err(e) => Err(e.to_string()),
         };
         told.map_err(|e| {
-            held(&self.shared).session = Session::default();
+            held(&self.shared).session = StepSession::default();
             format!("cannot start the step: {e}")
         })
     }

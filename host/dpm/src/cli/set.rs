@@ -3,7 +3,7 @@
 use super::watch::print;
 use dpm_rig::control::change::{change, ChangeError};
 use dpm_rig::failure::{Failure, FailureKind};
-use dpm_rig::parameters::Command;
+use dpm_rig::parameters::ParameterCommand;
 
 /// Flags of `dpm set`.
 #[derive(clap::Args, Clone, Debug)]
@@ -34,13 +34,15 @@ pub(crate) fn execute(args: &SetArgs) -> Result<(), Failure> {
         };
         Failure::new(kind, e)
     };
-    let mut commands: Vec<Command> = args.undo.then_some(Command::Undo).into_iter().collect();
+    let mut commands: Vec<ParameterCommand> =
+        args.undo.then_some(ParameterCommand::Undo).into_iter().collect();
     for text in &args.changes {
-        commands.push(Command::parse_change(text).map_err(|e| Failure::new(FailureKind::BadInput, e))?);
+        commands
+            .push(ParameterCommand::parse_change(text).map_err(|e| Failure::new(FailureKind::BadInput, e))?);
     }
-    commands.extend(args.save.then_some(Command::Save));
+    commands.extend(args.save.then_some(ParameterCommand::Save));
     if commands.is_empty() {
-        commands.push(Command::List);
+        commands.push(ParameterCommand::List);
     }
     for command in &commands {
         print(&(change(args.pid, command).map_err(failed)? + "\n"));

@@ -124,7 +124,7 @@ impl Drop for Teller {
 }
 
 /// Frames per second over the last seconds.
-struct Rate {
+struct RecentRate {
     /// The count starts at the oldest one.
     seen: VecDeque<(Duration, u64)>,
 }
@@ -134,7 +134,7 @@ const RATE_OVER: Duration = Duration::from_secs(2);
 /// Maximum number of readings: one per [`SHOWN_EVERY`], and one more.
 const RATE_READINGS: usize = (RATE_OVER.as_millis() / SHOWN_EVERY.as_millis()) as usize + 1;
 
-impl Rate {
+impl RecentRate {
     /// Records the count at `elapsed`; returns the rate per second.
     fn at(&mut self, elapsed: Duration, count: u64) -> f64 {
         while self.seen.len() >= RATE_READINGS || self.seen.len() > 1 && self.seen[1].0 + RATE_OVER <= elapsed
@@ -210,7 +210,7 @@ struct Progress {
     seconds: f64,
     /// When the first frame was planned; an end in time counts from there.
     began: Option<Instant>,
-    rate: Rate,
+    rate: RecentRate,
     shown: TellView,
 }
 
@@ -222,7 +222,7 @@ impl Progress {
         let shown = bar(total, seconds).map_or(lines, TellView::Bar);
         #[cfg(not(feature = "terminal"))]
         let shown = lines;
-        let rate = Rate { seen: VecDeque::new() };
+        let rate = RecentRate { seen: VecDeque::new() };
         Self { started: Instant::now(), total, seconds, began: None, rate, shown }
     }
 
@@ -331,7 +331,7 @@ mod tests {
 
     #[test]
     fn the_rate_is_that_of_the_last_seconds() {
-        let mut rate = Rate { seen: VecDeque::new() };
+        let mut rate = RecentRate { seen: VecDeque::new() };
         assert_eq!(rate.at(Duration::ZERO, 0), 0.0);
         let mut frames = 0;
         let mut last = 0.0;

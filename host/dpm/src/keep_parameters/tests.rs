@@ -38,9 +38,9 @@ fn a_form_that_is_not_edited_is_refused_with_what_to_write() {
     assert!(edited("[render\n", &[]).is_err());
 }
 
-struct Folder(PathBuf);
+struct KeptFolder(PathBuf);
 
-impl Folder {
+impl KeptFolder {
     fn new(name: &str) -> Self {
         let dir = std::env::temp_dir().join(format!("dpm-keep-{}-{name}", std::process::id()));
         let _ = std::fs::remove_dir_all(&dir);
@@ -57,7 +57,7 @@ impl Folder {
     }
 }
 
-impl Drop for Folder {
+impl Drop for KeptFolder {
     fn drop(&mut self) {
         let _ = std::fs::remove_dir_all(&self.0);
     }
@@ -65,7 +65,7 @@ impl Drop for Folder {
 
 #[test]
 fn the_next_run_has_the_values_and_the_old_file_is_kept() {
-    let folder = Folder::new("file");
+    let folder = KeptFolder::new("file");
     let (path, rig) = folder.rig(RIG);
     let kept = ToKeep { keys: vec![(["render", "exposure"], Setting::Number(2.5))], ..ToKeep::default() };
     let told = saver(path.clone())(&rig, &kept).unwrap();
@@ -86,7 +86,7 @@ fn the_next_run_has_the_values_and_the_old_file_is_kept() {
 
 #[test]
 fn a_motion_that_cannot_be_kept_is_refused_before_a_file_is_touched() {
-    let folder = Folder::new("motion");
+    let folder = KeptFolder::new("motion");
     let (path, rig) = folder.rig(RIG);
     let keys = vec![(["render", "exposure"], Setting::Number(2.5))];
     let body = vec![("bunny".to_owned(), DAffine3::IDENTITY)];
@@ -103,7 +103,7 @@ fn a_motion_that_cannot_be_kept_is_refused_before_a_file_is_touched() {
 /// not name it.
 #[test]
 fn a_motion_that_is_kept_moves_the_light_of_the_next_run() {
-    let folder = Folder::new("named");
+    let folder = KeptFolder::new("named");
     let text = "# Mine.\n[tracker] # far\nkind = \"natnet\"\nserver = \"127.0.0.1\"\n[[scene.bodies]]\nname = \"bunny\"\n";
     let (path, rig) = folder.rig(text);
     assert_eq!(rig.config.calibration.file, None);

@@ -3,7 +3,7 @@
 //!
 //! Everything runs at a raster of 48 x 32, where software Vulkan needs milliseconds per frame.
 
-use crate::cli_common::{code, dpm, err, out, start, Folder, NO_DRIVER};
+use crate::cli_common::{code, dpm, err, out, start, TestFolder, NO_DRIVER};
 use dpm_device::pose::Pose;
 use dpm_device::time::{HostClock, HostTime};
 use hil_mock::motion::{Motion, MotionSpec};
@@ -17,7 +17,7 @@ use std::time::{Duration, Instant};
 const SMALL: [&str; 5] = ["--json", "--raster", "48x32", "--frames", "6"];
 
 /// Runs a command at the small raster with its output in `folder`; returns the report.
-fn report(command: &[&str], folder: &Folder, more: &[&str]) -> serde_json::Value {
+fn report(command: &[&str], folder: &TestFolder, more: &[&str]) -> serde_json::Value {
     let args = [command, &SMALL, &["--out", folder.text()], more].concat();
     let output = dpm(&args, &[("DPM_VALIDATION", "1")]);
     assert_eq!(code(&output), 0, "{args:?}: {}", err(&output));
@@ -29,7 +29,7 @@ fn report(command: &[&str], folder: &Folder, more: &[&str]) -> serde_json::Value
 
 #[test]
 fn the_demo_prints_one_object_with_the_agreed_keys_and_leaves_its_files() {
-    let folder = Folder::new("demo");
+    let folder = TestFolder::new("demo");
     let json = report(&["demo"], &folder, &[]);
     for key in
         ["frames_lit", "frames_dropped", "frames_late", "raster", "frame_rate_hz", "pace", "gpu", "wall_s"]
@@ -79,7 +79,7 @@ fn the_demo_prints_one_object_with_the_agreed_keys_and_leaves_its_files() {
 
 #[test]
 fn a_film_shows_the_planes_of_the_run_and_lies_beside_a_strip() {
-    let folder = Folder::new("film");
+    let folder = TestFolder::new("film");
     let film = folder.path("film.gif");
     let path = film.to_str().expect("text");
     let small = ["--json", "--raster", "48x32", "--out", folder.text()];
@@ -118,7 +118,7 @@ fn a_film_shows_the_planes_of_the_run_and_lies_beside_a_strip() {
 
 #[test]
 fn the_rig_file_is_the_demo_and_the_same_seed_gives_the_same_light() {
-    let folder = Folder::new("hash");
+    let folder = TestFolder::new("hash");
     let rig = concat!(env!("CARGO_MANIFEST_DIR"), "/../../rigs/demo.toml");
     let no_pictures = ["--set", "output.images=false"];
     let demo = report(&["demo"], &folder, &no_pictures);
@@ -132,7 +132,7 @@ const RIG: &str = concat!(env!("CARGO_MANIFEST_DIR"), "/../../rigs/demo.toml");
 
 #[test]
 fn bad_input_ends_with_2_and_names_the_place() {
-    let folder = Folder::new("bad");
+    let folder = TestFolder::new("bad");
     let rig = folder.write("rig.toml", "[projector]\nwidth = 64\n\n[render]\n  smaples = 4\nspp = 0\n");
     let cut = folder.write("cut.glb", "glTF\u{2}\0\0\0");
     let in_the_way = folder.write("file", "");
@@ -175,7 +175,7 @@ fn bad_input_ends_with_2_and_names_the_place() {
 
 #[test]
 fn a_raster_beyond_the_machine_is_refused_not_attempted() {
-    let folder = Folder::new("huge");
+    let folder = TestFolder::new("huge");
     let output = dpm(&["demo", "--raster", "8192x8192", "--frames", "1", "--out", folder.text()], &[]);
     // A large GPU may be able to do it; software Vulkan is not.
     if code(&output) != 0 {
@@ -190,7 +190,7 @@ fn a_raster_beyond_the_machine_is_refused_not_attempted() {
 
 #[test]
 fn without_a_driver_the_demo_ends_with_4_and_says_what_to_install() {
-    let folder = Folder::new("driver");
+    let folder = TestFolder::new("driver");
     let output = dpm(&["demo", "--json", "--out", folder.text()], &NO_DRIVER);
     assert_eq!((code(&output), out(&output).as_str()), (4, ""));
     assert!(
@@ -202,7 +202,7 @@ fn without_a_driver_the_demo_ends_with_4_and_says_what_to_install() {
 
 #[test]
 fn a_setting_in_the_environment_reaches_the_run() {
-    let folder = Folder::new("variable");
+    let folder = TestFolder::new("variable");
     let output = dpm(&["demo", "--out", folder.text()], &[("DPM_SET_RENDER__SPP", "none")]);
     assert_eq!(code(&output), 2);
     assert!(
@@ -217,7 +217,7 @@ fn a_setting_in_the_environment_reaches_the_run() {
 /// cannot be written before the run stops it there, with pictures or without.
 #[test]
 fn a_report_that_cannot_be_written_is_printed_all_the_same() {
-    let folder = Folder::new("lost");
+    let folder = TestFolder::new("lost");
     let dir = folder.path("out");
     let args =
         ["demo", "--json", "--raster", "48x32", "--frames", "10000000", "--set", "output.images=false"];
@@ -251,7 +251,7 @@ fn a_report_that_cannot_be_written_is_printed_all_the_same() {
 /// loses; and R17: what is scaled down.
 #[test]
 fn plan_tells_what_a_run_would_tell_and_writes_where_it_is_asked_to() {
-    let folder = Folder::new("plan");
+    let folder = TestFolder::new("plan");
     // One row of a large picture in the plainest coding: 8192 x 2048 texels of the same light.
     let mut sky = b"Pf\n8192 2048\n-1\n".to_vec();
     sky.extend(0.5f32.to_le_bytes().repeat(8192 * 2048));
@@ -280,7 +280,7 @@ fn plan_tells_what_a_run_would_tell_and_writes_where_it_is_asked_to() {
 /// Found in use, R18: a named pipe in the place of a file was awaited forever.
 #[test]
 fn pipes_and_devices_are_refused_at_once() {
-    let folder = Folder::new("pipe");
+    let folder = TestFolder::new("pipe");
     let pipe = folder.path("pipe").display().to_string();
     let made = std::process::Command::new("mkfifo").arg(&pipe).status().expect("mkfifo");
     assert!(made.success());
@@ -325,7 +325,7 @@ pub(crate) fn natnet(motion: &MotionSpec, position_m: [f64; 3]) -> NatNetHost {
 }
 
 /// A rig file for the body of `server`; `safety` are further lines of its last table.
-fn natnet_rig(folder: &Folder, server: &NatNetHost, frame_rate: u32, safety: &str) -> String {
+fn natnet_rig(folder: &TestFolder, server: &NatNetHost, frame_rate: u32, safety: &str) -> String {
     let port = server.address().port();
     let text = format!(
         "[projector]\nframe_rate = {frame_rate}\n[tracker]\nkind = \"natnet\"\nserver = \"127.0.0.1\"\nlocal = \"127.0.0.1\"\n\
@@ -380,7 +380,7 @@ mod breadth {
     /// rendered"; R20: faults of the mock projector had no effect.
     #[test]
     fn eight_planes_are_checked_exactly_and_faults_are_applied() {
-        let folder = Folder::new("planes");
+        let folder = TestFolder::new("planes");
         for planes in ["8", "24"] {
             let json = report(&["demo"], &folder, &["--set", &format!("projector.planes={planes}")]);
             assert_eq!(
@@ -441,7 +441,7 @@ mod real_pace {
     /// frames, however long they took.
     #[test]
     fn a_real_rig_runs_against_the_mocks_for_as_long_as_it_is_told() {
-        let folder = Folder::new("simulate");
+        let folder = TestFolder::new("simulate");
         let rig = folder.write(
             "rig.toml",
             "[projector]\nframe_rate = 20\n[projector.backend]\nkind = \"usb\"\n[tracker]\nkind = \"natnet\"\nserver = \"10.9.8.7\"\nrate_hz = 240\n\
@@ -482,7 +482,7 @@ mod real_pace {
     /// A deployed rig: poses come over UDP from a NatNet server with its own clock, and light is emitted at real pace.
     #[test]
     fn a_rig_with_a_networked_tracker_lights_what_the_tracker_sees() {
-        let folder = Folder::new("natnet");
+        let folder = TestFolder::new("natnet");
         let server = natnet(&MotionSpec::paper_translation(), [0.0, 0.1, 0.0]);
         let rig = natnet_rig(&folder, &server, 10, "predict_ms = 500\n");
         let json = report(&["run", &rig], &folder, &["--set", "output.images=true"]);
@@ -504,7 +504,7 @@ mod real_pace {
     /// that its frames were lit, and ended with exit code 0.
     #[test]
     fn a_run_that_lights_nothing_ends_with_1_and_names_the_key() {
-        let folder = Folder::new("nothing");
+        let folder = TestFolder::new("nothing");
         // The latency from the tracker to the light is at least 5 ms.
         let args =
             [&["demo"][..], &SMALL, &["--out", folder.text(), "--set", "safety.predict_ms=4"]].concat();
@@ -546,7 +546,7 @@ mod real_pace {
     /// A run that would take hours is stopped: it reports what it did and ends with 0. Meanwhile a second run is refused.
     #[test]
     fn signals_end_a_run_in_order_and_two_runs_do_not_share_a_folder() {
-        let folder = Folder::new("signal");
+        let folder = TestFolder::new("signal");
         let args = ["demo", "--json", "--raster", "48x32", "--frames", "10000000", "--out", folder.text()];
         let mut running = start(&args);
         running.wait_for_line(Duration::from_secs(60), |line| {
@@ -577,7 +577,7 @@ mod real_pace {
     /// fall. The run reports this, whether or not the poses are new enough for light.
     #[test]
     fn wrong_units_of_a_real_tracker_are_told_at_the_end_of_a_run() {
-        let folder = Folder::new("units");
+        let folder = TestFolder::new("units");
         let server = natnet(&MotionSpec::Still {}, [150.0, 0.0, 0.0]);
         let rig = natnet_rig(&folder, &server, 50, "");
         // Less than a frame usually takes here: little is new enough to be lit, and formerly what was not lit was not

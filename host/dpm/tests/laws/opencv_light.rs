@@ -4,7 +4,7 @@
 //! `tests/assets/opencv/make.py` made the files and the outlines. Every pixel whose centre lies farther than
 //! [`TOLERANCE_PX`] from an outline must be lit inside and dark outside.
 
-use crate::cli_common::{code, dpm, err, out, Folder};
+use crate::cli_common::{code, dpm, err, out, TestFolder};
 use dpm_camera_files::{self as camera_files, LengthUnit, LensKind, ReadOptions};
 use glam::{DVec2, DVec3};
 use std::path::{Path, PathBuf};
@@ -105,7 +105,7 @@ fn depth_inside(outline: &[DVec2; 6], point: DVec2) -> f64 {
 
 /// What the light of one run says about outlines that are moved by `shift`.
 #[derive(Debug, Default)]
-struct Verdict {
+struct OutlineVerdict {
     lit: u32,
     /// Pixels within 0.1 px of an outline, but not within the tolerance: what makes the test sharp.
     close: u32,
@@ -114,8 +114,8 @@ struct Verdict {
     worst_px: f64,
 }
 
-fn judge(light: &image::RgbImage, triangles: &[Triangle], shift: DVec2) -> Verdict {
-    let mut verdict = Verdict::default();
+fn judge(light: &image::RgbImage, triangles: &[Triangle], shift: DVec2) -> OutlineVerdict {
+    let mut verdict = OutlineVerdict::default();
     for (x, y, pixel) in light.enumerate_pixels() {
         // OpenCV's pixel centres are at whole numbers.
         let centre = DVec2::new(f64::from(x), f64::from(y)) - shift;
@@ -143,7 +143,7 @@ fn light_of(model: &str, form: &str, method: &str, triangles: &[Triangle]) -> im
     // The wall only tells the picture's writer that there is a surface; it is far and wide.
     let at = |x: f64, y: f64| camera.world_from_projector.transform_point3(DVec3::new(x, y, -4.0));
     let [a, b, c, d] = [at(-8.0, -8.0), at(8.0, -8.0), at(8.0, 8.0), at(-8.0, 8.0)];
-    let folder = Folder::new(&format!("opencv-{model}-{method}"));
+    let folder = TestFolder::new(&format!("opencv-{model}-{method}"));
     std::fs::write(folder.path("scene.glb"), scene(triangles, [a, b, c, a, c, d])).expect("written");
     // So little light that every glowing pixel is driven in full, and an eye in the lens, from which nothing is hidden.
     let eye = camera.position().to_array();
@@ -186,7 +186,7 @@ fn a_pinhole_of_opencv_lights_what_opencv_projects() {
 /// The rays of such a lens cross inside the raster, so no single ray belongs to a mirror there.
 #[test]
 fn a_lens_that_folds_is_refused_before_there_is_light() {
-    let folder = Folder::new("fold");
+    let folder = TestFolder::new("fold");
     let text = std::fs::read_to_string(asset("brown5.yml")).expect("an asset");
     let k1 = "data: [ -0.23999999999999999,";
     assert!(text.contains(k1), "{text}");

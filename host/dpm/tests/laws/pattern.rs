@@ -1,7 +1,7 @@
 //! `dpm pattern` from the user's point of view: light without GPU, scene and tracker, pictures as files, a stop, and
 //! refusals.
 
-use crate::cli_common::{code, dpm, err, out, start_with, Folder, NO_DRIVER};
+use crate::cli_common::{code, dpm, err, out, start_with, TestFolder, NO_DRIVER};
 use std::time::Duration;
 
 /// A rig whose scene, tracker and calibration do not exist, and whose own run would be over after a frame.
@@ -15,7 +15,7 @@ fn pixels(path: &std::path::Path) -> image::RgbImage {
 
 #[test]
 fn a_pattern_needs_neither_gpu_nor_scene_nor_tracker() {
-    let folder = Folder::new("pattern-run");
+    let folder = TestFolder::new("pattern-run");
     let rig = folder.write("rig.toml", RIG);
     for kind in ["full", "counter", "focus-star"] {
         let args = ["pattern", kind, &rig, "--frames", "20", "--pace", "virtual", "--json"];
@@ -32,7 +32,7 @@ fn a_pattern_needs_neither_gpu_nor_scene_nor_tracker() {
 
 #[test]
 fn a_pattern_is_shown_until_it_is_stopped_and_ends_dark() {
-    let folder = Folder::new("pattern-stop");
+    let folder = TestFolder::new("pattern-stop");
     let rig = folder.write("rig.toml", RIG);
     let args =
         ["pattern", "gray-columns", &rig, "--hold-ms", "20", "--json", "--set", "projector.frame_rate=60"];
@@ -49,7 +49,7 @@ fn a_pattern_is_shown_until_it_is_stopped_and_ends_dark() {
 
 #[test]
 fn pictures_are_what_would_be_shown() {
-    let folder = Folder::new("pattern-png");
+    let folder = TestFolder::new("pattern-png");
     let rig = folder.write("rig.toml", RIG);
     let file = |name: &str| folder.path(name);
     let write = |words: &[&str], name: &str| {
@@ -84,7 +84,7 @@ fn pictures_are_what_would_be_shown() {
 
 #[test]
 fn bad_arguments_are_refused_by_name() {
-    let folder = Folder::new("pattern-bad");
+    let folder = TestFolder::new("pattern-bad");
     let rig = folder.write("rig.toml", RIG);
     let told = |words: &[&str]| {
         let output = dpm(&[&["pattern"], words, &[&rig]].concat(), &NO_DRIVER);

@@ -2,7 +2,7 @@
 //! ends at once.
 #![allow(unsafe_code)]
 
-use crate::cli_common::{code, command, dpm, err, out, start_with, Folder, NO_DRIVER};
+use crate::cli_common::{code, command, dpm, err, out, start_with, TestFolder, NO_DRIVER};
 use std::io::Read;
 use std::process::Stdio;
 use std::time::Duration;
@@ -36,7 +36,7 @@ fn costs(args: &[&str], variables: &[(&str, &str)]) -> (i32, f64, String) {
 /// Found in use, O4: a run compiled its shaders and built its scene, and then said that the cable is unplugged.
 #[test]
 fn what_is_missing_ends_a_run_before_anything_is_prepared_and_the_doctor_says_the_same() {
-    let folder = Folder::new("missing");
+    let folder = TestFolder::new("missing");
     let rig = concat!(env!("CARGO_MANIFEST_DIR"), "/../../rigs/mock.toml");
     for (key, exit, word) in [
         (
@@ -79,7 +79,7 @@ fn what_is_missing_ends_a_run_before_anything_is_prepared_and_the_doctor_says_th
 /// Found in use, O4: SIGTERM while shaders are compiled ended with "the rig did not end in time" and without a report.
 #[test]
 fn a_stop_while_the_run_sets_up_ends_at_once_with_its_report() {
-    let folder = Folder::new("early");
+    let folder = TestFolder::new("early");
     let rig = concat!(env!("CARGO_MANIFEST_DIR"), "/../../rigs/mock.toml");
     // Shaders that no run has compiled before.
     let cache = folder.path("shaders").display().to_string();

@@ -1,10 +1,10 @@
 //! `dpm report` of what the other commands leave in a folder: one page that needs nothing else.
 
-use crate::cli_common::{code, dpm, err, out, Folder};
+use crate::cli_common::{code, dpm, err, out, TestFolder};
 use std::path::{Path, PathBuf};
 
 /// Runs a command whose output goes to `name` in `folder`; returns that folder.
-fn measured(folder: &Folder, name: &str, args: &[&str]) -> PathBuf {
+fn measured(folder: &TestFolder, name: &str, args: &[&str]) -> PathBuf {
     let dir = Path::new(folder.text()).join(name);
     let output = dpm(&[args, &["--out", dir.to_str().expect("text")]].concat(), &[]);
     assert_eq!(code(&output), 0, "{args:?}: {}", err(&output));
@@ -37,7 +37,7 @@ fn refused(dir: &Path) -> String {
 
 #[test]
 fn a_profile_is_a_page_with_its_latencies_and_missed_slots() {
-    let folder = Folder::new("report-profile");
+    let folder = TestFolder::new("report-profile");
     let args = [
         "profile",
         "--no-render",
@@ -79,7 +79,7 @@ fn a_profile_is_a_page_with_its_latencies_and_missed_slots() {
 /// Owners of GPUs send files in; a page of a folder of them sets each beside the model.
 #[test]
 fn reports_of_several_machines_stand_beside_the_model() {
-    let folder = Folder::new("sent");
+    let folder = TestFolder::new("sent");
     let sent = folder.path("sent");
     let file = |name: &str| sent.join(name).display().to_string();
     for name in ["bench-mine.json", "bench-of-a-friend.json"] {
@@ -120,7 +120,7 @@ fn reports_of_several_machines_stand_beside_the_model() {
 
 #[test]
 fn a_folder_without_results_is_refused_with_what_to_do() {
-    let folder = Folder::new("report-refused");
+    let folder = TestFolder::new("report-refused");
     let root = Path::new(folder.text());
     let dir = |name: &str, files: &[(&str, &str)]| {
         let dir = root.join(name);
@@ -143,7 +143,7 @@ fn a_folder_without_results_is_refused_with_what_to_do() {
 
 #[test]
 fn what_others_put_beside_a_result_is_left_out_by_name() {
-    let folder = Folder::new("report-foreign");
+    let folder = TestFolder::new("report-foreign");
     let dir = measured(&folder, "bench", &["bench", "--raster", "48x32", "--count", "3", "--method", "full"]);
     let evil = "<svg xmlns=\"http://www.w3.org/2000/svg\"><script>alert(1)</script></svg>";
     std::fs::write(dir.join("evil.svg"), evil).expect("a file");
@@ -160,7 +160,7 @@ mod breadth {
 
     #[test]
     fn a_run_and_a_bench_are_pages_with_pictures_and_tables() {
-        let folder = Folder::new("report-run");
+        let folder = TestFolder::new("report-run");
         let run = measured(&folder, "run", &["demo", "--raster", "48x32", "--frames", "6"]);
         let (page_of_run, _) = page(&run);
         for part in [

@@ -1,6 +1,6 @@
 //! `dpm snapshot` of a scene by itself: its pictures show the whole of it, whatever its size and place.
 
-use crate::cli_common::{code, dpm, err, out, Folder};
+use crate::cli_common::{code, dpm, err, out, TestFolder};
 use std::fmt::Write;
 use std::path::Path;
 
@@ -18,11 +18,11 @@ fn cuboid(from: [f64; 3], to: [f64; 3]) -> String {
 }
 
 /// Runs `dpm snapshot` at the small raster; returns its report.
-fn snapshot(folder: &Folder, args: &[&str]) -> serde_json::Value {
+fn snapshot(folder: &TestFolder, args: &[&str]) -> serde_json::Value {
     snapshot_at(2, folder, args)
 }
 
-fn snapshot_at(frame: u32, folder: &Folder, args: &[&str]) -> serde_json::Value {
+fn snapshot_at(frame: u32, folder: &TestFolder, args: &[&str]) -> serde_json::Value {
     let raster = format!("{WIDTH}x{HEIGHT}");
     let frame = frame.to_string();
     let common = ["snapshot", "--json", "--raster", &raster, "--frame", &frame, "--out", folder.text()];
@@ -41,7 +41,7 @@ fn radiance(path: &Path) -> Vec<f32> {
 
 /// All of the asset is in the picture and is well lit: what is lit touches no border, fills half of a side, and is mid grey on
 /// average with the exposure that was chosen.
-fn shows_all(folder: &Folder, report: &serde_json::Value) {
+fn shows_all(folder: &TestFolder, report: &serde_json::Value) {
     let pixels = radiance(&Path::new(folder.text()).join("radiance.pfm"));
     let lit: Vec<usize> = (0..pixels.len()).filter(|i| pixels[*i] > 0.0).collect();
     let range = |of: &dyn Fn(usize) -> usize| {
@@ -58,7 +58,7 @@ fn shows_all(folder: &Folder, report: &serde_json::Value) {
 
 #[test]
 fn what_cannot_be_shown_is_told() {
-    let folder = Folder::new("snapshot-told");
+    let folder = TestFolder::new("snapshot-told");
     let lamp = "mtllib lamp.mtl\nusemtl lamp\n".to_owned() + &cuboid([0.0; 3], [1.0; 3]);
     let lamp = folder.write("lamp.obj", &lamp);
     folder.write("lamp.mtl", "newmtl lamp\nKe 1 1 1\n");
@@ -76,7 +76,7 @@ fn what_cannot_be_shown_is_told() {
 /// A scene that is too dark is shown brighter, and how much is told.
 #[test]
 fn a_far_greater_exposure_is_told() {
-    let folder = Folder::new("snapshot-dark");
+    let folder = TestFolder::new("snapshot-dark");
     let file = folder.write("thing.obj", &cuboid([0.0; 3], [1.0; 3]));
     let told = |radiance: &str| {
         let light = format!(
@@ -113,7 +113,7 @@ mod breadth {
 
     #[test]
     fn an_asset_of_any_size_and_place_is_shown_whole_and_lit() {
-        let folder = Folder::new("snapshot-any");
+        let folder = TestFolder::new("snapshot-any");
         let assets = [
             ("tiny", cuboid([0.0; 3], [1e-4, 2e-4, 1e-4])),
             ("huge", cuboid([-1e5, 0.0, -1e5], [1e5, 2e5, 1e5])),
@@ -134,7 +134,7 @@ mod breadth {
 
     #[test]
     fn a_rig_file_that_places_its_projector_keeps_its_view() {
-        let folder = Folder::new("snapshot-rig");
+        let folder = TestFolder::new("snapshot-rig");
         let asset = folder.write("box.obj", &cuboid([7.0, 0.0, 0.0], [8.0, 1.0, 1.0]));
         let body = "[[scene.bodies]]\nname = \"thing\"\nmotion = { kind = \"translate\", speed_m_s = 1.0, amplitude_m = 0.5 }\n";
         let scene = format!("[scene]\nfile = {asset:?}\n{body}");
@@ -156,7 +156,7 @@ mod real_pace {
     /// A snapshot keeps the first picture of another program; without one the body is black, which is told.
     #[test]
     fn a_picture_of_another_program_is_waited_for_and_kept() {
-        let folder = Folder::new("snapshot-live");
+        let folder = TestFolder::new("snapshot-live");
         let pipe = Path::new(folder.text()).join("pictures");
         assert!(std::process::Command::new("mkfifo").arg(&pipe).status().expect("mkfifo").success());
         let bodies = format!(

@@ -1,6 +1,6 @@
 //! Codecs: what a device says that it reads, it reads, and nothing else.
 
-use super::driver::{Bench, R};
+use super::driver::{ConformanceDriver, R};
 use super::planes::{incomplete, lit};
 use super::shot::lz4_block;
 use super::{check, fates, tell, Rule, Stop};
@@ -43,7 +43,7 @@ pub(super) const RULES: &[Rule] = &[
 ];
 
 /// Sends a frame whose first plane is written by `codec`.
-fn by_codec(b: &mut Bench<'_>, codec: Codec, what: &str, bytes: Vec<u8>) -> R {
+fn by_codec(b: &mut ConformanceDriver<'_>, codec: Codec, what: &str, bytes: Vec<u8>) -> R {
     lit(b, what, |_, shot| {
         (shot.pieces[0].codec, shot.pieces[0].bytes) = (codec, bytes);
         Ok(())
@@ -51,7 +51,7 @@ fn by_codec(b: &mut Bench<'_>, codec: Codec, what: &str, bytes: Vec<u8>) -> R {
     .map(|_| ())
 }
 
-fn codec_raw(b: &mut Bench<'_>) -> R {
+fn codec_raw(b: &mut ConformanceDriver<'_>) -> R {
     b.armed(|_| {})?;
     b.needs_raw()?;
     let plane = b.faint(0xa0);
@@ -59,7 +59,7 @@ fn codec_raw(b: &mut Bench<'_>) -> R {
 }
 
 /// Not judged where the device does not name `codec`, or its planes are too short for it.
-fn needs(b: &mut Bench<'_>, codec: Codec, least: usize) -> R {
+fn needs(b: &mut ConformanceDriver<'_>, codec: Codec, least: usize) -> R {
     b.armed(|_| {})?;
     if !b.reads(codec) {
         return Err(Stop::NotJudged(format!("it does not name codec {}", codec as u8)));
@@ -70,7 +70,7 @@ fn needs(b: &mut Bench<'_>, codec: Codec, least: usize) -> R {
     b.needs_frames()
 }
 
-fn codec_rle(b: &mut Bench<'_>) -> R {
+fn codec_rle(b: &mut ConformanceDriver<'_>) -> R {
     needs(b, Codec::Rle, 8)?;
     let n = b.plane_bytes();
     // A short literal and a short run, then runs for the rest.
@@ -103,7 +103,7 @@ fn codec_rle(b: &mut Bench<'_>) -> R {
     Ok(())
 }
 
-fn codec_rle_wrong(b: &mut Bench<'_>) -> R {
+fn codec_rle_wrong(b: &mut ConformanceDriver<'_>) -> R {
     needs(b, Codec::Rle, 8)?;
     let n = b.plane_bytes();
     let run = |m: usize| -> Vec<u8> {
@@ -140,7 +140,7 @@ fn codec_rle_wrong(b: &mut Bench<'_>) -> R {
     Ok(())
 }
 
-fn codec_xor(b: &mut Bench<'_>) -> R {
+fn codec_xor(b: &mut ConformanceDriver<'_>) -> R {
     needs(b, Codec::XorRle, 8)?;
     let base = lit(b, "a frame", |_, _| Ok(()))?;
     let (_, bytes) = b.coded(&b.faint(0x80));
@@ -155,7 +155,7 @@ fn codec_xor(b: &mut Bench<'_>) -> R {
     Ok(())
 }
 
-fn codec_xor_base(b: &mut Bench<'_>) -> R {
+fn codec_xor_base(b: &mut ConformanceDriver<'_>) -> R {
     needs(b, Codec::XorRle, 8)?;
     let (codec, bytes) = b.coded(&b.faint(0x80));
     if codec != Codec::Rle {
@@ -173,7 +173,7 @@ fn codec_xor_base(b: &mut Bench<'_>) -> R {
     check(fates(&before, &s) == [0, 1, 0, 0, 0], "one frame incomplete", || tell(&s))
 }
 
-fn codec_lz4(b: &mut Bench<'_>) -> R {
+fn codec_lz4(b: &mut ConformanceDriver<'_>) -> R {
     needs(b, Codec::Lz4, 32)?;
     let block = lz4_block(&b.faint(0xe0));
     if block.len() >= b.plane_bytes() {
@@ -182,7 +182,7 @@ fn codec_lz4(b: &mut Bench<'_>) -> R {
     by_codec(b, Codec::Lz4, "a block with a match", block)
 }
 
-fn codec_lz4_wrong(b: &mut Bench<'_>) -> R {
+fn codec_lz4_wrong(b: &mut ConformanceDriver<'_>) -> R {
     needs(b, Codec::Lz4, 40)?;
     let mut short = b.faint(0xe0);
     short.pop();
@@ -196,7 +196,7 @@ fn codec_lz4_wrong(b: &mut Bench<'_>) -> R {
     })
 }
 
-fn codec_unnamed(b: &mut Bench<'_>) -> R {
+fn codec_unnamed(b: &mut ConformanceDriver<'_>) -> R {
     b.armed(|_| {})?;
     let Some(codec) = [Codec::Rle, Codec::Lz4].into_iter().find(|c| !b.reads(*c)) else {
         return Err(Stop::NotJudged("it names all codecs".into()));

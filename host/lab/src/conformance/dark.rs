@@ -1,6 +1,6 @@
 //! Light that ends by itself: `dark from`.
 
-use super::driver::{Bench, R};
+use super::driver::{ConformanceDriver, R};
 use super::light::begun;
 use super::orders::lit_frame;
 use super::{check, fates, grew, tell, Rule, Stop};
@@ -54,7 +54,7 @@ fn all_lit(all: &[Status], from: u64, to: u64, lit: bool) -> Option<bool> {
 }
 
 /// A frame whose light ends `halves` half slots after its start: the reports meanwhile and after, and that instant.
-fn ends(b: &mut Bench<'_>, halves: u64) -> R<(Status, Vec<Status>, u64, u64)> {
+fn ends(b: &mut ConformanceDriver<'_>, halves: u64) -> R<(Status, Vec<Status>, u64, u64)> {
     b.needs_frames()?;
     let before = b.report()?;
     let slot = b.slot_ahead()?;
@@ -68,7 +68,7 @@ fn ends(b: &mut Bench<'_>, halves: u64) -> R<(Status, Vec<Status>, u64, u64)> {
     Ok((before, all, shot.target, dark))
 }
 
-fn dark_from(b: &mut Bench<'_>) -> R {
+fn dark_from(b: &mut ConformanceDriver<'_>) -> R {
     b.armed(|_| {})?;
     let (before, all, lit_at, dark) = ends(b, 7)?;
     let slack = b.ticks_of_ms(2);
@@ -95,7 +95,7 @@ fn dark_from(b: &mut Bench<'_>) -> R {
     Ok(())
 }
 
-fn dark_from_mid_slot(b: &mut Bench<'_>) -> R {
+fn dark_from_mid_slot(b: &mut ConformanceDriver<'_>) -> R {
     b.armed(|c| c.rate = FrameRate::new(2, 1).unwrap_or(c.rate))?;
     // A slot of half a second, dark from its middle on.
     let (before, all, lit_at, dark) = ends(b, 1)?;
@@ -114,7 +114,7 @@ fn dark_from_mid_slot(b: &mut Bench<'_>) -> R {
     }
 }
 
-fn dark_from_replaced(b: &mut Bench<'_>) -> R {
+fn dark_from_replaced(b: &mut ConformanceDriver<'_>) -> R {
     b.armed(|_| {})?;
     b.needs_frames()?;
     let slot = b.slot_ahead()? + 1;
@@ -131,7 +131,7 @@ fn dark_from_replaced(b: &mut Bench<'_>) -> R {
     check(s.last_lit_frame == second.id, "the second frame lit last", || tell(&s))
 }
 
-fn dark_from_wrong(b: &mut Bench<'_>) -> R {
+fn dark_from_wrong(b: &mut ConformanceDriver<'_>) -> R {
     b.armed(|_| {})?;
     b.needs_frames()?;
     let slot = b.slot_ahead()?;
@@ -144,7 +144,7 @@ fn dark_from_wrong(b: &mut Bench<'_>) -> R {
     check(grew(&before, &s, |s| s.packets_ignored) >= 1, "FRAME_COMMIT counted as ignored", || tell(&s))
 }
 
-fn dark_from_late(b: &mut Bench<'_>) -> R {
+fn dark_from_late(b: &mut ConformanceDriver<'_>) -> R {
     b.armed(|c: &mut Config| c.late_slots = 20)?;
     b.needs_frames()?;
     let slot = begun(b)?;
@@ -156,7 +156,7 @@ fn dark_from_late(b: &mut Bench<'_>) -> R {
     check(fates(&before, &s) == [0, 0, 1, 0, 0] && !s.lit, "the frame dropped as late", || tell(&s))
 }
 
-fn dark_from_frozen(b: &mut Bench<'_>) -> R {
+fn dark_from_frozen(b: &mut ConformanceDriver<'_>) -> R {
     b.armed(|_| {})?;
     b.needs_frames()?;
     let slot = b.slot_ahead()?;

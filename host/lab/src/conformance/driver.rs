@@ -100,7 +100,7 @@ impl PacketSink for Inbox {
 }
 
 /// The driver.
-pub(super) struct Bench<'a> {
+pub(super) struct ConformanceDriver<'a> {
     pub medium: Medium<'a>,
     decoders: [Decoder; 2],
     inbox: Inbox,
@@ -127,7 +127,7 @@ pub(super) struct Bench<'a> {
     pub may_flash: bool,
 }
 
-impl<'a> Bench<'a> {
+impl<'a> ConformanceDriver<'a> {
     /// Nothing is sent yet.
     pub(super) fn new(medium: Medium<'a>) -> Self {
         let now = (medium.clock)();
@@ -317,7 +317,7 @@ impl<'a> Bench<'a> {
         }
     }
 
-    /// As [`Bench::wait`], for a STATUS of this session.
+    /// As [`ConformanceDriver::wait`], for a STATUS of this session.
     pub(crate) fn wait_status(
         &mut self,
         limit_ns: i64,

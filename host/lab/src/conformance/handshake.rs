@@ -1,6 +1,6 @@
 //! HELLO and CONFIG: who is there, what it can do, and what it must refuse.
 
-use super::driver::{Bench, R};
+use super::driver::{ConformanceDriver, R};
 use super::orders::lit_frame;
 use super::{check, grew, tell, Rule, Stop};
 use dpm_device::link::{DeviceMessage, DeviceState, FaultCode, HostHello, HostMessage, MessageType, VERSION};
@@ -88,7 +88,7 @@ pub(super) const RULES: &[Rule] = &[
     },
 ];
 
-fn no_session(b: &mut Bench<'_>) -> R {
+fn no_session(b: &mut ConformanceDriver<'_>) -> R {
     if b.hello.is_some() {
         return Err(Stop::NotJudged("a session was opened before".into()));
     }
@@ -113,7 +113,7 @@ fn no_session(b: &mut Bench<'_>) -> R {
     }
 }
 
-fn hello_answer(b: &mut Bench<'_>) -> R {
+fn hello_answer(b: &mut ConformanceDriver<'_>) -> R {
     let h = b.open()?;
     check(h.version == u16::from(VERSION), "version 2", || h.version.to_string())?;
     check((1..=32).contains(&h.max_planes), "1 to 32 planes", || h.max_planes.to_string())?;
@@ -132,7 +132,7 @@ fn hello_answer(b: &mut Bench<'_>) -> R {
     )
 }
 
-fn hello_version(b: &mut Bench<'_>) -> R {
+fn hello_version(b: &mut ConformanceDriver<'_>) -> R {
     b.open()?;
     let open = b.session;
     let other = open ^ 0x0f0f_0f0f;
@@ -150,7 +150,7 @@ fn hello_version(b: &mut Bench<'_>) -> R {
     check(answered.is_none(), "no session of that number", || "its ECHO answered".into())
 }
 
-fn hello_zero(b: &mut Bench<'_>) -> R {
+fn hello_zero(b: &mut ConformanceDriver<'_>) -> R {
     b.open()?;
     b.forget()?;
     b.say_as(0, &HostMessage::Hello(HostHello { version_min: 0, version_max: 9, codecs: 1 }))?;
@@ -164,7 +164,7 @@ fn hello_zero(b: &mut Bench<'_>) -> R {
     check(s.state == DeviceState::Greeted || s.faults != 0, "the session that was open to go on", || tell(&s))
 }
 
-fn hello_same(b: &mut Bench<'_>) -> R {
+fn hello_same(b: &mut ConformanceDriver<'_>) -> R {
     b.armed(|_| {})?;
     let before = lit_frame(b)?;
     b.forget()?;
@@ -189,7 +189,7 @@ fn hello_same(b: &mut Bench<'_>) -> R {
     )
 }
 
-fn hello_new(b: &mut Bench<'_>) -> R {
+fn hello_new(b: &mut ConformanceDriver<'_>) -> R {
     b.armed(|_| {})?;
     let lit = lit_frame(b)?;
     check(lit.frames_lit == 1, "one frame lit", || tell(&lit))?;
@@ -206,7 +206,7 @@ fn hello_new(b: &mut Bench<'_>) -> R {
     check(s.packets <= 8, "packets counted from the HELLO on", || format!("{} packets", s.packets))
 }
 
-fn session_other(b: &mut Bench<'_>) -> R {
+fn session_other(b: &mut ConformanceDriver<'_>) -> R {
     b.configured(|_| {})?;
     let before = b.report()?;
     let other = b.session.wrapping_add(1).max(1);
@@ -222,14 +222,14 @@ fn session_other(b: &mut Bench<'_>) -> R {
     check(ignored == 2, "2 packets more counted as ignored", || ignored.to_string())
 }
 
-fn config_accepted(b: &mut Bench<'_>) -> R {
+fn config_accepted(b: &mut ConformanceDriver<'_>) -> R {
     let s = b.configured(|_| {})?;
     check(s.state == DeviceState::Configured || s.faults != 0, "state 2 (configured)", || tell(&s))?;
     check(!s.lit && s.frame_limit == s.frames_accounted, "dark, without credit", || tell(&s))
 }
 
 /// A CONFIG that must be refused with `detail`, and leave the device as it was.
-fn refused(b: &mut Bench<'_>, config: &[u8], details: &[u16], what: &str) -> R {
+fn refused(b: &mut ConformanceDriver<'_>, config: &[u8], details: &[u16], what: &str) -> R {
     b.forget()?;
     b.say_raw(MessageType::Config, config)?;
     let limit = b.answer_ns();
@@ -245,7 +245,7 @@ fn refused(b: &mut Bench<'_>, config: &[u8], details: &[u16], what: &str) -> R {
 }
 
 /// The plain CONFIG's payload.
-fn plain(b: &mut Bench<'_>) -> R<Vec<u8>> {
+fn plain(b: &mut ConformanceDriver<'_>) -> R<Vec<u8>> {
     b.open()?;
     let config = b.plain_config()?;
     let mut out = [0u8; dpm_device::link::MAX_CONTROL_BYTES];
@@ -253,7 +253,7 @@ fn plain(b: &mut Bench<'_>) -> R<Vec<u8>> {
     Ok(out[..n].to_vec())
 }
 
-fn config_raster(b: &mut Bench<'_>) -> R {
+fn config_raster(b: &mut ConformanceDriver<'_>) -> R {
     for at in [0, 2] {
         let mut p = plain(b)?;
         let side = u16::from_le_bytes([p[at], p[at + 1]]);
@@ -264,7 +264,7 @@ fn config_raster(b: &mut Bench<'_>) -> R {
     Ok(())
 }
 
-fn config_planes(b: &mut Bench<'_>) -> R {
+fn config_planes(b: &mut ConformanceDriver<'_>) -> R {
     let mut p = plain(b)?;
     let most = b.hello.map_or(32, |h| h.max_planes);
     if most >= 32 {
@@ -278,7 +278,7 @@ fn config_planes(b: &mut Bench<'_>) -> R {
     refused(b, &p, &[2], "one plane more than it takes")
 }
 
-fn config_rate(b: &mut Bench<'_>) -> R {
+fn config_rate(b: &mut ConformanceDriver<'_>) -> R {
     let mut p = plain(b)?;
     let shortest = b.hello.map_or(0, |h| h.min_plane_ns);
     let planes = u64::from(p[16]);
@@ -293,7 +293,7 @@ fn config_rate(b: &mut Bench<'_>) -> R {
     refused(b, &p, &[3], "planes of 3/4 of the shortest time")
 }
 
-fn config_format(b: &mut Bench<'_>) -> R {
+fn config_format(b: &mut ConformanceDriver<'_>) -> R {
     let set = |p: &mut Vec<u8>, at: usize, bytes: &[u8]| p[at..at + bytes.len()].copy_from_slice(bytes);
     type Break<'x> = (&'x str, &'x dyn Fn(&mut Vec<u8>));
     let cases: [Break<'_>; 6] = [
@@ -325,7 +325,7 @@ fn config_format(b: &mut Bench<'_>) -> R {
     Ok(())
 }
 
-fn config_disarms(b: &mut Bench<'_>) -> R {
+fn config_disarms(b: &mut ConformanceDriver<'_>) -> R {
     b.armed(|_| {})?;
     lit_frame(b)?;
     let config = b.plain_config()?;
@@ -333,7 +333,7 @@ fn config_disarms(b: &mut Bench<'_>) -> R {
     check(s.state == DeviceState::Configured && !s.lit, "configured and dark", || tell(&s))
 }
 
-fn payload_length(b: &mut Bench<'_>) -> R {
+fn payload_length(b: &mut ConformanceDriver<'_>) -> R {
     b.configured(|_| {})?;
     let before = b.report()?;
     b.say_raw(MessageType::Arm, &[0; 8])?;
@@ -348,7 +348,7 @@ fn payload_length(b: &mut Bench<'_>) -> R {
     check(ignored == 4, "4 packets more counted as ignored", || ignored.to_string())
 }
 
-fn padding_ignored(b: &mut Bench<'_>) -> R {
+fn padding_ignored(b: &mut ConformanceDriver<'_>) -> R {
     use dpm_device::link::{crc32c, Header, Packet};
     let p = plain(b)?;
     let pad = (4 - p.len() % 4) % 4;

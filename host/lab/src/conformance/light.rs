@@ -1,6 +1,6 @@
 //! Credits, frames and slots: what is lit when, what is dropped and counted.
 
-use super::driver::{Bench, R};
+use super::driver::{ConformanceDriver, R};
 use super::orders::lit_frame;
 use super::shot::Shot;
 use super::{check, fates, grew, tell, Rule, Stop};
@@ -82,7 +82,7 @@ pub(super) const RULES: &[Rule] = &[
     },
 ];
 
-fn credit_beyond(b: &mut Bench<'_>) -> R {
+fn credit_beyond(b: &mut ConformanceDriver<'_>) -> R {
     // So slow that the frames wait while they are sent, and are within two seconds.
     b.armed(|c| c.rate = FrameRate::new(1, 1).unwrap_or(c.rate))?;
     b.needs_frames()?;
@@ -119,7 +119,7 @@ fn credit_beyond(b: &mut Bench<'_>) -> R {
     )
 }
 
-fn credit_lost(b: &mut Bench<'_>) -> R {
+fn credit_lost(b: &mut ConformanceDriver<'_>) -> R {
     b.armed(|_| {})?;
     b.needs_frames()?;
     b.frames_sent = 5;
@@ -137,7 +137,7 @@ fn credit_lost(b: &mut Bench<'_>) -> R {
     )
 }
 
-fn credit_sync(b: &mut Bench<'_>) -> R {
+fn credit_sync(b: &mut ConformanceDriver<'_>) -> R {
     b.armed(|_| {})?;
     for (sent, expected) in [(7u32, 7u32), (3, 7), (9, 9)] {
         b.frames_sent = sent;
@@ -154,7 +154,7 @@ fn credit_sync(b: &mut Bench<'_>) -> R {
     Ok(())
 }
 
-fn frame_lit(b: &mut Bench<'_>) -> R {
+fn frame_lit(b: &mut ConformanceDriver<'_>) -> R {
     b.armed(|_| {})?;
     b.needs_frames()?;
     let before = b.report()?;
@@ -175,7 +175,7 @@ fn frame_lit(b: &mut Bench<'_>) -> R {
     )
 }
 
-fn slot_start(b: &mut Bench<'_>) -> R {
+fn slot_start(b: &mut ConformanceDriver<'_>) -> R {
     // A rate that no clock divides.
     b.armed(|c| c.rate = FrameRate::new(c.rate.num() - 3, c.rate.den()).unwrap_or(c.rate))?;
     b.needs_frames()?;
@@ -197,7 +197,7 @@ fn slot_start(b: &mut Bench<'_>) -> R {
     Ok(())
 }
 
-fn slots_counted(b: &mut Bench<'_>) -> R {
+fn slots_counted(b: &mut ConformanceDriver<'_>) -> R {
     b.armed(|_| {})?;
     let a = b.report()?;
     let slots = b.slots()?;
@@ -211,7 +211,7 @@ fn slots_counted(b: &mut Bench<'_>) -> R {
     check(u64::from(grew(&a, &s, |s| s.slots_blank)) == counted, "blank ones: nothing was sent", || tell(&s))
 }
 
-fn underrun_repeat(b: &mut Bench<'_>) -> R {
+fn underrun_repeat(b: &mut ConformanceDriver<'_>) -> R {
     b.armed(|_| {})?;
     let lit = lit_frame(b)?;
     let slots = b.slots()?;
@@ -221,7 +221,7 @@ fn underrun_repeat(b: &mut Bench<'_>) -> R {
     check(grew(&lit, &s, |s| s.slots_blank) == 0, "no blank slot", || tell(&s))
 }
 
-fn underrun_blank(b: &mut Bench<'_>) -> R {
+fn underrun_blank(b: &mut ConformanceDriver<'_>) -> R {
     b.armed(|c| c.underrun = Underrun::Blank)?;
     b.needs_frames()?;
     let before = b.report()?;
@@ -236,7 +236,7 @@ fn underrun_blank(b: &mut Bench<'_>) -> R {
 }
 
 /// The slot that runs, a little after its start.
-pub(super) fn begun(b: &mut Bench<'_>) -> R<u64> {
+pub(super) fn begun(b: &mut ConformanceDriver<'_>) -> R<u64> {
     let now = b.report()?;
     let slot = b.slots()?.slot_at(now.now).map_or(0, |k| k + 1);
     b.until_slot(slot)?;
@@ -244,7 +244,7 @@ pub(super) fn begun(b: &mut Bench<'_>) -> R<u64> {
 }
 
 /// A frame for the slot that runs, with the reports before it and three slots later.
-fn late(b: &mut Bench<'_>) -> R<(Shot, Status, Status)> {
+fn late(b: &mut ConformanceDriver<'_>) -> R<(Shot, Status, Status)> {
     b.needs_frames()?;
     let slot = begun(b)?;
     let before = b.report()?;
@@ -253,13 +253,13 @@ fn late(b: &mut Bench<'_>) -> R<(Shot, Status, Status)> {
     Ok((shot, before, after))
 }
 
-fn frame_late(b: &mut Bench<'_>) -> R {
+fn frame_late(b: &mut ConformanceDriver<'_>) -> R {
     b.armed(|_| {})?;
     let (_, before, s) = late(b)?;
     check(fates(&before, &s) == [0, 0, 1, 0, 0] && !s.lit, "one frame late, none lit", || tell(&s))
 }
 
-fn frame_late_allowed(b: &mut Bench<'_>) -> R {
+fn frame_late_allowed(b: &mut ConformanceDriver<'_>) -> R {
     b.armed(|c| c.late_slots = 20)?;
     let (shot, before, s) = late(b)?;
     check(fates(&before, &s) == [1, 0, 0, 0, 0], "the late frame lit", || tell(&s))?;
@@ -271,7 +271,7 @@ fn frame_late_allowed(b: &mut Bench<'_>) -> R {
     check(fates(&before, &s) == [0, 0, 1, 0, 0], "a frame 35 slots late dropped as late", || tell(&s))
 }
 
-fn frame_early(b: &mut Bench<'_>) -> R {
+fn frame_early(b: &mut ConformanceDriver<'_>) -> R {
     b.armed(|_| {})?;
     b.needs_frames()?;
     let before = b.report()?;
@@ -287,7 +287,7 @@ fn frame_early(b: &mut Bench<'_>) -> R {
     check(fates(&before, &s) == [0, 0, 0, 0, 1], "a frame 1.5 s ahead taken", || tell(&s))
 }
 
-fn frame_superseded(b: &mut Bench<'_>) -> R {
+fn frame_superseded(b: &mut ConformanceDriver<'_>) -> R {
     if b.hello.is_some_and(|h| h.frame_buffers < 2) {
         return Err(Stop::NotJudged("it has one frame buffer".into()));
     }

@@ -25,7 +25,7 @@ pub use driver::{Medium, MediumKind};
 
 use dpm_device::link::{DeviceHello, Status};
 use dpm_device::transport::TransportError;
-use driver::{Bench, R};
+use driver::{ConformanceDriver, R};
 
 /// A rule that fails is tried this often: the machine may have kept its host from sending in time.
 const TRIES: u32 = 3;
@@ -46,7 +46,7 @@ pub(crate) enum Stop {
 /// What became of a rule.
 #[derive(Clone, Debug, PartialEq, Eq, serde::Serialize)]
 #[serde(rename_all = "snake_case", tag = "verdict", content = "why")]
-pub enum Verdict {
+pub enum RuleVerdict {
     /// The device keeps it.
     Ok,
     /// It does not: what was expected, and what was seen.
@@ -63,7 +63,7 @@ pub struct Rule {
     pub section: &'static str,
     /// What it demands.
     pub statement: &'static str,
-    check: fn(&mut Bench<'_>) -> R,
+    check: fn(&mut ConformanceDriver<'_>) -> R,
 }
 
 /// Every rule, in the order in which they are judged.
@@ -89,7 +89,7 @@ pub fn rules() -> impl Iterator<Item = &'static Rule> {
 
 /// A rule's line.
 #[derive(Clone, Debug, serde::Serialize)]
-pub struct Line {
+pub struct RuleLine {
     /// The rule.
     pub rule: &'static str,
     /// Its section.
@@ -98,7 +98,7 @@ pub struct Line {
     pub statement: &'static str,
     /// What became of it.
     #[serde(flatten)]
-    pub verdict: Verdict,
+    pub verdict: RuleVerdict,
     /// Times that it was tried; more than one where it failed at first.
     pub tries: u32,
 }
@@ -130,7 +130,7 @@ pub struct Judgement {
     /// The device; null where it never said HELLO.
     pub device: Option<DeviceLine>,
     /// A line for each rule.
-    pub lines: Vec<Line>,
+    pub lines: Vec<RuleLine>,
     /// Numbers of rules kept, broken, and not judged.
     pub counts: [usize; 3],
     /// Why it ended before its time.
@@ -149,7 +149,7 @@ pub struct Extent<'a> {
 /// Judges the device behind `medium`. Its light is the least that a frame can have, but for the rules on limits of light. It is left dark.
 pub fn judge(medium: Medium<'_>, extent: Extent<'_>) -> Judgement {
     let name = medium.transport.name().to_owned();
-    let mut bench = Bench::new(medium);
+    let mut bench = ConformanceDriver::new(medium);
     bench.may_flash = extent.flashes;
     let mut lines = Vec::new();
     let mut ended = None;
@@ -158,9 +158,9 @@ pub fn judge(medium: Medium<'_>, extent: Extent<'_>) -> Judgement {
         let verdict = loop {
             tries += 1;
             match (rule.check)(&mut bench) {
-                Ok(()) => break Some(Verdict::Ok),
-                Err(Stop::NotJudged(why)) => break Some(Verdict::NotJudged(why)),
-                Err(Stop::Failed(told)) if tries >= TRIES => break Some(Verdict::Failed(told)),
+                Ok(()) => break Some(RuleVerdict::Ok),
+                Err(Stop::NotJudged(why)) => break Some(RuleVerdict::NotJudged(why)),
+                Err(Stop::Failed(told)) if tries >= TRIES => break Some(RuleVerdict::Failed(told)),
                 Err(Stop::Failed(_)) => {}
                 Err(Stop::Lost(e)) => {
                     ended = Some(e.to_string());
@@ -173,14 +173,20 @@ pub fn judge(medium: Medium<'_>, extent: Extent<'_>) -> Judgement {
             }
         };
         let Some(verdict) = verdict else { break };
-        lines.push(Line { rule: rule.id, section: rule.section, statement: rule.statement, verdict, tries });
+        lines.push(RuleLine {
+            rule: rule.id,
+            section: rule.section,
+            statement: rule.statement,
+            verdict,
+            tries,
+        });
     }
     bench.darken();
-    let count = |wanted: fn(&Verdict) -> bool| lines.iter().filter(|l| wanted(&l.verdict)).count();
+    let count = |wanted: fn(&RuleVerdict) -> bool| lines.iter().filter(|l| wanted(&l.verdict)).count();
     let counts = [
-        count(|v| *v == Verdict::Ok),
-        count(|v| matches!(v, Verdict::Failed(_))),
-        count(|v| matches!(v, Verdict::NotJudged(_))),
+        count(|v| *v == RuleVerdict::Ok),
+        count(|v| matches!(v, RuleVerdict::Failed(_))),
+        count(|v| matches!(v, RuleVerdict::NotJudged(_))),
     ];
     Judgement { medium: name, device: bench.hello.map(|h| DeviceLine::of(&h)), lines, counts, ended }
 }
@@ -225,10 +231,10 @@ impl Judgement {
         };
         for line in &self.lines {
             let verdict = match &line.verdict {
-                Verdict::Ok if line.tries > 1 => format!("ok (at try {})", line.tries),
-                Verdict::Ok => "ok".into(),
-                Verdict::Failed(told) => format!("FAILED: {told}"),
-                Verdict::NotJudged(why) => format!("not judged: {why}"),
+                RuleVerdict::Ok if line.tries > 1 => format!("ok (at try {})", line.tries),
+                RuleVerdict::Ok => "ok".into(),
+                RuleVerdict::Failed(told) => format!("FAILED: {told}"),
+                RuleVerdict::NotJudged(why) => format!("not judged: {why}"),
             };
             out += &format!("{:<22} {:<4} {}: {verdict}\n", line.rule, line.section, line.statement);
         }

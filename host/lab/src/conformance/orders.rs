@@ -1,6 +1,6 @@
 //! ARM and the four verbs: permission to make light, and its end.
 
-use super::driver::{Bench, R};
+use super::driver::{ConformanceDriver, R};
 use super::{check, grew, tell, Rule, Stop};
 use dpm_device::link::{faults, Config, DeviceState, FaultCode, HostMessage, Status};
 use dpm_device::time::FrameRate;
@@ -87,7 +87,7 @@ pub(super) const RULES: &[Rule] = &[
     },
 ];
 
-fn arm_unconfigured(b: &mut Bench<'_>) -> R {
+fn arm_unconfigured(b: &mut ConformanceDriver<'_>) -> R {
     b.open()?;
     b.forget()?;
     b.say(&HostMessage::Arm(u32::MAX))?;
@@ -98,7 +98,7 @@ fn arm_unconfigured(b: &mut Bench<'_>) -> R {
     check(!matches!(s.state, DeviceState::Armed), "not armed", || tell(&s))
 }
 
-fn arm(b: &mut Bench<'_>) -> R {
+fn arm(b: &mut ConformanceDriver<'_>) -> R {
     b.armed(|_| {})?;
     let s = b.report()?;
     check(s.state == DeviceState::Armed && !s.lit && s.faults == 0, "armed, dark, without faults", || {
@@ -112,7 +112,7 @@ fn arm(b: &mut Bench<'_>) -> R {
     )
 }
 
-fn arm_twice(b: &mut Bench<'_>) -> R {
+fn arm_twice(b: &mut ConformanceDriver<'_>) -> R {
     let first = b.armed(|_| {})?;
     lit_frame(b)?;
     let before = b.report()?;
@@ -124,7 +124,7 @@ fn arm_twice(b: &mut Bench<'_>) -> R {
     })
 }
 
-fn arm_faults(b: &mut Bench<'_>) -> R {
+fn arm_faults(b: &mut ConformanceDriver<'_>) -> R {
     b.armed(|_| {})?;
     b.say(&HostMessage::Safe)?;
     b.forget()?;
@@ -145,7 +145,7 @@ fn arm_faults(b: &mut Bench<'_>) -> R {
 }
 
 /// One frame is lit, and stays so for two seconds.
-pub(super) fn lit_frame(b: &mut Bench<'_>) -> R<Status> {
+pub(super) fn lit_frame(b: &mut ConformanceDriver<'_>) -> R<Status> {
     b.needs_frames()?;
     let shot = b.send_ahead()?;
     let s = b.until_slot(shot.slot)?;
@@ -159,7 +159,7 @@ fn slow(c: &mut Config) {
 }
 
 /// A verb ends light in the middle of a slot.
-fn dark_at_once(b: &mut Bench<'_>, message: &HostMessage, session: Option<u32>) -> R<Status> {
+fn dark_at_once(b: &mut ConformanceDriver<'_>, message: &HostMessage, session: Option<u32>) -> R<Status> {
     b.armed(slow)?;
     lit_frame(b)?;
     // At the beginning of a slot, so that the rest of it lies ahead.
@@ -177,12 +177,12 @@ fn dark_at_once(b: &mut Bench<'_>, message: &HostMessage, session: Option<u32>) 
     Ok(s)
 }
 
-fn stop(b: &mut Bench<'_>) -> R {
+fn stop(b: &mut ConformanceDriver<'_>) -> R {
     let s = dark_at_once(b, &HostMessage::Stop, None)?;
     check(s.state == DeviceState::Configured, "configured", || tell(&s))
 }
 
-fn stop_any_session(b: &mut Bench<'_>) -> R {
+fn stop_any_session(b: &mut ConformanceDriver<'_>) -> R {
     for other in [0, b.session ^ 0x5555_aaaa] {
         let s = dark_at_once(b, &HostMessage::Stop, Some(other))?;
         check(s.state == DeviceState::Configured, "configured", || tell(&s))?;
@@ -190,7 +190,7 @@ fn stop_any_session(b: &mut Bench<'_>) -> R {
     Ok(())
 }
 
-fn black(b: &mut Bench<'_>) -> R {
+fn black(b: &mut ConformanceDriver<'_>) -> R {
     let s = dark_at_once(b, &HostMessage::Black, None)?;
     check(s.state == DeviceState::Black && s.faults == 0, "black, without faults", || tell(&s))?;
     b.say(&HostMessage::Arm(0))?;
@@ -200,7 +200,7 @@ fn black(b: &mut Bench<'_>) -> R {
     Ok(())
 }
 
-fn black_any_session(b: &mut Bench<'_>) -> R {
+fn black_any_session(b: &mut ConformanceDriver<'_>) -> R {
     for other in [0, b.session ^ 0x5555_aaaa] {
         let s = dark_at_once(b, &HostMessage::Black, Some(other))?;
         check(s.state == DeviceState::Black, "black", || tell(&s))?;
@@ -208,7 +208,7 @@ fn black_any_session(b: &mut Bench<'_>) -> R {
     Ok(())
 }
 
-fn black_frames(b: &mut Bench<'_>) -> R {
+fn black_frames(b: &mut ConformanceDriver<'_>) -> R {
     b.armed(|_| {})?;
     b.needs_frames()?;
     b.say(&HostMessage::Black)?;
@@ -232,7 +232,7 @@ fn black_frames(b: &mut Bench<'_>) -> R {
     check(grew(&before, &s, |s| s.slots_blank) > 0, "blank slots", || tell(&s))
 }
 
-fn freeze(b: &mut Bench<'_>) -> R {
+fn freeze(b: &mut ConformanceDriver<'_>) -> R {
     b.armed(|_| {})?;
     let before = lit_frame(b)?;
     b.say(&HostMessage::Freeze)?;
@@ -254,7 +254,7 @@ fn freeze(b: &mut Bench<'_>) -> R {
     Ok(())
 }
 
-fn freeze_dark(b: &mut Bench<'_>) -> R {
+fn freeze_dark(b: &mut ConformanceDriver<'_>) -> R {
     b.armed(|_| {})?;
     b.say(&HostMessage::Freeze)?;
     let before = b.report()?;
@@ -266,7 +266,7 @@ fn freeze_dark(b: &mut Bench<'_>) -> R {
     check(grew(&before, &s, |s| s.slots_blank) >= 2, "blank slots", || tell(&s))
 }
 
-fn slots_over_arms(b: &mut Bench<'_>) -> R {
+fn slots_over_arms(b: &mut ConformanceDriver<'_>) -> R {
     b.armed(|_| {})?;
     let before = lit_frame(b)?;
     b.say(&HostMessage::Stop)?;
@@ -279,7 +279,7 @@ fn slots_over_arms(b: &mut Bench<'_>) -> R {
     )
 }
 
-fn is_safe(b: &mut Bench<'_>, s: &Status) -> R {
+fn is_safe(b: &mut ConformanceDriver<'_>, s: &Status) -> R {
     check(
         s.state == DeviceState::Faulted && s.faults & faults::HOST_SAFE != 0,
         "faulted, fault 3 latched",
@@ -291,7 +291,7 @@ fn is_safe(b: &mut Bench<'_>, s: &Status) -> R {
     check(s.state == DeviceState::Faulted && !s.lit, "latched", || tell(&s))
 }
 
-fn safe(b: &mut Bench<'_>) -> R {
+fn safe(b: &mut ConformanceDriver<'_>) -> R {
     let s = dark_at_once(b, &HostMessage::Safe, None)?;
     is_safe(b, &s)?;
     b.arm()?;
@@ -302,7 +302,7 @@ fn safe(b: &mut Bench<'_>) -> R {
     check(fault.latched & faults::HOST_SAFE != 0, "fault 3 in the FAULT", || format!("{:#x}", fault.latched))
 }
 
-fn safe_any_session(b: &mut Bench<'_>) -> R {
+fn safe_any_session(b: &mut ConformanceDriver<'_>) -> R {
     for other in [0, b.session ^ 0x5555_aaaa] {
         let s = dark_at_once(b, &HostMessage::Safe, Some(other))?;
         is_safe(b, &s)?;

@@ -1,6 +1,6 @@
 //! Packets that are damaged, foreign, cut short or no packets at all: skipped, counted, and the next one found.
 
-use super::driver::{Bench, MediumKind, R};
+use super::driver::{ConformanceDriver, MediumKind, R};
 use super::shot::{damaged_payload, other_header};
 use super::{check, grew, tell, Rule, Stop};
 use dpm_device::link::{
@@ -84,7 +84,7 @@ pub(super) const RULES: &[Rule] = &[
 ];
 
 /// Sends `packets` on the control lane together with an ECHO that must be answered; the reports before and after.
-fn answered(b: &mut Bench<'_>, packets: &[Packet<'_>], what: &str) -> R<(Status, Status)> {
+fn answered(b: &mut ConformanceDriver<'_>, packets: &[Packet<'_>], what: &str) -> R<(Status, Status)> {
     let before = b.report()?;
     let stamp = 0x0bad_0000_0000_0000 | u64::from(b.now().0 as u32);
     let mut payload = [0u8; MAX_CONTROL_BYTES];
@@ -107,7 +107,7 @@ fn arm_payload() -> ([u8; 4], Header) {
     ([0; 4], Header::control(MessageType::Arm, 0, 4))
 }
 
-fn header_damaged(b: &mut Bench<'_>) -> R {
+fn header_damaged(b: &mut ConformanceDriver<'_>) -> R {
     b.configured(|_| {})?;
     let (payload, header) = arm_payload();
     let header = Header { session: b.session, ..header };
@@ -122,7 +122,7 @@ fn header_damaged(b: &mut Bench<'_>) -> R {
     check(grew(&before, &after, |s| s.header_errors) == 1, "one damaged header counted", || tell(&after))
 }
 
-fn payload_damaged(b: &mut Bench<'_>) -> R {
+fn payload_damaged(b: &mut ConformanceDriver<'_>) -> R {
     b.configured(|_| {})?;
     let (payload, header) = arm_payload();
     let header = Header { session: b.session, ..header };
@@ -134,7 +134,7 @@ fn payload_damaged(b: &mut Bench<'_>) -> R {
 }
 
 /// An ARM that is right but for one byte of its header. What it acknowledges spells the beginning of a packet: nobody must look for one there.
-fn foreign(b: &mut Bench<'_>, at: usize, value: u8, what: &str) -> R {
+fn foreign(b: &mut ConformanceDriver<'_>, at: usize, value: u8, what: &str) -> R {
     b.configured(|_| {})?;
     let payload = *b"DPML";
     let header = Header::control(MessageType::Arm, b.session, 4);
@@ -150,19 +150,19 @@ fn foreign(b: &mut Bench<'_>, at: usize, value: u8, what: &str) -> R {
     })
 }
 
-fn version_foreign(b: &mut Bench<'_>) -> R {
+fn version_foreign(b: &mut ConformanceDriver<'_>) -> R {
     foreign(b, 4, 99, "a packet of version 99")
 }
 
-fn type_unknown(b: &mut Bench<'_>) -> R {
+fn type_unknown(b: &mut ConformanceDriver<'_>) -> R {
     foreign(b, 5, 200, "a packet of type 200")
 }
 
-fn flags_unknown(b: &mut Bench<'_>) -> R {
+fn flags_unknown(b: &mut ConformanceDriver<'_>) -> R {
     foreign(b, 6, 0x40, "a packet of flags 0x40")
 }
 
-fn direction(b: &mut Bench<'_>) -> R {
+fn direction(b: &mut ConformanceDriver<'_>) -> R {
     b.configured(|_| {})?;
     let status = [0u8; 96];
     let header = Header::control(MessageType::Status, b.session, 96);
@@ -176,7 +176,7 @@ fn direction(b: &mut Bench<'_>) -> R {
     check(grew(&before, &after, |s| s.packets_ignored) == 2, "2 packets counted as ignored", || tell(&after))
 }
 
-fn noise(b: &mut Bench<'_>) -> R {
+fn noise(b: &mut ConformanceDriver<'_>) -> R {
     b.configured(|_| {})?;
     // Bytes that begin like packets here and there.
     let mut header = [0x5au8; 32];
@@ -187,7 +187,7 @@ fn noise(b: &mut Bench<'_>) -> R {
     check(after.state == DeviceState::Configured, "no effect", || tell(&after))
 }
 
-fn cut_short(b: &mut Bench<'_>) -> R {
+fn cut_short(b: &mut ConformanceDriver<'_>) -> R {
     if b.medium.kind == MediumKind::InProcess {
         return Err(Stop::NotJudged("nothing ends a transfer to a device in this process".into()));
     }
@@ -211,7 +211,7 @@ fn cut_short(b: &mut Bench<'_>) -> R {
     check(grew(&before, &after, |s| s.header_errors) == 0, "no damaged header", || tell(&after))
 }
 
-fn packets_counted(b: &mut Bench<'_>) -> R {
+fn packets_counted(b: &mut ConformanceDriver<'_>) -> R {
     b.configured(|_| {})?;
     let before = b.report()?;
     b.feed = false;
@@ -230,7 +230,7 @@ fn packets_counted(b: &mut Bench<'_>) -> R {
     check((8..=12).contains(&packets), "8 to 12 packets counted", || packets.to_string())
 }
 
-fn last_plane(b: &mut Bench<'_>) -> R {
+fn last_plane(b: &mut ConformanceDriver<'_>) -> R {
     b.armed(|_| {})?;
     b.needs_frames()?;
     if b.plain_config()?.schedule.len() < 2 {
@@ -247,7 +247,7 @@ fn last_plane(b: &mut Bench<'_>) -> R {
     Ok(())
 }
 
-fn status_commit(b: &mut Bench<'_>) -> R {
+fn status_commit(b: &mut ConformanceDriver<'_>) -> R {
     // Slots so long that none of them asks for a STATUS.
     b.armed(|c| c.rate = dpm_device::time::FrameRate::new(1, 1).unwrap_or(c.rate))?;
     b.needs_frames()?;
@@ -268,7 +268,7 @@ fn status_commit(b: &mut Bench<'_>) -> R {
     check(s.is_some(), "STATUS after SYNC", || "none".into())
 }
 
-fn status_slots(b: &mut Bench<'_>) -> R {
+fn status_slots(b: &mut ConformanceDriver<'_>) -> R {
     b.armed(|_| {})?;
     b.report()?;
     b.pass(20_000_000)?;

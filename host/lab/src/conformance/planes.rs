@@ -1,6 +1,6 @@
 //! Planes and what frames refer to: when a frame is whole, and when it is not.
 
-use super::driver::{Bench, R};
+use super::driver::{ConformanceDriver, R};
 use super::shot::Shot;
 use super::{check, fates, grew, tell, Rule, Stop};
 use dpm_device::transport::Lane;
@@ -88,9 +88,9 @@ pub(super) const RULES: &[Rule] = &[
 
 /// Sends a frame that must not be whole: incomplete, and dark.
 pub(super) fn incomplete(
-    b: &mut Bench<'_>,
+    b: &mut ConformanceDriver<'_>,
     what: &str,
-    spoil: impl FnOnce(&mut Bench<'_>, &mut Shot) -> R,
+    spoil: impl FnOnce(&mut ConformanceDriver<'_>, &mut Shot) -> R,
 ) -> R {
     b.armed(|_| {})?;
     b.needs_frames()?;
@@ -110,9 +110,9 @@ pub(super) fn incomplete(
 
 /// Sends a frame that must be lit.
 pub(super) fn lit(
-    b: &mut Bench<'_>,
+    b: &mut ConformanceDriver<'_>,
     what: &str,
-    make: impl FnOnce(&mut Bench<'_>, &mut Shot) -> R,
+    make: impl FnOnce(&mut ConformanceDriver<'_>, &mut Shot) -> R,
 ) -> R<Shot> {
     let slot = b.slot_ahead()?;
     let before = b.report()?;
@@ -128,14 +128,14 @@ pub(super) fn lit(
     Ok(shot)
 }
 
-fn plane_missing(b: &mut Bench<'_>) -> R {
+fn plane_missing(b: &mut ConformanceDriver<'_>) -> R {
     incomplete(b, "a plane too few", |_, shot| {
         shot.pieces.pop();
         Ok(())
     })
 }
 
-fn frame_abandoned(b: &mut Bench<'_>) -> R {
+fn frame_abandoned(b: &mut ConformanceDriver<'_>) -> R {
     b.armed(|_| {})?;
     b.needs_frames()?;
     let slot = b.slot_ahead_quietly()? + 1;
@@ -154,7 +154,7 @@ fn frame_abandoned(b: &mut Bench<'_>) -> R {
     )
 }
 
-fn frame_old(b: &mut Bench<'_>) -> R {
+fn frame_old(b: &mut ConformanceDriver<'_>) -> R {
     b.armed(|_| {})?;
     b.needs_frames()?;
     let slot = b.slot_ahead()? + 2;
@@ -174,7 +174,7 @@ fn frame_old(b: &mut Bench<'_>) -> R {
     check(s.frames_lit == 1 && s.last_lit_frame == newer.id, "the newer frame lit", || tell(&s))
 }
 
-fn frame_wrap(b: &mut Bench<'_>) -> R {
+fn frame_wrap(b: &mut ConformanceDriver<'_>) -> R {
     b.armed(|_| {})?;
     b.needs_frames()?;
     b.next_frame = u32::MAX;
@@ -185,7 +185,7 @@ fn frame_wrap(b: &mut Bench<'_>) -> R {
     Ok(())
 }
 
-fn plane_again(b: &mut Bench<'_>) -> R {
+fn plane_again(b: &mut ConformanceDriver<'_>) -> R {
     b.armed(|_| {})?;
     b.needs_frames()?;
     let before = b.report()?;
@@ -200,7 +200,7 @@ fn plane_again(b: &mut Bench<'_>) -> R {
     check(grew(&before, &s, |s| s.packets_ignored) >= 1, "the copy counted as ignored", || tell(&s))
 }
 
-fn plane_damaged(b: &mut Bench<'_>) -> R {
+fn plane_damaged(b: &mut ConformanceDriver<'_>) -> R {
     incomplete(b, "a damaged plane", |_, shot| {
         shot.pieces[0].damaged = true;
         Ok(())
@@ -209,14 +209,14 @@ fn plane_damaged(b: &mut Bench<'_>) -> R {
     check(s.payload_errors >= 1, "a damaged payload counted", || tell(&s))
 }
 
-fn plane_led(b: &mut Bench<'_>) -> R {
+fn plane_led(b: &mut ConformanceDriver<'_>) -> R {
     incomplete(b, "another LED code", |_, shot| {
         shot.pieces[0].led = 0x27;
         Ok(())
     })
 }
 
-fn plane_target(b: &mut Bench<'_>) -> R {
+fn plane_target(b: &mut ConformanceDriver<'_>) -> R {
     incomplete(b, "another target", |b, shot| {
         if shot.pieces.len() < 2 {
             return Err(Stop::NotJudged("its frames have one plane".into()));
@@ -227,7 +227,7 @@ fn plane_target(b: &mut Bench<'_>) -> R {
     })
 }
 
-fn masks(b: &mut Bench<'_>) -> R {
+fn masks(b: &mut ConformanceDriver<'_>) -> R {
     incomplete(b, "a plane in neither mask", |_, shot| {
         let last = shot.pieces.len() as u32 - 1;
         if last == 0 {
@@ -250,7 +250,7 @@ fn masks(b: &mut Bench<'_>) -> R {
     check(grew(&before, &s, |s| s.packets_ignored) >= 1, "FRAME_COMMIT counted as ignored", || tell(&s))
 }
 
-fn kept(b: &mut Bench<'_>) -> R {
+fn kept(b: &mut ConformanceDriver<'_>) -> R {
     b.armed(|_| {})?;
     b.needs_frames()?;
     let base = lit(b, "a frame", |_, _| Ok(()))?;
@@ -268,7 +268,7 @@ fn kept(b: &mut Bench<'_>) -> R {
     Ok(())
 }
 
-fn kept_base(b: &mut Bench<'_>) -> R {
+fn kept_base(b: &mut ConformanceDriver<'_>) -> R {
     b.armed(|_| {})?;
     b.needs_frames()?;
     let base = lit(b, "a frame", |_, _| Ok(()))?;
@@ -290,7 +290,7 @@ fn kept_base(b: &mut Bench<'_>) -> R {
     })
 }
 
-fn base_dropped(b: &mut Bench<'_>) -> R {
+fn base_dropped(b: &mut ConformanceDriver<'_>) -> R {
     b.armed(|_| {})?;
     b.needs_frames()?;
     let slot = b.slot_ahead()?;
@@ -313,7 +313,7 @@ fn base_dropped(b: &mut Bench<'_>) -> R {
     Ok(())
 }
 
-fn lanes(b: &mut Bench<'_>) -> R {
+fn lanes(b: &mut ConformanceDriver<'_>) -> R {
     if b.medium.kind == super::MediumKind::Serial {
         return Err(Stop::NotJudged("a serial line is one stream for both lanes".into()));
     }

@@ -1,6 +1,6 @@
 //! What a device does against damage, flashes and too much light, whatever its host says; and a host that goes and comes back.
 
-use super::driver::{Bench, R};
+use super::driver::{ConformanceDriver, R};
 use super::orders::lit_frame;
 use super::shot::damaged_payload;
 use super::{check, grew, tell, Rule, Stop};
@@ -59,7 +59,7 @@ pub(super) const RULES: &[Rule] = &[
     },
 ];
 
-fn checksum_storm(b: &mut Bench<'_>) -> R {
+fn checksum_storm(b: &mut ConformanceDriver<'_>) -> R {
     b.armed(|_| {})?;
     let header = Header::control(MessageType::Echo, b.session, 4);
     let one = || damaged_payload(&header, &[7; 4]);
@@ -92,7 +92,11 @@ fn checksum_storm(b: &mut Bench<'_>) -> R {
 }
 
 /// A CONFIG with limits; `false` where the device refuses to count light.
-fn with_limits(b: &mut Bench<'_>, limits: LightLimits, change: impl FnOnce(&mut Config)) -> R<bool> {
+fn with_limits(
+    b: &mut ConformanceDriver<'_>,
+    limits: LightLimits,
+    change: impl FnOnce(&mut Config),
+) -> R<bool> {
     b.open()?;
     let mut config = b.plain_config()?;
     config.limits = limits;
@@ -125,7 +129,7 @@ fn with_limits(b: &mut Bench<'_>, limits: LightLimits, change: impl FnOnce(&mut 
     }
 }
 
-fn limits_format(b: &mut Bench<'_>) -> R {
+fn limits_format(b: &mut ConformanceDriver<'_>) -> R {
     let cases: [(&str, usize, &[u8]); 4] = [
         ("a mean of 1001 thousandths", 20, &1001u16.to_le_bytes()),
         ("a window of 499 ms", 32, &499u32.to_le_bytes()),
@@ -152,7 +156,7 @@ fn limits_format(b: &mut Bench<'_>) -> R {
 }
 
 /// A frame of `code` in every mirror of the first plane, for `slot`.
-fn full(b: &mut Bench<'_>, slot: u64) -> R {
+fn full(b: &mut ConformanceDriver<'_>, slot: u64) -> R {
     let mut shot = b.shot(slot)?;
     let raster = b.hello.map(|h| h.raster).ok_or(Stop::Failed("no HELLO".into()))?;
     let mut row = vec![0xffu8; raster.row_bytes()];
@@ -169,7 +173,7 @@ fn full(b: &mut Bench<'_>, slot: u64) -> R {
 }
 
 /// Frames of full planes take the medium no longer than a few slots.
-fn needs_full(b: &mut Bench<'_>) -> R {
+fn needs_full(b: &mut ConformanceDriver<'_>) -> R {
     let hello = b.open()?;
     let plane = vec![0xff; hello.raster.plane_bytes()];
     let bytes = if hello.raster.width() % 8 == 0 { b.coded(&plane).1.len() } else { plane.len() };
@@ -180,7 +184,7 @@ fn needs_full(b: &mut Bench<'_>) -> R {
 }
 
 /// Waits for `fault`, then for ARM to be refused because light rests. The time from `began` to the fault, ms.
-fn rests(b: &mut Bench<'_>, fault: u32, began: u64, within_ms: u64) -> R<u64> {
+fn rests(b: &mut ConformanceDriver<'_>, fault: u32, began: u64, within_ms: u64) -> R<u64> {
     let limit = (within_ms as i64) * 1_000_000 + b.answer_ns();
     let session = b.session;
     // It may have come while frames were still sent.
@@ -222,7 +226,7 @@ fn not_counted() -> Stop {
     Stop::NotJudged("it does not count light (FAULT 2, detail 5)".into())
 }
 
-fn limit_mean(b: &mut Bench<'_>) -> R {
+fn limit_mean(b: &mut ConformanceDriver<'_>) -> R {
     needs_full(b)?;
     // 128 of 255 in one channel, against a tenth over half a second: after a fifth of the window.
     let limits = LightLimits { mean_permille: 100, window_ms: 500, full_white_ms: 0 };
@@ -261,7 +265,7 @@ fn white_planes(c: &mut Config, most: u8) -> bool {
     }
 }
 
-fn limit_white(b: &mut Bench<'_>) -> R {
+fn limit_white(b: &mut ConformanceDriver<'_>) -> R {
     needs_full(b)?;
     let hello = b.open()?;
     if hello.max_planes < 8 {
@@ -286,7 +290,7 @@ fn limit_white(b: &mut Bench<'_>) -> R {
     )
 }
 
-fn flashes(b: &mut Bench<'_>) -> R {
+fn flashes(b: &mut ConformanceDriver<'_>) -> R {
     if !b.may_flash {
         return Err(Stop::NotJudged(
             "the light would flash for a second, which can cause seizures; --flashes allows it".into(),
@@ -318,7 +322,7 @@ fn flashes(b: &mut Bench<'_>) -> R {
     Ok(())
 }
 
-fn replug(b: &mut Bench<'_>) -> R {
+fn replug(b: &mut ConformanceDriver<'_>) -> R {
     b.armed(|_| {})?;
     lit_frame(b)?;
     if b.medium.kind == super::MediumKind::InProcess {
@@ -342,7 +346,7 @@ fn replug(b: &mut Bench<'_>) -> R {
     check(ms <= 1000 + slack, "light within a second", || format!("{ms} ms"))
 }
 
-fn session_old(b: &mut Bench<'_>) -> R {
+fn session_old(b: &mut ConformanceDriver<'_>) -> R {
     b.configured(|_| {})?;
     let old = b.session;
     b.configured(|_| {})?;

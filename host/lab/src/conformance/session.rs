@@ -1,6 +1,6 @@
 //! The way to light: a session, its configuration, ARM; and the device's time.
 
-use super::driver::{Bench, R, WATCHDOG_US};
+use super::driver::{ConformanceDriver, R, WATCHDOG_US};
 use super::Stop;
 use dpm_device::link::{
     Config, DeviceHello, DeviceMessage, DeviceState, FaultCode, HostHello, HostMessage, LightLimits,
@@ -9,7 +9,7 @@ use dpm_device::link::{
 use dpm_device::planes::{Channel, PlaneSchedule, PlaneSpec};
 use dpm_device::time::{DeviceTicks, FrameRate};
 
-impl Bench<'_> {
+impl ConformanceDriver<'_> {
     /// Opens a new session and waits for the device's HELLO.
     pub(super) fn open(&mut self) -> R<DeviceHello> {
         self.session = self.sessions.draw();

@@ -1,6 +1,6 @@
 //! SHIFT: slots that begin earlier or later. What holds is seen from the epoch in STATUS, and from when frames are lit.
 
-use super::driver::{Bench, R};
+use super::driver::{ConformanceDriver, R};
 use super::{check, grew, tell, Rule, Stop};
 use dpm_device::link::{HostMessage, SlotShift, Status, SHIFT_PARTS};
 use dpm_device::time::DeviceTicks;
@@ -33,7 +33,7 @@ pub(super) const RULES: &[Rule] = &[
     },
 ];
 
-impl Bench<'_> {
+impl ConformanceDriver<'_> {
     /// A new session of a device whose slots can be shifted, armed.
     fn armed_to_shift(&mut self) -> R {
         self.offers_shifts()?;
@@ -77,7 +77,7 @@ fn epoch(s: &Status) -> R<u32> {
 }
 
 /// A frame for the second slot after a shift is lit when that slot begins.
-fn lights(b: &mut Bench<'_>, shift: SlotShift) -> R {
+fn lights(b: &mut ConformanceDriver<'_>, shift: SlotShift) -> R {
     let after = b.until_slot(shift.slot)?;
     check(epoch(&after)? == shift.epoch.0 as u32, &format!("the epoch {}", shift.epoch.0 as u32), || {
         format!("{:?}", after.timing)
@@ -92,7 +92,7 @@ fn lights(b: &mut Bench<'_>, shift: SlotShift) -> R {
     )
 }
 
-fn unasked(b: &mut Bench<'_>) -> R {
+fn unasked(b: &mut ConformanceDriver<'_>) -> R {
     b.offers_shifts()?;
     b.armed(|config| config.timing = true)?;
     let before = b.report()?;
@@ -102,7 +102,7 @@ fn unasked(b: &mut Bench<'_>) -> R {
     check(epoch(&s)? == 0, "an epoch of 0", || format!("{:?}", s.timing))
 }
 
-fn slot(b: &mut Bench<'_>) -> R {
+fn slot(b: &mut ConformanceDriver<'_>) -> R {
     b.armed_to_shift()?;
     let part = b.slot_part()?;
     for ticks in [part, -part, part / 2] {
@@ -114,7 +114,7 @@ fn slot(b: &mut Bench<'_>) -> R {
     Ok(())
 }
 
-fn far(b: &mut Bench<'_>) -> R {
+fn far(b: &mut ConformanceDriver<'_>) -> R {
     b.armed_to_shift()?;
     let part = b.slot_part()?;
     for ticks in [part + 1, -part - 1] {
@@ -129,7 +129,7 @@ fn far(b: &mut Bench<'_>) -> R {
     Ok(())
 }
 
-fn dark(b: &mut Bench<'_>) -> R {
+fn dark(b: &mut ConformanceDriver<'_>) -> R {
     b.armed_to_shift()?;
     let shift = b.shifts(b.slots()?.slot_ticks() as i64 * 3 / 5)?;
     lights(b, shift)

@@ -1,6 +1,6 @@
 //! Frames that a rule sends: right ones, and wrong ones in one point.
 
-use super::driver::{Bench, R};
+use super::driver::{ConformanceDriver, R};
 use super::Stop;
 use dpm_device::link::{
     crc32c, packet_bytes, rle_encode, Codec, Commit, Header, HostMessage, MessageType, Packet, COMMIT_BYTES,
@@ -36,7 +36,7 @@ pub(super) struct Shot {
     pub commits: bool,
 }
 
-impl Bench<'_> {
+impl ConformanceDriver<'_> {
     /// Bytes of one plane.
     pub(super) fn plane_bytes(&self) -> usize {
         self.hello.map_or(1, |h| h.raster.plane_bytes())
@@ -60,7 +60,7 @@ impl Bench<'_> {
         Ok(())
     }
 
-    /// See [`Bench::needs_frames`], for a rule that is about raw planes.
+    /// See [`ConformanceDriver::needs_frames`], for a rule that is about raw planes.
     pub(crate) fn needs_raw(&self) -> R {
         if self.carry_ns(packet_bytes(self.plane_bytes())) > LONGEST_PLANE_NS {
             return Err(Stop::NotJudged(format!(

@@ -1,6 +1,6 @@
 //! The device's clock, and the laws that were watched over all of the judging.
 
-use super::driver::{Bench, R};
+use super::driver::{ConformanceDriver, R};
 use super::{check, Rule, Stop};
 use dpm_device::link::DeviceMessage;
 
@@ -63,7 +63,7 @@ pub(super) const RULES: &[Rule] = &[
 ];
 
 /// A law that was watched; where only some rules are judged, a little is done first so that there is something to watch.
-fn law(b: &mut Bench<'_>, breach: fn(&Bench<'_>) -> Option<String>, what: &str) -> R {
+fn law(b: &mut ConformanceDriver<'_>, breach: fn(&ConformanceDriver<'_>) -> Option<String>, what: &str) -> R {
     if b.laws().reports < 200 {
         exercise(b)?;
     }
@@ -74,7 +74,7 @@ fn law(b: &mut Bench<'_>, breach: fn(&Bench<'_>) -> Option<String>, what: &str) 
 }
 
 /// Frames of every fate, and every state.
-fn exercise(b: &mut Bench<'_>) -> R {
+fn exercise(b: &mut ConformanceDriver<'_>) -> R {
     use dpm_device::link::HostMessage;
     b.armed(|_| {})?;
     if b.needs_frames().is_ok() {
@@ -103,7 +103,7 @@ fn exercise(b: &mut Bench<'_>) -> R {
 }
 
 /// One exchange: the host's two stamps, and the device's.
-fn exchange(b: &mut Bench<'_>, mark: u64) -> R<Option<([i64; 2], [u64; 2])>> {
+fn exchange(b: &mut ConformanceDriver<'_>, mark: u64) -> R<Option<([i64; 2], [u64; 2])>> {
     let sent = b.now().0;
     let stamp = mark << 56 | (sent as u64 & 0x00ff_ffff_ffff_ffff);
     b.forget()?;
@@ -119,7 +119,7 @@ fn exchange(b: &mut Bench<'_>, mark: u64) -> R<Option<([i64; 2], [u64; 2])>> {
     })
 }
 
-fn echo(b: &mut Bench<'_>) -> R {
+fn echo(b: &mut ConformanceDriver<'_>) -> R {
     b.configured(|_| {})?;
     for mark in [0x01, 0x80, 0xff] {
         let found = exchange(b, mark)?;
@@ -141,14 +141,14 @@ fn echo(b: &mut Bench<'_>) -> R {
     Ok(())
 }
 
-fn echo_greeted(b: &mut Bench<'_>) -> R {
+fn echo_greeted(b: &mut ConformanceDriver<'_>) -> R {
     b.open()?;
     let found = exchange(b, 0x11)?;
     check(found.is_some(), "an ECHO before CONFIG", || "none".into())
 }
 
 /// The best of some exchanges: middle of the host's stamps, the device's arrival, half the round trip, ns.
-fn best(b: &mut Bench<'_>) -> R<(f64, f64, f64)> {
+fn best(b: &mut ConformanceDriver<'_>) -> R<(f64, f64, f64)> {
     let mut best: Option<(f64, f64, f64)> = None;
     for k in 0..12 {
         if let Some((host, device)) = exchange(b, k)? {
@@ -162,7 +162,7 @@ fn best(b: &mut Bench<'_>) -> R<(f64, f64, f64)> {
     best.ok_or_else(|| b.silent("an ECHO"))
 }
 
-fn clock_rate(b: &mut Bench<'_>) -> R {
+fn clock_rate(b: &mut ConformanceDriver<'_>) -> R {
     b.configured(|_| {})?;
     let first = best(b)?;
     b.pass(1_500_000_000)?;
@@ -175,7 +175,7 @@ fn clock_rate(b: &mut Bench<'_>) -> R {
     check(ppm.abs() <= 1000.0 + open, "1000 ppm at most", || format!("{ppm:.0} ppm, {open:.0} ppm uncertain"))
 }
 
-fn replies(b: &mut Bench<'_>) -> R {
+fn replies(b: &mut ConformanceDriver<'_>) -> R {
     law(b, |b| b.laws().packets.clone(), "packets by section 2")?;
     let noise = b.noise();
     check(noise == [0; 4], "no damaged, foreign or stray bytes on the way back", || {

@@ -1,7 +1,7 @@
 //! Timing: how early frames are whole. Every bound comes from the device's own clock in the reports before and after, so
 //! no map of the clocks is needed.
 
-use super::driver::{Bench, R};
+use super::driver::{ConformanceDriver, R};
 use super::{check, tell, Rule, Stop};
 use dpm_device::link::{FrameTiming, Status};
 use dpm_device::time::DeviceTicks;
@@ -36,7 +36,7 @@ pub(super) const RULES: &[Rule] = &[
 /// Ticks that a device may lose by rounding.
 const ROUNDING: f64 = 2.0;
 
-impl Bench<'_> {
+impl ConformanceDriver<'_> {
     /// A new session of a device that measures timing.
     fn measures(&mut self) -> R {
         self.open()?;
@@ -68,7 +68,7 @@ fn timing(s: &Status, frame: u32) -> R<FrameTiming> {
 }
 
 /// Sends a frame for the slot `ahead` from now and judges its slack.
-fn judge(b: &mut Bench<'_>, slot: u64) -> R<FrameTiming> {
+fn judge(b: &mut ConformanceDriver<'_>, slot: u64) -> R<FrameTiming> {
     let before = b.report()?;
     let shot = b.send_for(slot)?;
     let after = b.report()?;
@@ -81,7 +81,7 @@ fn judge(b: &mut Bench<'_>, slot: u64) -> R<FrameTiming> {
     Ok(told)
 }
 
-fn unasked(b: &mut Bench<'_>) -> R {
+fn unasked(b: &mut ConformanceDriver<'_>) -> R {
     b.measures()?;
     b.armed(|_| {})?;
     b.needs_frames()?;
@@ -90,7 +90,7 @@ fn unasked(b: &mut Bench<'_>) -> R {
     check(s.timing.is_none(), "a STATUS without timing", || tell(&s))
 }
 
-fn slack(b: &mut Bench<'_>) -> R {
+fn slack(b: &mut ConformanceDriver<'_>) -> R {
     b.armed_to_measure()?;
     for more in [1, 2] {
         let slot = b.slot_ahead()? + more;
@@ -101,7 +101,7 @@ fn slack(b: &mut Bench<'_>) -> R {
     Ok(())
 }
 
-fn late(b: &mut Bench<'_>) -> R {
+fn late(b: &mut ConformanceDriver<'_>) -> R {
     b.armed_to_measure()?;
     let slot = b.slot_ahead()?;
     b.until_slot(slot + 2)?;
@@ -109,7 +109,7 @@ fn late(b: &mut Bench<'_>) -> R {
     check(told.slack_ns < 0, "a slack below 0", || told.slack_ns.to_string())
 }
 
-fn transfer(b: &mut Bench<'_>) -> R {
+fn transfer(b: &mut ConformanceDriver<'_>) -> R {
     b.armed_to_measure()?;
     let slot = b.slot_ahead()?;
     let before = b.report()?;

@@ -3,7 +3,7 @@
 //! Every rule lets tracks hold around the middle of one plane only, so that the counters say what became of that plane and
 //! every other lit plane counts as stale.
 
-use super::driver::{Bench, R};
+use super::driver::{ConformanceDriver, R};
 use super::shot::Shot;
 use super::{check, grew, tell, Rule, Stop};
 use dpm_device::link::{
@@ -119,12 +119,12 @@ const SENT: u32 = 16;
 const MIRROR: i16 = 256;
 
 /// The middle of a plane, and TRACKS that hold from 1 ms before it to 1 ms after it.
-struct Aim {
+struct PlaneAim {
     middle: u64,
     tracks: Tracks,
 }
 
-impl Bench<'_> {
+impl ConformanceDriver<'_> {
     /// The greatest shift that HELLO offers.
     fn greatest_shift(&self) -> R<u8> {
         let offered = self.hello.and_then(|hello| hello.greatest_shift);
@@ -154,12 +154,12 @@ impl Bench<'_> {
     }
 
     /// Around the middle of plane `plane` of the slot `slot`, for `frame`, without a region.
-    fn aim(&self, frame: u32, slot: u64, plane: u64) -> R<Aim> {
+    fn aim(&self, frame: u32, slot: u64, plane: u64) -> R<PlaneAim> {
         let (start, end) = (self.slots()?.start(slot).0, self.slots()?.start(slot + 1).0);
         let halves = u128::from(end - start) * u128::from(2 * plane + 1);
         let middle = start + (halves / u128::from(2 * self.planes())) as u64;
         let begin = middle - self.tick_hz() / 1000;
-        Ok(Aim { middle, tracks: Tracks::new(frame, 0, DeviceTicks(begin), 2000) })
+        Ok(PlaneAim { middle, tracks: Tracks::new(frame, 0, DeviceTicks(begin), 2000) })
     }
 
     /// Planes of a frame.
@@ -199,7 +199,11 @@ fn became(before: &Status, after: &Status) -> R<[u32; 3]> {
 
 /// Lights a frame whose planes follow what `send` sends, and says what became of them by the end of the slot `slots` after its
 /// own: planes moved, clamped, and stale.
-fn followed(b: &mut Bench<'_>, slots: u64, send: impl FnOnce(&mut Bench<'_>, &Shot) -> R) -> R<[u32; 3]> {
+fn followed(
+    b: &mut ConformanceDriver<'_>,
+    slots: u64,
+    send: impl FnOnce(&mut ConformanceDriver<'_>, &Shot) -> R,
+) -> R<[u32; 3]> {
     let slot = b.slot_ahead()? + 1;
     let before = b.report()?;
     let shot = b.send_for(slot)?;
@@ -210,7 +214,7 @@ fn followed(b: &mut Bench<'_>, slots: u64, send: impl FnOnce(&mut Bench<'_>, &Sh
 }
 
 /// The same for one region around the middle of plane 0 in the frame's own slot. The others are stale.
-fn judge_region(b: &mut Bench<'_>, what: &str, region: Region, moved: u32, clamped: u32) -> R {
+fn judge_region(b: &mut ConformanceDriver<'_>, what: &str, region: Region, moved: u32, clamped: u32) -> R {
     let stale = b.planes() as u32 - 1;
     let seen = followed(b, 0, |b, shot| {
         let mut tracks = b.aim(shot.id, shot.slot, 0)?.tracks;
@@ -225,13 +229,13 @@ fn judge(what: &str, seen: [u32; 3], expected: [u32; 3]) -> R {
     check(seen == expected, &format!("{what}: planes {}", of(expected)), || of(seen))
 }
 
-fn offered(b: &mut Bench<'_>) -> R {
+fn offered(b: &mut ConformanceDriver<'_>) -> R {
     b.open()?;
     let most = b.greatest_shift()?;
     check((1..=MAX_SHIFT).contains(&most), "a greatest shift of 1 to 64", || most.to_string())
 }
 
-fn unasked(b: &mut Bench<'_>) -> R {
+fn unasked(b: &mut ConformanceDriver<'_>) -> R {
     b.open()?;
     b.greatest_shift()?;
     b.configured(|_| {})?;
@@ -243,7 +247,7 @@ fn unasked(b: &mut Bench<'_>) -> R {
 }
 
 /// Sends `n` TRACKS one after the other, and counts what the device says meanwhile.
-fn messages_after(b: &mut Bench<'_>, n: u32) -> R<usize> {
+fn messages_after(b: &mut ConformanceDriver<'_>, n: u32) -> R<usize> {
     b.forget()?;
     b.feed = false;
     let (mut heard, step_ns) = (0, b.answer_ns() / 4 / i64::from(SENT));
@@ -260,7 +264,7 @@ fn messages_after(b: &mut Bench<'_>, n: u32) -> R<usize> {
     Ok(heard)
 }
 
-fn silent(b: &mut Bench<'_>) -> R {
+fn silent(b: &mut ConformanceDriver<'_>) -> R {
     b.open()?;
     b.greatest_shift()?;
     b.configured(|config| config.tracks = true)?;
@@ -278,7 +282,7 @@ fn silent(b: &mut Bench<'_>) -> R {
     check(after.packets_ignored == before.packets_ignored, "none ignored", || tell(&after))
 }
 
-fn watchdog(b: &mut Bench<'_>) -> R {
+fn watchdog(b: &mut ConformanceDriver<'_>) -> R {
     const BITE_US: u32 = 200_000;
     b.armed_to_follow(|config| config.watchdog_us = BITE_US)?;
     b.feed = false;
@@ -292,7 +296,7 @@ fn watchdog(b: &mut Bench<'_>) -> R {
 }
 
 /// Sends TRACKS that must be refused.
-fn refused(b: &mut Bench<'_>, what: &str, tracks: Tracks) -> R {
+fn refused(b: &mut ConformanceDriver<'_>, what: &str, tracks: Tracks) -> R {
     let before = b.report()?;
     b.say(&HostMessage::Tracks(tracks))?;
     let after = b.report()?;
@@ -307,7 +311,7 @@ fn refused(b: &mut Bench<'_>, what: &str, tracks: Tracks) -> R {
     })
 }
 
-fn old(b: &mut Bench<'_>) -> R {
+fn old(b: &mut ConformanceDriver<'_>) -> R {
     b.armed_to_follow(|_| {})?;
     let base = Tracks::new(1, 0, DeviceTicks(0), 1000);
     b.say(&HostMessage::Tracks(base.numbered(7)))?;
@@ -319,7 +323,7 @@ fn old(b: &mut Bench<'_>) -> R {
     check(after.taken == before.taken + 1, "a newer number taken", || told(&after))
 }
 
-fn outside(b: &mut Bench<'_>) -> R {
+fn outside(b: &mut ConformanceDriver<'_>) -> R {
     b.armed_to_follow(|_| {})?;
     let whole = b.region([0; 2])?;
     let Area { width, height, .. } = whole.area;
@@ -340,9 +344,9 @@ fn outside(b: &mut Bench<'_>) -> R {
     Ok(())
 }
 
-fn gate(b: &mut Bench<'_>) -> R {
+fn gate(b: &mut ConformanceDriver<'_>) -> R {
     b.armed_to_follow(|_| {})?;
-    let of = |b: &Bench<'_>, offset, gate| Ok(Region { gate, ..b.region(offset)? });
+    let of = |b: &ConformanceDriver<'_>, offset, gate| Ok(Region { gate, ..b.region(offset)? });
     for (offset, least, moved) in [
         ([128, 0], 0, 1),
         ([-128, 0], 0, 1),
@@ -358,7 +362,7 @@ fn gate(b: &mut Bench<'_>) -> R {
     Ok(())
 }
 
-fn motion(b: &mut Bench<'_>) -> R {
+fn motion(b: &mut ConformanceDriver<'_>) -> R {
     b.armed_to_follow(|_| {})?;
     // The plane's middle is 1 ms after `begin`.
     for (offset, velocity, half_acceleration, moved) in [
@@ -377,7 +381,7 @@ fn motion(b: &mut Bench<'_>) -> R {
     Ok(())
 }
 
-fn drawn(b: &mut Bench<'_>) -> R {
+fn drawn(b: &mut ConformanceDriver<'_>) -> R {
     b.armed_to_follow(|config| config.underrun = Underrun::Repeat)?;
     // A slot lasts 20 ms at least, in which this is a mirror and a half.
     let region = Region { drawn: [20, 0], ..b.region([0; 2])? };
@@ -394,7 +398,7 @@ fn drawn(b: &mut Bench<'_>) -> R {
     Ok(())
 }
 
-fn clamp(b: &mut Bench<'_>) -> R {
+fn clamp(b: &mut ConformanceDriver<'_>) -> R {
     b.armed_to_follow(|_| {})?;
     let most = i16::from(b.greatest_shift()?);
     let far = b.region([5 * MIRROR, 0])?;
@@ -406,7 +410,7 @@ fn clamp(b: &mut Bench<'_>) -> R {
     judge_region(b, "a mirror more than the greatest shift", Region { clamp: u8::MAX, ..beyond }, 1, 1)
 }
 
-fn window(b: &mut Bench<'_>) -> R {
+fn window(b: &mut ConformanceDriver<'_>) -> R {
     b.armed_to_follow(|_| {})?;
     let region = b.region([MIRROR, 0])?;
     let planes = b.planes() as u32;
@@ -428,7 +432,7 @@ fn window(b: &mut Bench<'_>) -> R {
     Ok(())
 }
 
-fn other_frame(b: &mut Bench<'_>) -> R {
+fn other_frame(b: &mut ConformanceDriver<'_>) -> R {
     b.armed_to_follow(|_| {})?;
     let region = b.region([MIRROR, 0])?;
     let seen = followed(b, 0, |b, shot| {
@@ -439,7 +443,7 @@ fn other_frame(b: &mut Bench<'_>) -> R {
     judge("TRACKS of the next frame", seen, [0; 3])
 }
 
-fn newest(b: &mut Bench<'_>) -> R {
+fn newest(b: &mut ConformanceDriver<'_>) -> R {
     b.armed_to_follow(|_| {})?;
     let region = b.region([MIRROR, 0])?;
     let stale = b.planes() as u32 - 1;
@@ -460,7 +464,7 @@ fn newest(b: &mut Bench<'_>) -> R {
     Ok(())
 }
 
-fn two_frames(b: &mut Bench<'_>) -> R {
+fn two_frames(b: &mut ConformanceDriver<'_>) -> R {
     // Half a second a slot: TRACKS of the next frame arrive while the last plane of the one on the mirrors is still to come.
     b.armed_to_follow(|config| config.rate = FrameRate::new(2, 1).unwrap_or(config.rate))?;
     let region = b.region([MIRROR, 0])?;
@@ -480,7 +484,7 @@ fn two_frames(b: &mut Bench<'_>) -> R {
     judge("one plane of either frame", seen, [2, 0, 2 * (b.planes() as u32 - 1)])
 }
 
-fn forgotten(b: &mut Bench<'_>) -> R {
+fn forgotten(b: &mut ConformanceDriver<'_>) -> R {
     b.armed_to_follow(|_| {})?;
     let region = b.region([MIRROR, 0])?;
     for order in ["STOP", "CONFIG"] {
@@ -503,7 +507,7 @@ fn forgotten(b: &mut Bench<'_>) -> R {
     Ok(())
 }
 
-fn age(b: &mut Bench<'_>) -> R {
+fn age(b: &mut ConformanceDriver<'_>) -> R {
     b.armed_to_follow(|_| {})?;
     let mut expected = 0;
     followed(b, 0, |b, shot| {

@@ -1,6 +1,6 @@
 //! The watchdog: who feeds it, and when it bites.
 
-use super::driver::{Bench, R};
+use super::driver::{ConformanceDriver, R};
 use super::orders::lit_frame;
 use super::shot::damaged_payload;
 use super::{check, tell, Rule, Stop};
@@ -58,7 +58,7 @@ fn watchful(c: &mut Config) {
 }
 
 /// Silence, until the device says that the watchdog bit; the device's time from the last packet to the bite, ms.
-fn bitten(b: &mut Bench<'_>) -> R<u64> {
+fn bitten(b: &mut ConformanceDriver<'_>) -> R<u64> {
     let stamp = 0x0abc_0000_0000_0000 | u64::from(b.session);
     b.forget()?;
     b.say(&b.echo(stamp))?;
@@ -90,7 +90,7 @@ fn bitten(b: &mut Bench<'_>) -> R<u64> {
     Ok(at.saturating_sub(heard) * 1000 / b.tick_hz().max(1))
 }
 
-fn watchdog(b: &mut Bench<'_>) -> R {
+fn watchdog(b: &mut ConformanceDriver<'_>) -> R {
     b.armed(watchful)?;
     lit_frame(b)?;
     let ms = bitten(b)?;
@@ -102,7 +102,7 @@ fn watchdog(b: &mut Bench<'_>) -> R {
     )
 }
 
-fn watchdog_fed(b: &mut Bench<'_>) -> R {
+fn watchdog_fed(b: &mut ConformanceDriver<'_>) -> R {
     b.armed(watchful)?;
     b.feed = false;
     let steps = 3 * 4;
@@ -120,7 +120,7 @@ fn watchdog_fed(b: &mut Bench<'_>) -> R {
 }
 
 /// Three watchdogs' time in which only `send` is sent.
-fn not_fed(b: &mut Bench<'_>, mut send: impl FnMut(&mut Bench<'_>) -> R) -> R {
+fn not_fed(b: &mut ConformanceDriver<'_>, mut send: impl FnMut(&mut ConformanceDriver<'_>) -> R) -> R {
     b.armed(watchful)?;
     b.feed = false;
     for _ in 0..9 {
@@ -132,25 +132,25 @@ fn not_fed(b: &mut Bench<'_>, mut send: impl FnMut(&mut Bench<'_>) -> R) -> R {
     check(s.state == DeviceState::Faulted && s.faults & faults::WATCHDOG != 0, "fault 0 latched", || tell(&s))
 }
 
-fn watchdog_strangers(b: &mut Bench<'_>) -> R {
+fn watchdog_strangers(b: &mut ConformanceDriver<'_>) -> R {
     not_fed(b, |b| b.say_as(b.session ^ 7, &b.echo(0)))
 }
 
-fn watchdog_damaged(b: &mut Bench<'_>) -> R {
+fn watchdog_damaged(b: &mut ConformanceDriver<'_>) -> R {
     not_fed(b, |b| {
         let header = Header::control(MessageType::Echo, b.session, 24);
         b.send_packets(Lane::Control, &[damaged_payload(&header, &[0; 24])])
     })
 }
 
-fn watchdog_black(b: &mut Bench<'_>) -> R {
+fn watchdog_black(b: &mut ConformanceDriver<'_>) -> R {
     b.armed(watchful)?;
     b.say(&HostMessage::Black)?;
     bitten(b)?;
     Ok(())
 }
 
-fn watchdog_disarmed(b: &mut Bench<'_>) -> R {
+fn watchdog_disarmed(b: &mut ConformanceDriver<'_>) -> R {
     b.armed(watchful)?;
     b.say(&HostMessage::Stop)?;
     b.feed = false;

@@ -11,7 +11,7 @@ use std::path::{Path, PathBuf};
 
 /// Where a method's part of a group lies.
 #[derive(Clone, Debug)]
-pub(super) struct Part {
+pub(super) struct GroupShare {
     path: PathBuf,
 }
 
@@ -25,7 +25,7 @@ struct PartFile {
 /// Largest part that is read, bytes.
 const MAX_PART_BYTES: u64 = 4 << 30;
 
-impl Part {
+impl GroupShare {
     /// That of method `name` in the group with this key.
     pub(super) fn new(cache: &Path, key: &str, name: &str) -> Self {
         Self { path: cache.join(format!("part-{key}-{}.json", file_word(name))) }

@@ -69,7 +69,7 @@ pub const MOTIONS: [CardMotion; 7] = [
 
 /// What shows the card: the planes of its frames, and when they are lit.
 #[derive(Clone, Debug)]
-pub struct Panel {
+pub struct CardPanel {
     /// What it is called in the table.
     pub name: String,
     schedule: PlaneSchedule,
@@ -82,7 +82,7 @@ pub struct Panel {
     follow: f64,
 }
 
-impl Panel {
+impl CardPanel {
     /// A bit-plane projector at 947 frames/s that shows the bits in `order`, red, green and blue of each in turn.
     ///
     /// # Panics
@@ -155,7 +155,7 @@ pub struct Remedies {
 
 /// What is on the card.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Pattern {
+pub enum CardPattern {
     /// White noise of the full contrast, in grains of 6 x 8 mirrors: hardly a surface has more detail.
     Noise,
     /// Overlapping patches of 6 to 40 mirrors a side, mottled with noise that grows with its wavelength, as pictures of
@@ -175,8 +175,8 @@ enum Drawing {
 }
 
 /// A card before a part of 320 x 240 mirrors of a projector of 1024 x 768: one mirror is 0.58 mm.
-pub struct Card {
-    pattern: Pattern,
+pub struct TestCard {
+    pattern: CardPattern,
     gpu: Arc<Gpu>,
     scene: Scene,
     camera: ProjectorCamera,
@@ -188,7 +188,7 @@ pub struct Card {
 /// each plane.
 type LitFrame = (Vec<u32>, Vec<DMat3>);
 
-impl Card {
+impl TestCard {
     /// Draws the card at rest, with `pattern` on it.
     ///
     /// # Errors
@@ -196,11 +196,11 @@ impl Card {
     ///
     /// # Panics
     /// Never: the raster and the projector are given.
-    pub fn new(gpu: &Arc<Gpu>, pattern: Pattern) -> Result<Self, RenderError> {
+    pub fn new(gpu: &Arc<Gpu>, pattern: CardPattern) -> Result<Self, RenderError> {
         let mut scene = Scene::default();
         let texture = match pattern {
-            Pattern::Noise => shapes::noise_texture(40, 5, 5, 255, false),
-            Pattern::Patches => patches(),
+            CardPattern::Noise => shapes::noise_texture(40, 5, 5, 255, false),
+            CardPattern::Patches => patches(),
         };
         let glow = shapes::use_texture(&mut scene, texture);
         let card = shapes::quad(Vec3::new(-0.15, -0.15, 0.0), Vec3::X * 0.3, Vec3::Y * 0.3);
@@ -225,7 +225,7 @@ impl Card {
     ///
     /// # Errors
     /// The renderer's.
-    pub fn measure(&self, motion: &CardMotion, panel: &Panel) -> Result<PlanesRow, RenderError> {
+    pub fn measure(&self, motion: &CardMotion, panel: &CardPanel) -> Result<PlanesRow, RenderError> {
         let (mut follows, mut rests) = (Remedies::default(), Remedies::default());
         let (middle, centre) = (panel.middle(), panel.centre());
         let ways = [(middle, Drawing::Once), (centre, Drawing::Once), (centre, Drawing::Warped)];
@@ -237,8 +237,8 @@ impl Card {
             }
         }
         let texture = match self.pattern {
-            Pattern::Noise => "noise",
-            Pattern::Patches => "patches",
+            CardPattern::Noise => "noise",
+            CardPattern::Patches => "patches",
         };
         let (texture, motion, planes) = (texture.into(), motion.name.into(), panel.name.clone());
         Ok(PlanesRow { texture, motion, planes, follows, rests })
@@ -249,7 +249,11 @@ impl Card {
     ///
     /// # Errors
     /// The renderer's.
-    pub fn measure_drawn_anew(&self, motion: &CardMotion, panel: &Panel) -> Result<[f64; 2], RenderError> {
+    pub fn measure_drawn_anew(
+        &self,
+        motion: &CardMotion,
+        panel: &CardPanel,
+    ) -> Result<[f64; 2], RenderError> {
         let frames = self.lit_frames(panel, motion, panel.centre(), Drawing::Anew)?;
         Ok([true, false].map(|eye_follows| self.error_of_light(&frames, panel, eye_follows)))
     }
@@ -286,12 +290,12 @@ impl Card {
     /// The frames of 33 ms, drawn for the instant `aim`, in frames from their beginning.
     fn lit_frames(
         &self,
-        panel: &Panel,
+        panel: &CardPanel,
         motion: &CardMotion,
         aim: f64,
         drawing: Drawing,
     ) -> Result<Vec<LitFrame>, RenderError> {
-        let Panel { schedule, middles, .. } = panel;
+        let CardPanel { schedule, middles, .. } = panel;
         let instants: Vec<f64> = middles.iter().map(|middle| (middle - aim) * panel.follow).collect();
         let groups = if drawing == Drawing::Warped { plane_groups(schedule, &instants) } else { Vec::new() };
         let mut frames = self.frames(&self.camera, &groups, Halftone::of(schedule))?;
@@ -329,7 +333,7 @@ impl Card {
 
     /// By how much the red light that an eye sees differs from that of the texture. In every plane a mirror shows the bit
     /// of some code value; the texture is that of the place on the card that is at the middle of this mirror.
-    fn error_of_light(&self, frames: &[LitFrame], panel: &Panel, follows: bool) -> f64 {
+    fn error_of_light(&self, frames: &[LitFrame], panel: &CardPanel, follows: bool) -> f64 {
         let schedule = &panel.schedule;
         let bits = source_bits(schedule);
         let full = 255.0 / f64::from(schedule.white_weight());
@@ -373,7 +377,7 @@ impl Card {
 /// Texels of one side of the patches, about as wide as a mirror.
 const PATCHES: usize = 256;
 
-/// The texture of [`Pattern::Patches`].
+/// The texture of [`CardPattern::Patches`].
 fn patches() -> Texture {
     let mut random = Sampler::new(4, 0);
     let grey = mottled(&mut random, 0.16);

@@ -166,7 +166,7 @@ pub(crate) fn time_ms(r: &ErrorRow) -> f64 {
 
 /// What a curve says at a place.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub(crate) enum Reading {
+pub(crate) enum CurveReading {
     /// Between two measured points.
     Within(f64),
     /// Beyond an end by at most [`REACH`] either way, along the last line.
@@ -178,7 +178,7 @@ pub(crate) const REACH: f64 = 4.0;
 
 /// `y` where `x` is on a curve of straight lines between the logarithms of points. `None` farther beyond its ends than [`REACH`], and where
 /// it passes `x` more than once: then no one value is right.
-pub(crate) fn on_curve(points: &[(f64, f64)], x: f64) -> Option<Reading> {
+pub(crate) fn on_curve(points: &[(f64, f64)], x: f64) -> Option<CurveReading> {
     let at = |a: (f64, f64), b: (f64, f64)| {
         let t = (x / a.0).ln() / (b.0 / a.0).ln();
         (a.1.ln() + t * (b.1 / a.1).ln()).exp()
@@ -196,7 +196,7 @@ pub(crate) fn on_curve(points: &[(f64, f64)], x: f64) -> Option<Reading> {
         }
     }
     if let Some(y) = found {
-        return y.is_finite().then_some(Reading::Within(y));
+        return y.is_finite().then_some(CurveReading::Within(y));
     }
     let by_x = |a: &&(f64, f64), b: &&(f64, f64)| a.0.total_cmp(&b.0);
     let (low, high) = (points.iter().min_by(by_x)?, points.iter().max_by(by_x)?);
@@ -209,7 +209,7 @@ pub(crate) fn on_curve(points: &[(f64, f64)], x: f64) -> Option<Reading> {
     let is_end = points.first() == Some(end) || points.last() == Some(end);
     let y = at(*next, *end);
     let reach = [x / end.0, end.0 / x, y / end.1, end.1 / y].into_iter().fold(1.0, f64::max);
-    (is_end && next.0 != end.0 && reach <= REACH && y.is_finite()).then_some(Reading::Beyond(y))
+    (is_end && next.0 != end.0 && reach <= REACH && y.is_finite()).then_some(CurveReading::Beyond(y))
 }
 
 /// Every method against every point of `paper`: its error at paper's time, and its time at paper's error, read off its curve.
@@ -232,9 +232,9 @@ fn equal_cost(groups: &[&GroupResult]) -> String {
             own.sort_by(|a, b| a.budget.total_cmp(&b.budget));
             let by_time: Vec<(f64, f64)> = own.iter().map(|r| (time_ms(r), r.perceived_rmse)).collect();
             let by_error: Vec<(f64, f64)> = by_time.iter().map(|&(t, e)| (e, t)).collect();
-            let mut told = |found: Option<Reading>, paper: f64| match found {
-                Some(Reading::Within(v)) => format!("{:.2}", v / paper),
-                Some(Reading::Beyond(v)) => format!("~{:.2}", v / paper),
+            let mut told = |found: Option<CurveReading>, paper: f64| match found {
+                Some(CurveReading::Within(v)) => format!("{:.2}", v / paper),
+                Some(CurveReading::Beyond(v)) => format!("~{:.2}", v / paper),
                 None => {
                     missing = true;
                     "-".to_owned()
@@ -282,8 +282,8 @@ mod tests {
         let points: Vec<(f64, f64)> = [1.0f64, 4.0, 64.0].iter().map(|x| (*x, 3.0 / x.sqrt())).collect();
         for x in [1.0f64, 2.5, 4.0, 20.0, 64.0, 0.3, 250.0] {
             let (y, within) = match on_curve(&points, x).unwrap() {
-                Reading::Within(y) => (y, true),
-                Reading::Beyond(y) => (y, false),
+                CurveReading::Within(y) => (y, true),
+                CurveReading::Beyond(y) => (y, false),
             };
             assert!((y * x.sqrt() / 3.0 - 1.0).abs() < 1e-12, "{x}: {y}");
             assert_eq!(within, (1.0..=64.0).contains(&x));

@@ -9,13 +9,13 @@
 use super::costs::CardCosts;
 pub use super::equal::RACES;
 use super::equal::{corrected, least_spp, most_spp, samples_at_equal_time, with_samples, Trial};
-use super::parts::Part;
+use super::parts::GroupShare;
 use super::plan::{contenders, looks, paper_at, Contender, Setting, Window};
 use super::reference::{mean_of, Reference};
 use crate::metrics::error::compare;
 use crate::metrics::flicker::TileSeries;
 use crate::metrics::flip::{mean_flip, DEFAULT_PIXELS_PER_DEGREE};
-use crate::metrics::{luminance, white_of, MetricError, Picture};
+use crate::metrics::{luminance, white_of, LinearImage, MetricError};
 use crate::sequence::{eye_mean, rmse, FrameTime, Seen, Span, Theatre};
 use crate::stamp::Stamp;
 use dpm_common::fnv::Fnv;
@@ -32,7 +32,7 @@ use std::sync::Arc;
 
 /// How much is drawn of every sequence.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
-pub struct Extent {
+pub struct SequenceExtent {
     /// Frames before those that count.
     pub warm_up: u32,
     /// Frames that count: flicker is measured over all of them, the eye over the last [`EYE_FRAMES`].
@@ -45,7 +45,7 @@ pub struct Extent {
 #[derive(Clone, Debug)]
 pub struct ErrorOptions {
     /// How much.
-    pub extent: Extent,
+    pub extent: SequenceExtent,
     /// Dpm with each part off in turn is measured too.
     pub ablation: bool,
     /// Runs of each method where figures have intervals: an even number, at least 4.
@@ -164,7 +164,7 @@ pub struct GroupResult {
     /// Hash of all that the result depends on.
     pub key: String,
     /// How much was drawn.
-    pub extent: Extent,
+    pub extent: SequenceExtent,
     /// Probes: lit surface points that the eye follows.
     pub probes: usize,
     /// Their mean radiance.
@@ -195,13 +195,13 @@ pub struct Measured {
     pub reference: Vec<Vec3>,
     /// By method, in the order of the rows: what it saw in the first run.
     pub eyes: Vec<(&'static str, Vec<Vec3>)>,
-    parts: Vec<Part>,
+    parts: Vec<GroupShare>,
 }
 
 impl Measured {
     /// The group is kept as a whole: what was kept of its methods one by one is not needed any more.
     pub fn is_kept(self) {
-        self.parts.iter().for_each(Part::remove);
+        self.parts.iter().for_each(GroupShare::remove);
     }
 }
 
@@ -293,7 +293,8 @@ impl ErrorRuns {
         }
         let reference = self.reference(each)?;
         let contenders = self.contenders();
-        let parts: Vec<Part> = (contenders.iter().map(|c| Part::new(&o.cache, &key, c.name))).collect();
+        let parts: Vec<GroupShare> =
+            (contenders.iter().map(|c| GroupShare::new(&o.cache, &key, c.name))).collect();
         let (mut rows, mut eyes): (Vec<ErrorRow>, Vec<_>) = (Vec::new(), Vec::new());
         let mut wanted = None;
         for (contender, part) in contenders.iter().zip(&parts) {
@@ -508,7 +509,7 @@ impl ErrorRuns {
         let single = |seen: &Seen| {
             let last = seen.frames.last().map_or(&[][..], Vec::as_slice);
             let (test, truth) =
-                (Picture::new(last.len(), 1, last)?, Picture::new(last.len(), 1, &reference.last)?);
+                (LinearImage::new(last.len(), 1, last)?, LinearImage::new(last.len(), 1, &reference.last)?);
             compare(&test, &truth, None, 1.0)
         };
         let (first, second) = (single(a)?, single(b)?);
@@ -600,7 +601,8 @@ impl ErrorRuns {
             out
         };
         let (test, truth) = (paint(test), paint(truth));
-        let (test, truth) = (Picture::new(width, height, &test)?, Picture::new(width, height, &truth)?);
+        let (test, truth) =
+            (LinearImage::new(width, height, &test)?, LinearImage::new(width, height, &truth)?);
         let over_all = mean_flip(&test, &truth, DEFAULT_PIXELS_PER_DEGREE)?;
         Ok(over_all * raster.pixel_count() as f64 / theatre.probes().len() as f64)
     }

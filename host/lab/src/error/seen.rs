@@ -6,8 +6,8 @@
 
 use super::plan::{Setting, Window};
 use super::reference::mean_of;
-use super::runs::{ErrorOptions, ErrorRunError, ErrorRuns, Extent, EYE_FRAMES};
-use crate::metrics::flicker::{Line, TileSeries};
+use super::runs::{ErrorOptions, ErrorRunError, ErrorRuns, SequenceExtent, EYE_FRAMES};
+use crate::metrics::flicker::{SpectralLine, TileSeries};
 use crate::metrics::jod::{jod, Viewing};
 use crate::metrics::sensitivity::{
     flicker_sensitivity, stroboscopic_threshold, summed, Field, NOTICED_LATE_S,
@@ -85,7 +85,7 @@ pub struct SeenGroup {
     /// Hash of all that the result depends on.
     pub key: String,
     /// How much was drawn.
-    pub extent: Extent,
+    pub extent: SequenceExtent,
     /// Bodies move.
     pub moving: bool,
     /// The group's budget: samples a pixel of `paper` where the eye looks.
@@ -119,7 +119,7 @@ pub fn key(stamp: &Stamp, setting: Setting, options: &ErrorOptions) -> String {
 }
 
 /// What should be seen.
-struct Truth {
+struct SeenTruth {
     /// Frame after frame, per probe.
     frames: Vec<Vec<Vec3>>,
     /// What the eye sees of each part.
@@ -183,7 +183,7 @@ pub fn measure_beside(
 }
 
 /// The reference of every frame, and of the eye in parts: the last frames of the sequence are the first part.
-fn truth(runs: &ErrorRuns, each: &mut dyn FnMut(&str)) -> Result<Truth, RenderError> {
+fn truth(runs: &ErrorRuns, each: &mut dyn FnMut(&str)) -> Result<SeenTruth, RenderError> {
     let extent = runs.options.extent;
     let spp = extent.reference_spp.div_ceil(PARTS);
     let method = Method::full(spp);
@@ -201,14 +201,14 @@ fn truth(runs: &ErrorRuns, each: &mut dyn FnMut(&str)) -> Result<Truth, RenderEr
     let eye: Vec<Vec3> = (0..parts[0].len()).map(mean).collect();
     // Where nothing moves, every frame should look as the mean of all does.
     let frames = if runs.setting.moving { frames } else { vec![eye.clone(); frames.len()] };
-    Ok(Truth { frames, parts, eye })
+    Ok(SeenTruth { frames, parts, eye })
 }
 
 /// What judges the runs of every method alike.
 struct Judge<'a> {
     runs: &'a ErrorRuns,
     theatre: &'a Theatre,
-    truth: &'a Truth,
+    truth: &'a SeenTruth,
     pixels_per_degree: f64,
     speed_px_s: f64,
     frame_hz: f64,
@@ -219,7 +219,7 @@ struct Judge<'a> {
 }
 
 impl<'a> Judge<'a> {
-    fn new(runs: &'a ErrorRuns, theatre: &'a Theatre, truth: &'a Truth) -> Self {
+    fn new(runs: &'a ErrorRuns, theatre: &'a Theatre, truth: &'a SeenTruth) -> Self {
         let raster = theatre.raster();
         let frame_hz = 1e9 / runs.rig.rate().slot_len_ns(0).max(1) as f64;
         Self {
@@ -347,7 +347,8 @@ impl<'a> Judge<'a> {
             luminance: mean * self.luminance_scale,
         };
         let lines = series.lines(FLICKER_HZ[0], FASTEST_HZ);
-        let (slow, quick): (Vec<&Line>, Vec<&Line>) = lines.iter().partition(|line| line.hz <= FLICKER_HZ[1]);
+        let (slow, quick): (Vec<&SpectralLine>, Vec<&SpectralLine>) =
+            lines.iter().partition(|line| line.hz <= FLICKER_HZ[1]);
         let mut known: BTreeMap<i64, Vec<f64>> = BTreeMap::new();
         let (mut flicker, mut fast) = (0.0, 0.0);
         for (place, (sum, n)) in &angles {
@@ -356,7 +357,7 @@ impl<'a> Judge<'a> {
                 slow.iter().map(|line| flicker_sensitivity(field(degrees), line.hz)).collect()
             });
             // Half of the difference's power is that of one run, and an amplitude is the root of twice a power.
-            let modulation = |line: &Line| line.power[*place].sqrt() / mean;
+            let modulation = |line: &SpectralLine| line.power[*place].sqrt() / mean;
             flicker +=
                 slow.iter().zip(sensitivities).map(|(line, s)| (modulation(line) * *s).powi(2)).sum::<f64>();
             fast +=

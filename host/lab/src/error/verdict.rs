@@ -24,7 +24,7 @@ pub(super) struct Ratio {
 
 /// What one group says.
 #[derive(Clone, Debug, PartialEq)]
-pub(super) struct Verdict {
+pub(super) struct GroupVerdict {
     /// Name of the group.
     pub group: String,
     /// Errors at the rays of the method `paper`.
@@ -65,7 +65,7 @@ pub(super) fn verdict(
     group: String,
     result: &GroupResult,
     flicker: &dyn Fn(&ErrorRow) -> f64,
-) -> Option<Verdict> {
+) -> Option<GroupVerdict> {
     let (dpm, best) = (dpm_of(result)?, best_other(result)?);
     let timed = result.rows.iter().filter(|r| is_other(&r.method)).filter_map(|r| Some((r, r.equal_time?)));
     let best_timed = timed
@@ -75,7 +75,7 @@ pub(super) fn verdict(
         ratio(errors(dpm), dpm.runs_raw, [t.perceived_rmse_raw, t.perceived_rmse], t.runs_raw, name)
     };
     let whole = result.rows.iter().filter(|r| is_other(&r.method) || r.method == dpm.method);
-    Some(Verdict {
+    Some(GroupVerdict {
         group,
         rays: ratio(errors(dpm), dpm.runs_raw, errors(best), best.runs_raw, &best.method),
         time: best_timed.map(in_time),
@@ -190,7 +190,7 @@ fn ends<'a>(what: &str, ratios: impl Iterator<Item = (&'a str, f64)>) -> String 
 }
 
 /// A table of all groups and what they say together. Nothing without any.
-pub(super) fn table(verdicts: &[Verdict]) -> String {
+pub(super) fn table(verdicts: &[GroupVerdict]) -> String {
     if verdicts.is_empty() {
         return String::new();
     }
@@ -238,9 +238,9 @@ pub(super) fn table(verdicts: &[Verdict]) -> String {
 mod tests {
     use super::*;
 
-    fn of(group: &str, raw: f64, time: Option<f64>, flip: &str, mean_shift: f64) -> Verdict {
+    fn of(group: &str, raw: f64, time: Option<f64>, flip: &str, mean_shift: f64) -> GroupVerdict {
         let ratio = |raw: f64| Ratio { raw, clean: raw, runs: [raw, raw], other: "sequence".into() };
-        Verdict {
+        GroupVerdict {
             group: group.into(),
             rays: ratio(raw),
             time: time.map(ratio),

@@ -150,7 +150,7 @@ fn shoot(
     let gpu = open_gpu(config)?;
     let failed = |e: RenderError| Failure::from(PipelineError::Render(e));
     let mut studio = Studio::new(&rig, &gpu).map_err(failed)?;
-    let mut window = Window::new(&rig);
+    let mut window = FilmWindow::new(&rig);
     let mut pictures: Vec<Canvas> = Vec::new();
     let wanted = request.pictures();
     let begun_ns = first.first_photon_at.0;
@@ -177,7 +177,7 @@ fn shoot(
 }
 
 /// The light of the last slots, as many as an eye adds up.
-struct Window {
+struct FilmWindow {
     slots: VecDeque<FallenLight>,
     length_ns: i64,
     /// Every so many slots are kept.
@@ -185,7 +185,7 @@ struct Window {
     taken: u64,
 }
 
-impl Window {
+impl FilmWindow {
     fn new(rig: &Rig) -> Self {
         let length_ns = (rig.config.light_window_ms() * 1e6) as i64;
         let slots = (length_ns / rig.rate().slot_len_ns(0)).max(1) as usize;

@@ -1,11 +1,11 @@
 //! One picture of the film: the room, the observer's view, and what is on the mirrors.
 
-use super::stages::Stage;
+use super::stages::FilmStage;
 use super::SLOWED;
 use crate::paint::Canvas;
 use crate::room::furniture::{observer_camera, Bounds};
 use crate::room::raster;
-use crate::room::view::View;
+use crate::room::view::FilmCamera;
 use crate::room::{exposure_of, lit, shown, RoomLight, RoomPicture};
 use dpm_device::planes::Channel;
 use dpm_render::gpu::Gpu;
@@ -32,7 +32,7 @@ const MARKED: [u8; 3] = [250, 190, 60];
 pub(super) struct Studio {
     rig: Arc<Rig>,
     room: RoomPicture,
-    observer: View,
+    observer: FilmCamera,
     /// From radiance to brightness; known when light has been seen.
     exposure: Option<f32>,
     planes: SlowPlanes,
@@ -55,7 +55,7 @@ impl Studio {
         let bounds = Bounds::of_run(rig, length_ns);
         let room = RoomPicture::new(rig, gpu, bounds, raster(ROOM))?;
         let camera = observer_camera(bounds, room.eye(), raster(OBSERVER)).unwrap_or(*room.camera());
-        let observer = View::new(rig, gpu, camera.at_raster(raster(OBSERVER)))?;
+        let observer = FilmCamera::new(rig, gpu, camera.at_raster(raster(OBSERVER)))?;
         Ok(Self { rig: rig.clone(), room, observer, exposure: None, planes: SlowPlanes::default() })
     }
 
@@ -69,7 +69,7 @@ impl Studio {
         window: &[FallenLight],
         seen: &SeenLight,
     ) -> Result<Canvas, RenderError> {
-        let stage = Stage::at(share);
+        let stage = FilmStage::at(share);
         let Some(last) = window.last() else { return Ok(Canvas::new(1, 1)) };
         if let Some(camera) = observer_camera(self.room.bounds(), self.room.eye(), raster(OBSERVER)) {
             self.observer.camera = camera;
@@ -91,7 +91,7 @@ impl Studio {
     }
 
     /// What is on the mirrors: the sum of the planes, or one plane after the other.
-    fn mirrors(&mut self, canvas: &mut Canvas, window: &[FallenLight], seen: &SeenLight, stage: Stage) {
+    fn mirrors(&mut self, canvas: &mut Canvas, window: &[FallenLight], seen: &SeenLight, stage: FilmStage) {
         let rig = self.rig.clone();
         let raster = rig.camera.raster;
         let plane_bytes = raster.plane_bytes();

@@ -2,7 +2,7 @@
 
 /// What a picture of the film shows.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub(super) struct Stage {
+pub(super) struct FilmStage {
     /// Three words.
     pub caption: &'static str,
     /// Light of the room, 1 where it is bright.
@@ -30,7 +30,7 @@ const DIM: f32 = 0.1;
 /// The instants of the strip: one of each stage, shares of the film.
 pub(super) const INSTANTS: [f64; 4] = [0.1, 0.34, 0.55, 0.88];
 
-impl Stage {
+impl FilmStage {
     /// At `share` of the film, 0 to 1.
     pub(super) fn at(share: f64) -> Self {
         let index = CAPTIONS.iter().rposition(|(begin, _)| share >= *begin).unwrap_or(0);
@@ -53,18 +53,18 @@ mod tests {
     fn every_caption_has_three_words_and_its_instant_in_the_strip() {
         for (caption, instant) in CAPTIONS.iter().zip(INSTANTS) {
             assert_eq!(caption.1.split_whitespace().count(), 3, "{}", caption.1);
-            assert_eq!(Stage::at(instant).caption, caption.1);
+            assert_eq!(FilmStage::at(instant).caption, caption.1);
         }
     }
 
     #[test]
     fn the_projector_is_off_in_the_first_stage_and_fully_on_in_the_third() {
-        assert_eq!((Stage::at(0.0).projector, Stage::at(0.0).room), (0.0, 1.0));
-        let third = Stage::at(CAPTIONS[2].0);
+        assert_eq!((FilmStage::at(0.0).projector, FilmStage::at(0.0).room), (0.0, 1.0));
+        let third = FilmStage::at(CAPTIONS[2].0);
         assert_eq!(third.projector, 1.0);
         assert!((third.room - DIM).abs() < 1e-6);
         // The light only grows.
-        let shares = (0..=100).map(|i| Stage::at(f64::from(i) / 100.0).projector);
+        let shares = (0..=100).map(|i| FilmStage::at(f64::from(i) / 100.0).projector);
         assert!(shares.clone().zip(shares.skip(1)).all(|(a, b)| b >= a));
     }
 }

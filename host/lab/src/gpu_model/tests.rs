@@ -69,7 +69,7 @@ fn rays_that_are_proven_to_miss_cost_less_than_walked_ones_and_more_than_nothing
 /// What `trace` took on a card by the fit: 1 is what it says.
 fn of_fit(frame: &CardFrame) -> Option<f64> {
     let (rays, paths, proven) = (frame.path_rays?, frame.paths?, frame.proven_share?);
-    Some(frame.trace_ms / Card::measured_chip().trace_ms(rays, 1.0 - proven, rays / paths))
+    Some(frame.trace_ms / GpuCard::measured_chip().trace_ms(rays, 1.0 - proven, rays / paths))
 }
 
 fn measured() -> Vec<(String, CardFrame, f64)> {
@@ -106,7 +106,7 @@ fn the_range_of_the_model_is_that_of_all_measured_frames() {
 /// more than 2 samples.
 #[test]
 fn the_old_assumption_fails_where_a_card_was_measured() {
-    let chip = Card::measured_chip();
+    let chip = GpuCard::measured_chip();
     let many = measured().into_iter().filter(|(_, f, _)| f.samples == "8" || f.samples == "18");
     let mut n = 0;
     for (card, frame, _) in many.filter(|(_, f, _)| !f.horizons) {

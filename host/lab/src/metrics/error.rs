@@ -1,6 +1,6 @@
 //! Two pictures into numbers of their difference, weighted where the eye looks.
 
-use super::{MetricError, Picture};
+use super::{LinearImage, MetricError};
 
 /// Keeps dark pixels from ruling [`PictureError::rel_mse`].
 const REL_MSE_EPSILON: f64 = 0.01;
@@ -28,8 +28,8 @@ pub(crate) struct PictureError {
 /// # Errors
 /// Sizes that differ; weights as described at [`MetricError::Weights`], also when every pixel that has one is not finite.
 pub(crate) fn compare(
-    test: &Picture,
-    reference: &Picture,
+    test: &LinearImage,
+    reference: &LinearImage,
     weights: Option<&[f32]>,
     peak: f64,
 ) -> Result<PictureError, MetricError> {
@@ -78,8 +78,8 @@ mod tests {
     use super::*;
     use glam::Vec3;
 
-    fn picture(pixels: &[Vec3]) -> Picture<'_> {
-        Picture::new(pixels.len(), 1, pixels).unwrap()
+    fn picture(pixels: &[Vec3]) -> LinearImage<'_> {
+        LinearImage::new(pixels.len(), 1, pixels).unwrap()
     }
 
     #[test]
@@ -116,9 +116,9 @@ mod tests {
             Err(MetricError::SizesDiffer(..))
         ));
         assert!(
-            Picture::new(2, 2, &r).is_err()
-                && Picture::new(0, 5, &[]).is_err()
-                && Picture::new(usize::MAX, 2, &r).is_err()
+            LinearImage::new(2, 2, &r).is_err()
+                && LinearImage::new(0, 5, &[]).is_err()
+                && LinearImage::new(usize::MAX, 2, &r).is_err()
         );
     }
 }

@@ -11,7 +11,7 @@ pub(crate) const HIGHEST_HZ: f64 = 60.0;
 
 /// A frequency, and the power that each tile has at it, row by row.
 #[derive(Clone, Debug, PartialEq)]
-pub(crate) struct Line {
+pub(crate) struct SpectralLine {
     /// The frequency.
     pub hz: f64,
     /// Mean squares, in the square of the values' unit: half of the squared amplitude.
@@ -111,7 +111,7 @@ impl TileSeries {
     }
 
     /// The spectrum of every tile from `lowest_hz` to `highest_hz`, as far as half of the frame rate: see [`Self::power`].
-    pub(crate) fn lines(&self, lowest_hz: f64, highest_hz: f64) -> Vec<Line> {
+    pub(crate) fn lines(&self, lowest_hz: f64, highest_hz: f64) -> Vec<SpectralLine> {
         let n = self.frames;
         let hz = |k: usize| k as f64 / (n as f64 * self.frame_period_s);
         let band = (1..=n / 2).filter(|&k| (lowest_hz..=highest_hz).contains(&hz(k)));
@@ -133,7 +133,7 @@ impl TileSeries {
             // The line at half the frame rate stands for itself, every other also for its negative frequency.
             let sides = if 2 * k == n { 1.0 } else { 2.0 };
             let of = |(re, im): (&f64, &f64)| sides * (re * re + im * im) / (n as f64 * n as f64);
-            lines.push(Line { hz: hz(k), power: re.iter().zip(&im).map(of).collect() });
+            lines.push(SpectralLine { hz: hz(k), power: re.iter().zip(&im).map(of).collect() });
         }
         lines
     }

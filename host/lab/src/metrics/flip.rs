@@ -5,7 +5,7 @@
 
 use glam::{DMat3, DVec3};
 
-use super::{MetricError, Picture};
+use super::{LinearImage, MetricError};
 
 /// Pixels a degree at which the paper judges by default: a screen 0.7 m wide of 3840 pixels seen from 0.7 m.
 pub(crate) const DEFAULT_PIXELS_PER_DEGREE: f64 = 67.020_643_276_582_26;
@@ -35,8 +35,8 @@ const WIDEST: f64 = 0.04;
 /// # Errors
 /// Sizes that differ; `pixels_per_degree` outside 1 to 1000.
 pub(crate) fn flip(
-    test: &Picture,
-    reference: &Picture,
+    test: &LinearImage,
+    reference: &LinearImage,
     pixels_per_degree: f64,
 ) -> Result<Vec<f32>, MetricError> {
     test.check_same_size(reference)?;
@@ -61,8 +61,8 @@ pub(crate) fn flip(
 /// # Errors
 /// As [`flip`].
 pub(crate) fn mean_flip(
-    test: &Picture,
-    reference: &Picture,
+    test: &LinearImage,
+    reference: &LinearImage,
     pixels_per_degree: f64,
 ) -> Result<f64, MetricError> {
     let map = flip(test, reference, pixels_per_degree)?;
@@ -78,13 +78,16 @@ struct FlipPicture {
 }
 
 impl FlipPicture {
-    fn new(picture: &Picture, pixels_per_degree: f64) -> Self {
+    fn new(picture: &LinearImage, pixels_per_degree: f64) -> Self {
         let (width, height) = picture.size();
         let clean = |c: &glam::Vec3| c.as_dvec3().map(|x| if x.is_nan() { 0.0 } else { x.clamp(0.0, 1.0) });
         let opponent: Vec<DVec3> =
             picture.pixels().iter().map(|c| opponent_from_xyz(xyz_from_rgb() * clean(c))).collect();
-        let plane =
-            |f: &dyn Fn(&DVec3) -> f64| Plane { width, height, values: opponent.iter().map(f).collect() };
+        let plane = |f: &dyn Fn(&DVec3) -> f64| FlipChannel {
+            width,
+            height,
+            values: opponent.iter().map(f).collect(),
+        };
         let blurred = [
             plane(&|c| c.x).see(ACHROMATIC, pixels_per_degree),
             plane(&|c| c.y).see(RED_GREEN, pixels_per_degree),
@@ -174,15 +177,15 @@ fn map_to_unit(difference: f64, greatest: f64) -> f64 {
 }
 
 /// One channel of a picture.
-struct Plane {
+struct FlipChannel {
     width: usize,
     height: usize,
     values: Vec<f64>,
 }
 
-impl Plane {
+impl FlipChannel {
     /// Filters with `across(dx) * down(dy)`; the border's pixels go on outside. Both kernels have the odd length `2 r + 1`.
-    fn separable(&self, across: &[f64], down: &[f64]) -> Plane {
+    fn separable(&self, across: &[f64], down: &[f64]) -> FlipChannel {
         let r = across.len() as isize / 2;
         let (w, h) = (self.width as isize, self.height as isize);
         let mut rows = vec![0.0; self.values.len()];
@@ -202,11 +205,11 @@ impl Plane {
                 out.iter_mut().zip(from).for_each(|(o, v)| *o += c * v);
             }
         }
-        Plane { width: self.width, height: self.height, values }
+        FlipChannel { width: self.width, height: self.height, values }
     }
 
     /// Blurs by a contrast sensitivity function.
-    fn see(&self, sensitivity: Sensitivity, pixels_per_degree: f64) -> Plane {
+    fn see(&self, sensitivity: Sensitivity, pixels_per_degree: f64) -> FlipChannel {
         let radius =
             (3.0 * (WIDEST / (2.0 * std::f64::consts::PI.powi(2))).sqrt() * pixels_per_degree).ceil() as i32;
         let kernel = |b: f64| -> Vec<f64> {
@@ -219,7 +222,8 @@ impl Plane {
         let terms: Vec<(f64, Vec<f64>)> =
             sensitivity.iter().map(|&(a, b)| (a * (std::f64::consts::PI / b).sqrt(), kernel(b))).collect();
         let total: f64 = terms.iter().map(|(a, k)| a * k.iter().sum::<f64>().powi(2)).sum();
-        let mut out = Plane { width: self.width, height: self.height, values: vec![0.0; self.values.len()] };
+        let mut out =
+            FlipChannel { width: self.width, height: self.height, values: vec![0.0; self.values.len()] };
         for (a, k) in &terms {
             let scaled: Vec<f64> = k.iter().map(|c| c * a / total).collect();
             let part = self.separable(&scaled, k);
@@ -255,8 +259,8 @@ mod tests {
         vec![c; 24 * 16]
     }
 
-    fn picture(pixels: &[Vec3]) -> Picture<'_> {
-        Picture::new(24, 16, pixels).unwrap()
+    fn picture(pixels: &[Vec3]) -> LinearImage<'_> {
+        LinearImage::new(24, 16, pixels).unwrap()
     }
 
     fn mean(a: &[Vec3], b: &[Vec3]) -> f64 {
@@ -325,7 +329,7 @@ mod tests {
     fn separable_filters_equal_the_two_dimensional_definition() {
         let ppd = 25.0;
         let values: Vec<f64> = noise(5).iter().map(|c| f64::from(c.x)).collect();
-        let plane = Plane { width: 24, height: 16, values: values.clone() };
+        let plane = FlipChannel { width: 24, height: 16, values: values.clone() };
         let at = |x: i32, y: i32| values[(y.clamp(0, 15) * 24 + x.clamp(0, 23)) as usize];
         let brute = |kernel: &dyn Fn(i32, i32) -> f64, r: i32, x: i32, y: i32| -> f64 {
             (-r..=r)
@@ -380,6 +384,6 @@ mod tests {
             flip(&picture(&a), &picture(&b), 0.0).is_err()
                 && flip(&picture(&a), &picture(&b), f64::NAN).is_err()
         );
-        assert!(flip(&picture(&a), &Picture::new(16, 24, &b).unwrap(), 67.0).is_err());
+        assert!(flip(&picture(&a), &LinearImage::new(16, 24, &b).unwrap(), 67.0).is_err());
     }
 }

@@ -189,13 +189,13 @@ fn filtered(video: &[[Vec<f32>; 3]], filters: &[Vec<f32>; CHANNELS], frame: usiz
 
 /// A picture of one channel.
 #[derive(Clone, Debug)]
-struct Plane {
+struct JodChannel {
     width: usize,
     height: usize,
     values: Vec<f32>,
 }
 
-impl Plane {
+impl JodChannel {
     fn filled(width: usize, height: usize, of: impl Fn(usize, usize) -> f32) -> Self {
         let values =
             (0..height).flat_map(|y| (0..width).map(move |x| (x, y))).map(|(x, y)| of(x, y)).collect();
@@ -297,12 +297,12 @@ impl Pyramid {
     /// The difference between what the channels see of both videos at a frame.
     fn difference(&self, seen: &[[Vec<f32>; CHANNELS]; 2], sensitivity: &Sensitivity) -> f64 {
         let (width, height) = (self.viewing.width, self.viewing.height);
-        let plane = |values: &Vec<f32>| Plane { width, height, values: values.clone() };
+        let plane = |values: &Vec<f32>| JodChannel { width, height, values: values.clone() };
         let mut level = seen.each_ref().map(|video| video.each_ref().map(plane));
         let mut by_channel = [0.0; CHANNELS];
         let rest = self.frequencies.len() - 1;
         for band in 0..rest {
-            let next = level.each_ref().map(|video| video.each_ref().map(Plane::reduced));
+            let next = level.each_ref().map(|video| video.each_ref().map(JodChannel::reduced));
             let (w, h) = (level[0][0].width, level[0][0].height);
             let low = next.each_ref().map(|video| video.each_ref().map(|plane| plane.expanded(w, h)));
             let scale = if band == 0 { 1.0 } else { 2.0 };
@@ -351,7 +351,7 @@ fn masked(
     let mutual: [Vec<f32>; CHANNELS] = std::array::from_fn(|c| {
         let least = |i: usize| seen(0, c, i).abs().min(seen(1, c, i).abs());
         let values = (0..background.len()).map(least).collect();
-        let blurred = Plane { width, height, values }.blurred().values;
+        let blurred = JodChannel { width, height, values }.blurred().values;
         blurred.iter().map(|m| soft32((m * reach).abs(), MASK_Q[c])).collect()
     });
     let weights = CROSS_MASKING.map(|row| row.map(f32::exp2));

@@ -22,7 +22,7 @@ pub(crate) fn white_of(colours: &[Vec3]) -> f32 {
 
 /// A picture in linear Rec. 709, rows from the top.
 #[derive(Clone, Copy, Debug)]
-pub(crate) struct Picture<'a> {
+pub(crate) struct LinearImage<'a> {
     width: usize,
     height: usize,
     pixels: &'a [Vec3],
@@ -52,7 +52,7 @@ pub enum MetricError {
     Parameter(&'static str),
 }
 
-impl<'a> Picture<'a> {
+impl<'a> LinearImage<'a> {
     /// Takes `width * height` pixels, at least one.
     ///
     /// # Errors
@@ -74,7 +74,7 @@ impl<'a> Picture<'a> {
         self.pixels
     }
 
-    fn check_same_size(&self, other: &Picture) -> Result<(), MetricError> {
+    fn check_same_size(&self, other: &LinearImage) -> Result<(), MetricError> {
         if self.size() == other.size() {
             return Ok(());
         }

@@ -2,7 +2,7 @@
 
 use super::lobes::*;
 use super::microfacet::*;
-use super::surface::{Look, SurfacePoint};
+use super::surface::{PointMaterial, SurfacePoint};
 use dpm_scene::albedo_table::AlbedoTable;
 use dpm_scene::lobes::Coat;
 use glam::{DMat3, DVec2, DVec3};
@@ -16,7 +16,7 @@ pub(crate) const LEAST_COS: f64 = 1e-3;
 
 /// Scattering at a point seen from one direction.
 pub(crate) struct Bsdf<'t> {
-    look: Look,
+    look: PointMaterial,
     table: &'t AlbedoTable,
     /// Columns tangent, bitangent, shading normal; the normal is on the side of the viewer.
     world_from_local: DMat3,

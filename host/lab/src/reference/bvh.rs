@@ -28,7 +28,7 @@ pub(crate) struct Hit {
 }
 
 #[derive(Clone, Copy, Debug)]
-struct Node {
+struct ReferenceNode {
     min: DVec3,
     max: DVec3,
     /// Leaf: first triangle. Inner: left child; the right one follows it.
@@ -40,7 +40,7 @@ struct Node {
 /// The hierarchy.
 #[derive(Clone, Debug)]
 pub(crate) struct Bvh {
-    nodes: Vec<Node>,
+    nodes: Vec<ReferenceNode>,
     triangles: Vec<Triangle>,
 }
 
@@ -106,7 +106,7 @@ impl RayFrame {
     }
 
     /// Entry distance into a box, `None` when it is missed or farther than `t_max`.
-    fn enter(&self, node: &Node, t_max: f64) -> Option<f64> {
+    fn enter(&self, node: &ReferenceNode, t_max: f64) -> Option<f64> {
         let (mut near, mut far) = (0.0, t_max);
         for axis in 0..3 {
             let (lo, hi, o) = (node.min[axis], node.max[axis], self.origin[axis]);
@@ -133,20 +133,20 @@ impl Bvh {
         if triangles.is_empty() {
             return Self { nodes, triangles };
         }
-        nodes.push(Node { min: DVec3::ZERO, max: DVec3::ZERO, first: 0, count: 0 });
+        nodes.push(ReferenceNode { min: DVec3::ZERO, max: DVec3::ZERO, first: 0, count: 0 });
         let mut work = vec![(0usize, 0usize, triangles.len(), 0u32)];
         while let Some((node, from, to, depth)) = work.pop() {
             let part = &mut triangles[from..to];
             let (min, max) = bounds(part);
             let split = if part.len() <= LEAF { None } else { Some(split(part, depth)) };
             nodes[node] = match split {
-                None => Node { min, max, first: from as u32, count: part.len() as u32 },
+                None => ReferenceNode { min, max, first: from as u32, count: part.len() as u32 },
                 Some(middle) => {
                     let left = nodes.len();
                     nodes.extend([nodes[node]; 2]);
                     work.push((left, from, from + middle, depth + 1));
                     work.push((left + 1, from + middle, to, depth + 1));
-                    Node { min, max, first: left as u32, count: 0 }
+                    ReferenceNode { min, max, first: left as u32, count: 0 }
                 }
             };
         }

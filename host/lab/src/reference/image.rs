@@ -57,7 +57,7 @@ impl ReferenceImage {
 
 /// Where the outgoing light is wanted.
 #[derive(Clone, Copy)]
-enum View {
+enum LightTarget {
     /// At an eye, if it sees the point.
     Eye(DVec3),
     /// Back along the ray.
@@ -90,7 +90,7 @@ impl Reference<'_> {
         eye: DVec3,
         settings: &RenderSettings,
     ) -> ReferenceImage {
-        self.render_view(camera, View::Eye(eye), settings)
+        self.render_view(camera, LightTarget::Eye(eye), settings)
     }
 
     /// An ordinary camera's image: radiance back along each ray, every body visible, the sky behind them. All pixels are lit.
@@ -99,10 +99,15 @@ impl Reference<'_> {
         camera: &ProjectorCamera,
         settings: &RenderSettings,
     ) -> ReferenceImage {
-        self.render_view(camera, View::Camera, settings)
+        self.render_view(camera, LightTarget::Camera, settings)
     }
 
-    fn render_view(&self, camera: &ProjectorCamera, view: View, settings: &RenderSettings) -> ReferenceImage {
+    fn render_view(
+        &self,
+        camera: &ProjectorCamera,
+        view: LightTarget,
+        settings: &RenderSettings,
+    ) -> ReferenceImage {
         let raster = camera.raster;
         let (width, height) = (raster.width() as usize, raster.height() as usize);
         let mut pixels = vec![Pixel::default(); raster.pixel_count()];
@@ -141,7 +146,7 @@ impl Reference<'_> {
     fn pixel(
         &self,
         camera: &ProjectorCamera,
-        view: View,
+        view: LightTarget,
         settings: &RenderSettings,
         x: usize,
         y: usize,
@@ -181,17 +186,17 @@ impl Reference<'_> {
         result
     }
 
-    fn primary(&self, camera: &ProjectorCamera, view: View, pixel: DVec2) -> Primary {
+    fn primary(&self, camera: &ProjectorCamera, view: LightTarget, pixel: DVec2) -> Primary {
         let ray = camera.ray(pixel);
-        let real_only = matches!(view, View::Eye(_));
+        let real_only = matches!(view, LightTarget::Eye(_));
         let hit = self.trace(ray.origin, ray.direction, f64::INFINITY, real_only);
         match (hit, view) {
-            (Some(point), View::Eye(eye)) if self.lit(&point, camera.position(), eye) => {
+            (Some(point), LightTarget::Eye(eye)) if self.lit(&point, camera.position(), eye) => {
                 let v = (eye - point.position).normalize();
                 Primary::Surface(point, v)
             }
-            (Some(point), View::Camera) => Primary::Surface(point, -ray.direction),
-            (None, View::Camera) => Primary::Sky(self.lights.sky_radiance(ray.direction)),
+            (Some(point), LightTarget::Camera) => Primary::Surface(point, -ray.direction),
+            (None, LightTarget::Camera) => Primary::Sky(self.lights.sky_radiance(ray.direction)),
             _ => Primary::Unlit,
         }
     }

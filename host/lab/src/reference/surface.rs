@@ -36,12 +36,12 @@ pub struct SurfacePoint {
     /// Triangle of [`super::bvh::Bvh`].
     pub bvh_triangle: usize,
     /// Material values here.
-    pub look: Look,
+    pub look: PointMaterial,
 }
 
 /// A material at one point, textures applied.
 #[derive(Clone, Copy, Debug)]
-pub struct Look {
+pub struct PointMaterial {
     /// Index of the material.
     pub material: u32,
     /// Linear, 0..1.
@@ -129,7 +129,7 @@ impl Reference<'_> {
     }
 
     /// The direction of a brushed surface in the plane of tangent and bitangent, and its widths into `look`.
-    fn brush(&self, m: &Material, look: &mut Look, uv: DVec2) -> DVec2 {
+    fn brush(&self, m: &Material, look: &mut PointMaterial, uv: DVec2) -> DVec2 {
         let anisotropy = &m.lobes.anisotropy;
         let mut strength = f64::from(anisotropy.strength);
         let mut along = DVec2::from_angle(f64::from(anisotropy.rotation));
@@ -147,12 +147,12 @@ impl Reference<'_> {
         along
     }
 
-    fn look(&self, m: &Material, material: u32, uv: DVec2) -> Look {
+    fn look(&self, m: &Material, material: u32, uv: DVec2) -> PointMaterial {
         let value = |r: &Option<TextureRef>| r.as_ref().map_or(DVec4::ONE, |r| self.look_up(r, uv));
         let rough_metal = value(&m.metallic_roughness_texture);
         let roughness = (f64::from(m.roughness) * rough_metal.y).clamp(0.0, 1.0);
         let ior = f64::from(m.ior).max(1.0);
-        Look {
+        PointMaterial {
             material,
             base: m.base_color.as_dvec3() * value(&m.base_color_texture).truncate(),
             metallic: (f64::from(m.metallic) * rough_metal.z).clamp(0.0, 1.0),

@@ -1,7 +1,7 @@
 //! What was measured on a GPU beside what the model of `dpm bench --model` expects of it, for reports of any machines.
 
 use super::folder::FolderEntry;
-use super::html::Part;
+use super::html::PagePart;
 use super::table::{Cell, Table};
 use serde_json::Value;
 
@@ -25,7 +25,7 @@ const HEAD: [&str; 11] = [
 ];
 
 /// A table with a row for every method of every bench report among `results`; nothing where there is none.
-pub(super) fn against_model(results: &[FolderEntry]) -> Vec<Part> {
+pub(super) fn against_model(results: &[FolderEntry]) -> Vec<PagePart> {
     let rows: Vec<Vec<Cell>> = results.iter().flat_map(rows).collect();
     if rows.is_empty() {
         return Vec::new();
@@ -35,9 +35,9 @@ pub(super) fn against_model(results: &[FolderEntry]) -> Vec<Part> {
                 each pass.";
     let head = HEAD.map(str::to_owned).to_vec();
     vec![
-        Part::Heading("Measured beside the model".into()),
-        Part::Text(told.into()),
-        Part::Table(Table { title: "Measured beside the model".into(), head, rows }),
+        PagePart::Heading("Measured beside the model".into()),
+        PagePart::Text(told.into()),
+        PagePart::Table(Table { title: "Measured beside the model".into(), head, rows }),
     ]
 }
 
@@ -124,7 +124,7 @@ mod tests {
 
     fn shown(results: &[FolderEntry]) -> Vec<Vec<String>> {
         let parts = against_model(results);
-        let Some(Part::Table(table)) = parts.last() else { return Vec::new() };
+        let Some(PagePart::Table(table)) = parts.last() else { return Vec::new() };
         assert!(table.rows.iter().all(|row| row.len() == table.head.len()));
         table.rows.iter().map(|row| row.iter().map(|cell| cell.shown.clone()).collect()).collect()
     }

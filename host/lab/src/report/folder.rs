@@ -43,7 +43,7 @@ pub(super) struct FolderEntry {
 
 /// What is in a folder.
 #[derive(Default)]
-pub(super) struct Folder {
+pub(super) struct ReportFolder {
     pub(super) results: Vec<FolderEntry>,
     /// SVG texts.
     pub(super) plots: Vec<String>,
@@ -61,7 +61,7 @@ fn bad(path: &Path, told: impl std::fmt::Display) -> Failure {
     Failure::new(FailureKind::BadInput, format!("{}: {told}", path.display()))
 }
 
-impl Folder {
+impl ReportFolder {
     /// Reads the results in `dir`, and what lies beside them.
     ///
     /// # Errors

@@ -1,13 +1,13 @@
 //! A report into one HTML file that needs nothing else: no script, no font, no file beside it, no address.
 
-use super::markdown::Block;
+use super::markdown::MarkdownBlock;
 use super::table::Table;
 use base64::Engine;
 use std::fmt::Write;
 
 /// A part of the page.
 #[derive(Clone, Debug)]
-pub(crate) enum Part {
+pub(crate) enum PagePart {
     /// A heading.
     Heading(String),
     /// A paragraph.
@@ -24,13 +24,13 @@ pub(crate) enum Part {
     Folded(String, String),
 }
 
-impl From<Block> for Part {
-    fn from(block: Block) -> Self {
+impl From<MarkdownBlock> for PagePart {
+    fn from(block: MarkdownBlock) -> Self {
         match block {
-            Block::Heading(text) => Self::Heading(text),
-            Block::Table(table) => Self::Table(table),
-            Block::List(items) => Self::List(items),
-            Block::Paragraph(text) => Self::Text(text),
+            MarkdownBlock::Heading(text) => Self::Heading(text),
+            MarkdownBlock::Table(table) => Self::Table(table),
+            MarkdownBlock::List(items) => Self::List(items),
+            MarkdownBlock::Paragraph(text) => Self::Text(text),
         }
     }
 }
@@ -61,7 +61,7 @@ pre { font-size: 12px; overflow-x: auto; background: #f6f6f6; padding: .6rem; }
 ";
 
 /// The page.
-pub(crate) fn page(title: &str, parts: &[Part]) -> String {
+pub(crate) fn page(title: &str, parts: &[PagePart]) -> String {
     let title = escaped(title);
     let mut out = format!("{HEAD}<title>{title}</title>\n{STYLE}</head><body>\n<h1>{title}</h1>\n");
     parts.iter().for_each(|part| add(&mut out, part));
@@ -69,24 +69,24 @@ pub(crate) fn page(title: &str, parts: &[Part]) -> String {
 }
 
 // Writing into a string cannot fail.
-fn add(out: &mut String, part: &Part) {
+fn add(out: &mut String, part: &PagePart) {
     let _ = match part {
-        Part::Heading(text) => writeln!(out, "<h2>{}</h2>", escaped(text)),
-        Part::Text(text) => writeln!(out, "<p>{}</p>", prose(text)),
-        Part::List(items) => {
+        PagePart::Heading(text) => writeln!(out, "<h2>{}</h2>", escaped(text)),
+        PagePart::Text(text) => writeln!(out, "<p>{}</p>", prose(text)),
+        PagePart::List(items) => {
             let items: String = items.iter().map(|item| format!("<li>{}</li>\n", prose(item))).collect();
             writeln!(out, "<ul>\n{items}</ul>")
         }
-        Part::Table(table) => add_table(out, table),
-        Part::Plot(svg) => writeln!(out, "<figure>{}</figure>", svg.trim()),
-        Part::Picture(name, bytes) => {
+        PagePart::Table(table) => add_table(out, table),
+        PagePart::Plot(svg) => writeln!(out, "<figure>{}</figure>", svg.trim()),
+        PagePart::Picture(name, bytes) => {
             let (name, data) = (escaped(name), base64::engine::general_purpose::STANDARD.encode(bytes));
             writeln!(
                 out,
                 "<figure><img alt=\"{name}\" src=\"data:image/png;base64,{data}\"><figcaption>{name}</figcaption></figure>"
             )
         }
-        Part::Folded(title, text) => writeln!(
+        PagePart::Folded(title, text) => writeln!(
             out,
             "<details><summary>{}</summary>\n<pre>{}</pre></details>",
             escaped(title),
@@ -147,12 +147,12 @@ mod tests {
         let evil = "<script>alert(1)</script>\" onload=\"x";
         let table = Table { title: evil.into(), head: vec![evil.into()], rows: vec![vec![Cell::text(evil)]] };
         let parts = [
-            Part::Heading(evil.into()),
-            Part::Text(evil.into()),
-            Part::List(vec![evil.into()]),
-            Part::Table(table),
-            Part::Picture(evil.into(), vec![1]),
-            Part::Folded(evil.into(), evil.into()),
+            PagePart::Heading(evil.into()),
+            PagePart::Text(evil.into()),
+            PagePart::List(vec![evil.into()]),
+            PagePart::Table(table),
+            PagePart::Picture(evil.into(), vec![1]),
+            PagePart::Folded(evil.into(), evil.into()),
         ];
         let page = page(evil, &parts);
         assert!(!page.contains("<script") && !page.contains("\" onload"), "{page}");

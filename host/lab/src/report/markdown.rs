@@ -5,7 +5,7 @@ use super::table::{Cell, Table};
 
 /// A part of a text.
 #[derive(Clone, Debug, PartialEq)]
-pub(crate) enum Block {
+pub(crate) enum MarkdownBlock {
     /// A heading.
     Heading(String),
     /// A table, named by the heading or the sentence above it.
@@ -17,7 +17,7 @@ pub(crate) enum Block {
 }
 
 /// The blocks of `text`. Tables without a heading above are named `name` with their number.
-pub(crate) fn blocks(name: &str, text: &str) -> Vec<Block> {
+pub(crate) fn blocks(name: &str, text: &str) -> Vec<MarkdownBlock> {
     let mut out = Vec::new();
     let mut heading = String::new();
     let mut tables = 0;
@@ -25,7 +25,7 @@ pub(crate) fn blocks(name: &str, text: &str) -> Vec<Block> {
         let lines: Vec<&str> = part.lines().collect();
         if let Some(title) = part.strip_prefix('#').filter(|_| lines.len() == 1) {
             heading = title.trim_start_matches('#').trim().to_owned();
-            out.push(Block::Heading(heading.clone()));
+            out.push(MarkdownBlock::Heading(heading.clone()));
         } else if let [head, rule, rows @ ..] = &lines[..] {
             if head.starts_with('|') && rule.trim_matches(['|', '-', ':', ' ']).is_empty() {
                 tables += 1;
@@ -34,7 +34,7 @@ pub(crate) fn blocks(name: &str, text: &str) -> Vec<Block> {
                 } else {
                     format!("{heading} {tables}")
                 };
-                out.push(Block::Table(table(title, head, rows)));
+                out.push(MarkdownBlock::Table(table(title, head, rows)));
             } else {
                 out.push(prose(&lines));
             }
@@ -45,11 +45,11 @@ pub(crate) fn blocks(name: &str, text: &str) -> Vec<Block> {
     out
 }
 
-fn prose(lines: &[&str]) -> Block {
+fn prose(lines: &[&str]) -> MarkdownBlock {
     if lines.iter().all(|line| line.starts_with("- ")) {
-        return Block::List(lines.iter().map(|line| line[2..].to_owned()).collect());
+        return MarkdownBlock::List(lines.iter().map(|line| line[2..].to_owned()).collect());
     }
-    Block::Paragraph(lines.join(" "))
+    MarkdownBlock::Paragraph(lines.join(" "))
 }
 
 fn table(title: String, head: &str, rows: &[&str]) -> Table {
@@ -74,7 +74,7 @@ mod tests {
         let text =
             "## Errors\n\nTwo runs,\none device.\n\n| a | b |\n|---|---:|\n| 1 | 2 |\n| 3 |\n\n- x\n- y\n";
         let parts = blocks("error", text);
-        let [Block::Heading(heading), Block::Paragraph(told), Block::Table(table), Block::List(list)] =
+        let [MarkdownBlock::Heading(heading), MarkdownBlock::Paragraph(told), MarkdownBlock::Table(table), MarkdownBlock::List(list)] =
             &parts[..]
         else {
             panic!("{parts:?}");

@@ -13,8 +13,8 @@ use dpm_common::files::write_atomically;
 use dpm_profile::civil;
 use dpm_rig::failure::Failure;
 use dpm_rig::run_rig::cannot_write;
-use folder::{Folder, FolderEntry};
-use html::{page, Part};
+use folder::{FolderEntry, ReportFolder};
+use html::{page, PagePart};
 use markdown::blocks;
 use serde::Serialize;
 use serde_json::Value;
@@ -39,7 +39,7 @@ pub struct ReportFiles {
 /// # Errors
 /// `dir` is no folder, has no result, or has one that cannot be read; `out` cannot be written.
 pub fn report(dir: &Path, out: &Path, title: Option<&str>) -> Result<ReportFiles, Failure> {
-    let folder = Folder::read(dir)?;
+    let folder = ReportFolder::read(dir)?;
     let parts = parts(&folder);
     let name =
         dir.canonicalize().ok().and_then(|path| Some(path.file_name()?.to_string_lossy().into_owned()));
@@ -55,7 +55,7 @@ pub fn report(dir: &Path, out: &Path, title: Option<&str>) -> Result<ReportFiles
     put(&html, &page(&title, &parts))?;
     let mut written: Vec<PathBuf> = Vec::new();
     for table in
-        parts.iter().filter_map(|part| if let Part::Table(table) = part { Some(table) } else { None })
+        parts.iter().filter_map(|part| if let PagePart::Table(table) = part { Some(table) } else { None })
     {
         let path = out.join("tables").join(table.file_word() + ".csv");
         put(&path, &table.to_csv())?;
@@ -65,12 +65,12 @@ pub fn report(dir: &Path, out: &Path, title: Option<&str>) -> Result<ReportFiles
 }
 
 /// The parts of the page, what matters most first.
-fn parts(folder: &Folder) -> Vec<Part> {
-    let mut parts: Vec<Part> = folder.results.iter().map(|found| Part::Table(facts(found))).collect();
+fn parts(folder: &ReportFolder) -> Vec<PagePart> {
+    let mut parts: Vec<PagePart> = folder.results.iter().map(|found| PagePart::Table(facts(found))).collect();
     let told: Vec<String> =
         folder.results.iter().flat_map(warnings).chain(folder.notes.iter().cloned()).collect();
     if !told.is_empty() {
-        parts.extend([Part::Heading("Notes".into()), Part::List(told)]);
+        parts.extend([PagePart::Heading("Notes".into()), PagePart::List(told)]);
     }
     for found in &folder.results {
         parts.extend(missed(found));
@@ -78,29 +78,31 @@ fn parts(folder: &Folder) -> Vec<Part> {
     parts.extend(against_model(&folder.results));
     for text in &folder.flights {
         let first = text.lines().next().unwrap_or("Flight").to_owned();
-        parts.push(Part::Folded(first, text.clone()));
+        parts.push(PagePart::Folded(first, text.clone()));
     }
     if !folder.plots.is_empty() {
-        parts.push(Part::Heading("Plots".into()));
-        parts.extend(folder.plots.iter().cloned().map(Part::Plot));
+        parts.push(PagePart::Heading("Plots".into()));
+        parts.extend(folder.plots.iter().cloned().map(PagePart::Plot));
     }
     for found in &folder.results {
-        parts.push(Part::Heading(found.name.clone()));
+        parts.push(PagePart::Heading(found.name.clone()));
         match &found.text {
-            Some(text) => parts.extend(blocks(&found.name, text).into_iter().map(Part::from)),
+            Some(text) => parts.extend(blocks(&found.name, text).into_iter().map(PagePart::from)),
             None => {
                 let told = [&FACTS[..], &TOLD].concat();
-                parts.extend(tables(&found.name, &found.figures, &told).into_iter().map(Part::Table));
+                parts.extend(tables(&found.name, &found.figures, &told).into_iter().map(PagePart::Table));
             }
         }
     }
     if !folder.pictures.is_empty() {
-        parts.push(Part::Heading("Pictures".into()));
-        parts.extend(folder.pictures.iter().map(|(name, bytes)| Part::Picture(name.clone(), bytes.clone())));
+        parts.push(PagePart::Heading("Pictures".into()));
+        parts.extend(
+            folder.pictures.iter().map(|(name, bytes)| PagePart::Picture(name.clone(), bytes.clone())),
+        );
     }
-    parts.push(Part::Heading("Files".into()));
+    parts.push(PagePart::Heading("Files".into()));
     let size = |(name, bytes): &(String, u64)| format!("{name}, {:.1} kB", *bytes as f64 * 1e-3);
-    parts.push(Part::List(folder.files.iter().map(size).collect()));
+    parts.push(PagePart::List(folder.files.iter().map(size).collect()));
     parts
 }
 
@@ -174,7 +176,7 @@ fn warnings(found: &FolderEntry) -> Vec<String> {
 }
 
 /// How many slots were missed, and why; nothing for a measurement without slots.
-fn missed(found: &FolderEntry) -> Vec<Part> {
+fn missed(found: &FolderEntry) -> Vec<PagePart> {
     let count = |key: &str| found.figures.get(key).and_then(Value::as_u64);
     let (Some(slots), Some(missed)) = (count("slots"), count("missed_slots")) else { return Vec::new() };
     let share = found.figures.get("missed_share").and_then(Value::as_f64).unwrap_or(0.0);
@@ -197,10 +199,10 @@ fn missed(found: &FolderEntry) -> Vec<Part> {
         .get("missed_by_cause")
         .or_else(|| found.figures.get("missed"))
         .and_then(Value::as_object);
-    let mut parts = vec![Part::Heading(format!("{}: missed slots", found.name)), Part::Text(told)];
+    let mut parts = vec![PagePart::Heading(format!("{}: missed slots", found.name)), PagePart::Text(told)];
     if let Some(causes) = causes.filter(|_| missed > 0) {
         let row = |(cause, slots): (&String, &Value)| vec![Cell::text(cause), Cell::text(slots.to_string())];
-        parts.push(Part::Table(Table {
+        parts.push(PagePart::Table(Table {
             title: format!("{}: missed slots by cause", found.name),
             head: vec!["cause".into(), "slots".into()],
             rows: causes.iter().map(row).collect(),

@@ -15,7 +15,7 @@ use dpm_scene::geometry::projector::ProjectorCamera;
 use furniture::{camera, Bounds, Room};
 use glam::{DVec2, DVec3, Vec3};
 use std::sync::Arc;
-use view::{SeenPoint, View};
+use view::{FilmCamera, SeenPoint};
 
 /// Steps through the air in which light is looked for along a ray.
 const STEPS: usize = 96;
@@ -47,9 +47,9 @@ pub(crate) struct RoomPicture {
     rig: Arc<Rig>,
     bounds: Bounds,
     furniture: Room,
-    view: View,
+    view: FilmCamera,
     /// What the projector's rays meet first.
-    shadow: View,
+    shadow: FilmCamera,
     /// Normals of the sides of the projector's cone, inward.
     cone: [DVec3; 4],
     eye: DVec3,
@@ -73,8 +73,8 @@ impl RoomPicture {
             rig: rig.clone(),
             bounds,
             furniture: Room::new(rig, bounds.ball(), eye),
-            view: View::new(rig, gpu, of_room)?,
-            shadow: View::new(rig, gpu, projector)?,
+            view: FilmCamera::new(rig, gpu, of_room)?,
+            shadow: FilmCamera::new(rig, gpu, projector)?,
             cone: sides_of_cone(&rig.camera),
             eye,
         })

@@ -34,14 +34,14 @@ pub(crate) struct SeenPoint {
 }
 
 /// A camera of the film with its renderer.
-pub(crate) struct View {
+pub(crate) struct FilmCamera {
     /// The camera.
     pub camera: ProjectorCamera,
     renderer: Renderer,
     slot: FrameSlot,
 }
 
-impl View {
+impl FilmCamera {
     /// For a camera that stands still or moves; its raster and lens stay.
     ///
     /// # Errors

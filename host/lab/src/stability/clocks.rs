@@ -98,7 +98,7 @@ impl Device {
     }
 }
 
-struct Line {
+struct DelayLine {
     random: Sampler,
     there_ns: i64,
     back_ns: i64,
@@ -106,7 +106,7 @@ struct Line {
     stall_share: f64,
 }
 
-impl Line {
+impl DelayLine {
     fn new(seed: u64) -> Self {
         Self {
             random: Sampler::new(seed, 0),
@@ -136,7 +136,7 @@ const PERIOD_NS: i64 = 100_000_000;
 
 /// The 99th percentile of the error of stamps between exchanges, from exchange `settle` on, in ns; and the most by which any error
 /// exceeds its stated bound.
-fn track(device: &Device, line: &mut Line, start_ns: i64, n: i64, settle: i64, loss: f64) -> (f64, f64) {
+fn track(device: &Device, line: &mut DelayLine, start_ns: i64, n: i64, settle: i64, loss: f64) -> (f64, f64) {
     let Ok(mut map) = ClockMap::with_bits(device.hz, device.bits) else { return (f64::NAN, f64::NAN) };
     let mut beyond: f64 = 0.0;
     let mut errors = Vec::new();
@@ -164,7 +164,7 @@ fn skew(seed: u64) -> f64 {
     let mut worst: f64 = 0.0;
     for (ppm, drift_ppm_s) in [(200.0, 0.0), (-200.0, 0.0), (200.0, -1.0), (-200.0, 1.0), (0.0, 1.0)] {
         let device = Device { ppm, drift_ppm_s, ..Device::new(1_000_000_000) };
-        worst = worst.max(track(&device, &mut Line::new(seed), 0, 3000, 30, 0.0).0);
+        worst = worst.max(track(&device, &mut DelayLine::new(seed), 0, 3000, 30, 0.0).0);
     }
     worst * 1e-3
 }
@@ -173,7 +173,8 @@ fn honest_bound(seed: u64) -> f64 {
     let mut beyond: f64 = 0.0;
     for ppm in [0.0, 200.0, -150.0] {
         let device = Device { ppm, drift_ppm_s: 0.5, ..Device::new(10_000_000) };
-        let mut line = Line { there_ns: 40_000, back_ns: 300_000, stall_share: 0.01, ..Line::new(seed) };
+        let mut line =
+            DelayLine { there_ns: 40_000, back_ns: 300_000, stall_share: 0.01, ..DelayLine::new(seed) };
         beyond = beyond.max(track(&device, &mut line, 0, 1000, 0, 0.5).1);
     }
     beyond.max(0.0)
@@ -183,7 +184,7 @@ fn steps(seed: u64) -> f64 {
     let mut worst: f64 = 0.0;
     for step_ns in [3_000_000, -3_000_000, 3_600_000_000_000, -3_600_000_000_000, i64::MIN] {
         let mut device = Device { ppm: 30.0, start_ticks: 1 << 50, ..Device::new(1_000_000_000) };
-        let mut line = Line::new(seed);
+        let mut line = DelayLine::new(seed);
         let Ok(mut map) = ClockMap::new(device.hz) else { return f64::NAN };
         for i in 0..100 {
             line.exchange(&device, &mut map, i * PERIOD_NS);
@@ -213,7 +214,7 @@ fn steps(seed: u64) -> f64 {
 
 fn monotone(seed: u64) -> f64 {
     let mut device = Device { ppm: -180.0, start_ticks: 1 << 45, ..Device::new(1_000_000_000) };
-    let mut line = Line { stall_share: 0.05, ..Line::new(seed) };
+    let mut line = DelayLine { stall_share: 0.05, ..DelayLine::new(seed) };
     let Ok(mut map) = ClockMap::new(device.hz) else { return f64::NAN };
     let mut last = HostTime(i64::MIN);
     let mut violations = 0;
@@ -238,8 +239,8 @@ fn wraps(seed: u64) -> f64 {
     // 2^32 ticks of 48 MHz are 89.5 s: 540 s are six wraps.
     let short = Device { bits: 32, ppm: 50.0, ..Device::new(48_000_000) };
     let long = Device { start_ticks: u64::MAX - 20_000_000_000, ppm: 50.0, ..Device::new(1_000_000_000) };
-    let a = track(&short, &mut Line::new(seed), 0, 5_400, 30, 0.0).0;
-    let b = track(&long, &mut Line::new(seed), 0, 400, 30, 0.0).0;
+    let a = track(&short, &mut DelayLine::new(seed), 0, 5_400, 30, 0.0).0;
+    let b = track(&long, &mut DelayLine::new(seed), 0, 400, 30, 0.0).0;
     a.max(b) * 1e-3
 }
 
@@ -253,7 +254,7 @@ fn frequencies(seed: u64) -> f64 {
     }
     for hz in [1u64, 1000, 1_000_000, 10_000_000_000, 1_000_000_000_000] {
         let device = Device::new(hz);
-        let (error, beyond) = track(&device, &mut Line::new(seed), 0, 2000, 50, 0.0);
+        let (error, beyond) = track(&device, &mut DelayLine::new(seed), 0, 2000, 50, 0.0);
         faults += u32::from(beyond > 0.0 || error.is_nan() || error > 2e9 / hz as f64 + 10_000.0);
     }
     f64::from(faults)
@@ -266,12 +267,12 @@ fn uptime(seed: u64) -> f64 {
 /// Devices that have been up for so many intervals of exchanges.
 pub(super) fn up_for(intervals: f64, seed: u64) -> f64 {
     let device = Device { ppm: 0.0, ..Device::new(10_000_000_000) };
-    track(&device, &mut Line::new(seed), (intervals * PERIOD_NS as f64) as i64, 600, 30, 0.0).0 * 1e-3
+    track(&device, &mut DelayLine::new(seed), (intervals * PERIOD_NS as f64) as i64, 600, 30, 0.0).0 * 1e-3
 }
 
 fn impossible(seed: u64) -> f64 {
     let device = Device::new(1_000_000);
-    let mut line = Line::new(seed);
+    let mut line = DelayLine::new(seed);
     let Ok(mut map) = ClockMap::new(device.hz) else { return f64::NAN };
     for i in 0..50 {
         line.exchange(&device, &mut map, i * PERIOD_NS);

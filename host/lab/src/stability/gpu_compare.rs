@@ -1,7 +1,7 @@
 //! A picture of the GPU against the f64 reference: the same surfaces, the same light, errors that the variances explain.
 
 use super::estimate::Estimate;
-use super::gpu_shot::{Picture, Shot};
+use super::gpu_shot::{Shot, ShotPicture};
 use crate::reference::{Reference, ReferenceImage, RenderSettings};
 use dpm_render::gpu::Gpu;
 use glam::DVec2;
@@ -10,7 +10,7 @@ use std::sync::Arc;
 /// Both pictures and the pixels in which they can be compared.
 pub struct Comparison {
     /// The GPU's.
-    pub picture: Picture,
+    pub picture: ShotPicture,
     /// The reference's.
     pub reference: ReferenceImage,
     /// Pixels that both light, on the same body, at the same distance.

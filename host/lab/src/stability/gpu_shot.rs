@@ -119,7 +119,7 @@ impl<'a> Shot<'a> {
     ///
     /// # Panics
     /// When the scene does not fit the GPU or a frame does not end: a failure of whoever asked for it.
-    pub fn draw(&self, gpu: &Arc<Gpu>) -> Picture {
+    pub fn draw(&self, gpu: &Arc<Gpu>) -> ShotPicture {
         self.draw_keeping(gpu, Keep::default())
     }
 
@@ -127,11 +127,11 @@ impl<'a> Shot<'a> {
     ///
     /// # Panics
     /// As [`Shot::draw`].
-    pub fn draw_keeping(&self, gpu: &Arc<Gpu>, keep: Keep) -> Picture {
+    pub fn draw_keeping(&self, gpu: &Arc<Gpu>, keep: Keep) -> ShotPicture {
         let mut renderer =
             Renderer::keeping(gpu, self.scene, self.settings(), keep).expect("the scene fits the GPU");
         let poses = self.world_from_body();
-        let mut picture = Picture::default();
+        let mut picture = ShotPicture::default();
         self.play(
             &mut renderer,
             0..self.frames,
@@ -177,7 +177,7 @@ impl<'a> Shot<'a> {
 
 /// What came back.
 #[derive(Clone, Debug, Default)]
-pub struct Picture {
+pub struct ShotPicture {
     /// Mean radiance of every pixel over the frames.
     pub estimates: Vec<Estimate>,
     /// What each pixel's ray met.
@@ -190,7 +190,7 @@ pub struct Picture {
     pub counters: Vec<Counters>,
 }
 
-impl Picture {
+impl ShotPicture {
     /// Takes one frame's radiance into the means.
     fn add(&mut self, slot: &FrameSlot, counters: Counters) {
         let radiance = slot.radiance().unwrap_or(&[]);

@@ -3,7 +3,7 @@
 use super::estimate::{pooled, Estimate};
 use super::gpu::GpuCase;
 use super::gpu_compare::{compare, Rounding};
-use super::gpu_shot::{Picture, Shot};
+use super::gpu_shot::{Shot, ShotPicture};
 use crate::reference::microfacet::fresnel_dielectric;
 use dpm_render::gpu::Gpu;
 use dpm_scene::shapes::*;
@@ -171,9 +171,10 @@ fn furnace_convex(gpu: &Arc<Gpu>, seed: u64) -> f64 {
     let shot = Shot { depth: 64, seed: seed as u32, ..Shot::new(&scene, camera) };
     let seen = shot.draw(gpu);
     let rig = Shot { eye: Some(DVec3::new(2.0, 1.0, 5.0)), ..shot }.draw(gpu);
-    let count =
-        |p: &Picture, of: fn(&Picture, usize) -> bool| (0..p.surfaces.len()).filter(|&i| of(p, i)).count();
-    let (hits, lit) = (count(&seen, Picture::hit), count(&rig, Picture::lit));
+    let count = |p: &ShotPicture, of: fn(&ShotPicture, usize) -> bool| {
+        (0..p.surfaces.len()).filter(|&i| of(p, i)).count()
+    };
+    let (hits, lit) = (count(&seen, ShotPicture::hit), count(&rig, ShotPicture::lit));
     let counted = rig.counters[0].lit_pixels as usize == lit;
     if hits < 200
         || !(100..hits).contains(&lit)
@@ -582,8 +583,9 @@ fn firefly_limit(gpu: &Arc<Gpu>, seed: u64) -> f64 {
     // A limit is another program.
     let rounding = Rounding::of(gpu);
     let few = rounding.few_of(free.radiance.len()) as u32;
-    let others =
-        |a: &Picture, b: &Picture| (rounding.different(&a.radiance, &b.radiance) as u32).saturating_sub(few);
+    let others = |a: &ShotPicture, b: &ShotPicture| {
+        (rounding.different(&a.radiance, &b.radiance) as u32).saturating_sub(few)
+    };
     let mut faults = others(&free, &loose);
     faults += free.counters[0].clamped_samples + loose.counters[0].clamped_samples;
     faults += u32::from(tight.counters[0].clamped_samples <= 100);
@@ -592,7 +594,7 @@ fn firefly_limit(gpu: &Arc<Gpu>, seed: u64) -> f64 {
     // Of paths that end at their third vertex a sample of a light and a hit are indirect, neither beyond the limit; without one some are.
     let (two, three, beyond) = (draw(2, None), draw(3, Some(0.002)), draw(3, None));
     let luminance = |m: &[f64; 3]| 0.2126 * m[0] + 0.7152 * m[1] + 0.0722 * m[2];
-    let over = |p: &Picture| {
+    let over = |p: &ShotPicture| {
         let pairs = p.estimates.iter().zip(&two.estimates);
         let most = |b: &Estimate| 2.0 * 0.002 + 1e-5 + rounding.of_value(luminance(&b.mean));
         pairs.filter(|(a, b)| luminance(&a.mean) - luminance(&b.mean) > most(b)).count() as u32

@@ -3,7 +3,7 @@
 use super::gpu::GpuCase;
 use super::gpu_compare::compare;
 use super::gpu_history::methods;
-use super::gpu_shot::{Picture, Shot};
+use super::gpu_shot::{Shot, ShotPicture};
 use super::gpu_tracer::still_life;
 use crate::reference::Sampler;
 use dpm_render::gpu::Gpu;
@@ -278,7 +278,7 @@ fn same_bits(gpu: &Arc<Gpu>, seed: u64) -> f64 {
             method: Some(method),
             ..Shot::new(&scene, camera)
         };
-        let bits = |p: &Picture| p.radiance.iter().map(|r| r.map(f32::to_bits)).collect::<Vec<_>>();
+        let bits = |p: &ShotPicture| p.radiance.iter().map(|r| r.map(f32::to_bits)).collect::<Vec<_>>();
         let (a, b) = (shot.draw(gpu), shot.draw(gpu));
         different += bits(&a).iter().zip(&bits(&b)).filter(|(a, b)| a != b).count();
         different += a.codes.iter().zip(&b.codes).filter(|(a, b)| a != b).count();

@@ -46,14 +46,14 @@ pub struct RateConstants {
 
 /// Shading rate of a tile: log2 of the coarse pixel's sides.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
-pub struct Rate {
+pub struct ShadingRate {
     /// 0, 1, 2: 1, 2 or 4 pixels along x.
     pub x: u32,
     /// Likewise along y.
     pub y: u32,
 }
 
-impl Rate {
+impl ShadingRate {
     /// As the shader stores it.
     pub(crate) fn code(self) -> u32 {
         self.x | (self.y << 2)
@@ -178,10 +178,14 @@ fn gather(tile: &[Option<PixelGuide>; 256]) -> Row {
 }
 
 /// The rate of a tile of 16 x 16 pixels, row by row; `None` is a pixel that is not lit or lies outside the raster.
-pub fn decide(tile: &[Option<PixelGuide>; 256], table: &[[f32; 2]], constants: &RateConstants) -> Rate {
+pub fn decide(
+    tile: &[Option<PixelGuide>; 256],
+    table: &[[f32; 2]],
+    constants: &RateConstants,
+) -> ShadingRate {
     let t = gather(tile);
     if t.lit == 0 {
-        return Rate::default();
+        return ShadingRate::default();
     }
     let by_angle = if t.angle <= constants.degrees[0] {
         0
@@ -204,7 +208,7 @@ pub fn decide(tile: &[Option<PixelGuide>; 256], table: &[[f32; 2]], constants: &
 }
 
 /// The six allowed rates (\[paper\] section 2.1): 1x4 becomes 1x2, 4x1 becomes 2x1, 4x4 stays finer along the axis with the larger error.
-fn combine([mut x, mut y]: [u32; 2], more_error_along_x: bool) -> Rate {
+fn combine([mut x, mut y]: [u32; 2], more_error_along_x: bool) -> ShadingRate {
     if x == 2 && y == 0 {
         x = 1;
     }
@@ -218,7 +222,7 @@ fn combine([mut x, mut y]: [u32; 2], more_error_along_x: bool) -> Rate {
             y = 1;
         }
     }
-    Rate { x, y }
+    ShadingRate { x, y }
 }
 
 #[cfg(test)]
@@ -356,24 +360,24 @@ mod tests {
         // phi = phi_H is Full, above is Half; phi = phi_Q is Half, above is Quarter.
         let flat =
             |angle| decide(&tile(|x, y| ((x + y) % 2) as f32 * 9.0, [0.0; 2], 9.0, angle), &table, &PAPER);
-        assert_eq!(flat(15.0), Rate { x: 0, y: 0 });
-        assert_eq!(flat(15.000_001), Rate { x: 1, y: 1 });
-        assert_eq!(flat(30.0), Rate { x: 1, y: 1 });
-        assert!(matches!(flat(30.000_002), Rate { x: 1, y: 2 } | Rate { x: 2, y: 1 }));
+        assert_eq!(flat(15.0), ShadingRate { x: 0, y: 0 });
+        assert_eq!(flat(15.000_001), ShadingRate { x: 1, y: 1 });
+        assert_eq!(flat(30.0), ShadingRate { x: 1, y: 1 });
+        assert!(matches!(flat(30.000_002), ShadingRate { x: 1, y: 2 } | ShadingRate { x: 2, y: 1 }));
     }
 
     #[test]
     fn extremes_are_defined() {
         let table = rate_table();
-        assert_eq!(decide(&[None; 256], &table, &PAPER), Rate::default(), "empty tiles are skipped");
+        assert_eq!(decide(&[None; 256], &table, &PAPER), ShadingRate::default(), "empty tiles are skipped");
         // No detail: coarsest, and only allowed rates come out.
         let flat = decide(&tile(|_, _| 0.5, [0.0; 2], 1.0, 0.0), &table, &PAPER);
         assert_eq!(flat.x + flat.y, 3);
         for odd in [f32::NAN, f32::INFINITY, -1.0] {
             let t = tile(|x, y| if (x, y) == (3, 3) { odd } else { 0.5 }, [0.0; 2], 1.0, 0.0);
-            assert_eq!(decide(&t, &table, &PAPER), Rate::default(), "{odd}");
+            assert_eq!(decide(&t, &table, &PAPER), ShadingRate::default(), "{odd}");
             let t = tile(|_, _| 0.5, [if odd < 0.0 { f32::NAN } else { odd }, 0.0], 1.0, 0.0);
-            assert_eq!(decide(&t, &table, &PAPER), Rate::default(), "motion {odd}");
+            assert_eq!(decide(&t, &table, &PAPER), ShadingRate::default(), "motion {odd}");
         }
         let fast = decide(&tile(|x, _| (x % 2) as f32, [1e12, 1e12], 1.0, 0.0), &table, &PAPER);
         assert_eq!(fast.x.max(fast.y), 2);

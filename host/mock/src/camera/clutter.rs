@@ -14,14 +14,14 @@ pub(super) fn background(config: &MockCameraConfig, draws: Draws) -> Vec<f32> {
         }
     }
     for k in 0..u64::from(config.clutter) {
-        let shape = Shape::drawn(config, draws.stream(k));
+        let shape = ClutterShape::drawn(config, draws.stream(k));
         shape.paint(config, &mut light);
     }
     light
 }
 
 #[derive(Clone, Copy)]
-enum Kind {
+enum ClutterKind {
     Disc,
     Plate,
     Stroke,
@@ -31,8 +31,8 @@ enum Kind {
     Frame,
 }
 
-struct Shape {
-    kind: Kind,
+struct ClutterShape {
+    kind: ClutterKind,
     middle: [f64; 2],
     radius: f64,
     turn: (f64, f64),
@@ -40,15 +40,15 @@ struct Shape {
     level: f64,
 }
 
-impl Shape {
+impl ClutterShape {
     fn drawn(config: &MockCameraConfig, draws: Draws) -> Self {
         let [w, h] = config.optics.size.map(f64::from);
         let kind = match draws.bits(0) % 8 {
-            0 => Kind::Disc,
-            1 | 2 => Kind::Plate,
-            3 => Kind::Stroke,
-            4 => Kind::Frame,
-            _ => Kind::Cells(draws.bits(1)),
+            0 => ClutterKind::Disc,
+            1 | 2 => ClutterKind::Plate,
+            3 => ClutterKind::Stroke,
+            4 => ClutterKind::Frame,
+            _ => ClutterKind::Cells(draws.bits(1)),
         };
         Self {
             kind,
@@ -64,11 +64,11 @@ impl Shape {
     fn at(&self, [x, y]: [f64; 2], white: f64) -> Option<f64> {
         let edge = x.abs().max(y.abs());
         match self.kind {
-            Kind::Disc => (x.hypot(y) < 1.0).then_some(self.level),
-            Kind::Plate => (edge < 1.0).then_some(self.level),
-            Kind::Stroke => (x.abs() < 1.0 && y.abs() < 0.08).then_some(self.level),
-            Kind::Frame => (edge < 1.0).then_some(if edge > 0.8 { 0.1 * white } else { 0.8 * white }),
-            Kind::Cells(bits) => (edge < 1.0).then(|| {
+            ClutterKind::Disc => (x.hypot(y) < 1.0).then_some(self.level),
+            ClutterKind::Plate => (edge < 1.0).then_some(self.level),
+            ClutterKind::Stroke => (x.abs() < 1.0 && y.abs() < 0.08).then_some(self.level),
+            ClutterKind::Frame => (edge < 1.0).then_some(if edge > 0.8 { 0.1 * white } else { 0.8 * white }),
+            ClutterKind::Cells(bits) => (edge < 1.0).then(|| {
                 let cell = |v: f64| ((0.5 * (v + 1.0) * 10.0) as usize).min(9);
                 let (i, j) = (cell(x), cell(y));
                 let is_white = match i.min(j).min(9 - i).min(9 - j) {

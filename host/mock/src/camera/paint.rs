@@ -12,7 +12,7 @@ const BLACK: f64 = 0.05;
 const MARKER: f64 = 0.95;
 
 /// What of a body is painted.
-enum Content<'a> {
+enum PaintedContent<'a> {
     Tag(&'a PrintedTag),
     Marker(&'a BrightMarker),
 }
@@ -20,7 +20,7 @@ enum Content<'a> {
 /// Something to paint: a tag or a marker, and where in the picture it may be.
 pub(super) struct Sheet<'a> {
     motion: &'a Motion,
-    content: Content<'a>,
+    content: PaintedContent<'a>,
     /// From the camera in the middle of the exposure, metres.
     pub distance: f64,
     /// First and last column, and rows.
@@ -69,8 +69,8 @@ pub(super) fn sheets<'a>(
         let poses: Vec<Pose> = (0..=8)
             .map(|i| in_camera(&config.pose, &body.motion.pose_at(begin_ns + (end_ns - begin_ns) * i / 8)))
             .collect();
-        let tags = body.tags.iter().map(Content::Tag);
-        for content in tags.chain(body.markers.iter().map(Content::Marker)) {
+        let tags = body.tags.iter().map(PaintedContent::Tag);
+        for content in tags.chain(body.markers.iter().map(PaintedContent::Marker)) {
             let points: Vec<[f64; 3]> = poses.iter().flat_map(|p| outline(&content, p)).collect();
             let Some([columns, rows]) = extent(&config.optics, &points) else { continue };
             let middle = points[points.len() / 2];
@@ -82,9 +82,9 @@ pub(super) fn sheets<'a>(
 }
 
 /// Points in camera space between which it lies.
-fn outline(content: &Content<'_>, body: &Pose) -> Vec<[f64; 3]> {
+fn outline(content: &PaintedContent<'_>, body: &Pose) -> Vec<[f64; 3]> {
     match content {
-        Content::Tag(tag) => {
+        PaintedContent::Tag(tag) => {
             let tag_pose = joined(body, &tag.place);
             let half = 0.5 * tag.side_m * PRINTED as f64 / CELLS as f64;
             let corner = |x: f64, y: f64| {
@@ -92,7 +92,7 @@ fn outline(content: &Content<'_>, body: &Pose) -> Vec<[f64; 3]> {
             };
             vec![corner(-1.0, -1.0), corner(1.0, -1.0), corner(1.0, 1.0), corner(-1.0, 1.0)]
         }
-        Content::Marker(marker) => {
+        PaintedContent::Marker(marker) => {
             let middle = add(body.position_m, rotate(body.rotation_xyzw, marker.middle_m));
             let r = 1.2 * marker.radius_m;
             [[r, 0.0, 0.0], [-r, 0.0, 0.0], [0.0, r, 0.0], [0.0, -r, 0.0], [0.0, 0.0, r]]
@@ -199,10 +199,10 @@ pub(super) fn paint(
 ) {
     let width = config.optics.size[0] as usize;
     let cells: [[bool; PRINTED]; PRINTED] = match &sheet.content {
-        Content::Tag(tag) => {
+        PaintedContent::Tag(tag) => {
             std::array::from_fn(|y| std::array::from_fn(|x| printed_cell(tag.id, x, y).unwrap_or(false)))
         }
-        Content::Marker(_) => [[true; PRINTED]; PRINTED],
+        PaintedContent::Marker(_) => [[true; PRINTED]; PRINTED],
     };
     let mut instants = Vec::new();
     for y in sheet.rows[0]..sheet.rows[1] {
@@ -230,8 +230,10 @@ fn instants_of(config: &MockCameraConfig, sheet: &Sheet<'_>, begin_ns: i64) -> V
             let t = begin_ns + config.exposure_ns * (2 * i + 1) / (2 * count);
             let body = in_camera(&config.pose, &sheet.motion.pose_at(t));
             match &sheet.content {
-                Content::Tag(tag) => Plane::of(config, tag, &body).map_or(Instant::Away, Instant::Plane),
-                Content::Marker(marker) => {
+                PaintedContent::Tag(tag) => {
+                    Plane::of(config, tag, &body).map_or(Instant::Away, Instant::Plane)
+                }
+                PaintedContent::Marker(marker) => {
                     let middle = add(body.position_m, rotate(body.rotation_xyzw, marker.middle_m));
                     Instant::Ball(Ball { middle, radius: marker.radius_m })
                 }

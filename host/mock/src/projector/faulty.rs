@@ -248,7 +248,7 @@ mod tests {
         }
     }
 
-    struct Run {
+    struct SecondOfRun {
         cable: Direct<FaultyProjector>,
         link: HostLink,
         lit: Vec<u32>,
@@ -256,7 +256,7 @@ mod tests {
     }
 
     /// One second at virtual pace, arming again whenever the link is ready or faulted.
-    fn run(plan: &str, seed: u64) -> Run {
+    fn run(plan: &str, seed: u64) -> SecondOfRun {
         let mock = MockProjector::new(MockConfig::new(raster()));
         let faulty = FaultyProjector::new(mock, plan.parse().unwrap(), seed, HostTime(0)).unwrap();
         let mut cable = Direct::new(faulty);
@@ -293,7 +293,7 @@ mod tests {
                 longest = longest.max(now.ns_since(*dark_from.get_or_insert(now)));
             }
         }
-        Run { cable, link, lit, longest_dark_ns: longest }
+        SecondOfRun { cable, link, lit, longest_dark_ns: longest }
     }
 
     #[test]

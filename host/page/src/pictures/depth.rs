@@ -7,7 +7,7 @@ use glam::{DAffine3, DVec3, Vec3};
 
 /// A surface point that a pixel sees.
 #[derive(Clone, Copy, Debug)]
-pub(super) struct Surface {
+pub(super) struct SeenSurface {
     /// Number of the body.
     pub body: usize,
     pub position: Vec3,
@@ -96,7 +96,7 @@ impl DepthBuffer {
     }
 
     /// What the pixel `at` sees, of the bodies that were drawn.
-    pub(super) fn surface(&self, at: usize, bodies: &[(&CoarseMesh, DAffine3)]) -> Option<Surface> {
+    pub(super) fn surface(&self, at: usize, bodies: &[(&CoarseMesh, DAffine3)]) -> Option<SeenSurface> {
         if self.near[at] <= 0.0 {
             return None;
         }
@@ -108,7 +108,7 @@ impl DepthBuffer {
         let normal = pose.transform_vector3(blend(&mesh.normals).as_dvec3()).as_vec3().normalize_or_zero();
         let [p, q, r] = mesh.uvs[triangle as usize];
         let uv = (p * (1.0 - u - v) + q * u + r * v).to_array();
-        Some(Surface { body: usize::from(body), position, normal, uv })
+        Some(SeenSurface { body: usize::from(body), position, normal, uv })
     }
 
     /// One over the distance of the nearest surface at a pixel position; 0 where nothing is.

@@ -48,31 +48,31 @@ pub(crate) struct Newest {
 }
 
 #[derive(Debug)]
-struct State {
+struct PictureRequests {
     looked_until: Option<Instant>,
     stop: bool,
     newest: Arc<Newest>,
 }
 
 #[derive(Debug)]
-struct Inner {
+struct PictureQueue {
     monitor: Arc<RunMonitor>,
-    state: Mutex<State>,
+    state: Mutex<PictureRequests>,
     changed: Condvar,
 }
 
 /// The thread that makes pictures; it ends when this is dropped.
 #[derive(Debug)]
-pub(crate) struct Pictures {
-    inner: Arc<Inner>,
+pub(crate) struct PictureThread {
+    inner: Arc<PictureQueue>,
     thread: Option<JoinHandle<()>>,
 }
 
-impl Pictures {
+impl PictureThread {
     /// Starts the thread, which sleeps until somebody looks.
     pub(crate) fn start(monitor: Arc<RunMonitor>) -> std::io::Result<Self> {
-        let state = State { looked_until: None, stop: false, newest: Arc::default() };
-        let inner = Arc::new(Inner { monitor, state: Mutex::new(state), changed: Condvar::new() });
+        let state = PictureRequests { looked_until: None, stop: false, newest: Arc::default() };
+        let inner = Arc::new(PictureQueue { monitor, state: Mutex::new(state), changed: Condvar::new() });
         let thread = std::thread::Builder::new().name("dpm-pictures".into()).spawn({
             let inner = inner.clone();
             move || {
@@ -99,7 +99,7 @@ impl Pictures {
     }
 }
 
-impl Drop for Pictures {
+impl Drop for PictureThread {
     fn drop(&mut self) {
         self.inner.state().stop = true;
         self.inner.changed.notify_all();
@@ -110,8 +110,8 @@ impl Drop for Pictures {
     }
 }
 
-impl Inner {
-    fn state(&self) -> MutexGuard<'_, State> {
+impl PictureQueue {
+    fn state(&self) -> MutexGuard<'_, PictureRequests> {
         // Nothing panics while it holds this lock.
         self.state.lock().unwrap_or_else(PoisonError::into_inner)
     }

@@ -1,9 +1,9 @@
 //! One question to a rig's page, and why there was no answer.
 
 use super::address::RigAddress;
-use super::told::Answer;
+use super::told::StateAnswer;
 use crate::connections::Connection;
-use crate::stream::Stream;
+use crate::stream::WatchedSocket;
 use hyper::body::Body;
 use hyper::client::conn::http1;
 use hyper::{header, Request, StatusCode};
@@ -67,7 +67,7 @@ impl From<hyper::Error> for AskError {
 }
 
 /// Asks a rig for its state.
-pub(super) async fn ask(rig: &RigAddress) -> Result<Answer, AskError> {
+pub(super) async fn ask(rig: &RigAddress) -> Result<StateAnswer, AskError> {
     let stream = match timeout(CONNECT_WITHIN, TcpStream::connect(rig.address())).await {
         Ok(Ok(stream)) => stream,
         Ok(Err(e)) if e.kind() == io::ErrorKind::ConnectionRefused => return Err(AskError::Refused),
@@ -81,7 +81,7 @@ pub(super) async fn ask(rig: &RigAddress) -> Result<Answer, AskError> {
 /// Asks over `stream` for the state of the rig that answers to `host`, and returns the body of the answer.
 async fn exchange(stream: TcpStream, host: String) -> Result<Vec<u8>, AskError> {
     let _ = stream.set_nodelay(true);
-    let stream = Stream::new(stream, Connection::new());
+    let stream = WatchedSocket::new(stream, Connection::new());
     let (mut sender, connection) =
         http1::Builder::new().max_buf_size(HEAD_BYTES).handshake::<_, String>(stream).await?;
     // It carries the exchange, and ends with this future, whatever ends that.

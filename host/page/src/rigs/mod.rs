@@ -14,7 +14,7 @@ use ask::{ask, AskError};
 use std::sync::{Arc, Mutex, PoisonError};
 use std::time::{Duration, Instant};
 use tokio::sync::watch;
-use told::{Answer, Minute, RigView};
+use told::{Minute, RigView, StateAnswer};
 
 /// Where an overview listens if nobody says otherwise.
 pub const DEFAULT_LISTEN: &str = "127.0.0.1:8940";
@@ -44,7 +44,7 @@ pub enum BadRigs {
 /// The rigs of one overview, and what they told last.
 #[derive(Debug)]
 pub struct Rigs {
-    all: Vec<Arc<Rig>>,
+    all: Vec<Arc<NeighbourRig>>,
     /// When somebody looked; `None` before the first time.
     looked: watch::Sender<Option<LastLook>>,
 }
@@ -60,7 +60,7 @@ struct LastLook {
 
 /// One rig.
 #[derive(Debug)]
-struct Rig {
+struct NeighbourRig {
     address: RigAddress,
     heard: Mutex<RigNews>,
 }
@@ -126,7 +126,8 @@ impl Rigs {
                 }
             }
         }
-        let all = addresses.into_iter().map(|address| Arc::new(Rig { address, heard: Mutex::default() }));
+        let all =
+            addresses.into_iter().map(|address| Arc::new(NeighbourRig { address, heard: Mutex::default() }));
         Ok(Self { all: all.collect(), looked: watch::Sender::new(None) })
     }
 
@@ -149,7 +150,7 @@ impl Rigs {
     }
 }
 
-async fn follow(rig: Arc<Rig>, mut looked: watch::Receiver<Option<LastLook>>) {
+async fn follow(rig: Arc<NeighbourRig>, mut looked: watch::Receiver<Option<LastLook>>) {
     let is_looking = |looked: &Option<LastLook>| looked.is_some_and(|l| l.last.elapsed() < LOOKED_WITHIN);
     while looked.wait_for(is_looking).await.is_ok() {
         let begin = Instant::now();
@@ -158,9 +159,9 @@ async fn follow(rig: Arc<Rig>, mut looked: watch::Receiver<Option<LastLook>>) {
     }
 }
 
-impl Rig {
+impl NeighbourRig {
     /// Keeps the outcome of an attempt.
-    fn note(&self, outcome: Result<Answer, AskError>) {
+    fn note(&self, outcome: Result<StateAnswer, AskError>) {
         let mut heard = self.heard.lock().unwrap_or_else(PoisonError::into_inner);
         let now = Instant::now();
         match outcome {

@@ -35,7 +35,7 @@ impl<'de> Deserialize<'de> for Short {
 
 /// The answer to `GET /api/state`. A run without a collector has no figures but the link's.
 #[derive(Debug, Deserialize)]
-pub(super) struct Answer {
+pub(super) struct StateAnswer {
     now: Now,
     #[serde(default)]
     figures: Figures,
@@ -45,15 +45,15 @@ pub(super) struct Answer {
 struct Now {
     pid: u32,
     up_s: f64,
-    counts: Counts,
+    counts: FrameCounts,
     #[serde(flatten)]
-    state: State,
+    state: NeighbourState,
 }
 
 /// What is passed on as the rig tells it.
 #[derive(Clone, Debug, Deserialize, Serialize)]
-struct State {
-    light: Light,
+struct NeighbourState {
+    light: NeighbourLight,
     /// The order that is kept over restarts.
     standing: Option<Short>,
     /// On what light depends, and whether it is permitted.
@@ -66,7 +66,7 @@ struct State {
 
 /// The state of the light.
 #[derive(Clone, Debug, Deserialize, Serialize)]
-struct Light {
+struct NeighbourLight {
     /// As a word, and as a sentence behind it.
     word: Short,
     told: Short,
@@ -75,7 +75,7 @@ struct Light {
 }
 
 #[derive(Clone, Copy, Debug, Deserialize)]
-struct Counts {
+struct FrameCounts {
     frames_lit: u64,
     slots: u64,
     slots_missed: u64,
@@ -84,20 +84,20 @@ struct Counts {
 #[derive(Debug, Default, Deserialize)]
 #[serde(default)]
 struct Figures {
-    bodies: Vec<Body>,
-    link: Link,
-    setup: Setup,
+    bodies: Vec<NeighbourBody>,
+    link: NeighbourLink,
+    setup: NeighbourSetup,
 }
 
 #[derive(Debug, Default, Deserialize)]
 #[serde(default)]
-struct Link {
+struct NeighbourLink {
     celsius: Option<f64>,
 }
 
 #[derive(Debug, Default, Deserialize)]
 #[serde(default)]
-struct Setup {
+struct NeighbourSetup {
     rig: Short,
     version: Short,
     commit: Short,
@@ -105,7 +105,7 @@ struct Setup {
 
 /// A body of a rig.
 #[derive(Clone, Debug, Deserialize, Serialize)]
-pub(super) struct Body {
+pub(super) struct NeighbourBody {
     name: Short,
     /// Why no light falls on it, as a word and as a sentence; `None` while it is lit.
     dark: Option<Short>,
@@ -116,21 +116,21 @@ pub(super) struct Body {
 #[derive(Clone, Debug, Serialize)]
 pub(super) struct RigView {
     #[serde(flatten)]
-    state: State,
+    state: NeighbourState,
     /// Frames lit a second, over the last seconds; `None` before the second answer.
     lit_per_s: Option<f64>,
     /// Share of the slots of the last minute, or of the time for which somebody has looked, that were missed, 0 to 1.
     missed: Option<f64>,
     /// Temperature of the projector's hottest sensor, degrees Celsius.
     celsius: Option<f64>,
-    bodies: Vec<Body>,
+    bodies: Vec<NeighbourBody>,
     /// The rig file, the program's version, and the commit from which it was built.
     rig: Short,
     version: Short,
     commit: Short,
 }
 
-impl Answer {
+impl StateAnswer {
     /// What is kept of it. Its counters are added to `minute`, which gives the rates.
     pub(super) fn told(self, minute: &mut Minute) -> RigView {
         let (now, mut figures) = (self.now, self.figures);
@@ -154,7 +154,7 @@ impl Answer {
 struct CounterSample {
     pid: u32,
     up_s: f64,
-    counts: Counts,
+    counts: FrameCounts,
 }
 
 /// The counters of the last minute, oldest first.
@@ -201,7 +201,7 @@ mod tests {
     use super::*;
 
     fn counted(pid: u32, up_s: f64, frames_lit: u64, slots: u64, slots_missed: u64) -> CounterSample {
-        CounterSample { pid, up_s, counts: Counts { frames_lit, slots, slots_missed } }
+        CounterSample { pid, up_s, counts: FrameCounts { frames_lit, slots, slots_missed } }
     }
 
     #[test]

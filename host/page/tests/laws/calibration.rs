@@ -1,6 +1,6 @@
 //! The guided page of a calibration over HTTP, with a run and without one.
 
-use crate::common::{ask, NoSteps, Running};
+use crate::common::{ask, NoSteps, RunWithPage};
 use dpm_page::{Page, Settings};
 use dpm_rig::config::{Overrides, Purpose, RigConfig};
 use serde_json::Value;
@@ -13,7 +13,7 @@ fn told(body: &str) -> Value {
 
 #[test]
 fn a_rig_that_runs_shows_its_steps_to_whoever_may_look() {
-    let rig = Running::start("steps");
+    let rig = RunWithPage::start("steps");
     let page = rig.ask("GET", "/calibration", &[]);
     assert!(page.status == 200 && page.head.contains("script-src 'nonce-"), "{}", page.head);
     // Both pages are whole, and every mark in them was replaced.
@@ -57,7 +57,7 @@ fn a_rig_that_is_only_calibrated_has_steps_and_no_orders() {
 
 #[test]
 fn nobody_does_a_step_without_the_token_under_another_name_or_from_another_site() {
-    let rig = Running::start("acts");
+    let rig = RunWithPage::start("acts");
     let path = "/api/calibration/start?step=wand&way=0";
     let (host, right) = (rig.address.to_string(), rig.signed("POST", path));
     let (host, right) = (("Host", host.as_str()), ("X-Dpm-Order", right.as_str()));

@@ -1,6 +1,6 @@
 //! The metrics are those of the report, in the text that Prometheus reads.
 
-use crate::common::Running;
+use crate::common::RunWithPage;
 use dpm_page::metrics::FAMILIES;
 use std::collections::{BTreeMap, BTreeSet};
 
@@ -57,7 +57,7 @@ fn the_manual_lists_every_metric_as_it_is() {
 
 #[test]
 fn counters_equal_the_report_and_histograms_add_up() {
-    let mut rig = Running::start("metrics");
+    let mut rig = RunWithPage::start("metrics");
     rig.order("black");
     let dark = "dpm_slots_ordered_dark_total{reason=\"black\"}";
     rig.wait("a dark slot", || {
@@ -153,7 +153,7 @@ fn pictures_of_other_programs_are_counted() {
     let bodies = "scene.bodies=[{ name = \"bunny\", texture = \"pipe:/nowhere/a\", texture_size = [1, 1] }, \
                   { name = \"venus\", texture = \"pipe:/nowhere/b\" }]";
     let mut rig =
-        Running::with("pictures", &["real_time.pace=\"real\"", "projector.frame_rate=\"100/1\"", bodies]);
+        RunWithPage::with("pictures", &["real_time.pace=\"real\"", "projector.frame_rate=\"100/1\"", bodies]);
     let count = |name: &str| {
         parse(&rig.ask("GET", "/metrics", &[]).body)[&format!("dpm_live_pictures_total{{body=\"{name}\"}}")]
     };

@@ -1,6 +1,6 @@
 //! Orders over HTTP: from a request to the light of the mock projector, and who may not give them.
 
-use crate::common::{ask, signed_by, Answer, Running, PATIENCE};
+use crate::common::{ask, signed_by, HttpAnswer, RunWithPage, PATIENCE};
 use dpm_page::probe::is_rig;
 use dpm_page::proof::{verifies_answer, Key};
 use dpm_page::token::Token;
@@ -11,7 +11,7 @@ use std::net::{TcpListener, TcpStream};
 use std::time::Instant;
 
 /// The frame on the mirrors of the mock projector; `None` while it is dark.
-fn lit(rig: &Running) -> Option<u32> {
+fn lit(rig: &RunWithPage) -> Option<u32> {
     let mut light = SeenLight::default();
     rig.monitor.live().want_light();
     let begin = Instant::now();
@@ -25,7 +25,7 @@ fn lit(rig: &Running) -> Option<u32> {
 
 #[test]
 fn an_order_is_answered_when_the_light_has_obeyed() {
-    let rig = Running::start("orders");
+    let rig = RunWithPage::start("orders");
     for (word, health, is_lit) in [
         ("black", "BLACK", false),
         ("arm", "up", true),
@@ -58,7 +58,7 @@ fn an_order_is_answered_when_the_light_has_obeyed() {
 
 #[test]
 fn nobody_gives_an_order_without_the_token_under_another_name_or_from_another_site() {
-    let rig = Running::start("refused");
+    let rig = RunWithPage::start("refused");
     let host = rig.address.to_string();
     let path = "/api/orders/black";
     let challenge = || rig.ask("GET", "/api/challenge", &[]).body;
@@ -114,7 +114,7 @@ fn nobody_gives_an_order_without_the_token_under_another_name_or_from_another_si
 
 #[test]
 fn the_page_allows_no_foreign_script_and_tells_the_token_to_nobody() {
-    let rig = Running::start("secret");
+    let rig = RunWithPage::start("secret");
     let first = rig.ask("GET", "/", &[]);
     let second = rig.ask("GET", "/", &[]);
     assert_eq!(first.status, 200);
@@ -149,9 +149,9 @@ fn the_page_allows_no_foreign_script_and_tells_the_token_to_nobody() {
 /// Found in use, R5: an impostor on the port answered "ok: projector dark", and the page showed it in green.
 #[test]
 fn what_the_rig_answers_and_tells_is_proven_and_nobody_else_can() {
-    let rig = Running::start("proven");
+    let rig = RunWithPage::start("proven");
     let (key, number) = (Key::of_rig(&rig.token), "0123456789abcdef0123456789abcdef");
-    let proof = |answer: &Answer| {
+    let proof = |answer: &HttpAnswer| {
         let line = answer
             .head
             .lines()

@@ -1,8 +1,8 @@
 //! Parameters over HTTP: from a request to the frame that uses the change, and who may not change them.
 
-use crate::common::{ask, Running, Viewer};
+use crate::common::{ask, RunWithPage, Viewer};
 
-impl Running {
+impl RunWithPage {
     fn change(&self, path: &str) -> (u16, String) {
         let answer = self.ask_signed("POST", path);
         (answer.status, answer.body)
@@ -21,7 +21,7 @@ impl Running {
 
 #[test]
 fn a_change_is_answered_when_a_frame_uses_it_and_is_taken_back() {
-    let rig = Running::start("change");
+    let rig = RunWithPage::start("change");
     let (status, body) = rig.change("/api/parameters/set?name=exposure&value=1.5");
     assert!(status == 200 && body.contains("ok: exposure is 1.5, from frame "), "{body}");
     // The answer is the state: planning uses it already.
@@ -52,7 +52,7 @@ fn a_change_is_answered_when_a_frame_uses_it_and_is_taken_back() {
 
 #[test]
 fn the_room_has_every_body_and_the_projector_moves_in_it_by_hand() {
-    let rig = Running::start("room");
+    let rig = RunWithPage::start("room");
     let answer = rig.ask("GET", "/api/room", &[]);
     assert_eq!(answer.status, 200, "{}", answer.body);
     let shapes: serde_json::Value = serde_json::from_str(&answer.body).unwrap();
@@ -78,7 +78,7 @@ fn the_room_has_every_body_and_the_projector_moves_in_it_by_hand() {
 
 #[test]
 fn nonsense_is_refused_and_changes_nothing() {
-    let rig = Running::start("nonsense");
+    let rig = RunWithPage::start("nonsense");
     for (path, status, word) in [
         ("/api/parameters/set?name=exposure&value=NaN", 400, "NaN is not allowed"),
         ("/api/parameters/set?name=exposure&value=1e99", 400, "must be 0.000001 to 1000000"),
@@ -96,7 +96,7 @@ fn nonsense_is_refused_and_changes_nothing() {
 
 #[test]
 fn nobody_changes_anything_without_the_token_under_another_name_or_from_another_site() {
-    let rig = Running::start("stranger");
+    let rig = RunWithPage::start("stranger");
     let path = "/api/parameters/set?name=exposure&value=9";
     let host = rig.address.to_string();
     let [other, right] = ["/api/parameters/undo", path].map(|path| rig.signed("POST", path));

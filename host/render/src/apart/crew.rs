@@ -3,10 +3,10 @@
 //! Every thread waits in the driver until the device asks, takes chunks of the rays until none is left, and the one that ends the last chunk answers.
 //! They wait for one another nowhere. A thread that is late finds nothing to do.
 
-use super::frame::{ApartFrame, Bench};
+use super::frame::{ApartFrame, WalkMemory};
 use crate::gpu::{Gpu, GpuError, Relay};
 use crate::scene_data::SceneData;
-use crate::walker::Kernel;
+use crate::walker::WalkKernel;
 use crossbeam::queue::ArrayQueue;
 use dpm_handoff::path;
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -27,18 +27,18 @@ type Job = (u64, Arc<ApartFrame>);
 struct Common {
     relay: Relay,
     data: Arc<SceneData>,
-    kernel: Kernel,
+    kernel: WalkKernel,
     stops: AtomicBool,
 }
 
 /// The threads of one renderer. Dropping it ends them.
-pub(crate) struct Crew {
+pub(crate) struct WalkCrew {
     common: Arc<Common>,
     jobs: Vec<Arc<ArrayQueue<Job>>>,
     threads: Vec<JoinHandle<()>>,
 }
 
-impl Crew {
+impl WalkCrew {
     /// A thread for each processor that this process may use.
     ///
     /// # Errors
@@ -47,7 +47,7 @@ impl Crew {
         let common = Arc::new(Common {
             relay: Relay::new(gpu)?,
             data: data.clone(),
-            kernel: Kernel::best(),
+            kernel: WalkKernel::best(),
             stops: AtomicBool::new(false),
         });
         // They are unpacked now and not by the first frame.
@@ -57,7 +57,7 @@ impl Crew {
         for i in 0..count {
             let (common, jobs) = (crew.common.clone(), Arc::new(ArrayQueue::new(BEHIND)));
             let own = jobs.clone();
-            let bench = Bench::new(data.bodies.len(), nodes);
+            let bench = WalkMemory::new(data.bodies.len(), nodes);
             let thread = std::thread::Builder::new()
                 .name(format!("dpm-walk-{i}"))
                 .spawn(move || walk(&common, &own, bench));
@@ -91,7 +91,7 @@ impl Crew {
     }
 }
 
-impl Drop for Crew {
+impl Drop for WalkCrew {
     fn drop(&mut self) {
         self.common.stops.store(true, Ordering::Release);
         let begin = std::time::Instant::now();
@@ -102,7 +102,7 @@ impl Drop for Crew {
 }
 
 /// The loop of a thread.
-fn walk(common: &Common, jobs: &ArrayQueue<Job>, mut bench: Bench) {
+fn walk(common: &Common, jobs: &ArrayQueue<Job>, mut bench: WalkMemory) {
     let mut current: Option<Job> = None;
     let mut question = 1;
     while !common.stops.load(Ordering::Acquire) {

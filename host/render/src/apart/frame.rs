@@ -1,8 +1,8 @@
 //! The rays of a frame in flight, and what a thread of the host does with them at each step.
 
-use super::layout::{Layout, COUNTED_WORD, ENTRY_BYTES};
+use super::layout::{QueueLayout, COUNTED_WORD, ENTRY_BYTES};
 use crate::gpu::{Buffer, Gpu, GpuError, MemoryKind};
-use crate::walker::{Kernel, Ray, WalkScene, WideTree};
+use crate::walker::{Ray, WalkKernel, WalkScene, WideTree};
 use bytemuck::Zeroable;
 use dpm_shaders::structs::{BodyNode, Instance, WorkItem, NO_HIT, RAY_NONE, TRACE_LANES};
 use std::sync::atomic::Ordering::{AcqRel, Acquire, Relaxed, Release};
@@ -14,7 +14,7 @@ const CHUNK: u32 = 256;
 
 /// What device and host share of a frame.
 pub(crate) struct ApartFrame {
-    pub(crate) layout: Layout,
+    pub(crate) layout: QueueLayout,
     /// Rays, hits, lists and paths: see `queue.glsl`.
     pub(crate) queue: Buffer,
     /// The schedule, and the entries of the steps and batches.
@@ -37,7 +37,7 @@ pub(crate) struct ApartFrame {
 }
 
 /// What a thread keeps from step to step. After it was made it allocates nothing.
-pub(crate) struct Bench {
+pub(crate) struct WalkMemory {
     bodies: Vec<Instance>,
     nodes: Vec<BodyNode>,
     rays: Vec<Ray>,
@@ -45,7 +45,7 @@ pub(crate) struct Bench {
     slots: Vec<u32>,
 }
 
-impl Bench {
+impl WalkMemory {
     pub(crate) fn new(bodies: usize, nodes: usize) -> Self {
         let chunk = CHUNK as usize;
         Self {
@@ -72,14 +72,14 @@ fn load(from: &[AtomicU32], to: &mut [u32]) {
 
 /// What a step is about.
 #[derive(Clone, Copy)]
-struct Work {
+struct StepWork {
     /// Slots of paths, or entries of the list before.
     count: u32,
-    kind: Kind,
+    kind: StepKind,
 }
 
 #[derive(Clone, Copy, PartialEq, Eq)]
-enum Kind {
+enum StepKind {
     /// All paths of a batch, and the slots before the first of them.
     Begun { before: u32 },
     /// The paths that the step before has listed.
@@ -93,7 +93,7 @@ impl ApartFrame {
     /// Out of memory.
     pub(crate) fn new(
         gpu: &Arc<Gpu>,
-        layout: Layout,
+        layout: QueueLayout,
         bodies: usize,
         nodes: usize,
         pixels: usize,
@@ -133,13 +133,13 @@ impl ApartFrame {
         self.listed.iter().for_each(|count| count.store(0, Relaxed));
         // Of batches that the frame may not need nothing is dispatched.
         let control = self.control.words();
-        let entries = &control[Layout::entry_of_step(0) / 4..];
+        let entries = &control[QueueLayout::entry_of_step(0) / 4..];
         entries.iter().for_each(|word| word.store(0, Relaxed));
         self.cursor.store(first << 32, Release);
     }
 
     /// Copies where the bodies are.
-    pub(crate) fn look(&self, bench: &mut Bench) {
+    pub(crate) fn look(&self, bench: &mut WalkMemory) {
         load(&self.bodies, bytemuck::cast_slice_mut(&mut bench.bodies));
         load(&self.nodes, bytemuck::cast_slice_mut(&mut bench.nodes));
     }
@@ -147,7 +147,7 @@ impl ApartFrame {
     /// The rays that the paths of the frame, if it has one batch, have asked for last, in the order of its samples, with where its bodies are and the tree
     /// over them. Valid once the frame is done.
     pub(crate) fn last_rays(&self) -> (Vec<Ray>, Vec<Instance>, Vec<BodyNode>) {
-        let mut bench = Bench::new(self.bodies.len() * 4 / size_of::<Instance>(), 0);
+        let mut bench = WalkMemory::new(self.bodies.len() * 4 / size_of::<Instance>(), 0);
         load(&self.bodies, bytemuck::cast_slice_mut(&mut bench.bodies));
         let words = self.node_words.load(Relaxed) as usize;
         let mut nodes = vec![BodyNode::zeroed(); words * 4 / size_of::<BodyNode>()];
@@ -200,15 +200,15 @@ impl ApartFrame {
         low
     }
 
-    fn work_of(&self, step: u32) -> Work {
+    fn work_of(&self, step: u32) -> StepWork {
         let (batch, vertex) = self.layout.batch_and_vertex(step);
         if vertex == 0 {
             let [begin, end] = [batch, batch + 1].map(|b| self.first_of(self.item_of(b)));
             let before = begin.saturating_sub(batch * self.layout.batch);
-            return Work { count: end.saturating_sub(begin), kind: Kind::Begun { before } };
+            return StepWork { count: end.saturating_sub(begin), kind: StepKind::Begun { before } };
         }
-        let entry = Layout::entry_of_step(step - 1) / 4;
-        Work { count: self.control.words()[entry].load(Relaxed), kind: Kind::Listed }
+        let entry = QueueLayout::entry_of_step(step - 1) / 4;
+        StepWork { count: self.control.words()[entry].load(Relaxed), kind: StepKind::Listed }
     }
 
     /// Walks what nobody has taken of a step, which the device asks for by the number `question`. Returns how many questions are answered by that: none
@@ -217,8 +217,8 @@ impl ApartFrame {
         &self,
         (step, question): (u32, u64),
         trees: &[WideTree],
-        kernel: Kernel,
-        bench: &mut Bench,
+        kernel: WalkKernel,
+        bench: &mut WalkMemory,
     ) -> u32 {
         let work = self.work_of(step);
         let chunks = work.count.div_ceil(CHUNK).max(1);
@@ -230,12 +230,12 @@ impl ApartFrame {
             let from = cursor as u32 * CHUNK;
             let count = work.count.saturating_sub(from).min(CHUNK);
             match work.kind {
-                Kind::Begun { before } => {
+                StepKind::Begun { before } => {
                     let slots = bench.slots.iter_mut().zip(before + from..);
                     slots.for_each(|(to, slot)| *to = slot);
                     self.walk_paths(step, count, trees, kernel, bench);
                 }
-                Kind::Listed => {
+                StepKind::Listed => {
                     let list = self.list_of(step - 1) as usize + from as usize;
                     load(&self.queue.words()[list..][..count as usize], &mut bench.slots);
                     self.walk_paths(step, count, trees, kernel, bench);
@@ -266,9 +266,16 @@ impl ApartFrame {
     }
 
     /// Walks both rays of so many paths, and lists the paths.
-    fn walk_paths(&self, step: u32, count: u32, trees: &[WideTree], kernel: Kernel, bench: &mut Bench) {
+    fn walk_paths(
+        &self,
+        step: u32,
+        count: u32,
+        trees: &[WideTree],
+        kernel: WalkKernel,
+        bench: &mut WalkMemory,
+    ) {
         let (words, layout) = (self.queue.words(), &self.layout);
-        let Bench { bodies, nodes, rays, hits, slots } = bench;
+        let WalkMemory { bodies, nodes, rays, hits, slots } = bench;
         let slots = &mut slots[..count as usize];
         for (slot, rays) in slots.iter().zip(rays.chunks_exact_mut(2)) {
             let first = 4 * layout.rays_row as usize + 16 * *slot as usize;
@@ -314,7 +321,11 @@ impl ApartFrame {
         let (batch, vertex) = layout.batch_and_vertex(step);
         let [front, back] = [0, 1].map(|i| self.listed[i].swap(0, Relaxed));
         let now = [front, back, self.list_of(step), batch * layout.batch];
-        self.write_entry(Layout::entry_of_step(step), now, [front, back].map(|n| n.div_ceil(TRACE_LANES)));
+        self.write_entry(
+            QueueLayout::entry_of_step(step),
+            now,
+            [front, back].map(|n| n.div_ceil(TRACE_LANES)),
+        );
         if vertex + 1 < layout.vertices || batch + 1 == layout.batches {
             return 1;
         }

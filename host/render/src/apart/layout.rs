@@ -23,7 +23,7 @@ pub(crate) const SCHEDULE_WORDS: usize = 16;
 
 /// The places, in rows of four words or in words, and the steps at which the host walks.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(crate) struct Layout {
+pub(crate) struct QueueLayout {
     /// Paths that have room.
     pub(crate) paths: u32,
     /// Samples of a batch. The last item of a batch may have as many more as a pixel has at most.
@@ -48,7 +48,7 @@ pub(crate) struct Layout {
     pub(crate) last_is_any: bool,
 }
 
-impl Layout {
+impl QueueLayout {
     /// For frames with these settings, in a buffer of at most `most_bytes`. `None`: a path has no ray or too many vertices, or a raster has no room.
     pub(crate) fn new(
         settings: &RendererSettings,

@@ -1,7 +1,7 @@
 //! The commands of a frame whose rays the host walks: a list for each question, and one after the last answer.
 
 use super::frame::ApartFrame;
-use super::layout::{Layout, COUNTED_WORD, NOW_ROW};
+use super::layout::{QueueLayout, COUNTED_WORD, NOW_ROW};
 use crate::gpu::{BindingSet, BindingTable, Buffer, CommandList, ComputePipeline, Gpu, GpuError, Recorder};
 use dpm_shaders as shaders;
 use dpm_shaders::structs::{Counters, Schedule};
@@ -103,7 +103,7 @@ fn record_step(
 ) {
     let layout = &frame.layout;
     let (batch, vertex) = layout.batch_and_vertex(step);
-    let entry = Layout::entry_of_step(step);
+    let entry = QueueLayout::entry_of_step(step);
     let is_last = vertex + 1 == layout.vertices;
     r.barrier_from_host();
     about(r, frame, entry);

@@ -16,9 +16,9 @@ mod lists;
 #[cfg(test)]
 mod tests;
 
-pub(super) use crew::Crew;
+pub(super) use crew::WalkCrew;
 pub(super) use frame::ApartFrame;
-pub(super) use layout::Layout;
+pub(super) use layout::QueueLayout;
 pub(super) use lists::{ApartLists, ApartPipelines, Side};
 
 use super::scene_data::SceneData;

@@ -122,8 +122,9 @@ fn the_light_is_the_same_whoever_walks() {
 #[test]
 fn a_frame_has_room_or_is_walked_by_the_shaders() {
     let camera = camera(1024, 768, DVec3::Z, DVec3::ZERO);
-    let of =
-        |method: &Method, bytes| Layout::new(&settings(method, &camera, Tracing::Host), false, true, bytes);
+    let of = |method: &Method, bytes| {
+        QueueLayout::new(&settings(method, &camera, Tracing::Host), false, true, bytes)
+    };
     let (full, many) = (Method::full(2), Method::full(128));
     let pixels = u64::from(camera.raster.pixel_count() as u32);
     let layout = of(&full, 128 << 20).expect("room");

@@ -30,7 +30,7 @@ pub enum MemoryKind {
 
 /// Where a buffer's memory lies.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub struct Place {
+pub struct MemoryPlace {
     /// In the GPU's own memory.
     pub on_device: bool,
     /// The host can write and read it.
@@ -306,10 +306,10 @@ impl Buffer {
     }
 
     /// Where its memory lies.
-    pub fn place(&self) -> Place {
+    pub fn place(&self) -> MemoryPlace {
         use vk::MemoryPropertyFlags as P;
         let has = |flag| self.properties.contains(flag);
-        Place {
+        MemoryPlace {
             on_device: has(P::DEVICE_LOCAL),
             host_visible: has(P::HOST_VISIBLE),
             host_cached: has(P::HOST_CACHED),

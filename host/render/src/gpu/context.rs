@@ -9,7 +9,7 @@ use super::error::GpuError;
 use super::instance::{create_instance, Instance};
 use super::kept::DeviceStore;
 use super::leftovers::Leftovers;
-use super::turn::{Held, Turn};
+use super::turn::{HeldTurn, Turn};
 use ash::{khr, vk};
 use std::ffi::{CStr, CString};
 use std::mem::ManuallyDrop;
@@ -69,7 +69,7 @@ pub struct Gpu {
     /// What was dropped while the device, given up, may still use it.
     pub(super) leftovers: Leftovers,
     instance: ManuallyDrop<Instance>,
-    /// One of [`State`].
+    /// One of [`GpuState`].
     state: AtomicU8,
     /// Memory that buffers hold, bytes.
     held_bytes: AtomicU64,
@@ -82,7 +82,7 @@ pub struct Gpu {
 /// The state of a device.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 #[repr(u8)]
-enum State {
+enum GpuState {
     /// It works, as far as the program knows.
     Well,
     /// Its driver reports that it is lost. Nothing runs on it, and everything made from it may be destroyed.
@@ -330,7 +330,7 @@ impl Gpu {
                 kept: DeviceStore::default(),
                 leftovers: Leftovers::default(),
                 instance: ManuallyDrop::new(instance),
-                state: AtomicU8::new(State::Well as u8),
+                state: AtomicU8::new(GpuState::Well as u8),
                 held_bytes: AtomicU64::new(0),
                 most_bytes,
                 setup_wait_ns,
@@ -390,7 +390,7 @@ impl<T> On<T> for Result<T, vk::Result> {
     fn on(self, gpu: &Gpu, operation: &'static str) -> Result<T, GpuError> {
         self.map_err(|result| {
             if result == vk::Result::ERROR_DEVICE_LOST {
-                gpu.becomes(State::Lost);
+                gpu.becomes(GpuState::Lost);
             }
             GpuError::from_result(result, operation, &gpu.name, gpu.heap_mib())
         })
@@ -401,13 +401,13 @@ impl Gpu {
     /// True once the driver reported the device as lost, or [`Gpu::give_up`] was called. Every use of it fails from then on, and
     /// [`Gpu::reopen`] opens another.
     pub fn is_lost(&self) -> bool {
-        self.state() != State::Well
+        self.state() != GpuState::Well
     }
 
     /// Gives up a device that does not finish. Nothing is submitted to it any more, and dropping what was made from it returns at once: what the device
     /// may still use is destroyed when it has finished. Calling it again changes nothing.
     pub fn give_up(&self) {
-        if self.becomes(State::GivenUp) {
+        if self.becomes(GpuState::GivenUp) {
             let bytes = self.held_bytes.load(Ordering::Relaxed);
             DEVICES_GIVEN_UP.fetch_add(1, Ordering::Relaxed);
             BYTES_GIVEN_UP.fetch_add(bytes, Ordering::Relaxed);
@@ -419,17 +419,17 @@ impl Gpu {
         }
     }
 
-    fn state(&self) -> State {
+    fn state(&self) -> GpuState {
         match self.state.load(Ordering::Acquire) {
-            0 => State::Well,
-            1 => State::Lost,
-            _ => State::GivenUp,
+            0 => GpuState::Well,
+            1 => GpuState::Lost,
+            _ => GpuState::GivenUp,
         }
     }
 
     /// Changes the state of a device that works, and returns whether it did. The first fault of a device stays.
-    fn becomes(&self, state: State) -> bool {
-        let well = State::Well as u8;
+    fn becomes(&self, state: GpuState) -> bool {
+        let well = GpuState::Well as u8;
         self.state.compare_exchange(well, state as u8, Ordering::AcqRel, Ordering::Acquire).is_ok()
     }
 
@@ -437,19 +437,19 @@ impl Gpu {
     pub(super) fn alive(&self, operation: &'static str) -> Result<(), GpuError> {
         let device = || self.name.clone();
         match self.state() {
-            State::Well => Ok(()),
-            State::Lost => Err(GpuError::DeviceLost { operation, device: device() }),
-            State::GivenUp => Err(GpuError::GivenUp { operation, device: device() }),
+            GpuState::Well => Ok(()),
+            GpuState::Lost => Err(GpuError::DeviceLost { operation, device: device() }),
+            GpuState::GivenUp => Err(GpuError::GivenUp { operation, device: device() }),
         }
     }
 
     /// True when the device may still use what was made from it.
     pub(super) fn is_abandoned(&self) -> bool {
-        self.state() == State::GivenUp
+        self.state() == GpuState::GivenUp
     }
 
     /// The queues, for one submission: as long as the turn is held. In a rig one thread submits, so the turn is free.
-    pub(super) fn queues(&self) -> Result<([vk::Queue; 2], Held<'_>), GpuError> {
+    pub(super) fn queues(&self) -> Result<([vk::Queue; 2], HeldTurn<'_>), GpuError> {
         let turn = self.turn.take().map_or_else(|| self.wait_for_turn(), Ok)?;
         Ok((self.queues, turn))
     }
@@ -471,7 +471,7 @@ impl Gpu {
 
     /// Waits for another thread's submission: one of an abandoned crew, or of another renderer in a test.
     #[cold]
-    fn wait_for_turn(&self) -> Result<Held<'_>, GpuError> {
+    fn wait_for_turn(&self) -> Result<HeldTurn<'_>, GpuError> {
         let begin = Instant::now();
         loop {
             // The other thread may be in a call of the driver that does not return.

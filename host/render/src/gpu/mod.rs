@@ -28,7 +28,7 @@ mod statistics;
 mod turn;
 
 pub(crate) use acceleration::{triangle_buffer, BodyTrees, BodyTriangles, FrameTree};
-pub use buffer::{Buffer, MemoryKind, Place};
+pub use buffer::{Buffer, MemoryKind, MemoryPlace};
 pub(crate) use commands::run_now;
 pub use commands::{CommandList, FrameFence, Recorder};
 pub use context::{memory_given_up, Gpu, GpuOptions};
@@ -37,7 +37,7 @@ pub use error::{GpuError, MemoryPool};
 pub use instance::validation_messages;
 pub use leftovers::devices_unfinished;
 pub use loss::{AfterLoss, LossBudget};
-pub(crate) use overlap::{submit_frame, Order, Orders, Overlap};
+pub(crate) use overlap::{submit_frame, FrameOrder, Orders, Overlap};
 pub use pipeline::{shared_bindings, BindingKind, BindingSet, BindingTable, ComputePipeline};
 pub(crate) use relay::Relay;
 pub use statistics::Executable;

@@ -20,7 +20,7 @@ pub(crate) struct Overlap {
 
 /// A frame's place in the order.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(crate) struct Order {
+pub(crate) struct FrameOrder {
     /// Its number: above those of all frames before, those that could not be submitted included.
     number: u64,
     /// The frame whose second list must have ended before; 0: none.
@@ -37,13 +37,13 @@ pub(crate) struct Orders {
 
 impl Orders {
     /// The place of the next frame, which writes the history `parity`.
-    pub(crate) fn next(&mut self, parity: usize) -> Order {
+    pub(crate) fn next(&mut self, parity: usize) -> FrameOrder {
         self.numbered += 1;
-        Order { number: self.numbered, after: self.has[parity] }
+        FrameOrder { number: self.numbered, after: self.has[parity] }
     }
 
     /// The frame of this place was submitted.
-    pub(crate) fn submitted(&mut self, parity: usize, order: Order) {
+    pub(crate) fn submitted(&mut self, parity: usize, order: FrameOrder) {
         self.has[parity] = order.number;
     }
 }
@@ -74,7 +74,7 @@ impl Overlap {
         &self,
         before: Option<&CommandList>,
         lists: [&CommandList; 2],
-        order: Order,
+        order: FrameOrder,
         fence: &mut FrameFence,
     ) -> Result<(), GpuError> {
         let gpu = &self.gpu;
@@ -143,7 +143,7 @@ impl Drop for Overlap {
 pub(crate) fn submit_frame(
     before: Option<&CommandList>,
     lists: [&CommandList; 2],
-    overlap: Option<(&Overlap, Order)>,
+    overlap: Option<(&Overlap, FrameOrder)>,
     fence: &mut FrameFence,
 ) -> Result<(), GpuError> {
     match (overlap, before) {

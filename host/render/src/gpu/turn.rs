@@ -17,19 +17,19 @@ pub(super) struct Turn {
 
 impl Turn {
     /// Takes the turn if it is free. It ends when the result is dropped.
-    pub(super) fn take(&self) -> Option<Held<'_>> {
+    pub(super) fn take(&self) -> Option<HeldTurn<'_>> {
         // What the thread before did to the queue happened before this.
         let was_taken = self.taken.swap(true, Ordering::Acquire);
         // Not `then_some`: a value that is made and not returned would end the turn of the other thread.
-        (!was_taken).then(|| Held(self))
+        (!was_taken).then(|| HeldTurn(self))
     }
 }
 
 /// A turn that was taken.
 #[derive(Debug)]
-pub(super) struct Held<'a>(&'a Turn);
+pub(super) struct HeldTurn<'a>(&'a Turn);
 
-impl Drop for Held<'_> {
+impl Drop for HeldTurn<'_> {
     fn drop(&mut self) {
         self.0.taken.store(false, Ordering::Release);
     }

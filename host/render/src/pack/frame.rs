@@ -6,7 +6,7 @@ use dpm_device::planes::{PlaneSchedule, Raster, MAX_PLANES};
 /// One cache line.
 #[derive(Clone, Copy, bytemuck::Zeroable, bytemuck::Pod)]
 #[repr(C, align(64))]
-struct Line([u8; 64]);
+struct CacheLine([u8; 64]);
 
 /// All planes of a frame, plane after plane in the order they are shown, starting on a cache line. The layout of a plane is
 /// that of [`dpm_device::planes`].
@@ -15,7 +15,7 @@ pub struct BitPlaneFrame {
     raster: Raster,
     schedule: PlaneSchedule,
     source_bits: [u8; MAX_PLANES],
-    lines: Vec<Line>,
+    lines: Vec<CacheLine>,
 }
 
 impl BitPlaneFrame {
@@ -23,7 +23,7 @@ impl BitPlaneFrame {
     pub fn new(raster: Raster, schedule: PlaneSchedule) -> Self {
         let source_bits = source_bits(&schedule);
         let len = raster.plane_bytes() * schedule.len();
-        Self { raster, schedule, source_bits, lines: vec![Line([0; 64]); len.div_ceil(64)] }
+        Self { raster, schedule, source_bits, lines: vec![CacheLine([0; 64]); len.div_ceil(64)] }
     }
 
     /// Mirrors of every plane.

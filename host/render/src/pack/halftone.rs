@@ -212,7 +212,7 @@ pub fn halftone_of_bodies(
     for (channel, &(bits_at, code_at)) in halftone.channels().iter().enumerate() {
         for y in (0..height).step_by(SIDE) {
             for x in (0..width).step_by(SIDE) {
-                let block = Block { halftone, channel, at: [x, y], raster, frame, anchor };
+                let block = HalftoneBlock { halftone, channel, at: [x, y], raster, frame, anchor };
                 block.share_out(codes, code_at, words, bits_at);
             }
         }
@@ -220,7 +220,7 @@ pub fn halftone_of_bodies(
 }
 
 /// A channel of 8 x 8 mirrors; fewer at the right and lower edge.
-struct Block<'a> {
+struct HalftoneBlock<'a> {
     halftone: Halftone,
     channel: usize,
     at: [usize; 2],
@@ -229,7 +229,7 @@ struct Block<'a> {
     anchor: &'a dyn Fn(usize) -> [i32; 2],
 }
 
-impl Block<'_> {
+impl HalftoneBlock<'_> {
     fn share_out(&self, codes: &[u32], code_at: u32, words: &mut [u32], bits_at: u32) {
         let width = self.raster.width() as usize;
         let [right, lower] = [width, self.raster.height() as usize];

@@ -116,7 +116,7 @@ fn loads_and_stores(shader: &Shader) -> [BTreeSet<String>; 2] {
 }
 
 /// The shaders that each of the methods may run, in their order.
-fn kernels(is_dpm: bool) -> impl Iterator<Item = (&'static str, &'static Kernel)> {
+fn kernels(is_dpm: bool) -> impl Iterator<Item = (&'static str, &'static PassKernel)> {
     static PASSES: [Pass; TABLE.len()] = TABLE;
     PASSES.iter().map(move |pass| (pass.name, pass.code.kernel(is_dpm)))
 }

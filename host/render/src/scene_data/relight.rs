@@ -39,14 +39,14 @@ fn roughness(lobe: u32) -> f32 {
 }
 
 /// A part of the sky: its direction, its radiance, its solid angle.
-struct Part {
+struct SkyPart {
     toward: Vec3,
     radiance: Vec3,
     size: f32,
 }
 
 /// The sky in few parts of nearly even size.
-fn parts([width, height]: [usize; 2], texels: &[Vec3], rotation: f32) -> Vec<Part> {
+fn parts([width, height]: [usize; 2], texels: &[Vec3], rotation: f32) -> Vec<SkyPart> {
     let (columns, rows) = (width.min(COLUMNS), height.min(COLUMNS / 2));
     let cosine = |y: usize| (PI * y as f32 / height as f32).cos();
     let mut all = Vec::with_capacity(columns * rows);
@@ -65,7 +65,7 @@ fn parts([width, height]: [usize; 2], texels: &[Vec3], rotation: f32) -> Vec<Par
             }
             let azimuth = ((x0 + x1) as f32 / (2 * width) as f32 - 0.5) * 2.0 * PI - rotation;
             let toward = Vec3::new(across * azimuth.sin(), up, -across * azimuth.cos());
-            all.push(Part { toward, radiance: sum / size.max(1e-20), size });
+            all.push(SkyPart { toward, radiance: sum / size.max(1e-20), size });
         }
     }
     all
@@ -87,8 +87,8 @@ fn weight(lobe: u32, cosine: f32) -> f32 {
 }
 
 /// Takes the suns out of the sky: what their parts have beyond the brightest of the rest.
-fn take_suns(parts: &mut [Part]) -> Vec<Light> {
-    let light = |parts: &[Part]| parts.iter().map(|p| luminance(p.radiance) * p.size).sum::<f32>();
+fn take_suns(parts: &mut [SkyPart]) -> Vec<Light> {
+    let light = |parts: &[SkyPart]| parts.iter().map(|p| luminance(p.radiance) * p.size).sum::<f32>();
     let whole = light(parts);
     let bright = SUN_BRIGHTER * whole / (4.0 * PI);
     let mut suns = Vec::new();
@@ -140,7 +140,7 @@ pub(super) fn relit_sky(size: [usize; 2], texels: &[Vec3], rotation: f32) -> Rel
     RelitSky { suns, filtered: filtered_sky(&parts) }
 }
 
-fn filtered_sky(parts: &[Part]) -> Vec<[f32; 4]> {
+fn filtered_sky(parts: &[SkyPart]) -> Vec<[f32; 4]> {
     let nodes = SKY_NODES as usize;
     let directions: Vec<Vec3> = (0..nodes * nodes).map(|i| node_direction(i % nodes, i / nodes)).collect();
     let map = |lobe: u32| {
@@ -319,7 +319,7 @@ mod tests {
         assert!(toward.dot(whole[9 * 64 + 43].toward) > 3f32.to_radians().cos());
         let (radius, size) = (suns[0].cone_offset, whole[9 * 64 + 43].size);
         assert!((PI * radius * radius / size - 2.0).abs() < 1e-3);
-        let irradiance = |parts: &[Part], n: Vec3| {
+        let irradiance = |parts: &[SkyPart], n: Vec3| {
             parts.iter().map(|p| p.radiance * (p.size * n.dot(p.toward).max(0.0))).sum::<Vec3>()
         };
         // Where all of the sun is above the horizon; the centre of its light stands for it.

@@ -2,7 +2,7 @@
 #![allow(unsafe_code)]
 
 use super::plain::LEAVE;
-use super::tree::{Node, Triangles, LEAF_LANES};
+use super::tree::{Triangles, WideNode, LEAF_LANES};
 use super::{walk_all, LocalRay, Ray, WalkScene};
 use std::arch::x86_64::*;
 
@@ -13,7 +13,7 @@ pub(super) fn is_there() -> bool {
 /// Walks with AVX2; falls back to plain Rust where there is none.
 pub(super) fn walk(scene: &WalkScene<'_>, rays: &[Ray], hits: &mut [u32]) {
     if !is_there() {
-        return walk_all::<super::plain::Lanes>(scene, rays, hits);
+        return walk_all::<super::plain::PlainLanes>(scene, rays, hits);
     }
     // SAFETY: the processor has all of the features, as just checked.
     unsafe { walk_with_avx2(scene, rays, hits) }
@@ -22,15 +22,15 @@ pub(super) fn walk(scene: &WalkScene<'_>, rays: &[Ray], hits: &mut [u32]) {
 // Without fused products: the shader has none.
 #[target_feature(enable = "avx2,lzcnt,bmi1")]
 fn walk_with_avx2(scene: &WalkScene<'_>, rays: &[Ray], hits: &mut [u32]) {
-    walk_all::<Lanes>(scene, rays, hits);
+    walk_all::<Avx2Lanes>(scene, rays, hits);
 }
 
 /// Only [`walk_with_avx2`] names it.
-struct Lanes;
+struct Avx2Lanes;
 
-impl super::Lanes for Lanes {
+impl super::Lanes for Avx2Lanes {
     #[inline(always)]
-    fn enters(node: &Node, ray: &LocalRay, t_max: f32) -> u32 {
+    fn enters(node: &WideNode, ray: &LocalRay, t_max: f32) -> u32 {
         // SAFETY: this is inlined into a function that runs only where there is AVX2.
         unsafe { enters(node, ray, t_max) }
     }
@@ -60,7 +60,7 @@ macro_rules! product {
 
 #[inline]
 #[target_feature(enable = "avx2")]
-fn enters(node: &Node, ray: &LocalRay, t_max: f32) -> u32 {
+fn enters(node: &WideNode, ray: &LocalRay, t_max: f32) -> u32 {
     macro_rules! distance {
         ($axis:literal, $is_far:expr) => {{
             let row = $axis + 3 * usize::from(ray.down[$axis] != $is_far);

@@ -38,7 +38,7 @@ mod tree;
 
 use dpm_shaders::structs::{BodyNode, Instance, BODY_NODE_INNER, INSTANCE_EMPTY, NO_HIT};
 pub use tree::WideTree;
-use tree::{Node, Triangles, LEAF_LANES};
+use tree::{Triangles, WideNode, LEAF_LANES};
 
 /// A ray as the shaders write it into the queue of a frame: 32 bytes.
 #[repr(C)]
@@ -77,14 +77,14 @@ pub struct WalkScene<'a> {
 /// A way to walk, chosen by what the processor can do.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, serde::Serialize)]
 #[serde(rename_all = "lowercase")]
-pub enum Kernel {
+pub enum WalkKernel {
     /// Plain Rust for every processor, in the registers that its instruction set has at least (SSE2, NEON).
     Plain,
     /// x86-64 with AVX2.
     Avx2,
 }
 
-impl Kernel {
+impl WalkKernel {
     /// The kernels that this processor can run, slowest first.
     pub fn available() -> &'static [Self] {
         #[cfg(target_arch = "x86_64")]
@@ -117,7 +117,7 @@ impl Kernel {
         match self {
             #[cfg(target_arch = "x86_64")]
             Self::Avx2 => avx2::walk(scene, rays, hits),
-            _ => walk_all::<plain::Lanes>(scene, rays, hits),
+            _ => walk_all::<plain::PlainLanes>(scene, rays, hits),
         }
     }
 }
@@ -125,7 +125,7 @@ impl Kernel {
 /// What a kernel computes many at once.
 trait Lanes {
     /// The children of a node whose boxes the ray enters before `t_max`, a bit each.
-    fn enters(node: &Node, ray: &LocalRay, t_max: f32) -> u32;
+    fn enters(node: &WideNode, ray: &LocalRay, t_max: f32) -> u32;
     /// The triangles that the ray meets before `t_max`, a bit each, and where.
     fn meets(triangles: &Triangles, ray: &LocalRay, t_max: f32) -> (u32, [f32; LEAF_LANES]);
 }

@@ -1,20 +1,20 @@
 //! The tests of boxes and triangles in plain Rust, for every processor. Compilers turn these loops into whatever registers they may use.
 
-use super::tree::{Node, Triangles, LEAF_LANES};
+use super::tree::{Triangles, WideNode, LEAF_LANES};
 use super::LocalRay;
 use std::array::from_fn;
 
 /// See the module.
-pub(super) struct Lanes;
+pub(super) struct PlainLanes;
 
 /// What a ray's box test allows for rounding, as a factor of where it leaves.
 pub(super) const LEAVE: f32 = 1.000_001_2;
 
 type Row = [f32; LEAF_LANES];
 
-impl super::Lanes for Lanes {
+impl super::Lanes for PlainLanes {
     #[inline(always)]
-    fn enters(node: &Node, ray: &LocalRay, t_max: f32) -> u32 {
+    fn enters(node: &WideNode, ray: &LocalRay, t_max: f32) -> u32 {
         let (mut enter, mut leave) = ([0.0f32; 8], [t_max; 8]);
         for axis in 0..3 {
             let (o, i) = (ray.origin[axis], ray.inverse[axis]);

@@ -8,13 +8,13 @@ use dpm_shaders::structs::INSTANCE_PROJECTED;
 use glam::{DAffine3, DQuat, DVec3, Vec3};
 
 /// A body where it stands, with its tree and its mesh in BVH order.
-struct Body {
+struct WalkedBody {
     instance: Instance,
     tree: WideTree,
     corners: Vec<[Vec3; 3]>,
 }
 
-fn body(number: usize, mesh: &TriangleMesh, pose: DAffine3, flags: u32) -> Body {
+fn body(number: usize, mesh: &TriangleMesh, pose: DAffine3, flags: u32) -> WalkedBody {
     let bvh = BodyBvh::build(mesh);
     let corners: Vec<[Vec3; 3]> =
         (bvh.order.iter()).map(|&t| mesh.triangles[t as usize].map(|v| mesh.positions[v as usize])).collect();
@@ -29,7 +29,7 @@ fn body(number: usize, mesh: &TriangleMesh, pose: DAffine3, flags: u32) -> Body 
         flags,
         ..Instance::zeroed()
     };
-    Body { instance, tree, corners }
+    WalkedBody { instance, tree, corners }
 }
 
 fn point(random: &mut Sampler) -> Vec3 {
@@ -40,7 +40,7 @@ fn ray(origin: Vec3, direction: Vec3, kind: u32) -> Ray {
     Ray { origin: origin.into(), t_max: 3e38, direction: direction.into(), kind }
 }
 
-fn hits_of(kernel: Kernel, bodies: &[Body], body_nodes: &[BodyNode], rays: &[Ray]) -> Vec<u32> {
+fn hits_of(kernel: WalkKernel, bodies: &[WalkedBody], body_nodes: &[BodyNode], rays: &[Ray]) -> Vec<u32> {
     let instances: Vec<_> = bodies.iter().map(|b| b.instance).collect();
     let trees: Vec<_> = bodies.iter().map(|b| b.tree.clone()).collect();
     let mut hits = vec![0; rays.len()];
@@ -49,7 +49,7 @@ fn hits_of(kernel: Kernel, bodies: &[Body], body_nodes: &[BodyNode], rays: &[Ray
 }
 
 /// Distances along a ray at which it meets each triangle of all bodies, by f64 and without a tree.
-fn distances(bodies: &[Body], ray: &Ray, mask: u32) -> Vec<(f64, u32)> {
+fn distances(bodies: &[WalkedBody], ray: &Ray, mask: u32) -> Vec<(f64, u32)> {
     let mut met = Vec::new();
     for (i, body) in bodies.iter().enumerate().filter(|(_, b)| mask == 0 || b.instance.flags & mask != 0) {
         let row = |r: usize| body.instance.object_from_world[r].map(f64::from);
@@ -75,7 +75,7 @@ fn distances(bodies: &[Body], ray: &Ray, mask: u32) -> Vec<(f64, u32)> {
     met
 }
 
-fn some_bodies(random: &mut Sampler) -> Vec<Body> {
+fn some_bodies(random: &mut Sampler) -> Vec<WalkedBody> {
     let soup = join((0..300).map(|_| {
         let at = point(random);
         triangle([at, at + point(random) * 0.2, at + point(random) * 0.2])
@@ -103,7 +103,8 @@ fn the_nearest_triangle_is_found_by_every_kernel() {
         rays.push(ray(origin, direction, Ray::CLOSEST | mask));
         rays.push(Ray { t_max: 0.7, ..ray(origin, direction, Ray::ANY | mask) });
     }
-    let all: Vec<Vec<u32>> = Kernel::available().iter().map(|k| hits_of(*k, &bodies, &[], &rays)).collect();
+    let all: Vec<Vec<u32>> =
+        WalkKernel::available().iter().map(|k| hits_of(*k, &bodies, &[], &rays)).collect();
     for other in &all[1..] {
         assert_eq!(&all[0], other, "kernels differ");
     }
@@ -149,7 +150,7 @@ fn no_ray_leaks_through_an_edge() {
                 rays.push(ray(origin, world(target) - origin, Ray::CLOSEST));
             }
         }
-        for kernel in Kernel::available() {
+        for kernel in WalkKernel::available() {
             let hits = hits_of(*kernel, std::slice::from_ref(&one), &[], &rays);
             let leaks = hits.iter().filter(|hit| **hit == NO_HIT).count();
             assert_eq!(leaks, 0, "{} of {} rays by {}", leaks, rays.len(), kernel.name());
@@ -162,7 +163,7 @@ fn no_ray_leaks_through_an_edge() {
 fn a_tree_over_the_bodies_changes_nothing_and_rays_without_a_way_meet_nothing() {
     let mut random = Sampler::new(3, 0);
     let ball = sphere(Vec3::ZERO, 0.2, 2, true);
-    let bodies: Vec<Body> = (0..40)
+    let bodies: Vec<WalkedBody> = (0..40)
         .map(|i| body(i, &ball, DAffine3::from_translation(point(&mut random).as_dvec3() * 2.0), 0))
         .collect();
     let mut over = crate::body_tree::BodyTree::new(bodies.len());
@@ -171,7 +172,7 @@ fn a_tree_over_the_bodies_changes_nothing_and_rays_without_a_way_meet_nothing() 
     let count = over.write(&mut nodes) as usize;
     let toward = |origin: Vec3, at: Vec3| ray(origin, at - origin, Ray::CLOSEST);
     let rays: Vec<Ray> = (0..2000).map(|_| toward(point(&mut random) * 3.0, point(&mut random))).collect();
-    let best = Kernel::best();
+    let best = WalkKernel::best();
     let found = hits_of(best, &bodies, &[], &rays);
     assert_eq!(found, hits_of(best, &bodies, &nodes[..8 * count], &rays));
     assert!(found.iter().filter(|hit| **hit != NO_HIT).count() > 200);
@@ -181,7 +182,7 @@ fn a_tree_over_the_bodies_changes_nothing_and_rays_without_a_way_meet_nothing() 
         ray(Vec3::ZERO, Vec3::ZERO, Ray::CLOSEST),
         ray(Vec3::ZERO, Vec3::X, Ray::NONE),
     ];
-    for kernel in Kernel::available() {
+    for kernel in WalkKernel::available() {
         assert_eq!(hits_of(*kernel, &bodies, &[], &nowhere), [NO_HIT; 4], "{}", kernel.name());
     }
 }

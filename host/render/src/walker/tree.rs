@@ -11,7 +11,7 @@ const NODE_WORDS: usize = 5;
 /// A node with its eight children: 256 bytes, four cache lines.
 #[repr(C, align(64))]
 #[derive(Clone, Copy, Debug)]
-pub(super) struct Node {
+pub(super) struct WideNode {
     /// Lower planes along x, y and z, then upper planes. Of a child that is not there the lower are above the upper.
     pub planes: [[f32; 8]; 6],
     /// Of an inner child its node, of a leaf its entry in [`WideTree::triangles`].
@@ -34,7 +34,7 @@ pub(super) struct Triangles {
 #[derive(Clone, Debug, Default)]
 pub struct WideTree {
     /// The root is the first; empty: the body has no surface.
-    pub(super) nodes: Vec<Node>,
+    pub(super) nodes: Vec<WideNode>,
     pub(super) triangles: Vec<Triangles>,
 }
 
@@ -88,7 +88,7 @@ impl WideTree {
     }
 }
 
-const NO_CHILDREN: Node = Node {
+const NO_CHILDREN: WideNode = WideNode {
     planes: [
         [f32::INFINITY; 8],
         [f32::INFINITY; 8],

@@ -23,7 +23,7 @@ pub struct Drawn<'a> {
 
 /// What a mirror shows at an instant.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-struct Place {
+struct MirrorSource {
     /// The place in the picture that was drawn, in 1/64 pixel; a pixel's centre is a multiple of 64.
     at: [i32; 2],
     /// Who is there; `OWNER_NONE` for a hole, which takes whatever is near.
@@ -107,12 +107,12 @@ impl Drawn<'_> {
         self.place_at(pixel, instant).map(|place| nearest(place.at))
     }
 
-    fn place_at(&self, pixel: [i32; 2], instant: i32) -> Option<Place> {
+    fn place_at(&self, pixel: [i32; 2], instant: i32) -> Option<MirrorSource> {
         let own = self.at(pixel);
         let owner = owner_of(own);
         let (mut closest, mut found) = (u32::MAX, None);
         if owner == OWNER_STILL {
-            (closest, found) = (depth_of(own), Some(Place { at: pixel.map(|c| c << 6), owner }));
+            (closest, found) = (depth_of(own), Some(MirrorSource { at: pixel.map(|c| c << 6), owner }));
         }
         for (mover, number) in self.movers.iter().zip(OWNER_STILL + 1..) {
             if !within(mover, pixel) {
@@ -126,7 +126,7 @@ impl Drawn<'_> {
             let at = source(mover, pixel, motion_of(near), instant);
             let Some(there) = of_mover(at) else { continue };
             if depth_of(there) < closest {
-                (closest, found) = (depth_of(there), Some(Place { at, owner: number }));
+                (closest, found) = (depth_of(there), Some(MirrorSource { at, owner: number }));
             }
         }
         if found.is_some() || owner <= OWNER_STILL {
@@ -136,12 +136,12 @@ impl Drawn<'_> {
         let mover = self.mover_of(owner);
         let at = source(mover, pixel, motion_of(own), instant);
         let behind = self.moved_at(mover, nearest(at));
-        behind.filter(|m| owner_of(m) != OWNER_NONE).map(|_| Place { at, owner: OWNER_NONE })
+        behind.filter(|m| owner_of(m) != OWNER_NONE).map(|_| MirrorSource { at, owner: OWNER_NONE })
     }
 
     /// The word at a place for the planes of a group: that of its pixel, or code values between those of the pixels around it
     /// that show the same body.
-    fn word_at(&self, Place { at, owner }: Place, group: &PlaneGroup, number: u32) -> u32 {
+    fn word_at(&self, MirrorSource { at, owner }: MirrorSource, group: &PlaneGroup, number: u32) -> u32 {
         if !self.are_codes || owner <= OWNER_STILL {
             return self.shown(self.at(nearest(at)).word, at, [0, 0]);
         }

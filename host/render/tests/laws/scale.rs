@@ -56,7 +56,7 @@ fn settings(camera: &ProjectorCamera, scale: Scale, method: &Method) -> Renderer
 }
 
 /// What a frame shows on the panel.
-pub(super) struct Picture {
+pub(super) struct PanelPicture {
     pub(super) codes: Vec<u32>,
     pub(super) light: Vec<Vec3>,
     surfaces: Vec<Surface>,
@@ -64,26 +64,32 @@ pub(super) struct Picture {
 }
 
 /// A scene before a projector and an eye.
-pub(super) struct View<'a> {
+pub(super) struct ScaleScene<'a> {
     gpu: Arc<Gpu>,
     scene: &'a Scene,
     pub(super) camera: ProjectorCamera,
     eye: DVec3,
 }
 
-impl<'a> View<'a> {
+impl<'a> ScaleScene<'a> {
     fn new(scene: &'a Scene, camera: ProjectorCamera, eye: DVec3) -> Self {
         let gpu = Gpu::open(&GpuOptions::default()).expect("a Vulkan device");
         Self { gpu, scene, camera, eye }
     }
 
     /// The last of so many frames, each on its rung.
-    fn show(&self, scale: Scale, method: &Method, rungs: &[usize]) -> Picture {
+    fn show(&self, scale: Scale, method: &Method, rungs: &[usize]) -> PanelPicture {
         self.show_by(2.0, scale, method, rungs)
     }
 
     /// The same by so many samples of a pixel a frame.
-    pub(super) fn show_by(&self, budget_spp: f32, scale: Scale, method: &Method, rungs: &[usize]) -> Picture {
+    pub(super) fn show_by(
+        &self,
+        budget_spp: f32,
+        scale: Scale,
+        method: &Method,
+        rungs: &[usize],
+    ) -> PanelPicture {
         let settings = settings(&self.camera, scale, method);
         let mut renderer = Renderer::new(&self.gpu, self.scene, settings).expect("the scene fits");
         let mut slot = renderer.create_slot(true).expect("memory");
@@ -96,7 +102,7 @@ impl<'a> View<'a> {
             lit = slot.wait(WAIT_NS).expect("the frame ends").counters().lit_pixels;
         }
         let light = slot.radiance().expect("for debugging").iter().map(|&[r, g, b, _]| Vec3::new(r, g, b));
-        Picture {
+        PanelPicture {
             codes: slot.codes().to_vec(),
             light: light.collect(),
             surfaces: slot.surfaces().expect("for debugging"),
@@ -104,7 +110,7 @@ impl<'a> View<'a> {
         }
     }
 
-    fn at(&self, share: f64, method: &Method) -> Picture {
+    fn at(&self, share: f64, method: &Method) -> PanelPicture {
         self.show(Scale::Share(share), method, &[0, 0, 0])
     }
 
@@ -171,8 +177,12 @@ pub(super) fn balls() -> Scene {
     scene
 }
 
-pub(super) fn view_of_balls(scene: &Scene) -> View<'_> {
-    View::new(scene, camera(161, 121, DVec3::new(0.0, 0.0, 2.6), DVec3::ZERO), DVec3::new(0.25, 0.15, 2.6))
+pub(super) fn view_of_balls(scene: &Scene) -> ScaleScene<'_> {
+    ScaleScene::new(
+        scene,
+        camera(161, 121, DVec3::new(0.0, 0.0, 2.6), DVec3::ZERO),
+        DVec3::new(0.25, 0.15, 2.6),
+    )
 }
 
 /// The four reduced pixels around a pixel of the panel.
@@ -298,7 +308,7 @@ mod breadth {
         let step = one_body(at(edge - 0.7, 0.0, Vec3::X * 0.7), at(edge, -0.3, Vec3::X * 0.7));
         for (name, scene) in [("body", bodies), ("normal", crease), ("depth", step)] {
             let eye = DVec3::new(0.0, 0.05, 2.6);
-            let view = View::new(&scene, camera(160, 120, DVec3::new(0.0, 0.0, 2.6), DVec3::ZERO), eye);
+            let view = ScaleScene::new(&scene, camera(160, 120, DVec3::new(0.0, 0.0, 2.6), DVec3::ZERO), eye);
             let method = Method::full(2);
             let whole = view.at(1.0, &method);
             for share in [0.5, 0.25] {
@@ -329,9 +339,9 @@ mod breadth {
         );
         scene.environment = sky(SKY);
         let eye = DVec3::new(0.1, 0.2, 2.0);
-        let view = View::new(&scene, camera(160, 120, DVec3::new(0.3, 0.4, 2.0), DVec3::ZERO), eye);
+        let view = ScaleScene::new(&scene, camera(160, 120, DVec3::new(0.3, 0.4, 2.0), DVec3::ZERO), eye);
         for method in [dpm(), Method::full(2)] {
-            let mean = |shown: &Picture| {
+            let mean = |shown: &PanelPicture| {
                 let codes = shown
                     .codes
                     .iter()
@@ -356,9 +366,9 @@ mod breadth {
         scene.materials[0].base_color_texture = texture;
         scene.environment = sky(SKY);
         let eye = DVec3::new(0.1, 0.2, 2.0);
-        let view = View::new(&scene, camera(160, 120, DVec3::new(0.0, 0.0, 2.0), DVec3::ZERO), eye);
+        let view = ScaleScene::new(&scene, camera(160, 120, DVec3::new(0.0, 0.0, 2.0), DVec3::ZERO), eye);
         let whole = view.at(1.0, &dpm());
-        let rmse = |shown: &Picture| {
+        let rmse = |shown: &PanelPicture| {
             let apart = whole
                 .light
                 .iter()
@@ -382,7 +392,7 @@ mod breadth {
             for rung in [0, 2, 4] {
                 let [steady, later] =
                     [3, 7].map(|frames| view.show(Scale::Ladder, &method, &[rung; 7][..frames]));
-                let apart = |a: &Picture, b: &Picture| {
+                let apart = |a: &PanelPicture, b: &PanelPicture| {
                     let apart = a.light.iter().zip(&b.light).map(|(a, b)| (*a - *b).abs().max_element());
                     apart.sum::<f32>() / a.light.len() as f32
                 };
@@ -398,7 +408,7 @@ mod breadth {
                         .filter(|(a, b)| body_of(a) == body_of(b))
                         .count();
                     assert_eq!(same, steady.surfaces.len(), "rung {rung} after {before:?}");
-                    let off = |s: &Picture| {
+                    let off = |s: &PanelPicture| {
                         (0..s.codes.len()).filter(|&i| s.codes[i] != 0 && !s.surfaces[i].is_lit()).count()
                     };
                     assert_eq!(off(&shown), 0);

@@ -1,7 +1,7 @@
 //! The steps one by one, with their needs and commands.
 
 use super::judged::{day, FileVerdict, Part};
-use super::{State, Step, Way, SENSOR};
+use super::{CalibrationStep, StepStatus, Way, SENSOR};
 use crate::config::PlaneTiming;
 use dpm_calibration_file::{CheckSection, Provenance};
 use std::path::Path;
@@ -10,7 +10,7 @@ use std::path::Path;
 const USUAL_WAND: &str = "wand";
 
 /// All steps, in the order of `docs/CALIBRATION.md`.
-pub(super) fn steps(judged: &FileVerdict) -> Vec<Step> {
+pub(super) fn steps(judged: &FileVerdict) -> Vec<CalibrationStep> {
     let names: Vec<&str> = judged.about.config.scene.bodies.iter().map(|b| b.name.as_str()).collect();
     let mut all = vec![aim(judged), wand(judged), projector(judged)];
     all.extend(names.iter().map(|name| body(judged, name)));
@@ -67,13 +67,13 @@ fn need_wand(judged: &FileVerdict) -> String {
     format!("the wand, which {from} reports as \"{}\"", wand_name(judged))
 }
 
-fn step(id: &str, title: &str, gives: &'static str) -> Step {
+fn step(id: &str, title: &str, gives: &'static str) -> CalibrationStep {
     let (id, title) = (id.to_owned(), title.to_owned());
-    let (state, told) = (State::Missing, String::new());
-    Step { id, title, gives, needs: Vec::new(), state, told, measured: None, ways: Vec::new() }
+    let (state, told) = (StepStatus::Missing, String::new());
+    CalibrationStep { id, title, gives, needs: Vec::new(), state, told, measured: None, ways: Vec::new() }
 }
 
-impl Step {
+impl CalibrationStep {
     fn with(mut self, (state, told, measured): Part) -> Self {
         (self.state, self.told, self.measured) = (state, told, measured);
         self
@@ -81,16 +81,16 @@ impl Step {
 
     /// A step that was not measured and needs the wand's tip.
     fn after_wand(mut self, judged: &FileVerdict) -> Self {
-        if self.measured.is_none() && self.state == State::Missing && judged.file.wand.is_none() {
-            (self.state, self.told) = (State::Waits, "It needs the wand's tip first.".into());
+        if self.measured.is_none() && self.state == StepStatus::Missing && judged.file.wand.is_none() {
+            (self.state, self.told) = (StepStatus::Waits, "It needs the wand's tip first.".into());
         }
         self
     }
 }
 
-fn aim(judged: &FileVerdict) -> Step {
+fn aim(judged: &FileVerdict) -> CalibrationStep {
     let mut step = step("pattern", "Sharpen and aim the picture", "a sharp picture where the bodies move");
-    step.state = State::Unrecorded;
+    step.state = StepStatus::Unrecorded;
     step.needs = vec!["the projector, and your eyes".into()];
     step.ways = vec![
         way(
@@ -104,7 +104,7 @@ fn aim(judged: &FileVerdict) -> Step {
     step
 }
 
-fn wand(judged: &FileVerdict) -> Step {
+fn wand(judged: &FileVerdict) -> CalibrationStep {
     let mut step = step("wand", "Find the tip of the wand", "where the tip is in the wand's body");
     step.needs = vec![need_wand(judged), "a small dent in which the tip can turn, for 15 s".into()];
     step.ways = vec![calibrate(judged, "Turn the wand about its tip.", "wand", &[])];
@@ -112,12 +112,12 @@ fn wand(judged: &FileVerdict) -> Step {
         None => step,
         Some(wand) => {
             let quality = format!("the tip is known to {:.2} mm", 1e3 * wand.tip_sigma_m);
-            step.with((State::Done, String::new(), judged.measured(quality, &wand.provenance)))
+            step.with((StepStatus::Done, String::new(), judged.measured(quality, &wand.provenance)))
         }
     }
 }
 
-fn projector(judged: &FileVerdict) -> Step {
+fn projector(judged: &FileVerdict) -> CalibrationStep {
     let config = &judged.about.config.projector;
     let mut step = step(
         "projector",
@@ -147,12 +147,12 @@ fn projector(judged: &FileVerdict) -> Step {
     }
     if let Some(file) = &config.calibration {
         let told = format!("Lens and pose come from {} (projector.calibration).", file.display());
-        return step.with((State::Given, told, None));
+        return step.with((StepStatus::Given, told, None));
     }
     step.after_wand(judged)
 }
 
-fn body(judged: &FileVerdict, name: &str) -> Step {
+fn body(judged: &FileVerdict, name: &str) -> CalibrationStep {
     let title = format!("Find the mesh in \"{name}\"");
     let mut step =
         step(&format!("body:{name}"), &title, "where the mesh is in the body that the tracker reports");
@@ -172,12 +172,12 @@ fn body(judged: &FileVerdict, name: &str) -> Step {
     let own = judged.about.config.scene.bodies.iter().find(|b| b.name == name);
     if own.is_some_and(|b| b.mesh_to_body != Default::default()) {
         let told = "The rig file gives its place (scene.bodies[].mesh_to_body).";
-        return step.with((State::Given, told.into(), None));
+        return step.with((StepStatus::Given, told.into(), None));
     }
     step.after_wand(judged)
 }
 
-fn light(judged: &FileVerdict) -> Step {
+fn light(judged: &FileVerdict) -> CalibrationStep {
     let config = &judged.about.config.projector;
     let mut step = step(
         "light",
@@ -196,13 +196,13 @@ fn light(judged: &FileVerdict) -> Step {
     }
     if config.response != Default::default() || config.flat_field.is_some() {
         let told = "The rig file gives it (projector.response, projector.flat_field).";
-        return step.with((State::Given, told.into(), None));
+        return step.with((StepStatus::Given, told.into(), None));
     }
     let told = "Without it light counts as proportional to the code value, and as even over the picture.";
-    step.with((State::Optional, told.into(), None))
+    step.with((StepStatus::Optional, told.into(), None))
 }
 
-fn check(judged: &FileVerdict, name: &str) -> Step {
+fn check(judged: &FileVerdict, name: &str) -> CalibrationStep {
     let title = format!("Check the light on \"{name}\"");
     let mut step =
         step(&format!("check:{name}"), &title, "the error of the light, and what to measure again");
@@ -214,7 +214,7 @@ fn check(judged: &FileVerdict, name: &str) -> Step {
         let is_ready = judged.dates_of(name).next().is_some() && judged.file.wand.is_some();
         if !is_ready {
             let told = "It needs the wand's tip, and a projector or a body that was measured.";
-            step = step.with((State::Waits, told.into(), None));
+            step = step.with((StepStatus::Waits, told.into(), None));
         }
         return step;
     };
@@ -226,20 +226,22 @@ fn check(judged: &FileVerdict, name: &str) -> Step {
     // Dates of one form are in the order of their letters.
     let newer = judged.dates_of(name).find(|date| *date > section.provenance.date.as_str());
     let (state, told) = match newer {
-        Some(date) => (State::Missing, format!("It was measured again on {}, after this check.", day(date))),
+        Some(date) => {
+            (StepStatus::Missing, format!("It was measured again on {}, after this check.", day(date)))
+        }
         None if !section.is_within() => {
             let told = format!(
                 "An error was larger than {} px. Measure again what the check named.",
                 section.limit_px
             );
-            (State::Wrong, told)
+            (StepStatus::Wrong, told)
         }
         None => judged.by_age(&section.provenance, &[]),
     };
     step.with((state, told, measured))
 }
 
-fn nudge(judged: &FileVerdict, names: &[&str]) -> Step {
+fn nudge(judged: &FileVerdict, names: &[&str]) -> CalibrationStep {
     let mut step =
         step("nudge", "Move things by eye", "a mesh or a projector that was moved until its outlines fit");
     step.needs = vec!["your eyes, and a body at rest in the light".into()];
@@ -253,10 +255,10 @@ fn nudge(judged: &FileVerdict, names: &[&str]) -> Step {
     let all: Vec<&Provenance> = judged.file.projector.iter().map(|p| &p.provenance).chain(places).collect();
     let newest = all.into_iter().filter(|p| p.is_by_eye()).max_by(|a, b| a.date.cmp(&b.date));
     match newest {
-        Some(from) => step.with((State::Given, format!("Done on {}, by eye.", day(&from.date)), None)),
+        Some(from) => step.with((StepStatus::Given, format!("Done on {}, by eye.", day(&from.date)), None)),
         None => {
             let told = "Only where a check finds a shift, or outlines do not fit. A running rig has the same motions among its parameters.";
-            step.with((State::Optional, told.into(), None))
+            step.with((StepStatus::Optional, told.into(), None))
         }
     }
 }
@@ -280,7 +282,7 @@ const KEYS: [(&str, &str); 15] = [
     ("q", "end"),
 ];
 
-fn export(judged: &FileVerdict) -> Step {
+fn export(judged: &FileVerdict) -> CalibrationStep {
     let mut step = step("export", "Write lens and pose for OpenCV", "a file that other programs read");
     let out = judged.about.rig.with_file_name("projector.yml");
     step.ways = vec![way(judged, "", &["calibrate", "export"], &[&out.display().to_string()])];
@@ -289,10 +291,10 @@ fn export(judged: &FileVerdict) -> Step {
         true => format!("{} is there.", out.display()),
         false => "Only where another program needs it.".into(),
     };
-    step.with((State::Optional, told, None))
+    step.with((StepStatus::Optional, told, None))
 }
 
-fn latency(judged: &FileVerdict) -> Step {
+fn latency(judged: &FileVerdict) -> CalibrationStep {
     let mut step = step(
         "latency",
         "Measure the latency alone",
@@ -307,10 +309,14 @@ fn latency(judged: &FileVerdict) -> Step {
         return step.with(judged.of_projector((quality, &section.provenance), None, &[]));
     }
     if judged.about.config.tracker.frame().is_some_and(|(_, latency_us)| latency_us != 0) {
-        return step.with((State::Given, "The rig file gives it (tracker.latency_us).".into(), None));
+        return step.with((StepStatus::Given, "The rig file gives it (tracker.latency_us).".into(), None));
     }
     if judged.file.projector.is_none() {
-        return step.with((State::Waits, "It needs the projector first.".into(), None));
+        return step.with((StepStatus::Waits, "It needs the projector first.".into(), None));
     }
-    step.with((State::Optional, "The projector's step with the light sensor measures it, too.".into(), None))
+    step.with((
+        StepStatus::Optional,
+        "The projector's step with the light sensor measures it, too.".into(),
+        None,
+    ))
 }

@@ -1,7 +1,7 @@
 //! What speaks for and against a part of a calibration file.
 
 use super::age::{aged, days_since, is_old, OLD_DAYS};
-use super::{About, State, StepQuantity};
+use super::{About, StepQuantity, StepStatus};
 use crate::standing::{seconds_of_utc, Identity};
 use dpm_calibration_file::{CalibrationFile, CheckSection, Provenance};
 use std::time::UNIX_EPOCH;
@@ -13,7 +13,7 @@ pub(super) struct FileVerdict<'a> {
 }
 
 /// A part of the file, and how it stands with it.
-pub(super) type Part = (State, String, Option<StepQuantity>);
+pub(super) type Part = (StepStatus, String, Option<StepQuantity>);
 
 impl FileVerdict<'_> {
     /// What was measured, with its age; `None` for what was moved by eye since: nothing of it is measured.
@@ -45,7 +45,7 @@ impl FileVerdict<'_> {
                     own.width(),
                     own.height()
                 );
-                return (State::Wrong, told, measured);
+                return (StepStatus::Wrong, told, measured);
             }
         }
         let rigs = Identity::of(&self.about.config.projector.backend).to_string();
@@ -54,23 +54,23 @@ impl FileVerdict<'_> {
                 "It was measured with \"{}\", and the rig file names \"{rigs}\". Measure again if that is another projector.",
                 from.device
             );
-            return (State::Doubtful, told, measured);
+            return (StepStatus::Doubtful, told, measured);
         }
         let (state, told) = self.by_age(from, checks);
         (state, told, measured)
     }
 
     /// Whether a part is old and none of `checks` has confirmed it since, or was moved by eye.
-    pub(super) fn by_age(&self, from: &Provenance, checks: &[&CheckSection]) -> (State, String) {
+    pub(super) fn by_age(&self, from: &Provenance, checks: &[&CheckSection]) -> (StepStatus, String) {
         if from.is_by_eye() {
             let told = format!(
                 "It was moved by eye on {} and not measured since, so nothing says how good it is. A check tells.",
                 day(&from.date)
             );
-            return (State::Given, told);
+            return (StepStatus::Given, told);
         }
         if !is_old(days_since(&from.date, self.about.now)) {
-            return (State::Done, String::new());
+            return (StepStatus::Done, String::new());
         }
         let confirms = |check: &&&CheckSection| {
             let date = &check.provenance.date;
@@ -79,9 +79,11 @@ impl FileVerdict<'_> {
                 && !is_old(days_since(date, self.about.now))
         };
         match checks.iter().find(confirms) {
-            Some(check) => (State::Done, format!("A check confirmed it on {}.", day(&check.provenance.date))),
+            Some(check) => {
+                (StepStatus::Done, format!("A check confirmed it on {}.", day(&check.provenance.date)))
+            }
             None => (
-                State::Old,
+                StepStatus::Old,
                 format!("It is older than {OLD_DAYS} days. A check tells whether it still holds."),
             ),
         }

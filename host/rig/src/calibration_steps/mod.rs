@@ -33,7 +33,7 @@ pub fn is_simulated(config: &RigConfig) -> bool {
 /// How it stands with a step.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
 #[serde(rename_all = "lowercase")]
-pub enum State {
+pub enum StepStatus {
     /// It was measured, and nothing speaks against it.
     Done,
     /// The rig file, or somebody's eye, gives what would be measured.
@@ -89,7 +89,7 @@ pub struct Way {
 
 /// A step.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize)]
-pub struct Step {
+pub struct CalibrationStep {
     /// Its name: the command's, with the body's for a step of one body.
     pub id: String,
     /// Its heading.
@@ -99,7 +99,7 @@ pub struct Step {
     /// What must be at hand.
     pub needs: Vec<String>,
     /// How it stands with it.
-    pub state: State,
+    pub state: StepStatus,
     /// Why, one sentence; empty where the state says it all.
     pub told: String,
     /// What was measured, if it was.
@@ -124,7 +124,7 @@ pub struct Steps {
     /// What else to know.
     pub notes: Vec<String>,
     /// In their order.
-    pub steps: Vec<Step>,
+    pub steps: Vec<CalibrationStep>,
     /// The index of the step that should be done next.
     pub next: Option<usize>,
 }
@@ -200,15 +200,15 @@ fn none(config: &RigConfig) -> Option<String> {
 
 /// The step that should be done next: the first that is missing or wrong, or else what is in doubt. Where parts are only
 /// old, a check comes first, since it tells whether they still hold.
-fn next(steps: &[Step]) -> Option<usize> {
-    let first = |is: &dyn Fn(&Step) -> bool| steps.iter().position(is);
-    if steps.iter().all(|s| s.measured.is_none() && s.state != State::Given) {
+fn next(steps: &[CalibrationStep]) -> Option<usize> {
+    let first = |is: &dyn Fn(&CalibrationStep) -> bool| steps.iter().position(is);
+    if steps.iter().all(|s| s.measured.is_none() && s.state != StepStatus::Given) {
         return (!steps.is_empty()).then_some(0);
     }
-    first(&|s| matches!(s.state, State::Missing | State::Wrong))
-        .or_else(|| first(&|s| s.state == State::Doubtful))
-        .or_else(|| first(&|s| s.state == State::Old && s.id.starts_with("check")))
-        .or_else(|| first(&|s| s.state == State::Old))
+    first(&|s| matches!(s.state, StepStatus::Missing | StepStatus::Wrong))
+        .or_else(|| first(&|s| s.state == StepStatus::Doubtful))
+        .or_else(|| first(&|s| s.state == StepStatus::Old && s.id.starts_with("check")))
+        .or_else(|| first(&|s| s.state == StepStatus::Old))
 }
 
 #[cfg(test)]

@@ -12,7 +12,7 @@ use dpm_scene::geometry::projector::ProjectorCamera;
 use glam::{DAffine3, DQuat, DVec3};
 use std::time::{Duration, UNIX_EPOCH};
 
-/// The projector of [`Bench`], as it names itself.
+/// The projector of [`StepsFolder`], as it names itself.
 const PROJECTOR: &str = "projector on /dev/ttyACM1";
 /// Days from 1970 to the tests' now.
 const TODAY: u64 = 21_000;
@@ -26,9 +26,9 @@ fn from(device: &str, days_ago: u64) -> Provenance {
 }
 
 /// A folder with a rig file whose bodies are "venus" and "the hare's", and perhaps its calibration file.
-struct Bench(PathBuf);
+struct StepsFolder(PathBuf);
 
-impl Bench {
+impl StepsFolder {
     fn new(name: &str, measured: Option<&CalibrationFile>) -> Self {
         let dir = std::env::temp_dir().join(format!("dpm-steps-{}-{name}", std::process::id()));
         let _ = std::fs::remove_dir_all(&dir);
@@ -58,7 +58,7 @@ impl Bench {
     }
 }
 
-impl Drop for Bench {
+impl Drop for StepsFolder {
     fn drop(&mut self) {
         let _ = std::fs::remove_dir_all(&self.0);
     }
@@ -115,7 +115,7 @@ fn whole(days_ago: u64) -> CalibrationFile {
     file
 }
 
-fn step<'a>(steps: &'a Steps, id: &str) -> &'a Step {
+fn step<'a>(steps: &'a Steps, id: &str) -> &'a CalibrationStep {
     steps.steps.iter().find(|s| s.id == id).unwrap_or_else(|| panic!("no {id}: {steps:?}"))
 }
 
@@ -125,7 +125,7 @@ fn next(steps: &Steps) -> Option<&str> {
 
 #[test]
 fn a_new_rig_begins_with_the_first_step_and_its_commands_name_it() {
-    let bench = Bench::new("new", None);
+    let bench = StepsFolder::new("new", None);
     let steps = bench.steps(&[], None);
     let ids: Vec<&str> = steps.steps.iter().map(|s| s.id.as_str()).collect();
     let order = "pattern wand projector body:venus body:the hare's light check:venus check:the hare's nudge export latency";
@@ -133,12 +133,12 @@ fn a_new_rig_begins_with_the_first_step_and_its_commands_name_it() {
     assert_eq!(next(&steps), Some("pattern"));
     assert_eq!((&steps.none, &steps.fault, &steps.unnamed), (&None, &None, &None));
     for (id, state) in [
-        ("wand", State::Missing),
-        ("projector", State::Waits),
-        ("body:venus", State::Waits),
-        ("light", State::Optional),
-        ("check:venus", State::Waits),
-        ("latency", State::Waits),
+        ("wand", StepStatus::Missing),
+        ("projector", StepStatus::Waits),
+        ("body:venus", StepStatus::Waits),
+        ("light", StepStatus::Optional),
+        ("check:venus", StepStatus::Waits),
+        ("latency", StepStatus::Waits),
     ] {
         assert_eq!(step(&steps, id).state, state, "{id}");
     }
@@ -153,7 +153,7 @@ fn a_new_rig_begins_with_the_first_step_and_its_commands_name_it() {
 
 #[test]
 fn a_measured_rig_has_no_next_step_and_tells_what_each_part_is_worth() {
-    let bench = Bench::new("whole", Some(&whole(3)));
+    let bench = StepsFolder::new("whole", Some(&whole(3)));
     let steps = bench.steps(&[], None);
     assert_eq!(next(&steps), None, "{steps:?}");
     let projector = step(&steps, "projector").measured.as_ref().unwrap();
@@ -164,7 +164,7 @@ fn a_measured_rig_has_no_next_step_and_tells_what_each_part_is_worth() {
     {
         let step = step(&steps, id);
         assert!(
-            step.state == State::Done && step.measured.as_ref().unwrap().quality.contains(word),
+            step.state == StepStatus::Done && step.measured.as_ref().unwrap().quality.contains(word),
             "{step:?}"
         );
     }
@@ -185,77 +185,77 @@ fn what_was_moved_by_eye_is_never_shown_as_measured() {
     for residual_m in [None, Some(0.0), Some(1e-4)] {
         let body = file.bodies.get_mut("venus").unwrap();
         (body.residual_m, body.provenance) = (residual_m, by_eye.clone());
-        let steps = Bench::new("by-eye", Some(&file)).steps(&[], None);
+        let steps = StepsFolder::new("by-eye", Some(&file)).steps(&[], None);
         let venus = step(&steps, "body:venus");
-        assert_eq!((venus.state, venus.measured.as_ref()), (State::Given, None), "{venus:?}");
+        assert_eq!((venus.state, venus.measured.as_ref()), (StepStatus::Given, None), "{venus:?}");
         assert!(venus.told.contains("by eye") && !venus.told.contains("0.00"), "{venus:?}");
         assert_eq!(step(&steps, "nudge").measured, None);
         // The check is older than the motion.
-        assert_eq!(step(&steps, "check:venus").state, State::Missing);
+        assert_eq!(step(&steps, "check:venus").state, StepStatus::Missing);
     }
     let projector = file.projector.as_mut().unwrap();
     projector.provenance = Provenance { device: PROJECTOR.into(), ..by_eye };
-    let steps = Bench::new("by-eye", Some(&file)).steps(&[], None);
+    let steps = StepsFolder::new("by-eye", Some(&file)).steps(&[], None);
     let projector = step(&steps, "projector");
-    assert_eq!((projector.state, projector.measured.as_ref()), (State::Given, None), "{projector:?}");
+    assert_eq!((projector.state, projector.measured.as_ref()), (StepStatus::Given, None), "{projector:?}");
 }
 
 #[test]
 fn what_is_old_is_checked_before_it_is_measured_again() {
     let mut file = whole(40);
-    let steps = Bench::new("old", Some(&file)).steps(&[], None);
+    let steps = StepsFolder::new("old", Some(&file)).steps(&[], None);
     for id in ["projector", "body:venus", "check:venus", "latency"] {
-        assert_eq!(step(&steps, id).state, State::Old, "{id}");
+        assert_eq!(step(&steps, id).state, StepStatus::Old, "{id}");
     }
     assert_eq!(next(&steps), Some("check:venus"));
     // A check of a body confirms the projector and that body.
     file.checks.get_mut("venus").unwrap().provenance.date = date(1);
-    let steps = Bench::new("checked", Some(&file)).steps(&[], None);
+    let steps = StepsFolder::new("checked", Some(&file)).steps(&[], None);
     for (id, state) in [
-        ("projector", State::Done),
-        ("body:venus", State::Done),
-        ("body:the hare's", State::Old),
-        ("light", State::Old),
+        ("projector", StepStatus::Done),
+        ("body:venus", StepStatus::Done),
+        ("body:the hare's", StepStatus::Old),
+        ("light", StepStatus::Old),
     ] {
         assert_eq!(step(&steps, id).state, state, "{id}");
     }
     assert!(step(&steps, "projector").told.contains("confirmed"));
     assert_eq!(next(&steps), Some("check:the hare's"));
     file.checks.get_mut("the hare's").unwrap().provenance.date = date(1);
-    let steps = Bench::new("confirmed", Some(&file)).steps(&[], None);
-    assert_eq!(step(&steps, "body:the hare's").state, State::Done);
+    let steps = StepsFolder::new("confirmed", Some(&file)).steps(&[], None);
+    assert_eq!(step(&steps, "body:the hare's").state, StepStatus::Done);
 }
 
 #[test]
 fn what_cannot_hold_is_measured_again() {
     let file = whole(3);
-    let bench = Bench::new("other", Some(&file));
+    let bench = StepsFolder::new("other", Some(&file));
     let steps = bench.steps(&["projector.height=640"], None);
     let projector = step(&steps, "projector");
-    assert!(projector.state == State::Wrong && projector.told.contains("1024 x 640"), "{projector:?}");
+    assert!(projector.state == StepStatus::Wrong && projector.told.contains("1024 x 640"), "{projector:?}");
     assert_eq!(next(&steps), Some("projector"));
     // The same shape with other pixels will do.
     let steps = bench.steps(&["projector.width=512", "projector.height=384"], None);
-    assert_eq!(step(&steps, "projector").state, State::Done);
+    assert_eq!(step(&steps, "projector").state, StepStatus::Done);
     let steps = bench.steps(&["projector.backend.port=\"/dev/ttyACM7\""], None);
     let projector = step(&steps, "projector");
-    assert!(projector.state == State::Doubtful && projector.told.contains("ttyACM7"), "{projector:?}");
+    assert!(projector.state == StepStatus::Doubtful && projector.told.contains("ttyACM7"), "{projector:?}");
     assert_eq!(next(&steps), Some("projector"));
     // A check that found too much, and one that is older than what it checked.
     let mut failed = file.clone();
     failed.checks.get_mut("venus").unwrap().largest_px = 2.5;
-    let steps = Bench::new("failed", Some(&failed)).steps(&[], None);
-    assert_eq!((step(&steps, "check:venus").state, next(&steps)), (State::Wrong, Some("check:venus")));
+    let steps = StepsFolder::new("failed", Some(&failed)).steps(&[], None);
+    assert_eq!((step(&steps, "check:venus").state, next(&steps)), (StepStatus::Wrong, Some("check:venus")));
     let mut again = file;
     again.bodies.get_mut("venus").unwrap().provenance.date = date(1);
-    let steps = Bench::new("again", Some(&again)).steps(&[], None);
-    assert_eq!((step(&steps, "check:venus").state, next(&steps)), (State::Missing, Some("check:venus")));
-    assert_eq!(step(&steps, "check:the hare's").state, State::Done);
+    let steps = StepsFolder::new("again", Some(&again)).steps(&[], None);
+    assert_eq!((step(&steps, "check:venus").state, next(&steps)), (StepStatus::Missing, Some("check:venus")));
+    assert_eq!(step(&steps, "check:the hare's").state, StepStatus::Done);
 }
 
 #[test]
 fn the_rig_file_may_give_what_would_be_measured() {
-    let bench = Bench::new("given", None);
+    let bench = StepsFolder::new("given", None);
     let steps = bench.steps(
         &[
             "scene.bodies.0.mesh_to_body.position=[0, 0, 0.1]",
@@ -265,9 +265,9 @@ fn the_rig_file_may_give_what_would_be_measured() {
         None,
     );
     for id in ["body:venus", "light", "latency"] {
-        assert_eq!(step(&steps, id).state, State::Given, "{id}");
+        assert_eq!(step(&steps, id).state, StepStatus::Given, "{id}");
     }
-    assert_eq!(step(&steps, "body:the hare's").state, State::Waits);
+    assert_eq!(step(&steps, "body:the hare's").state, StepStatus::Waits);
     assert_eq!(next(&steps), Some("wand"));
 }
 
@@ -276,7 +276,7 @@ fn what_a_run_does_not_know_and_bodies_without_a_use_are_told() {
     let mut file = whole(3);
     let body = file.bodies["venus"].clone();
     file.bodies.insert("gone".into(), body);
-    let bench = Bench::new("notes", Some(&file));
+    let bench = StepsFolder::new("notes", Some(&file));
     let begin = |days_ago: u64| Some(UNIX_EPOCH + Duration::from_secs(86_400 * (TODAY - days_ago)));
     let notes = bench.steps(&[], begin(1)).notes;
     assert!(notes.len() == 1 && notes[0].contains("\"gone\""), "{notes:?}");
@@ -286,7 +286,7 @@ fn what_a_run_does_not_know_and_bodies_without_a_use_are_told() {
 
 #[test]
 fn a_rig_with_a_mock_has_no_steps_and_a_broken_file_is_named() {
-    let bench = Bench::new("none", None);
+    let bench = StepsFolder::new("none", None);
     let steps = bench.steps(&["projector.backend={kind=\"mock\"}"], None);
     assert!(steps.steps.is_empty() && steps.next.is_none() && steps.none.unwrap().contains("mock"));
     std::fs::write(bench.0.join(USUAL_NAME), "version = 9").unwrap();

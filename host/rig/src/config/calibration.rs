@@ -3,7 +3,7 @@
 use super::check::refuse;
 use super::RigConfig;
 use dpm_calibration_file::{self as file, CalibrationFile};
-use dpm_common::keys::read::{NotEmpty, Reader};
+use dpm_common::keys::read::{KeyReader, NotEmpty};
 use dpm_common::section;
 use std::path::PathBuf;
 
@@ -19,7 +19,7 @@ section! {
 }
 
 /// Refuses a calibration file that cannot be read, and keys that are given twice.
-pub(super) fn check(rig: &RigConfig, reader: &mut Reader) {
+pub(super) fn check(rig: &RigConfig, reader: &mut KeyReader) {
     let Some(path) = &rig.calibration.file else { return };
     let measured = match file::load(path) {
         Ok(measured) => measured,

@@ -3,9 +3,9 @@
 use super::check_projector::projector;
 use super::world::EnvironmentConfig;
 use super::{LiveSource, Pace, PictureSource, Purpose, ResponseConfig, RigConfig, Wearable, WearableConfig};
-use crate::gaze::Aim;
+use crate::gaze::GazeAim;
 use crate::trackers::PoseOrigin;
-use dpm_common::keys::read::Reader;
+use dpm_common::keys::read::KeyReader;
 pub(super) use dpm_common::keys::read::{contradict, refuse, shown};
 use dpm_common::keys::rows::OfKind;
 use dpm_device::regular_file;
@@ -19,7 +19,7 @@ pub(crate) const MAX_TRACKED: usize = 256;
 /// The maximum number of heads that are guarded: each costs every frame a look at all mirrors.
 const MAX_HEADS: usize = 16;
 
-pub(super) fn check(rig: &RigConfig, purpose: Purpose, reader: &mut Reader) {
+pub(super) fn check(rig: &RigConfig, purpose: Purpose, reader: &mut KeyReader) {
     projector(rig, reader);
     bodies(rig, reader);
     render(rig, reader);
@@ -31,7 +31,7 @@ pub(super) fn check(rig: &RigConfig, purpose: Purpose, reader: &mut Reader) {
     super::osc::check(rig, reader);
 }
 
-fn transforms(rig: &RigConfig, reader: &mut Reader) {
+fn transforms(rig: &RigConfig, reader: &mut KeyReader) {
     let mut check = |key: String, is_good: bool, both: bool| {
         if !is_good {
             let problem = "is a quaternion of length zero".to_owned();
@@ -50,7 +50,7 @@ fn transforms(rig: &RigConfig, reader: &mut Reader) {
     }
 }
 
-fn bodies(rig: &RigConfig, reader: &mut Reader) {
+fn bodies(rig: &RigConfig, reader: &mut KeyReader) {
     let bodies = &rig.scene.bodies;
     let (mut names, mut nodes, mut ids) = (HashMap::new(), HashMap::new(), HashMap::new());
     for (i, body) in bodies.iter().enumerate() {
@@ -108,7 +108,7 @@ fn bodies(rig: &RigConfig, reader: &mut Reader) {
 }
 
 /// What the observer and the scene's key name exists, and is given once.
-fn observer(rig: &RigConfig, reader: &mut Reader) {
+fn observer(rig: &RigConfig, reader: &mut KeyReader) {
     let bodies = &rig.scene.bodies;
     let mut must_exist = |key: &str, name: &str, worn: &[&WearableConfig]| {
         let mut known = bodies.iter().map(|b| &b.name).chain(worn.iter().map(|w| &w.name));
@@ -121,7 +121,7 @@ fn observer(rig: &RigConfig, reader: &mut Reader) {
     if let Some(name) = &rig.observer.body {
         must_exist("observer.body", name, &[]);
     }
-    if let Aim::Body(key, name) = rig.observer.gaze.aim() {
+    if let GazeAim::Body(key, name) = rig.observer.gaze.aim() {
         must_exist(key, &name, &rig.worn());
     }
     if rig.scene.file.is_some() && reader.is_written("scene.builtin") {
@@ -134,7 +134,7 @@ fn observer(rig: &RigConfig, reader: &mut Reader) {
     }
     let is_carried = rig.observer.body.is_some() || rig.observer.tracked.is_some();
     rig.observer.gaze.check(reader);
-    if !is_carried && rig.observer.gaze.aim() == Aim::Measured {
+    if !is_carried && rig.observer.gaze.aim() == GazeAim::Measured {
         let problem = format!(
             "{:?} measures in the space of the glasses, and none are tracked",
             rig.observer.gaze.word()
@@ -157,7 +157,7 @@ fn observer(rig: &RigConfig, reader: &mut Reader) {
 }
 
 /// What people wear: the observer, and the heads of `[safety.eyes]`.
-fn worn(rig: &RigConfig, ids: &HashMap<i64, usize>, reader: &mut Reader) {
+fn worn(rig: &RigConfig, ids: &HashMap<i64, usize>, reader: &mut KeyReader) {
     let bodies = &rig.scene.bodies;
     if let (Some(Wearable(tracked)), Some(body)) = (&rig.observer.tracked, &rig.observer.body) {
         let keys =
@@ -221,7 +221,7 @@ fn worn(rig: &RigConfig, ids: &HashMap<i64, usize>, reader: &mut Reader) {
     }
 }
 
-fn render(rig: &RigConfig, reader: &mut Reader) {
+fn render(rig: &RigConfig, reader: &mut KeyReader) {
     let paper = &rig.render.paper;
     let mut ascending = |low: (&str, f64), high: (&str, f64)| {
         if low.1 > high.1 {
@@ -238,7 +238,7 @@ fn render(rig: &RigConfig, reader: &mut Reader) {
     ascending(("filter_from_deg", paper.filter_from_deg), ("filter_to_deg", paper.filter_to_deg));
 }
 
-fn time(rig: &RigConfig, purpose: Purpose, reader: &mut Reader) {
+fn time(rig: &RigConfig, purpose: Purpose, reader: &mut KeyReader) {
     if rig.real_time.pace == Pace::Virtual {
         if !rig.projector.backend.is_mock() {
             refuse(
@@ -256,7 +256,7 @@ fn time(rig: &RigConfig, purpose: Purpose, reader: &mut Reader) {
                 "use real_time.pace = \"real\"".into(),
             );
         }
-        if rig.observer.gaze.aim() == Aim::Measured {
+        if rig.observer.gaze.aim() == GazeAim::Measured {
             refuse(
                 reader,
                 &["observer.gaze.kind", "real_time.pace"],
@@ -284,7 +284,7 @@ fn time(rig: &RigConfig, purpose: Purpose, reader: &mut Reader) {
 
 /// Checks the times in `[safety]` and `[output]` that were written against the frame's and the tracker's. Times that
 /// were not written adapt to these by themselves, so each problem names first the key that was written.
-fn horizon(rig: &RigConfig, reader: &mut Reader) {
+fn horizon(rig: &RigConfig, reader: &mut KeyReader) {
     let (frame_ms, rate) = (rig.frame_ms(), rig.projector.frame_rate.hz());
     // What shows loaded frames has no watchdog.
     let has_watchdog = !rig.projector.backend.kind().is_loaded();
@@ -340,14 +340,14 @@ fn horizon(rig: &RigConfig, reader: &mut Reader) {
 
 /// Makes the path of `key` relative to `base`, the rig file's folder. A path from a flag or a variable is relative to the
 /// working directory.
-fn place(path: &mut PathBuf, base: &Path, reader: &Reader, key: &str) {
+fn place(path: &mut PathBuf, base: &Path, reader: &KeyReader, key: &str) {
     if path.is_relative() && matches!(reader.origin_of(key), super::Origin::File { .. }) {
         *path = base.join(&*path);
     }
 }
 
 /// Makes the paths of input files relative to `base`, the rig file's folder, and refuses missing files.
-pub(super) fn resolve_files(rig: &mut RigConfig, base: &Path, purpose: Purpose, reader: &mut Reader) {
+pub(super) fn resolve_files(rig: &mut RigConfig, base: &Path, purpose: Purpose, reader: &mut KeyReader) {
     for (i, body) in rig.scene.bodies.iter_mut().enumerate() {
         // The pipe may be made later: the rig says that there is none, and goes on.
         if let Some(PictureSource::Live(LiveSource::Pipe(pipe))) = &mut body.texture {

@@ -2,9 +2,9 @@
 
 use super::check::{contradict, refuse, shown};
 use super::{PlaneWeights, ProjectorConfig, ResponseConfig, RigConfig};
-use dpm_common::keys::read::Reader;
+use dpm_common::keys::read::KeyReader;
 
-pub(super) fn projector(rig: &RigConfig, reader: &mut Reader) {
+pub(super) fn projector(rig: &RigConfig, reader: &mut KeyReader) {
     let p = &rig.projector;
     let (num, den) = (u64::from(p.frame_rate.num()), u64::from(p.frame_rate.den()));
     if num * u64::from(p.planes) > u64::from(p.max_planes_per_second) * den {
@@ -75,7 +75,7 @@ pub(super) fn projector(rig: &RigConfig, reader: &mut Reader) {
 }
 
 /// Response and flat field are of the planes with which they were measured.
-fn measured_light(p: &ProjectorConfig, reader: &mut Reader) {
+fn measured_light(p: &ProjectorConfig, reader: &mut KeyReader) {
     let of_response = (p.response != ResponseConfig::default()).then_some("projector.response");
     let keys: Vec<&str> =
         of_response.into_iter().chain(p.flat_field.as_ref().map(|_| "projector.flat_field")).collect();
@@ -105,7 +105,7 @@ fn measured_light(p: &ProjectorConfig, reader: &mut Reader) {
 }
 
 /// The keys that say how to read the calibration file.
-fn calibration(p: &ProjectorConfig, reader: &mut Reader) {
+fn calibration(p: &ProjectorConfig, reader: &mut KeyReader) {
     if p.calibration.is_none() {
         for key in ["calibration_lens", "calibration_region", "calibration_device", "calibration_camera"] {
             let key = format!("projector.{key}");

@@ -22,7 +22,7 @@ mod world;
 #[cfg(test)]
 mod tests;
 
-use crate::gaze::Aim;
+use crate::gaze::GazeAim;
 pub use crate::gaze::GazeConfig;
 pub use crate::projectors::{LitTime, PlaneTiming, PlaneWeights, ProjectorBackend};
 pub use crate::trackers::{PoseConfig, TrackerConfig, TrackerTransformConfig};
@@ -45,7 +45,7 @@ pub use wearable::{Wearable, WearableConfig};
 pub use world::*;
 
 use crate::mock::MotionSpec;
-use dpm_common::keys::read::{Any, ConfigValue, Reader};
+use dpm_common::keys::read::{Any, ConfigValue, KeyReader};
 use dpm_common::keys::rows::Section;
 use dpm_common::keys::source;
 use dpm_common::section;
@@ -112,7 +112,7 @@ impl Overrides {
         Self { variables, flags }
     }
 
-    fn apply(&self, root: &mut source::Node, errors: &mut Vec<ConfigError>) {
+    fn apply(&self, root: &mut source::SourceNode, errors: &mut Vec<ConfigError>) {
         for (name, value) in &self.variables {
             if let Some(path) = source::variable_path(name) {
                 source::set(root, &path, value, &Origin::Variable(name.clone()), errors);
@@ -180,7 +180,7 @@ impl RigConfig {
         if !self.tracker.is_mock() {
             self.tracker = crate::trackers::simulated(self.tracker.rate_hz());
         }
-        if self.observer.gaze.aim() == Aim::Measured {
+        if self.observer.gaze.aim() == GazeAim::Measured {
             self.observer.gaze = crate::gaze::straight();
         }
         if !self.projector.backend.is_mock() {
@@ -346,7 +346,7 @@ impl RigConfig {
         overrides: &Overrides,
         purpose: Purpose,
     ) -> Result<Self, ConfigErrors> {
-        let mut reader = Reader::default();
+        let mut reader = KeyReader::default();
         let mut root = source::parse(name, text, &mut reader.errors);
         if !reader.errors.is_empty() {
             // A half-read file would only add false errors.

@@ -1,7 +1,7 @@
 //! `[osc]`: Open Sound Control, over which other programs take light away, and change parameters if they know the token.
 
 use super::{Origin, RigConfig};
-use dpm_common::keys::read::{Any, NotEmpty, Reader};
+use dpm_common::keys::read::{Any, KeyReader, NotEmpty};
 use dpm_common::section;
 use std::net::{IpAddr, SocketAddr};
 
@@ -41,7 +41,7 @@ impl OscConfig {
 }
 
 /// Checks for contradictions in `[osc]`.
-pub(super) fn check(rig: &RigConfig, reader: &mut Reader) {
+pub(super) fn check(rig: &RigConfig, reader: &mut KeyReader) {
     let mut refuse = |key: &str, problem: &str, remedy: &str| {
         let origin: Origin = reader.origin_of(key);
         reader.refuse(&origin, key, problem.to_owned(), remedy.to_owned());

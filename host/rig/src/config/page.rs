@@ -1,7 +1,7 @@
 //! `[page]`: the live page and the metrics.
 
 use super::{Origin, RigConfig};
-use dpm_common::keys::read::{Any, NotEmpty, Reader};
+use dpm_common::keys::read::{Any, KeyReader, NotEmpty};
 use dpm_common::section;
 use std::net::SocketAddr;
 
@@ -43,7 +43,7 @@ fn is_host(name: &str) -> bool {
 }
 
 /// Checks for contradictions in `[page]`.
-pub(super) fn check(rig: &RigConfig, reader: &mut Reader) {
+pub(super) fn check(rig: &RigConfig, reader: &mut KeyReader) {
     let mut refuse = |key: &str, problem: &str, remedy: &str| {
         let origin: Origin = reader.origin_of(key);
         reader.refuse(&origin, key, problem.to_owned(), remedy.to_owned());

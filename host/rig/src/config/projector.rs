@@ -4,7 +4,7 @@ use super::values::{BitOrder, Each, PerChannel};
 use crate::projectors::{FrameKeys, LitTime, PlaneTiming, PlaneWeights, ProjectorBackend};
 use crate::trackers::PoseConfig;
 use dpm_common::keys::read::{Any, Limit, NotEmpty, Within};
-use dpm_common::keys::Rate;
+use dpm_common::keys::RateBound;
 use dpm_common::{kinds, section, words};
 use dpm_device::planes::{PlaneSchedule, Raster};
 use dpm_device::time::FrameRate;
@@ -21,7 +21,7 @@ section! {
         height: u32 = 768, "px", Within(1, Raster::MAX_SIDE);
         /// Frames per second, as a whole number or as a fraction in a string, for example "60000/1001". Change it to
         /// the rate at which the projector is driven.
-        frame_rate: FrameRate = FrameRate::new(947, 1).expect("not zero"), "frames/s", Within(Rate(1, 1), Rate(100_000, 1));
+        frame_rate: FrameRate = FrameRate::new(947, 1).expect("not zero"), "frames/s", Within(RateBound(1, 1), RateBound(100_000, 1));
         /// Bit planes in a frame: 24 are eight bits of red, green and blue; 8 are eight bits of one white channel,
         /// which shows the green of the picture at three times the frame rate.
         planes: u32 = 24, "", OneOf(&[8, 24]);

@@ -2,7 +2,7 @@
 //! must permit it.
 
 use super::{Origin, PlaneWeights, ProjectorConfig, RigConfig, Wearable};
-use dpm_common::keys::read::{Any, NotEmpty, Reader, Within};
+use dpm_common::keys::read::{Any, KeyReader, NotEmpty, Within};
 use dpm_common::{kinds, section, words};
 use dpm_device::link::{LightLimits, MAX_LIMIT_MS, MIN_LIMIT_MS};
 use dpm_device::tty::ControlSignal;
@@ -206,7 +206,7 @@ impl InterlockSignal {
 }
 
 /// Checks for contradictions in `[safety]` and with other sections.
-pub(super) fn check(rig: &RigConfig, reader: &mut Reader) {
+pub(super) fn check(rig: &RigConfig, reader: &mut KeyReader) {
     let mut refuse = |key: &str, problem: &str, remedy: &str| {
         let origin: Origin = reader.origin_of(key);
         reader.refuse(&origin, key, problem.to_owned(), remedy.to_owned());

@@ -1,7 +1,7 @@
 //! Kinds of values that several sections use: numbers by channel, sources of pictures, and the order of bits.
 
-use dpm_common::keys::read::{ConfigValue, Limit, Reader, Within};
-use dpm_common::keys::source::{Node, Value};
+use dpm_common::keys::read::{ConfigValue, KeyReader, Limit, Within};
+use dpm_common::keys::source::{SourceNode, Value};
 use dpm_device::planes::PlaneSchedule;
 use std::fmt;
 use std::path::PathBuf;
@@ -15,7 +15,7 @@ impl ConfigValue for PerChannel {
         "a number, or an array of 3".into()
     }
 
-    fn read(node: &Node, reader: &mut Reader, key: &str) -> Option<Self> {
+    fn read(node: &SourceNode, reader: &mut KeyReader, key: &str) -> Option<Self> {
         match node.value {
             Value::Array(_) => <[f64; 3]>::read(node, reader, key).map(Self),
             _ => f64::read(node, reader, key).map(|v| Self([v; 3])),
@@ -65,7 +65,7 @@ impl ConfigValue for RenderScale {
         "a number, or \"auto\"".into()
     }
 
-    fn read(node: &Node, reader: &mut Reader, key: &str) -> Option<Self> {
+    fn read(node: &SourceNode, reader: &mut KeyReader, key: &str) -> Option<Self> {
         match &node.value {
             Value::String(word) if word == "auto" => Some(Self::Auto),
             _ => f64::read(node, reader, key).map(Self::Share),
@@ -133,7 +133,7 @@ impl ConfigValue for PictureSource {
         "a path, or `pipe:` and a path, or `pipewire:` and a node".into()
     }
 
-    fn read(node: &Node, reader: &mut Reader, key: &str) -> Option<Self> {
+    fn read(node: &SourceNode, reader: &mut KeyReader, key: &str) -> Option<Self> {
         let path = PathBuf::read(node, reader, key)?;
         let text = path.to_string_lossy();
         let (source, is_sound) = match (text.strip_prefix("pipe:"), text.strip_prefix("pipewire:")) {
@@ -180,7 +180,7 @@ impl ConfigValue for BitOrder {
         "a string of eight bits".into()
     }
 
-    fn read(node: &Node, reader: &mut Reader, key: &str) -> Option<Self> {
+    fn read(node: &SourceNode, reader: &mut KeyReader, key: &str) -> Option<Self> {
         let bits = match &node.value {
             Value::String(text) => text
                 .split([' ', ','])

@@ -1,8 +1,8 @@
 //! What people wear that is tracked, such as glasses: rigid bodies that need neither a node of the scene nor a mesh.
 
 use super::world::MotionValue;
-use dpm_common::keys::read::{Any, ConfigValue, NotEmpty, Reader, Within};
-use dpm_common::keys::source::{Node, Value};
+use dpm_common::keys::read::{Any, ConfigValue, KeyReader, NotEmpty, Within};
+use dpm_common::keys::source::{SourceNode, Value};
 use dpm_common::section;
 
 section! {
@@ -28,7 +28,7 @@ impl ConfigValue for Wearable {
         "a name, or a table with `name`, `id`, `position` and `motion`".into()
     }
 
-    fn read(node: &Node, reader: &mut Reader, key: &str) -> Option<Self> {
+    fn read(node: &SourceNode, reader: &mut KeyReader, key: &str) -> Option<Self> {
         let worn = match &node.value {
             Value::String(name) => WearableConfig { name: name.clone(), ..WearableConfig::default() },
             Value::Table(_) => WearableConfig::read(node, reader, key)?,

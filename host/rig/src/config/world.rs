@@ -5,8 +5,8 @@ use super::wearable::Wearable;
 use crate::gaze::GazeConfig;
 use crate::mock::{Motion, MotionSpec};
 use crate::trackers::PoseConfig;
-use dpm_common::keys::read::{Any, ConfigValue, NotEmpty, Reader, Within};
-use dpm_common::keys::source::Node;
+use dpm_common::keys::read::{Any, ConfigValue, KeyReader, NotEmpty, Within};
+use dpm_common::keys::source::SourceNode;
 use dpm_common::{kinds, section, words};
 use dpm_device::pose::Pose;
 use std::path::PathBuf;
@@ -204,7 +204,7 @@ impl ConfigValue for MotionValue {
         "a table".into()
     }
 
-    fn read(node: &Node, reader: &mut Reader, key: &str) -> Option<Self> {
+    fn read(node: &SourceNode, reader: &mut KeyReader, key: &str) -> Option<Self> {
         let entries = reader.table(node, key)?;
         let Some(toml::Value::Table(table)) = node.to_toml() else {
             reader.refuse(&node.origin, key, "holds a date or an integer beyond 64 bits", "");

@@ -14,7 +14,7 @@ const KEPT_WITHIN: Duration = Duration::from_millis(1000);
 
 /// The last word on an order.
 #[derive(Clone, Debug, PartialEq, Eq)]
-pub struct Answer {
+pub struct OrderOutcome {
     /// The projector has confirmed it, and it is kept over restarts where it should be.
     pub is_done: bool,
     /// One line for the operator.
@@ -28,11 +28,11 @@ pub fn answer_to(
     ago: Duration,
     monitor: &RunMonitor,
     orders: &Orders,
-) -> Option<Answer> {
+) -> Option<OrderOutcome> {
     let health = monitor.projector();
     let is_done = is_obeyed(order, health);
     let kept = orders.outcome(ticket);
-    let failed = |text| Some(Answer { is_done: false, text });
+    let failed = |text| Some(OrderOutcome { is_done: false, text });
     if let (Order::Arm, Some(KeepResult::Not(why))) = (order, &kept) {
         return failed(format!("not armed: the standing order cannot be removed: {why}; projector {health}"));
     }
@@ -59,5 +59,5 @@ pub fn answer_to(
             ))
         }
     };
-    Some(Answer { is_done, text: format!("{done}: projector {health}{on_disk}") })
+    Some(OrderOutcome { is_done, text: format!("{done}: projector {health}{on_disk}") })
 }

@@ -1,7 +1,7 @@
 //! The operator's end of a change: tells a running rig to change its parameters, and reports what it answers.
 
-use super::client::{connect, folders, list, search, Place};
-use crate::parameters::Command;
+use super::client::{connect, folders, list, search, RigSocket};
+use crate::parameters::ParameterCommand;
 use std::io::{self, Read, Write};
 use std::os::unix::net::UnixStream;
 use std::path::PathBuf;
@@ -49,17 +49,17 @@ pub enum ChangeError {
 ///
 /// # Errors
 /// See [`ChangeError`].
-pub fn change(pid: Option<u32>, command: &Command) -> Result<String, ChangeError> {
+pub fn change(pid: Option<u32>, command: &ParameterCommand) -> Result<String, ChangeError> {
     change_in(&folders(), pid, command)
 }
 
 pub(super) fn change_in(
     folders: &[PathBuf],
     pid: Option<u32>,
-    command: &Command,
+    command: &ParameterCommand,
 ) -> Result<String, ChangeError> {
     let found = search(folders);
-    let rigs: Vec<Place> =
+    let rigs: Vec<RigSocket> =
         found.rigs.into_iter().filter(|place| pid.is_none_or(|pid| pid == place.pid)).collect();
     // What a killed process has left is no rig.
     let mut open: Vec<_> = rigs.iter().filter_map(|place| Some((place, connect(place).ok()?.0))).collect();
@@ -72,7 +72,7 @@ pub(super) fn change_in(
     let pid = place.pid;
     let text = ask(stream, command).map_err(|source| ChangeError::Io { pid, source })?;
     let text = text.trim_end().to_owned();
-    if text.starts_with("ok: ") || *command == Command::List && !text.starts_with("refused") {
+    if text.starts_with("ok: ") || *command == ParameterCommand::List && !text.starts_with("refused") {
         Ok(text)
     } else if text.starts_with("refused: ") {
         Err(ChangeError::Refused(text))
@@ -84,7 +84,7 @@ pub(super) fn change_in(
     }
 }
 
-fn ask(mut stream: UnixStream, command: &Command) -> io::Result<String> {
+fn ask(mut stream: UnixStream, command: &ParameterCommand) -> io::Result<String> {
     stream.set_read_timeout(Some(STEP))?;
     stream.set_write_timeout(Some(STEP))?;
     stream.write_all(format!("{}\n", command.line()).as_bytes())?;

@@ -6,7 +6,7 @@ use crate::order::Order;
 use crate::standing::state_folder;
 use crossbeam::channel::unbounded;
 use dpm_common::folder::{Folder, FolderError, Owner};
-use dpm_common::unix::{monotonic_ns, peer, send_signal, user, user_name, Peer};
+use dpm_common::unix::{monotonic_ns, peer, send_signal, user, user_name, SocketPeer};
 use std::collections::BTreeSet;
 use std::fs;
 use std::io::{self, Read, Write};
@@ -29,7 +29,7 @@ const MAX_RIGS: usize = 256;
 
 /// A rig that listens, identified by its socket.
 #[derive(Clone, Debug)]
-pub(crate) struct Place {
+pub(crate) struct RigSocket {
     folder: Arc<Folder>,
     /// Its process.
     pub pid: u32,
@@ -42,9 +42,9 @@ pub(crate) struct Place {
 
 /// Result of a search for running rigs.
 #[derive(Debug, Default)]
-pub(crate) struct Search {
+pub(crate) struct RigSearch {
     /// Rigs that this user may give orders to.
-    pub rigs: Vec<Place>,
+    pub rigs: Vec<RigSocket>,
     /// Rigs and folders that it may not use, with the reason.
     pub refused: Vec<String>,
     /// Folders of other users, into which this one cannot look.
@@ -92,7 +92,7 @@ fn advice(order: Order) -> String {
 
 /// A rig's answer.
 #[derive(Clone, Debug, PartialEq, Eq)]
-pub struct Answer {
+pub struct RigAnswer {
     /// Its process.
     pub pid: u32,
     /// Its user.
@@ -129,8 +129,8 @@ pub(super) fn folders() -> Vec<PathBuf> {
 }
 
 /// Searches `folders` for rigs.
-pub(super) fn search(folders: &[PathBuf]) -> Search {
-    let mut found = Search::default();
+pub(super) fn search(folders: &[PathBuf]) -> RigSearch {
+    let mut found = RigSearch::default();
     for path in folders {
         let folder = match Folder::open(path, Owner::OwnOrAnyForRoot) {
             Ok(folder) => Arc::new(folder),
@@ -162,7 +162,7 @@ pub(super) fn search(folders: &[PathBuf]) -> Search {
             .into_iter()
             .filter_map(|name| pid_of(&name))
             .collect::<BTreeSet<_>>();
-        found.rigs.extend(pids.into_iter().map(|pid| Place {
+        found.rigs.extend(pids.into_iter().map(|pid| RigSocket {
             folder: folder.clone(),
             pid,
             uid: folder.owner(),
@@ -203,7 +203,7 @@ fn foreign(path: &Path, why: &FolderError) -> Option<String> {
 #[derive(Debug)]
 pub struct OrderResult {
     /// Answers of all rigs that were reached.
-    pub answers: Vec<Answer>,
+    pub answers: Vec<RigAnswer>,
     /// Rigs that were not reached.
     pub refused: Vec<String>,
     /// Folders of other users, into which this one cannot look.
@@ -231,8 +231,8 @@ pub(super) fn tell_in(
     pid: Option<u32>,
     order: Order,
 ) -> Result<OrderResult, ControlError> {
-    let Search { rigs, refused, closed, looked } = search(folders);
-    let mut rigs: Vec<Place> =
+    let RigSearch { rigs, refused, closed, looked } = search(folders);
+    let mut rigs: Vec<RigSocket> =
         rigs.into_iter().filter(|place| pid.is_none_or(|pid| pid == place.pid)).collect();
     let none = || ControlError::NoRig { order, looked: looked.clone() };
     if !order.is_dark() && pid.is_none() {
@@ -257,18 +257,18 @@ pub(super) fn tell_in(
     }
     drop(sender);
     let end = Instant::now() + ANSWERED_WITHIN + Duration::from_millis(200);
-    let mut told: Vec<Option<Option<Answer>>> = vec![None; asked];
+    let mut told: Vec<Option<Option<RigAnswer>>> = vec![None; asked];
     while let Ok((n, answer)) = answers.recv_timeout(end.saturating_duration_since(Instant::now())) {
         told[n] = Some(answer);
     }
-    let answers: Vec<Answer> = rigs
+    let answers: Vec<RigAnswer> = rigs
         .iter()
         .zip(told)
         .filter_map(|(place, answer)| {
             answer.unwrap_or_else(|| {
                 // Its socket accepts no connection. A signal cannot be sent either, because the kernel confirms no
                 // process.
-                Some(Answer {
+                Some(RigAnswer {
                     pid: place.pid,
                     uid: place.uid,
                     rig: String::new(),
@@ -298,7 +298,7 @@ fn by_hand(order: Order, pid: u32) -> String {
 }
 
 /// Connects, and asks the kernel which process listens there.
-pub(super) fn connect(place: &Place) -> io::Result<(UnixStream, Peer)> {
+pub(super) fn connect(place: &RigSocket) -> io::Result<(UnixStream, SocketPeer)> {
     let name = socket_name(place.pid);
     let stream = UnixStream::connect(place.folder.path_to(&name)).inspect_err(|e| {
         if e.kind() == io::ErrorKind::ConnectionRefused {
@@ -313,7 +313,7 @@ pub(super) fn connect(place: &Place) -> io::Result<(UnixStream, Peer)> {
 }
 
 /// Anyone who can write to a folder could listen in it, so only the folder's owner is trusted.
-fn check_listener(listener: Peer, place: &Place) -> io::Result<()> {
+fn check_listener(listener: SocketPeer, place: &RigSocket) -> io::Result<()> {
     if listener.uid == place.uid {
         return Ok(());
     }
@@ -337,9 +337,16 @@ fn signal_of(order: Order) -> Option<i32> {
 }
 
 /// The answer of one rig; `None` if there is no rig.
-fn ask(place: &Place, order: Order) -> Option<Answer> {
+fn ask(place: &RigSocket, order: Order) -> Option<RigAnswer> {
     let answer = |rig: String, text: String, done: bool| {
-        Some(Answer { pid: place.pid, uid: place.uid, rig, text, done, is_vouched_for: place.is_vouched_for })
+        Some(RigAnswer {
+            pid: place.pid,
+            uid: place.uid,
+            rig,
+            text,
+            done,
+            is_vouched_for: place.is_vouched_for,
+        })
     };
     let (begin, begin_ns) = (Instant::now(), monotonic_ns());
     let (mut stream, listener) = match connect(place) {

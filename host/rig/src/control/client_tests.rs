@@ -49,12 +49,12 @@ fn with_several_rigs_only_the_dark_is_for_all_and_dead_sockets_go() {
 fn r8_only_the_folders_own_user_is_believed() {
     let dir = place("impostor");
     let folder = Arc::new(Folder::open(&dir, Owner::Own).unwrap());
-    let own = Place { folder, pid: 4242, uid: user(), is_vouched_for: true };
-    check_listener(Peer { pid: 4242, uid: user() }, &own).unwrap();
-    let told = check_listener(Peer { pid: 4242, uid: user() + 1 }, &own).unwrap_err().to_string();
+    let own = RigSocket { folder, pid: 4242, uid: user(), is_vouched_for: true };
+    check_listener(SocketPeer { pid: 4242, uid: user() }, &own).unwrap();
+    let told = check_listener(SocketPeer { pid: 4242, uid: user() + 1 }, &own).unwrap_err().to_string();
     assert!(told.contains("in a folder of") && told.contains("is served by process 4242"), "{told}");
     // The answer of another user's process proves nothing, whatever it says.
-    let answer = Answer {
+    let answer = RigAnswer {
         pid: 1,
         uid: user() + 1,
         rig: String::new(),
@@ -62,11 +62,11 @@ fn r8_only_the_folders_own_user_is_believed() {
         done: true,
         is_vouched_for: false,
     };
-    let told = |answers: Vec<Answer>| OrderResult { answers, refused: vec![], closed: vec![] };
+    let told = |answers: Vec<RigAnswer>| OrderResult { answers, refused: vec![], closed: vec![] };
     assert!(!told(vec![]).is_done() && !told(vec![answer.clone()]).is_done());
-    let mine = Answer { is_vouched_for: true, ..answer.clone() };
+    let mine = RigAnswer { is_vouched_for: true, ..answer.clone() };
     assert!(told(vec![answer.clone(), mine.clone()]).is_done());
-    assert!(!told(vec![Answer { done: false, ..answer }, mine]).is_done());
+    assert!(!told(vec![RigAnswer { done: false, ..answer }, mine]).is_done());
     fs::remove_dir_all(dir).unwrap();
 }
 

@@ -19,7 +19,7 @@ pub mod server;
 pub mod status_file;
 
 use crate::order::Order;
-use crate::parameters::command::{Command, MAX_LINE};
+use crate::parameters::command::{ParameterCommand, MAX_LINE};
 use crate::telemetry::monitor::ProjectorHealth;
 use dpm_common::folder::{Folder, FolderError, Owner};
 use dpm_common::unix::user;
@@ -39,7 +39,7 @@ pub enum ClientRequest {
     /// An order.
     Order(Order),
     /// A look at the parameters, or a change of them.
-    Parameters(Command),
+    Parameters(ParameterCommand),
 }
 
 static RIG: OnceLock<String> = OnceLock::new();

@@ -75,7 +75,7 @@ impl OrderOnItsWay {
 /// Decides what becomes of orders: which one stands, which is written next, and when ARM reaches the light. It has no
 /// thread and no file.
 #[derive(Debug)]
-pub(crate) struct Desk {
+pub(crate) struct OrderDesk {
     monitor: Arc<RunMonitor>,
     /// Number of the newest order.
     newest: u64,
@@ -88,7 +88,7 @@ pub(crate) struct Desk {
     stands: Option<Order>,
 }
 
-impl Desk {
+impl OrderDesk {
     /// For a run that begins while `stands` stands in `path`. The light receives that order before this returns, so
     /// that the link comes up dark.
     pub(crate) fn new(monitor: Arc<RunMonitor>, stands: Option<&Stands>, path: PathBuf) -> Self {
@@ -160,7 +160,7 @@ impl Desk {
         }
     }
 
-    /// The next order to be written; pass the result to [`Desk::settle`].
+    /// The next order to be written; pass the result to [`OrderDesk::settle`].
     pub(crate) fn next(&mut self) -> Option<OrderOnItsWay> {
         self.absorb();
         let given = self.waiting.take()?;
@@ -215,26 +215,26 @@ impl Desk {
 }
 
 #[derive(Debug)]
-struct State {
-    desk: Desk,
+struct OrderState {
+    desk: OrderDesk,
     /// The thread must end.
     closing: bool,
     closed: bool,
 }
 
 #[derive(Debug)]
-struct Inner {
+struct OrderShare {
     file: OrderFile,
     /// The folder is writable.
     keeps: bool,
-    state: Mutex<State>,
+    state: Mutex<OrderState>,
     changed: Condvar,
 }
 
 /// See the module's documentation. If it is dropped without [`Orders::end`], the standing order remains.
 #[derive(Debug)]
 pub struct Orders {
-    inner: Arc<Inner>,
+    inner: Arc<OrderShare>,
     thread: Option<JoinHandle<()>>,
 }
 
@@ -251,9 +251,9 @@ impl Orders {
         stands: Option<&Stands>,
     ) -> std::io::Result<Self> {
         monitor.hold_devices(file.by_serial_number());
-        let desk = Desk::new(monitor, stands, file.path());
-        let state = Mutex::new(State { desk, closing: false, closed: false });
-        let inner = Arc::new(Inner { file, keeps, state, changed: Condvar::new() });
+        let desk = OrderDesk::new(monitor, stands, file.path());
+        let state = Mutex::new(OrderState { desk, closing: false, closed: false });
+        let inner = Arc::new(OrderShare { file, keeps, state, changed: Condvar::new() });
         let thread = std::thread::Builder::new().name("dpm-orders".into()).spawn({
             let inner = inner.clone();
             move || inner.write_down()
@@ -308,8 +308,8 @@ impl Drop for Orders {
     }
 }
 
-impl Inner {
-    fn state(&self) -> MutexGuard<'_, State> {
+impl OrderShare {
+    fn state(&self) -> MutexGuard<'_, OrderState> {
         // Nothing panics while it holds this lock; and even then an order must get through.
         self.state.lock().unwrap_or_else(PoisonError::into_inner)
     }
@@ -346,13 +346,13 @@ mod tests {
     use std::sync::atomic::{AtomicBool, Ordering};
     use std::time::Instant;
 
-    struct Rig {
+    struct OrderedRig {
         dir: PathBuf,
         identity: Identity,
         monitor: Arc<RunMonitor>,
     }
 
-    impl Rig {
+    impl OrderedRig {
         fn new(name: &str) -> Self {
             Self::with(name, &backend("mock").unwrap())
         }
@@ -379,7 +379,7 @@ mod tests {
         }
     }
 
-    impl Drop for Rig {
+    impl Drop for OrderedRig {
         fn drop(&mut self) {
             let _ = std::fs::remove_dir_all(&self.dir);
         }
@@ -399,7 +399,7 @@ mod tests {
     /// Found in use, R4.
     #[test]
     fn r4_the_light_hears_first_and_arm_comes_after_the_disk_has_forgotten() {
-        let rig = Rig::new("first");
+        let rig = OrderedRig::new("first");
         let orders = rig.start();
         assert_eq!(rig.monitor.take_order(), None);
         let ticket = orders.give(Order::Safe, By::Key);
@@ -422,7 +422,7 @@ mod tests {
     #[test]
     fn r3_no_end_lifts_an_order_but_that_of_a_mock_and_then_only_what_is_no_safe() {
         let real = backend("usb").unwrap();
-        let [mut mock, mut real] = [Rig::new("end"), Rig::with("end-real", &real)];
+        let [mut mock, mut real] = [OrderedRig::new("end"), OrderedRig::with("end-real", &real)];
         let (black, safe) = (Some(Order::Black), Some(Order::Safe));
         // What is left of a mock's order and of a real projector's.
         for (order, orderly, of_mock, of_real) in [
@@ -452,7 +452,7 @@ mod tests {
 
     #[test]
     fn a_start_by_hand_is_dark_until_somebody_arms_and_so_is_the_next() {
-        let mut rig = Rig::new("by-hand");
+        let mut rig = OrderedRig::new("by-hand");
         for _ in 0..2 {
             rig.monitor = Arc::default();
             let orders = rig.start_by(Restart::ByHand);
@@ -472,9 +472,9 @@ mod tests {
         assert_eq!(rig.on_disk(), Some(Order::Black));
     }
 
-    struct Switch(Arc<AtomicBool>);
+    struct ContactFlag(Arc<AtomicBool>);
 
-    impl Contact for Switch {
+    impl Contact for ContactFlag {
         fn is_closed(&mut self) -> bool {
             self.0.load(Ordering::Relaxed)
         }
@@ -483,9 +483,9 @@ mod tests {
     /// An interlock that is reset by hand and has opened: dark after it has closed, and in the next run.
     #[test]
     fn an_interlock_that_is_reset_by_hand_waits_for_arm_over_restarts() {
-        let rig = Rig::with("reset", &backend("usb").unwrap());
+        let rig = OrderedRig::with("reset", &backend("usb").unwrap());
         let contact = Arc::new(AtomicBool::new(true));
-        let interlock = Interlock::with_contact("a switch", Switch(contact.clone())).unwrap();
+        let interlock = Interlock::with_contact("a switch", ContactFlag(contact.clone())).unwrap();
         rig.monitor.set_interlock(interlock.reset_by(Restart::ByHand));
         let orders = rig.start();
         let until = |what: &str, done: &dyn Fn() -> bool| {
@@ -517,7 +517,7 @@ mod tests {
 
     #[test]
     fn a_dark_order_that_follows_an_arm_at_once_wins() {
-        let rig = Rig::new("race");
+        let rig = OrderedRig::new("race");
         let orders = rig.start();
         for _ in 0..50 {
             orders.give(Order::Safe, By::Key);
@@ -533,7 +533,7 @@ mod tests {
 
     #[test]
     fn an_order_that_cannot_be_kept_is_obeyed_and_an_arm_that_cannot_forget_is_not() {
-        let rig = Rig::new("broken");
+        let rig = OrderedRig::new("broken");
         let orders = rig.start();
         let ticket = orders.give(Order::Safe, By::Key);
         settled(&orders, ticket);

@@ -1,9 +1,9 @@
 //! Commands about the parameters, from whichever side they come: what becomes of each, and when it is answered: when
 //! planning uses the change, or the disk has it.
 
-use super::answer::Answer;
+use super::answer::OrderOutcome;
 use crate::parameters::desk::{AllShown, ParameterDesk, ParameterView, ToKeep};
-use crate::parameters::{told_of, ChangeRefusal, Command};
+use crate::parameters::{told_of, ChangeRefusal, ParameterCommand};
 use crate::telemetry::monitor::RunMonitor;
 use dpm_common::unix::monotonic_ns;
 use std::sync::{Arc, OnceLock};
@@ -39,8 +39,8 @@ pub struct Saving(Writing);
 
 impl ChangeResult {
     /// The answer to a request that was made `ago`; `None` while a better one is possible.
-    pub fn answer(&self, ago: Duration, desk: &ParameterDesk) -> Option<Answer> {
-        let answer = |is_done, text| Some(Answer { is_done, text });
+    pub fn answer(&self, ago: Duration, desk: &ParameterDesk) -> Option<OrderOutcome> {
+        let answer = |is_done, text| Some(OrderOutcome { is_done, text });
         match self {
             Self::Told(text) => answer(true, text.clone()),
             Self::Changed { version, told } => match desk.used_since(*version) {
@@ -62,23 +62,27 @@ impl ChangeResult {
 ///
 /// # Errors
 /// The command was refused, and nothing has changed.
-pub fn give(monitor: &Arc<RunMonitor>, command: &Command, by: &str) -> Result<ChangeResult, ChangeRefusal> {
+pub fn give(
+    monitor: &Arc<RunMonitor>,
+    command: &ParameterCommand,
+    by: &str,
+) -> Result<ChangeResult, ChangeRefusal> {
     let desk = monitor.parameters();
     match command {
-        Command::Set { name, numbers } => {
+        ParameterCommand::Set { name, numbers } => {
             let (version, told, is_step) = desk.set(name, numbers, monotonic_ns())?;
             if is_step {
                 monitor.note(format!("{by}: {told}"));
             }
             Ok(ChangeResult::Changed { version, told })
         }
-        Command::Undo => {
+        ParameterCommand::Undo => {
             let (version, told) = desk.undo()?;
             monitor.note(format!("{by}: undo: {told}"));
             Ok(ChangeResult::Changed { version, told })
         }
-        Command::Save => save(monitor, by),
-        Command::List => {
+        ParameterCommand::Save => save(monitor, by),
+        ParameterCommand::List => {
             let shown = desk.shown().ok_or(ChangeRefusal::NoRun)?;
             Ok(ChangeResult::Told(list(&shown)))
         }

@@ -5,7 +5,7 @@ use super::orders::{Orders, Ticket};
 use super::parameters::{self, ChangeResult};
 use super::{rig_name, socket_name, ClientRequest, HEARD, MAX_WORD};
 use crate::order::Order;
-use crate::parameters::Command;
+use crate::parameters::ParameterCommand;
 use crate::standing::By;
 use crate::telemetry::monitor::RunMonitor;
 use dpm_common::folder::{Folder, FolderError};
@@ -58,7 +58,8 @@ impl ControlSocket {
         std::fs::set_permissions(&path, std::fs::Permissions::from_mode(0o600)).map_err(failed)?;
         listener.set_nonblocking(true).map_err(failed)?;
         let stop = Arc::new(AtomicBool::new(false));
-        let mut desk = Desk { listener, monitor, orders, clients: VecDeque::new(), stop: stop.clone() };
+        let mut desk =
+            ControlDesk { listener, monitor, orders, clients: VecDeque::new(), stop: stop.clone() };
         let thread = std::thread::Builder::new()
             .name("dpm-control".into())
             .spawn(move || desk.run())
@@ -100,7 +101,7 @@ enum PendingAnswer {
     Change(ChangeResult),
 }
 
-struct Desk {
+struct ControlDesk {
     listener: UnixListener,
     monitor: Arc<RunMonitor>,
     orders: Arc<Orders>,
@@ -109,7 +110,7 @@ struct Desk {
     stop: Arc<AtomicBool>,
 }
 
-impl Desk {
+impl ControlDesk {
     fn run(&mut self) {
         let mut ready = Vec::new();
         while !self.stop.load(Ordering::Relaxed) {
@@ -228,7 +229,7 @@ impl Client {
     }
 
     /// Gives a command about the parameters. False if it was refused, of which the client is told.
-    fn change(&mut self, command: &Command, monitor: &Arc<RunMonitor>) -> bool {
+    fn change(&mut self, command: &ParameterCommand, monitor: &Arc<RunMonitor>) -> bool {
         match parameters::give(monitor, command, &format!("user {}", user_name(self.uid))) {
             Ok(sent) => {
                 self.given = Some(PendingAnswer::Change(sent));
@@ -264,7 +265,7 @@ pub fn read_word(stream: &mut (impl Read + Write), word: &mut Vec<u8>) -> io::Re
     if let Some(order) = Order::from_word(text) {
         return Ok(Some(ClientRequest::Order(order)));
     }
-    let told = match Command::parse(text) {
+    let told = match ParameterCommand::parse(text) {
         Ok(Some(command)) => return Ok(Some(ClientRequest::Parameters(command))),
         Ok(None) => {
             let known: Vec<_> = Order::ALL.iter().map(|(_, word)| *word).collect();

@@ -30,7 +30,7 @@ fn link(monitor: &Arc<RunMonitor>, stop: &Arc<AtomicBool>) -> JoinHandle<()> {
 }
 
 /// A rig that listens, and a thread that obeys.
-struct Rig {
+struct ListeningRig {
     dir: PathBuf,
     monitor: Arc<RunMonitor>,
     socket: Option<ControlSocket>,
@@ -38,7 +38,7 @@ struct Rig {
     thread: Option<JoinHandle<()>>,
 }
 
-impl Rig {
+impl ListeningRig {
     fn new(name: &str) -> Self {
         let dir = std::env::temp_dir().join(format!("dpm-control-{}-{name}", std::process::id()));
         let _ = std::fs::remove_dir_all(&dir);
@@ -71,7 +71,7 @@ impl Rig {
     }
 }
 
-impl Drop for Rig {
+impl Drop for ListeningRig {
     fn drop(&mut self) {
         self.stop_link();
         self.socket = None;
@@ -81,9 +81,10 @@ impl Drop for Rig {
 
 #[test]
 fn parameters_are_shown_changed_and_refused_over_the_socket() {
-    let rig = Rig::new("parameters");
+    let rig = ListeningRig::new("parameters");
     let folders = [rig.dir.join("run")];
-    let ask = |line: &str| change::change_in(&folders, None, &Command::parse(line).unwrap().unwrap());
+    let ask =
+        |line: &str| change::change_in(&folders, None, &ParameterCommand::parse(line).unwrap().unwrap());
     assert!(matches!(ask("list"), Err(ChangeError::Refused(told)) if told.contains("no parameters")));
     let config = RigConfig::demo(&Overrides::default()).unwrap();
     let scene = Arc::new(crate::rig::Rig::build(&config, Raster::new(8, 8)).unwrap());
@@ -103,13 +104,13 @@ fn parameters_are_shown_changed_and_refused_over_the_socket() {
     // No order was given by all this, and one still arrives.
     assert_eq!(rig.monitor.projector(), ProjectorHealth::Connecting);
     assert!(rig.tell(Order::Black).unwrap().is_done());
-    let nobody = change::change_in(&folders, Some(1), &Command::List);
+    let nobody = change::change_in(&folders, Some(1), &ParameterCommand::List);
     assert!(matches!(nobody, Err(ChangeError::NoRig { .. })));
 }
 
 #[test]
 fn every_order_is_obeyed_and_bad_clients_cost_nothing() {
-    let mut rig = Rig::new("orders");
+    let mut rig = ListeningRig::new("orders");
     assert_eq!(std::fs::metadata(rig.socket()).unwrap().permissions().mode() & 0o777, 0o600);
     // One client is silent, one never ends its line, and one sends nonsense.
     let mut silent = UnixStream::connect(rig.socket()).unwrap();
@@ -152,7 +153,7 @@ fn every_order_is_obeyed_and_bad_clients_cost_nothing() {
 /// Found in use, R9: a thousand silent clients blocked `dpm safe` forever.
 /// Orders among a thousand clients that say nothing; each takes `limit` at most.
 fn silent_clients(limit: Duration) {
-    let rig = Rig::new("flood");
+    let rig = ListeningRig::new("flood");
     let mut flood = Vec::new();
     for _ in 0..500 {
         // There may be too few descriptors for this process, which holds both ends.

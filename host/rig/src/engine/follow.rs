@@ -1,7 +1,7 @@
 //! Tracks: tells a projector that can move parts of a frame where its bodies are by what the tracker has said since the
 //! frame was planned (docs/PROTOCOL.md, section 14).
 //!
-//! The link's part polls [`Follower::poll`]. It reads the newest tracks, which another thread publishes, and never waits;
+//! The link's part polls [`PlaneFollower::poll`]. It reads the newest tracks, which another thread publishes, and never waits;
 //! nothing is allocated after the start.
 
 use crate::pack::eye_mask::TILE;
@@ -162,7 +162,7 @@ impl FrameAim {
 }
 
 /// See the module's documentation.
-pub(crate) struct Follower {
+pub(crate) struct PlaneFollower {
     raster: Raster,
     shapes: Vec<Option<Shape>>,
     light_delay_ns: i64,
@@ -174,7 +174,7 @@ pub(crate) struct Follower {
     regions: [(f64, Region); MAX_REGIONS],
 }
 
-impl Follower {
+impl PlaneFollower {
     /// Follows the bodies of `rig` by the tracks that arrive at `newest`.
     pub(crate) fn new(rig: &Arc<Rig>, newest: Reader<TrackSnapshot>) -> Self {
         Self {
@@ -227,8 +227,11 @@ impl Follower {
                 // After an order to go dark the last frame that was sent is an old one.
                 continue;
             }
-            let scene =
-                Scene { raster: self.raster, shapes: &self.shapes, light_delay_ns: self.light_delay_ns };
+            let scene = FollowedScene {
+                raster: self.raster,
+                shapes: &self.shapes,
+                light_delay_ns: self.light_delay_ns,
+            };
             let tracks = scene.tracks(drawn, snapshot, now, time, most.min(CLAMP), &mut self.regions);
             // What does not get through now is followed by newer tracks.
             let _ = link.send_tracks(now, &tracks, transport);
@@ -237,13 +240,13 @@ impl Follower {
 }
 
 /// What tracks are made of beside the frame and the newest samples.
-struct Scene<'a> {
+struct FollowedScene<'a> {
     raster: Raster,
     shapes: &'a [Option<Shape>],
     light_delay_ns: i64,
 }
 
-impl Scene<'_> {
+impl FollowedScene<'_> {
     /// The tracks of a frame at `now`, with a region for each body on which light falls.
     fn tracks(
         &self,

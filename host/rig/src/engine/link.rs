@@ -2,14 +2,14 @@
 
 use super::cadence::Cadence;
 use super::facts::{Facts, RECEIPT_NS};
-use super::follow::Follower;
+use super::follow::PlaneFollower;
 use super::genlock;
 use super::keeper::{is_dark, LinkKeeper};
 use super::pace::Pace;
 use super::pack::is_overtaken;
 use super::queue::{FrameNeed, QueueWatch, StandingWait};
 use super::reported_light::has_light;
-use super::slack::{SentFrame, SlackMeter};
+use super::slack::{SlackFrame, SlackMeter};
 use crate::frame::job::{Fate, FrameNote};
 use crate::plan::lead::LeadEstimator;
 use crate::telemetry::projector::ProjectorReport;
@@ -78,7 +78,7 @@ pub(crate) struct LinkStage<P> {
     /// Sessions of the link, and steps of the projector's clock, so far.
     seen: [u64; 2],
     /// `None` if no tracks are sent.
-    follower: Option<Follower>,
+    follower: Option<PlaneFollower>,
     slot_ns: i64,
     /// When the frame being offered was ready; `None` between frames.
     ready_at: Option<HostTime>,
@@ -142,12 +142,12 @@ impl<P: Pace> LinkStage<P> {
 
     /// From now on the projector is told of the bodies between frames, if it follows tracks, by what arrives at `newest`.
     pub(crate) fn follow_by(&mut self, newest: Reader<TrackSnapshot>) {
-        self.follower = Some(Follower::new(&self.facts.rig, newest));
+        self.follower = Some(PlaneFollower::new(&self.facts.rig, newest));
     }
 
     /// When the next tracks are due; `None` if none are sent.
     pub(crate) fn tracks_due_at(&self) -> Option<HostTime> {
-        self.follower.as_ref().filter(|_| self.link.greatest_shift().is_some()).map(Follower::due_at)
+        self.follower.as_ref().filter(|_| self.link.greatest_shift().is_some()).map(PlaneFollower::due_at)
     }
 
     /// True while frames can be sent.
@@ -295,7 +295,7 @@ impl<P: Pace> LinkStage<P> {
         self.learn_cadence(&note.fate, now);
         let Some([waited_ns, behind_ns]) = self.waits_ns.take() else { return };
         if self.link.measures_timing() && note.is_sent() {
-            self.slack.sent(SentFrame {
+            self.slack.sent(SlackFrame {
                 frame: note.plan.id.0 as u32,
                 latch_due_at: note.latch_due_at,
                 due_at: note.timeline.due_at,

@@ -14,7 +14,7 @@ const SHOWN: usize = REMEMBERED;
 
 /// What a frame that was sent shows.
 #[derive(Clone, Copy, Debug)]
-struct Content {
+struct SentContent {
     /// Low 32 bits of its number.
     frame: u32,
     /// At least one mirror is lit in one of its planes.
@@ -26,7 +26,7 @@ struct Content {
 /// Reads the reports of the projector, one session after the other. Its memory is taken at the start.
 #[derive(Debug)]
 pub(crate) struct ReportedLight {
-    sent: [Option<Content>; SHOWN + 1],
+    sent: [Option<SentContent>; SHOWN + 1],
     next: usize,
     /// Per remembered frame and tracked body: why it is dark.
     dark: Vec<Option<DarkCause>>,
@@ -64,7 +64,7 @@ impl ReportedLight {
         let place = self.next;
         self.next = (self.next + 1) % REMEMBERED;
         self.sent[place] =
-            Some(Content { frame: plan.id.0 as u32, has_light, head_lost: plan.eyes.lost.is_some() });
+            Some(SentContent { frame: plan.id.0 as u32, has_light, head_lost: plan.eyes.lost.is_some() });
         self.sent_at = now;
         let bodies = self.body_lit_at.len();
         let dark = self.dark[place * bodies..].iter_mut();
@@ -112,7 +112,7 @@ impl ReportedLight {
             return;
         }
         let bodies = self.body_lit_at.len();
-        let is_it = |sent: &Option<Content>| sent.is_some_and(|s| s.frame == status.last_lit_frame);
+        let is_it = |sent: &Option<SentContent>| sent.is_some_and(|s| s.frame == status.last_lit_frame);
         if !is_it(&self.sent[SHOWN]) {
             let place = self.sent.iter().position(is_it);
             self.sent[SHOWN] = place.and_then(|place| self.sent[place]);
@@ -158,19 +158,19 @@ mod tests {
 
     const MS: i64 = 1_000_000;
 
-    struct Bench {
+    struct LightBench {
         light: ReportedLight,
         gauge: LightGauge,
         plan: FramePlan,
         status: Status,
     }
 
-    fn bench() -> Bench {
+    fn bench() -> LightBench {
         let config = RigConfig::demo(&Overrides::default()).unwrap_or_else(|e| panic!("{e}"));
         let rig = Rig::build(&config, Raster::new(16, 16)).unwrap_or_else(|e| panic!("{e}"));
         assert_eq!(rig.bodies.len(), 2);
         let status = Status { state: DeviceState::Armed, ..Status::default() };
-        Bench {
+        LightBench {
             light: ReportedLight::new(2),
             gauge: LightGauge::default(),
             plan: FramePlan::empty(&rig),
@@ -178,7 +178,7 @@ mod tests {
         }
     }
 
-    impl Bench {
+    impl LightBench {
         fn sent(&mut self, frame: u64, has_light: bool, dark: [Option<DarkCause>; 2], ms: i64) {
             self.plan.id = FrameId(frame);
             self.plan.dark = dark.to_vec();

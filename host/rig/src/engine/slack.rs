@@ -24,7 +24,7 @@ const HEARD_WITHIN_TRAVELS: i64 = 4;
 
 /// A frame that was sent.
 #[derive(Clone, Copy, Debug)]
-pub(crate) struct SentFrame {
+pub(crate) struct SlackFrame {
     /// Low 32 bits of its number.
     pub frame: u32,
     /// When it should have been latched.
@@ -41,7 +41,7 @@ pub(crate) struct SentFrame {
 
 /// See the module's documentation.
 pub(crate) struct SlackMeter {
-    sent: [Option<SentFrame>; REMEMBERED],
+    sent: [Option<SlackFrame>; REMEMBERED],
     next: usize,
     /// The newest report that was read.
     read: Option<FrameTiming>,
@@ -72,7 +72,7 @@ impl SlackMeter {
     }
 
     /// A frame was sent.
-    pub(crate) fn sent(&mut self, frame: SentFrame) {
+    pub(crate) fn sent(&mut self, frame: SlackFrame) {
         self.sent[self.next] = Some(frame);
         self.next = (self.next + 1) % REMEMBERED;
     }
@@ -98,7 +98,7 @@ impl SlackMeter {
     fn on_the_way(&self, now: HostTime) -> usize {
         let within_ns = (HEARD_WITHIN_TRAVELS * self.travel_ns()).clamp(HEARD_WITHIN_NS, LONGEST_NS);
         let newest = self.whole.map_or(HostTime(i64::MIN), |[sent_at, _]| sent_at);
-        let is_open = |sent: &&SentFrame| sent.sent_at > newest && now.ns_since(sent.sent_at) < within_ns;
+        let is_open = |sent: &&SlackFrame| sent.sent_at > newest && now.ns_since(sent.sent_at) < within_ns;
         self.sent.iter().flatten().filter(is_open).count()
     }
 
@@ -175,10 +175,10 @@ mod tests {
 
     const MS: i64 = 1_000_000;
 
-    fn frame(frame: u32) -> SentFrame {
+    fn frame(frame: u32) -> SlackFrame {
         let latch_due_at = HostTime(100 * MS + i64::from(frame) * MS);
         let (due_at, sent_at) = (latch_due_at.plus_ns(3 * MS), latch_due_at.plus_ns(MS));
-        SentFrame { frame, latch_due_at, due_at, sent_at, waited_ns: 0, behind_ns: 0 }
+        SlackFrame { frame, latch_due_at, due_at, sent_at, waited_ns: 0, behind_ns: 0 }
     }
 
     fn timing(frame: u32, slack_ns: i64) -> FrameTiming {
@@ -189,7 +189,7 @@ mod tests {
     fn what_a_frame_needed_is_its_lead_without_its_slack() {
         let mut meter = SlackMeter::new();
         for k in 0..200 {
-            meter.sent(SentFrame { waited_ns: i64::from(k % 3), behind_ns: 5, ..frame(k) });
+            meter.sent(SlackFrame { waited_ns: i64::from(k % 3), behind_ns: 5, ..frame(k) });
             let read_at = frame(k).due_at;
             // It is whole before the next one is sent.
             let need = meter.observe(timing(k, 5 * MS / 4), read_at);

@@ -86,7 +86,7 @@ pub(crate) enum Remake {
 
 /// What to do with a crew that is in trouble.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(crate) enum Verdict {
+pub(crate) enum CrewVerdict {
     /// The run ends; the crew ends by itself.
     End,
     /// The crew is abandoned. Then a new crew is made, or with `None` the run ends.
@@ -295,23 +295,23 @@ impl Supervision {
     }
 
     /// Decides what to do with a crew in `trouble`.
-    pub(crate) fn judge(&mut self, trouble: Trouble, now: HostTime) -> Verdict {
+    pub(crate) fn judge(&mut self, trouble: Trouble, now: HostTime) -> CrewVerdict {
         let facts = self.facts.clone();
         facts.gpu_since_ns.store(i64::MAX, Ordering::Relaxed);
         facts.crew_lost.store(true, Ordering::Relaxed);
         if let Trouble::Panicked(_) = trouble {
             facts.fail(trouble.into_error());
-            return Verdict::End;
+            return CrewVerdict::End;
         }
         let remake = trouble.remake();
         if facts.monitor.stop_requested() {
             // The light ends anyway, and nothing of the run is lost by it.
             facts.monitor.note(format!("{}, while the run ends", trouble.in_words()));
-            return Verdict::Abandon { remake: None };
+            return CrewVerdict::Abandon { remake: None };
         }
         if facts.is_complete.load(Ordering::Acquire) {
             facts.fail(trouble.into_error());
-            return Verdict::Abandon { remake: None };
+            return CrewVerdict::Abandon { remake: None };
         }
         let (budget, most) = match remake {
             Remake::Crew => (&mut self.hung, MOST_HUNG),
@@ -319,7 +319,7 @@ impl Supervision {
         };
         if budget.lost(now) == AfterLoss::GiveUp {
             facts.fail(PipelineError::KeepsFailing { most, last: trouble.into_error().to_string() });
-            return Verdict::Abandon { remake: None };
+            return CrewVerdict::Abandon { remake: None };
         }
         let bound = match remake {
             Remake::Crew => String::new(),
@@ -338,7 +338,7 @@ impl Supervision {
         self.is_back = false;
         facts.monitor.light_gauge().set_restarts(true);
         self.made_by = now.plus_ns(MADE_WITHIN_NS);
-        Verdict::Abandon { remake: Some(remake) }
+        CrewVerdict::Abandon { remake: Some(remake) }
     }
 
     /// A new crew is not ready yet. True while the run waits for it. Otherwise the run ends or has ended, and `Making::Waits`

@@ -10,7 +10,7 @@ use super::pace::{Pace, Real, Virtual};
 use super::pack::PackStage;
 use super::plan::PlanStage;
 use super::pulse::Pulse;
-use super::supervision::{Irreplaceable, Making, Remake, Supervision, Trouble, Verdict};
+use super::supervision::{CrewVerdict, Irreplaceable, Making, Remake, Supervision, Trouble};
 use crate::config::{Overrides, RigConfig};
 use crate::frame::job::{Fate, FrameNote};
 use crate::mock::{EmulatedProjector, MockConfig};
@@ -42,7 +42,7 @@ fn rig(flags: &[&str]) -> Arc<Rig> {
 }
 
 /// A rig whose link to a mock is up, and the current time.
-struct Bench {
+struct LinkedRig {
     facts: Arc<Facts>,
     crew: Arc<CrewFacts>,
     link: Option<(HostLink, LinkKeeper)>,
@@ -53,12 +53,12 @@ struct Bench {
     slot_ns: i64,
 }
 
-fn bench(flags: &[&str], options: RunOptions) -> Bench {
+fn bench(flags: &[&str], options: RunOptions) -> LinkedRig {
     bench_with(flags, options, 1)
 }
 
 /// The same with a mock that holds so many frames.
-fn bench_with(flags: &[&str], options: RunOptions, frame_buffers: u8) -> Bench {
+fn bench_with(flags: &[&str], options: RunOptions, frame_buffers: u8) -> LinkedRig {
     bench_of(flags, options, |setup| setup.frame_buffers = frame_buffers, Arc::default())
 }
 
@@ -68,7 +68,7 @@ fn bench_of(
     options: RunOptions,
     change: impl Fn(&mut MockConfig),
     monitor: Arc<RunMonitor>,
-) -> Bench {
+) -> LinkedRig {
     let rig = rig(flags);
     let mut now = HostTime(5 * MS);
     let mut setup = MockConfig::new(rig.camera.raster);
@@ -89,10 +89,10 @@ fn bench_of(
     let facts = Arc::new(Facts::new(rig.clone(), monitor, options, &lead, now));
     let keeper = LinkKeeper::new(time, &link, rig.bodies.len(), None);
     let crew = Arc::new(CrewFacts::new(0, slot_ns));
-    Bench { facts, crew, link: Some((link, keeper)), cable, lead, time, now, slot_ns }
+    LinkedRig { facts, crew, link: Some((link, keeper)), cable, lead, time, now, slot_ns }
 }
 
-impl Bench {
+impl LinkedRig {
     fn plan<P: Pace>(&self) -> PlanStage<P> {
         PlanStage::new(self.facts.clone(), self.crew.clone(), &self.time, self.now)
     }
@@ -504,17 +504,17 @@ fn three_lost_gpus_a_minute_are_made_good_and_many_more_stages_that_hang() {
     for second in 0..20 {
         // The GPU is asked whether it hangs too, and is kept if it answers.
         let verdict = mind.judge(Trouble::Hung(["tracking", "plan", "pack"][second % 3]), at(second as i64));
-        assert_eq!(verdict, Verdict::Abandon { remake: Some(Remake::Crew) });
+        assert_eq!(verdict, CrewVerdict::Abandon { remake: Some(Remake::Crew) });
     }
     bench.facts.monitor.take_notes();
     for second in 20..23 {
         let verdict = mind.judge(gpu(), at(second));
-        assert_eq!(verdict, Verdict::Abandon { remake: Some(Remake::CrewAndGpu) });
+        assert_eq!(verdict, CrewVerdict::Abandon { remake: Some(Remake::CrewAndGpu) });
         let notes = bench.facts.monitor.take_notes().join("\n");
         assert!(notes.contains("within 2 s") && notes.contains("after 180 s the run ends"), "{notes}");
         assert!(bench.facts.take_error().is_none(), "the run goes on");
     }
-    assert_eq!(mind.judge(gpu(), at(24)), Verdict::Abandon { remake: None });
+    assert_eq!(mind.judge(gpu(), at(24)), CrewVerdict::Abandon { remake: None });
     assert!(matches!(bench.facts.take_error(), Some(PipelineError::KeepsFailing { most: 3, .. })));
     assert!(bench.facts.monitor.stop_requested());
 }
@@ -524,7 +524,7 @@ fn a_stage_that_hangs_every_other_second_ends_the_run_in_the_end() {
     let bench = bench(&[], RunOptions::default());
     let mut mind = supervision(&bench.facts);
     let judged = |k: i64| mind.judge(Trouble::Hung("pack"), HostTime(2_000 * MS * k));
-    let ended = (0..40).map(judged).position(|v| v == Verdict::Abandon { remake: None });
+    let ended = (0..40).map(judged).position(|v| v == CrewVerdict::Abandon { remake: None });
     assert_eq!(ended, Some(20));
     assert!(matches!(bench.facts.take_error(), Some(PipelineError::KeepsFailing { most: 20, .. })));
 }
@@ -540,7 +540,7 @@ fn a_stop_during_a_recovery_is_no_failure() {
     assert!(!mind.waits_for(Making::Waits, HostTime(2 * MS)), "nobody waits for the crew");
     let gpu = PipelineError::GpuHangs { frame: 7, ms: 100 };
     let verdict = mind.judge(Trouble::Failed(gpu), HostTime(3 * MS));
-    assert_eq!(verdict, Verdict::Abandon { remake: None });
+    assert_eq!(verdict, CrewVerdict::Abandon { remake: None });
     mind.tell_of_recovery(None);
     assert!(bench.facts.take_error().is_none());
     let recoveries = bench.facts.recoveries();
@@ -656,11 +656,11 @@ fn a_frame_that_stays_on_the_gpu_for_a_second_is_told_once() {
 fn a_panic_and_a_failure_at_the_end_are_not_made_good() {
     let bench = bench(&[], RunOptions::default());
     let mut mind = supervision(&bench.facts);
-    assert_eq!(mind.judge(Trouble::Panicked("plan"), HostTime(0)), Verdict::End);
+    assert_eq!(mind.judge(Trouble::Panicked("plan"), HostTime(0)), CrewVerdict::End);
     assert!(matches!(bench.facts.take_error(), Some(PipelineError::Panicked("plan"))));
     // The first failure requested a stop, so no further crew is made.
     let verdict = mind.judge(Trouble::Hung("plan"), HostTime(MS));
-    assert_eq!(verdict, Verdict::Abandon { remake: None });
+    assert_eq!(verdict, CrewVerdict::Abandon { remake: None });
 }
 
 #[test]

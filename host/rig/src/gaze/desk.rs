@@ -47,13 +47,13 @@ pub struct GazeReport {
 /// Where gaze passes. Writers add to numbers; each is right, but they are not all of one instant.
 #[derive(Debug, Default)]
 pub struct GazeDesk {
-    state: Lock<State>,
+    state: Lock<GazeState>,
     frames: [AtomicU64; 2],
     age_ns: AtomicI64,
 }
 
 #[derive(Debug, Default)]
-struct State {
+struct GazeState {
     /// To the planning of each crew; those of crews that are gone are dropped.
     to_planning: Vec<Publisher<Option<GazeSample>>>,
     newest: Option<GazeSample>,
@@ -64,7 +64,7 @@ struct State {
 }
 
 impl GazeDesk {
-    fn state(&self) -> std::sync::MutexGuard<'_, State> {
+    fn state(&self) -> std::sync::MutexGuard<'_, GazeState> {
         self.state.lock().unwrap_or_else(PoisonError::into_inner)
     }
 

@@ -1,6 +1,6 @@
 //! The row of a kind of gaze, its keys, and what a device that measures it does.
 
-use dpm_common::keys::read::Reader;
+use dpm_common::keys::read::KeyReader;
 use dpm_common::keys::rows::{KeyValues, KindWord, OfKind, Registry, Row, Section};
 use dpm_common::keys::source::{Entry, Value};
 use dpm_device::time::{HostClock, HostTime};
@@ -11,7 +11,7 @@ use std::time::Duration;
 
 /// Where the eye looks.
 #[derive(Clone, Debug, PartialEq)]
-pub enum Aim {
+pub enum GazeAim {
     /// At a point of the world, metres.
     Point(DVec3),
     /// At the origin of a tracked body of this name, which the key names.
@@ -78,13 +78,13 @@ pub trait GazeSource: Send {
 /// The keys of a kind of gaze. A [`section!`](dpm_common::section) implements the rest of it.
 pub trait GazeKeys: KeyValues {
     /// Where the eye looks.
-    fn aim(&self) -> Aim;
+    fn aim(&self) -> GazeAim;
 
     /// The keys with their values, as they would be written.
     fn written(&self) -> Vec<(&'static str, Value)>;
 
     /// Refuses values that make no sense.
-    fn check(&self, _reader: &mut Reader) {}
+    fn check(&self, _reader: &mut KeyReader) {}
 
     /// The device; `None` for a kind without one. `examines`: more is asked of it than a run needs, to find what is missing.
     fn open(&self, _clock: Arc<dyn HostClock>, _examines: bool) -> Option<Box<dyn GazeSource>> {
@@ -93,7 +93,7 @@ pub trait GazeKeys: KeyValues {
 }
 
 /// Reads the keys of a kind from a table of the rig file, whose name comes last.
-type ReadKeys = fn(&BTreeMap<String, Entry>, &mut Reader, &str) -> Arc<dyn GazeKeys>;
+type ReadKeys = fn(&BTreeMap<String, Entry>, &mut KeyReader, &str) -> Arc<dyn GazeKeys>;
 
 /// A kind of gaze: a row of the table.
 pub struct GazeKind {
@@ -126,7 +126,12 @@ impl Row for GazeKind {
         false
     }
 
-    fn read(&self, table: &BTreeMap<String, Entry>, reader: &mut Reader, section: &str) -> Arc<dyn GazeKeys> {
+    fn read(
+        &self,
+        table: &BTreeMap<String, Entry>,
+        reader: &mut KeyReader,
+        section: &str,
+    ) -> Arc<dyn GazeKeys> {
         (self.read)(table, reader, section)
     }
 }

@@ -11,7 +11,7 @@ mod plain;
 mod pupil;
 
 pub use desk::{GazeDesk, GazeReport};
-pub use kind::{Aim, GazeConfig, GazeCounts, GazeDoubt, GazeKeys, GazeKind, GazeSample, GazeSource};
+pub use kind::{GazeAim, GazeConfig, GazeCounts, GazeDoubt, GazeKeys, GazeKind, GazeSample, GazeSource};
 
 use dpm_common::keys::rows::Registry;
 use std::sync::Arc;

@@ -1,8 +1,8 @@
 //! The kinds of gaze that need no device: a point, a tracked body, the axis of the glasses.
 
-use super::kind::{Aim, GazeKeys, GazeKind};
+use super::kind::{GazeAim, GazeKeys, GazeKind};
 use dpm_common::keys::read::{NotEmpty, Within};
-use dpm_common::keys::source::{Node, Value};
+use dpm_common::keys::source::{SourceNode, Value};
 use dpm_common::keys::Origin;
 use dpm_common::section;
 use glam::DVec3;
@@ -39,13 +39,13 @@ pub(super) static STRAIGHT: GazeKind = GazeKind::of::<GazeStraightConfig>(
 
 /// Three numbers as a value of the rig file.
 pub(super) fn vector(numbers: [f64; 3]) -> Value {
-    let node = |number| Node { value: Value::Float(number), origin: Origin::Default };
+    let node = |number| SourceNode { value: Value::Float(number), origin: Origin::Default };
     Value::Array(numbers.map(node).into())
 }
 
 impl GazeKeys for GazePointConfig {
-    fn aim(&self) -> Aim {
-        Aim::Point(DVec3::from_array(self.point))
+    fn aim(&self) -> GazeAim {
+        GazeAim::Point(DVec3::from_array(self.point))
     }
 
     fn written(&self) -> Vec<(&'static str, Value)> {
@@ -54,8 +54,8 @@ impl GazeKeys for GazePointConfig {
 }
 
 impl GazeKeys for GazeTrackedConfig {
-    fn aim(&self) -> Aim {
-        Aim::Body("observer.gaze.target", self.target.clone())
+    fn aim(&self) -> GazeAim {
+        GazeAim::Body("observer.gaze.target", self.target.clone())
     }
 
     fn written(&self) -> Vec<(&'static str, Value)> {
@@ -64,8 +64,8 @@ impl GazeKeys for GazeTrackedConfig {
 }
 
 impl GazeKeys for GazeStraightConfig {
-    fn aim(&self) -> Aim {
-        Aim::Ahead
+    fn aim(&self) -> GazeAim {
+        GazeAim::Ahead
     }
 
     fn written(&self) -> Vec<(&'static str, Value)> {

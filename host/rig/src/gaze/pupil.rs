@@ -1,8 +1,8 @@
 //! `observer.gaze.kind = "pupil"`: Pupil Core's eye cameras, by the network interface of Pupil Capture or Pupil Service.
 
-use super::kind::{Aim, GazeCounts, GazeDoubt, GazeKeys, GazeKind, GazeSample, GazeSource};
+use super::kind::{GazeAim, GazeCounts, GazeDoubt, GazeKeys, GazeKind, GazeSample, GazeSource};
 use super::plain::vector;
-use dpm_common::keys::read::{refuse, NotEmpty, Reader, Within};
+use dpm_common::keys::read::{refuse, KeyReader, NotEmpty, Within};
 use dpm_common::keys::source::Value;
 use dpm_common::section;
 use dpm_device::time::HostClock;
@@ -50,8 +50,8 @@ impl PupilGazeConfig {
 }
 
 impl GazeKeys for PupilGazeConfig {
-    fn aim(&self) -> Aim {
-        Aim::Measured
+    fn aim(&self) -> GazeAim {
+        GazeAim::Measured
     }
 
     fn written(&self) -> Vec<(&'static str, Value)> {
@@ -65,7 +65,7 @@ impl GazeKeys for PupilGazeConfig {
         ]
     }
 
-    fn check(&self, reader: &mut Reader) {
+    fn check(&self, reader: &mut KeyReader) {
         if self.ip().is_none() {
             let problem = format!("{:?} is no address", self.address);
             refuse(reader, &["observer.gaze.address"], problem, "write for example \"192.168.1.10\"".into());

@@ -1,9 +1,9 @@
 //! What holds for every kind of gaze, and what a rig file with a measured one may not say.
 
-use super::{kinds, Aim, GazeConfig, GazeCounts, GazeDesk, GazeSample};
+use super::{kinds, GazeAim, GazeConfig, GazeCounts, GazeDesk, GazeSample};
 use crate::config::{Overrides, Purpose, RigConfig};
 use dpm_common::keys::rows::Row;
-use dpm_common::keys::source::{Node, Value};
+use dpm_common::keys::source::{SourceNode, Value};
 use dpm_device::time::HostTime;
 use glam::DVec3;
 use std::path::Path;
@@ -21,7 +21,7 @@ fn toml(value: &Value) -> String {
         Value::Integer(number) => number.to_string(),
         Value::String(text) => format!("{text:?}"),
         Value::Array(nodes) => {
-            let all: Vec<String> = nodes.iter().map(|node: &Node| toml(&node.value)).collect();
+            let all: Vec<String> = nodes.iter().map(|node: &SourceNode| toml(&node.value)).collect();
             format!("[{}]", all.join(", "))
         }
         other => panic!("{other:?}"),
@@ -71,7 +71,7 @@ fn a_measured_gaze_needs_glasses_a_clock_and_an_address() {
     assert!(nowhere.contains("observer.gaze.address") && nowhere.contains("192.168"), "{nowhere}");
     // Without the device it is the axis of the glasses.
     let simulated = parse(&format!("{GLASSES}{pupil}"), Purpose { simulate: true, ..Purpose::default() });
-    assert_eq!(simulated.expect("valid").observer.gaze.aim(), Aim::Ahead);
+    assert_eq!(simulated.expect("valid").observer.gaze.aim(), GazeAim::Ahead);
 }
 
 /// Crews that take over read the newest sample too, and the report adds nothing up twice.

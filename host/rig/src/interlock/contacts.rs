@@ -28,7 +28,7 @@ pub(super) fn of(config: &InterlockConfig, shared: &Arc<InterlockState>) -> Box<
             (None, None) => Box::new(Nothing),
         },
         InterlockConfig::Line(l) => match (&l.port, &l.file) {
-            (Some(port), _) => Box::new(Line {
+            (Some(port), _) => Box::new(ModemLine {
                 path: port.clone(),
                 signal: l.signal.line(),
                 open: None,
@@ -165,14 +165,14 @@ impl Contact for ByPidFile {
 }
 
 /// An input of a serial port.
-struct Line {
+struct ModemLine {
     path: String,
     signal: ControlSignal,
     open: Option<ControlLine>,
     look_at: Instant,
 }
 
-impl Contact for Line {
+impl Contact for ModemLine {
     fn is_closed(&mut self) -> bool {
         let now = Instant::now();
         if self.open.is_none() && now >= self.look_at {

@@ -12,7 +12,7 @@ use dpm_device::time::HostTime;
 const EPISODE_NS: i64 = 100_000_000;
 
 #[derive(Clone, Debug, Default)]
-struct Body {
+struct BodyDarkness {
     frames: [u64; DarkCause::ALL.len()],
     /// Since when it has been dark, or lit, without interruption.
     since: Option<(HostTime, bool)>,
@@ -23,13 +23,13 @@ struct Body {
 /// Per tracked body.
 #[derive(Clone, Debug)]
 pub(crate) struct DarkBodies {
-    bodies: Vec<Body>,
+    bodies: Vec<BodyDarkness>,
 }
 
 impl DarkBodies {
     /// For `bodies` tracked bodies.
     pub(crate) fn new(bodies: usize) -> Self {
-        Self { bodies: vec![Body::default(); bodies] }
+        Self { bodies: vec![BodyDarkness::default(); bodies] }
     }
 
     /// A frame was lit at `at`, with or without light on each body. Calls `note` with the number of a body whose
@@ -72,7 +72,7 @@ impl DarkBodies {
 
     /// The counters, with the bodies' names.
     pub(crate) fn report<'a>(&self, names: impl Iterator<Item = &'a str>) -> Vec<DarkBody> {
-        let of = |body: &Body, cause: DarkCause| body.frames[cause as usize];
+        let of = |body: &BodyDarkness, cause: DarkCause| body.frames[cause as usize];
         self.bodies
             .iter()
             .zip(names)

@@ -15,7 +15,7 @@ const SOON: (u64, i64) = (3, 1_000_000_000);
 const POINTS: usize = 8;
 
 #[derive(Clone, Copy, Debug, Default)]
-struct Body {
+struct BodyReach {
     tracked: u64,
     within_reach: u64,
     last: DVec3,
@@ -25,7 +25,7 @@ struct Body {
     is_told: bool,
 }
 
-impl Body {
+impl BodyReach {
     /// Whether it was tracked for long enough and never came near the light.
     fn is_lost(&self) -> bool {
         let long = self.times.is_some_and(|[first, last]| last.ns_since(first) >= SOON.1);
@@ -45,13 +45,13 @@ impl Body {
 /// Checks every frame, beside the frame path.
 #[derive(Clone, Debug)]
 pub(crate) struct Placement {
-    bodies: Vec<Body>,
+    bodies: Vec<BodyReach>,
 }
 
 impl Placement {
     /// For `bodies` tracked bodies.
     pub(crate) fn new(bodies: usize) -> Self {
-        Self { bodies: vec![Body::default(); bodies] }
+        Self { bodies: vec![BodyReach::default(); bodies] }
     }
 
     /// Checks a frame. `poses` are the world-from-body poses; those of `seen` bodies are where the tracker saw them

@@ -24,7 +24,7 @@ const ARRIVALS: usize = 16;
 
 /// A frame that was sent.
 #[derive(Clone, Copy, Debug)]
-struct SentFrame {
+struct ReportedFrame {
     /// Low 32 bits of its number.
     frame: u32,
     /// Its slot.
@@ -40,7 +40,7 @@ pub(crate) struct StatusLight {
     light_delay_ns: i64,
     before: Option<Status>,
     counts: DeviceCounts,
-    sent: [Option<SentFrame>; REMEMBERED],
+    sent: [Option<ReportedFrame>; REMEMBERED],
     next: usize,
     travel_ns: i64,
     /// Upper bounds of the travel of the last frames, nanoseconds, and how many there are.
@@ -77,7 +77,7 @@ impl StatusLight {
 
     /// Frame number `frame` was sent for `slot` at `at`.
     pub(crate) fn sent(&mut self, frame: u32, slot: u64, at: HostTime) {
-        self.sent[self.next % REMEMBERED] = Some(SentFrame { frame, slot, at });
+        self.sent[self.next % REMEMBERED] = Some(ReportedFrame { frame, slot, at });
         self.next = (self.next + 1) % REMEMBERED;
     }
 
@@ -159,7 +159,7 @@ impl StatusLight {
         }
     }
 
-    fn sent_frame(&self, frame: u32) -> Option<SentFrame> {
+    fn sent_frame(&self, frame: u32) -> Option<ReportedFrame> {
         self.sent.iter().flatten().find(|sent| sent.frame == frame).copied()
     }
 
@@ -224,14 +224,17 @@ mod tests {
     }
 
     /// A reader of reports, and the receiver of its notes.
-    struct Reader(StatusLight, Receiver<LightNote>);
+    struct StatusReader(StatusLight, Receiver<LightNote>);
 
-    fn reader() -> Reader {
+    fn reader() -> StatusReader {
         let (lights, notes) = channel(4096, WaitPolicy::Park);
-        Reader(StatusLight::new(lights, 0), notes)
+        StatusReader(StatusLight::new(lights, 0), notes)
     }
 
-    fn told(Reader(light, notes): &mut Reader, s: &Status) -> Vec<(u64, LightKind, Option<u32>, u32)> {
+    fn told(
+        StatusReader(light, notes): &mut StatusReader,
+        s: &Status,
+    ) -> Vec<(u64, LightKind, Option<u32>, u32)> {
         light.observe(s, &time());
         std::iter::from_fn(|| notes.try_pop())
             .map(|n| (n.event.slot, n.event.kind, n.event.frame, n.unseen))
@@ -271,7 +274,7 @@ mod tests {
     }
 
     /// A frame that was sent at `sent_us` for `slot` and lit in `lit_slot`, with a report in the middle of that slot.
-    fn lit_in(reader: &mut Reader, k: u32, sent_us: i64, slot: u64, lit_slot: u64) {
+    fn lit_in(reader: &mut StatusReader, k: u32, sent_us: i64, slot: u64, lit_slot: u64) {
         let at = (lit_slot - 100) * 1_000;
         reader.0.sent(k, slot, HostTime(sent_us * 1_000));
         let report = Status { last_whole_frame: k, ..status(at + 500, [k, 0, 0], (k, at)) };

@@ -9,7 +9,7 @@ fn rig(flags: &[&str]) -> Rig {
 }
 
 fn choice(key: String) -> MethodChoice {
-    let of = |method: &str, error: f64| Candidate {
+    let of = |method: &str, error: f64| MethodCandidate {
         method: method.into(),
         spp: 3.0,
         time_to_dpm: 1.01,
@@ -29,9 +29,9 @@ fn choice(key: String) -> MethodChoice {
 }
 
 /// A folder of this test, which is removed at its end.
-struct Folder(PathBuf);
+struct ChoiceFolder(PathBuf);
 
-impl Folder {
+impl ChoiceFolder {
     fn new(name: &str) -> Self {
         let path = std::env::temp_dir().join(format!("dpm-{name}-{}", std::process::id()));
         std::fs::create_dir_all(&path).unwrap();
@@ -39,7 +39,7 @@ impl Folder {
     }
 }
 
-impl Drop for Folder {
+impl Drop for ChoiceFolder {
     fn drop(&mut self) {
         let _ = std::fs::remove_dir_all(&self.0);
     }
@@ -78,7 +78,7 @@ fn another_scene_rig_or_device_has_another_key() {
 
 #[test]
 fn a_run_has_the_method_and_the_samples_of_its_file() {
-    let (folder, card) = (Folder::new("method-choice"), "a card");
+    let (folder, card) = (ChoiceFolder::new("method-choice"), "a card");
     let wanted = choice(key(&rig(&[]), card));
     wanted.write(&folder.0).unwrap();
     for _ in 0..2 {
@@ -106,7 +106,7 @@ fn a_run_has_the_method_and_the_samples_of_its_file() {
 
 #[test]
 fn a_file_that_is_no_choice_of_this_key_is_named_and_not_used() {
-    let (folder, card) = (Folder::new("method-damaged"), "a card");
+    let (folder, card) = (ChoiceFolder::new("method-damaged"), "a card");
     let key = key(&rig(&[]), card);
     let good = choice(key.clone());
     let text = |change: fn(&mut MethodChoice)| {

@@ -22,7 +22,7 @@ const BENT: f64 = 1.02;
 
 /// Tiles next to each other in a row of tiles.
 #[derive(Clone, Debug, PartialEq, Eq)]
-struct Run {
+struct TileRun {
     row: usize,
     columns: Range<usize>,
 }
@@ -39,7 +39,7 @@ pub struct EyeMask {
     is_moved: bool,
     /// The tiles of the frame that are cut.
     is_cut: Vec<bool>,
-    runs: Vec<Run>,
+    runs: Vec<TileRun>,
 }
 
 impl EyeMask {
@@ -99,7 +99,7 @@ impl EyeMask {
         }
         let (row_bytes, height) = (self.raster.row_bytes(), self.raster.height() as usize);
         for plane in frame.bytes_mut().chunks_exact_mut(plane_bytes) {
-            for Run { row, columns } in &self.runs {
+            for TileRun { row, columns } in &self.runs {
                 let rows = row * TILE..((row + 1) * TILE).min(height);
                 for row in plane[rows.start * row_bytes..rows.end * row_bytes].chunks_exact_mut(row_bytes) {
                     row[columns.clone()].fill(0);
@@ -163,7 +163,7 @@ impl EyeMask {
                 let columns = first..first + same.len();
                 first = columns.end;
                 if same[0] {
-                    self.runs.push(Run { row, columns });
+                    self.runs.push(TileRun { row, columns });
                 }
             }
         }
@@ -172,7 +172,7 @@ impl EyeMask {
     /// Mirrors in the runs.
     fn mirrors(&self) -> u32 {
         let (width, height) = (self.raster.width() as usize, self.raster.height() as usize);
-        let of = |run: &Run| {
+        let of = |run: &TileRun| {
             let columns = (run.columns.end * TILE).min(width) - run.columns.start * TILE;
             columns * (((run.row + 1) * TILE).min(height) - run.row * TILE)
         };

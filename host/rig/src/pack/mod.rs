@@ -9,14 +9,14 @@ use crate::frame::Stage;
 use dpm_common::clock::Stopwatch;
 use dpm_render::pack::{self, Kernel, Shown};
 use eye_mask::EyeMask;
-use source::Pictures;
+use source::FrameSource;
 
 /// What turns finished frames into planes. All planes that are sent come from here.
 pub(crate) struct Packer {
     /// How to pack planes if the GPU does not.
     pub kernel: Kernel,
     /// `None` if a GPU renders.
-    pub pictures: Option<Pictures>,
+    pub pictures: Option<FrameSource>,
     /// `None` if no head is guarded.
     pub eyes: Option<EyeMask>,
 }
@@ -46,10 +46,10 @@ impl Packer {
                     note.touched_bytes += size_of_val(slot.codes()) as u64;
                 }
             },
-            (None, Some(Pictures::Marked(prepared))) => {
+            (None, Some(FrameSource::Marked(prepared))) => {
                 note.touched_bytes += prepared.pack(self.kernel, note.plan.id.0, &mut memory.planes);
             }
-            (None, Some(Pictures::Drawn(painter))) => {
+            (None, Some(FrameSource::Drawn(painter))) => {
                 note.touched_bytes = painter.pack(self.kernel, (note.plan.id.0, note.plan.slot), memory);
             }
             (None, None) => return,
@@ -66,7 +66,7 @@ impl Packer {
             let is_cut = |pixel: usize| eyes.is_some_and(|eyes| eyes.is_cut(pixel));
             let lit = slot.codes().iter().enumerate().map(|(i, &code)| if is_cut(i) { 0 } else { code });
             note.code_hash = hash_codes(lit.map(|code| shown.light(code)));
-        } else if let Some(Pictures::Drawn(painter)) = &mut self.pictures {
+        } else if let Some(FrameSource::Drawn(painter)) = &mut self.pictures {
             note.code_hash = hash_codes(painter.light_of(&memory.planes).iter().copied());
         }
     }

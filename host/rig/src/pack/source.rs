@@ -141,7 +141,7 @@ impl PatternPainter {
 }
 
 /// Where the frames of a run without a GPU come from.
-pub(crate) enum Pictures {
+pub(crate) enum FrameSource {
     /// Marked frames, by which torn light is found.
     Marked(super::prepared::PreparedFrames),
     /// Patterns.

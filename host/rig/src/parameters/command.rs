@@ -9,7 +9,7 @@ const MAX_NUMBERS: usize = 16;
 
 /// One request about the parameters.
 #[derive(Clone, Debug, PartialEq)]
-pub enum Command {
+pub enum ParameterCommand {
     /// Changes a parameter.
     Set {
         /// Its name.
@@ -25,7 +25,7 @@ pub enum Command {
     List,
 }
 
-impl Command {
+impl ParameterCommand {
     /// Reads a line without its line feed; `None` if its first word is no command about parameters.
     ///
     /// # Errors
@@ -52,7 +52,7 @@ impl Command {
         Ok(Self::Set { numbers: numbers_of(&name, numbers)?, name })
     }
 
-    /// The line that [`Command::parse`] reads as this.
+    /// The line that [`ParameterCommand::parse`] reads as this.
     pub fn line(&self) -> String {
         match self {
             Self::Set { name, numbers } => {
@@ -92,17 +92,20 @@ mod tests {
     #[test]
     fn a_line_and_its_command_are_one_thing() {
         for command in [
-            Command::Set { name: "exposure".into(), numbers: vec![1.5] },
-            Command::Set { name: "body.my = hare".into(), numbers: vec![1.0, -0.25, 0.0, 1e-9, 5.0, 6.0] },
-            Command::Set { name: "gaze".into(), numbers: vec![] },
-            Command::Undo,
-            Command::Save,
-            Command::List,
+            ParameterCommand::Set { name: "exposure".into(), numbers: vec![1.5] },
+            ParameterCommand::Set {
+                name: "body.my = hare".into(),
+                numbers: vec![1.0, -0.25, 0.0, 1e-9, 5.0, 6.0],
+            },
+            ParameterCommand::Set { name: "gaze".into(), numbers: vec![] },
+            ParameterCommand::Undo,
+            ParameterCommand::Save,
+            ParameterCommand::List,
         ] {
-            assert_eq!(Command::parse(&command.line()), Ok(Some(command)));
+            assert_eq!(ParameterCommand::parse(&command.line()), Ok(Some(command)));
         }
-        assert_eq!(Command::parse("black"), Ok(None));
-        assert_eq!(Command::parse("undone"), Ok(None));
+        assert_eq!(ParameterCommand::parse("black"), Ok(None));
+        assert_eq!(ParameterCommand::parse("undone"), Ok(None));
     }
 
     #[test]
@@ -110,9 +113,9 @@ mod tests {
         for (line, word) in
             [("set exposure", "NAME=VALUE"), ("set exposure=x", "exposure: \"x\""), ("set a=1,,2", "a: \"\"")]
         {
-            let told = Command::parse(line).unwrap_err().to_string();
+            let told = ParameterCommand::parse(line).unwrap_err().to_string();
             assert!(told.contains(word), "{line}: {told}");
         }
-        assert!(Command::parse(&format!("set a={}", "1,".repeat(100))).is_err());
+        assert!(ParameterCommand::parse(&format!("set a={}", "1,".repeat(100))).is_err());
     }
 }

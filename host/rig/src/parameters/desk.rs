@@ -5,7 +5,7 @@ use super::applied::{middles, ParameterVersion};
 use super::{told_of, ChangeRefusal, Parameter, Values};
 use crate::gaze::at_point;
 use crate::rig::Rig;
-use dpm_common::keys::source::{Node, Value};
+use dpm_common::keys::source::{SourceNode, Value};
 use dpm_handoff::latest::{latest, Publisher, Reader};
 use dpm_handoff::path::Lock;
 use glam::{DAffine3, DVec3};
@@ -48,7 +48,7 @@ pub struct ToKeep {
 /// Writes files; returns what to tell the operator, or why nothing was written.
 pub type Saver = Box<dyn Fn(&Rig, &ToKeep) -> Result<String, String> + Send + Sync>;
 
-struct State {
+struct ParameterHistory {
     rig: Arc<Rig>,
     middles: Vec<DVec3>,
     values: Values,
@@ -64,7 +64,7 @@ struct State {
 /// Where parameters are changed. It exists from the beginning, and is of use from the first [`ParameterDesk::follow`].
 #[derive(Default)]
 pub struct ParameterDesk {
-    state: Lock<Option<State>>,
+    state: Lock<Option<ParameterHistory>>,
     /// The newest version that planning uses, and its first frame.
     used: AtomicU64,
     used_since: AtomicU64,
@@ -93,7 +93,7 @@ pub struct ParameterView {
     /// The same when the run began.
     pub began_with: Vec<f64>,
     /// What each number is.
-    pub fields: Vec<super::Field>,
+    pub fields: Vec<super::ParameterField>,
 }
 
 /// All parameters at one moment.
@@ -112,7 +112,7 @@ pub struct AllShown {
 }
 
 impl ParameterDesk {
-    fn state(&self) -> MutexGuard<'_, Option<State>> {
+    fn state(&self) -> MutexGuard<'_, Option<ParameterHistory>> {
         // Nothing panics while it holds this lock.
         self.state.lock().unwrap_or_else(PoisonError::into_inner)
     }
@@ -130,7 +130,16 @@ impl ParameterDesk {
             None => {
                 let (rig, saved) = (rig.clone(), values.clone());
                 let (before, last) = (VecDeque::new(), None);
-                *place = Some(State { rig, middles, values, saved, version, before, last, to_planning });
+                *place = Some(ParameterHistory {
+                    rig,
+                    middles,
+                    values,
+                    saved,
+                    version,
+                    before,
+                    last,
+                    to_planning,
+                });
             }
         }
         reader
@@ -160,7 +169,7 @@ impl ParameterDesk {
     }
 
     /// The state of a run that draws a scene.
-    fn open(&self) -> Option<MutexGuard<'_, Option<State>>> {
+    fn open(&self) -> Option<MutexGuard<'_, Option<ParameterHistory>>> {
         let state = self.state();
         (state.is_some() && !self.is_closed.load(Ordering::Relaxed)).then_some(state)
     }
@@ -294,7 +303,7 @@ impl ParameterDesk {
     }
 }
 
-impl State {
+impl ParameterHistory {
     fn take_over(&mut self, values: Values) {
         self.version += 1;
         self.to_planning.publish(ParameterVersion::new(self.version, &values, &self.rig, &self.middles));
@@ -317,7 +326,7 @@ fn setting(value: &Value) -> Option<Setting> {
         Value::Integer(number) => Setting::Whole(*number),
         Value::String(text) => Setting::Text(text.clone()),
         Value::Array(nodes) => {
-            let number = |node: &Node| match node.value {
+            let number = |node: &SourceNode| match node.value {
                 Value::Float(number) => Some(number),
                 _ => None,
             };

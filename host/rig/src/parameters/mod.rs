@@ -9,7 +9,7 @@ pub mod applied;
 pub mod command;
 pub mod desk;
 
-pub use command::Command;
+pub use command::ParameterCommand;
 pub use desk::{ParameterDesk, Saver};
 
 use crate::rig::Rig;
@@ -142,7 +142,7 @@ pub enum ChangeRefusal {
 
 /// One number of a parameter, for those who show it.
 #[derive(Clone, Debug, PartialEq, serde::Serialize)]
-pub struct Field {
+pub struct ParameterField {
     /// What it is; empty if the parameter has one number only.
     pub label: &'static str,
     /// Unit; may be empty.
@@ -226,8 +226,9 @@ impl Parameter {
     }
 
     /// Its numbers.
-    pub fn fields(self, rig: &Rig) -> Vec<Field> {
-        let one = |unit, [low, high]: [f64; 2], step| vec![Field { label: "", unit, low, high, step }];
+    pub fn fields(self, rig: &Rig) -> Vec<ParameterField> {
+        let one =
+            |unit, [low, high]: [f64; 2], step| vec![ParameterField { label: "", unit, low, high, step }];
         let most = most_samples(rig);
         match self {
             Self::Exposure => one("", EXPOSURE, 0.05),
@@ -242,8 +243,13 @@ impl Parameter {
 }
 
 /// Three numbers of the same range on both sides of zero.
-fn axes(labels: [&'static str; 3], unit: &'static str, far: f64, step: f64) -> impl Iterator<Item = Field> {
-    labels.into_iter().map(move |label| Field { label, unit, low: -far, high: far, step })
+fn axes(
+    labels: [&'static str; 3],
+    unit: &'static str,
+    far: f64,
+    step: f64,
+) -> impl Iterator<Item = ParameterField> {
+    labels.into_iter().map(move |label| ParameterField { label, unit, low: -far, high: far, step })
 }
 
 /// Most samples per pixel that this rig may be asked for.

@@ -245,9 +245,9 @@ fn only_steps_of_different_brightness_are_refused_as_flashes() {
 }
 
 /// Twenty-four planes of noise that no code value explains: each plane of each frame differs.
-struct Noise(Option<PlaneSchedule>);
+struct PlaneNoise(Option<PlaneSchedule>);
 
-impl PatternSource for Noise {
+impl PatternSource for PlaneNoise {
     fn schedule(&self) -> Option<PlaneSchedule> {
         self.0
     }
@@ -306,8 +306,8 @@ fn the_light_of_the_mock_is_the_pattern_bit_for_bit() {
     // Every step for two frames.
     light_is_the_pattern(of(Pattern::Gray { axis: Axis::Columns }, 2), &rig, 40);
     light_is_the_pattern(of(Pattern::Counter, 1), &rig, 40);
-    light_is_the_pattern(Arc::new(Noise(None)), &rig, 40);
-    light_is_the_pattern(Arc::new(Noise(Some(PlaneSchedule::equal24()))), &rig, 40);
+    light_is_the_pattern(Arc::new(PlaneNoise(None)), &rig, 40);
+    light_is_the_pattern(Arc::new(PlaneNoise(Some(PlaneSchedule::equal24()))), &rig, 40);
 }
 
 #[test]

@@ -10,7 +10,7 @@ const MOST_TEXELS: u64 = 1 << 24;
 
 /// What a source sends.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(super) enum Form {
+pub(super) enum StreamForm {
     /// PPM or PAM images, each with its own size.
     Netpbm,
     /// RGBA texels of pictures that have the size of the texture.
@@ -19,7 +19,7 @@ pub(super) enum Form {
 
 /// Collects bytes into pictures.
 pub(super) struct Decoder {
-    form: Form,
+    form: StreamForm,
     size: [u32; 2],
     /// What has come of the next picture.
     bytes: Vec<u8>,
@@ -46,7 +46,7 @@ impl Header {
 
 impl Decoder {
     /// For textures of `size` texels (columns, rows).
-    pub(super) fn new(form: Form, size: [u32; 2]) -> Self {
+    pub(super) fn new(form: StreamForm, size: [u32; 2]) -> Self {
         Self { form, size, bytes: Vec::new(), sent: size, picture: Vec::new() }
     }
 
@@ -91,8 +91,8 @@ impl Decoder {
             return Ok(None);
         }
         match self.form {
-            Form::Rgba => Ok(Some(Header { len: 0, size: self.size, depth: 4 })),
-            Form::Netpbm => netpbm(&self.bytes[begin..]),
+            StreamForm::Rgba => Ok(Some(Header { len: 0, size: self.size, depth: 4 })),
+            StreamForm::Netpbm => netpbm(&self.bytes[begin..]),
         }
     }
 }
@@ -204,7 +204,12 @@ mod tests {
     use super::*;
 
     /// All pictures of `bytes`, pushed in pieces of `piece`.
-    fn decoded(form: Form, size: [u32; 2], bytes: &[u8], piece: usize) -> Result<Vec<Vec<[u8; 4]>>, String> {
+    fn decoded(
+        form: StreamForm,
+        size: [u32; 2],
+        bytes: &[u8],
+        piece: usize,
+    ) -> Result<Vec<Vec<[u8; 4]>>, String> {
         let (mut decoder, mut pictures) = (Decoder::new(form, size), vec![]);
         for part in bytes.chunks(piece) {
             decoder.push(part, |picture| pictures.push(picture.to_vec()))?;
@@ -240,13 +245,13 @@ mod tests {
     fn images_follow_each_other_however_they_are_cut() {
         let bytes = sequence();
         for piece in 1..=bytes.len() {
-            let pictures = decoded(Form::Netpbm, [3, 2], &bytes, piece).unwrap();
+            let pictures = decoded(StreamForm::Netpbm, [3, 2], &bytes, piece).unwrap();
             assert_eq!(pictures, vec![RGB.to_vec(); 3], "in pieces of {piece}");
         }
         let raw: Vec<u8> = RGB.iter().flat_map(|c| [c[0], c[1], c[2], 9]).collect();
         let twice = [&raw[..], &raw, &raw[..5]].concat();
         for piece in 1..=twice.len() {
-            assert_eq!(decoded(Form::Rgba, [3, 2], &twice, piece).unwrap(), vec![RGB.to_vec(); 2]);
+            assert_eq!(decoded(StreamForm::Rgba, [3, 2], &twice, piece).unwrap(), vec![RGB.to_vec(); 2]);
         }
     }
 
@@ -255,7 +260,7 @@ mod tests {
     fn other_sizes_are_fitted() {
         let even = [&b"P6 5 4 255 "[..], &[9, 200, 31].repeat(20)].concat();
         for size in [[1, 1], [2, 3], [5, 4], [16, 9]] {
-            let mut decoder = Decoder::new(Form::Netpbm, size);
+            let mut decoder = Decoder::new(StreamForm::Netpbm, size);
             let mut count = 0;
             let shown = |picture: &[[u8; 4]]| {
                 assert_eq!(picture, vec![[9, 200, 31, 255]; (size[0] * size[1]) as usize]);
@@ -265,7 +270,7 @@ mod tests {
             assert_eq!((count, decoder.sent()), (1, [5, 4]));
         }
         let halves = [&b"P6 8 2 255 "[..], &[0, 0, 0, 200, 200, 200].repeat(8)].concat();
-        let pictures = decoded(Form::Netpbm, [1, 1], &halves, 100).unwrap();
+        let pictures = decoded(StreamForm::Netpbm, [1, 1], &halves, 100).unwrap();
         assert_eq!(pictures, [[[100, 100, 100, 255]]]);
     }
 
@@ -284,12 +289,12 @@ mod tests {
             (&long, "no end"),
         ];
         for (bytes, reason) in cases {
-            let told = decoded(Form::Netpbm, [4, 4], bytes, 7).unwrap_err();
+            let told = decoded(StreamForm::Netpbm, [4, 4], bytes, 7).unwrap_err();
             assert!(told.contains(reason), "{told}");
         }
         // A header that is still to come is no error.
         for bytes in [&b"P"[..], b"P6", b"P6 4", b"P6 4 4 255", b"P7\nWIDTH 4", b"P6 # what"] {
-            assert_eq!(decoded(Form::Netpbm, [4, 4], bytes, 1), Ok(vec![]));
+            assert_eq!(decoded(StreamForm::Netpbm, [4, 4], bytes, 1), Ok(vec![]));
         }
     }
 
@@ -307,7 +312,7 @@ mod tests {
                 let at = next() % bytes.len();
                 bytes[at] = next() as u8;
             }
-            let mut decoder = Decoder::new(Form::Netpbm, [3, 2]);
+            let mut decoder = Decoder::new(StreamForm::Netpbm, [3, 2]);
             for part in bytes.chunks(1 + next() % 50) {
                 if decoder.push(part, |picture| assert_eq!(picture.len(), 6)).is_err() {
                     break;

@@ -16,7 +16,7 @@ use decode::Decoder;
 use dpm_common::realtime::os::give_way;
 use dpm_scene::LivePictures;
 pub use source::look_at;
-use source::{Stream, StreamEnd};
+use source::{OpenSource, StreamEnd};
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::Arc;
 use std::thread::{sleep, Builder, JoinHandle};
@@ -132,7 +132,7 @@ impl StreamReader {
     /// Opens the source and shows what it sends, until it ends or is no sequence of pictures. Counts in `shown`.
     fn read(&mut self, shown: &mut u64) -> StreamEnd {
         let size = self.pictures.size();
-        let mut stream = match Stream::open(&self.source, size) {
+        let mut stream = match OpenSource::open(&self.source, size) {
             Ok(stream) => stream,
             Err(ended) => return ended,
         };

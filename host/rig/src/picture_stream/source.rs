@@ -1,7 +1,7 @@
 //! Where pictures come from: a named pipe, or PipeWire by a program of GStreamer in a process of its own, so that what
 //! it does to itself cannot reach the rig.
 
-use super::decode::Form;
+use super::decode::StreamForm;
 use crate::config::LiveSource;
 use dpm_common::unix::{wait_readable, widen_pipe};
 use std::fmt;
@@ -51,14 +51,14 @@ impl fmt::Display for StreamEnd {
 }
 
 /// An open source.
-pub(super) enum Stream {
+pub(super) enum OpenSource {
     /// A named pipe, and whether anything has come.
     Pipe(File, bool),
     /// A program of its own, and the end of what it has said.
     Program(Child, Vec<u8>),
 }
 
-impl Stream {
+impl OpenSource {
     /// Opens a source for pictures of `size`. Never waits for a program at the other end.
     ///
     /// # Errors
@@ -73,10 +73,10 @@ impl Stream {
     }
 
     /// What it sends.
-    pub(super) fn form(&self) -> Form {
+    pub(super) fn form(&self) -> StreamForm {
         match self {
-            Self::Pipe(..) => Form::Netpbm,
-            Self::Program(..) => Form::Rgba,
+            Self::Pipe(..) => StreamForm::Netpbm,
+            Self::Program(..) => StreamForm::Rgba,
         }
     }
 
@@ -134,7 +134,7 @@ impl Stream {
     }
 }
 
-impl Drop for Stream {
+impl Drop for OpenSource {
     fn drop(&mut self) {
         if let Self::Program(child, _) = self {
             // It may have ended already.
@@ -187,13 +187,13 @@ fn not_installed() -> String {
     )
 }
 
-fn open_pipe(path: &Path) -> Result<Stream, String> {
+fn open_pipe(path: &Path) -> Result<OpenSource, String> {
     let file = File::options().read(true).custom_flags(libc::O_NONBLOCK | libc::O_CLOEXEC).open(path);
     let file = file.map_err(|e| not_opened(&e))?;
     check_kind(&file.metadata().map_err(|e| e.to_string())?)?;
     // A smaller one only means more calls.
     let _ = widen_pipe(&file, MOST_BYTES);
-    Ok(Stream::Pipe(file, false))
+    Ok(OpenSource::Pipe(file, false))
 }
 
 /// The program that writes the pictures of a PipeWire node to its output, as RGBA texels of this size.
@@ -215,7 +215,7 @@ pub(super) fn gstreamer_at(program: &Path, target: &str, [width, height]: [u32; 
 ///
 /// # Errors
 /// It is not installed, or cannot be started.
-pub(super) fn start(mut command: Command) -> Result<Stream, String> {
+pub(super) fn start(mut command: Command) -> Result<OpenSource, String> {
     let child = command.stdin(Stdio::null()).stdout(Stdio::piped()).stderr(Stdio::piped()).spawn();
     let child = child.map_err(|e| match e.kind() {
         io::ErrorKind::NotFound => not_installed(),
@@ -224,7 +224,7 @@ pub(super) fn start(mut command: Command) -> Result<Stream, String> {
     if let Some(out) = &child.stdout {
         let _ = widen_pipe(out, MOST_BYTES);
     }
-    Ok(Stream::Program(child, Vec::new()))
+    Ok(OpenSource::Program(child, Vec::new()))
 }
 
 /// The first error in what a program has said, or its last line.

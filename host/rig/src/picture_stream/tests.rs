@@ -8,9 +8,9 @@ use std::path::{Path, PathBuf};
 use std::process::Command;
 
 /// A folder that goes with the test.
-struct Folder(PathBuf);
+struct StreamFolder(PathBuf);
 
-impl Folder {
+impl StreamFolder {
     fn new(name: &str) -> Self {
         let path = std::env::temp_dir().join(format!("dpm-pictures-{name}-{}", std::process::id()));
         let _ = std::fs::remove_dir_all(&path);
@@ -25,7 +25,7 @@ impl Folder {
     }
 }
 
-impl Drop for Folder {
+impl Drop for StreamFolder {
     fn drop(&mut self) {
         let _ = std::fs::remove_dir_all(&self.0);
     }
@@ -68,7 +68,7 @@ fn wait_for_note(monitor: &RunMonitor, notes: &mut Vec<String>, part: &str) {
 /// What cannot be opened is told once, and tried again.
 #[test]
 fn a_pipe_that_is_made_later_is_found() {
-    let folder = Folder::new("later");
+    let folder = StreamFolder::new("later");
     let path = folder.0.join("pictures");
     let rig = rig_of(&format!("pipe:{}", path.display()));
     let monitor = Arc::new(RunMonitor::default());
@@ -98,7 +98,7 @@ fn program(folder: &Path, text: &str) {
 /// of by what it says.
 #[test]
 fn a_program_of_its_own_reads_pipewire() {
-    let folder = Folder::new("program");
+    let folder = StreamFolder::new("program");
     let said = folder.0.join("said");
     // 24 bytes are one picture of 3 x 2; `exec` so that the program itself is what is ended.
     let texels = "ABC\\377".repeat(6);
@@ -185,7 +185,7 @@ mod real_pace {
     /// something else is told of, and does not stop the one after it.
     #[test]
     fn a_pipe_shows_one_program_after_another() {
-        let folder = Folder::new("pipe");
+        let folder = StreamFolder::new("pipe");
         let pipe = folder.pipe("pictures");
         let rig = rig_of(&format!("pipe:{}", pipe.display()));
         assert_eq!(rig.scene.live.len(), 1);
@@ -233,7 +233,7 @@ mod real_pace {
     /// A program that sends one picture and ends at once: in the end the operator knows that the body is black.
     #[test]
     fn the_last_of_quick_changes_is_told() {
-        let folder = Folder::new("quick");
+        let folder = StreamFolder::new("quick");
         let pipe = folder.pipe("pictures");
         let rig = rig_of(&format!("pipe:{}", pipe.display()));
         let monitor = Arc::new(RunMonitor::default());

@@ -1,7 +1,7 @@
 //! Tracking, planning and packing as one crew: started together, watched by the supervisor, and abandoned together
 //! when one of them hangs.
 //!
-//! A crew owns everything that it works with and passes frames to the link through a [`Port`]. To abandon it, the
+//! A crew owns everything that it works with and passes frames to the link through a [`CrewPort`]. To abandon it, the
 //! other end of the port is dropped. Whatever its threads still do when they wake up cannot reach the link, and so
 //! cannot reach the light.
 
@@ -34,7 +34,7 @@ pub(super) const PLAN: usize = 1;
 pub(super) const PACK: usize = 2;
 
 /// Where the link's thread receives the frames of a crew and returns them.
-pub(super) struct Port {
+pub(super) struct CrewPort {
     pub(super) jobs: Receiver<FrameJob>,
     pub(super) free: Sender<FrameJob>,
     /// Publishes the projector's clock to the crew.
@@ -120,7 +120,7 @@ impl Crew {
     ///
     /// # Errors
     /// The system cannot start a thread.
-    pub(super) fn start(shared: &Arc<RunState>, parts: CrewParts) -> Result<(Self, Port), PipelineError> {
+    pub(super) fn start(shared: &Arc<RunState>, parts: CrewParts) -> Result<(Self, CrewPort), PipelineError> {
         let CrewParts { tracking, renderer, packer, budget, scale, memory, first, budget_milli } = parts;
         let rig = &shared.facts.rig;
         let policy = policy(rig);
@@ -188,7 +188,7 @@ impl Crew {
             silences: Default::default(),
             gpu_silence: Silence::default(),
         };
-        Ok((crew, Port { jobs: to_link_out, free: free_in, times, tracks }))
+        Ok((crew, CrewPort { jobs: to_link_out, free: free_in, times, tracks }))
     }
 
     /// Checks the crew, `step_ns` after the last check. `starved_ns` looks for how long of such a step a worker got no core for which a stage may

@@ -1,7 +1,7 @@
 //! From packed frames to light at real pace: the link's thread, and the mock projector's thread if it is in this
 //! process.
 
-use super::crew::Port;
+use super::crew::CrewPort;
 use super::rights::Rights;
 use super::threads::{enter_frame_path, may_stall, pop_within, RunState, STEP_NS, WARM_UP_FRAMES};
 use crate::engine::error::PipelineError;
@@ -29,7 +29,7 @@ const CLEARED_WITHIN_NS: u64 = 300_000_000;
 const CLEAR_STEP_NS: i64 = 1_000_000;
 
 /// The link thread's state: the deciding part and the medium.
-pub(super) struct Line {
+pub(super) struct LinkThread {
     pub(super) stage: LinkStage<Real>,
     pub(super) medium: Box<dyn Transport>,
 }
@@ -38,13 +38,13 @@ pub(super) struct Line {
 /// the last frames' light if the run is complete. A panic in this thread also ends in the dark.
 pub(super) fn link_thread(
     shared: &RunState,
-    mut line: Line,
-    ports: Receiver<Port>,
+    mut line: LinkThread,
+    ports: Receiver<CrewPort>,
     notes: NoteSender,
 ) -> ProjectorReport {
     shared.rights.enter(3);
     shared.link_pulse.begin(thread_id());
-    let mut desk = Desk { ports, crew: None, notes };
+    let mut desk = FramePort { ports, crew: None, notes };
     let served = catch_unwind(AssertUnwindSafe(|| line.serve(shared, &mut desk)));
     enter_frame_path(false);
     if served.is_err() {
@@ -61,14 +61,14 @@ pub(super) fn link_thread(
 }
 
 /// Where the link's thread receives its frames and returns them.
-struct Desk {
-    ports: Receiver<Port>,
+struct FramePort {
+    ports: Receiver<CrewPort>,
     /// Frames of the current crew, and the way back for them.
     crew: Option<(Receiver<FrameJob>, Sender<FrameJob>)>,
     notes: NoteSender,
 }
 
-impl Desk {
+impl FramePort {
     /// True when no frame will come any more, except from another crew.
     fn is_finished(&self) -> bool {
         self.crew.as_ref().is_none_or(|(jobs, _)| jobs.is_finished())
@@ -112,9 +112,9 @@ impl Desk {
     }
 }
 
-impl Line {
+impl LinkThread {
     /// Sends frames until no more will come or a stop is requested.
-    fn serve(&mut self, shared: &RunState, desk: &mut Desk) {
+    fn serve(&mut self, shared: &RunState, desk: &mut FramePort) {
         while !shared.facts.monitor.stop_requested() {
             if let Some(port) = desk.ports.try_pop() {
                 // Frames of the former crew are dropped.

@@ -10,7 +10,7 @@ use crate::light::recorder::{LightRecorder, LightSender};
 use crate::mock::{DeviceClock, EmulatedProjector, MockConfig, GREATEST_SHIFT};
 use crate::pack::eye_mask::EyeMask;
 use crate::pack::prepared::PreparedFrames;
-use crate::pack::source::{PatternPainter, PatternSource, Pictures};
+use crate::pack::source::{FrameSource, PatternPainter, PatternSource};
 use crate::pack::Packer;
 use crate::pipeline::projector;
 use crate::plan::budget::BudgetController;
@@ -41,7 +41,7 @@ const MOVES_KEPT: usize = 64;
 
 /// Where the pictures of a run come from.
 #[derive(Clone)]
-pub(super) enum Origin {
+pub(super) enum PictureOrigin {
     /// A GPU traces them.
     Gpu(Arc<Gpu>),
     /// They are prepared and marked.
@@ -50,7 +50,7 @@ pub(super) enum Origin {
     Pattern(Arc<dyn PatternSource>, Option<MonotonicClock>),
 }
 
-impl Origin {
+impl PictureOrigin {
     /// The clock that stamps the run at real pace, if others compare its stamps with theirs.
     pub(super) fn clock(&self) -> Option<MonotonicClock> {
         match self {
@@ -60,7 +60,7 @@ impl Origin {
     }
 }
 
-impl Origin {
+impl PictureOrigin {
     /// The GPU, if there is one.
     pub(super) fn gpu(&self) -> Option<&Arc<Gpu>> {
         match self {
@@ -75,11 +75,11 @@ impl Origin {
     }
 
     /// What gives the pictures if no GPU does.
-    fn pictures(&self, raster: dpm_device::planes::Raster) -> Option<Pictures> {
+    fn pictures(&self, raster: dpm_device::planes::Raster) -> Option<FrameSource> {
         match self {
             Self::Gpu(_) => None,
-            Self::Prepared => Some(Pictures::Marked(PreparedFrames::new(raster))),
-            Self::Pattern(source, _) => Some(Pictures::Drawn(PatternPainter::new(source.clone(), raster))),
+            Self::Prepared => Some(FrameSource::Marked(PreparedFrames::new(raster))),
+            Self::Pattern(source, _) => Some(FrameSource::Drawn(PatternPainter::new(source.clone(), raster))),
         }
     }
 }
@@ -120,7 +120,7 @@ impl CrewParts {
     /// The tracker cannot be opened, or the GPU refuses.
     pub(super) fn new(
         rig: &Rig,
-        origin: &Origin,
+        origin: &PictureOrigin,
         options: RunOptions,
         clock: Arc<dyn HostClock>,
     ) -> Result<Self, PipelineError> {
@@ -141,7 +141,7 @@ impl CrewParts {
     pub(super) fn taking_over(
         heritage: &Heritage,
         rig: &Rig,
-        origin: &Origin,
+        origin: &PictureOrigin,
         options: RunOptions,
         clock: Arc<dyn HostClock>,
     ) -> Result<Self, PipelineError> {
@@ -165,7 +165,7 @@ impl CrewParts {
     fn drawn_by<E>(
         renderer: impl FnOnce() -> Result<Option<Renderer>, E>,
         rig: &Rig,
-        origin: &Origin,
+        origin: &PictureOrigin,
         options: RunOptions,
         clock: Arc<dyn HostClock>,
     ) -> Result<Self, PipelineError>
@@ -174,7 +174,7 @@ impl CrewParts {
     {
         // The tracker first: to open it takes a moment, and shaders may take a minute.
         let tracker: Box<dyn Tracker> = match origin {
-            Origin::Pattern(..) if rig.heads.is_empty() => Box::new(NoTracker),
+            PictureOrigin::Pattern(..) if rig.heads.is_empty() => Box::new(NoTracker),
             _ => open_for(rig, clock, HostTime(0))?,
         };
         let mut renderer = renderer()?;
@@ -208,7 +208,7 @@ impl CrewParts {
     pub(super) fn at_real_pace(
         mut self,
         rig: &Rig,
-        origin: &Origin,
+        origin: &PictureOrigin,
         wakes: bool,
     ) -> Result<Self, PipelineError> {
         if rig.config.render.method.takes_a_budget() && self.renderer.is_some() {

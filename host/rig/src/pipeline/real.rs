@@ -1,9 +1,9 @@
 //! A run at real pace: a thread each for the stages, the link, the supervisor and the mock projector. The caller's
 //! thread collects.
 
-use super::crew::{Crew, OnExit, Port};
-use super::link::{device_thread, link_thread, Line};
-use super::parts::{bring_up, mock_projector, CrewParts, Heritage, Origin};
+use super::crew::{Crew, CrewPort, OnExit};
+use super::link::{device_thread, link_thread, LinkThread};
+use super::parts::{bring_up, mock_projector, CrewParts, Heritage, PictureOrigin};
 use super::projector::{self, OpenMedium};
 use super::rights::Rights;
 use super::run::Ran;
@@ -59,7 +59,7 @@ const END_WITHIN: Duration = Duration::from_secs(1);
 
 pub(super) fn run_at_real_pace(
     rig: &Arc<Rig>,
-    origin: &Origin,
+    origin: &PictureOrigin,
     open: &OpenMedium,
     options: RunOptions,
     monitor: &Arc<RunMonitor>,
@@ -88,7 +88,7 @@ pub(super) fn run_at_real_pace(
     tell_horizon(&facts);
     let lights_of = far.lights.map(|lights| (lights, rig.config.projector.light_delay_ns()));
     let keeper = LinkKeeper::new(time, &link, rig.bodies.len(), lights_of);
-    let line = Line { stage: LinkStage::new(facts.clone(), link, keeper, lead), medium: far.medium };
+    let line = LinkThread { stage: LinkStage::new(facts.clone(), link, keeper, lead), medium: far.medium };
     let shared = Arc::new(RunState::new(&facts, clock, time, &rights));
     let mut collector =
         Collector::new(rig.clone(), options.keep_frames.max(options.keep_records), options.verify)
@@ -128,7 +128,7 @@ pub(super) fn run_at_real_pace(
 
 fn crew_parts(
     rig: &Rig,
-    origin: &Origin,
+    origin: &PictureOrigin,
     options: RunOptions,
     clock: MonotonicClock,
     wakes: bool,
@@ -140,7 +140,7 @@ fn crew_parts(
 /// with the same options.
 fn maker(
     facts: &Arc<Facts>,
-    origin: Origin,
+    origin: PictureOrigin,
     heritage: Heritage,
     clock: MonotonicClock,
     seen: Arc<SeenBodies>,
@@ -150,7 +150,7 @@ fn maker(
     Arc::new(move |remake| {
         let mut state = state.lock().map_err(|_| PipelineError::Panicked("remake"))?;
         let (origin, heritage) = &mut *state;
-        if let Origin::Gpu(gpu) = origin {
+        if let PictureOrigin::Gpu(gpu) = origin {
             let answers = remake == Remake::Crew && gpu.answers(ANSWERS_WITHIN);
             if remake == Remake::Crew && !answers {
                 facts.monitor.note(format!("the GPU does not answer either; {}", until_gpu_is_back(&facts)));
@@ -176,11 +176,11 @@ fn maker(
 /// Begins to hear where the observer looks, if a scene is drawn.
 fn hear_gaze(
     rig: &Rig,
-    origin: &Origin,
+    origin: &PictureOrigin,
     monitor: &Arc<RunMonitor>,
     clock: MonotonicClock,
 ) -> Option<GazeStream> {
-    let is_drawn = !matches!(origin, Origin::Pattern(..));
+    let is_drawn = !matches!(origin, PictureOrigin::Pattern(..));
     is_drawn.then(|| GazeStream::start(rig, monitor, Arc::new(move || clock.now())))
 }
 
@@ -277,12 +277,12 @@ impl Threads {
     fn start(
         shared: &Arc<RunState>,
         parts: CrewParts,
-        line: Line,
+        line: LinkThread,
         maker: Maker,
         lights: LightReceiver,
     ) -> Result<(Self, Inbox), PipelineError> {
         let (crew, port) = Crew::start(shared, parts)?;
-        let (mut ports_in, ports) = channel::<Port>(4, WaitPolicy::Park);
+        let (mut ports_in, ports) = channel::<CrewPort>(4, WaitPolicy::Park);
         let _ = ports_in.push(port);
         let (notes_in, notes) = note_channel(&shared.facts.rig, &shared.facts.monitor);
         let on_link = shared.clone();

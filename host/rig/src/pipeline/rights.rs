@@ -3,7 +3,7 @@
 use crate::config::RealTimeConfig;
 use crate::telemetry::monitor::RunMonitor;
 use dpm_common::realtime::awake::CoresAwake;
-use dpm_common::realtime::{enter_frame_path, os, Refusal, ThreadRights};
+use dpm_common::realtime::{enter_frame_path, os, RightRefusal, ThreadRights};
 use dpm_handoff::path::Lock;
 use std::sync::Arc;
 
@@ -16,7 +16,7 @@ pub(super) struct Rights {
     cores: Vec<u32>,
     locked: bool,
     _awake: Option<CoresAwake>,
-    refusals: Lock<Vec<Refusal>>,
+    refusals: Lock<Vec<RightRefusal>>,
     /// Tells the operator of a refusal at once: a service may run for weeks before its report is written.
     monitor: Arc<RunMonitor>,
 }
@@ -25,7 +25,7 @@ impl Rights {
     /// Reads `[real_time]`, locks memory and keeps cores awake if it says so.
     pub(super) fn new(config: &RealTimeConfig, monitor: &Arc<RunMonitor>) -> Self {
         let mut refusals = Vec::new();
-        let mut refused = |refusal: Refusal| {
+        let mut refused = |refusal: RightRefusal| {
             monitor.note(refusal.to_string());
             refusals.push(refusal);
         };
@@ -83,7 +83,7 @@ impl Rights {
 
     /// The refusals as text.
     pub(super) fn warnings(&self) -> Vec<String> {
-        self.refusals.lock().map(|r| r.iter().map(Refusal::to_string).collect()).unwrap_or_default()
+        self.refusals.lock().map(|r| r.iter().map(RightRefusal::to_string).collect()).unwrap_or_default()
     }
 }
 

@@ -1,7 +1,7 @@
 //! One run, from a rig to a report.
 
 use super::outcome::RunOutcome;
-use super::parts::Origin;
+use super::parts::PictureOrigin;
 use super::projector::{self, OpenMedium};
 use super::real::run_at_real_pace;
 use super::virtual_pace::run_at_virtual_pace;
@@ -37,7 +37,7 @@ pub fn run(
     options: RunOptions,
     monitor: &Arc<RunMonitor>,
 ) -> Result<RunOutcome, PipelineError> {
-    run_from(rig, &Origin::Gpu(gpu.clone()), &projector::open, options, monitor)
+    run_from(rig, &PictureOrigin::Gpu(gpu.clone()), &projector::open, options, monitor)
 }
 
 /// Like [`run`] at real pace, over the medium that `open` opens instead of the rig's own.
@@ -51,7 +51,7 @@ pub fn run_over(
     options: RunOptions,
     monitor: &Arc<RunMonitor>,
 ) -> Result<RunOutcome, PipelineError> {
-    run_from(rig, &Origin::Gpu(gpu.clone()), open, options, monitor)
+    run_from(rig, &PictureOrigin::Gpu(gpu.clone()), open, options, monitor)
 }
 
 /// Like [`run`] with prepared frames instead of rendered ones, without a GPU. Every lit frame is checked for parts of
@@ -64,7 +64,13 @@ pub fn run_prepared(
     options: RunOptions,
     monitor: &Arc<RunMonitor>,
 ) -> Result<RunOutcome, PipelineError> {
-    run_from(rig, &Origin::Prepared, &projector::open, RunOptions { verify: false, ..options }, monitor)
+    run_from(
+        rig,
+        &PictureOrigin::Prepared,
+        &projector::open,
+        RunOptions { verify: false, ..options },
+        monitor,
+    )
 }
 
 /// Shows the pictures of `source`, without a GPU. The rig's tracker is asked for heads that are guarded, and for nothing
@@ -87,12 +93,12 @@ pub fn run_pattern(
     };
     // Nothing renders: a slow link tells of itself by what it carries.
     let options = RunOptions { tells_slow: false, ..options };
-    run_from(rig, &Origin::Pattern(source, clock), &projector::open, options, monitor)
+    run_from(rig, &PictureOrigin::Pattern(source, clock), &projector::open, options, monitor)
 }
 
 fn run_from(
     rig: Arc<Rig>,
-    origin: &Origin,
+    origin: &PictureOrigin,
     open: &OpenMedium,
     options: RunOptions,
     monitor: &Arc<RunMonitor>,
@@ -111,7 +117,7 @@ fn run_from(
             heads.join(", ")
         ));
     }
-    if matches!(origin, Origin::Pattern(..)) {
+    if matches!(origin, PictureOrigin::Pattern(..)) {
         monitor.parameters().close();
     }
     let streams = PictureStreams::start(&rig, monitor);
@@ -138,7 +144,7 @@ pub(super) struct Ran {
 }
 
 impl Ran {
-    fn into_outcome(self, rig: &Rig, origin: &Origin) -> RunOutcome {
+    fn into_outcome(self, rig: &Rig, origin: &PictureOrigin) -> RunOutcome {
         let Self { facts, mut collector, slots, recorder, carried, wall_s, standstills, warnings } = self;
         let config = &rig.config;
         let gpu = origin.gpu();
@@ -150,9 +156,9 @@ impl Ran {
             gpu: gpu.map_or_else(|| "none".into(), |gpu| gpu.summary().name.clone()),
             software_gpu: gpu.is_some_and(|gpu| gpu.summary().software),
             method: match origin {
-                Origin::Gpu(_) => config.render.method.word(),
-                Origin::Prepared => "prepared",
-                Origin::Pattern(..) => "pattern",
+                PictureOrigin::Gpu(_) => config.render.method.word(),
+                PictureOrigin::Prepared => "prepared",
+                PictureOrigin::Pattern(..) => "pattern",
             },
             prediction: config.prediction.on,
             method_choice: rig.method_choice.clone(),

@@ -1,13 +1,13 @@
 //! The supervisor's thread, which no stage can delay. It checks every other thread and carries out what
 //! [`Supervision`] decides.
 
-use super::crew::{Crew, CrewState, Port};
+use super::crew::{Crew, CrewPort, CrewState};
 use super::parts::CrewParts;
 use super::threads::RunState;
 use crate::engine::error::PipelineError;
 use crate::engine::facts::Facts;
 use crate::engine::pulse::Pulse;
-use crate::engine::supervision::{Irreplaceable, Making, Remake, Supervision, Trouble, Verdict};
+use crate::engine::supervision::{CrewVerdict, Irreplaceable, Making, Remake, Supervision, Trouble};
 use crossbeam::channel::{unbounded, Receiver, Sender, TryRecvError};
 use dpm_common::clock::{Clock, Stopwatch};
 use dpm_common::realtime::os::processor_pressure;
@@ -50,7 +50,7 @@ pub(super) struct Supervisor {
     pub(super) shared: Arc<RunState>,
     pub(super) mind: Supervision,
     /// Informs the link of a new crew.
-    pub(super) ports: PortSender<Port>,
+    pub(super) ports: PortSender<CrewPort>,
     pub(super) maker: Maker,
     pub(super) workshop: Workshop,
     pub(super) wreckage: Wreckage,
@@ -254,8 +254,8 @@ impl Supervisor {
     /// Abandons a crew that is in trouble and starts making a new one, if that can help.
     fn replace(&mut self, crew: Box<Crew>, trouble: Trouble, now: HostTime) -> Shift {
         let remake = match self.mind.judge(trouble, now) {
-            Verdict::End => return Shift::Works(crew),
-            Verdict::Abandon { remake } => remake,
+            CrewVerdict::End => return Shift::Works(crew),
+            CrewVerdict::Abandon { remake } => remake,
         };
         let state = crew.state.clone();
         self.wreckage.take(*crew);

@@ -1,7 +1,7 @@
 //! A run at virtual pace. One thread drives every part of the engine under a clock that it moves. Each stage takes
 //! the modelled cost in the rig file, so a run is a function of its inputs, however fast or busy the machine is.
 
-use super::parts::{bring_up, mock_projector, CrewParts, Origin, FIRST_FRAME_TIMEOUT_NS};
+use super::parts::{bring_up, mock_projector, CrewParts, PictureOrigin, FIRST_FRAME_TIMEOUT_NS};
 use super::run::Ran;
 use super::settings::lead_estimator;
 use super::supervisor::leave_behind;
@@ -42,7 +42,7 @@ const CONNECT_STEP_NS: i64 = 50_000;
 
 pub(super) fn run_at_virtual_pace(
     rig: &Arc<Rig>,
-    origin: &Origin,
+    origin: &PictureOrigin,
     options: RunOptions,
     monitor: &Arc<RunMonitor>,
 ) -> Result<Ran, PipelineError> {
@@ -113,8 +113,8 @@ struct LateTracks {
 
 impl LateTracks {
     /// `None` if no tracks are sent.
-    fn of(rig: &Rig, origin: &Origin) -> Result<Option<Self>, PipelineError> {
-        if !rig.wants_tracks() || matches!(origin, Origin::Pattern(..)) {
+    fn of(rig: &Rig, origin: &PictureOrigin) -> Result<Option<Self>, PipelineError> {
+        if !rig.wants_tracks() || matches!(origin, PictureOrigin::Pattern(..)) {
             return Ok(None);
         }
         let tracker = open_for(rig, Arc::new(|| HostTime(0)), HostTime(0))?;

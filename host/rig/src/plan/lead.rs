@@ -91,7 +91,7 @@ impl Spans {
 
 /// How the frames compare with those before.
 #[derive(Clone, Copy, Debug)]
-enum Pace {
+enum FramePace {
     Usual,
     /// So many frames in a row needed more than what was the lead before them, nanoseconds.
     Rises {
@@ -110,7 +110,7 @@ enum Pace {
 #[derive(Clone, Debug)]
 pub struct LeadEstimator {
     spans: Spans,
-    pace: Pace,
+    pace: FramePace,
     /// What was known before the machine became slower, and the bins of the frames that showed it.
     before: Spans,
     row: [usize; MOST_IN_A_ROW],
@@ -141,7 +141,7 @@ impl LeadEstimator {
         }
         Self {
             spans: Spans::EMPTY,
-            pace: Pace::Usual,
+            pace: FramePace::Usual,
             before: Spans::EMPTY,
             row: [0; MOST_IN_A_ROW],
             row_len: ((ROW_NS / slot_ns) as usize).clamp(FEWEST_IN_A_ROW, MOST_IN_A_ROW),
@@ -184,35 +184,35 @@ impl LeadEstimator {
         self.since_slower = self.since_slower.saturating_add(1);
         let row_len = self.row_len;
         self.pace = match self.pace {
-            Pace::Usual if self.total() >= FEW && needed_ns > self.lead_ns() => {
+            FramePace::Usual if self.total() >= FEW && needed_ns > self.lead_ns() => {
                 self.before.clone_from(&self.spans);
                 self.row[0] = bin;
-                Pace::Rises { lead_ns: self.lead_ns(), row: 1 }
+                FramePace::Rises { lead_ns: self.lead_ns(), row: 1 }
             }
-            Pace::Rises { lead_ns, row } if needed_ns > lead_ns && row < row_len => {
+            FramePace::Rises { lead_ns, row } if needed_ns > lead_ns && row < row_len => {
                 self.row[row] = bin;
-                Pace::Rises { lead_ns, row: row + 1 }
+                FramePace::Rises { lead_ns, row: row + 1 }
             }
-            Pace::Rises { lead_ns, .. } if needed_ns > lead_ns => {
+            FramePace::Rises { lead_ns, .. } if needed_ns > lead_ns => {
                 self.spans = Spans::EMPTY;
                 self.row[..row_len].iter().for_each(|bin| self.spans.add(*bin, most));
-                Pace::Slower { lead_ns, row: 0, frames: 0 }
+                FramePace::Slower { lead_ns, row: 0, frames: 0 }
             }
-            Pace::Usual | Pace::Rises { .. } => Pace::Usual,
+            FramePace::Usual | FramePace::Rises { .. } => FramePace::Usual,
             // It is the rule now.
-            Pace::Slower { frames, .. } if i64::from(frames) >= most => Pace::Usual,
-            Pace::Slower { lead_ns, row, .. } if needed_ns <= lead_ns && row + 1 >= row_len => {
+            FramePace::Slower { frames, .. } if i64::from(frames) >= most => FramePace::Usual,
+            FramePace::Slower { lead_ns, row, .. } if needed_ns <= lead_ns && row + 1 >= row_len => {
                 if i64::from(self.since_slower) >= most {
                     self.spans.clone_from(&self.before);
                 } else {
                     self.spans.join(&self.before);
                 }
                 self.since_slower = 0;
-                Pace::Usual
+                FramePace::Usual
             }
-            Pace::Slower { lead_ns, row, frames } => {
+            FramePace::Slower { lead_ns, row, frames } => {
                 let row = if needed_ns <= lead_ns { row + 1 } else { 0 };
-                Pace::Slower { lead_ns, row, frames: frames + 1 }
+                FramePace::Slower { lead_ns, row, frames: frames + 1 }
             }
         };
     }

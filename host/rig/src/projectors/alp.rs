@@ -1,11 +1,11 @@
 //! `projector.backend.kind = "alp"`: a ViALUX ALP, by the vendor's library that its user has installed.
 
 use super::alp_library;
-use super::keys::{DeviceName, FrameKeys, Look, Medium, Opening, Panel, ProjectorKeys};
+use super::keys::{DeviceLook, DeviceName, FrameKeys, Medium, Opening, Panel, ProjectorKeys};
 use super::kind::ProjectorKind;
 use super::light::{LitTime, PlaneTiming, PlaneWeights};
-use dpm_alp::{AlpSettings, AlpTransport, Showing, Weights};
-use dpm_common::keys::read::{contradict, shown, Any, NotEmpty, Reader, Within};
+use dpm_alp::{AlpSettings, AlpTransport, ShowMode, Weights};
+use dpm_common::keys::read::{contradict, shown, Any, KeyReader, NotEmpty, Within};
 use dpm_common::{section, words};
 use dpm_device::transport::TransportError;
 use dpm_render::pack::Halftone;
@@ -70,7 +70,7 @@ impl ProjectorKeys for AlpConfig {
 
     /// An ALP has one picture time for each sequence, so binary weights take a sequence for each plane. What the panel, its
     /// memory and its cable hold is known when it is opened.
-    fn check(&self, frames: &FrameKeys, reader: &mut Reader) {
+    fn check(&self, frames: &FrameKeys, reader: &mut KeyReader) {
         if self.plane_times != AlpWeights::Binary {
             return;
         }
@@ -131,8 +131,8 @@ impl ProjectorKeys for AlpConfig {
         })
     }
 
-    fn examine(&self, loads: bool) -> Option<Result<Look, String>> {
-        let look = |(file, doubt): (PathBuf, String)| Look {
+    fn examine(&self, loads: bool) -> Option<Result<DeviceLook, String>> {
+        let look = |(file, doubt): (PathBuf, String)| DeviceLook {
             found: format!("{} is a library for this machine{doubt}", file.display()),
             is_doubtful: !doubt.is_empty(),
             remedy: "`dpm doctor --load-libraries RIG.toml` runs it, and asks the device what it can show"
@@ -147,7 +147,7 @@ impl ProjectorKeys for AlpConfig {
             library: self.library.clone(),
             number: self.device_number as i32,
             raster: panel.raster,
-            showing: Showing {
+            showing: ShowMode {
                 schedule: panel.schedule,
                 weights: self.plane_times.weights(),
                 rate: panel.rate,

@@ -1,7 +1,7 @@
 //! `projector.backend.compaction`: the codecs of a link.
 
-use dpm_common::keys::read::{ConfigValue, Reader};
-use dpm_common::keys::source::{Node, Value};
+use dpm_common::keys::read::{ConfigValue, KeyReader};
+use dpm_common::keys::source::{SourceNode, Value};
 use dpm_device::link::Codec;
 
 /// The codecs that a link may use.
@@ -36,8 +36,8 @@ impl ConfigValue for Compaction {
         r#""auto" | "raw" | a list of "rle", "xor-rle", "lz4""#.into()
     }
 
-    fn read(node: &Node, reader: &mut Reader, key: &str) -> Option<Self> {
-        let word = |node: &Node| match &node.value {
+    fn read(node: &SourceNode, reader: &mut KeyReader, key: &str) -> Option<Self> {
+        let word = |node: &SourceNode| match &node.value {
             Value::String(s) => Self::WORDS.iter().find(|(word, _)| word == s).map(|(_, codec)| codec.mask()),
             _ => None,
         };

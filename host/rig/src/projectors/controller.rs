@@ -3,9 +3,9 @@
 
 use super::keys::{FrameKeys, Panel, Surroundings};
 use super::light::LitTime;
-use dpm_common::keys::read::{ConfigValue, KeyDoc, Reader};
+use dpm_common::keys::read::{ConfigValue, KeyDoc, KeyReader};
 use dpm_common::keys::rows::KeyValues;
-use dpm_common::keys::source::{Entry, Node};
+use dpm_common::keys::source::{Entry, SourceNode};
 use dpm_device::planes::Parts;
 use dpm_device::transport::TransportError;
 use dpm_display::transport::Opener;
@@ -16,7 +16,7 @@ use std::sync::{Arc, OnceLock};
 /// the display.
 pub trait Controller: KeyValues {
     /// Refuses values that do not fit the frames.
-    fn check(&self, parts: Parts, frames: &FrameKeys, reader: &mut Reader);
+    fn check(&self, parts: Parts, frames: &FrameKeys, reader: &mut KeyReader);
 
     /// Which part of a frame its patterns take.
     fn lit_time(&self, parts: Parts, frames: &FrameKeys) -> LitTime;
@@ -47,7 +47,7 @@ pub trait Controller: KeyValues {
 }
 
 /// Reads the keys of a controller from a table of the rig file, whose name comes last.
-type ReadKeys = fn(&BTreeMap<String, Entry>, &mut Reader, &str) -> Arc<dyn Controller>;
+type ReadKeys = fn(&BTreeMap<String, Entry>, &mut KeyReader, &str) -> Arc<dyn Controller>;
 
 /// The row of a controller.
 pub struct ControllerKind {
@@ -97,7 +97,7 @@ impl ConfigValue for Behind {
         "a table".into()
     }
 
-    fn read(node: &Node, reader: &mut Reader, key: &str) -> Option<Self> {
+    fn read(node: &SourceNode, reader: &mut KeyReader, key: &str) -> Option<Self> {
         let Some(kind) = KIND.get() else {
             reader.refuse(&node.origin, key, "needs what this program was built without", "");
             return None;

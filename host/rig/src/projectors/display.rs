@@ -4,7 +4,7 @@ use super::controller::Behind;
 use super::keys::{DeviceName, FrameKeys, Medium, Opening, Panel, ProjectorKeys};
 use super::kind::{ProjectorKind, SlotClock};
 use super::light::{LitTime, PlaneTiming, PlaneWeights};
-use dpm_common::keys::read::{contradict, refuse, shown, Any, NotEmpty, Reader, Within};
+use dpm_common::keys::read::{contradict, refuse, shown, Any, KeyReader, NotEmpty, Within};
 use dpm_common::{section, words};
 use dpm_device::planes::{Parts, PlaneSchedule};
 use dpm_device::transport::TransportError;
@@ -151,7 +151,7 @@ impl ProjectorKeys for DisplayConfig {
         DeviceName { named: connector.clone(), connector: Some(connector), ..DeviceName::of(KIND.name) }
     }
 
-    fn check(&self, frames: &FrameKeys, reader: &mut Reader) {
+    fn check(&self, frames: &FrameKeys, reader: &mut KeyReader) {
         if let Err(e) = self.mode.parse::<ModeWish>() {
             refuse(
                 reader,
@@ -269,7 +269,7 @@ impl ProjectorKeys for DisplayConfig {
 
 impl DisplayConfig {
     /// The weights of planes behind a controller are those of its patterns.
-    fn check_weights(&self, frames: &FrameKeys, reader: &mut Reader) {
+    fn check_weights(&self, frames: &FrameKeys, reader: &mut KeyReader) {
         let weights = self.encoding.weights();
         if !reader.is_written("projector.weights") || frames.weights == weights {
             return;

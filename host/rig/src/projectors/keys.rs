@@ -4,7 +4,7 @@ use super::compaction::Compaction;
 use super::kind::ProjectorKind;
 use super::light::{LitTime, PlaneTiming, PlaneWeights};
 use super::mock::MockProjectorConfig;
-use dpm_common::keys::read::Reader;
+use dpm_common::keys::read::KeyReader;
 use dpm_common::keys::rows::{KeyValues, OfKind};
 use dpm_common::stopping;
 use dpm_device::link::{packet_bytes, COMMIT_BYTES};
@@ -143,7 +143,7 @@ pub enum Cable {
 
 /// What was seen of a device without its link.
 #[derive(Clone, Debug, PartialEq, Eq)]
-pub struct Look {
+pub struct DeviceLook {
     /// What it is and how it stands.
     pub found: String,
     /// Something speaks against it.
@@ -164,7 +164,7 @@ pub trait ProjectorKeys: KeyValues {
     }
 
     /// Refuses values that make no sense with each other or with those of frames.
-    fn check(&self, _frames: &FrameKeys, _reader: &mut Reader) {}
+    fn check(&self, _frames: &FrameKeys, _reader: &mut KeyReader) {}
 
     /// How the light of a frame is shared out over its exposure.
     fn plane_timing(&self) -> PlaneTiming {
@@ -235,7 +235,7 @@ pub trait ProjectorKeys: KeyValues {
     ///
     /// # Errors
     /// It does not answer.
-    fn examine(&self, _loads: bool) -> Option<Result<Look, String>> {
+    fn examine(&self, _loads: bool) -> Option<Result<DeviceLook, String>> {
         None
     }
 

@@ -1,7 +1,7 @@
 //! The row of a kind of projectors.
 
 use super::keys::ProjectorKeys;
-use dpm_common::keys::read::Reader;
+use dpm_common::keys::read::KeyReader;
 use dpm_common::keys::rows::{KindWord, Registry, Row, Section};
 use dpm_common::keys::source::Entry;
 use std::any::Any;
@@ -30,7 +30,7 @@ pub enum SlotClock {
 }
 
 /// Reads the keys of a kind from a table of the rig file, whose name comes last.
-type ReadKeys = fn(&BTreeMap<String, Entry>, &mut Reader, &str) -> Arc<dyn ProjectorKeys>;
+type ReadKeys = fn(&BTreeMap<String, Entry>, &mut KeyReader, &str) -> Arc<dyn ProjectorKeys>;
 
 /// A kind of projectors: a row of the table.
 pub struct ProjectorKind {
@@ -119,7 +119,7 @@ impl Row for ProjectorKind {
     fn read(
         &self,
         table: &BTreeMap<String, Entry>,
-        reader: &mut Reader,
+        reader: &mut KeyReader,
         section: &str,
     ) -> Arc<dyn ProjectorKeys> {
         (self.read)(table, reader, section)
@@ -128,7 +128,7 @@ impl Row for ProjectorKind {
 
 fn read<K: ProjectorKeys + Section>(
     table: &BTreeMap<String, Entry>,
-    reader: &mut Reader,
+    reader: &mut KeyReader,
     section: &str,
 ) -> Arc<dyn ProjectorKeys> {
     Arc::new(K::read_keys(table, reader, section))

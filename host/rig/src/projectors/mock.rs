@@ -4,7 +4,7 @@ use super::compaction::Compaction;
 use super::keys::{DeviceName, FrameKeys, ProjectorKeys};
 use super::kind::{FrameRoad, ProjectorKind};
 use crate::mock;
-use dpm_common::keys::read::{refuse, Any, Reader, Within};
+use dpm_common::keys::read::{refuse, Any, KeyReader, Within};
 use dpm_common::section;
 
 section! {
@@ -35,7 +35,7 @@ impl ProjectorKeys for MockProjectorConfig {
         DeviceName { is_single: true, ..DeviceName::of(KIND.name) }
     }
 
-    fn check(&self, _frames: &FrameKeys, reader: &mut Reader) {
+    fn check(&self, _frames: &FrameKeys, reader: &mut KeyReader) {
         if let Err(e) = mock::check_projector_faults(&self.faults) {
             let remedy = mock::FAULTS_REMEDY.to_owned();
             refuse(reader, &["projector.backend.faults"], e.to_string(), remedy);

@@ -25,8 +25,8 @@ mod window;
 
 pub use compaction::Compaction;
 pub use keys::{
-    frame_bytes, Cable, DeviceName, FrameKeys, Look, Medium, Opening, Panel, ProjectorBackend, ProjectorKeys,
-    Surroundings,
+    frame_bytes, Cable, DeviceLook, DeviceName, FrameKeys, Medium, Opening, Panel, ProjectorBackend,
+    ProjectorKeys, Surroundings,
 };
 pub use kind::{FrameRoad, ProjectorKind, SlotClock};
 pub use light::{LitTime, PlaneTiming, PlaneWeights};

@@ -4,7 +4,7 @@ use super::display::{linear_code_values, middle_row_ns, open_panel};
 use super::keys::{DeviceName, FrameKeys, Medium, Opening, Panel, ProjectorKeys};
 use super::kind::{ProjectorKind, SlotClock};
 use super::light::{PlaneTiming, PlaneWeights};
-use dpm_common::keys::read::{contradict, NotEmpty, Reader, Within};
+use dpm_common::keys::read::{contradict, KeyReader, NotEmpty, Within};
 use dpm_common::section;
 use dpm_device::transport::TransportError;
 use dpm_display::window::{self, interrupt_program, WindowSettings};
@@ -58,7 +58,7 @@ impl ProjectorKeys for WindowConfig {
         DeviceName { is_single: true, ..DeviceName::of(KIND.name) }
     }
 
-    fn check(&self, frames: &FrameKeys, reader: &mut Reader) {
+    fn check(&self, frames: &FrameKeys, reader: &mut KeyReader) {
         if frames.weights == PlaneWeights::Equal {
             let why = "a window shows code values, whose bits have binary weights";
             let backend = ("projector.backend.kind", format!("{:?}", KIND.word.word));

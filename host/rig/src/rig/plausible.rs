@@ -55,7 +55,7 @@ impl fmt::Display for Doubt {
 }
 
 /// A body as the projector meets it.
-struct Shape {
+struct MetBody {
     name: String,
     /// Points of its surface, in the space of what the tracker reports, metres.
     points: Vec<DVec3>,
@@ -64,7 +64,7 @@ struct Shape {
     high: DVec3,
 }
 
-impl Shape {
+impl MetBody {
     fn longest(&self) -> f64 {
         (self.high - self.low).max_element()
     }
@@ -76,7 +76,7 @@ impl Shape {
 }
 
 /// The tracked body `tracked` of a rig; `None` if no light falls on it.
-fn shape(rig: &Rig, tracked: usize) -> Option<Shape> {
+fn shape(rig: &Rig, tracked: usize) -> Option<MetBody> {
     let body = rig.bodies.get(tracked)?;
     let meshes = rig.scene.bodies.iter().filter(|b| b.tracked == Some(tracked as u16) && b.projected);
     let whole: Vec<&TriangleMesh> = meshes.filter(|b| b.is_whole()).map(|b| &b.mesh).collect();
@@ -91,12 +91,12 @@ fn shape(rig: &Rig, tracked: usize) -> Option<Shape> {
             points.push(p);
         }
     }
-    (!points.is_empty()).then(|| Shape { name: body.name.clone(), points, low, high })
+    (!points.is_empty()).then(|| MetBody { name: body.name.clone(), points, low, high })
 }
 
 /// What the projector shows of a body at one place.
 #[derive(Clone, Copy, Debug)]
-struct View {
+struct BodyView {
     /// Metres to the nearest point.
     distance: f64,
     /// Columns and rows between its outermost points.
@@ -105,7 +105,7 @@ struct View {
     is_near: bool,
 }
 
-fn view(camera: &ProjectorCamera, points: &[DVec3], place: &DAffine3) -> View {
+fn view(camera: &ProjectorCamera, points: &[DVec3], place: &DAffine3) -> BodyView {
     let (width, height) = (f64::from(camera.raster.width()), f64::from(camera.raster.height()));
     let (mut low, mut high) = ([f64::INFINITY; 2], [f64::NEG_INFINITY; 2]);
     let mut distance = f64::INFINITY;
@@ -119,7 +119,7 @@ fn view(camera: &ProjectorCamera, points: &[DVec3], place: &DAffine3) -> View {
     let is_near =
         high[0] > -0.5 * width && low[0] < 1.5 * width && high[1] > -0.5 * height && low[1] < 1.5 * height;
     let size_px = [0, 1].map(|i| (high[i] - low[i]).max(0.0));
-    View { distance, size_px, is_near }
+    BodyView { distance, size_px, is_near }
 }
 
 /// The unit that makes a length the most usual one, with its metres; `None` if none makes it usual.
@@ -155,7 +155,7 @@ pub fn doubts(rig: &Rig) -> Vec<Doubt> {
     all
 }
 
-fn of_shape(shape: &Shape) -> Vec<Doubt> {
+fn of_shape(shape: &MetBody) -> Vec<Doubt> {
     let mut all = Vec::new();
     let about = format!("body \"{}\"", shape.name);
     let size = shape.longest();
@@ -313,11 +313,11 @@ pub fn of_places(rig: &Rig, places: &[Vec<DAffine3>]) -> Vec<Doubt> {
         // A mesh of a doubtful size or place says nothing of where its body is.
         let Some(shape) = shape(rig, tracked).filter(|shape| of_shape(shape).is_empty()) else { continue };
         let of_body: Vec<&DAffine3> = places.iter().filter_map(|at| at.get(tracked)).collect();
-        let seen: Vec<(View, &DAffine3)> =
+        let seen: Vec<(BodyView, &DAffine3)> =
             of_body.iter().map(|place| (view(camera, &shape.points, place), *place)).collect();
         // The instant at which it is best within reach.
         let best = seen.iter().max_by(|a, b| {
-            let key = |v: &View| (v.is_near, v.size_px[0] * v.size_px[1]);
+            let key = |v: &BodyView| (v.is_near, v.size_px[0] * v.size_px[1]);
             key(&a.0).partial_cmp(&key(&b.0)).unwrap_or(std::cmp::Ordering::Equal)
         });
         let Some((best, place)) = best else { continue };
@@ -346,7 +346,7 @@ pub fn of_places(rig: &Rig, places: &[Vec<DAffine3>]) -> Vec<Doubt> {
 }
 
 /// The doubt about a body that is not within the projector's reach, or that is `across` pixels wide there.
-fn of_place(rig: &Rig, shape: &Shape, place: &DAffine3, (best, across): (&View, f64)) -> Doubt {
+fn of_place(rig: &Rig, shape: &MetBody, place: &DAffine3, (best, across): (&BodyView, f64)) -> Doubt {
     let about = format!("body \"{}\"", shape.name);
     match (projector_unit(rig, shape, place, best.distance), tracker_unit(rig, shape, place)) {
         (Some((unit, name)), _) => Doubt {
@@ -385,7 +385,12 @@ fn at_place(place: &DAffine3) -> String {
 }
 
 /// The unit in which the projector's place would make sense, if it is too far away.
-fn projector_unit(rig: &Rig, shape: &Shape, place: &DAffine3, distance: f64) -> Option<(f64, &'static str)> {
+fn projector_unit(
+    rig: &Rig,
+    shape: &MetBody,
+    place: &DAffine3,
+    distance: f64,
+) -> Option<(f64, &'static str)> {
     if distance < *DISTANCES_M.end() || place.translation.length() > *USUAL_DISTANCES_M.0.end() {
         return None;
     }
@@ -399,7 +404,7 @@ fn projector_unit(rig: &Rig, shape: &Shape, place: &DAffine3, distance: f64) -> 
 }
 
 /// The unit in which a body's place would be within reach.
-fn tracker_unit(rig: &Rig, shape: &Shape, place: &DAffine3) -> Option<(f64, &'static str)> {
+fn tracker_unit(rig: &Rig, shape: &MetBody, place: &DAffine3) -> Option<(f64, &'static str)> {
     if place.translation.length() < 10.0 {
         return None;
     }
@@ -521,7 +526,7 @@ mod tests {
             let distance = (1.5 * size).max(0.5 * 16f64.powf(drawn()));
             let scale = size / own.longest();
             let points: Vec<DVec3> = own.points.iter().map(|p| *p * scale).collect();
-            let scaled = Shape {
+            let scaled = MetBody {
                 name: "thing".into(),
                 points: points.clone(),
                 low: own.low * scale,
@@ -538,7 +543,7 @@ mod tests {
             assert!(seen.is_near && DISTANCES_M.contains(&seen.distance), "{i}: {seen:?}");
             assert!(seen.size_px[0].max(seen.size_px[1]) >= LEAST_PX, "{i}: {seen:?}");
             // In millimetres it is told, with the unit; small things in millimetres may be large ones in centimetres.
-            let large = Shape { low: scaled.low * 1000.0, high: scaled.high * 1000.0, ..scaled };
+            let large = MetBody { low: scaled.low * 1000.0, high: scaled.high * 1000.0, ..scaled };
             let word = if size > 0.12 { "millimetres?" } else { "metres?" };
             assert!(of_shape(&large).iter().any(|d| d.told.contains(word)), "{i}: {size}");
         }

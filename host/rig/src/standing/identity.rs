@@ -1,6 +1,6 @@
 //! `[projector.backend]` into what the projector is, as far as that is known before it is opened.
 
-use super::port::{Port, System, THIS_MACHINE};
+use super::port::{SerialDevice, System, THIS_MACHINE};
 use super::ENDING;
 use crate::projectors::{kinds, DeviceName, ProjectorBackend};
 use std::fmt;
@@ -28,7 +28,7 @@ pub struct Identity {
     /// a video input has a connection of its own.
     is_video: bool,
     /// The port behind a serial projector, if it is there now.
-    port: Option<Port>,
+    port: Option<SerialDevice>,
     system: System,
     is_mock: bool,
 }
@@ -60,7 +60,7 @@ impl Identity {
             None if is_single => family.clone(),
             None => format!("{family} any"),
         };
-        let key = port.as_ref().map(Port::key).or(display).or(named.filter(|_| is_lasting));
+        let key = port.as_ref().map(SerialDevice::key).or(display).or(named.filter(|_| is_lasting));
         let is_video = backend.kind().is_video;
         Self { what, family, key, is_proof, is_video, port, system, is_mock: backend.is_mock() }
     }
@@ -103,19 +103,19 @@ impl Identity {
         short(&plain(&format!("{}-{}", self.family, self.key.as_deref().unwrap_or("any"))))
     }
 
-    pub(super) fn port(&self) -> Option<&Port> {
+    pub(super) fn port(&self) -> Option<&SerialDevice> {
         self.port.as_ref()
     }
 
     /// What an order of another projector calls this one once a person has armed it.
     pub(super) fn instance(&self) -> String {
         let named = || format!("{} {}", self.family, self.key.as_deref().unwrap_or("any"));
-        self.port.as_ref().map_or_else(named, Port::instance)
+        self.port.as_ref().map_or_else(named, SerialDevice::instance)
     }
 
     /// Whether an order in the file `name` holds this projector. `projector` and `port`: those that the file names.
     /// Where nothing proves that they are another projector, it does.
-    pub(super) fn is_meant_by(&self, name: &str, projector: &str, port: Option<&Port>) -> Match {
+    pub(super) fn is_meant_by(&self, name: &str, projector: &str, port: Option<&SerialDevice>) -> Match {
         let stem = name.strip_suffix(ENDING).unwrap_or(name);
         // Which serial number was told is for the content to say.
         let stem = stem.split(AND_SERIAL).next().unwrap_or(stem);

@@ -6,7 +6,7 @@ use crate::config::{Overrides, RigConfig};
 use crate::projectors::{self, DeviceName, ProjectorBackend, ProjectorKeys, ProjectorKind, SlotClock};
 use dpm_common::keys::read::NotEmpty;
 use dpm_common::section;
-use port::{Node, System};
+use port::{DeviceFile, System};
 use std::fs;
 use std::os::unix::fs::symlink;
 
@@ -16,11 +16,11 @@ struct Machine {
     disk: Disk,
 }
 
-fn node(file: &Path) -> Option<Node> {
+fn node(file: &Path) -> Option<DeviceFile> {
     let text = fs::read_to_string(file).ok()?;
     let mut numbers = text.split_whitespace().map(|n| n.parse::<u32>().unwrap());
     let mut next = || numbers.next();
-    Some(Node { number: [next()?, next()?], since: [next()?.into(), 0] })
+    Some(DeviceFile { number: [next()?, next()?], since: [next()?.into(), 0] })
 }
 
 section! {

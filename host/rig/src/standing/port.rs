@@ -11,7 +11,7 @@ const MAX_PATH: usize = 300;
 
 /// A device file as it is now.
 #[derive(Clone, Copy, Debug)]
-pub(super) struct Node {
+pub(super) struct DeviceFile {
     /// Major and minor number of the device.
     pub(super) number: [u32; 2],
     /// When the file was made, or when its owner or mode changed last: seconds and nanoseconds.
@@ -24,20 +24,20 @@ pub(super) struct System {
     /// The folder that contains `dev` and `sys`. Tests make one of their own.
     pub(super) root: &'static str,
     /// Reads a device file. Tests have no right to make one.
-    pub(super) node: fn(&Path) -> Option<Node>,
+    pub(super) node: fn(&Path) -> Option<DeviceFile>,
 }
 
 /// The machine that this program runs on.
 pub(super) const THIS_MACHINE: System = System { root: "/", node: character_device };
 
-fn character_device(file: &Path) -> Option<Node> {
+fn character_device(file: &Path) -> Option<DeviceFile> {
     let about = fs::metadata(file).ok().filter(|about| about.file_type().is_char_device())?;
-    Some(Node { number: device_number(&about), since: [about.ctime(), about.ctime_nsec()] })
+    Some(DeviceFile { number: device_number(&about), since: [about.ctime(), about.ctime_nsec()] })
 }
 
 /// The device behind the path of a serial port.
 #[derive(Clone, Debug, Serialize, Deserialize)]
-pub(super) struct Port {
+pub(super) struct SerialDevice {
     /// Its device file, without links on the way.
     file: String,
     number: [u32; 2],
@@ -61,11 +61,11 @@ struct Usb {
 
 impl System {
     /// The port at `path`; `None` if there is no device now.
-    pub(super) fn port(&self, path: &str) -> Option<Port> {
+    pub(super) fn port(&self, path: &str) -> Option<SerialDevice> {
         let root = Path::new(self.root);
         let at = path.strip_prefix('/').map_or_else(|| PathBuf::from(path), |below| root.join(below));
         let file = fs::canonicalize(at).ok()?;
-        let Node { number, since } = (self.node)(&file)?;
+        let DeviceFile { number, since } = (self.node)(&file)?;
         let [major, minor] = number;
         let folder = fs::canonicalize(root.join(format!("sys/dev/char/{major}:{minor}"))).ok();
         let usb = folder.as_deref().and_then(usb_above);
@@ -74,7 +74,7 @@ impl System {
             (below.len() <= MAX_PATH).then(|| format!("/{below}"))
         };
         let place = folder.as_deref().and_then(below_root);
-        Some(Port { file: below_root(&file)?, number, since, place, usb })
+        Some(SerialDevice { file: below_root(&file)?, number, since, place, usb })
     }
 }
 
@@ -105,7 +105,7 @@ impl Usb {
     }
 }
 
-impl Port {
+impl SerialDevice {
     /// What names it in files: of an adapter its numbers, or without a serial number its socket; of every other port
     /// its device file. Two devices may share a key one after the other, and cheap adapters may share it at once.
     pub(super) fn key(&self) -> String {

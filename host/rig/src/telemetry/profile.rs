@@ -21,7 +21,7 @@ const MAX_BATCHES: usize = 1024;
 
 /// The distribution of one interval, with signs.
 #[derive(Clone, Debug)]
-struct Track {
+struct IntervalDistribution {
     whole: SignedHistogram,
     batch: SignedHistogram,
     /// Median and 99 % of each batch kept, ms.
@@ -32,7 +32,7 @@ struct Track {
     ended: u64,
 }
 
-impl Track {
+impl IntervalDistribution {
     fn new() -> Self {
         Self {
             whole: SignedHistogram::new(LONGEST_NS),
@@ -192,8 +192,8 @@ pub struct Profiler {
     ideal_light: bool,
     batch_frames: u64,
     in_batch: u64,
-    tracks: Vec<Track>,
-    jitter: Track,
+    tracks: Vec<IntervalDistribution>,
+    jitter: IntervalDistribution,
     last_lit: Option<(u64, HostTime)>,
     frames_lit: u64,
     frames_late: u64,
@@ -210,8 +210,8 @@ impl Profiler {
             ideal_light: false,
             batch_frames: batch_frames.max(1),
             in_batch: 0,
-            tracks: Interval::ALL.iter().map(|_| Track::new()).collect(),
-            jitter: Track::new(),
+            tracks: Interval::ALL.iter().map(|_| IntervalDistribution::new()).collect(),
+            jitter: IntervalDistribution::new(),
             last_lit: None,
             frames_lit: 0,
             frames_late: 0,
@@ -243,7 +243,7 @@ impl Profiler {
         self.in_batch += 1;
         if self.in_batch == self.batch_frames {
             self.in_batch = 0;
-            self.tracks.iter_mut().chain([&mut self.jitter]).for_each(Track::end_batch);
+            self.tracks.iter_mut().chain([&mut self.jitter]).for_each(IntervalDistribution::end_batch);
         }
     }
 
@@ -423,7 +423,7 @@ mod tests {
     /// Ten thousand batches: memory stays constant, and the batches kept are spread over the whole run.
     #[test]
     fn batches_of_a_long_run_are_thinned_out_evenly() {
-        let mut track = Track::new();
+        let mut track = IntervalDistribution::new();
         for k in 1..=10_000i64 {
             track.record(k * 1_000_000);
             track.end_batch();

@@ -26,14 +26,14 @@ const BATCH_SLOTS: u64 = 128;
 
 /// What is known about a slot.
 #[derive(Clone, Copy, Debug, Default)]
-struct Entry {
-    light: Light,
+struct SlotEntry {
+    light: SlotOutcome,
     /// Why its frame may have missed the slot, and when that frame was latched.
     trouble: Option<(MissCause, HostTime)>,
 }
 
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
-enum Light {
+enum SlotOutcome {
     /// Nothing was reported yet.
     #[default]
     Untold,
@@ -153,7 +153,7 @@ pub(crate) struct SlotLedger {
     reference: (u64, HostTime),
     /// The first undecided slot.
     base: u64,
-    window: VecDeque<Entry>,
+    window: VecDeque<SlotEntry>,
     counts: SlotCounts,
     batches: Batches,
     /// The misses that were found since they were last read; `None` if nobody reads them.
@@ -255,14 +255,14 @@ impl SlotLedger {
     /// The frame that was planned for `slot`, which begins at `begin`, was lit in it. The last `unseen` unreported
     /// slots before it showed frames of which only the number is known; each counts as having shown its own frame.
     pub(crate) fn own(&mut self, slot: u64, begin: HostTime, unseen: u32) {
-        self.told(slot, begin, Light::Own, unseen);
+        self.told(slot, begin, SlotOutcome::Own, unseen);
         self.spans.lit(begin);
     }
 
     /// The projector showed nothing new in `slot`, which began at `begin`, or a frame that was meant for an earlier
     /// slot. `unseen` as in [`SlotLedger::own`].
     pub(crate) fn nothing_new(&mut self, slot: u64, begin: HostTime, unseen: u32) {
-        self.told(slot, begin, Light::NothingNew, unseen);
+        self.told(slot, begin, SlotOutcome::NothingNew, unseen);
     }
 
     /// Decides what can be decided. Call it regularly.
@@ -271,10 +271,10 @@ impl SlotLedger {
         while let (Some(front), Some(last)) = (self.window.front(), self.last_planned) {
             let slot = self.base;
             let known = match front.light {
-                Light::Own => true,
-                Light::NothingNew => self.begin_of(slot) <= through,
+                SlotOutcome::Own => true,
+                SlotOutcome::NothingNew => self.begin_of(slot) <= through,
                 // Light is reported in order, so a slot that was passed over will not be reported any more.
-                Light::Untold => {
+                SlotOutcome::Untold => {
                     self.newest_light.is_some_and(|newest| newest > slot) && self.begin_of(slot) <= through
                 }
             };
@@ -314,7 +314,7 @@ impl SlotLedger {
             self.window.clear();
         } else {
             for _ in slot..self.base {
-                self.window.push_front(Entry::default());
+                self.window.push_front(SlotEntry::default());
             }
             for _ in self.base..slot {
                 self.window.pop_front();
@@ -330,7 +330,7 @@ impl SlotLedger {
         begin.plus_ns(ns)
     }
 
-    fn entry(&mut self, slot: u64) -> Option<&mut Entry> {
+    fn entry(&mut self, slot: u64) -> Option<&mut SlotEntry> {
         let at = usize::try_from(slot.checked_sub(self.base)?).ok()?;
         self.window.get_mut(at)
     }
@@ -350,16 +350,16 @@ impl SlotLedger {
                 self.base = keep_from;
             }
             while self.base < keep_from {
-                self.window.push_back(Entry { light: Light::Untold, trouble });
+                self.window.push_back(SlotEntry { light: SlotOutcome::Untold, trouble });
                 self.decide_front();
             }
         }
         while self.end() <= slot {
-            self.window.push_back(Entry { light: Light::Untold, trouble });
+            self.window.push_back(SlotEntry { light: SlotOutcome::Untold, trouble });
         }
     }
 
-    fn told(&mut self, slot: u64, begin: HostTime, light: Light, unseen: u32) {
+    fn told(&mut self, slot: u64, begin: HostTime, light: SlotOutcome, unseen: u32) {
         // Light far beyond the last planned slot does not belong to the run, unless planning continues, which then
         // covers it. A projector also must not decide how much memory or time is spent here.
         let newest = self.last_planned.unwrap_or(slot).saturating_add(WINDOW as u64);
@@ -381,8 +381,8 @@ impl SlotLedger {
             entry.light = light;
         }
         let before = self.window.iter_mut().take(at).rev();
-        for entry in before.filter(|e| e.light == Light::Untold).take(unseen as usize) {
-            entry.light = Light::Own;
+        for entry in before.filter(|e| e.light == SlotOutcome::Untold).take(unseen as usize) {
+            entry.light = SlotOutcome::Own;
         }
     }
 
@@ -398,8 +398,8 @@ impl SlotLedger {
         self.count(judgement, 1);
     }
 
-    fn judged(&self, slot: u64, entry: Entry) -> Judgement {
-        if entry.light == Light::Own {
+    fn judged(&self, slot: u64, entry: SlotEntry) -> Judgement {
+        if entry.light == SlotOutcome::Own {
             return Judgement::Own;
         }
         let begin = self.begin_of(slot);

@@ -20,7 +20,7 @@ const DEVICE: u32 = 3;
 /// Where slices go.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 #[repr(usize)]
-enum Track {
+enum TraceTrack {
     Tracker = 0,
     Plan,
     Gpu,
@@ -29,13 +29,13 @@ enum Track {
     Light,
 }
 
-const TRACKS: [(Track, u32, &str); 6] = [
-    (Track::Tracker, DEVICE, "tracker: exposure to arrival"),
-    (Track::Plan, HOST, "plan"),
-    (Track::Gpu, GPU, "render"),
-    (Track::Pack, HOST, "pack"),
-    (Track::Link, HOST, "link"),
-    (Track::Light, DEVICE, "projector: light"),
+const TRACKS: [(TraceTrack, u32, &str); 6] = [
+    (TraceTrack::Tracker, DEVICE, "tracker: exposure to arrival"),
+    (TraceTrack::Plan, HOST, "plan"),
+    (TraceTrack::Gpu, GPU, "render"),
+    (TraceTrack::Pack, HOST, "pack"),
+    (TraceTrack::Link, HOST, "link"),
+    (TraceTrack::Light, DEVICE, "projector: light"),
 ];
 
 /// Lanes per track. If more frames are in flight, they share the last lane, and each is clipped to begin there when
@@ -137,26 +137,26 @@ impl<W: Write> TraceWriter<W> {
     pub(crate) fn frame(&mut self, frame: &FrameTrace<'_>) -> Result<(), Error> {
         let t = frame.timeline;
         let mut journey = vec![
-            self.slice(Track::Tracker, "sample", t.captured_at, t.received_at, frame)?,
-            self.slice(Track::Plan, "latch and submit", t.latched_at, t.submitted_at, frame)?,
+            self.slice(TraceTrack::Tracker, "sample", t.captured_at, t.received_at, frame)?,
+            self.slice(TraceTrack::Plan, "latch and submit", t.latched_at, t.submitted_at, frame)?,
         ];
         // A stamp of zero: the frame never got there.
         if t.rendered_at != HostTime(0) {
-            let gpu = self.slice(Track::Gpu, "render", t.submitted_at, t.rendered_at, frame)?;
+            let gpu = self.slice(TraceTrack::Gpu, "render", t.submitted_at, t.rendered_at, frame)?;
             self.passes(&gpu, frame.passes)?;
             journey.push(gpu);
         }
         if t.packed_at != HostTime(0) {
-            journey.push(self.slice(Track::Pack, "pack", t.packing_at, t.packed_at, frame)?);
+            journey.push(self.slice(TraceTrack::Pack, "pack", t.packing_at, t.packed_at, frame)?);
         }
         if t.sent_at != HostTime(0) {
             let sending = i64::try_from(t.wall_ns[Stage::Link as usize]).unwrap_or(i64::MAX);
             let link_began = t.sent_at.plus_ns(-sending).max(t.packed_at);
-            journey.push(self.slice(Track::Link, "send", link_began, t.sent_at, frame)?);
+            journey.push(self.slice(TraceTrack::Link, "send", link_began, t.sent_at, frame)?);
         }
         if let Some(lit_at) = t.lit_at {
             let end = frame.last_photon_at.unwrap_or(lit_at.plus_ns(1_000));
-            journey.push(self.slice(Track::Light, "light", lit_at, end, frame)?);
+            journey.push(self.slice(TraceTrack::Light, "light", lit_at, end, frame)?);
         }
         let last = journey.len() - 1;
         for (i, place) in journey.iter().enumerate() {
@@ -182,7 +182,7 @@ impl<W: Write> TraceWriter<W> {
         let plain: String = name.chars().filter(|c| !c.is_control() && !matches!(c, '"' | '\\')).collect();
         self.event(format_args!(
             r#"{{"ph":"i","name":"{plain}","s":"g","pid":{HOST},"tid":{},"ts":{}}}"#,
-            tid(Track::Plan, 0),
+            tid(TraceTrack::Plan, 0),
             Micros(at.0)
         ))
     }
@@ -216,7 +216,7 @@ impl<W: Write> TraceWriter<W> {
     /// Places a slice on the first free lane and writes it.
     fn slice(
         &mut self,
-        track: Track,
+        track: TraceTrack,
         name: &str,
         from: HostTime,
         to: HostTime,
@@ -248,7 +248,7 @@ impl<W: Write> TraceWriter<W> {
     }
 }
 
-fn tid(track: Track, lane: usize) -> u32 {
+fn tid(track: TraceTrack, lane: usize) -> u32 {
     (10 * (track as usize + 1) + lane) as u32
 }
 

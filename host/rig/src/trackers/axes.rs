@@ -1,7 +1,7 @@
 //! `tracker.transform.axes`: which axes of a tracker are the world's.
 
-use dpm_common::keys::read::{ConfigValue, Reader};
-use dpm_common::keys::source::{Node, Value};
+use dpm_common::keys::read::{ConfigValue, KeyReader};
+use dpm_common::keys::source::{SourceNode, Value};
 use glam::{DMat3, DVec3};
 
 /// Which axes of the tracker point along the world's x, y and z.
@@ -49,7 +49,7 @@ impl ConfigValue for Axes {
         "a string of three axes".into()
     }
 
-    fn read(node: &Node, reader: &mut Reader, key: &str) -> Option<Self> {
+    fn read(node: &SourceNode, reader: &mut KeyReader, key: &str) -> Option<Self> {
         let parsed = match &node.value {
             Value::String(text) => Self::parse(text),
             _ => None,

@@ -5,7 +5,7 @@ use super::transform::TrackerTransformConfig;
 use crate::mock::Motion;
 #[cfg(feature = "camera")]
 use dpm_camera::{CameraDoubt, CameraLook};
-use dpm_common::keys::read::Reader;
+use dpm_common::keys::read::KeyReader;
 use dpm_common::keys::rows::{KeyValues, OfKind};
 use dpm_device::time::{HostClock, HostTime};
 use dpm_device::tracker::{BodyKey, Tracker, TrackerError};
@@ -82,7 +82,7 @@ pub trait TrackerKeys: KeyValues {
     }
 
     /// Refuses values that make no sense.
-    fn check(&self, _reader: &mut Reader) {}
+    fn check(&self, _reader: &mut KeyReader) {}
 
     /// The same keys with each input file placed by `place`, which gets the file and its key; `None` without files.
     fn placed(&self, _place: &mut dyn FnMut(&mut PathBuf, &str)) -> Option<Arc<dyn TrackerKeys>> {

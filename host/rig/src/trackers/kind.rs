@@ -2,7 +2,7 @@
 
 use super::keys::TrackerKeys;
 use crate::mock::{Motion, SampleSource};
-use dpm_common::keys::read::Reader;
+use dpm_common::keys::read::KeyReader;
 use dpm_common::keys::rows::{KindWord, Registry, Row, Section};
 use dpm_common::keys::source::Entry;
 use dpm_device::time::HostClock;
@@ -26,7 +26,7 @@ pub enum PoseOrigin {
 pub type Decoder = (&'static str, fn(&[u8]));
 
 /// Reads the keys of a kind from a table of the rig file, whose name comes last.
-type ReadKeys = fn(&BTreeMap<String, Entry>, &mut Reader, &str) -> Arc<dyn TrackerKeys>;
+type ReadKeys = fn(&BTreeMap<String, Entry>, &mut KeyReader, &str) -> Arc<dyn TrackerKeys>;
 
 /// A kind of trackers: a row of the table.
 pub struct TrackerKind {
@@ -75,7 +75,7 @@ impl Row for TrackerKind {
     fn read(
         &self,
         table: &BTreeMap<String, Entry>,
-        reader: &mut Reader,
+        reader: &mut KeyReader,
         section: &str,
     ) -> Arc<dyn TrackerKeys> {
         (self.read)(table, reader, section)
@@ -84,7 +84,7 @@ impl Row for TrackerKind {
 
 fn read<K: TrackerKeys + Section>(
     table: &BTreeMap<String, Entry>,
-    reader: &mut Reader,
+    reader: &mut KeyReader,
     section: &str,
 ) -> Arc<dyn TrackerKeys> {
     Arc::new(K::read_keys(table, reader, section))

@@ -4,7 +4,7 @@ use super::keys::{SampleErrors, SourceError, TrackerConfig, TrackerKeys, Tracker
 use super::kind::{MockServer, PoseOrigin, TrackerKind};
 use super::transform::TrackerTransformConfig;
 use crate::mock::{self, FaultPlan, MockTracker};
-use dpm_common::keys::read::{refuse, Any, Reader, Within};
+use dpm_common::keys::read::{refuse, Any, KeyReader, Within};
 use dpm_common::keys::rows::OfKind;
 use dpm_common::section;
 use dpm_device::time::FrameRate;
@@ -75,7 +75,7 @@ impl TrackerKeys for MockTrackerConfig {
         "`tracker.faults` and `tracker.drop_out` may silence the mock"
     }
 
-    fn check(&self, reader: &mut Reader) {
+    fn check(&self, reader: &mut KeyReader) {
         if let Err(e) = mock::check_tracker_faults(&self.faults) {
             let remedy = mock::FAULTS_REMEDY.to_owned();
             refuse(reader, &["tracker.faults"], e.to_string(), remedy);

@@ -4,7 +4,7 @@ use super::keys::{SourceError, TrackerKeys, TrackerPlace};
 use super::kind::{MockScene, MockServer, PoseOrigin, TrackerKind};
 use super::transform::TrackerTransformConfig;
 use crate::mock::{free_port, NatNetHost, NatNetServer, NatNetServerConfig, ANY_PORT};
-use dpm_common::keys::read::{refuse, Any, NotEmpty, Reader, Within};
+use dpm_common::keys::read::{refuse, Any, KeyReader, NotEmpty, Within};
 use dpm_common::section;
 use dpm_device::tracker::natnet::client::{NatNetClient, NatNetConfig};
 use dpm_device::tracker::natnet::frame::{decode_frame, RigidBody};
@@ -78,7 +78,7 @@ impl TrackerKeys for NatnetConfig {
         "is streaming on in the tracking software, are tracker.server and tracker.local right, and do bodies have the same names there?"
     }
 
-    fn check(&self, reader: &mut Reader) {
+    fn check(&self, reader: &mut KeyReader) {
         for (key, text) in self.addresses() {
             match text.map(|text| (text, text.trim().parse::<Ipv4Addr>())) {
                 Some((text, Err(_))) => {

@@ -51,7 +51,7 @@ fn what_cannot_be_opened_is_named() {
         let overrides = Overrides { variables: vec![], flags };
         // What the check of the rig file would refuse.
         let kind = kinds().into_iter().find(|k| k.word.word == kind).expect("a kind");
-        let mut reader = dpm_common::keys::read::Reader::default();
+        let mut reader = dpm_common::keys::read::KeyReader::default();
         let mut root = dpm_common::keys::source::parse("rig.toml", "", &mut reader.errors);
         for flag in &overrides.flags {
             let (path, value) = flag.split_once('=').expect("a key");

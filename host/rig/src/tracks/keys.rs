@@ -17,11 +17,11 @@ const RESTS: [f64; 2] = [0.1, 0.3];
 
 /// Counts the looks at one body, for its position and its rotation.
 #[derive(Clone, Debug, Default)]
-pub(super) struct KeyWatch([Option<Run>; 2]);
+pub(super) struct KeyWatch([Option<KeyStreak>; 2]);
 
 /// Looks in a row at which a key was wrong in the same direction.
 #[derive(Clone, Copy, Debug)]
-struct Run {
+struct KeyStreak {
     sign: i32,
     looks: u32,
 }
@@ -41,7 +41,7 @@ impl KeyWatch {
             }
             let sign = if levels[k].abs() < FAR || excess[k] < COSTS[k] { 0 } else { levels[k].signum() };
             let looks = run.filter(|run| run.sign == sign).map_or(0, |run| run.looks).saturating_add(1);
-            *run = Some(Run { sign, looks });
+            *run = Some(KeyStreak { sign, looks });
             if sign != 0 && looks == LOOKS {
                 contradicted[k].store(levels[k], Ordering::Relaxed);
             }

@@ -32,9 +32,9 @@ const RADIX_FROM: usize = 250_001;
 
 /// What is left of the work that may be done.
 #[derive(Clone, Copy, Debug)]
-pub(super) struct Work(u64);
+pub(super) struct WorkLeft(u64);
 
-impl Work {
+impl WorkLeft {
     /// Nodes that reinsertion may look at in a tree of `boxes` boxes: several times what ordinary meshes need, and never more than a few seconds'.
     pub(super) fn of_reinsertion(boxes: usize) -> Self {
         Self((2_000 * boxes as u64 + 5_000_000).min(400_000_000))
@@ -50,13 +50,13 @@ impl Work {
 /// A place on the Morton curve, of the size and layout that `obvhs` sorts.
 #[derive(Clone, Copy)]
 #[repr(C)]
-struct Place {
+struct MortonPlace {
     code: u128,
     index: u64,
     padding: u64,
 }
 
-impl RadixKey for Place {
+impl RadixKey for MortonPlace {
     const LEVELS: usize = 16;
 
     #[inline]
@@ -74,12 +74,12 @@ fn in_order(boxes: &[Aabb]) -> Vec<Bvh2Node> {
     });
     let scale = 1.0 / all.diagonal().as_dvec3();
     let offset: DVec3 = -all.min.as_dvec3() * scale;
-    let place = |(index, b): (usize, &Aabb)| Place {
+    let place = |(index, b): (usize, &Aabb)| MortonPlace {
         code: morton_encode_u128_unorm(b.center().as_dvec3() * scale + offset),
         index: index as u64,
         padding: 0,
     };
-    let mut places: Vec<Place> = boxes.iter().enumerate().map(place).collect();
+    let mut places: Vec<MortonPlace> = boxes.iter().enumerate().map(place).collect();
     if places.len() < RADIX_FROM {
         places.sort_unstable_by_key(|p| p.code);
     } else {
@@ -173,7 +173,7 @@ pub(super) fn clustered(boxes: &[Aabb]) -> Bvh2 {
     let mut next = Vec::with_capacity(count);
     let mut partners = vec![0i8; count];
     let mut costs = Box::new(Costs([[0.0; SEARCH]; SEARCH]));
-    let mut work = Work(LOOKS.0 * count as u64 + LOOKS.1);
+    let mut work = WorkLeft(LOOKS.0 * count as u64 + LOOKS.1);
     let mut passes = 0;
     while clusters.len() > 1 {
         if passes >= PASSES || !work.take(clusters.len() as u64) {
@@ -215,12 +215,12 @@ pub(super) fn clustered(boxes: &[Aabb]) -> Bvh2 {
 
 /// A node that may find a better place, and how much it takes up.
 #[derive(Clone, Copy)]
-struct Candidate {
+struct MovableNode {
     node: u32,
     cost: f32,
 }
 
-impl RadixKey for Candidate {
+impl RadixKey for MovableNode {
     const LEVELS: usize = 4;
 
     #[inline]
@@ -240,7 +240,7 @@ struct Move {
 
 /// Moves nodes to where the tree's boxes become smaller, `share` of all nodes in the first of sixteen rounds and fewer in each that follows,
 /// until `work` is used up. False when the tree has become so deep that no ray could walk it.
-pub(super) fn optimise(bvh: &mut Bvh2, share: f32, work: &mut Work) -> bool {
+pub(super) fn optimise(bvh: &mut Bvh2, share: f32, work: &mut WorkLeft) -> bool {
     if bvh.nodes.first().is_none_or(Bvh2Node::is_leaf) || share <= 0.0 {
         return true;
     }
@@ -255,13 +255,13 @@ pub(super) fn optimise(bvh: &mut Bvh2, share: f32, work: &mut Work) -> bool {
         let ratio = 1.0 / round as f32;
         let batch = (((bvh.nodes.len() as f32 * share) * ratio) as usize).max(1);
         let count = bvh.nodes.len().min(batch + 1);
-        let mut candidates: Vec<Candidate> = bvh
+        let mut candidates: Vec<MovableNode> = bvh
             .nodes
             .iter()
             .enumerate()
             .take(count * 2)
             .skip(1)
-            .map(|(node, n)| Candidate { node: node as u32, cost: n.aabb().half_area() })
+            .map(|(node, n)| MovableNode { node: node as u32, cost: n.aabb().half_area() })
             .collect();
         candidates.radix_sort_unstable();
         let mut moves = Vec::new();
@@ -309,7 +309,7 @@ fn levels(bvh: &Bvh2) -> usize {
 }
 
 /// Where `node` would make the tree's boxes smaller by most; a gain of 0 where it is well placed. `None` when the work is used up.
-fn better_place(bvh: &Bvh2, node: usize, stack: &mut Vec<(f32, u32)>, work: &mut Work) -> Option<Move> {
+fn better_place(bvh: &Bvh2, node: usize, stack: &mut Vec<(f32, u32)>, work: &mut WorkLeft) -> Option<Move> {
     let area = |n: usize| bvh.nodes[n].aabb().half_area();
     let own = bvh.nodes[node].aabb();
     let own_area = area(node);
@@ -398,7 +398,7 @@ mod tests {
 
     fn own(boxes: &[Aabb], share: f32) -> Bvh2 {
         let mut tree = clustered(boxes);
-        let most = Work::of_reinsertion(boxes.len());
+        let most = WorkLeft::of_reinsertion(boxes.len());
         let mut left = most;
         optimise(&mut tree, share, &mut left);
         let used = (most.0 - left.0) as f64 / boxes.len() as f64;

@@ -6,7 +6,7 @@ mod cluster;
 mod refit;
 
 use crate::TriangleMesh;
-use cluster::{clustered, optimise, Work};
+use cluster::{clustered, optimise, WorkLeft};
 use glam::Vec3A;
 use obvhs::aabb::Aabb;
 use obvhs::bvh2::node::Bvh2Node;
@@ -66,7 +66,8 @@ impl BodyBvh {
     /// The faster tree: neighbours of least common area first. It may be deeper than a ray's stack; `None` where it surely is.
     fn clustered(boxes: &[Aabb]) -> Option<Self> {
         let mut tree = clustered(boxes);
-        let walkable = optimise(&mut tree, Self::share(boxes.len()), &mut Work::of_reinsertion(boxes.len()));
+        let walkable =
+            optimise(&mut tree, Self::share(boxes.len()), &mut WorkLeft::of_reinsertion(boxes.len()));
         walkable.then(|| Self::from(bvh2_to_cwbvh(&tree, LEAF, true, false)))
     }
 

@@ -49,7 +49,7 @@ impl Component {
 
 /// A checked range of a buffer.
 #[derive(Clone, Copy, Debug)]
-struct View {
+struct BufferRange {
     buffer: usize,
     start: u64,
     length: u64,
@@ -58,7 +58,7 @@ struct View {
 
 /// The place of an accessor's elements: `start + i * step` in a buffer.
 #[derive(Clone, Copy, Debug)]
-struct Run {
+struct ElementRun {
     buffer: usize,
     start: u64,
     step: u64,
@@ -69,8 +69,8 @@ struct Run {
 struct Sparse {
     count: u64,
     index_type: Component,
-    indices: Run,
-    values: Run,
+    indices: ElementRun,
+    values: ElementRun,
 }
 
 /// A checked accessor.
@@ -86,7 +86,7 @@ pub(crate) struct Accessor {
     pub normalized: bool,
     /// Elements; at least 1.
     pub count: u64,
-    base: Option<Run>,
+    base: Option<ElementRun>,
     sparse: Option<Sparse>,
 }
 
@@ -94,7 +94,7 @@ pub(crate) struct Accessor {
 #[derive(Debug)]
 pub(super) struct Data {
     buffers: Vec<Vec<u8>>,
-    views: Vec<View>,
+    views: Vec<BufferRange>,
     /// In the order of the file.
     pub accessors: Vec<Accessor>,
 }
@@ -136,7 +136,7 @@ impl Data {
         self.buffers[v.buffer].get(v.start as usize..(v.start + v.length) as usize)
     }
 
-    fn check_view(&self, item: &Item) -> Result<View, SceneError> {
+    fn check_view(&self, item: &Item) -> Result<BufferRange, SceneError> {
         let (buffer, start, length) = range_of(item, &self.buffers)?;
         let stride = item.whole("byteStride")?;
         if let Some(stride) = stride.filter(|s| !(4..=252).contains(s) || s % 4 != 0) {
@@ -144,7 +144,7 @@ impl Data {
                 item.error(format!("'byteStride' is {stride}; it must be a multiple of 4 from 4 to 252"))
             );
         }
-        Ok(View { buffer, start, length, stride })
+        Ok(BufferRange { buffer, start, length, stride })
     }
 
     fn check_accessor(&self, item: &Item) -> Result<Accessor, SceneError> {
@@ -210,7 +210,7 @@ impl Data {
         count: u64,
         size: u64,
         stride: Option<u64>,
-    ) -> Result<Run, SceneError> {
+    ) -> Result<ElementRun, SceneError> {
         let v = self.views[view];
         let step = stride.unwrap_or(size);
         if step < size {
@@ -223,7 +223,7 @@ impl Data {
             .and_then(|n| n.checked_add(size))
             .and_then(|n| n.checked_add(offset));
         match needed {
-            Some(n) if n <= v.length => Ok(Run { buffer: v.buffer, start: v.start + offset, step }),
+            Some(n) if n <= v.length => Ok(ElementRun { buffer: v.buffer, start: v.start + offset, step }),
             Some(n) => Err(item.error(format!("needs {n} bytes, but bufferView {view} has {}", v.length))),
             None => {
                 Err(item.error(format!("'count' {count} with 'byteOffset' {offset} is beyond any buffer")))
@@ -274,14 +274,14 @@ impl Data {
     }
 
     /// `N` bytes at an element of a run. The run was checked, so the bytes exist.
-    fn bytes<const N: usize>(&self, run: Run, element: u64, offset: u64) -> [u8; N] {
+    fn bytes<const N: usize>(&self, run: ElementRun, element: u64, offset: u64) -> [u8; N] {
         let at = (run.start + element * run.step + offset) as usize;
         let mut out = [0; N];
         out.copy_from_slice(&self.buffers[run.buffer][at..at + N]);
         out
     }
 
-    fn unsigned(&self, component: Component, run: Run, element: u64) -> u64 {
+    fn unsigned(&self, component: Component, run: ElementRun, element: u64) -> u64 {
         match component {
             Component::U8 => self.bytes::<1>(run, element, 0)[0].into(),
             Component::U16 => u16::from_le_bytes(self.bytes(run, element, 0)).into(),
@@ -290,7 +290,7 @@ impl Data {
     }
 
     /// The place of an element after sparse replacement; `None` reads as zero.
-    fn locate(&self, accessor: &Accessor, element: u64) -> Option<(Run, u64)> {
+    fn locate(&self, accessor: &Accessor, element: u64) -> Option<(ElementRun, u64)> {
         if let Some(sparse) = accessor.sparse {
             let (mut low, mut high) = (0, sparse.count);
             while low < high {

@@ -30,7 +30,7 @@ const TRANSFORM: &str = "KHR_texture_transform";
 
 /// What a value must be.
 #[derive(Clone, Copy)]
-enum Rule {
+enum ValueRule {
     /// A number in a range.
     Number(f32, f32),
     /// So many numbers, each in a range.
@@ -50,37 +50,37 @@ enum Rule {
     Texture,
 }
 
-const FACTOR: Rule = Rule::Number(0.0, UNIT);
-const INTENSITY: Rule = Rule::Number(0.0, GREATEST_INTENSITY);
-const POSITIVE: Rule = Rule::Number(0.0, f32::MAX);
-const ANY_NUMBER: Rule = Rule::Number(f32::MIN, f32::MAX);
-const COLOR: Rule = Rule::Numbers(3, 0.0, UNIT);
-const TWO_NUMBERS: Rule = Rule::Numbers(2, f32::MIN, f32::MAX);
+const FACTOR: ValueRule = ValueRule::Number(0.0, UNIT);
+const INTENSITY: ValueRule = ValueRule::Number(0.0, GREATEST_INTENSITY);
+const POSITIVE: ValueRule = ValueRule::Number(0.0, f32::MAX);
+const ANY_NUMBER: ValueRule = ValueRule::Number(f32::MIN, f32::MAX);
+const COLOR: ValueRule = ValueRule::Numbers(3, 0.0, UNIT);
+const TWO_NUMBERS: ValueRule = ValueRule::Numbers(2, f32::MIN, f32::MAX);
 /// This program reads sets of coordinates below this number.
-const SET: Rule = Rule::Below(256);
-const WRAP: Rule = Rule::Code(&[33071, 33648, 10497]);
+const SET: ValueRule = ValueRule::Below(256);
+const WRAP: ValueRule = ValueRule::Code(&[33071, 33648, 10497]);
 
-type Rules = &'static [(&'static str, Rule)];
+type Rules = &'static [(&'static str, ValueRule)];
 
-const NAME: Rules = &[("name", Rule::Text)];
+const NAME: Rules = &[("name", ValueRule::Text)];
 
 const MATERIAL: Rules = &[
-    ("name", Rule::Text),
-    ("emissiveFactor", Rule::Numbers(3, 0.0, GREATEST_INTENSITY)),
+    ("name", ValueRule::Text),
+    ("emissiveFactor", ValueRule::Numbers(3, 0.0, GREATEST_INTENSITY)),
     ("alphaCutoff", POSITIVE),
-    ("alphaMode", Rule::Word(&["OPAQUE", "MASK", "BLEND"])),
-    ("doubleSided", Rule::Flag),
-    ("normalTexture", Rule::Texture),
-    ("occlusionTexture", Rule::Texture),
-    ("emissiveTexture", Rule::Texture),
+    ("alphaMode", ValueRule::Word(&["OPAQUE", "MASK", "BLEND"])),
+    ("doubleSided", ValueRule::Flag),
+    ("normalTexture", ValueRule::Texture),
+    ("occlusionTexture", ValueRule::Texture),
+    ("emissiveTexture", ValueRule::Texture),
 ];
 
 const METALLIC_ROUGHNESS: Rules = &[
-    ("baseColorFactor", Rule::Numbers(4, 0.0, UNIT)),
+    ("baseColorFactor", ValueRule::Numbers(4, 0.0, UNIT)),
     ("metallicFactor", FACTOR),
     ("roughnessFactor", FACTOR),
-    ("baseColorTexture", Rule::Texture),
-    ("metallicRoughnessTexture", Rule::Texture),
+    ("baseColorTexture", ValueRule::Texture),
+    ("metallicRoughnessTexture", ValueRule::Texture),
 ];
 
 /// The extensions of materials that are reproduced.
@@ -90,7 +90,7 @@ const EXTENSIONS: [(&str, Rules); 13] = [
         &[
             ("anisotropyStrength", FACTOR),
             ("anisotropyRotation", ANY_NUMBER),
-            ("anisotropyTexture", Rule::Texture),
+            ("anisotropyTexture", ValueRule::Texture),
         ],
     ),
     (
@@ -98,9 +98,9 @@ const EXTENSIONS: [(&str, Rules); 13] = [
         &[
             ("clearcoatFactor", FACTOR),
             ("clearcoatRoughnessFactor", FACTOR),
-            ("clearcoatTexture", Rule::Texture),
-            ("clearcoatRoughnessTexture", Rule::Texture),
-            ("clearcoatNormalTexture", Rule::Texture),
+            ("clearcoatTexture", ValueRule::Texture),
+            ("clearcoatRoughnessTexture", ValueRule::Texture),
+            ("clearcoatNormalTexture", ValueRule::Texture),
         ],
     ),
     (
@@ -108,32 +108,32 @@ const EXTENSIONS: [(&str, Rules); 13] = [
         &[
             ("diffuseTransmissionFactor", FACTOR),
             ("diffuseTransmissionColorFactor", COLOR),
-            ("diffuseTransmissionTexture", Rule::Texture),
-            ("diffuseTransmissionColorTexture", Rule::Texture),
+            ("diffuseTransmissionTexture", ValueRule::Texture),
+            ("diffuseTransmissionColorTexture", ValueRule::Texture),
         ],
     ),
     ("KHR_materials_dispersion", &[("dispersion", POSITIVE)]),
     ("KHR_materials_emissive_strength", &[("emissiveStrength", INTENSITY)]),
-    ("KHR_materials_ior", &[("ior", Rule::Ior)]),
+    ("KHR_materials_ior", &[("ior", ValueRule::Ior)]),
     (
         "KHR_materials_iridescence",
         &[
             ("iridescenceFactor", FACTOR),
-            ("iridescenceIor", Rule::Number(1.0, 10.0)),
-            ("iridescenceThicknessMinimum", Rule::Number(0.0, THICKEST_FILM_NM)),
-            ("iridescenceThicknessMaximum", Rule::Number(0.0, THICKEST_FILM_NM)),
-            ("iridescenceTexture", Rule::Texture),
-            ("iridescenceThicknessTexture", Rule::Texture),
+            ("iridescenceIor", ValueRule::Number(1.0, 10.0)),
+            ("iridescenceThicknessMinimum", ValueRule::Number(0.0, THICKEST_FILM_NM)),
+            ("iridescenceThicknessMaximum", ValueRule::Number(0.0, THICKEST_FILM_NM)),
+            ("iridescenceTexture", ValueRule::Texture),
+            ("iridescenceThicknessTexture", ValueRule::Texture),
         ],
     ),
     (
         spec_gloss::NAME,
         &[
-            ("diffuseFactor", Rule::Numbers(4, 0.0, UNIT)),
+            ("diffuseFactor", ValueRule::Numbers(4, 0.0, UNIT)),
             ("specularFactor", COLOR),
             ("glossinessFactor", FACTOR),
-            ("diffuseTexture", Rule::Texture),
-            ("specularGlossinessTexture", Rule::Texture),
+            ("diffuseTexture", ValueRule::Texture),
+            ("specularGlossinessTexture", ValueRule::Texture),
         ],
     ),
     (
@@ -141,20 +141,23 @@ const EXTENSIONS: [(&str, Rules); 13] = [
         &[
             ("sheenColorFactor", COLOR),
             ("sheenRoughnessFactor", FACTOR),
-            ("sheenColorTexture", Rule::Texture),
-            ("sheenRoughnessTexture", Rule::Texture),
+            ("sheenColorTexture", ValueRule::Texture),
+            ("sheenRoughnessTexture", ValueRule::Texture),
         ],
     ),
     (
         "KHR_materials_specular",
         &[
             ("specularFactor", FACTOR),
-            ("specularColorFactor", Rule::Numbers(3, 0.0, GREATEST_COLOR)),
-            ("specularTexture", Rule::Texture),
-            ("specularColorTexture", Rule::Texture),
+            ("specularColorFactor", ValueRule::Numbers(3, 0.0, GREATEST_COLOR)),
+            ("specularTexture", ValueRule::Texture),
+            ("specularColorTexture", ValueRule::Texture),
         ],
     ),
-    ("KHR_materials_transmission", &[("transmissionFactor", FACTOR), ("transmissionTexture", Rule::Texture)]),
+    (
+        "KHR_materials_transmission",
+        &[("transmissionFactor", FACTOR), ("transmissionTexture", ValueRule::Texture)],
+    ),
     ("KHR_materials_unlit", &[]),
     (
         "KHR_materials_volume",
@@ -162,43 +165,43 @@ const EXTENSIONS: [(&str, Rules); 13] = [
             ("thicknessFactor", POSITIVE),
             ("attenuationDistance", POSITIVE),
             ("attenuationColor", COLOR),
-            ("thicknessTexture", Rule::Texture),
+            ("thicknessTexture", ValueRule::Texture),
         ],
     ),
 ];
 
 /// What the use of a texture has besides its index.
 const TEXTURE_USE: Rules =
-    &[("texCoord", SET), ("scale", Rule::Number(-100.0, 100.0)), ("strength", ANY_NUMBER)];
+    &[("texCoord", SET), ("scale", ValueRule::Number(-100.0, 100.0)), ("strength", ANY_NUMBER)];
 
 const TEXTURE_PLACE: Rules =
     &[("offset", TWO_NUMBERS), ("scale", TWO_NUMBERS), ("rotation", ANY_NUMBER), ("texCoord", SET)];
 
 const SAMPLER: Rules = &[
-    ("magFilter", Rule::Code(&[9728, 9729])),
-    ("minFilter", Rule::Code(&[9728, 9729, 9984, 9985, 9986, 9987])),
+    ("magFilter", ValueRule::Code(&[9728, 9729])),
+    ("minFilter", ValueRule::Code(&[9728, 9729, 9984, 9985, 9986, 9987])),
     ("wrapS", WRAP),
     ("wrapT", WRAP),
-    ("name", Rule::Text),
+    ("name", ValueRule::Text),
 ];
 
 const LIGHT: Rules = &[
-    ("name", Rule::Text),
-    ("color", Rule::Numbers(3, 0.0, GREATEST_INTENSITY)),
+    ("name", ValueRule::Text),
+    ("color", ValueRule::Numbers(3, 0.0, GREATEST_INTENSITY)),
     ("intensity", INTENSITY),
-    ("range", Rule::Number(f32::MIN_POSITIVE, f32::MAX)),
+    ("range", ValueRule::Number(f32::MIN_POSITIVE, f32::MAX)),
 ];
 
-const KINDS_OF_LIGHT: Rule = Rule::Word(&["point", "spot", "directional"]);
+const KINDS_OF_LIGHT: ValueRule = ValueRule::Word(&["point", "spot", "directional"]);
 /// A spot's angles, radians; writers round a quarter turn up.
 const CONE: Rules = &[
-    ("innerConeAngle", Rule::Number(0.0, FRAC_PI_2 + 1e-4)),
-    ("outerConeAngle", Rule::Number(0.0, FRAC_PI_2 + 1e-4)),
+    ("innerConeAngle", ValueRule::Number(0.0, FRAC_PI_2 + 1e-4)),
+    ("outerConeAngle", ValueRule::Number(0.0, FRAC_PI_2 + 1e-4)),
 ];
 /// The angles that glTF has where a file gives none.
 const CONE_DEFAULT: [f64; 2] = [0.0, std::f64::consts::FRAC_PI_4];
 
-impl Rule {
+impl ValueRule {
     fn fits(self, value: &Value) -> bool {
         let number = |v: &Value| v.as_f64().map(|x| x as f32).filter(|x| x.is_finite());
         let within = |v: &Value, low, high| number(v).is_some_and(|x| (low..=high).contains(&x));
@@ -324,17 +327,17 @@ impl Amender {
     }
 
     /// An object of whose extensions none is read.
-    fn plain(&mut self, object: &mut Object, name: &str, rules: &[(&str, Rule)]) {
+    fn plain(&mut self, object: &mut Object, name: &str, rules: &[(&str, ValueRule)]) {
         self.values(object, name, rules);
         self.object(object, name, "extensions");
     }
 
-    fn values(&mut self, object: &mut Object, name: &str, rules: &[(&str, Rule)]) {
+    fn values(&mut self, object: &mut Object, name: &str, rules: &[(&str, ValueRule)]) {
         for &(key, rule) in rules {
             let Some(value) = object.get(key) else { continue };
             if !rule.fits(value) {
                 self.leave_out(object, name, key, &rule.wanted());
-            } else if matches!(rule, Rule::Texture) {
+            } else if matches!(rule, ValueRule::Texture) {
                 self.texture_use(object, name, key);
             }
         }
@@ -365,8 +368,12 @@ impl Amender {
     }
 
     fn texture(&mut self, texture: &mut Object, name: &str, images: usize, samplers: usize) {
-        let source = [("source", Rule::Below(images))];
-        self.values(texture, name, &[("name", Rule::Text), ("sampler", Rule::Below(samplers)), source[0]]);
+        let source = [("source", ValueRule::Below(images))];
+        self.values(
+            texture,
+            name,
+            &[("name", ValueRule::Text), ("sampler", ValueRule::Below(samplers)), source[0]],
+        );
         let mut shown = texture.contains_key("source");
         for key in [BASISU, WEBP] {
             if let Some(extension) = self.extension(texture, name, key) {
@@ -450,7 +457,7 @@ impl Amender {
     fn node(&mut self, node: &mut Object, name: &str) {
         self.values(node, name, NAME);
         if let Some(light) = self.extension(node, name, LIGHTS) {
-            let rules = [("light", Rule::Below(self.lights.len()))];
+            let rules = [("light", ValueRule::Below(self.lights.len()))];
             self.values(light, &format!("{name}, {LIGHTS}"), &rules);
             let lit = light.get("light").and_then(Value::as_u64).map(|i| self.lights[i as usize]);
             if let Some(extensions) = node.get_mut("extensions").filter(|_| lit != Some(true)) {
@@ -458,7 +465,7 @@ impl Amender {
             }
         }
         if let Some(visibility) = self.extension(node, name, VISIBILITY) {
-            self.values(visibility, &format!("{name}, {VISIBILITY}"), &[("visible", Rule::Flag)]);
+            self.values(visibility, &format!("{name}, {VISIBILITY}"), &[("visible", ValueRule::Flag)]);
         }
     }
 }
@@ -468,15 +475,15 @@ mod tests {
     use super::*;
 
     /// What a rule refuses.
-    fn wrong(rule: Rule) -> Vec<Value> {
+    fn wrong(rule: ValueRule) -> Vec<Value> {
         let beyond = |low: f32, high: f32| {
             let below = (low > f32::MIN).then(|| json!(f64::from(low) - 0.01));
             let above = (high < f32::MAX).then(|| json!(f64::from(high) * 1.01));
             below.into_iter().chain(above).chain([json!(1e39), json!(-1e39)])
         };
         let own: Vec<Value> = match rule {
-            Rule::Number(low, high) => beyond(low, high).chain([json!([0.5]), json!("0.5")]).collect(),
-            Rule::Numbers(count, low, high) => {
+            ValueRule::Number(low, high) => beyond(low, high).chain([json!([0.5]), json!("0.5")]).collect(),
+            ValueRule::Numbers(count, low, high) => {
                 let lists = beyond(low, high).chain([json!("x"), json!(null)]).map(|v| {
                     let mut all = vec![json!(0.5); count];
                     all[count - 1] = v;
@@ -484,28 +491,28 @@ mod tests {
                 });
                 lists.chain([json!(0.5), json!(vec![0.5; count + 1]), json!([])]).collect()
             }
-            Rule::Ior => vec![json!(0.5), json!(-1), json!(11), json!("1.5")],
-            Rule::Below(end) => vec![json!(end), json!(-1), json!(0.5), json!("0")],
-            Rule::Code(_) => vec![json!(1), json!("9729"), json!(-1)],
-            Rule::Word(_) => vec![json!("GLOW"), json!(1)],
-            Rule::Text => vec![json!(5), json!(["a"])],
-            Rule::Flag => vec![json!("true"), json!(1)],
-            Rule::Texture => vec![json!({"index": 2}), json!({"index": -1}), json!({}), json!(0)],
+            ValueRule::Ior => vec![json!(0.5), json!(-1), json!(11), json!("1.5")],
+            ValueRule::Below(end) => vec![json!(end), json!(-1), json!(0.5), json!("0")],
+            ValueRule::Code(_) => vec![json!(1), json!("9729"), json!(-1)],
+            ValueRule::Word(_) => vec![json!("GLOW"), json!(1)],
+            ValueRule::Text => vec![json!(5), json!(["a"])],
+            ValueRule::Flag => vec![json!("true"), json!(1)],
+            ValueRule::Texture => vec![json!({"index": 2}), json!({"index": -1}), json!({}), json!(0)],
         };
         own.into_iter().chain([json!(null)]).collect()
     }
 
-    fn right(rule: Rule) -> Value {
+    fn right(rule: ValueRule) -> Value {
         match rule {
-            Rule::Number(low, high) => json!(low.max(0.0).max(high.min(1.0) * 0.5)),
-            Rule::Numbers(count, ..) => json!(vec![0.5; count]),
-            Rule::Ior => json!(1.4),
-            Rule::Below(_) => json!(0),
-            Rule::Code(codes) => json!(codes[0]),
-            Rule::Word(words) => json!(words[0]),
-            Rule::Text => json!("text"),
-            Rule::Flag => json!(true),
-            Rule::Texture => {
+            ValueRule::Number(low, high) => json!(low.max(0.0).max(high.min(1.0) * 0.5)),
+            ValueRule::Numbers(count, ..) => json!(vec![0.5; count]),
+            ValueRule::Ior => json!(1.4),
+            ValueRule::Below(_) => json!(0),
+            ValueRule::Code(codes) => json!(codes[0]),
+            ValueRule::Word(words) => json!(words[0]),
+            ValueRule::Text => json!("text"),
+            ValueRule::Flag => json!(true),
+            ValueRule::Texture => {
                 json!({"index": 1, "texCoord": 1, "extensions": {TRANSFORM: {"offset": [0.1, 0.2]}}})
             }
         }

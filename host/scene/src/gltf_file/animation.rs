@@ -6,7 +6,7 @@ use std::collections::HashMap;
 
 use glam::{DQuat, DVec3};
 
-use super::super::part_motion::{Interpolation, Keyed, Keys, Track};
+use super::super::part_motion::{Interpolation, Keyed, Keys, ValueTrack};
 use super::super::{AnimationChoice, LoadOptions, SceneError};
 use super::accessor::{Accessor, Component, Data};
 use super::json::{shorten, Item};
@@ -42,29 +42,30 @@ impl Animation {
 #[derive(Clone, Debug, Default)]
 pub(crate) struct Channels {
     /// Metres, or units of the parent.
-    pub translation: Option<Track<DVec3>>,
+    pub translation: Option<ValueTrack<DVec3>>,
     /// Unit quaternions.
-    pub rotation: Option<Track<DQuat>>,
+    pub rotation: Option<ValueTrack<DQuat>>,
     /// Along the node's own axes.
-    pub scale: Option<Track<DVec3>>,
+    pub scale: Option<ValueTrack<DVec3>>,
     /// Of each morph target of the node's mesh.
-    pub weights: Option<Vec<Track<f64>>>,
+    pub weights: Option<Vec<ValueTrack<f64>>>,
 }
 
 impl Channels {
     /// True if the node moves as something rigid does.
     pub(crate) fn moves(&self) -> bool {
-        matches!(self.translation, Some(Track::Keys(_))) || matches!(self.rotation, Some(Track::Keys(_)))
+        matches!(self.translation, Some(ValueTrack::Keys(_)))
+            || matches!(self.rotation, Some(ValueTrack::Keys(_)))
     }
 
     /// True if the node's size changes.
     pub(crate) fn resizes(&self) -> bool {
-        matches!(self.scale, Some(Track::Keys(_)))
+        matches!(self.scale, Some(ValueTrack::Keys(_)))
     }
 
     /// True if the shape of the node's mesh changes.
     pub(crate) fn morphs(&self) -> bool {
-        self.weights.iter().flatten().any(|weight| matches!(weight, Track::Keys(_)))
+        self.weights.iter().flatten().any(|weight| matches!(weight, ValueTrack::Keys(_)))
     }
 
     fn is_empty(&self) -> bool {
@@ -108,7 +109,7 @@ pub(super) fn read(
         };
         warnings.push(format!("of {} animations one is played: {played}", all.len()));
     }
-    let mut reader = Reader { item, data, nodes, lost: Vec::new(), values_left: MOST_VALUES };
+    let mut reader = AnimationReader { item, data, nodes, lost: Vec::new(), values_left: MOST_VALUES };
     let mut animation = reader.animation(options);
     let lost = reader.lost;
     if let Some((first, more)) = lost.split_first() {
@@ -128,7 +129,7 @@ fn unknown(name: &str, all: &[Item]) -> SceneError {
     }
 }
 
-struct Reader<'a> {
+struct AnimationReader<'a> {
     item: &'a Item<'a>,
     data: &'a Data,
     nodes: &'a [Item<'a>],
@@ -138,7 +139,7 @@ struct Reader<'a> {
     values_left: u64,
 }
 
-impl Reader<'_> {
+impl AnimationReader<'_> {
     fn animation(&mut self, options: &LoadOptions) -> Animation {
         let limit = options.limits.objects;
         let lists = self.item.list("channels", "channel", limit);
@@ -228,7 +229,7 @@ impl Reader<'_> {
     }
 
     /// The weights of morph targets, of which each key frame has as many as there are targets.
-    fn weights(&mut self, sampler: &Item, times: &[f64]) -> Result<Vec<Track<f64>>, String> {
+    fn weights(&mut self, sampler: &Item, times: &[f64]) -> Result<Vec<ValueTrack<f64>>, String> {
         let interpolation = interpolation(sampler)?;
         let output = accessor(self.data, sampler, "output")?;
         let small =
@@ -324,9 +325,9 @@ fn normalise(keys: &mut Keys<DQuat>) -> Result<(), String> {
 }
 
 /// Exporters write keys for nodes that never move, too.
-fn track<T: Keyed>(keys: Keys<T>) -> Track<T> {
+fn track<T: Keyed>(keys: Keys<T>) -> ValueTrack<T> {
     match keys.constant() {
-        Some(value) => Track::Constant(value),
-        None => Track::Keys(keys),
+        Some(value) => ValueTrack::Constant(value),
+        None => ValueTrack::Keys(keys),
     }
 }

@@ -14,7 +14,7 @@ use glam::{Vec2, Vec4};
 
 use super::super::srgb::{from_linear, to_linear};
 use super::super::{Material, SceneError, Texture, TextureRef, Wrap};
-use super::look::Look;
+use super::look::SceneLook;
 
 /// Texels in a row of squares.
 const ROW: usize = 2048;
@@ -78,7 +78,7 @@ impl Bake {
     /// More texels than one texture may have.
     pub(super) fn faces(
         &mut self,
-        look: &Look,
+        look: &SceneLook,
         (material, next): (u32, u32),
         (primitive, faces): (usize, &[[u64; 3]]),
         vertices: &Vertices,
@@ -134,7 +134,7 @@ impl Bake {
     }
 
     /// Says what was resampled.
-    pub(super) fn warn(&self, look: &Look, warnings: &mut Vec<String>) {
+    pub(super) fn warn(&self, look: &SceneLook, warnings: &mut Vec<String>) {
         let mut names: Vec<&str> =
             self.baked.keys().map(|m| look.materials[*m as usize].name.as_str()).collect();
         names.sort_unstable();
@@ -149,7 +149,7 @@ impl Bake {
     }
 
     /// The materials with their numbers; their textures are added to `textures`.
-    pub(super) fn into_materials(self, look: &mut Look) -> Vec<(u32, Material)> {
+    pub(super) fn into_materials(self, look: &mut SceneLook) -> Vec<(u32, Material)> {
         let mut all: Vec<(u32, BakedMaterial)> = self.baked.into_iter().collect();
         all.sort_unstable_by_key(|(_, baked)| baked.material);
         let made = |(plain, baked): (u32, BakedMaterial)| {
@@ -198,7 +198,7 @@ impl BakedMaterial {
     }
 
     /// The power of two of texels along the sides of a triangle's square.
-    fn size_of(&self, look: &Look, face: [u64; 3], vertices: &Vertices) -> u32 {
+    fn size_of(&self, look: &SceneLook, face: [u64; 3], vertices: &Vertices) -> u32 {
         let longest = |made: &Made| {
             let Some(reference) = made.source else { return 1.0 };
             let texture = &look.textures[reference.texture as usize];
@@ -228,7 +228,7 @@ impl BakedMaterial {
     /// Samples all textures into a square.
     fn fill(
         &mut self,
-        look: &Look,
+        look: &SceneLook,
         face: [u64; 3],
         vertices: &Vertices,
         ([left, top], size): ([usize; 2], u32),

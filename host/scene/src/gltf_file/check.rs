@@ -41,7 +41,7 @@ const UNDERSTOOD: [&str; 25] = [
 ];
 
 /// Counts that references are checked against.
-pub(super) struct Counts {
+pub(super) struct ObjectCounts {
     /// Entries of "nodes".
     pub nodes: usize,
     /// Entries of "meshes".
@@ -63,8 +63,11 @@ pub(super) fn check(root: &Item, data: &Data, limits: &Limits) -> Result<CheckRe
     let mut warnings = vec![];
     let list = |key, kind| root.list(key, kind, limits.objects);
     let (nodes, meshes) = (list("nodes", "node")?, list("meshes", "mesh")?);
-    let counts =
-        Counts { nodes: nodes.len(), meshes: meshes.len(), materials: list("materials", "material")?.len() };
+    let counts = ObjectCounts {
+        nodes: nodes.len(),
+        meshes: meshes.len(),
+        materials: list("materials", "material")?.len(),
+    };
     let quantized = list_of_strings(root, "extensionsUsed")?.contains(&"KHR_mesh_quantization");
     let mut triangles = Vec::with_capacity(meshes.len());
     for mesh in &meshes {
@@ -123,7 +126,7 @@ fn list_of_strings<'a>(root: &Item<'a>, key: &str) -> Result<Vec<&'a str>, Scene
 fn check_mesh(
     mesh: &Item,
     data: &Data,
-    counts: &Counts,
+    counts: &ObjectCounts,
     quantized: bool,
     limits: &Limits,
     warnings: &mut Vec<String>,
@@ -230,7 +233,7 @@ fn check_attributes(
 fn check_nodes(
     root: &Item,
     nodes: &[Item],
-    counts: &Counts,
+    counts: &ObjectCounts,
     triangles: &[u64],
     instances: &Instances,
     limits: &Limits,
@@ -302,7 +305,7 @@ fn check_tree(
 /// Checks that scenes list nodes without a parent, each once.
 fn check_scenes(
     root: &Item,
-    counts: &Counts,
+    counts: &ObjectCounts,
     parent: &[Option<usize>],
     limits: &Limits,
 ) -> Result<(), SceneError> {

@@ -135,9 +135,9 @@ fn split_glb(bytes: &[u8]) -> Result<Chunks<'_>, SceneError> {
 
 /// The folder in which side files may lie.
 #[derive(Clone, Debug)]
-pub(super) struct Folder(PathBuf);
+pub(super) struct SideFolder(PathBuf);
 
-impl Folder {
+impl SideFolder {
     /// The folder that holds `file`.
     pub(super) fn of(file: &Path) -> Result<Self, SceneError> {
         let parent = file.parent().filter(|p| !p.as_os_str().is_empty()).unwrap_or(Path::new("."));
@@ -231,7 +231,7 @@ fn percent_decode(uri: &str) -> Result<String, SceneError> {
 }
 
 /// The content of a URI: `data:` with base64, or a file in `folder`.
-pub(crate) fn fetch(uri: &str, folder: Option<&Folder>, limit: u64) -> Result<Vec<u8>, SceneError> {
+pub(crate) fn fetch(uri: &str, folder: Option<&SideFolder>, limit: u64) -> Result<Vec<u8>, SceneError> {
     if let Some(rest) = uri.strip_prefix("data:") {
         let Some((head, payload)) = rest.split_once(',') else {
             return Err(SceneError::broken("data URI", "has no comma before its content"));
@@ -288,7 +288,7 @@ fn base64(text: &[u8]) -> Result<Vec<u8>, SceneError> {
 pub(crate) fn load_buffers(
     root: &Item,
     binary: Option<Vec<u8>>,
-    folder: Option<&Folder>,
+    folder: Option<&SideFolder>,
     limits: &Limits,
 ) -> Result<(Vec<Vec<u8>>, u64), SceneError> {
     let mut binary = binary;
@@ -352,7 +352,7 @@ mod tests {
 
     #[test]
     fn uris_stay_inside_the_folder() {
-        let folder = Folder::of(Path::new("Cargo.toml")).unwrap();
+        let folder = SideFolder::of(Path::new("Cargo.toml")).unwrap();
         for uri in [
             "../Cargo.toml",
             "/etc/passwd",

@@ -12,7 +12,7 @@ use glam::{DAffine3, DMat3, DMat4, DVec3, Vec3};
 
 use super::super::limits::Cancel;
 use super::super::mesh::{DropCounts, MAX_COORDINATE_M};
-use super::super::part_motion::{Link, NodeMotion, PartMotion, Track};
+use super::super::part_motion::{NodeMotion, PartLink, PartMotion, ValueTrack};
 use super::super::{
     Body, DeformingMesh, Limits, LoadOptions, PunctualKind, PunctualLight, SceneError, TriangleMesh,
 };
@@ -20,7 +20,7 @@ use super::accessor::Data;
 use super::animation::{Animation, Channels};
 use super::deform::{Deformations, Pose};
 use super::instancing::Instances;
-use super::look::Look;
+use super::look::SceneLook;
 use super::primitive::read_primitive;
 use super::vertex_paint::Paint;
 use claims::roots;
@@ -56,7 +56,7 @@ impl Group {
 
 /// A subtree still to be walked.
 #[derive(Clone, Copy)]
-struct Step {
+struct Subtree {
     node: usize,
     /// World-from-parent at rest.
     world: DAffine3,
@@ -68,10 +68,10 @@ struct Step {
 }
 
 /// Nodes that an animation moves with all below them, up to the next such node.
-struct Part {
+struct MovingSubtree {
     name: String,
     /// From the carrier to the part.
-    links: Vec<Arc<Link>>,
+    links: Vec<Arc<PartLink>>,
 }
 
 /// The result of [`flatten`].
@@ -89,7 +89,7 @@ pub(super) struct Source<'a> {
     /// Buffers.
     pub data: &'a Data,
     /// Materials and textures.
-    pub look: &'a Look,
+    pub look: &'a SceneLook,
     /// The places of the meshes of instanced nodes.
     pub instances: &'a Instances,
     /// How nodes move.
@@ -156,7 +156,7 @@ struct Gatherer<'a> {
     skinned: Vec<(usize, Group)>,
     /// By claim: world-from-body at rest.
     rest: Vec<DAffine3>,
-    parts: Vec<Part>,
+    parts: Vec<MovingSubtree>,
     /// Meshes that an animation deforms, with the names of their nodes.
     deforming: Vec<(String, DeformingMesh)>,
     /// Nodes that show such a mesh without a skin.
@@ -210,10 +210,10 @@ impl<'a> Gatherer<'a> {
         }
         let world = DAffine3::from_translation(-away) * world;
         let group = Group { claim: None, is_virtual: false, part: None, deforming: None };
-        let mut walk: Vec<Step> = roots(document)
+        let mut walk: Vec<Subtree> = roots(document)
             .into_iter()
             .rev()
-            .map(|node| Step { node, world, place: world, group, resizes: false })
+            .map(|node| Subtree { node, world, place: world, group, resizes: false })
             .collect();
         while let Some(step) = walk.pop() {
             self.cancel.check(self.limits)?;
@@ -223,7 +223,7 @@ impl<'a> Gatherer<'a> {
             }
             let step = self.enter(step, &node, claim_of.get(&step.node).copied(), warnings)?;
             self.add_node(&step, &node, warnings)?;
-            walk.extend(node.children().map(|c| Step { node: c.index(), ..step }));
+            walk.extend(node.children().map(|c| Subtree { node: c.index(), ..step }));
         }
         self.add_skinned_meshes(warnings)?;
         self.add_unskinned_meshes(warnings)
@@ -233,12 +233,12 @@ impl<'a> Gatherer<'a> {
     /// of what it holds.
     fn enter(
         &mut self,
-        step: Step,
+        step: Subtree,
         node: &gltf::Node,
         claim: Option<usize>,
         warnings: &mut Vec<String>,
-    ) -> Result<Step, SceneError> {
-        let Step { node: index, world, place, mut group, mut resizes } = step;
+    ) -> Result<Subtree, SceneError> {
+        let Subtree { node: index, world, place, mut group, mut resizes } = step;
         let claims = self.claims;
         let channels = self.source.animation.nodes.get(&index);
         let local = local_transform(node, channels);
@@ -274,17 +274,17 @@ impl<'a> Gatherer<'a> {
         }
         let place = self.place_at(group, &world, &place);
         group.is_virtual |= claims.virtual_nodes.binary_search(&index).is_ok();
-        Ok(Step { node: index, world, place, group, resizes })
+        Ok(Subtree { node: index, world, place, group, resizes })
     }
 
     /// Adds the mesh and the lamp of the node at which a step stands.
     fn add_node(
         &mut self,
-        step: &Step,
+        step: &Subtree,
         node: &gltf::Node,
         warnings: &mut Vec<String>,
     ) -> Result<(), SceneError> {
-        let Step { node: index, ref place, group, resizes, .. } = *step;
+        let Subtree { node: index, ref place, group, resizes, .. } = *step;
         if let Some(mesh) = node.mesh() {
             let deformations = &self.source.deformations;
             let channels = self.source.animation.nodes.get(&index);
@@ -373,19 +373,19 @@ impl<'a> Gatherer<'a> {
             return Err("too many nodes above it move");
         }
         if rigid != DAffine3::IDENTITY {
-            links.push(Arc::new(Link::Fixed(rigid)));
+            links.push(Arc::new(PartLink::Fixed(rigid)));
         }
         let mut motion = NodeMotion {
-            translation: channels.translation.clone().unwrap_or(Track::Constant(translation)),
-            rotation: channels.rotation.clone().unwrap_or(Track::Constant(rotation)),
+            translation: channels.translation.clone().unwrap_or(ValueTrack::Constant(translation)),
+            rotation: channels.rotation.clone().unwrap_or(ValueTrack::Constant(rotation)),
         };
         match &mut motion.translation {
-            Track::Constant(at) => *at *= scale,
-            Track::Keys(keys) => keys.values.iter_mut().for_each(|at| *at *= scale),
+            ValueTrack::Constant(at) => *at *= scale,
+            ValueTrack::Keys(keys) => keys.values.iter_mut().for_each(|at| *at *= scale),
         }
-        links.push(Arc::new(Link::Node(motion)));
+        links.push(Arc::new(PartLink::Node(motion)));
         let name = node.name().map_or_else(|| format!("node {}", node.index()), str::to_owned);
-        self.parts.push(Part { name, links });
+        self.parts.push(MovingSubtree { name, links });
         Ok((self.parts.len() - 1, DAffine3::from_scale(own_scale * scale)))
     }
 
@@ -573,13 +573,13 @@ fn local_transform(node: &gltf::Node, channels: Option<&Channels>) -> DAffine3 {
         let matrix = node.transform().matrix().map(|c| c.map(f64::from));
         return DAffine3::from_mat4(DMat4::from_cols_array_2d(&matrix));
     };
-    if let Some(Track::Constant(at)) = channels.and_then(|c| c.translation.as_ref()) {
+    if let Some(ValueTrack::Constant(at)) = channels.and_then(|c| c.translation.as_ref()) {
         translation = *at;
     }
-    if let Some(Track::Constant(turn)) = channels.and_then(|c| c.rotation.as_ref()) {
+    if let Some(ValueTrack::Constant(turn)) = channels.and_then(|c| c.rotation.as_ref()) {
         rotation = *turn;
     }
-    if let Some(Track::Constant(size)) = channels.and_then(|c| c.scale.as_ref()) {
+    if let Some(ValueTrack::Constant(size)) = channels.and_then(|c| c.scale.as_ref()) {
         scale = *size;
     }
     DAffine3::from_scale_rotation_translation(scale, rotation, translation)

@@ -8,13 +8,13 @@ use super::super::limits::Cancel;
 use super::super::{Limits, Material, SceneError, Texture, TextureRef, Wrap};
 use super::accessor::Data;
 use super::bake::NORMALS;
-use super::container::{fetch, Folder};
+use super::container::{fetch, SideFolder};
 use super::json::Item;
 use super::lobes::read_lobes;
-use super::picture::{self, Picture, Size};
+use super::picture::{self, Size, TexturePicture};
 
 /// The result of [`read_look`].
-pub(super) struct Look {
+pub(super) struct SceneLook {
     /// One for each material of the file, followed by glTF's default material.
     pub materials: Vec<Material>,
     /// For each material the sets of texture coordinates of its textures, in the order of [`Material::textures`]; 0 where there is none.
@@ -28,12 +28,12 @@ pub(crate) fn read_look(
     document: &gltf::Document,
     root: &Item,
     data: &Data,
-    folder: Option<&Folder>,
+    folder: Option<&SideFolder>,
     limits: &Limits,
     cancel: &Cancel,
     warnings: &mut Vec<String>,
-) -> Result<Look, SceneError> {
-    let mut reader = Reader {
+) -> Result<SceneLook, SceneError> {
+    let mut reader = LookReader {
         document,
         image_items: root.list("images", "image", limits.objects)?,
         data,
@@ -55,7 +55,7 @@ pub(crate) fn read_look(
     }
     materials.push(Material::default());
     sets.push(vec![]);
-    Ok(Look { materials, sets, textures: reader.textures })
+    Ok(SceneLook { materials, sets, textures: reader.textures })
 }
 
 /// KHR_materials_unlit: the base colour is what the surface sends out, whatever falls on it. It reflects nothing, and nothing else
@@ -83,15 +83,15 @@ fn unlit(material: Material) -> Material {
     }
 }
 
-struct Reader<'a> {
+struct LookReader<'a> {
     document: &'a gltf::Document,
     image_items: Vec<Item<'a>>,
     data: &'a Data,
-    folder: Option<&'a Folder>,
+    folder: Option<&'a SideFolder>,
     limits: &'a Limits,
     cancel: &'a Cancel,
     /// Decoded images; `None`: one that cannot be read, which is told.
-    images: HashMap<usize, Option<Picture>>,
+    images: HashMap<usize, Option<TexturePicture>>,
     /// Image to index in `textures`: the first texture of an image takes its texels, so that no picture is held twice.
     holders: HashMap<usize, usize>,
     /// (image, sampler, sRGB, with heights) to index in `textures`: textures of a file may differ in their names alone.
@@ -116,7 +116,7 @@ pub(super) struct Use {
     srgb: bool,
 }
 
-impl Look {
+impl SceneLook {
     /// The set of a material's coordinates, or that of its map of normals if its textures lie on several.
     pub(super) fn set_of(&self, material: u32) -> u32 {
         let normals = self.used_sets(material).find(|(slot, _)| *slot == NORMALS);
@@ -139,7 +139,7 @@ impl Look {
     }
 }
 
-impl Reader<'_> {
+impl LookReader<'_> {
     fn material(
         &mut self,
         m: &gltf::Material,
@@ -324,7 +324,7 @@ impl Reader<'_> {
         })
     }
 
-    fn decode(&self, index: usize) -> Result<Picture, SceneError> {
+    fn decode(&self, index: usize) -> Result<TexturePicture, SceneError> {
         let Some(item) = self.image_items.get(index) else {
             return Err(SceneError::broken("textures", format!("name image {index}, which is not there")));
         };

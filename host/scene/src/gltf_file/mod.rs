@@ -30,14 +30,14 @@ use serde_json::Value;
 use super::limits::Cancel;
 use super::lobes::MOST_ABSORPTION;
 use super::{Environment, Limits, LoadOptions, Scene, SceneError, Texture};
-use container::Folder;
+use container::SideFolder;
 use json::Item;
 
 pub(super) use container::read_file;
 
 /// The content of a URI: inline, or a file in the folder of `beside`.
 pub(super) fn fetch_beside(uri: &str, beside: Option<&Path>, limit: u64) -> Result<Vec<u8>, SceneError> {
-    container::fetch(uri, beside.map(Folder::of).transpose()?.as_ref(), limit)
+    container::fetch(uri, beside.map(SideFolder::of).transpose()?.as_ref(), limit)
 }
 
 /// `Ok` if an image, which `name` may tell more of, is of a format that is read and has no more texels than the limits allow.
@@ -86,7 +86,7 @@ pub(super) fn read(
     cancel: &Cancel,
 ) -> Result<Scene, SceneError> {
     let limits = &options.limits;
-    let folder = beside.map(Folder::of).transpose()?;
+    let folder = beside.map(SideFolder::of).transpose()?;
     let container::Container { root: mut tree, binary, told } = container::split(bytes, limits)?;
     check::check_asset(&Item::new(&tree, "document".into())?)?;
     let left_out = amend_look::amend_look(&mut tree);
@@ -149,7 +149,7 @@ pub(super) fn read(
 }
 
 /// Light goes the further through a solid the larger the file's unit of `unit_m` metres makes it.
-fn absorb_by_metre(look: &mut look::Look, unit_m: f64) {
+fn absorb_by_metre(look: &mut look::SceneLook, unit_m: f64) {
     for lobes in look.materials.iter_mut().map(|m| &mut m.lobes) {
         let per_metre = lobes.absorption.as_dvec3() / unit_m;
         lobes.absorption = per_metre.min(glam::DVec3::splat(f64::from(MOST_ABSORPTION))).as_vec3();

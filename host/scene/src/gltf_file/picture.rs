@@ -12,7 +12,7 @@ use super::super::limits::{largest_piece, of_header, of_picture};
 use super::super::{Limits, SceneError};
 use super::bmp;
 use super::json::Item;
-use crate::jpeg_picture::Frame;
+use crate::jpeg_picture::JpegFrame;
 use crate::tiff_picture::{is_tiff, Tiff};
 
 /// The first bytes of every file in KTX2.
@@ -42,14 +42,14 @@ impl Size {
 }
 
 /// A decoded image.
-pub(super) struct Picture {
+pub(super) struct TexturePicture {
     /// Its sides.
     pub size: Size,
     /// RGBA, row by row from the top.
     pub texels: Vec<[u8; 4]>,
     /// Whether red, green and blue are encoded as sRGB, if the image says so in words that glTF makes binding.
     pub srgb: Option<bool>,
-    /// It stores red and green alone. As normals such a picture lacks their heights ([`Picture::with_heights`]).
+    /// It stores red and green alone. As normals such a picture lacks their heights ([`TexturePicture::with_heights`]).
     pub red_green_only: bool,
     /// Some of its numbers lay outside of 0 to 1 and were cut off there.
     pub cut_off: bool,
@@ -60,7 +60,7 @@ pub(super) struct Picture {
     pub notes: Vec<String>,
 }
 
-impl Picture {
+impl TexturePicture {
     /// The texels with blue as normals of length 1 need it, which point away from the surface.
     pub(super) fn with_heights(&self) -> Vec<[u8; 4]> {
         let height = |[r, g, _, a]: [u8; 4]| {
@@ -83,12 +83,12 @@ pub(super) fn decode(
     name: &str,
     texels_so_far: u64,
     limits: &Limits,
-) -> Result<Picture, SceneError> {
+) -> Result<TexturePicture, SceneError> {
     if bytes.starts_with(&KTX2_MAGIC) {
         return ktx2(item, bytes, texels_so_far, limits);
     }
     let format = format_of(item, bytes, name)?;
-    let room = Room::of(item, bytes, texels_so_far, limits)?;
+    let room = PictureBudget::of(item, bytes, texels_so_far, limits)?;
     if format == ImageFormat::Tiff {
         return tiff(item, bytes, &room);
     }
@@ -98,7 +98,7 @@ pub(super) fn decode(
         picture.notes.extend(told);
         return Ok(picture);
     }
-    let frame = Frame::of(bytes).filter(|_| format == ImageFormat::Jpeg);
+    let frame = JpegFrame::of(bytes).filter(|_| format == ImageFormat::Jpeg);
     if let Some(picture) = frame.and_then(|frame| jpeg(item, bytes, &frame, &room, limits).transpose()) {
         return picture;
     }
@@ -107,7 +107,12 @@ pub(super) fn decode(
 
 /// A picture in KTX2, level 0.
 #[cfg(feature = "compressed")]
-fn ktx2(item: &Item, bytes: &[u8], texels_so_far: u64, limits: &Limits) -> Result<Picture, SceneError> {
+fn ktx2(
+    item: &Item,
+    bytes: &[u8],
+    texels_so_far: u64,
+    limits: &Limits,
+) -> Result<TexturePicture, SceneError> {
     let failed = |e: Ktx2Error| match e {
         Ktx2Error::Damaged(why) => item.error(why),
         Ktx2Error::Unsupported { what, remedy } => {
@@ -120,11 +125,11 @@ fn ktx2(item: &Item, bytes: &[u8], texels_so_far: u64, limits: &Limits) -> Resul
     check_size(item, size, texels_so_far, limits)?;
     check_decoded(item, bytes, 4 * size.texels() as u64, limits)?;
     let Texels { texels, srgb, red_green_only, cut_off } = image.texels().map_err(failed)?;
-    Ok(Picture { size, texels, srgb, red_green_only, cut_off, stored: None, notes: vec![] })
+    Ok(TexturePicture { size, texels, srgb, red_green_only, cut_off, stored: None, notes: vec![] })
 }
 
 #[cfg(not(feature = "compressed"))]
-fn ktx2(item: &Item, _: &[u8], _: u64, _: &Limits) -> Result<Picture, SceneError> {
+fn ktx2(item: &Item, _: &[u8], _: u64, _: &Limits) -> Result<TexturePicture, SceneError> {
     let remedy = "build it with the feature `compressed`, or export PNG or JPEG textures";
     Err(SceneError::unsupported(
         format!("{}: an image in KTX2, without which this program was built", item.name),
@@ -137,9 +142,9 @@ fn of_image(
     item: &Item,
     bytes: &[u8],
     format: ImageFormat,
-    room: &Room,
+    room: &PictureBudget,
     limits: &Limits,
-) -> Result<Picture, SceneError> {
+) -> Result<TexturePicture, SceneError> {
     let mut reader = ImageReader::with_format(Cursor::new(bytes), format);
     reader.limits(of_header());
     let failed = |e: image::ImageError| item.error(format!("cannot be decoded: {e}"));
@@ -163,10 +168,10 @@ fn of_image(
 fn jpeg(
     item: &Item,
     bytes: &[u8],
-    frame: &Frame,
-    room: &Room,
+    frame: &JpegFrame,
+    room: &PictureBudget,
     limits: &Limits,
-) -> Result<Option<Picture>, SceneError> {
+) -> Result<Option<TexturePicture>, SceneError> {
     let [width, height] = frame.sides;
     let size = room.admitted(item, Size { width, height })?;
     let sides = match frame.sides_within(room.bytes) {
@@ -181,7 +186,7 @@ fn jpeg(
 }
 
 /// What a picture may take.
-struct Room {
+struct PictureBudget {
     /// Bytes of the largest piece of memory.
     bytes: u64,
     /// Texels that the scene's other textures leave.
@@ -195,7 +200,7 @@ struct Room {
 /// Texels for each byte of a file that may have more than the limit: a JPEG of a smooth picture has some forty.
 const MOST_IN_A_BYTE: u64 = 64;
 
-impl Room {
+impl PictureBudget {
     fn of(item: &Item, bytes: &[u8], texels_so_far: u64, limits: &Limits) -> Result<Self, SceneError> {
         let texels = limits.texels.saturating_sub(texels_so_far);
         if texels == 0 {
@@ -231,14 +236,22 @@ impl Room {
 }
 
 /// A picture of a size in its file, with as many texels as there is room for.
-fn of_decoded(decoded: image::DynamicImage, size: Size, room: &Room) -> Picture {
+fn of_decoded(decoded: image::DynamicImage, size: Size, room: &PictureBudget) -> TexturePicture {
     let (kept, texels) = as_rgba(decoded, room);
     let stored = (kept.texels() < size.texels()).then_some(size);
-    Picture { size: kept, texels, srgb: None, red_green_only: false, cut_off: false, stored, notes: vec![] }
+    TexturePicture {
+        size: kept,
+        texels,
+        srgb: None,
+        red_green_only: false,
+        cut_off: false,
+        stored,
+        notes: vec![],
+    }
 }
 
 /// The texels of a decoded picture, or the means of squares of them.
-fn as_rgba(decoded: image::DynamicImage, room: &Room) -> (Size, Vec<[u8; 4]>) {
+fn as_rgba(decoded: image::DynamicImage, room: &PictureBudget) -> (Size, Vec<[u8; 4]>) {
     use image::GenericImageView;
     let (width, height) = decoded.dimensions();
     let step = room.step(Size { width, height }, [4, 4]);
@@ -268,7 +281,7 @@ fn as_rgba(decoded: image::DynamicImage, room: &Room) -> (Size, Vec<[u8; 4]>) {
 }
 
 /// The texels of a TIFF, or the means of squares of them.
-fn tiff(item: &Item, bytes: &[u8], room: &Room) -> Result<Picture, SceneError> {
+fn tiff(item: &Item, bytes: &[u8], room: &PictureBudget) -> Result<TexturePicture, SceneError> {
     let file = Tiff::open(bytes).map_err(|e| item.error(e))?;
     let [width, height] = file.sides();
     let stored = room.admitted(item, Size { width, height })?;
@@ -299,7 +312,7 @@ fn tiff(item: &Item, bytes: &[u8], room: &Room) -> Result<Picture, SceneError> {
     };
     let stored = (step > 1).then_some(stored);
     let cut_off = rounder.cut_off;
-    Ok(Picture { size, texels, srgb: None, red_green_only: false, cut_off, stored, notes })
+    Ok(TexturePicture { size, texels, srgb: None, red_green_only: false, cut_off, stored, notes })
 }
 
 /// The format of an image by its first bytes. TGA has none of its own: its header, its last bytes or its name show it.
@@ -337,7 +350,7 @@ pub(super) fn check(item: &Item, bytes: &[u8], name: &str, limits: &Limits) -> R
         let [width, height] = Tiff::open(bytes).map_err(|e| item.error(e))?.sides();
         return check_size(item, Size { width, height }, 0, limits);
     }
-    if let Some(frame) = Frame::of(bytes).filter(|frame| format == ImageFormat::Jpeg && frame.is_odd()) {
+    if let Some(frame) = JpegFrame::of(bytes).filter(|frame| format == ImageFormat::Jpeg && frame.is_odd()) {
         let [width, height] = frame.sides;
         return check_size(item, Size { width, height }, 0, limits);
     }

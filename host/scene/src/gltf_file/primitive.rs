@@ -12,7 +12,7 @@ use super::super::{Limits, SceneError, TriangleMesh};
 use super::accessor::{Accessor, Data};
 use super::bake::Vertices;
 use super::deform::Deformation;
-use super::look::Look;
+use super::look::SceneLook;
 use super::vertex_paint::Paint;
 
 /// Reads a primitive's triangles with their material; decodes only vertices that a triangle uses. `None` if there is
@@ -20,7 +20,7 @@ use super::vertex_paint::Paint;
 pub(crate) fn read_primitive(
     primitive: &Primitive,
     data: &Data,
-    (look, material): (&Look, u32),
+    (look, material): (&SceneLook, u32),
     deformation: &Deformation,
     paint: &mut Paint,
     stop: (&Cancel, &Limits),

@@ -10,7 +10,7 @@ use glam::{Vec2, Vec3};
 use super::super::srgb::{from_linear, to_linear};
 use super::super::{Limits, SceneError, Texture, TextureRef, Wrap};
 use super::bake::{Bake, Vertices};
-use super::look::Look;
+use super::look::SceneLook;
 
 /// Triangles in a row of the texture.
 const PER_ROW: u32 = 4096;
@@ -35,7 +35,7 @@ pub(super) struct Paint {
 
 impl Paint {
     /// For the materials of a file.
-    pub(super) fn new(look: &Look, limits: &Limits) -> Self {
+    pub(super) fn new(look: &SceneLook, limits: &Limits) -> Self {
         let texels: u64 = look.textures.iter().map(|t| u64::from(t.width) * u64::from(t.height)).sum();
         let rows = u64::from(limits.texture_side / 2);
         let most = (limits.texels.saturating_sub(texels) / 4).min(rows * u64::from(PER_ROW));
@@ -50,7 +50,7 @@ impl Paint {
     /// More colours than a texture holds.
     pub(super) fn faces(
         &mut self,
-        look: &Look,
+        look: &SceneLook,
         (primitive, faces): (usize, &[[u64; 3]]),
         material: u32,
         vertices: &Vertices,
@@ -94,12 +94,12 @@ impl Paint {
     }
 
     /// Says what is sampled anew.
-    pub(super) fn warn(&self, look: &Look, warnings: &mut Vec<String>) {
+    pub(super) fn warn(&self, look: &SceneLook, warnings: &mut Vec<String>) {
         self.bake.warn(look, warnings);
     }
 
     /// Adds the textures and the painted materials.
-    pub(super) fn add_to(mut self, look: &mut Look) {
+    pub(super) fn add_to(mut self, look: &mut SceneLook) {
         let mut made = std::mem::take(&mut self.bake).into_materials(look);
         if !self.blocks.is_empty() {
             let (width, height) = self.sides();

@@ -6,7 +6,7 @@ use std::collections::BTreeMap;
 
 /// Triangles of one material.
 #[derive(Clone, Debug, Default, PartialEq)]
-pub(super) struct Part {
+pub(super) struct MaterialTriangles {
     /// Index into [`Document::materials`]; `None`: plain white.
     pub material: Option<usize>,
     /// In the file's own unit and axes.
@@ -27,7 +27,7 @@ pub(super) struct Object {
     /// Name of the node.
     pub name: String,
     /// At least one with a triangle, or the object is left out.
-    pub parts: Vec<Part>,
+    pub parts: Vec<MaterialTriangles>,
 }
 
 /// What a mesh file holds.
@@ -93,7 +93,7 @@ impl Document {
     /// Makes one object of all, and one part of all triangles of a material.
     pub(super) fn join(&mut self, name: String) {
         self.warnings.push(format!("the file has {} objects; all are read as one", self.objects.len()));
-        let mut joined: BTreeMap<(Option<usize>, [bool; 3]), Part> = BTreeMap::new();
+        let mut joined: BTreeMap<(Option<usize>, [bool; 3]), MaterialTriangles> = BTreeMap::new();
         for part in self.objects.drain(..).flat_map(|object| object.parts) {
             // What a part lacks has no value that would stand for it.
             let has =
@@ -155,7 +155,7 @@ impl Document {
     }
 }
 
-fn primitive(part: &Part, binary: &mut Binary) -> Value {
+fn primitive(part: &MaterialTriangles, binary: &mut Binary) -> Value {
     let mut attributes = json!({"POSITION": binary.floats(&part.positions, "VEC3")});
     if !part.normals.is_empty() {
         attributes["NORMAL"] = binary.floats(&part.normals, "VEC3").into();

@@ -28,7 +28,7 @@ pub(super) fn picture(uri: &str, beside: Option<&Path>, limits: &Limits) -> Resu
 
 /// What a statement of a material may say.
 #[derive(Clone, Debug)]
-struct Look {
+struct MtlStatement {
     name: String,
     diffuse: [f32; 3],
     emissive: [f32; 3],
@@ -43,7 +43,7 @@ struct Look {
     normal_map: Option<usize>,
 }
 
-impl Look {
+impl MtlStatement {
     fn new(name: &str) -> Self {
         Self {
             name: name.to_owned(),
@@ -91,7 +91,7 @@ impl Look {
 /// The materials that an OBJ file names.
 #[derive(Default)]
 pub(super) struct Library {
-    looks: Vec<Look>,
+    looks: Vec<MtlStatement>,
     numbers: BTreeMap<String, usize>,
     /// Names without capitals, with the only name that has these letters; `None` if there are several.
     alike: HashMap<String, Option<String>>,
@@ -183,7 +183,7 @@ impl Library {
     }
 
     fn declare(&mut self, name: &str) -> usize {
-        self.looks.push(Look::new(name));
+        self.looks.push(MtlStatement::new(name));
         let number = self.looks.len() - 1;
         self.numbers.insert(name.to_owned(), number);
         let only = self.alike.entry(name.to_lowercase()).or_insert_with(|| Some(name.to_owned()));

@@ -1,6 +1,6 @@
 //! OBJ: vertices, texture coordinates, normals, and faces that refer to them line by line.
 
-use super::document::{smooth_normals, Document, Object, Part};
+use super::document::{smooth_normals, Document, MaterialTriangles, Object};
 use super::mtl::Library;
 use super::ply::add_fan;
 use super::{far, linear, lines, numbers};
@@ -46,8 +46,8 @@ struct Lost {
 
 impl Faces {
     /// The triangles of the faces whose vertices are there; `near` are the positions in single precision.
-    fn into_part(self, lists: &Lists, near: &[[f32; 3]], lost: &mut Lost) -> Part {
-        let mut part = Part::default();
+    fn into_part(self, lists: &Lists, near: &[[f32; 3]], lost: &mut Lost) -> MaterialTriangles {
+        let mut part = MaterialTriangles::default();
         let mut known: HashMap<Corner, u32> = HashMap::new();
         let (mut has_uvs, mut has_normals) = (false, false);
         let mut rest = &self.corners[..];
@@ -110,7 +110,7 @@ pub(super) fn is_likely(bytes: &[u8]) -> bool {
 }
 
 /// What is read line by line.
-struct Reader<'a> {
+struct ObjReader<'a> {
     lists: Lists,
     library: Library,
     /// The objects, and in each the faces by material; `None`: the file has named none.
@@ -141,7 +141,7 @@ pub(super) fn read(
     let bytes = bytes.strip_prefix(b"\xef\xbb\xbf").unwrap_or(bytes);
     let has_objects =
         bytes.split(|&b| matches!(b, b'\n' | b'\r')).any(|line| line.trim_ascii_start().starts_with(b"o "));
-    let mut reader = Reader {
+    let mut reader = ObjReader {
         lists: Lists::default(),
         library: Library::default(),
         objects: vec![(name.to_owned(), BTreeMap::new())],
@@ -163,7 +163,7 @@ pub(super) fn read(
     reader.into_document()
 }
 
-impl Reader<'_> {
+impl ObjReader<'_> {
     fn line(&mut self, line: usize, text: &str) -> Result<(), SceneError> {
         if let Some(colours) = text.trim_start().strip_prefix("#MRGB") {
             return self.comment(colours);
@@ -273,7 +273,7 @@ impl Reader<'_> {
         let (near, offset) = far::single(&self.lists.positions);
         let mut lost = Lost::default();
         let objects = self.objects.into_iter().map(|(name, faces)| {
-            let parts = faces.into_iter().map(|(material, faces)| Part {
+            let parts = faces.into_iter().map(|(material, faces)| MaterialTriangles {
                 material: material.or(white),
                 ..faces.into_part(&self.lists, &near, &mut lost)
             });

@@ -1,6 +1,6 @@
 //! PLY: a header that declares elements and their properties, then their values as text or as bytes of either order.
 
-use super::document::{smooth_normals, Document, Object, Part};
+use super::document::{smooth_normals, Document, MaterialTriangles, Object};
 use super::{far, linear, mtl, uri_of};
 use crate::limits::{Cancel, Limits};
 use crate::SceneError;
@@ -15,14 +15,14 @@ const MAX_TEXTURES: usize = 256;
 const MAX_CORNERS: usize = 65_536;
 
 #[derive(Clone, Copy, Debug, PartialEq)]
-enum Form {
+enum PlyForm {
     Text,
     Little,
     Big,
 }
 
 #[derive(Clone, Copy, Debug, PartialEq)]
-enum Kind {
+enum NumberKind {
     I8,
     U8,
     I16,
@@ -33,7 +33,7 @@ enum Kind {
     F64,
 }
 
-impl Kind {
+impl NumberKind {
     fn of(word: &str) -> Option<Self> {
         Some(match word {
             "char" | "int8" => Self::I8,
@@ -70,19 +70,19 @@ impl Kind {
 struct Property {
     name: String,
     /// Kind of the count, if it is a list.
-    count: Option<Kind>,
-    kind: Kind,
+    count: Option<NumberKind>,
+    kind: NumberKind,
 }
 
-struct Element {
+struct PlyElement {
     name: String,
     count: usize,
     properties: Vec<Property>,
 }
 
 struct Header {
-    form: Form,
-    elements: Vec<Element>,
+    form: PlyForm,
+    elements: Vec<PlyElement>,
     textures: Vec<String>,
 }
 
@@ -92,7 +92,7 @@ fn broken(problem: impl Into<String>) -> SceneError {
 
 /// The header, and the bytes after it.
 fn read_header(bytes: &[u8]) -> Result<(Header, &[u8]), SceneError> {
-    let mut header = Header { form: Form::Text, elements: vec![], textures: vec![] };
+    let mut header = Header { form: PlyForm::Text, elements: vec![], textures: vec![] };
     let mut has_form = false;
     let mut rest = bytes;
     for number in 1.. {
@@ -108,9 +108,9 @@ fn read_header(bytes: &[u8]) -> Result<(Header, &[u8]), SceneError> {
             ["format", form, ..] => {
                 has_form = true;
                 header.form = match form {
-                    "ascii" => Form::Text,
-                    "binary_little_endian" => Form::Little,
-                    "binary_big_endian" => Form::Big,
+                    "ascii" => PlyForm::Text,
+                    "binary_little_endian" => PlyForm::Little,
+                    "binary_big_endian" => PlyForm::Big,
                     other => return Err(broken(format!("names the format '{other}', which is none of PLY"))),
                 };
             }
@@ -128,18 +128,23 @@ fn read_header(bytes: &[u8]) -> Result<(Header, &[u8]), SceneError> {
 }
 
 /// Adds what a line declares; `None` if it is wrong.
-fn declare(words: &[&str], elements: &mut Vec<Element>) -> Option<()> {
+fn declare(words: &[&str], elements: &mut Vec<PlyElement>) -> Option<()> {
     match *words {
         ["element", name, count] if elements.len() < MAX_ELEMENTS => {
-            elements.push(Element { name: name.to_owned(), count: count.parse().ok()?, properties: vec![] });
+            elements.push(PlyElement {
+                name: name.to_owned(),
+                count: count.parse().ok()?,
+                properties: vec![],
+            });
         }
         ["property", "list", count, kind, name] => {
-            let count = Kind::of(count).filter(|kind| !matches!(kind, Kind::F32 | Kind::F64))?;
-            let list = Property { name: name.to_owned(), count: Some(count), kind: Kind::of(kind)? };
+            let count =
+                NumberKind::of(count).filter(|kind| !matches!(kind, NumberKind::F32 | NumberKind::F64))?;
+            let list = Property { name: name.to_owned(), count: Some(count), kind: NumberKind::of(kind)? };
             elements.last_mut().filter(|e| e.properties.len() < MAX_PROPERTIES)?.properties.push(list);
         }
         ["property", kind, name] => {
-            let plain = Property { name: name.to_owned(), count: None, kind: Kind::of(kind)? };
+            let plain = Property { name: name.to_owned(), count: None, kind: NumberKind::of(kind)? };
             elements.last_mut().filter(|e| e.properties.len() < MAX_PROPERTIES)?.properties.push(plain);
         }
         _ => return None,
@@ -149,7 +154,7 @@ fn declare(words: &[&str], elements: &mut Vec<Element>) -> Option<()> {
 
 /// The values after the header, one after the other.
 struct Values<'a> {
-    form: Form,
+    form: PlyForm,
     rest: &'a [u8],
     /// Lines of a text that hold more than their element.
     too_long: usize,
@@ -157,8 +162,8 @@ struct Values<'a> {
 
 impl Values<'_> {
     /// The next value; `None` at the end of the file, or if a text is no number.
-    fn next(&mut self, kind: Kind) -> Option<f64> {
-        if self.form == Form::Text {
+    fn next(&mut self, kind: NumberKind) -> Option<f64> {
+        if self.form == PlyForm::Text {
             let begin = self.rest.iter().position(|b| !b.is_ascii_whitespace())?;
             let word = &self.rest[begin..];
             let end = word.iter().position(u8::is_ascii_whitespace).unwrap_or(word.len());
@@ -169,26 +174,26 @@ impl Values<'_> {
         let mut raw = [0; 8];
         raw[..size].copy_from_slice(self.rest.get(..size)?);
         self.rest = &self.rest[size..];
-        if self.form == Form::Big {
+        if self.form == PlyForm::Big {
             raw[..size].reverse();
         }
         let [a, b, c, d, ..] = raw;
         Some(match kind {
-            Kind::I8 => f64::from(a as i8),
-            Kind::U8 => f64::from(a),
-            Kind::I16 => f64::from(i16::from_le_bytes([a, b])),
-            Kind::U16 => f64::from(u16::from_le_bytes([a, b])),
-            Kind::I32 => f64::from(i32::from_le_bytes([a, b, c, d])),
-            Kind::U32 => f64::from(u32::from_le_bytes([a, b, c, d])),
-            Kind::F32 => f64::from(f32::from_le_bytes([a, b, c, d])),
-            Kind::F64 => f64::from_le_bytes(raw),
+            NumberKind::I8 => f64::from(a as i8),
+            NumberKind::U8 => f64::from(a),
+            NumberKind::I16 => f64::from(i16::from_le_bytes([a, b])),
+            NumberKind::U16 => f64::from(u16::from_le_bytes([a, b])),
+            NumberKind::I32 => f64::from(i32::from_le_bytes([a, b, c, d])),
+            NumberKind::U32 => f64::from(u32::from_le_bytes([a, b, c, d])),
+            NumberKind::F32 => f64::from(f32::from_le_bytes([a, b, c, d])),
+            NumberKind::F64 => f64::from_le_bytes(raw),
         })
     }
 
     /// Leaves out what a text has behind an element in its line: an element has a line of its own, and what is more than the header
     /// declares is no part of the next one.
     fn end_line(&mut self) {
-        if self.form != Form::Text {
+        if self.form != PlyForm::Text {
             return;
         }
         let end = self.rest.iter().position(|b| matches!(b, b'\n' | b'\r')).unwrap_or(self.rest.len());
@@ -197,7 +202,7 @@ impl Values<'_> {
     }
 
     /// One element; `lists` get the members of its lists, one for each property.
-    fn element(&mut self, element: &Element, row: &mut Vec<f64>, lists: &mut [Vec<f64>]) -> Option<()> {
+    fn element(&mut self, element: &PlyElement, row: &mut Vec<f64>, lists: &mut [Vec<f64>]) -> Option<()> {
         row.clear();
         for (property, list) in element.properties.iter().zip(lists) {
             list.clear();
@@ -215,10 +220,10 @@ impl Values<'_> {
     }
 
     /// How many of an element the rest of the file can hold at most.
-    fn room(&self, element: &Element) -> usize {
+    fn room(&self, element: &PlyElement) -> usize {
         let size = |p: &Property| match (self.form, p.count) {
             // A digit, and a blank before the next one.
-            (Form::Text, _) => 2,
+            (PlyForm::Text, _) => 2,
             (_, Some(count)) => count.bytes(),
             (_, None) => p.kind.bytes(),
         };
@@ -289,7 +294,7 @@ pub(super) fn read(
         (Vertices::default(), Faces::default(), Document::default());
     let mut unused: Vec<String> = vec![];
     for element in header.elements.iter().filter(|element| !element.properties.is_empty()) {
-        let mut reader = Reader {
+        let mut reader = ElementReader {
             element,
             limits,
             cancel,
@@ -338,7 +343,7 @@ fn parts(
     textures: &[String],
     (beside, limits): (Option<&Path>, &Limits),
     document: &mut Document,
-) -> Result<Vec<Part>, SceneError> {
+) -> Result<Vec<MaterialTriangles>, SceneError> {
     let count = vertices.positions.len();
     let lost = faces.leave_out_without(count);
     if faces.triangles.is_empty() {
@@ -353,12 +358,12 @@ fn parts(
     vertices.positions = vec![];
     document.offset = offset;
     let has_normals = !vertices.normals.is_empty();
-    let mut part = Part {
+    let mut part = MaterialTriangles {
         normals: if has_normals { vertices.normals } else { smooth_normals(&near, &faces.triangles) },
         positions: near,
         uvs: vertices.uvs,
         colours: vertices.colours,
-        ..Part::default()
+        ..MaterialTriangles::default()
     };
     say_of_corners(&mut part, &mut faces);
     let numbers = materials(textures, part.uvs.is_empty(), (beside, limits), document);
@@ -383,7 +388,7 @@ fn parts(
             true => (std::mem::take(&mut part), triangles),
             false => (compact(&part, &triangles), of_own_corners(triangles.len())),
         };
-        Part { material: Some(material), triangles, ..whole }
+        MaterialTriangles { material: Some(material), triangles, ..whole }
     };
     Ok(all.into_iter().enumerate().map(own).collect())
 }
@@ -408,7 +413,7 @@ fn of_own_corners(count: usize) -> Vec<[u32; 3]> {
 }
 
 /// What faces have of their own is said of each corner.
-fn say_of_corners(part: &mut Part, faces: &mut Faces) {
+fn say_of_corners(part: &mut MaterialTriangles, faces: &mut Faces) {
     if faces.colours.is_empty() && faces.uvs.is_empty() {
         return;
     }
@@ -461,20 +466,20 @@ fn materials(
 }
 
 /// The corners of some triangles of a part, one after the other.
-fn compact(part: &Part, triangles: &[[u32; 3]]) -> Part {
+fn compact(part: &MaterialTriangles, triangles: &[[u32; 3]]) -> MaterialTriangles {
     let corners = triangles.as_flattened();
     let apart = |list: &[[f32; 3]]| corners.iter().filter_map(|i| list.get(*i as usize).copied()).collect();
-    Part {
+    MaterialTriangles {
         positions: apart(&part.positions),
         normals: apart(&part.normals),
         colours: apart(&part.colours),
         uvs: corners.iter().filter_map(|i| part.uvs.get(*i as usize).copied()).collect(),
-        ..Part::default()
+        ..MaterialTriangles::default()
     }
 }
 
-struct Reader<'a, 'b> {
-    element: &'a Element,
+struct ElementReader<'a, 'b> {
+    element: &'a PlyElement,
     limits: &'a Limits,
     cancel: &'a Cancel,
     values: &'a mut Values<'b>,
@@ -482,7 +487,7 @@ struct Reader<'a, 'b> {
     used: Vec<bool>,
 }
 
-impl Reader<'_, '_> {
+impl ElementReader<'_, '_> {
     /// Calls `take` with the values and the lists of every element; gives how many are there.
     fn each(
         &mut self,

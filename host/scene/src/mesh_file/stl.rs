@@ -1,6 +1,6 @@
 //! STL: triangles, as text or binary; some binary files give them colours.
 
-use super::document::{Document, Object, Part};
+use super::document::{Document, MaterialTriangles, Object};
 use super::{far, linear, lines, mtl, numbers};
 use crate::limits::{Cancel, Limits};
 use crate::SceneError;
@@ -61,7 +61,7 @@ pub(super) fn read(
         warnings.push(format!("{more} bytes behind the last triangle are left out"));
     }
     let triangles = &bytes[HEAD..HEAD + count * TRIANGLE];
-    let mut part = Part::default();
+    let mut part = MaterialTriangles::default();
     part.positions.reserve(3 * count);
     for (i, triangle) in triangles.chunks_exact(TRIANGLE).enumerate() {
         if i % 65_536 == 0 {
@@ -106,7 +106,7 @@ fn check_triangles(count: usize, limits: &Limits) -> Result<(), SceneError> {
     SceneError::check_limit("the number of triangles", count as u64, limits.triangles, "decimate the mesh")
 }
 
-fn document(solids: Vec<(String, Part)>) -> Document {
+fn document(solids: Vec<(String, MaterialTriangles)>) -> Document {
     let objects = solids.into_iter().map(|(name, mut part)| {
         part.material = Some(0);
         part.triangles =
@@ -163,7 +163,10 @@ fn read_text(bytes: &[u8], name: &str, limits: &Limits, cancel: &Cancel) -> Resu
     let (near, offset) = far::single(&positions);
     let ends = solids.iter().skip(1).map(|(_, at)| *at).chain([near.len()]);
     let parts = solids.iter().zip(ends).map(|((name, from), to)| {
-        (name.clone(), Part { positions: near[*from..to].to_vec(), ..Part::default() })
+        (
+            name.clone(),
+            MaterialTriangles { positions: near[*from..to].to_vec(), ..MaterialTriangles::default() },
+        )
     });
     let mut made = document(parts.collect());
     made.offset = offset;

@@ -4,7 +4,7 @@ use std::borrow::Cow;
 use std::convert::Infallible;
 use std::io::Read;
 
-use crate::jpeg_picture::Frame;
+use crate::jpeg_picture::JpegFrame;
 use fax::decoder::{DecodeStatus, Group3Decoder};
 use flate2::read::ZlibDecoder;
 use ruzstd::decoding::StreamingDecoder;
@@ -161,7 +161,7 @@ impl Unpacking<'_> {
             // The last strip may be padded to the height of the others.
             across >= width && across < self.greatest[0] + 64 && down < self.greatest[1] + 64
         };
-        if let Some(frame) = Frame::of(&whole).filter(Frame::is_odd) {
+        if let Some(frame) = JpegFrame::of(&whole).filter(JpegFrame::is_odd) {
             let [across, down] = frame.sides.map(|side| side as usize);
             if !fits(across, down) {
                 return None;

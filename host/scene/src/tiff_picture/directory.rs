@@ -7,7 +7,7 @@ const MOST_PAGES: u32 = 1000;
 
 /// Where the numbers of a tag lie in the file.
 #[derive(Clone, Copy)]
-struct Entry {
+struct TagEntry {
     /// 1 to 18, as the format counts kinds of numbers.
     kind: u16,
     /// Of numbers.
@@ -21,7 +21,7 @@ pub(super) struct Directory<'a> {
     bytes: &'a [u8],
     /// Numbers have their high byte first.
     pub is_big_endian: bool,
-    entries: BTreeMap<u16, Entry>,
+    entries: BTreeMap<u16, TagEntry>,
     /// Pictures of full size in the file, this one included.
     pub pages: u32,
 }
@@ -46,7 +46,7 @@ impl<'a> Numbers<'a> {
     }
 
     /// The entries of a directory, and where the next one begins; `None` for the latter after the last one.
-    fn directory(self, place: u64, is_large: bool) -> Option<(BTreeMap<u16, Entry>, Option<u64>)> {
+    fn directory(self, place: u64, is_large: bool) -> Option<(BTreeMap<u16, TagEntry>, Option<u64>)> {
         let (length, step, of_count, inline) = if is_large { (8, 20, 8, 8) } else { (2, 12, 4, 4) };
         let count = self.number(place, length)?;
         let first = place.checked_add(length)?;
@@ -60,7 +60,7 @@ impl<'a> Numbers<'a> {
             let value = at + 4 + of_count;
             let fits = count.checked_mul(size_of(kind as u16)).is_some_and(|bytes| bytes <= inline);
             let Some(place) = (if fits { Some(value) } else { self.number(value, inline) }) else { break };
-            entries.insert(tag as u16, Entry { kind: kind as u16, count, place });
+            entries.insert(tag as u16, TagEntry { kind: kind as u16, count, place });
         }
         let next = self.number(end, inline).filter(|next| *next != 0);
         Some((entries, next))

@@ -10,7 +10,7 @@ mod numbers;
 #[cfg(test)]
 mod tests;
 
-use crate::jpeg_picture::Frame;
+use crate::jpeg_picture::JpegFrame;
 use chunk::{Packing, Unpacking};
 use colour::{Chroma, Colours};
 use directory::Directory;
@@ -21,7 +21,7 @@ const MOST_UNPACKED: u64 = 8;
 
 /// What a number of a texel is.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-enum Kind {
+enum TexelKind {
     Unsigned,
     Signed,
     Float,
@@ -40,7 +40,7 @@ pub(crate) struct Tiff<'a> {
     height: u32,
     /// Of each number of a texel.
     bits: Vec<u32>,
-    kind: Kind,
+    kind: TexelKind,
     colours: Colours,
     /// The number that is alpha, and whether the colours are multiplied by it.
     alpha: Option<(usize, bool)>,
@@ -118,24 +118,24 @@ fn palette(directory: &Directory, bits: u32) -> Result<Vec<[f32; 3]>, String> {
 }
 
 /// The kind of a texel's numbers, and the bits of each.
-fn numbers_of(directory: &Directory, samples: usize) -> Result<(Kind, Vec<u32>), String> {
+fn numbers_of(directory: &Directory, samples: usize) -> Result<(TexelKind, Vec<u32>), String> {
     let of_kind = directory.integers(339).unwrap_or_default();
     let first = of_kind.first().copied().unwrap_or(1);
     let kind = match first {
         _ if of_kind.iter().any(|kind| *kind != first) => None,
-        1 | 4 => Some(Kind::Unsigned),
+        1 | 4 => Some(TexelKind::Unsigned),
         // Bytes with a sign are codes to all other programs.
-        2 if directory.number(258) == Some(8) => Some(Kind::Unsigned),
-        2 => Some(Kind::Signed),
-        3 => Some(Kind::Float),
+        2 if directory.number(258) == Some(8) => Some(TexelKind::Unsigned),
+        2 => Some(TexelKind::Signed),
+        3 => Some(TexelKind::Float),
         _ => None,
     };
     let listed = directory.integers(258).unwrap_or_else(|| vec![1]);
     // One for all is written by some programs.
     let bits: Vec<u32> =
         (0..samples).map(|i| *listed.get(i).or(listed.first()).unwrap_or(&0) as u32).collect();
-    let fits = |kind: Kind| match kind {
-        Kind::Float => bits.iter().all(|b| matches!(b, 16 | 24 | 32 | 64) && *b == bits[0]),
+    let fits = |kind: TexelKind| match kind {
+        TexelKind::Float => bits.iter().all(|b| matches!(b, 16 | 24 | 32 | 64) && *b == bits[0]),
         _ => bits.iter().all(|b| matches!(b, 1..=16 | 24 | 32 | 64)),
     };
     match kind {
@@ -165,7 +165,7 @@ impl<'a> Tiff<'a> {
             // Of some files only the tables stand there, and the scan in the strips.
             let length = directory.number(514).and_then(|length| usize::try_from(length).ok());
             let file = from.map(|from| &from[..length.unwrap_or(from.len()).min(from.len())]);
-            file.and_then(Frame::of).is_some_and(|frame| frame.has_scan())
+            file.and_then(JpegFrame::of).is_some_and(|frame| frame.has_scan())
         };
         let file = directory.number(513).filter(|at| named == 6 && has_file(at));
         let packing = Packing::of(if file.is_some() { 7 } else { named })?;
@@ -239,7 +239,7 @@ impl<'a> Tiff<'a> {
         }
         let is_odd_depth = self.bits.iter().any(|bits| !matches!(bits, 8 | 16 | 32 | 64));
         if self.packing.is_picture()
-            && (self.bits.iter().any(|bits| *bits != 8) || self.kind != Kind::Unsigned)
+            && (self.bits.iter().any(|bits| *bits != 8) || self.kind != TexelKind::Unsigned)
         {
             return Err(
                 "is a TIFF whose packing has 8 bits and whose numbers have others: save it as PNG".into()
@@ -259,7 +259,7 @@ impl<'a> Tiff<'a> {
         if matches!(self.colours, Colours::Lab { .. }) && self.bits.iter().any(|bits| *bits != 8) {
             return Err("is a TIFF of CIELab with other than 8 bits: save it as RGB".into());
         }
-        let is_float = self.kind == Kind::Float;
+        let is_float = self.kind == TexelKind::Float;
         match self.predictor {
             1 => {}
             2 if !is_odd_depth
@@ -296,7 +296,7 @@ impl<'a> Tiff<'a> {
 
     /// Whether its numbers are floats, which are light by most programs, and not codes for a display.
     pub(crate) fn is_light(&self) -> bool {
-        self.kind == Kind::Float
+        self.kind == TexelKind::Float
     }
 
     /// Numbers of a texel that are stored together.
@@ -389,7 +389,7 @@ impl<'a> Tiff<'a> {
                 all - found
             ));
         }
-        if self.kind == Kind::Unsigned && self.directory.number(339) == Some(2) {
+        if self.kind == TexelKind::Unsigned && self.directory.number(339) == Some(2) {
             told.push("its bytes have a sign, and are read as codes from 0 to 255".into());
         }
         if self.directory.pages > 1 {
@@ -502,13 +502,13 @@ impl<'a> Tiff<'a> {
     /// A number of a texel as a part of its range.
     fn number(&self, raw: u64, bits: u32) -> f32 {
         match self.kind {
-            Kind::Unsigned => (raw as f64 / (u64::MAX >> (64 - bits)) as f64) as f32,
-            Kind::Signed => {
+            TexelKind::Unsigned => (raw as f64 / (u64::MAX >> (64 - bits)) as f64) as f32,
+            TexelKind::Signed => {
                 let signed = (raw << (64 - bits)) as i64 >> (64 - bits);
                 // Of one bit, the greatest is 0.
                 (signed as f64 / ((u64::MAX >> (65 - bits.max(2))) as f64)) as f32
             }
-            Kind::Float => match bits {
+            TexelKind::Float => match bits {
                 16 => half::f16::from_bits(raw as u16).to_f32(),
                 24 => float_of_24(raw as u32),
                 32 => f32::from_bits(raw as u32),

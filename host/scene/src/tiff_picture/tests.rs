@@ -6,7 +6,7 @@ use std::io::Write;
 
 /// A way to store a picture of 5 x 3 texels.
 #[derive(Clone)]
-struct Form {
+struct TiffForm {
     is_big_endian: bool,
     is_large: bool,
     bits: u32,
@@ -22,7 +22,7 @@ struct Form {
 
 const SIDES: [usize; 2] = [5, 3];
 
-impl Default for Form {
+impl Default for TiffForm {
     fn default() -> Self {
         Self {
             is_big_endian: false,
@@ -45,7 +45,7 @@ fn code(x: usize, y: usize, i: usize, bits: u32) -> u64 {
     mixed.wrapping_mul(0x9e37_79b9_7f4a_7c15) >> (64 - bits)
 }
 
-impl Form {
+impl TiffForm {
     fn number(&self, value: u64, bytes: usize) -> Vec<u8> {
         let little = value.to_le_bytes()[..bytes].to_vec();
         if self.is_big_endian {
@@ -218,7 +218,7 @@ fn places() -> impl Iterator<Item = (usize, usize)> {
     (0..SIDES[1]).flat_map(|y| (0..SIDES[0]).map(move |x| (x, y)))
 }
 
-fn check(form: &Form, told: &str) {
+fn check(form: &TiffForm, told: &str) {
     let bits = form.bits;
     let file = form.file(&|x, y, i| code(x, y, i, bits));
     let (_, texels, notes) = read(&file).unwrap_or_else(|e| panic!("{told}: {e}"));
@@ -244,7 +244,7 @@ fn every_depth_order_packing_and_layout_gives_the_same_texels() {
                             continue;
                         }
                         let photometric = if samples < 3 { 1 } else { 2 };
-                        let form = Form {
+                        let form = TiffForm {
                             is_big_endian,
                             is_large,
                             bits,
@@ -272,13 +272,13 @@ fn floats_of_every_width_are_light_with_and_without_their_predictor() {
     for (bits, predictor) in [(16, 1), (16, 3), (24, 1), (32, 1), (32, 3), (32, 2), (64, 1), (64, 3)] {
         for is_big_endian in [false, true] {
             let compression = if predictor == 1 { 1 } else { 8 };
-            let form = Form {
+            let form = TiffForm {
                 bits,
                 predictor,
                 compression,
                 is_big_endian,
                 more: vec![(339, vec![3; 3])],
-                ..Form::default()
+                ..TiffForm::default()
             };
             let raw = |x, y, i| {
                 let value = light(x, y, i);
@@ -306,7 +306,7 @@ fn floats_of_every_width_are_light_with_and_without_their_predictor() {
             }
         }
     }
-    assert!(!Tiff::open(&Form::default().file(&|_, _, _| 7)).unwrap().is_light());
+    assert!(!Tiff::open(&TiffForm::default().file(&|_, _, _| 7)).unwrap().is_light());
 }
 
 #[test]
@@ -318,8 +318,13 @@ fn colours_by_a_list_by_inks_by_darkness_and_by_chroma() {
             (0..3).flat_map(|c| (0..count).map(move |i| ((i * 53 + c * 91) % 256) << shift)).collect()
         };
         for shift in [8, 0] {
-            let form =
-                Form { bits, samples: 1, photometric: 3, more: vec![(320, list(shift))], ..Form::default() };
+            let form = TiffForm {
+                bits,
+                samples: 1,
+                photometric: 3,
+                more: vec![(320, list(shift))],
+                ..TiffForm::default()
+            };
             let (_, texels, _) = read(&form.file(&|x, y, _| code(x, y, 0, bits))).unwrap();
             for ((x, y), texel) in places().zip(&texels) {
                 let of = |c: u64| ((code(x, y, 0, bits) * 53 + c * 91) % 256) as f32 / 255.0;
@@ -327,21 +332,21 @@ fn colours_by_a_list_by_inks_by_darkness_and_by_chroma() {
             }
         }
     }
-    let one = |form: &Form, codes: &[u64]| read(&form.file(&|_, _, i| codes[i])).unwrap().1[0];
-    let dark = Form { samples: 1, photometric: 0, ..Form::default() };
+    let one = |form: &TiffForm, codes: &[u64]| read(&form.file(&|_, _, i| codes[i])).unwrap().1[0];
+    let dark = TiffForm { samples: 1, photometric: 0, ..TiffForm::default() };
     assert!(near(one(&dark, &[55]), [200.0 / 255.0, 200.0 / 255.0, 200.0 / 255.0, 1.0]));
-    let inks = Form { samples: 4, photometric: 5, ..Form::default() };
+    let inks = TiffForm { samples: 4, photometric: 5, ..TiffForm::default() };
     assert!(near(one(&inks, &[0, 51, 255, 102]), [0.6, 0.48, 0.0, 1.0]));
     // The codes of JFIF for a red of 200, 30, 60, and of the same by Rec. 709 within 16 to 235.
-    let chroma = Form { photometric: 6, more: vec![(530, vec![1, 1])], ..Form::default() };
+    let chroma = TiffForm { photometric: 6, more: vec![(530, vec![1, 1])], ..TiffForm::default() };
     let red = [200.0 / 255.0, 30.0 / 255.0, 60.0 / 255.0, 1.0];
     assert!(near(one(&chroma, &[84, 114, 211]), red), "{:?}", one(&chroma, &[84, 114, 211]));
-    let lab = Form { photometric: 8, ..Form::default() };
+    let lab = TiffForm { photometric: 8, ..TiffForm::default() };
     // White, and a grey of 50: 118.9 of 255 in sRGB.
     assert!(near(one(&lab, &[255, 0, 0]), [1.0; 4]));
     let grey = 118.9 / 255.0;
     assert!(near(one(&lab, &[128, 0, 0]), [grey, grey, grey, 1.0]), "{:?}", one(&lab, &[128, 0, 0]));
-    let icc = Form { photometric: 9, ..Form::default() };
+    let icc = TiffForm { photometric: 9, ..TiffForm::default() };
     assert!(near(one(&icc, &[128, 128, 128]), [grey, grey, grey, 1.0]));
 }
 
@@ -350,7 +355,8 @@ fn chroma_of_fewer_texels_is_spread() {
     // Units of 2 x 2 luminances over 5 x 3 texels: three across, two down.
     let unit = |u: u8| vec![10 * u, 10 * u + 1, 10 * u + 2, 10 * u + 3, 128, 128];
     let chunk: Vec<u8> = (0..6).flat_map(unit).collect();
-    let form = Form { photometric: 6, more: vec![(530, vec![2, 2]), (278, vec![4])], ..Form::default() };
+    let form =
+        TiffForm { photometric: 6, more: vec![(530, vec![2, 2]), (278, vec![4])], ..TiffForm::default() };
     let (_, texels, told) = read(&form.with_chunks(&[chunk])).unwrap();
     assert!(told.is_empty());
     for ((x, y), texel) in places().zip(&texels) {
@@ -363,7 +369,7 @@ fn chroma_of_fewer_texels_is_spread() {
 fn alpha_counts_as_the_file_names_it() {
     let of = |extra: Option<u64>| {
         let more = extra.map(|kind| (338, vec![kind])).into_iter().collect();
-        let form = Form { samples: 4, more, ..Form::default() };
+        let form = TiffForm { samples: 4, more, ..TiffForm::default() };
         let [r, _, _, alpha] = read(&form.file(&|_, _, i| [100, 0, 0, 200][i])).unwrap().1[0];
         [r, alpha].map(|x| (x * 255.0).round())
     };
@@ -376,8 +382,12 @@ fn alpha_counts_as_the_file_names_it() {
 #[test]
 fn pictures_are_turned_as_they_are_shown() {
     for orientation in 1..=8u64 {
-        let form =
-            Form { samples: 1, photometric: 1, more: vec![(274, vec![orientation])], ..Form::default() };
+        let form = TiffForm {
+            samples: 1,
+            photometric: 1,
+            more: vec![(274, vec![orientation])],
+            ..TiffForm::default()
+        };
         let ([width, height], texels, _) = read(&form.file(&|x, y, _| (10 * y + x) as u64)).unwrap();
         assert_eq!([width, height], if orientation < 5 { [5, 3] } else { [3, 5] });
         let code = |x: u32, y: u32| (texels[(y * width + x) as usize][0] * 255.0).round() as u32;
@@ -406,7 +416,7 @@ fn pictures_are_turned_as_they_are_shown() {
 
 #[test]
 fn what_is_missing_is_counted_and_what_is_not_read_is_named() {
-    let form = Form { compression: 8, ..Form::default() };
+    let form = TiffForm { compression: 8, ..TiffForm::default() };
     let mut chunks = form.chunks(&|x, y, i| code(x, y, i, 8));
     let half = chunks[0].len() / 2;
     chunks[0].truncate(half);
@@ -422,7 +432,7 @@ fn what_is_missing_is_counted_and_what_is_not_read_is_named() {
             assert!(!told.is_empty() || texels.iter().all(|texel| texel[3] == 1.0));
         }
     }
-    let refused = |form: Form| read(&form.file(&|_, _, _| 0)).unwrap_err();
+    let refused = |form: TiffForm| read(&form.file(&|_, _, _| 0)).unwrap_err();
     for (number, word) in [
         (34_925, "LZMA"),
         (33_003, "JPEG 2000"),
@@ -430,15 +440,15 @@ fn what_is_missing_is_counted_and_what_is_not_read_is_named() {
         (6, "before 1995"),
         (777, "no version"),
     ] {
-        let told = refused(Form { compression: number, ..Form::default() });
+        let told = refused(TiffForm { compression: number, ..TiffForm::default() });
         assert!(told.contains(word) && told.contains("save it"), "{told}");
     }
     for (number, word) in [(32_803, "sensor"), (32_845, "logarithms"), (99, "no colours")] {
-        let told = refused(Form { photometric: number, ..Form::default() });
+        let told = refused(TiffForm { photometric: number, ..TiffForm::default() });
         assert!(told.contains(word) && told.contains("save it"), "{told}");
     }
     let pages = {
-        let mut file = Form::default().file(&|_, _, _| 9);
+        let mut file = TiffForm::default().file(&|_, _, _| 9);
         // The directory points to itself as the next one: a circle ends.
         let begin = u32::from_le_bytes(file[4..8].try_into().unwrap()) as usize;
         let next = begin + 2 + 12 * usize::from(file[begin]);

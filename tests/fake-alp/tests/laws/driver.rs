@@ -1,6 +1,6 @@
 //! The driver on the fake panel: the light is the planes, it ends by itself, and nothing of the device stays behind.
 
-use dpm_alp::{Alp, AlpError, Showing, Weights};
+use dpm_alp::{Alp, AlpError, ShowMode, Weights};
 use dpm_device::planes::{PlaneSchedule, Raster};
 use dpm_device::rng::Sampler;
 use dpm_device::time::{FrameRate, HostTime};
@@ -8,8 +8,8 @@ use fake_alp::{library, FakeAlp, Shown};
 
 const MS: i64 = 1_000_000;
 
-fn showing(schedule: PlaneSchedule, weights: Weights, hz: u32) -> Showing {
-    Showing { schedule, weights, rate: FrameRate::new(hz, 1).unwrap(), frames: 3, runs: 1 }
+fn showing(schedule: PlaneSchedule, weights: Weights, hz: u32) -> ShowMode {
+    ShowMode { schedule, weights, rate: FrameRate::new(hz, 1).unwrap(), frames: 3, runs: 1 }
 }
 
 fn open(settings: &str) -> (FakeAlp, Alp) {
@@ -102,7 +102,7 @@ fn frames_queue_and_runs_give_way() {
     for runs in 1..=3 {
         let (fake, mut alp) = open("size=16x2,call=2,start=0");
         let hz = 100;
-        alp.prepare(&Showing { runs, ..showing(PlaneSchedule::mono8(), Weights::Equal, hz) }).unwrap();
+        alp.prepare(&ShowMode { runs, ..showing(PlaneSchedule::mono8(), Weights::Equal, hz) }).unwrap();
         for frame in 0..40u8 {
             let at = usize::from(frame) % 3;
             alp.progress().unwrap();
@@ -164,13 +164,13 @@ fn what_panel_memory_queue_and_cable_cannot_do_is_refused_with_figures() {
     );
     let queue = text(alp.prepare(&showing(PlaneSchedule::mono8(), Weights::Binary, 60)));
     assert!(queue.contains("queues 16 sequences") && queue.contains("need 18"), "{queue}");
-    let good = Showing { frames: 2, ..showing(PlaneSchedule::rgb24(), Weights::Equal, 200) };
+    let good = ShowMode { frames: 2, ..showing(PlaneSchedule::rgb24(), Weights::Equal, 200) };
     alp.prepare(&good).unwrap();
     let rate = alp.measure_cable(&|| HostTime(fake.witness().now_ns)).unwrap();
     assert!((270e6..350e6).contains(&rate), "{rate} bytes/s of 350e6, less 30 us a call");
     let cable = text(alp.check_cable(&good, rate));
     assert!(cable.contains("472 MB/s"), "{cable}");
-    alp.check_cable(&Showing { rate: FrameRate::new(120, 1).unwrap(), ..good }, rate).unwrap();
+    alp.check_cable(&ShowMode { rate: FrameRate::new(120, 1).unwrap(), ..good }, rate).unwrap();
 }
 
 #[test]

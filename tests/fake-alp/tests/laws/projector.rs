@@ -1,6 +1,6 @@
 //! The bit-plane projector whose panel is an ALP, at virtual pace: the host's own link on one side, the fake panel on the other.
 
-use dpm_alp::{Alp, AlpError, AlpProjector, Showing, Weights, MEMORY_SPARE};
+use dpm_alp::{Alp, AlpError, AlpProjector, ShowMode, Weights, MEMORY_SPARE};
 use dpm_device::link::{
     faults, Epoch, HostLink, LightLimits, LinkSettings, LinkState, SendOutcome, Underrun, Verb,
 };
@@ -43,7 +43,7 @@ fn open(fake: FakeAlp, case: &Case) -> Result<AlpProjector, AlpError> {
     let mut alp = Alp::open_paced(Some(&library()), fake.number(), pause)?;
     let rate = FrameRate::new(case.hz, 1).unwrap();
     let frames = 3 + MEMORY_SPARE;
-    let showing = Showing { schedule: case.schedule, weights: case.weights, rate, frames, runs: case.runs };
+    let showing = ShowMode { schedule: case.schedule, weights: case.weights, rate, frames, runs: case.runs };
     alp.prepare(&showing)?;
     AlpProjector::new(alp, showing, None, HostTime(0))
 }

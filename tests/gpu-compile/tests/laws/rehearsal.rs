@@ -1,18 +1,18 @@
 //! What the dry run judges, fed with faults.
 
-use dpm_render::gpu::Place;
+use dpm_render::gpu::MemoryPlace;
 use gpu_compile::rehearsal::{machine_wakes_late_ms, misplaced, too_large, Share, MOST_OF_A_SLOT_MS};
 
 #[test]
 fn each_kind_of_wrong_memory_is_named() {
-    let good = Place { on_device: true, host_visible: false, host_cached: false };
-    let host = Place { on_device: false, host_visible: true, host_cached: true };
+    let good = MemoryPlace { on_device: true, host_visible: false, host_cached: false };
+    let host = MemoryPlace { on_device: false, host_visible: true, host_cached: true };
     let all = [("instances", good), ("counters of the host", host)];
     assert!(misplaced(&all).is_empty());
     for (name, place, fault) in [
         ("instances", host, "across the bus"),
         ("counters of the host", good, "cannot read"),
-        ("counters of the host", Place { host_cached: false, ..host }, "without its caches"),
+        ("counters of the host", MemoryPlace { host_cached: false, ..host }, "without its caches"),
     ] {
         let wrong = misplaced(&[all[0], (name, place), all[1]]);
         assert!(wrong.len() == 1 && wrong[0].contains(name) && wrong[0].contains(fault), "{wrong:?}");

@@ -1,6 +1,6 @@
 //! Seeds that once broke a law, shrunk to what they need, and what a life has to be besides lawful: the same every time.
 
-use dpm_rig::pipeline::stepped::Part;
+use dpm_rig::pipeline::stepped::RunPart;
 use dpm_sim::guard::Guard;
 use dpm_sim::kinds::Kind;
 use dpm_sim::life::{live, Lived, Order};
@@ -352,7 +352,7 @@ fn a_collector_that_gets_no_time_changes_nothing_about_the_light() {
         let mut world = world(rate_hz);
         let begin = shown(&mut world, 3 * S);
         let end = shown(&mut world, 6 * S);
-        world.set_trap(Part::Collector, Trap::Stalls(4 * S));
+        world.set_trap(RunPart::Collector, Trap::Stalls(4 * S));
         let before = shown(&mut world, 6 * S + S / 10);
         let after = shown(&mut world, 10 * S);
         let (usual, later) = (missed(begin, end), missed(before, after));
@@ -385,10 +385,10 @@ fn world(rate_hz: u32) -> World {
 /// own again.
 #[test]
 fn half_a_second_after_a_stall_every_slot_is_lit_again() {
-    for part in [Part::Tracking, Part::Plan, Part::Pack, Part::Link, Part::Collector] {
+    for part in [RunPart::Tracking, RunPart::Plan, RunPart::Pack, RunPart::Link, RunPart::Collector] {
         let mut world = world(947);
         // A stall of the link must not let the projector's watchdog bite, which is another law.
-        let stall_ns = if part == Part::Link { 40 * MS } else { 90 * MS };
+        let stall_ns = if part == RunPart::Link { 40 * MS } else { 90 * MS };
         let begin = shown(&mut world, 3 * S);
         let end = shown(&mut world, 6 * S);
         world.set_trap(part, Trap::Stalls(stall_ns));

@@ -6,7 +6,7 @@ use std::time::{Duration, Instant};
 use dpm_dlpc900::driver::{Dlpc900, Dlpc900Error, HidPort, PortError};
 use dpm_dlpc900::image::PlaneOrder;
 use dpm_dlpc900::lut::Dmd;
-use dpm_dlpc900::sequence::{LedSetup, Pattern, Repeat, SequenceBuilder};
+use dpm_dlpc900::sequence::{BitPattern, LedSetup, Repeat, SequenceBuilder};
 use dpm_dlpc900::usb::{self, UsbHid, UsbPlace};
 use hil_mock::dlpc900::{Dlpc900Fault, Dlpc900Model, Options as Projector};
 use hil_mock::usb_plug::{monotonic_clock, Fault, UsbPlug};
@@ -100,7 +100,7 @@ fn a_controller_that_comes_back_is_loaded_again() {
     let mut b = bench(projector(), Options { kernel_driver: Some("usbhid".into()), ..Options::default() });
     let plane = vec![0xa5; Dmd::Dlp5500.raster().plane_bytes()];
     let mut s = SequenceBuilder::new(Dmd::Dlp5500);
-    s.push(&Pattern::white(vec![&plane], 500));
+    s.push(&BitPattern::white(vec![&plane], 500));
     let s = s.finish(Repeat::Forever, PlaneOrder::default(), None).unwrap();
     for cycle in 0..10 {
         let mut d = Dlpc900::new(b.open().unwrap()).unwrap();
@@ -156,7 +156,7 @@ mod breadth {
             .map(|p| (0..raster.plane_bytes()).map(|i| ((i * (2 * p + 1)) >> (i % 5)) as u8).collect())
             .collect();
         let mut s = SequenceBuilder::new(Dmd::Dlp5500);
-        planes.iter().for_each(|p| s.push(&Pattern::white(vec![p], 500)));
+        planes.iter().for_each(|p| s.push(&BitPattern::white(vec![p], 500)));
         let s = s.finish(Repeat::Forever, PlaneOrder::default(), None).unwrap();
         let start = Instant::now();
         d.upload(&s, LedSetup::default(), &mut |_| ()).unwrap();

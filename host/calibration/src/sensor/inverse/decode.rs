@@ -160,7 +160,7 @@ pub fn decode_pairs(
     let record = Record::new(blocks).ok_or(DecodeError::NoSamples)?;
     let (pairs, carried) = shown_pairs(timing, &record, shown);
     let brightest = light.brightest();
-    let search = Search { code, record: &record, pairs: &pairs, frame_ns: timing.frame_ns, brightest };
+    let search = LagSearch { code, record: &record, pairs: &pairs, frame_ns: timing.frame_ns, brightest };
     let (lag_ns, identity_percent) = search.lag()?;
     let ticks = ((timing.frame_ns / TICK_NS).round() as usize).clamp(2, TICKS);
     let raw: Vec<(PairStarts, [Option<f64>; TICKS])> =
@@ -209,7 +209,7 @@ fn shown_pairs(timing: &Timing, record: &Record, shown: &dyn Fn(u64) -> u64) -> 
     (fresh.windows(2).filter_map(pair).collect(), carried)
 }
 
-struct Search<'a> {
+struct LagSearch<'a> {
     code: &'a InverseCode,
     record: &'a Record,
     pairs: &'a [PairStarts],
@@ -218,7 +218,7 @@ struct Search<'a> {
     brightest: [f64; 2],
 }
 
-impl Search<'_> {
+impl LagSearch<'_> {
     /// First frame less second one, with the sign of the identity: stripes less inverse.
     fn difference(&self, pair: &PairStarts, from_ns: f64, until_ns: f64) -> Option<f64> {
         let [a, b] = pair.begins_ns.map(|begin| self.record.mean(begin + from_ns, begin + until_ns));

@@ -1,6 +1,6 @@
 //! Samples on the host's clock, and their means over any stretch of time.
 
-use super::super::lock::Block;
+use super::super::lock::SampleBlock;
 
 /// Samples are summed over so long, nanoseconds.
 const BIN_NS: f64 = 50_000.0;
@@ -10,7 +10,7 @@ const MOST_BINS: f64 = 7.2e7;
 const LEAST_SAMPLED: f64 = 0.9;
 
 /// A block of samples, and the sensor's clock less the host's when it came, nanoseconds.
-pub type Mapped = (Block, i64);
+pub type Mapped = (SampleBlock, i64);
 
 /// Samples by time.
 pub(super) struct Record {
@@ -85,7 +85,7 @@ mod tests {
     fn a_mean_is_that_of_the_samples_between_and_gaps_have_none() {
         let block = |start_ns: i64| {
             let levels = (0..250).map(|i| (start_ns / 10_000 + i) as f32).collect();
-            (Block { start_ns: start_ns + 7_000_000_000, interval_ns: 1e4, levels }, 7_000_000_000)
+            (SampleBlock { start_ns: start_ns + 7_000_000_000, interval_ns: 1e4, levels }, 7_000_000_000)
         };
         // Samples that rise by one every 10 us; 2.5 ms are missing after 7.5 ms.
         let record = Record::new(&[0, 2_500_000, 5_000_000, 10_000_000].map(block)).unwrap();

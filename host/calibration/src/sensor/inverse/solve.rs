@@ -6,7 +6,9 @@
 use super::super::fit::{refine, Scores, SensorError, Settings, Solution, MOST_MISFIT};
 use super::super::latency::{self, Latency};
 use super::super::lens::finish_told;
-use super::super::problem::{Fix, Limits, Measured, Moment, Problem, State, Tally, RADIUS, UNKNOWNS};
+use super::super::problem::{
+    Fix, LatencyLimits, Measured, Moment, SensorProblem, SensorUnknowns, Tally, RADIUS, UNKNOWNS,
+};
 use super::super::start::{is_inside, start, thin};
 use super::code::{InverseCode, Stripe};
 use super::decode::{DecodedPairs, Pair};
@@ -51,8 +53,8 @@ impl Measured for PairFix {
 
     fn tally(
         &self,
-        problem: &Problem,
-        state: &State,
+        problem: &SensorProblem,
+        state: &SensorUnknowns,
         sigma: f64,
         finest: f64,
         mut all: Option<&mut Equations>,
@@ -131,7 +133,7 @@ pub fn solve_latency_of_pairs(
     let problem = problem(code, path, settings, true);
     let seen = prepare(code, decoded, path)?;
     let radius_m = 0.5 * settings.aperture_m;
-    let held = State { model: *model, tip: settings.tip, latency_s: 0.0, drift: 0.0, radius_m };
+    let held = SensorUnknowns { model: *model, tip: settings.tip, latency_s: 0.0, drift: 0.0, radius_m };
     let fitted = refine(&problem, with_latency(&problem, held, &seen), &seen, &stages(code))?;
     if fitted.rms_level > MOST_MISFIT {
         let mut scores = Scores::default();
@@ -164,9 +166,9 @@ fn problem<'a>(
     path: &'a Trajectory,
     settings: &'a Settings,
     is_held: bool,
-) -> Problem<'a> {
-    let limits = Limits { latency_s: LATENCIES_S[1], latency_sigma_us: MOST_LATENCY_SIGMA_US };
-    Problem { limits, ..Problem::new(code.raster(), (path, settings), is_held) }
+) -> SensorProblem<'a> {
+    let limits = LatencyLimits { latency_s: LATENCIES_S[1], latency_sigma_us: MOST_LATENCY_SIGMA_US };
+    SensorProblem { limits, ..SensorProblem::new(code.raster(), (path, settings), is_held) }
 }
 
 /// The narrowest stripes of each stage: in motion a start may be a dozen pixels off.
@@ -292,12 +294,13 @@ fn add_place(found: &mut Vec<DVec3>, at: DVec3) {
 }
 
 /// The latency at which wide stripes fit best: in motion it is worth a hundred pixels.
-fn with_latency(problem: &Problem, begun: State, seen: &[PairFix]) -> State {
+fn with_latency(problem: &SensorProblem, begun: SensorUnknowns, seen: &[PairFix]) -> SensorUnknowns {
     let few: Vec<&PairFix> = thin(seen, 500).collect();
     let finest = f64::from(problem.raster.width()) / 16.0;
     let step = 0.004;
     let count = ((LATENCIES_S[1] - LATENCIES_S[0]) / step) as u32;
-    let tried = (0..=count).map(|i| State { latency_s: LATENCIES_S[0] + step * f64::from(i), ..begun });
+    let tried =
+        (0..=count).map(|i| SensorUnknowns { latency_s: LATENCIES_S[0] + step * f64::from(i), ..begun });
     let scored = tried.map(|s| (problem.cost_of_levels(&s, &few, (0.15, finest)), s));
     scored.min_by(|a, b| a.0.total_cmp(&b.0)).map_or(begun, |(_, state)| state)
 }

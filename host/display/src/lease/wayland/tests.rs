@@ -7,7 +7,7 @@ use std::time::{Duration, Instant};
 
 use super::super::compositor::{Compositor, LeaseLog, Manner, Request, FIRST};
 use super::super::socket::tests::HandedSocket;
-use super::{lease_over, socket_of, Lease, Refusal};
+use super::{lease_over, socket_of, Lease, LeaseRefusal};
 
 const OFFERS: [(&str, u32); 2] = [("DP-1", 33), ("HDMI-A-1", 44)];
 
@@ -25,11 +25,11 @@ fn compositor(
     (client, std::thread::spawn(move || compositor.serve()))
 }
 
-fn ask(stream: UnixStream, connector: Option<&str>, patience: Duration) -> Result<Lease, Refusal> {
+fn ask(stream: UnixStream, connector: Option<&str>, patience: Duration) -> Result<Lease, LeaseRefusal> {
     lease_over(stream, connector, "a fake".into(), Instant::now() + patience)
 }
 
-fn refused(manner: Manner, offers: &[(&'static str, u32)], connector: Option<&str>) -> Refusal {
+fn refused(manner: Manner, offers: &[(&'static str, u32)], connector: Option<&str>) -> LeaseRefusal {
     let (stream, thread) = compositor(manner, offers, None);
     let start = Instant::now();
     let refusal = ask(stream, connector, Duration::from_millis(400)).err().expect("refused");

@@ -14,7 +14,7 @@ use x11rb::x11_utils::Serialize;
 
 use super::super::compositor::send;
 use super::super::socket::tests::HandedSocket;
-use super::{lease_of, BoundedStream, Lease, Refusal};
+use super::{lease_of, BoundedStream, Lease, LeaseRefusal};
 
 /// Its number of the extension's requests.
 const RANDR: u8 = 140;
@@ -26,7 +26,7 @@ const BAD_ACCESS: u8 = 10;
 
 /// An output of the fake server.
 #[derive(Clone, Debug)]
-struct Output {
+struct FakeOutput {
     name: &'static str,
     connector_id: Option<u32>,
     /// Shows the desktop with this CRTC; 0 if it does not.
@@ -48,7 +48,7 @@ struct Manner {
     vanishes_at: Option<u8>,
     /// CRTCs on lease, which look free.
     leased_crtcs: Vec<u32>,
-    outputs: Vec<Output>,
+    outputs: Vec<FakeOutput>,
 }
 
 /// What the client did.
@@ -236,7 +236,7 @@ impl XServer {
         }
     }
 
-    fn output(&self, id: u32) -> &Output {
+    fn output(&self, id: u32) -> &FakeOutput {
         &self.manner.outputs[id as usize - 1]
     }
 
@@ -277,7 +277,7 @@ impl XServer {
 /// A desktop on the first of two outputs; the second is free, and either of two CRTCs can drive it.
 fn desktop() -> Manner {
     let output =
-        |name, crtc| Output { name, connector_id: None, crtc, crtcs: vec![11, 12], is_leased: false };
+        |name, crtc| FakeOutput { name, connector_id: None, crtc, crtcs: vec![11, 12], is_leased: false };
     Manner {
         has_randr: true,
         version: (1, 6),
@@ -301,7 +301,7 @@ fn ask(
     connector: Option<&str>,
     kernel: &[(u32, String)],
     patience: Duration,
-) -> Result<Lease, Refusal> {
+) -> Result<Lease, LeaseRefusal> {
     let (stream, _) = DefaultStream::from_unix_stream(stream).unwrap();
     let stream = BoundedStream::new(stream, Instant::now() + patience);
     let server = RustConnection::connect_to_stream(stream, 0).expect("greeted");
@@ -321,7 +321,7 @@ fn lent(manner: Manner, connector: Option<&str>, kernel: &[(u32, String)]) -> Op
     seen.lent
 }
 
-fn refused(manner: Manner, connector: Option<&str>) -> Refusal {
+fn refused(manner: Manner, connector: Option<&str>) -> LeaseRefusal {
     let (stream, thread) = start(manner, None);
     let start = Instant::now();
     let refusal = ask(stream, connector, &[], Duration::from_millis(400)).err().expect("refused");

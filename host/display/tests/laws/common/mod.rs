@@ -15,7 +15,7 @@ use dpm_display::encoding::Encoding;
 use dpm_display::fake::{display, FakeKms, FakeState, Shared};
 use dpm_display::kms::Kms;
 use dpm_display::mode::{ModeWish, Timing};
-use dpm_display::panel::Panel;
+use dpm_display::panel::DisplayPanel;
 use dpm_display::set_up::{plan, DisplaySettings};
 use dpm_display::transport::DisplayTransport;
 use dpm_handoff::path::Lock;
@@ -89,9 +89,9 @@ pub fn pixels(id: u64, encoding: Encoding) -> Vec<u8> {
 }
 
 /// A rig at virtual pace: a host, a display, and the time.
-pub struct Rig {
+pub struct DisplayRig {
     pub link: HostLink,
-    pub cable: Direct<Panel<FakeKms>>,
+    pub cable: Direct<DisplayPanel<FakeKms>>,
     pub shared: Shared,
     now: Arc<AtomicI64>,
     pub encoding: Encoding,
@@ -156,7 +156,7 @@ pub fn lit(link: &HostLink) -> u32 {
     link.status().map_or(0, |s| s.frames_lit)
 }
 
-impl Rig {
+impl DisplayRig {
     pub fn new(encoding: Encoding, change: impl FnOnce(&mut FakeState)) -> Self {
         let shared = shared();
         with(&shared, change);
@@ -166,7 +166,7 @@ impl Rig {
         let mut kms = FakeKms::new(shared.clone(), clock.clone());
         let plan = plan(&kms.connectors().unwrap(), &settings(encoding)).unwrap();
         kms.start(&plan.setup).unwrap();
-        let panel = Panel::new(kms, plan.panel, 1, clock.as_ref());
+        let panel = DisplayPanel::new(kms, plan.panel, 1, clock.as_ref());
         let mut link = HostLink::new(link_settings());
         link.connect();
         Self { link, cable: Direct::new(panel), shared, now, encoding, sent: Vec::new(), last_slot: 0 }

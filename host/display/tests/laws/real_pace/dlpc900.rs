@@ -28,13 +28,13 @@ fn lock(model: &Mutex<Dlpc900Model>) -> MutexGuard<'_, Dlpc900Model> {
 }
 
 /// A cable to the emulator at real pace, and a plug to pull.
-struct Cable {
+struct EmulatorCable {
     model: Arc<Mutex<Dlpc900Model>>,
     clock: Arc<dyn HostClock>,
     is_plugged: Arc<AtomicBool>,
 }
 
-impl HidPort for Cable {
+impl HidPort for EmulatorCable {
     fn write_report(&mut self, report: &[u8; REPORT_BYTES], _: Duration) -> Result<(), PortError> {
         if !self.is_plugged.load(Ordering::Relaxed) {
             return Err(PortError::Gone);
@@ -81,7 +81,11 @@ impl Chain {
         let kms = move || Ok(Box::new(FakeKms::new(card.clone(), clock.clone())) as Box<dyn Kms>);
         let (model, clock, is_plugged) = (self.model.clone(), self.clock.clone(), self.is_plugged.clone());
         let controller = move || {
-            Dlpc900::new(Cable { model: model.clone(), clock: clock.clone(), is_plugged: is_plugged.clone() })
+            Dlpc900::new(EmulatorCable {
+                model: model.clone(),
+                clock: clock.clone(),
+                is_plugged: is_plugged.clone(),
+            })
         };
         let stop = self.stop.clone();
         let stop = Arc::new(move || stop.load(Ordering::Relaxed));

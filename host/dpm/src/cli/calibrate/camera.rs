@@ -3,7 +3,7 @@
 use super::{form_of, seconds};
 use crate::cli::rig_args::RigArgs;
 use crate::cli::watch::print;
-use dpm_calibrate::camera::{calibrate, told_of, Task};
+use dpm_calibrate::camera::{calibrate, told_of, CameraTask};
 use dpm_camera::{board_pdf, TAGS};
 use dpm_camera_files::{export, MAX_BYTES};
 use dpm_common::files::{keep_old, write_atomically};
@@ -98,7 +98,7 @@ impl CameraArgs {
         let path = self.file.clone().or_else(|| view.calibration.clone()).unwrap_or_else(beside);
         let form = form_of(&path)?;
         let (views, time) = (usize::from(self.views), Duration::from_secs_f64(self.seconds));
-        let task = Task { board, raster: view.raster, views, time };
+        let task = CameraTask { board, raster: view.raster, views, time };
         let fit = calibrate(&mut *view.source, &task, &mut |text| print(&format!("{text}\n")))?;
         print(&format!("{}\n", told_of(&fit)));
         let camera = fit.model.camera(view.raster).map_err(|e| bad(e.to_string()))?;

@@ -5,7 +5,7 @@ use super::{tip_of, Common};
 use crate::cli::watch::{print, watch_quietly};
 use dpm_calibrate::aim::Aim;
 use dpm_calibrate::check::{self, judge, measure, RealBench, Target};
-use dpm_calibrate::nudge::{self, help, Stage};
+use dpm_calibrate::nudge::{self, help, OutlineStage};
 use dpm_calibrate::outline::Outlines;
 use dpm_calibrate::poses::Poses;
 use dpm_common::clock::MonotonicClock;
@@ -92,7 +92,7 @@ pub(super) fn nudge(args: &NudgeArgs) -> Result<(), Failure> {
     };
     check_known(&results, &moved)?;
     let names: Vec<String> = args.body.iter().cloned().collect();
-    let stage = Stage::of(&results.rig(&config)?, moved.clone(), &names)?;
+    let stage = OutlineStage::of(&results.rig(&config)?, moved.clone(), &names)?;
     let step_m = 1e-3 * args.step;
     let poses = Poses::start(&config, &stage.names(), MonotonicClock::new(0))?;
     poses.wait_until_seen()?;

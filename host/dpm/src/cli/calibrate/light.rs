@@ -26,7 +26,7 @@ struct SensorWand {
 
 impl SensorWand {
     /// How its sensor is recorded in coded light for so many seconds.
-    fn setup(&self, config: &RigConfig, seconds: f64) -> sensor::Setup {
+    fn setup(&self, config: &RigConfig, seconds: f64) -> sensor::SensorSetup {
         self.args.setup(&self.sensor, (&self.common, config), seconds, PlaceHint::default())
     }
 }
@@ -77,7 +77,7 @@ impl LightArgs {
             codes: self.codes,
             in_tiles: self.wand.args.is_held(&config),
         };
-        let progress = Arc::new(Mutex::new(light::Progress::default()));
+        let progress = Arc::new(Mutex::new(light::ReadingProgress::default()));
         let mut paced = config.clone();
         let channels = loop {
             let (ways, progress) = (ways.clone(), Arc::clone(&progress));

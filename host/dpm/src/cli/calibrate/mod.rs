@@ -17,7 +17,7 @@ use dpm_calibrate::recorder::Port;
 use dpm_calibrate::{body, sensor, wand};
 use dpm_calibration::projector::{LensTerms, PlaceHint};
 use dpm_calibration::rehearsal::{rehearse_with, Bias};
-use dpm_camera_files::{export, Form};
+use dpm_camera_files::{export, StorageForm};
 use dpm_rig::config::{PlaneTiming, RigConfig};
 use dpm_rig::failure::{Failure, FailureKind};
 use dpm_rig::results::Results;
@@ -126,8 +126,8 @@ impl SensorArgs {
         (common, config): (&Common, &RigConfig),
         seconds: f64,
         known: PlaceHint,
-    ) -> sensor::Setup {
-        sensor::Setup {
+    ) -> sensor::SensorSetup {
+        sensor::SensorSetup {
             port: self.port(path),
             wand: common.wand.clone(),
             seconds,
@@ -360,8 +360,8 @@ fn write_opencv(args: &ExportArgs) -> Result<(), Failure> {
     Ok(())
 }
 
-fn form_of(path: &Path) -> Result<Form, Failure> {
-    Form::of(path).ok_or_else(|| {
+fn form_of(path: &Path) -> Result<StorageForm, Failure> {
+    StorageForm::of(path).ok_or_else(|| {
         let told = format!("{}: name the file .xml, .yml, .yaml or .json", path.display());
         Failure::new(FailureKind::BadInput, told)
     })

@@ -1,7 +1,7 @@
 //! `dpm calibrate page`: the guided page of a rig that does not run.
 
 use crate::cli::guide::RigGuide;
-use crate::cli::live_page::{link, token, Link};
+use crate::cli::live_page::{link, token, PageLink};
 use crate::cli::rig_args::RigArgs;
 use dpm_common::signals;
 use dpm_page::{Page, Settings};
@@ -46,7 +46,7 @@ impl GuideArgs {
         signals::install()
             .map_err(|e| Failure::new(FailureKind::Device, format!("cannot handle signals: {e}")))?;
         let page = Page::serve_calibration(settings).map_err(|e| bad(e.to_string()))?;
-        let (Link::Secret(told) | Link::Open(told)) = link(page.address(), token);
+        let (PageLink::Secret(told) | PageLink::Open(told)) = link(page.address(), token);
         eprintln!("{told}");
         eprintln!("Nothing is lit before you start a step there. Ctrl-C ends the page and the step.");
         signals::wait();

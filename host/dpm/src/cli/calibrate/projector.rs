@@ -139,7 +139,7 @@ impl ProjectorArgs {
         let mut eyes = config.tracker.view(&clock).ok_or_else(none)?.map_err(|e| bad(e.to_string()))?;
         let eye = config.tracker.eye().ok_or_else(none)?.map_err(|e| bad(e.to_string()))?;
         let settle = Duration::from_secs_f64(self.settle);
-        let task = view::Task { clock, board: Some(self.paper.board().0), settle };
+        let task = view::ViewTask { clock, board: Some(self.paper.board().0), settle };
         let fit = watch_quietly(config.clone(), move |config, monitor| {
             view::calibrate(config, (&mut eyes, &eye), &task, monitor, &mut |text| {
                 print(&format!("{text}\n"))
@@ -162,7 +162,7 @@ impl ProjectorArgs {
         let seconds = self.seconds.unwrap_or(usual);
         let lens = self.lens.terms();
         let setup = self.sensor_args.setup(port, (&self.common, config), seconds, known);
-        let setup = sensor::Setup { lens, ..setup };
+        let setup = sensor::SensorSetup { lens, ..setup };
         let solution = at_a_rate_that_is_carried(&mut config.clone(), move |config, monitor| {
             sensor::calibrate(config, &setup, tip, monitor)
         })?;

@@ -2,7 +2,7 @@
 //! projector stays dark.
 
 use super::super::watch::take_locks;
-use super::{Finding, State};
+use super::{Finding, Severity};
 use dpm_common::clock::{Clock, MonotonicClock};
 use dpm_device::link::{faults, DeviceHello, HostLink, LinkState};
 use dpm_device::pose::Pose;
@@ -60,13 +60,13 @@ pub(super) type Heard = Vec<HeardBody>;
 pub(super) fn camera(config: &RigConfig) -> Option<Finding> {
     let name = "camera";
     Some(match config.tracker.examine()? {
-        Err(doubt) => Finding::new(name, State::Missing, doubt.found, doubt.remedy),
-        Ok(look) if look.doubts.is_empty() => Finding::new(name, State::Ok, look.found, ""),
+        Err(doubt) => Finding::new(name, Severity::Missing, doubt.found, doubt.remedy),
+        Ok(look) if look.doubts.is_empty() => Finding::new(name, Severity::Ok, look.found, ""),
         Ok(look) => {
             let doubts: Vec<&str> = look.doubts.iter().map(|doubt| &*doubt.found).collect();
             let remedies: Vec<&str> = look.doubts.iter().map(|doubt| &*doubt.remedy).collect();
             let found = format!("{}; {}", doubts.join("; "), look.found);
-            Finding::new(name, State::Warning, found, remedies.join("; "))
+            Finding::new(name, Severity::Warning, found, remedies.join("; "))
         }
     })
 }
@@ -77,15 +77,15 @@ pub(super) fn tracker(config: &RigConfig, rig: Option<&Rig>) -> (Finding, Option
     let name = "tracker";
     let page = format!("see {}", config.tracker.kind().page);
     if config.tracker.is_mock() {
-        return (Finding::new(name, State::Info, "the mock in this process", ""), None);
+        return (Finding::new(name, Severity::Info, "the mock in this process", ""), None);
     }
     let Some(bodies) = bodies(config, rig) else {
         let found = "which bodies it has to report is in the scene's file, which could not be read";
         let remedy = "name them as scene.bodies, or correct the scene first";
-        return (Finding::new(name, State::Warning, found, remedy), None);
+        return (Finding::new(name, Severity::Warning, found, remedy), None);
     };
     if bodies.is_empty() {
-        return (Finding::new(name, State::Info, "no body is tracked", ""), None);
+        return (Finding::new(name, Severity::Info, "no body is tracked", ""), None);
     }
     let clock = MonotonicClock::new(0);
     let start = clock.now();
@@ -94,7 +94,7 @@ pub(super) fn tracker(config: &RigConfig, rig: Option<&Rig>) -> (Finding, Option
     let mut tracker = match opened {
         Ok(tracker) => tracker,
         Err(e) => {
-            let finding = Finding::new(name, State::Missing, e.to_string(), page);
+            let finding = Finding::new(name, Severity::Missing, e.to_string(), page);
             return (finding, None);
         }
     };
@@ -106,16 +106,16 @@ pub(super) fn tracker(config: &RigConfig, rig: Option<&Rig>) -> (Finding, Option
     });
     let found = told.collect::<Vec<_>>().join(", ");
     let finding = match failed {
-        Some(why) => Finding::new(name, State::Missing, format!("{found}; {why}"), page),
+        Some(why) => Finding::new(name, Severity::Missing, format!("{found}; {why}"), page),
         None if heard.iter().any(|body| body.count == 0) => {
             let state =
-                if heard.iter().all(|body| body.count == 0) { State::Missing } else { State::Warning };
+                if heard.iter().all(|body| body.count == 0) { Severity::Missing } else { Severity::Warning };
             let remedy = format!("{}; a body that is not seen stays dark", tracker.status());
             Finding::new(name, state, found, remedy)
         }
         None => match tracker.warning() {
-            Some(warning) => Finding::new(name, State::Warning, format!("{found}; {warning}"), page),
-            None => Finding::new(name, State::Ok, found, ""),
+            Some(warning) => Finding::new(name, Severity::Warning, format!("{found}; {warning}"), page),
+            None => Finding::new(name, Severity::Ok, found, ""),
         },
     };
     (with_exchanges(finding, &exchanges, &heard), Some(heard))
@@ -161,7 +161,7 @@ fn with_exchanges(finding: Finding, exchanges: &Exchanges, heard: &Heard) -> Fin
     if swaps.is_empty() {
         return finding;
     }
-    let state = if finding.state == State::Ok { State::Warning } else { finding.state };
+    let state = if finding.state == Severity::Ok { Severity::Warning } else { finding.state };
     let remedy = "their markers are too alike: give each body an arrangement of its own";
     let remedy =
         if finding.remedy.is_empty() { remedy.into() } else { format!("{}; {remedy}", finding.remedy) };
@@ -183,7 +183,7 @@ pub(super) fn gaze(config: &RigConfig) -> Option<Finding> {
     let counts = source.counts();
     if let Some(doubt) = source.doubt() {
         let remedy = format!("{}; see docs/TRACKERS.md", doubt.remedy);
-        return Some(Finding::new(name, State::Warning, doubt.found, remedy));
+        return Some(Finding::new(name, Severity::Warning, doubt.found, remedy));
     }
     if counts.used == 0 {
         let found = format!(
@@ -191,7 +191,7 @@ pub(super) fn gaze(config: &RigConfig) -> Option<Finding> {
             counts.samples,
             LISTEN_NS / 1_000_000_000
         );
-        return Some(Finding::new(name, State::Warning, found, "see docs/TRACKERS.md"));
+        return Some(Finding::new(name, Severity::Warning, found, "see docs/TRACKERS.md"));
     }
     let found = format!(
         "{:.0} samples a second, {:.0} % of them unsure, {:.1} ms old when they come, clocks within {:.1} ms",
@@ -200,7 +200,7 @@ pub(super) fn gaze(config: &RigConfig) -> Option<Finding> {
         latency_ns as f64 * 1e-6 / counts.used as f64,
         counts.clock_bound_ns as f64 * 1e-6
     );
-    Some(Finding::new(name, State::Ok, found, ""))
+    Some(Finding::new(name, Severity::Ok, found, ""))
 }
 
 /// Whether the slots can follow the tracker: its rate in the rig file beside that of frames. If it was `heard` at another
@@ -214,13 +214,13 @@ pub(super) fn beat(config: &RigConfig, heard: Option<&Heard>) -> Option<Finding>
     let tracker_hz = meant_hz.filter(is_meant).or(counted_hz.map(f64::round))?;
     let pair = RatePair { tracker_hz, slots_hz: config.projector.frame_rate.hz() };
     Some(match pair.told() {
-        None => Finding::new("beat", State::Ok, "slots and samples of the tracker go together", ""),
+        None => Finding::new("beat", Severity::Ok, "slots and samples of the tracker go together", ""),
         Some(told) => {
             let [below, above] = pair.nearest_slots_hz();
             let remedy = format!(
                 "projector.frame_rate = \"{below:.0}\" or \"{above:.0}\", or another rate of the tracker"
             );
-            Finding::new("beat", State::Info, told, remedy)
+            Finding::new("beat", Severity::Info, told, remedy)
         }
     })
 }
@@ -229,7 +229,7 @@ pub(super) fn beat(config: &RigConfig, heard: Option<&Heard>) -> Option<Finding>
 /// file names may run.
 pub(super) fn projector(config: &RigConfig, loads: bool) -> Finding {
     let identity = Identity::of(&config.projector.backend).to_string();
-    let failed = |why: String| Finding::new("projector", State::Missing, why, "see docs/PROJECTORS.md");
+    let failed = |why: String| Finding::new("projector", Severity::Missing, why, "see docs/PROJECTORS.md");
     // A projector that another run lights is left alone.
     let _locks = match take_locks(config) {
         Ok(locks) => locks,
@@ -239,11 +239,11 @@ pub(super) fn projector(config: &RigConfig, loads: bool) -> Finding {
         return failed(missing.message);
     }
     if config.projector.backend.is_mock() {
-        return Finding::new("projector", State::Info, "the mock in this process", "");
+        return Finding::new("projector", Severity::Info, "the mock in this process", "");
     }
     let answered = match config.projector.backend.examine(loads) {
         Some(look) => look.map(|look| {
-            let state = if look.is_doubtful { State::Warning } else { State::Ok };
+            let state = if look.is_doubtful { Severity::Warning } else { Severity::Ok };
             (state, look.found, look.remedy)
         }),
         None => linked(config),
@@ -257,7 +257,7 @@ pub(super) fn projector(config: &RigConfig, loads: bool) -> Finding {
 }
 
 /// State, what was found, and what to do.
-type Answer = (State, String, String);
+type Answer = (Severity, String, String);
 
 /// Says HELLO and CONFIG to a projector of the link, and ends the session before it was armed.
 fn linked(config: &RigConfig) -> Result<Answer, String> {
@@ -290,9 +290,9 @@ fn linked(config: &RigConfig) -> Result<Answer, String> {
         found.push(format!("latched faults: {}", faults::names(latched)));
         let remedy =
             "`dpm arm` acknowledges them while the rig runs; a run acknowledges a watchdog by itself";
-        return Ok((State::Warning, found.join("; "), remedy.into()));
+        return Ok((Severity::Warning, found.join("; "), remedy.into()));
     }
-    Ok((State::Ok, found.join("; "), String::new()))
+    Ok((Severity::Ok, found.join("; "), String::new()))
 }
 
 fn told_of_device(device: &DeviceHello) -> String {

@@ -1,7 +1,7 @@
 //! What `dpm doctor` says of the displays that can serve as projectors.
 
 use super::super::display::{look, CardView};
-use super::{Finding, State};
+use super::{Finding, Severity};
 use dpm_display::kms::Connector;
 
 /// The displays of this machine.
@@ -18,7 +18,7 @@ fn displays(all: &[CardView]) -> Vec<Finding> {
         let connectors = match connectors {
             Ok(connectors) => connectors,
             Err(e) => {
-                findings.push(Finding::new(&name, State::Info, "cannot be used", e.to_string()));
+                findings.push(Finding::new(&name, Severity::Info, "cannot be used", e.to_string()));
                 continue;
             }
         };
@@ -40,10 +40,10 @@ fn displays(all: &[CardView]) -> Vec<Finding> {
         } else {
             UNTRIED
         };
-        findings.push(Finding::new(&name, State::Info, found, remedy));
+        findings.push(Finding::new(&name, Severity::Info, found, remedy));
     }
     if findings.is_empty() {
-        findings.push(Finding::new("displays", State::Info, "no graphics card that can set modes", ""));
+        findings.push(Finding::new("displays", Severity::Info, "no graphics card that can set modes", ""));
     }
     findings
 }

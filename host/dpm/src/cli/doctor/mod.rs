@@ -10,7 +10,7 @@ use super::os;
 use super::rig_args::RigArgs;
 use super::watch::print;
 use dpm_common::realtime::awake::CoresAwake;
-use dpm_common::realtime::{self, Refusal};
+use dpm_common::realtime::{self, RightRefusal};
 use dpm_render::gpu::{DeviceSummary, GpuOptions};
 use dpm_rig::failure::{Failure, FailureKind};
 #[cfg(feature = "alp")]
@@ -40,7 +40,7 @@ pub(crate) struct DoctorArgs {
 /// The severity of a finding.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, serde::Serialize)]
 #[serde(rename_all = "lowercase")]
-pub(super) enum State {
+pub(super) enum Severity {
     /// As it should be.
     Ok,
     /// Works, but at a cost.
@@ -57,7 +57,7 @@ pub(crate) struct Finding {
     /// The subject.
     pub name: String,
     /// Its state.
-    pub state: State,
+    pub state: Severity,
     /// What was found.
     pub found: String,
     /// What to do; empty if nothing is to be done.
@@ -65,7 +65,12 @@ pub(crate) struct Finding {
 }
 
 impl Finding {
-    pub(super) fn new(name: &str, state: State, found: impl Into<String>, remedy: impl Into<String>) -> Self {
+    pub(super) fn new(
+        name: &str,
+        state: Severity,
+        found: impl Into<String>,
+        remedy: impl Into<String>,
+    ) -> Self {
         Self { name: name.into(), state, found: found.into(), remedy: remedy.into() }
     }
 }
@@ -112,7 +117,7 @@ pub(super) fn execute(args: &DoctorArgs) -> Result<(), Failure> {
     let with = |keys: &[&str]| args.flags.with_keys(args.rig.as_deref(), keys);
     let of_rig = config.as_ref().map(|config| rig::findings(config, args.load_libraries, &with));
     let missing = |of: &[Finding]| {
-        of.iter().filter(|f| f.state == State::Missing).map(|f| f.name.clone()).collect::<Vec<_>>()
+        of.iter().filter(|f| f.state == Severity::Missing).map(|f| f.name.clone()).collect::<Vec<_>>()
     };
     let missing = of_rig.as_deref().map(missing);
     findings.extend(of_rig.into_iter().flatten());
@@ -139,7 +144,7 @@ fn vulkan(findings: &mut Vec<Finding>) -> bool {
     let devices = match dpm_render::gpu::Gpu::list() {
         Ok(devices) => devices,
         Err(e) => {
-            findings.push(Finding::new("Vulkan", State::Missing, e.to_string(), ""));
+            findings.push(Finding::new("Vulkan", Severity::Missing, e.to_string(), ""));
             return false;
         }
     };
@@ -153,14 +158,15 @@ fn vulkan(findings: &mut Vec<Finding>) -> bool {
         );
         usable |= device.refused.is_none();
         let (state, remedy) = match &device.refused {
-            Some(reason) => (State::Missing, format!("cannot be used: {reason}")),
+            Some(reason) => (Severity::Missing, format!("cannot be used: {reason}")),
             None if device.software => {
                 let advice = "runs at virtual pace with a small raster; install your GPU vendor's driver for real time";
-                (State::Warning, advice.to_string())
+                (Severity::Warning, advice.to_string())
             }
-            None => {
-                device.advice.clone().map_or((State::Ok, String::new()), |advice| (State::Warning, advice))
-            }
+            None => device
+                .advice
+                .clone()
+                .map_or((Severity::Ok, String::new()), |advice| (Severity::Warning, advice)),
         };
         findings.push(Finding::new(&format!("Vulkan device {i}"), state, found, remedy));
     }
@@ -168,7 +174,12 @@ fn vulkan(findings: &mut Vec<Finding>) -> bool {
     if devices.is_empty() {
         let remedy =
             "install the GPU vendor's driver, or software Vulkan: apt-get install mesa-vulkan-drivers";
-        findings.push(Finding::new("Vulkan", State::Missing, "found a Vulkan loader but no device", remedy));
+        findings.push(Finding::new(
+            "Vulkan",
+            Severity::Missing,
+            "found a Vulkan loader but no device",
+            remedy,
+        ));
     }
     usable
 }
@@ -185,16 +196,16 @@ fn priority_of_frames(devices: &[DeviceSummary]) -> Option<Finding> {
             "on a machine with a desktop: give the service AmbientCapabilities=CAP_SYS_NICE",
         )
     };
-    Some(Finding::new("GPU priority", State::Info, found, remedy))
+    Some(Finding::new("GPU priority", Severity::Info, found, remedy))
 }
 
 fn cores(count: usize) -> Finding {
     let found = format!("{count} usable");
     if count >= 4 {
-        Finding::new("cores", State::Ok, found, "")
+        Finding::new("cores", Severity::Ok, found, "")
     } else {
         let remedy = "threads park instead of spinning (real_time.wait = \"auto\"): hand-offs take about 30 us, not 0.5 us";
-        Finding::new("cores", State::Warning, found, remedy)
+        Finding::new("cores", Severity::Warning, found, remedy)
     }
 }
 
@@ -202,9 +213,9 @@ fn simd() -> Finding {
     let kernel = dpm_render::pack::Kernel::best();
     let (state, remedy) = match kernel {
         dpm_render::pack::Kernel::Scalar => {
-            (State::Warning, "packing on this CPU is slow: prefer a GPU or a CPU with AVX2")
+            (Severity::Warning, "packing on this CPU is slow: prefer a GPU or a CPU with AVX2")
         }
-        _ => (State::Ok, ""),
+        _ => (Severity::Ok, ""),
     };
     Finding::new("bit-plane packing", state, kernel.name(), remedy)
 }
@@ -215,31 +226,31 @@ fn alp_libraries(root: &std::path::Path) -> Finding {
     let found = alp_library::installed(root);
     if found.is_empty() {
         let remedy = "needed only for a ViALUX ALP: install the vendor's ALP for Linux";
-        return Finding::new("ALP library", State::Info, "none", remedy);
+        return Finding::new("ALP library", Severity::Info, "none", remedy);
     }
     let found: Vec<String> = found.iter().map(|file| file.display().to_string()).collect();
-    Finding::new("ALP library", State::Ok, found.join(", "), "")
+    Finding::new("ALP library", Severity::Ok, found.join(", "), "")
 }
 
 /// The result of trying a right on a thread that ended at once.
-fn right(name: &str, granted: &str, tried: Result<(), Refusal>) -> Finding {
+fn right(name: &str, granted: &str, tried: Result<(), RightRefusal>) -> Finding {
     match tried {
-        Ok(()) => Finding::new(name, State::Ok, granted, ""),
+        Ok(()) => Finding::new(name, Severity::Ok, granted, ""),
         Err(r) => {
-            Finding::new(name, State::Warning, format!("{} was refused ({})", r.what, r.reason), r.remedy)
+            Finding::new(name, Severity::Warning, format!("{} was refused ({})", r.what, r.reason), r.remedy)
         }
     }
 }
 
 /// Whether a run may keep idle cores awake; the result of trying.
-fn idle_cores(tried: Result<bool, Refusal>) -> Finding {
+fn idle_cores(tried: Result<bool, RightRefusal>) -> Finding {
     let name = "idle cores";
     match tried {
         Ok(false) => {
             let remedy = "in a container: pass /dev/cpu_dma_latency into it, or stages may wake 0.1 ms late";
             Finding::new(
                 name,
-                State::Info,
+                Severity::Info,
                 "this system has no /dev/cpu_dma_latency to keep them awake",
                 remedy,
             )
@@ -249,8 +260,9 @@ fn idle_cores(tried: Result<bool, Refusal>) -> Finding {
 }
 
 /// Runs `ask` on a thread that ends at once, so that this thread keeps nothing.
-fn briefly(ask: fn() -> Result<(), Refusal>) -> Result<(), Refusal> {
-    let refused = |reason: String| Err(Refusal { what: "a right".into(), reason, remedy: String::new() });
+fn briefly(ask: fn() -> Result<(), RightRefusal>) -> Result<(), RightRefusal> {
+    let refused =
+        |reason: String| Err(RightRefusal { what: "a right".into(), reason, remedy: String::new() });
     match std::thread::Builder::new().spawn(ask) {
         Ok(thread) => {
             thread.join().unwrap_or_else(|_| refused("the thread that tested it panicked".to_string()))
@@ -259,7 +271,7 @@ fn briefly(ask: fn() -> Result<(), Refusal>) -> Result<(), Refusal> {
     }
 }
 
-fn lock_and_unlock() -> Result<(), Refusal> {
+fn lock_and_unlock() -> Result<(), RightRefusal> {
     realtime::os::lock_memory()?;
     realtime::os::unlock_memory();
     Ok(())
@@ -293,12 +305,12 @@ impl System {
         let period: i64 = self.read("proc/sys/kernel/sched_rt_period_us")?.parse().ok()?;
         let name = "real-time throttling";
         Some(if runtime < 0 || runtime >= period {
-            Finding::new(name, State::Ok, "off", "")
+            Finding::new(name, Severity::Ok, "off", "")
         } else {
             let gap_ms = (period - runtime) as f64 / 1e3;
             Finding::new(
                 name,
-                State::Warning,
+                Severity::Warning,
                 format!("the kernel stops a spinning real-time thread for {gap_ms:.0} ms in every {:.0} ms", period as f64 / 1e3),
                 "on a machine for the rig alone: sysctl kernel.sched_rt_runtime_us=-1; else real_time.wait = \"park\"",
             )
@@ -309,11 +321,11 @@ impl System {
         let governor = self.read("sys/devices/system/cpu/cpu0/cpufreq/scaling_governor")?;
         let name = "clock frequency";
         Some(if governor == "performance" {
-            Finding::new(name, State::Ok, "governor performance", "")
+            Finding::new(name, Severity::Ok, "governor performance", "")
         } else {
             let remedy =
                 "cpupower frequency-set -g performance, so that a frame does not start on a slow core";
-            Finding::new(name, State::Warning, format!("governor {governor}"), remedy)
+            Finding::new(name, Severity::Warning, format!("governor {governor}"), remedy)
         })
     }
 
@@ -325,10 +337,10 @@ impl System {
                 source.as_str(),
                 "tsc" | "kvm-clock" | "arch_sys_counter" | "hyperv_clocksource_tsc_page"
             ) {
-                Finding::new(name, State::Ok, source, "")
+                Finding::new(name, Severity::Ok, source, "")
             } else {
                 let remedy = "reading the time takes a system call of about 1 us; boot with clocksource=tsc if the CPU's is stable";
-                Finding::new(name, State::Warning, source, remedy)
+                Finding::new(name, Severity::Warning, source, remedy)
             },
         )
     }
@@ -338,7 +350,7 @@ impl System {
         if !self.root.join("dev/bus/usb").is_dir() {
             out.push(Finding::new(
                 "USB",
-                State::Info,
+                Severity::Info,
                 "no USB bus on this machine",
                 "needed only for projectors on USB",
             ));
@@ -355,10 +367,10 @@ impl System {
             };
             let found = format!("usbfs_memory_mb = {mb}: {frames} frames of 1024 x 768 x 24 in flight");
             out.push(if mb == 0 || mb >= 64 {
-                Finding::new("USB memory", State::Ok, found, "")
+                Finding::new("USB memory", Severity::Ok, found, "")
             } else {
                 let remedy = "echo 256 > /sys/module/usbcore/parameters/usbfs_memory_mb, or usbcore.usbfs_memory_mb=256 at boot";
-                Finding::new("USB memory", State::Warning, found, remedy)
+                Finding::new("USB memory", Severity::Warning, found, remedy)
             });
         }
         for name in self.names("sys/bus/usb/devices") {
@@ -371,18 +383,18 @@ impl System {
             };
             let found = format!("{what} ({vendor}:{product}) at /{node}");
             out.push(if os::may_read_and_write(&self.root.join(&node)) {
-                Finding::new("USB projector", State::Ok, found, "")
+                Finding::new("USB projector", Severity::Ok, found, "")
             } else {
                 Finding::new(
                     "USB projector",
-                    State::Missing,
+                    Severity::Missing,
                     format!("{found}: no permission"),
                     udev_rule(&vendor, &product),
                 )
             });
         }
         if out.iter().all(|f| f.name != "USB projector") {
-            out.push(Finding::new("USB projector", State::Info, "none plugged in", ""));
+            out.push(Finding::new("USB projector", Severity::Info, "none plugged in", ""));
         }
         out
     }
@@ -396,16 +408,16 @@ impl System {
     fn serial_ports(&self) -> Finding {
         let ports = self.ports();
         if ports.is_empty() {
-            return Finding::new("serial ports", State::Info, "none", "");
+            return Finding::new("serial ports", Severity::Info, "none", "");
         }
         let barred: Vec<&String> =
             ports.iter().filter(|p| !os::may_read_and_write(&self.root.join("dev").join(p))).collect();
         let found = ports.iter().map(|p| format!("/dev/{p}")).collect::<Vec<_>>().join(", ");
         if barred.is_empty() {
-            Finding::new("serial ports", State::Ok, found, "")
+            Finding::new("serial ports", Severity::Ok, found, "")
         } else {
             let remedy = "no permission: usermod -aG dialout $USER, then log in again";
-            Finding::new("serial ports", State::Missing, found, remedy)
+            Finding::new("serial ports", Severity::Missing, found, remedy)
         }
     }
 }
@@ -436,10 +448,10 @@ fn table(findings: &[Finding]) -> String {
     let mut out = String::new();
     for f in findings {
         let state = match f.state {
-            State::Ok => "ok     ",
-            State::Warning => "warning",
-            State::Missing => "MISSING",
-            State::Info => "       ",
+            Severity::Ok => "ok     ",
+            Severity::Warning => "warning",
+            Severity::Missing => "MISSING",
+            Severity::Info => "       ",
         };
         out += &format!("{state}  {:width$}  {}\n", f.name, f.found);
         if !f.remedy.is_empty() {
@@ -484,10 +496,10 @@ mod tests {
         };
         let (_root, system) = Root::new("throttled", &files("950000\n"));
         let finding = system.throttling().unwrap();
-        assert_eq!(finding.state, State::Warning);
+        assert_eq!(finding.state, Severity::Warning);
         assert!(finding.found.contains("50 ms in every 1000 ms"), "{}", finding.found);
         let (_root, system) = Root::new("free", &files("-1\n"));
-        assert_eq!(system.throttling().unwrap().state, State::Ok);
+        assert_eq!(system.throttling().unwrap().state, Severity::Ok);
     }
 
     /// Found in use: the doctor looked for USB ids that no projector of the link has.
@@ -525,7 +537,7 @@ mod tests {
         let findings = system.usb();
         assert_eq!(findings.len(), 2, "{findings:?}");
         assert!(findings[0].found.contains("16: 6 frames"), "{}", findings[0].found);
-        assert_eq!((findings[0].state, findings[1].state), (State::Warning, State::Ok));
+        assert_eq!((findings[0].state, findings[1].state), (Severity::Warning, Severity::Ok));
         assert!(findings[1].found.contains("TI DLPC900 (0451:c900) at /dev/bus/usb/001/007"));
     }
 
@@ -543,7 +555,7 @@ mod tests {
         );
         // The device node does not exist, which counts as inaccessible, like one without permission (also for root).
         let findings = system.usb();
-        assert_eq!(findings[0].state, State::Missing);
+        assert_eq!(findings[0].state, Severity::Missing);
         assert!(findings[0].remedy.contains("ATTR{idProduct}==\"c900\", TAG+=\"uaccess\""));
     }
 
@@ -551,25 +563,25 @@ mod tests {
     fn a_machine_without_anything_is_told_so() {
         let (_root, system) = Root::new("bare", &[("dev/null", "")]);
         assert!(system.throttling().is_none() && system.governor().is_none() && system.clock().is_none());
-        assert_eq!(system.usb()[0].state, State::Info);
+        assert_eq!(system.usb()[0].state, Severity::Info);
         assert_eq!(system.serial_ports().found, "none");
     }
 
     #[test]
     fn a_refused_right_says_what_to_set() {
-        let refusal = Refusal {
+        let refusal = RightRefusal {
             what: "SCHED_FIFO priority 80".into(),
             reason: "Operation not permitted".into(),
             remedy: "set rtprio".into(),
         };
         let finding = right("real-time priority", "granted", Err(refusal));
-        assert_eq!(finding.state, State::Warning);
+        assert_eq!(finding.state, Severity::Warning);
         assert!(finding.found.contains("priority 80 was refused (Operation not permitted)"));
         assert_eq!(finding.remedy, "set rtprio");
-        assert_eq!(right("x", "granted", Ok(())).state, State::Ok);
-        let refusal = Refusal { what: "awake".into(), reason: "denied".into(), remedy: "a rule".into() };
+        assert_eq!(right("x", "granted", Ok(())).state, Severity::Ok);
+        let refusal = RightRefusal { what: "awake".into(), reason: "denied".into(), remedy: "a rule".into() };
         let states = [Ok(true), Ok(false), Err(refusal)].map(|tried| idle_cores(tried).state);
-        assert_eq!(states, [State::Ok, State::Info, State::Warning]);
+        assert_eq!(states, [Severity::Ok, Severity::Info, Severity::Warning]);
     }
 
     #[test]
@@ -577,6 +589,6 @@ mod tests {
         let (_root, system) =
             Root::new("serial", &[("dev/ttyUSB0", ""), ("dev/ttyACM3", ""), ("dev/tty7", "")]);
         let finding = system.serial_ports();
-        assert_eq!((finding.state, finding.found.as_str()), (State::Ok, "/dev/ttyACM3, /dev/ttyUSB0"));
+        assert_eq!((finding.state, finding.found.as_str()), (Severity::Ok, "/dev/ttyACM3, /dev/ttyUSB0"));
     }
 }

@@ -3,7 +3,7 @@
 
 use super::super::os;
 use super::devices;
-use super::{Finding, State};
+use super::{Finding, Severity};
 use dpm_calibration_file as file;
 #[cfg(feature = "lab")]
 use dpm_lab::temporal_light::{mend, TemporalLight, NO_MEND};
@@ -72,13 +72,13 @@ fn set_up(config: &RigConfig) -> Finding {
         p.planes,
         Identity::of(&p.backend)
     );
-    Finding::new("rig", State::Info, found, "")
+    Finding::new("rig", Severity::Info, found, "")
 }
 
 /// A part of the rig that cannot be built.
 fn faulty(error: &RigError) -> Finding {
     let (part, remedy) = error.part_and_remedy();
-    Finding::new(part, State::Missing, error.to_string(), remedy)
+    Finding::new(part, Severity::Missing, error.to_string(), remedy)
 }
 
 /// The GPU that a run would take, if there is none or the rig file asks for a certain one.
@@ -87,10 +87,10 @@ fn gpu(config: &RigConfig) -> Option<Finding> {
     match (part.look(config), &config.render.gpu) {
         (Err(missing), _) => {
             let remedy = "render.gpu names a part of one of the devices above; without it the best is taken";
-            Some(Finding::new(part.name, State::Missing, missing.message, remedy))
+            Some(Finding::new(part.name, Severity::Missing, missing.message, remedy))
         }
         (Ok(()), Some(name)) => {
-            Some(Finding::new(part.name, State::Ok, format!("there is one named {name:?}"), ""))
+            Some(Finding::new(part.name, Severity::Ok, format!("there is one named {name:?}"), ""))
         }
         (Ok(()), None) => None,
     }
@@ -105,13 +105,13 @@ fn scene(rig: &Rig) -> Finding {
         rig.bodies.len()
     );
     if scene.warnings.is_empty() {
-        return Finding::new("scene", State::Ok, found, "");
+        return Finding::new("scene", Severity::Ok, found, "");
     }
     let told: Vec<&str> = scene.warnings.iter().take(MOST_WARNINGS).map(String::as_str).collect();
     let more = scene.warnings.len() - told.len();
     let more = if more > 0 { format!("; and {more} more") } else { String::new() };
     let remedy = "`dpm plan` of this rig file lists every note, docs/SCENES.md says what is read";
-    Finding::new("scene", State::Warning, format!("{found}; {}{more}", told.join("; ")), remedy)
+    Finding::new("scene", Severity::Warning, format!("{found}; {}{more}", told.join("; ")), remedy)
 }
 
 /// Where the bodies are in the projector's light: by what was `heard` of the tracker, or by the motions of a mock.
@@ -120,7 +120,7 @@ fn reach(rig: &Rig, heard: Option<&devices::Heard>) -> Option<Finding> {
     let Some(heard) = heard else {
         // Doubts about known motions are among the scene's notes.
         let told = plausible::coverage(rig, &rig.true_poses(0)?);
-        return (!told.is_empty()).then(|| Finding::new(name, State::Info, told.join(", "), ""));
+        return (!told.is_empty()).then(|| Finding::new(name, Severity::Info, told.join(", "), ""));
     };
     let poses: Vec<_> = heard.iter().map(|body| body.last.as_ref().map(affine)).collect();
     // A body that is not seen is judged by the tracker's finding: it lies nowhere.
@@ -141,11 +141,11 @@ fn reach(rig: &Rig, heard: Option<&devices::Heard>) -> Option<Finding> {
         return None;
     }
     let Some(first) = doubts.first() else {
-        return Some(Finding::new(name, State::Ok, covered.join(", "), ""));
+        return Some(Finding::new(name, Severity::Ok, covered.join(", "), ""));
     };
     let remedy = first.remedy.clone();
     let told: Vec<String> = doubts.iter().map(|d| format!("{}: {}", d.about, d.told)).collect();
-    Some(Finding::new(name, State::Warning, told.join("; "), remedy))
+    Some(Finding::new(name, Severity::Warning, told.join("; "), remedy))
 }
 
 /// Whose eyes the rig follows and spares, and whether the tracker tells of them, if it was `heard`.
@@ -166,17 +166,17 @@ fn observer(config: &RigConfig, heard: Option<&devices::Heard>) -> Finding {
         let found = format!("{eye}; {spared}; the tracker does not tell of {}", named(missing));
         let remedy = "the rig stays dark until it does: give the rigid body this name in the tracking software and bring it into \
                       view, or take it out of observer.tracked and safety.eyes.heads";
-        return Finding::new(name, State::Warning, found, remedy);
+        return Finding::new(name, Severity::Warning, found, remedy);
     }
     if !heads.is_empty() {
         let found = format!("{eye}; {spared}, and the rig goes dark {} ms after one is lost", eyes.lost_ms);
-        return Finding::new(name, State::Ok, found, "");
+        return Finding::new(name, Severity::Ok, found, "");
     }
     if carrier.is_some() || !eyes.heads.is_empty() {
         let found = format!("{eye}; the eye guard is off: light falls on heads");
-        return Finding::new(name, State::Warning, found, "set safety.eyes.guard = true");
+        return Finding::new(name, Severity::Warning, found, "set safety.eyes.guard = true");
     }
-    Finding::new(name, State::Info, eye, "")
+    Finding::new(name, Severity::Info, eye, "")
 }
 
 /// What a person notices of the course of the projector's light, and the keys that mend it.
@@ -186,10 +186,10 @@ fn light_for_eyes(config: &RigConfig, with: &dyn Fn(&[&str]) -> Option<RigConfig
     let found = light.told();
     let name = "light for eyes";
     if light.noticed().is_empty() {
-        return Some(Finding::new(name, State::Ok, found, ""));
+        return Some(Finding::new(name, Severity::Ok, found, ""));
     }
     let remedy = mend(&light, with).map_or(NO_MEND.to_owned(), |mend| mend.told());
-    Some(Finding::new(name, State::Warning, found, remedy))
+    Some(Finding::new(name, Severity::Warning, found, remedy))
 }
 
 /// The laboratory judges that; without it nothing is said.
@@ -203,9 +203,9 @@ fn pictures(config: &RigConfig) -> Vec<Finding> {
     let finding = |body: &str, source: &LiveSource| {
         let name = format!("pictures of {body}");
         match look_at(source) {
-            Ok(()) => Finding::new(&name, State::Ok, source.to_string(), ""),
+            Ok(()) => Finding::new(&name, Severity::Ok, source.to_string(), ""),
             Err(why) => {
-                Finding::new(&name, State::Warning, format!("{source}: {why}"), "it is black until then")
+                Finding::new(&name, Severity::Warning, format!("{source}: {why}"), "it is black until then")
             }
         }
     };
@@ -222,13 +222,13 @@ fn calibration(config: &RigConfig) -> Finding {
     let is_simulated = is_simulated(config);
     let Some(path) = &config.calibration.file else {
         let known = match (is_simulated, &config.projector.calibration) {
-            (true, _) => return Finding::new(name, State::Info, "none; a mock needs none", ""),
+            (true, _) => return Finding::new(name, Severity::Info, "none; a mock needs none", ""),
             (false, Some(file)) => format!("lens and pose of {}; nothing else was measured", file.display()),
             (false, None) => "none: light falls where projector.position and projector.look_at say".into(),
         };
         return Finding::new(
             name,
-            State::Warning,
+            Severity::Warning,
             known,
             "measure with `dpm calibrate` (docs/CALIBRATION.md)",
         );
@@ -236,7 +236,7 @@ fn calibration(config: &RigConfig) -> Finding {
     let measured = match file::load(path) {
         Ok(measured) => measured,
         Err(e) => {
-            return Finding::new(name, State::Missing, e.to_string(), "measure again with `dpm calibrate`")
+            return Finding::new(name, Severity::Missing, e.to_string(), "measure again with `dpm calibrate`")
         }
     };
     let mut parts = Vec::new();
@@ -256,7 +256,7 @@ fn calibration(config: &RigConfig) -> Finding {
     if measured.projector.is_none() {
         return Finding::new(
             name,
-            State::Warning,
+            Severity::Warning,
             found,
             "the projector was not measured: `dpm calibrate projector`",
         );
@@ -264,12 +264,12 @@ fn calibration(config: &RigConfig) -> Finding {
     if ages.iter().any(|age| age.is_none_or(|days| days > OLD_DAYS)) {
         return Finding::new(
             name,
-            State::Warning,
+            Severity::Warning,
             found,
             "see by `dpm calibrate check` whether it still holds",
         );
     }
-    Finding::new(name, State::Ok, found, "")
+    Finding::new(name, Severity::Ok, found, "")
 }
 
 /// An order that outlived the run in which it was given.
@@ -278,7 +278,7 @@ fn standing_order(config: &RigConfig) -> Option<Finding> {
     let stands = standing(&identity)?;
     let found =
         format!("the projector stays dark: {} stands {}", stands.order.word().to_uppercase(), stands.told);
-    Some(Finding::new("standing order", State::Warning, found, "run the rig and say `dpm arm`"))
+    Some(Finding::new("standing order", Severity::Warning, found, "run the rig and say `dpm arm`"))
 }
 
 /// Whether the page can listen.
@@ -286,11 +286,11 @@ fn page(config: &RigConfig) -> Option<Finding> {
     let text = config.page.listen.as_ref()?;
     let address: SocketAddr = text.parse().ok()?;
     Some(match TcpListener::bind(address) {
-        Ok(_) => Finding::new("page", State::Ok, format!("http://{address} is free"), ""),
+        Ok(_) => Finding::new("page", Severity::Ok, format!("http://{address} is free"), ""),
         Err(e) => {
             let remedy =
                 "a dpm that runs, or another program, has the port: stop it, or change page.listen (which must be an address of this machine)";
-            Finding::new("page", State::Missing, format!("cannot listen on {address}: {e}"), remedy)
+            Finding::new("page", Severity::Missing, format!("cannot listen on {address}: {e}"), remedy)
         }
     })
 }
@@ -306,15 +306,17 @@ fn output(dir: &Path) -> Finding {
     if !there.is_dir() || !os::may_read_and_write(there) {
         let found =
             format!("{} cannot be written: {} is no folder that may be", dir.display(), there.display());
-        return Finding::new(name, State::Missing, found, "set output.dir, or give --out");
+        return Finding::new(name, Severity::Missing, found, "set output.dir, or give --out");
     }
     match os::free_bytes(there) {
-        None => Finding::new(name, State::Ok, format!("{}", dir.display()), ""),
+        None => Finding::new(name, Severity::Ok, format!("{}", dir.display()), ""),
         Some(free) => {
             let found = format!("{}, {:.1} GB free", dir.display(), free as f64 / 1e9);
             match free < LITTLE_SPACE {
-                true => Finding::new(name, State::Warning, found, "make room, or set output.dir elsewhere"),
-                false => Finding::new(name, State::Ok, found, ""),
+                true => {
+                    Finding::new(name, Severity::Warning, found, "make room, or set output.dir elsewhere")
+                }
+                false => Finding::new(name, Severity::Ok, found, ""),
             }
         }
     }
@@ -334,9 +336,9 @@ mod tests {
         let taken = TcpListener::bind("127.0.0.1:0").unwrap();
         let address = taken.local_addr().unwrap();
         let config = demo(&[format!("page.listen=\"{address}\"")]);
-        assert_eq!(page(&config).unwrap().state, State::Missing);
+        assert_eq!(page(&config).unwrap().state, Severity::Missing);
         drop(taken);
-        assert_eq!(page(&config).unwrap().state, State::Ok);
+        assert_eq!(page(&config).unwrap().state, Severity::Ok);
         assert!(page(&demo(&[])).is_none());
     }
 
@@ -347,7 +349,7 @@ mod tests {
             pictures(&demo(&[body]))
         };
         let missing = &of("pipe:/nowhere/bunny")[0];
-        assert_eq!((missing.state, &missing.name[..]), (State::Warning, "pictures of bunny"));
+        assert_eq!((missing.state, &missing.name[..]), (Severity::Warning, "pictures of bunny"));
         assert!(
             missing.found.contains("pipe:/nowhere/bunny: there is no such pipe; `mkfifo`"),
             "{missing:?}"
@@ -359,11 +361,11 @@ mod tests {
     #[test]
     fn a_folder_that_comes_later_is_judged_by_the_one_above_it() {
         let below = std::env::temp_dir().join("dpm-doctor-none/of/these");
-        assert_ne!(output(&below).state, State::Missing);
+        assert_ne!(output(&below).state, Severity::Missing);
         let file = std::env::temp_dir().join(format!("dpm-doctor-file-{}", std::process::id()));
         std::fs::write(&file, "").unwrap();
-        assert_eq!(output(&file.join("x")).state, State::Missing);
+        assert_eq!(output(&file.join("x")).state, Severity::Missing);
         std::fs::remove_file(file).unwrap();
-        assert_ne!(output(Path::new("out")).state, State::Missing);
+        assert_ne!(output(Path::new("out")).state, Severity::Missing);
     }
 }

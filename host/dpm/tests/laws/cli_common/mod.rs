@@ -69,18 +69,18 @@ pub(crate) fn err(output: &Output) -> String {
 }
 
 /// A program that runs during the test; it is killed if the test ends early.
-pub(crate) struct Running {
+pub(crate) struct ChildProgram {
     child: Child,
     lines: Receiver<String>,
 }
 
 /// Starts the program and returns.
-pub(crate) fn start<S: AsRef<OsStr>>(args: &[S]) -> Running {
+pub(crate) fn start<S: AsRef<OsStr>>(args: &[S]) -> ChildProgram {
     start_with(args, &[])
 }
 
 /// Starts the program with additional environment variables, and returns.
-pub(crate) fn start_with<S: AsRef<OsStr>>(args: &[S], variables: &[(&str, &str)]) -> Running {
+pub(crate) fn start_with<S: AsRef<OsStr>>(args: &[S], variables: &[(&str, &str)]) -> ChildProgram {
     let mut command = command(args);
     command.envs(variables.iter().copied()).stdout(Stdio::piped()).stderr(Stdio::piped());
     let mut child = command.spawn().expect("the program starts");
@@ -93,10 +93,10 @@ pub(crate) fn start_with<S: AsRef<OsStr>>(args: &[S], variables: &[(&str, &str)]
             }
         }
     });
-    Running { child, lines }
+    ChildProgram { child, lines }
 }
 
-impl Running {
+impl ChildProgram {
     /// Process number.
     pub(crate) fn id(&self) -> u32 {
         self.child.id()
@@ -146,7 +146,7 @@ impl Running {
     }
 }
 
-impl Drop for Running {
+impl Drop for ChildProgram {
     fn drop(&mut self) {
         let _ = self.child.kill();
         let _ = self.child.wait();
@@ -154,9 +154,9 @@ impl Drop for Running {
 }
 
 /// A folder that is deleted when the test is over.
-pub(crate) struct Folder(PathBuf, String);
+pub(crate) struct TestFolder(PathBuf, String);
 
-impl Folder {
+impl TestFolder {
     /// An empty folder.
     pub(crate) fn new(name: &str) -> Self {
         let path = std::env::temp_dir().join(format!("dpm-cli-{}-{name}", std::process::id()));
@@ -184,7 +184,7 @@ impl Folder {
     }
 }
 
-impl Drop for Folder {
+impl Drop for TestFolder {
     fn drop(&mut self) {
         let _ = std::fs::remove_dir_all(&self.0);
     }

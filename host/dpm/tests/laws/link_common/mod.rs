@@ -92,27 +92,27 @@ pub(crate) trait Projector: Send + Sync {
 }
 
 /// A run on a thread of its own. It ends together with the test.
-pub(crate) struct Running {
+pub(crate) struct RunThread {
     pub monitor: Arc<RunMonitor>,
     thread: Option<JoinHandle<Result<RunOutcome, PipelineError>>>,
 }
 
 /// Starts `rig` for `frames` frames; 0 runs until stopped.
-pub(crate) fn start(rig: &Arc<Rig>, frames: u64) -> Running {
+pub(crate) fn start(rig: &Arc<Rig>, frames: u64) -> RunThread {
     start_with(rig, frames, |_| {})
 }
 
 /// Like [`start`], with a monitor that `prepare` gets before the run.
-pub(crate) fn start_with(rig: &Arc<Rig>, frames: u64, prepare: impl FnOnce(&RunMonitor)) -> Running {
+pub(crate) fn start_with(rig: &Arc<Rig>, frames: u64, prepare: impl FnOnce(&RunMonitor)) -> RunThread {
     let monitor = Arc::new(RunMonitor::default());
     prepare(&monitor);
     let (rig, watched) = (rig.clone(), monitor.clone());
     let options = RunOptions { frames, ..RunOptions::default() };
     let thread = std::thread::spawn(move || run_prepared(rig, options, &watched));
-    Running { monitor, thread: Some(thread) }
+    RunThread { monitor, thread: Some(thread) }
 }
 
-impl Running {
+impl RunThread {
     /// Waits until `done`, at most 20 s, and no longer than the run goes on.
     pub(crate) fn until(&self, what: &str, mut done: impl FnMut(&RunMonitor) -> bool) {
         let begin = Instant::now();
@@ -139,7 +139,7 @@ impl Running {
     }
 }
 
-impl Drop for Running {
+impl Drop for RunThread {
     fn drop(&mut self) {
         let was_over = self.thread.as_ref().is_some_and(JoinHandle::is_finished);
         self.monitor.request_stop();

@@ -67,7 +67,7 @@ struct Whole {
 
 /// Counters in the order of STATUS, from byte 40.
 #[derive(Clone, Copy, Default)]
-struct Counts {
+struct StatusCounters {
     slots: u32,
     seen: u32,
     lit: u32,
@@ -107,7 +107,7 @@ pub(crate) struct Peer {
     last_plane: u8,
     last_lit: (u32, u64),
     accounted: u32,
-    n: Counts,
+    n: StatusCounters,
     damaged: u32,
     flash: Flash,
     level: Level,
@@ -209,7 +209,7 @@ impl Peer {
             last_plane: 0,
             last_lit: (0, 0),
             accounted: 0,
-            n: Counts::default(),
+            n: StatusCounters::default(),
             damaged: 0,
             flash: Flash::default(),
             level: Level::default(),
@@ -517,7 +517,7 @@ impl Peer {
             self.newest = None;
             self.accounted = 0;
             if !self.breaks("hello-new") {
-                self.n = Counts::default();
+                self.n = StatusCounters::default();
             }
             self.following = Following::default();
         }

@@ -1,6 +1,6 @@
 //! A rig on an ALP: the whole rig and the whole program, with a fake panel behind the vendor's interface.
 
-use crate::cli_common::{code, dpm, err, out, start_with, Folder, NO_DRIVER};
+use crate::cli_common::{code, dpm, err, out, start_with, TestFolder, NO_DRIVER};
 use crate::link_common::{raster, rig, start};
 use dpm_device::planes::PlaneSchedule;
 use dpm_rig::pack::prepared::is_whole;
@@ -99,7 +99,7 @@ fn an_unplugged_device_is_taken_up_again() {
 }
 
 /// The lines that the fake has written of a process.
-fn log(folder: &Folder) -> Vec<String> {
+fn log(folder: &TestFolder) -> Vec<String> {
     let text = std::fs::read_to_string(folder.path("alp.log")).unwrap_or_default();
     text.lines().map(str::to_owned).collect()
 }
@@ -117,7 +117,7 @@ fn of_example<'a>(words: &[&'a str], library: &'a str) -> Vec<&'a str> {
 fn a_killed_program_leaves_light_for_one_frame_at_most() {
     let _turn = FIRST.lock().unwrap_or_else(PoisonError::into_inner);
     for signal in ["KILL", "TERM"] {
-        let folder = Folder::new(&format!("alp-{signal}"));
+        let folder = TestFolder::new(&format!("alp-{signal}"));
         let path = folder.path("alp.log").display().to_string();
         let library = format!("projector.backend.library={:?}", library().display().to_string());
         let variables = [("FAKE_ALP_LOG", path.as_str()), NO_DRIVER[0], NO_DRIVER[1]];
@@ -151,7 +151,7 @@ fn a_killed_program_leaves_light_for_one_frame_at_most() {
 #[test]
 fn the_planes_that_reach_the_panel_are_those_of_the_picture() {
     let _turn = FIRST.lock().unwrap_or_else(PoisonError::into_inner);
-    let folder = Folder::new("alp-planes");
+    let folder = TestFolder::new("alp-planes");
     let path = folder.path("alp.log").display().to_string();
     let library = format!("projector.backend.library={:?}", library().display().to_string());
     let png = folder.path("board.png");

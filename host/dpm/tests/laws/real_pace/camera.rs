@@ -16,12 +16,12 @@ const SIZE: [u32; 2] = [640, 400];
 const HZ: u32 = 30;
 
 /// A mock camera before a body, a rig file that names a device file, and the file that says what lies there.
-struct Bench {
+struct CameraBench {
     folder: PathBuf,
     host: CameraHost,
 }
 
-impl Bench {
+impl CameraBench {
     fn new(name: &str) -> Self {
         let folder = std::env::temp_dir().join(format!("dpm-camera-{name}-{}", std::process::id()));
         let _ = std::fs::remove_dir_all(&folder);
@@ -86,7 +86,7 @@ impl Bench {
     }
 }
 
-impl Drop for Bench {
+impl Drop for CameraBench {
     fn drop(&mut self) {
         let _ = std::fs::remove_dir_all(&self.folder);
     }
@@ -94,7 +94,7 @@ impl Drop for Bench {
 
 #[test]
 fn the_doctor_judges_the_camera_of_a_rig() {
-    let b = Bench::new("doctor");
+    let b = CameraBench::new("doctor");
     b.plug(None);
     let [state, found, remedy] = b.doctor("camera");
     assert!(state == "missing" && found.contains("there is no "), "{found}");
@@ -124,7 +124,7 @@ fn the_doctor_judges_the_camera_of_a_rig() {
 /// A camera is pulled and plugged in again while its poses are recorded: the poses stop and go on, where the body is.
 #[test]
 fn poses_of_a_camera_go_on_after_its_plug_was_pulled() {
-    let b = Bench::new("record");
+    let b = CameraBench::new("record");
     b.plug(Some(""));
     let mut child = b.command(&["record", "a.dpmt", "--rig", "rig.toml", "--seconds", "6"]).spawn().unwrap();
     let grown = |least: u64| {

@@ -1,7 +1,7 @@
 //! `dpm profile` from the user's point of view: without a GPU at the true rate, its files, and the comparison of two
 //! profiles.
 
-use crate::cli_common::{code, dpm, err, out, start, start_with, Folder, NO_DRIVER};
+use crate::cli_common::{code, dpm, err, out, start, start_with, TestFolder, NO_DRIVER};
 use crate::trace_check;
 use std::time::Duration;
 
@@ -10,7 +10,7 @@ use std::time::Duration;
 /// twice or out of order.
 #[test]
 fn without_rendering_every_slot_is_accounted_for_and_no_frame_is_torn() {
-    let folder = Folder::new("profile");
+    let folder = TestFolder::new("profile");
     let args = ["profile", "--no-render", "--seconds", "1", "--json", "--out", folder.text()];
     let output = dpm(&args, &NO_DRIVER);
     assert_eq!(code(&output), 0, "{}", err(&output));
@@ -94,7 +94,7 @@ fn without_rendering_every_slot_is_accounted_for_and_no_frame_is_torn() {
 /// of a run of 6 s.
 #[test]
 fn slots_of_an_operators_black_are_not_late() {
-    let folder = Folder::new("black");
+    let folder = TestFolder::new("black");
     let args =
         ["profile", "--no-render", "--seconds", "6", "--raster", "64x48", "--json", "--out", folder.text()];
     // The order applies to every rig of this state folder with such a projector, including those of other tests.
@@ -130,7 +130,7 @@ fn slots_of_an_operators_black_are_not_late() {
 /// Two stored profiles of runs that differ only in the frames that they dropped.
 #[test]
 fn a_comparison_in_which_more_slots_are_missed_ends_with_1() {
-    let folder = Folder::new("gate");
+    let folder = TestFolder::new("gate");
     let kept = |name: &str, slots: u64, missed: u64| {
         let report = serde_json::json!({
             "slots": slots, "missed_slots": missed, "missed_share": missed as f64 / slots as f64,
@@ -150,7 +150,7 @@ fn a_comparison_in_which_more_slots_are_missed_ends_with_1() {
 /// late, as fast as frames come; and each can be followed through the GPU's passes to its light.
 #[test]
 fn a_gpu_too_slow_for_its_slots_shows_late_frames_not_none() {
-    let folder = Folder::new("slow");
+    let folder = TestFolder::new("slow");
     // Light this late falls behind any reasonable horizon; without a longer one there would be none.
     let args = ["profile", "--seconds", "2", "--raster", "64x48", "--json", "--out", folder.text()];
     let output = dpm(&[&args[..], &["--set", "safety.predict_ms=1000"]].concat(), &[]);
@@ -173,7 +173,7 @@ fn a_gpu_too_slow_for_its_slots_shows_late_frames_not_none() {
 /// A missing tracker leaves the rig dark, but informs the operator.
 #[test]
 fn bodies_that_were_never_seen_are_named_with_the_trackers_word_on_why() {
-    let folder = Folder::new("unseen");
+    let folder = TestFolder::new("unseen");
     let bodies = "[[scene.bodies]]\nname = \"bunny\"\n[[scene.bodies]]\nname = \"venus\"\n";
     for (tracker, told) in
         [("kind = \"mock\"", false), ("kind = \"serial\"\nport = \"/dev/nonexistent\"", true)]
@@ -197,7 +197,7 @@ fn bodies_that_were_never_seen_are_named_with_the_trackers_word_on_why() {
 /// A run without an end reports it after its first second, once, long before the report, and continues.
 #[test]
 fn a_tracker_that_does_not_speak_is_told_within_the_first_seconds_of_a_run() {
-    let folder = Folder::new("silent");
+    let folder = TestFolder::new("silent");
     let bodies = "[[scene.bodies]]\nname = \"bunny\"\n[[scene.bodies]]\nname = \"venus\"\n";
     let rig = folder
         .write("rig.toml", &format!("[tracker]\nkind = \"serial\"\nport = \"/dev/nonexistent\"\n{bodies}"));
@@ -223,7 +223,7 @@ fn a_tracker_that_does_not_speak_is_told_within_the_first_seconds_of_a_run() {
 
 #[test]
 fn what_is_no_profile_is_refused_with_its_name() {
-    let folder = Folder::new("noprofile");
+    let folder = TestFolder::new("noprofile");
     let text = folder.write("a.json", "{\"setup\": 3}");
     let output = dpm(&["profile", "--compare", &text, "/nonexistent/b.json"], &[]);
     assert_eq!((code(&output), out(&output).as_str()), (2, ""));

@@ -7,7 +7,7 @@ use dpm_device::link::packet_bytes;
 use dpm_device::planes::Raster;
 use dpm_device::time::HostTime;
 use dpm_device::transport::serial::{SerialSettings, SerialTransport};
-use dpm_lab::conformance::{judge, rules, Extent, Judgement, Medium, MediumKind, Verdict};
+use dpm_lab::conformance::{judge, rules, Extent, Judgement, Medium, MediumKind, RuleVerdict};
 use std::sync::atomic::{AtomicUsize, Ordering};
 use std::time::Instant;
 
@@ -56,14 +56,14 @@ fn a_device_written_from_the_document_keeps_every_rule() {
     let not_judged: Vec<&str> = judgement
         .lines
         .iter()
-        .filter(|l| matches!(l.verdict, Verdict::NotJudged(_)))
+        .filter(|l| matches!(l.verdict, RuleVerdict::NotJudged(_)))
         .map(|l| l.rule)
         .filter(|rule| !LATER.contains(rule))
         .collect();
     // It reads every codec; that rule has its own device below.
     assert_eq!(not_judged, ["lanes", "codec-unnamed"], "{}", judgement.to_table());
     let other = of_peer("without-lz4", &["codec-unnamed".to_owned()]);
-    assert_eq!(other.lines[0].verdict, Verdict::Ok, "{}", other.to_table());
+    assert_eq!(other.lines[0].verdict, RuleVerdict::Ok, "{}", other.to_table());
 }
 
 /// One device per rule, which breaks it: the check detects each. Several run at a time, because they mostly wait.
@@ -77,7 +77,7 @@ fn a_device_that_breaks_a_rule_fails_it() {
         while let Some(rule) = all.get(next.fetch_add(1, Ordering::Relaxed)) {
             let judgement = of_peer(rule, &[(*rule).to_owned()]);
             match judgement.lines.first().map(|l| &l.verdict) {
-                Some(Verdict::Failed(_)) => {}
+                Some(RuleVerdict::Failed(_)) => {}
                 other => unnoticed.push(format!("{rule}: {other:?} {:?}", judgement.ended)),
             }
         }

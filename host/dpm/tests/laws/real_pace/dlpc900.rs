@@ -2,7 +2,7 @@
 //! USB/IP.
 
 use crate::cli_common;
-use crate::cli_common::{start_with, Running};
+use crate::cli_common::{start_with, ChildProgram};
 use dpm_device::time::HostTime;
 use dpm_dlpc900::command::Opcode;
 use dpm_dlpc900::lut::{DisplayMode, Dmd};
@@ -13,14 +13,14 @@ use std::path::PathBuf;
 use std::process::{Command, Output};
 use std::sync::{Arc, Mutex};
 
-struct Bench {
+struct EmulatedBus {
     model: Arc<Mutex<Dlpc900Model>>,
     export: Export,
     server: Server,
     folder: PathBuf,
 }
 
-impl Bench {
+impl EmulatedBus {
     fn new(name: &str, devices: usize) -> Self {
         let folder = std::env::temp_dir().join(format!("dpm-cli-dlpc900-{name}-{}", std::process::id()));
         std::fs::create_dir_all(&folder).unwrap();
@@ -76,7 +76,7 @@ impl Bench {
     }
 
     /// A run of the rig file that continues during the test.
-    fn start(&self) -> Running {
+    fn start(&self) -> ChildProgram {
         self.until_free();
         let variables = self.variables();
         let variables: Vec<_> = variables.iter().map(|(name, value)| (*name, value.as_str())).collect();
@@ -84,7 +84,7 @@ impl Bench {
     }
 
     /// Gives an order to a running rig, which confirms it.
-    fn order(&self, word: &str, run: &Running) {
+    fn order(&self, word: &str, run: &ChildProgram) {
         let told = self.dpm(&[word, "--pid", &run.id().to_string()]);
         let out = text(&told.stdout);
         assert!(
@@ -114,7 +114,7 @@ impl Bench {
     }
 }
 
-impl Drop for Bench {
+impl Drop for EmulatedBus {
     fn drop(&mut self) {
         let _ = std::fs::remove_dir_all(&self.folder);
     }
@@ -126,7 +126,7 @@ fn text(bytes: &[u8]) -> String {
 
 #[test]
 fn pictures_are_uploaded_started_stopped_and_put_to_rest() {
-    let b = Bench::new("life", 1);
+    let b = EmulatedBus::new("life", 1);
     let status = b.ok(&["status"]);
     assert!(
         status.contains("DLP5500 (1024 x 768)") && status.contains("6.0.1 (DLPR900PROM-5500)"),
@@ -168,7 +168,7 @@ fn pictures_are_uploaded_started_stopped_and_put_to_rest() {
 
 #[test]
 fn mistakes_are_named_with_their_exit_codes() {
-    let b = Bench::new("mistakes", 2);
+    let b = EmulatedBus::new("mistakes", 2);
     let several = b.dpm(&["status"]);
     let err = text(&several.stderr);
     assert!(several.status.code() == Some(2) && err.contains("2 controllers are plugged in"), "{err}");
@@ -179,7 +179,7 @@ fn mistakes_are_named_with_their_exit_codes() {
             && err.contains("DLPC900 (0451:c900) at /dev/bus/usb/009/099: none is plugged in"),
         "{err}"
     );
-    let b = Bench::new("rules", 1);
+    let b = EmulatedBus::new("rules", 1);
     image::GrayImage::new(1024, 768).save(b.folder.join("a.png")).unwrap();
     image::GrayImage::new(64, 48).save(b.folder.join("b.png")).unwrap();
     let wrong = |words: &[&str], says: &str| {
@@ -208,7 +208,7 @@ fn mistakes_are_named_with_their_exit_codes() {
 /// rendered.
 #[test]
 fn a_rig_shows_its_first_frames_over_and_over_and_puts_the_controller_to_rest() {
-    let b = Bench::new("run", 1);
+    let b = EmulatedBus::new("run", 1);
     let rig = |panel: &str, more: &str| {
         let text = format!(
             "[projector]\nwidth = 1024\nheight = 768\nframe_rate = 30\nplanes = 8\n\
@@ -245,7 +245,7 @@ fn a_rig_shows_its_first_frames_over_and_over_and_puts_the_controller_to_rest() 
 /// Each step of a Gray code is one pattern of the controller, which shows them in turn for the time that they are held.
 #[test]
 fn a_pattern_is_uploaded_shown_and_ends_at_rest() {
-    let b = Bench::new("pattern", 1);
+    let b = EmulatedBus::new("pattern", 1);
     let text = "[projector]\nwidth = 1024\nheight = 768\nframe_rate = 60\n[projector.backend]\nkind = \"dlpc900\"\npanel = \"dlp5500\"\n";
     std::fs::write(b.folder.join("rig.toml"), text).unwrap();
     let out = b.ok(&["pattern", "gray-rows", "rig.toml", "--hold-ms", "250", "--seconds", "0.2", "--json"]);
@@ -269,7 +269,7 @@ fn a_pattern_is_uploaded_shown_and_ends_at_rest() {
     assert!(counter.status.code() == Some(2) && err.contains("cannot count frames; add --step"), "{err}");
 }
 
-fn video_rig(b: &Bench) {
+fn video_rig(b: &EmulatedBus) {
     let text = "[projector]\nwidth = 1024\nheight = 768\nframe_rate = 60\nplanes = 8\n\
                 backend = { kind = \"dlpc900\", panel = \"dlp5500\", mode = \"video\" }\n\
                 [[scene.bodies]]\nname = \"bunny\"\n";
@@ -277,7 +277,7 @@ fn video_rig(b: &Bench) {
 }
 
 /// Waits until the emulator is lit, or dark; at most 20 s.
-fn until_lit(b: &Bench, lit: bool) {
+fn until_lit(b: &EmulatedBus, lit: bool) {
     for _ in 0..4000 {
         if b.model.lock().unwrap().dark_because().is_none() == lit {
             return;
@@ -293,7 +293,7 @@ fn until_lit(b: &Bench, lit: bool) {
 /// watchdog.
 #[test]
 fn a_rig_in_video_mode_runs_again_and_again() {
-    let b = Bench::new("again", 1);
+    let b = EmulatedBus::new("again", 1);
     video_rig(&b);
     b.ok(&["run", "rig.toml", "--seconds", "0.2"]);
     assert_eq!(b.model.lock().unwrap().dark_because(), Some("mirrors exercised"));
@@ -318,7 +318,7 @@ fn a_rig_in_video_mode_runs_again_and_again() {
 }
 
 /// Waits until the mirrors exercise, as after a run; at most 20 s.
-fn until_rested(b: &Bench) {
+fn until_rested(b: &EmulatedBus) {
     for _ in 0..4000 {
         if b.model.lock().unwrap().dark_because() == Some("mirrors exercised") {
             return;
@@ -332,7 +332,7 @@ fn until_rested(b: &Bench) {
 /// ended in order, keeps the next run dark until somebody arms it. No other command makes light meanwhile.
 #[test]
 fn r4_safe_stands_over_restarts_until_somebody_arms() {
-    let b = Bench::new("safe", 1);
+    let b = EmulatedBus::new("safe", 1);
     video_rig(&b);
     let long = std::time::Duration::from_secs(60);
     let run = b.start();
@@ -378,7 +378,7 @@ fn r4_safe_stands_over_restarts_until_somebody_arms() {
 /// seconds with exit code 0, also while the mirrors exercise before the start.
 #[test]
 fn sigterm_makes_it_dark_and_ends_the_process() {
-    let b = Bench::new("term", 1);
+    let b = EmulatedBus::new("term", 1);
     video_rig(&b);
     let mut took = Vec::new();
     for _ in 0..3 {

@@ -2,7 +2,7 @@
 //!
 //! Found in use, R12 and R18.
 
-use crate::cli_common::{code, command_after, dpm, err, out, Folder};
+use crate::cli_common::{code, command_after, dpm, err, out, TestFolder};
 use std::process::Output;
 use std::time::{Duration, Instant};
 use vulkan_faults::FaultLayer;
@@ -12,7 +12,7 @@ const SMALL: [&str; 7] = ["demo", "--json", "--raster", "48x32", "--set", "outpu
 const LIMIT: Duration = Duration::from_secs(90);
 
 /// Runs the demo for this many frames at virtual pace on a GPU that fails as given.
-fn demo(layer: &FaultLayer, plan: &str, folder: &Folder, frames: &str) -> Output {
+fn demo(layer: &FaultLayer, plan: &str, folder: &TestFolder, frames: &str) -> Output {
     let args = [&SMALL[..], &[folder.text(), "--frames", frames]].concat();
     let mut variables = layer.variables(plan);
     variables.push(("DPM_VALIDATION".into(), "1".into()));
@@ -37,7 +37,7 @@ fn light_hash(output: &Output) -> String {
 /// A GPU that is lost again and again, and so is each one that is opened instead.
 #[test]
 fn a_gpu_that_is_lost_for_good_ends_the_run_clearly_and_nothing_more_is_submitted() {
-    let (layer, folder) = (FaultLayer::new("lost").unwrap(), Folder::new("gpu-lost"));
+    let (layer, folder) = (FaultLayer::new("lost").unwrap(), TestFolder::new("gpu-lost"));
     for plan in ["lost@frame=3..", "lost@wait=60.."] {
         let output = demo(&layer, plan, &folder, "40");
         assert_eq!(code(&output), 4, "{plan}: {}", err(&output));
@@ -55,7 +55,7 @@ fn a_gpu_that_is_lost_for_good_ends_the_run_clearly_and_nothing_more_is_submitte
 
 #[test]
 fn a_gpu_that_hangs_ends_the_run_clearly() {
-    let (layer, folder) = (FaultLayer::new("hang").unwrap(), Folder::new("gpu-hang"));
+    let (layer, folder) = (FaultLayer::new("hang").unwrap(), TestFolder::new("gpu-hang"));
     let output = demo(&layer, "submit-hang@frame=3..", &folder, "40");
     assert_eq!(code(&output), 4, "{}", err(&output));
     assert!(error(&output).contains("did not finish"), "{}", err(&output));
@@ -63,7 +63,7 @@ fn a_gpu_that_hangs_ends_the_run_clearly() {
 
 #[test]
 fn a_late_gpu_changes_no_light() {
-    let (layer, folder) = (FaultLayer::new("late").unwrap(), Folder::new("gpu-late"));
+    let (layer, folder) = (FaultLayer::new("late").unwrap(), TestFolder::new("gpu-late"));
     let hash = |plan: &str| {
         let output = demo(&layer, plan, &folder, "6");
         assert_eq!(code(&output), 0, "{plan}: {}", err(&output));
@@ -78,7 +78,7 @@ fn a_late_gpu_changes_no_light() {
 /// One of each kind of call that a start makes. (`tests/vulkan-faults/tests/laws/failing_calls.rs` has every single call.)
 #[test]
 fn a_start_that_finds_no_memory_or_no_device_is_refused_clearly() {
-    let (layer, folder) = (FaultLayer::new("start").unwrap(), Folder::new("gpu-start"));
+    let (layer, folder) = (FaultLayer::new("start").unwrap(), TestFolder::new("gpu-start"));
     for (plan, word) in [
         ("oom-host@instance=1", "out of main memory"),
         ("init-failed@device=1..", "opening the Vulkan device"),
@@ -101,7 +101,7 @@ fn a_start_that_finds_no_memory_or_no_device_is_refused_clearly() {
 /// Found in use, R18: software Vulkan crashed in a process with too little address space.
 #[test]
 fn too_little_address_space_for_software_vulkan_is_refused_before_it_crashes() {
-    let folder = Folder::new("gpu-space");
+    let folder = TestFolder::new("gpu-space");
     // Only if software Vulkan would be used.
     let plain = dpm(&[&SMALL[..], &[folder.text(), "--frames", "1"]].concat(), &[]);
     assert_eq!(code(&plain), 0, "{}", err(&plain));

@@ -3,7 +3,7 @@
 #![cfg(target_os = "linux")]
 #![allow(unsafe_code)]
 
-use crate::cli_common::{code, dpm, err, start, Folder, Running};
+use crate::cli_common::{code, dpm, err, start, ChildProgram, TestFolder};
 use crate::link_common::{raster, served_time, Projector, PtyProjector};
 use hil_mock::projector::MockConfig;
 use std::time::{Duration, Instant};
@@ -74,8 +74,8 @@ pub(super) fn threads(id: u32) -> Vec<(i32, String)> {
     all
 }
 
-fn rig(name: &str) -> (Folder, String, PtyProjector) {
-    let folder = Folder::new(name);
+fn rig(name: &str) -> (TestFolder, String, PtyProjector) {
+    let folder = TestFolder::new(name);
     let far = PtyProjector::new(name, MockConfig::new(raster()));
     let text = format!(
         "[projector]\nwidth = {}\nheight = {}\nframe_rate = 60\nplanes = 8\nbackend = {}\n\
@@ -90,7 +90,7 @@ fn rig(name: &str) -> (Folder, String, PtyProjector) {
     (folder, path, far)
 }
 
-fn lit_run(path: &str, far: &PtyProjector) -> Running {
+fn lit_run(path: &str, far: &PtyProjector) -> ChildProgram {
     let run = start(&["run", path]);
     let lit = far.status().frames_lit;
     far.until(LONG, "light", &mut |s| s.lit && s.frames_lit >= lit.saturating_add(10));
@@ -183,7 +183,7 @@ const PEACE: Duration = Duration::from_millis(2_200);
 /// writes the report.
 #[test]
 fn fifty_recoveries_leave_nothing_behind_and_a_stop_during_one_writes_the_report() {
-    let folder = Folder::new("recoveries");
+    let folder = TestFolder::new("recoveries");
     let text = include_str!("../../../../../rigs/mock.toml")
         .replace("listen = \"127.0.0.1:8947\"", "listen = \"127.0.0.1:0\"");
     let path = folder.write("rig.toml", &text);

@@ -2,7 +2,7 @@
 //! running rig agree with the mirrors of the projector.
 
 use super::hangs::{threads, HaltedThread};
-use crate::cli_common::{code, dpm, err, start, Folder, Running};
+use crate::cli_common::{code, dpm, err, start, ChildProgram, TestFolder};
 use crate::cli_run::natnet;
 use crate::link_common::{raster, rig, start_with, Projector, PtyProjector};
 use dpm_device::link::{faults, LimitReached};
@@ -30,9 +30,9 @@ fn has_light(far: &PtyProjector) -> bool {
 }
 
 /// Closed while the flag is set.
-struct Switch(Arc<AtomicBool>);
+struct WordContact(Arc<AtomicBool>);
 
-impl Contact for Switch {
+impl Contact for WordContact {
     fn is_closed(&mut self) -> bool {
         self.0.load(Ordering::Relaxed)
     }
@@ -42,7 +42,7 @@ impl Contact for Switch {
 fn orders_interlock_limit_fault_and_a_lost_cable_are_called_by_their_name() {
     let far = PtyProjector::new("words", MockConfig::new(raster()));
     let closed = Arc::new(AtomicBool::new(true));
-    let switch = Switch(closed.clone());
+    let switch = WordContact(closed.clone());
     let run = start_with(&rig(&far.backend(""), &[]), 0, |monitor| {
         monitor.set_interlock(Interlock::with_contact("a switch", switch).unwrap());
         assert_eq!(monitor.light(), LightState::NeverArmed(ProjectorHealth::Connecting));
@@ -143,18 +143,18 @@ impl PageWatch<'_> {
     }
 }
 
-fn order(word: &str, run: &Running) {
+fn order(word: &str, run: &ChildProgram) {
     let output = dpm(&[word, "--pid", &run.id().to_string()], &[]);
     assert_eq!(code(&output), 0, "{}", err(&output));
 }
 
 /// Starts a rig of two bodies, of which the server at `port` serves the bunny alone. `safety`: what else its file says of `[safety]`.
 fn start_asked<'a>(
-    folder: &Folder,
+    folder: &TestFolder,
     far: &'a PtyProjector,
     port: u16,
     safety: &str,
-) -> (Running, PageWatch<'a>) {
+) -> (ChildProgram, PageWatch<'a>) {
     // Free for a moment at least, and nobody else in this test asks for one.
     let address = TcpListener::bind("127.0.0.1:0").unwrap().local_addr().unwrap();
     let rig = folder.write(
@@ -177,7 +177,7 @@ fn start_asked<'a>(
 /// The page of a rig whose light rests again and again says so, and why.
 #[test]
 fn a_limit_is_called_by_its_name_on_the_page() {
-    let folder = Folder::new("word-rests");
+    let folder = TestFolder::new("word-rests");
     let far = PtyProjector::new("word-rests", MockConfig::new(raster()));
     let server = natnet(&MotionSpec::Still {}, [0.0, 0.1, 0.0]);
     let limits = "flashes_per_second = 0\nlimits = { mean_level = 0.002, mean_window_s = 3.0 }";
@@ -194,7 +194,7 @@ fn a_limit_is_called_by_its_name_on_the_page() {
 /// Found in use, O1: a rig without a tracker was green, up and lit, and so was one whose stages hung for 92 s.
 #[test]
 fn a_start_by_hand_an_interlock_a_lost_body_a_hung_stage_and_a_silent_tracker_are_called_by_their_name() {
-    let folder = Folder::new("word");
+    let folder = TestFolder::new("word");
     let far = PtyProjector::new("word", MockConfig::new(raster()));
     // It serves the bunny alone.
     let server = natnet(&MotionSpec::Still {}, [0.0, 0.1, 0.0]);

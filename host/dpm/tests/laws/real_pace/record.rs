@@ -18,7 +18,7 @@ use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 /// A folder with a rig file, and a NatNet server of two bodies that the rig names.
-struct Bench {
+struct RecordingBench {
     folder: PathBuf,
     server: Option<NatNetHost>,
 }
@@ -32,7 +32,7 @@ fn source() -> SampleSource {
     SampleSource::new(MockTrackerConfig::default(), motions).unwrap()
 }
 
-impl Bench {
+impl RecordingBench {
     fn new(name: &str, serves: bool) -> Self {
         let folder = std::env::temp_dir().join(format!("dpm-record-{name}-{}", std::process::id()));
         let _ = std::fs::remove_dir_all(&folder);
@@ -70,7 +70,7 @@ impl Bench {
     }
 }
 
-impl Drop for Bench {
+impl Drop for RecordingBench {
     fn drop(&mut self) {
         let _ = std::fs::remove_dir_all(&self.folder);
     }
@@ -99,7 +99,7 @@ fn replayed(folder: &Path, file: &str, start: HostTime) -> Vec<TrackerSample> {
 /// the same samples, bit for bit.
 #[test]
 fn a_recording_holds_what_was_sent_and_replay_gives_it_back() {
-    let b = Bench::new("round", true);
+    let b = RecordingBench::new("round", true);
     let o = b.record(&["a.dpmt", "--rig", "rig.toml", "--seconds", "1.5"]);
     assert!(o.status.success(), "{}", told(&o));
     let recording = b.read("a.dpmt");
@@ -137,7 +137,7 @@ fn a_recording_holds_what_was_sent_and_replay_gives_it_back() {
 /// At most 100 ms are lost by a SIGKILL (in one of three attempts, on a shared machine), and the rest can be played.
 #[test]
 fn a_killed_recording_lacks_its_last_tenth_of_a_second_at_most() {
-    let b = Bench::new("kill", true);
+    let b = RecordingBench::new("kill", true);
     let mut missing = Vec::new();
     for name in ["a.dpmt", "b.dpmt", "c.dpmt"] {
         let mut run = b.command(&[name, "--rig", "rig.toml"]).stderr(Stdio::null()).spawn().unwrap();
@@ -162,7 +162,7 @@ fn a_killed_recording_lacks_its_last_tenth_of_a_second_at_most() {
 /// played. SIGTERM ends it in order.
 #[test]
 fn a_full_disk_and_a_signal_end_a_recording_clearly() {
-    let b = Bench::new("full", true);
+    let b = RecordingBench::new("full", true);
     // No file may grow beyond 32 KiB, which is the same as a full disk for the writer.
     let words = ["record", "a.dpmt", "--rig", "rig.toml", "--seconds", "60"];
     let started = Instant::now();
@@ -193,7 +193,7 @@ fn a_full_disk_and_a_signal_end_a_recording_clearly() {
 /// mock, which any rig has, can be recorded as well.
 #[test]
 fn silence_is_an_error_and_any_tracker_can_be_recorded() {
-    let b = Bench::new("silent", false);
+    let b = RecordingBench::new("silent", false);
     let o = b.record(&["a.dpmt", "--rig", "rig.toml", "--seconds", "0.5"]);
     assert_eq!(o.status.code(), Some(3), "{}", told(&o));
     assert!(told(&o).contains("no sample") && told(&o).contains("did not answer"), "{}", told(&o));

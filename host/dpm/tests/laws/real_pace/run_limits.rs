@@ -14,9 +14,9 @@ use std::time::Duration;
 const LONG: Duration = Duration::from_secs(20);
 
 /// Closed while the flag is set.
-struct Switch(Arc<AtomicBool>);
+struct LimitContact(Arc<AtomicBool>);
 
-impl Contact for Switch {
+impl Contact for LimitContact {
     fn is_closed(&mut self) -> bool {
         self.0.load(Ordering::Relaxed)
     }
@@ -30,7 +30,7 @@ fn projector(name: &str) -> PtyProjector {
 fn an_open_interlock_is_dark_within_50_ms_and_a_closed_one_is_light_where_nobody_ordered_otherwise() {
     let far = projector("interlock");
     let closed = Arc::new(AtomicBool::new(true));
-    let switch = Switch(closed.clone());
+    let switch = LimitContact(closed.clone());
     let run = start_with(&rig(&far.backend(""), &[]), 0, |monitor| {
         monitor.set_interlock(Interlock::with_contact("a switch", switch).unwrap());
     });
@@ -98,7 +98,7 @@ fn an_open_interlock_is_dark_within_50_ms_and_a_closed_one_is_light_where_nobody
 fn a_run_whose_interlock_is_open_from_the_start_makes_no_light() {
     let far = projector("interlock-open");
     let closed = Arc::new(AtomicBool::new(false));
-    let switch = Switch(closed.clone());
+    let switch = LimitContact(closed.clone());
     let run = start_with(&rig(&far.backend(""), &[]), 0, |monitor| {
         monitor.set_interlock(Interlock::with_contact("a switch", switch).unwrap());
     });

@@ -1,7 +1,7 @@
 //! `dpm run` on a projector behind a real serial line (a pseudo-terminal): light, reports, orders, faults,
 //! unplugging, the dark at the end.
 
-use crate::cli_common::{code, dpm, err, Folder};
+use crate::cli_common::{code, dpm, err, TestFolder};
 use crate::link_common::{raster, rig, served_time, start, Projector, PtyProjector};
 use dpm_device::link::{faults, DeviceState};
 use dpm_rig::order::Order;
@@ -212,7 +212,7 @@ fn a_projector_that_offers_no_split_planes_is_lit_by_binary_ones() {
     for exceeds in [false, true] {
         let name = format!("offers-{exceeds}");
         let far = PtyProjector::new(&name, MockConfig { exceeds, ..MockConfig::new(raster()) });
-        let folder = Folder::new(&name);
+        let folder = TestFolder::new(&name);
         let text = format!(
             "[projector]\nwidth = {}\nheight = {}\nframe_rate = 60\nplanes = 8\nweights = \"auto\"\nbackend = {}\n\
              [render]\nspp = 1\nmethod = \"full\"\n[[scene.bodies]]\nname = \"bunny\"\n",

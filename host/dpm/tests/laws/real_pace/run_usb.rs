@@ -4,7 +4,7 @@ use crate::link_common::{raster, rig, served_time, start, Projector};
 use dpm_device::link::DeviceState;
 use dpm_device::transport::usb::DATA_OUT;
 use dpm_device::transport::LinkDevice;
-use dpm_lab::link_test::{link_test, Content};
+use dpm_lab::link_test::{link_test, TestFrames};
 use dpm_rig::order::Order;
 use dpm_rig::pipeline::{projector, PipelineError};
 use dpm_rig::telemetry::monitor::ProjectorHealth;
@@ -130,7 +130,7 @@ fn the_link_test_finds_the_rate_that_a_slow_cable_allows() {
     let frame = projector::frame_bytes(raster(), 8) as u64;
     far.model.lock().unwrap().set_bytes_per_second(Some(100 * frame));
     let report =
-        link_test(&rig, &Content::prepared(&rig, 4), 1.5, &|| false).unwrap_or_else(|e| panic!("{e}"));
+        link_test(&rig, &TestFrames::prepared(&rig, 4), 1.5, &|| false).unwrap_or_else(|e| panic!("{e}"));
     let [raw, auto] = &report.ways[..] else { panic!("{report:?}") };
     assert_eq!(raw.limited_by, "medium", "{raw:?}");
     // Not faster than the cable, except for its FIFO of 64 KiB at the start; slower only by the delays of a busy

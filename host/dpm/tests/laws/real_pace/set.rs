@@ -1,14 +1,14 @@
 //! `dpm set` on a running rig with software Vulkan: values are shown, changed, refused, taken back and saved, and a limit
 //! on light holds whatever is set.
 
-use crate::cli_common::{code, dpm, err, out, start, Folder};
+use crate::cli_common::{code, dpm, err, out, start, TestFolder};
 use std::time::Duration;
 
 const LONG: Duration = Duration::from_secs(120);
 
 #[test]
 fn parameters_change_a_running_rig_and_no_value_voids_a_limit_on_light() {
-    let folder = Folder::new("set");
+    let folder = TestFolder::new("set");
     // The picture is nearly black, so the limit is far.
     let text = include_str!("../../../../../rigs/demo.toml");
     let path = folder.write("rig.toml", text);

@@ -2,7 +2,7 @@
 //! pseudo-terminal.
 #![allow(unsafe_code)]
 
-use crate::cli_common::{code, command, dpm, err, out, own_folder, start_with, Folder, Running};
+use crate::cli_common::{code, command, dpm, err, out, own_folder, start_with, ChildProgram, TestFolder};
 use crate::link_common::{raster, Projector, PtyProjector};
 use crate::rig_file::{rig, run_words, WATCHDOG};
 use dpm_device::link::{faults, DeviceState};
@@ -25,26 +25,26 @@ fn is_root() -> bool {
 }
 
 /// A rig with a state folder of its own.
-struct Bench {
-    _folder: Folder,
+struct StateFolderRig {
+    _folder: TestFolder,
     path: String,
     far: PtyProjector,
     state: PathBuf,
 }
 
-impl Bench {
+impl StateFolderRig {
     fn new(name: &str) -> Self {
         let (folder, path, far) = rig(name);
         let state = folder.path("state");
         Self { _folder: folder, path, far, state }
     }
 
-    fn start(&self) -> Running {
+    fn start(&self) -> ChildProgram {
         start_with(&run_words(&self.path), &[("DPM_STATE_DIR", self.state.to_str().unwrap())])
     }
 
     /// A run that lights a projector that has just been switched on.
-    fn lit(&self) -> Running {
+    fn lit(&self) -> ChildProgram {
         self.power_cycle();
         let mut run = self.start();
         let begin = Instant::now();
@@ -74,7 +74,7 @@ impl Bench {
         assert_eq!(run.finish().0.code(), None);
     }
 
-    fn order(&self, word: &str, run: &Running, wanted: i32) -> String {
+    fn order(&self, word: &str, run: &ChildProgram, wanted: i32) -> String {
         let told = dpm(&[word, "--pid", &run.id().to_string()], &[]);
         assert_eq!(code(&told), wanted, "{word}: {}{}", out(&told), err(&told));
         out(&told)
@@ -116,7 +116,7 @@ impl Bench {
 /// Found in use, R4: `dpm safe`, `kill -9`, `dpm run` brought the light back without anybody's order.
 #[test]
 fn r4_safe_holds_over_kill_and_a_projector_without_power_until_somebody_arms() {
-    let bench = Bench::new("safe");
+    let bench = StateFolderRig::new("safe");
     bench.killed_after("safe");
     let text = fs::read_to_string(bench.kept().unwrap()).unwrap();
     assert!(text.contains("\"order\":\"safe\"") && text.contains("over the control socket"), "{text}");
@@ -127,7 +127,7 @@ fn r4_safe_holds_over_kill_and_a_projector_without_power_until_somebody_arms() {
 /// Found in use, R4: the projector's own latch counts without a file, whatever faults the rig file acknowledges.
 #[test]
 fn r4_safe_that_only_the_projector_remembers_holds_too() {
-    let bench = Bench::new("latched");
+    let bench = StateFolderRig::new("latched");
     bench.killed_after("safe");
     fs::remove_file(bench.kept().unwrap()).unwrap();
     assert_eq!(bench.far.status().faults & faults::HOST_SAFE, faults::HOST_SAFE);
@@ -151,7 +151,7 @@ fn r4_safe_that_only_the_projector_remembers_holds_too() {
 /// Found in use, R4: a state file that cannot be read counts as SAFE.
 #[test]
 fn r4_a_damaged_state_file_keeps_the_next_run_dark() {
-    let bench = Bench::new("damaged");
+    let bench = StateFolderRig::new("damaged");
     bench.killed_after("black");
     let path = bench.kept().unwrap();
     let half = fs::read(&path).unwrap();
@@ -163,7 +163,7 @@ fn r4_a_damaged_state_file_keeps_the_next_run_dark() {
 /// Found in use, R4 and R3: BLACK of a run that died remains, and whoever restarts a service brings no light back.
 #[test]
 fn r3_orders_outlive_a_run_that_died_and_one_that_ended() {
-    let bench = Bench::new("black");
+    let bench = StateFolderRig::new("black");
     bench.killed_after("black");
     bench.comes_up_dark_until_armed("BLACK stands since");
     for (order, told) in [("black", "BLACK stands since"), ("safe", "SAFE stands since")] {
@@ -180,7 +180,7 @@ fn r3_orders_outlive_a_run_that_died_and_one_that_ended() {
 /// the other name came as far as the port.
 #[test]
 fn r1_a_link_of_the_port_is_the_same_projector() {
-    let bench = Bench::new("link");
+    let bench = StateFolderRig::new("link");
     let link = bench._folder.path("port");
     symlink(&bench.far.path, &link).unwrap();
     let by_link = bench._folder.path("link.toml");
@@ -206,13 +206,13 @@ fn r1_a_link_of_the_port_is_the_same_projector() {
 /// Found in use again: BLACK for another projector at the same port replaced SAFE for the first one.
 #[test]
 fn orders_for_two_projectors_at_one_port_stand_side_by_side() {
-    let bench = Bench::new("two-projectors");
+    let bench = StateFolderRig::new("two-projectors");
     let plug = |serial| {
         bench.far.unplug();
         bench.far.exchange(MockConfig { serial, ..MockConfig::new(raster()) });
         bench.far.plug_in();
     };
-    let dark_after = |run: &mut Running, word: &str| {
+    let dark_after = |run: &mut ChildProgram, word: &str| {
         run.wait_for_line(LONG, |line| line.contains(word));
         // ARM is for the projector that has told who it is.
         bench.far.until(LONG, "a session", &mut |s| {
@@ -264,7 +264,7 @@ fn orders_for_two_projectors_at_one_port_stand_side_by_side() {
 
 #[test]
 fn a_start_by_hand_is_dark_until_somebody_arms() {
-    let bench = Bench::new("by-hand");
+    let bench = StateFolderRig::new("by-hand");
     let mut args = run_words(&bench.path);
     args.extend(["--set".into(), "safety.start=\"by hand\"".into()]);
     let mut run = start_with(&args, &[("DPM_STATE_DIR", bench.state.to_str().unwrap())]);
@@ -280,7 +280,7 @@ fn a_start_by_hand_is_dark_until_somebody_arms() {
 /// Found in use, R4: without a folder in which SAFE can be kept, a real projector is not run.
 #[test]
 fn r4_a_real_projector_without_a_state_folder_is_refused() {
-    let bench = Bench::new("no-state");
+    let bench = StateFolderRig::new("no-state");
     fs::write(&bench.state, b"a file").unwrap();
     let told = dpm(&["run", &bench.path], &[("DPM_STATE_DIR", bench.state.to_str().unwrap())]);
     assert_eq!(code(&told), 2, "{}", err(&told));
@@ -295,7 +295,7 @@ fn r4_a_real_projector_without_a_state_folder_is_refused() {
 /// Found in use, R9: a thousand silent clients of the same user delayed `dpm safe`, which then reported "delivered".
 #[test]
 fn r9_a_thousand_silent_connections_hold_no_emergency_up() {
-    let bench = Bench::new("flood");
+    let bench = StateFolderRig::new("flood");
     let run = bench.lit();
     let socket = own_folder("run").join(format!("run-{}.sock", run.id()));
     // SAFETY: plain numbers in places that outlive the calls.
@@ -325,7 +325,7 @@ fn r9_a_thousand_silent_connections_hold_no_emergency_up() {
 /// in the lock folder.
 #[test]
 fn r7_a_lock_folder_of_others_and_planted_links_are_refused() {
-    let bench = Bench::new("links");
+    let bench = StateFolderRig::new("links");
     let runtime = bench._folder.path("runtime");
     fs::create_dir(&runtime).unwrap();
     let victim = bench._folder.path("victim");
@@ -384,7 +384,7 @@ fn r8_another_users_word_is_not_taken_for_a_rigs() {
         eprintln!("needs root to be somebody else; the same rule is tested in control::client without");
         return;
     }
-    let folder = Folder::new("impostor");
+    let folder = TestFolder::new("impostor");
     fs::set_permissions(folder.text(), fs::Permissions::from_mode(0o777)).unwrap();
     let program = folder.path("program");
     fs::copy(std::env::current_exe().unwrap(), &program).unwrap();
@@ -413,7 +413,7 @@ fn r8_another_users_word_is_not_taken_for_a_rigs() {
 /// Only a running rig can be armed, and the message says what still stands.
 #[test]
 fn without_a_running_rig_arm_clears_nothing() {
-    let bench = Bench::new("arm");
+    let bench = StateFolderRig::new("arm");
     bench.killed_after("safe");
     let variables = [("DPM_STATE_DIR", bench.state.to_str().unwrap())];
     let alone = bench._folder.path("alone");

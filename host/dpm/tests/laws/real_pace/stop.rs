@@ -1,7 +1,7 @@
 //! Stop means dark, and the process ends, whichever of its threads hangs: ptrace stops each of them in turn.
 #![allow(unsafe_code)]
 
-use crate::cli_common::{code, command, dpm, err, out, start, Running};
+use crate::cli_common::{code, command, dpm, err, out, start, ChildProgram};
 use crate::link_common::{served_time, Projector};
 use crate::rig_file::{rig, run_words, WATCHDOG};
 use dpm_device::link::DeviceState;
@@ -80,7 +80,7 @@ fn thread_of(pid: u32, name: &str) -> i32 {
 }
 
 /// Waits for the end of `run` while `stopped` is traced; returns the time that counts.
-fn gone(run: &mut Running, stopped: &FrozenThread) -> Duration {
+fn gone(run: &mut ChildProgram, stopped: &FrozenThread) -> Duration {
     let pid = run.id();
     served_time("gone", || {
         stopped.reap(pid);

@@ -1,7 +1,7 @@
 //! A rig file on a projector behind a pseudo-terminal, for `dpm` in a process of its own.
 #![allow(dead_code)]
 
-use crate::cli_common::Folder;
+use crate::cli_common::TestFolder;
 use crate::link_common::{raster, PtyProjector};
 use hil_mock::projector::MockConfig;
 use std::time::Duration;
@@ -17,8 +17,8 @@ pub(crate) fn run_words(path: &str) -> Vec<String> {
 }
 
 /// A rig file for the projector, and the projector.
-pub(crate) fn rig(name: &str) -> (Folder, String, PtyProjector) {
-    let folder = Folder::new(name);
+pub(crate) fn rig(name: &str) -> (TestFolder, String, PtyProjector) {
+    let folder = TestFolder::new(name);
     let far = PtyProjector::new(name, MockConfig::new(raster()));
     let text = format!(
         "[projector]\nwidth = {}\nheight = {}\nframe_rate = 20\nplanes = 8\nbackend = {}\n\

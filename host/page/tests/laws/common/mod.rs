@@ -2,7 +2,7 @@
 #![allow(dead_code)] // Every test file uses a part of it.
 
 use dpm_device::planes::Raster;
-use dpm_page::calibration::{Act, Guide, Session};
+use dpm_page::calibration::{Act, Guide, StepSession};
 use dpm_page::proof::{sign_request, Key};
 use dpm_page::token::Token;
 use dpm_page::{Page, Settings};
@@ -37,7 +37,7 @@ impl Guide for NoSteps {
         Steps::of(&About { rig: &self.rig, config: &self.config, file: None, now, running_since: None })
     }
 
-    fn session(&self) -> Option<Session> {
+    fn session(&self) -> Option<StepSession> {
         None
     }
 
@@ -50,7 +50,7 @@ impl Guide for NoSteps {
     }
 }
 
-pub(crate) struct Running {
+pub(crate) struct RunWithPage {
     pub(crate) monitor: Arc<RunMonitor>,
     pub(crate) notes: Arc<Notes>,
     pub(crate) token: Token,
@@ -61,7 +61,7 @@ pub(crate) struct Running {
     dir: PathBuf,
 }
 
-impl Running {
+impl RunWithPage {
     /// A rig of prepared frames with the mock tracker and the mock projector, which runs until it is stopped.
     pub(crate) fn start(name: &str) -> Self {
         Self::with(name, &["real_time.pace=\"real\"", "projector.frame_rate=\"100/1\""])
@@ -117,7 +117,7 @@ impl Running {
     }
 
     /// The answer to a request with the headers that a browser would send, and with `more`.
-    pub(crate) fn ask(&self, method: &str, path: &str, more: &[(&str, &str)]) -> Answer {
+    pub(crate) fn ask(&self, method: &str, path: &str, more: &[(&str, &str)]) -> HttpAnswer {
         let host = self.address.to_string();
         let mut headers = vec![("Host", host.as_str())];
         headers.extend(more);
@@ -130,7 +130,7 @@ impl Running {
     }
 
     /// Asks with a signature.
-    pub(crate) fn ask_signed(&self, method: &str, path: &str) -> Answer {
+    pub(crate) fn ask_signed(&self, method: &str, path: &str) -> HttpAnswer {
         self.ask(method, path, &[("X-Dpm-Order", &self.signed(method, path))])
     }
 
@@ -148,7 +148,7 @@ impl Running {
     }
 }
 
-impl Drop for Running {
+impl Drop for RunWithPage {
     fn drop(&mut self) {
         self.monitor.request_stop();
         if let Some(run) = self.run.take() {
@@ -168,13 +168,13 @@ pub(crate) fn signed_by(token: &Token, method: &str, path: &str, challenge: &str
 }
 
 #[derive(Debug)]
-pub(crate) struct Answer {
+pub(crate) struct HttpAnswer {
     pub(crate) status: u16,
     pub(crate) head: String,
     pub(crate) body: String,
 }
 
-pub(crate) fn ask(address: SocketAddr, method: &str, path: &str, headers: &[(&str, &str)]) -> Answer {
+pub(crate) fn ask(address: SocketAddr, method: &str, path: &str, headers: &[(&str, &str)]) -> HttpAnswer {
     let mut text = format!("{method} {path} HTTP/1.1\r\nConnection: close\r\n");
     for (name, value) in headers {
         text += &format!("{name}: {value}\r\n");
@@ -183,7 +183,7 @@ pub(crate) fn ask(address: SocketAddr, method: &str, path: &str, headers: &[(&st
 }
 
 /// Sends bytes and reads the answer to its end.
-pub(crate) fn send(address: SocketAddr, bytes: &[u8]) -> std::io::Result<Answer> {
+pub(crate) fn send(address: SocketAddr, bytes: &[u8]) -> std::io::Result<HttpAnswer> {
     let mut stream = TcpStream::connect_timeout(&address, PATIENCE)?;
     stream.set_read_timeout(Some(PATIENCE))?;
     stream.write_all(bytes)?;
@@ -192,17 +192,17 @@ pub(crate) fn send(address: SocketAddr, bytes: &[u8]) -> std::io::Result<Answer>
     let text = String::from_utf8_lossy(&answer);
     let (head, body) = text.split_once("\r\n\r\n").unwrap_or((&text, ""));
     let status = head.split(' ').nth(1).and_then(|s| s.parse().ok()).unwrap_or(0);
-    Ok(Answer { status, head: head.to_owned(), body: body.to_owned() })
+    Ok(HttpAnswer { status, head: head.to_owned(), body: body.to_owned() })
 }
 
 /// One who follows the events of a rig.
 pub(crate) struct Viewer<'a> {
-    pub(crate) rig: &'a Running,
+    pub(crate) rig: &'a RunWithPage,
     lines: BufReader<TcpStream>,
 }
 
 impl<'a> Viewer<'a> {
-    pub(crate) fn new(rig: &'a Running) -> Self {
+    pub(crate) fn new(rig: &'a RunWithPage) -> Self {
         let mut stream = TcpStream::connect(rig.address).unwrap();
         stream.set_read_timeout(Some(PATIENCE)).unwrap();
         let request = format!("GET /api/events HTTP/1.1\r\nHost: {}\r\n\r\n", rig.address);

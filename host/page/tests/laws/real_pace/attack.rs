@@ -1,6 +1,6 @@
 //! The server under attack: its connections and its memory are bounded, and an order still gets through.
 
-use crate::common::{send, Running, PATIENCE};
+use crate::common::{send, RunWithPage, PATIENCE};
 use std::io::{Read, Write};
 use std::net::{Shutdown, SocketAddr, TcpStream};
 use std::time::{Duration, Instant};
@@ -37,7 +37,7 @@ fn is_ended(mut stream: &TcpStream) -> bool {
 
 #[test]
 fn a_thousand_connections_hold_no_order_up_and_take_no_memory() {
-    let rig = Running::start("thousand");
+    let rig = RunWithPage::start("thousand");
     rig.order("arm");
     let (files, memory) = (descriptors(), resident_kib());
     let host = format!("Host: {}\r\n", rig.address);
@@ -79,7 +79,7 @@ fn a_thousand_connections_hold_no_order_up_and_take_no_memory() {
 
 #[test]
 fn a_client_that_sends_its_request_byte_by_byte_is_cut_off() {
-    let rig = Running::start("slow");
+    let rig = RunWithPage::start("slow");
     let begin = Instant::now();
     let mut slow = connect(rig.address).unwrap();
     slow.set_read_timeout(Some(Duration::from_millis(100))).unwrap();
@@ -96,7 +96,7 @@ fn a_client_that_sends_its_request_byte_by_byte_is_cut_off() {
 
 #[test]
 fn large_heads_and_bodies_and_any_bytes_are_refused() {
-    let rig = Running::start("large");
+    let rig = RunWithPage::start("large");
     let host = rig.address.to_string();
     let [black, arm] = ["black", "arm"].map(|word| rig.signed("POST", &format!("/api/orders/{word}")));
     let status = |bytes: &[u8]| send(rig.address, bytes).map_or(0, |a| a.status);
@@ -133,7 +133,7 @@ fn large_heads_and_bodies_and_any_bytes_are_refused() {
 
 #[test]
 fn viewers_are_few_and_a_place_becomes_free_when_one_goes() {
-    let rig = Running::start("viewers");
+    let rig = RunWithPage::start("viewers");
     let request = format!("GET /api/events HTTP/1.1\r\nHost: {}\r\n\r\n", rig.address);
     let view = || {
         let mut stream = connect(rig.address).unwrap();
@@ -155,7 +155,7 @@ fn viewers_are_few_and_a_place_becomes_free_when_one_goes() {
 
 #[test]
 fn a_flood_of_requests_is_slowed_down_but_no_order_is() {
-    let rig = Running::start("flood");
+    let rig = RunWithPage::start("flood");
     let request = format!("GET /api/state HTTP/1.1\r\nHost: {}\r\n\r\n", rig.address);
     let stop = std::sync::atomic::AtomicBool::new(false);
     let address = rig.address;

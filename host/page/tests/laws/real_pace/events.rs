@@ -1,6 +1,6 @@
 //! The rig's events: state, figures, notes and pictures for those who look, and nothing for nobody.
 
-use crate::common::{Running, Viewer};
+use crate::common::{RunWithPage, Viewer};
 use base64::prelude::{Engine, BASE64_STANDARD};
 
 impl Viewer<'_> {
@@ -19,7 +19,7 @@ impl Viewer<'_> {
 
 #[test]
 fn a_viewer_sees_the_light_go_and_come_back() {
-    let rig = Running::start("light");
+    let rig = RunWithPage::start("light");
     assert!(!rig.monitor.live().is_looked_at(), "nobody looks");
     let mut viewer = Viewer::new(&rig);
     let bright = viewer.brightness(|mean| mean > 20.0);
@@ -46,7 +46,7 @@ fn a_viewer_sees_the_light_go_and_come_back() {
 
 #[test]
 fn figures_say_what_the_report_says() {
-    let rig = Running::start("figures");
+    let rig = RunWithPage::start("figures");
     let mut viewer = Viewer::new(&rig);
     let figures = viewer.next("figures", |f| f["report"]["frames_lit"].as_u64() > Some(3));
     let bounds = figures["setup"]["bounds_ms"].as_array().unwrap().len();
@@ -68,7 +68,7 @@ fn figures_say_what_the_report_says() {
 #[test]
 fn a_dark_body_says_why() {
     let flags = ["real_time.pace=\"real\"", "projector.frame_rate=\"100/1\"", "tracker.drop_out=1.0"];
-    let rig = Running::with("dark", &flags);
+    let rig = RunWithPage::with("dark", &flags);
     let mut viewer = Viewer::new(&rig);
     let figures = viewer.next("figures", |f| {
         f["bodies"].as_array().is_some_and(|all| !all.is_empty() && all.iter().all(|b| !b["dark"].is_null()))

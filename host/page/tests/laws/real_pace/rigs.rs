@@ -1,6 +1,6 @@
 //! The overview of several rigs: it shows those that answer, says of the others why not, and none delays another.
 
-use crate::common::{ask, Answer, Running, PATIENCE};
+use crate::common::{ask, HttpAnswer, RunWithPage, PATIENCE};
 use dpm_page::rigs::Rigs;
 use dpm_page::Page;
 use serde_json::Value;
@@ -82,7 +82,7 @@ fn overview(rigs: &[String]) -> Page {
     Page::serve_rigs("127.0.0.1:0".parse().unwrap(), rigs).unwrap()
 }
 
-fn get(page: &Page, path: &str) -> Answer {
+fn get(page: &Page, path: &str) -> HttpAnswer {
     ask(page.address(), "GET", path, &[("Host", &page.address().to_string())])
 }
 
@@ -224,7 +224,7 @@ fn a_rig_is_asked_by_the_port_of_its_address() {
 /// and of nobody else.
 #[test]
 fn a_rig_is_shown_and_commanded_through_a_tunnel() {
-    let mut rig = Running::start("tunnel");
+    let mut rig = RunWithPage::start("tunnel");
     let to = rig.address;
     let listener = TcpListener::bind("127.0.0.1:0").unwrap();
     let tunnel = listener.local_addr().unwrap();
@@ -258,7 +258,7 @@ fn a_rig_is_shown_and_commanded_through_a_tunnel() {
 
 #[test]
 fn a_real_rig_is_understood_and_its_silence_is_told() {
-    let mut rig = Running::start("overview");
+    let mut rig = RunWithPage::start("overview");
     let page = overview(&[format!("rig={}", rig.address)]);
     let now = wait(&page, "rig", PATIENCE, |rig| rig["told"]["lit_per_s"].as_f64().is_some_and(|n| n > 1.0));
     assert!(now["told"]["light"]["word"] == "LIT" && now["told"]["light"]["is_lit"] == true, "{now}");

@@ -10,7 +10,7 @@ use super::answer::answer_to;
 use super::orders::{Orders, Ticket};
 use super::parameters;
 use crate::order::Order;
-use crate::parameters::Command;
+use crate::parameters::ParameterCommand;
 use crate::standing::By;
 use crate::telemetry::monitor::RunMonitor;
 use decode::{decode, OscRequest, Said};
@@ -167,7 +167,7 @@ impl Ear {
                 }
                 Ok(OscRequest::Nothing) => Ok(()),
                 Ok(OscRequest::Set { name, numbers }) => {
-                    let command = Command::Set { name, numbers };
+                    let command = ParameterCommand::Set { name, numbers };
                     let given = parameters::give(&self.monitor, &command, &format!("osc {ip}"));
                     given.map(|_| ()).map_err(|e| format!("{ip}: {e}"))
                 }

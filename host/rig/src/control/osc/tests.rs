@@ -7,13 +7,13 @@ use dpm_device::planes::Raster;
 
 const TOKEN: &str = "abc-012345-XYZ";
 
-struct Bench {
+struct OscBench {
     monitor: Arc<RunMonitor>,
     osc: OscSocket,
     to: UdpSocket,
 }
 
-impl Bench {
+impl OscBench {
     fn new(sender: &str, token: Option<&str>) -> Self {
         let config = RigConfig::demo(&Overrides::default()).unwrap();
         let rig = Arc::new(Rig::build(&config, Raster::new(8, 8)).unwrap());
@@ -58,7 +58,7 @@ impl Bench {
 
 #[test]
 fn parameters_and_dark_orders_are_carried_out_and_arm_is_not() {
-    let bench = Bench::new("127.0.0.1", Some(TOKEN));
+    let bench = OscBench::new("127.0.0.1", Some(TOKEN));
     let with_token = |name: &str| format!("/dpm/token/{TOKEN}/{name}");
     bench.send(&with_token("exposure"), &[1.25]);
     bench.wait("exposure", || bench.exposure() == 1.25);
@@ -97,7 +97,7 @@ fn without_the_right_token_osc_only_makes_dark() {
     for (token, prefix) in
         [(None, "/dpm/"), (None, "/dpm/token/abc-012345-XYZ/"), (Some(TOKEN), "/dpm/"), (Some(TOKEN), &wrong)]
     {
-        let bench = Bench::new("127.0.0.1", token);
+        let bench = OscBench::new("127.0.0.1", token);
         let before = bench.exposure();
         bench.send(&format!("{prefix}exposure"), &[1.25]);
         bench.send(&format!("{prefix}freeze"), &[1.0]);
@@ -120,7 +120,7 @@ fn without_the_right_token_osc_only_makes_dark() {
 
 #[test]
 fn a_flood_of_anything_is_told_in_few_notes_and_black_still_arrives() {
-    let bench = Bench::new("127.0.0.1", None);
+    let bench = OscBench::new("127.0.0.1", None);
     for k in 0..3000u32 {
         let _ = bench.to.send(&k.to_be_bytes().repeat(k as usize % 100));
     }
@@ -135,7 +135,7 @@ fn a_flood_of_anything_is_told_in_few_notes_and_black_still_arrives() {
 
 #[test]
 fn a_sender_that_is_not_listed_is_not_heard() {
-    let bench = Bench::new("127.0.0.1", None);
+    let bench = OscBench::new("127.0.0.1", None);
     let mut ear = Ear {
         socket: UdpSocket::bind("127.0.0.1:0").unwrap(),
         door: Doorkeeper { from: vec!["192.0.2.7".parse().unwrap()], token: None },

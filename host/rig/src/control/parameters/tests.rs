@@ -23,7 +23,7 @@ fn run(rig: &Arc<Rig>) -> (Arc<RunMonitor>, Reader<ParameterVersion>) {
 }
 
 fn set(monitor: &Arc<RunMonitor>, text: &str) -> Result<ChangeResult, ChangeRefusal> {
-    give(monitor, &Command::parse_change(text)?, "test")
+    give(monitor, &ParameterCommand::parse_change(text)?, "test")
 }
 
 #[test]
@@ -48,12 +48,12 @@ fn a_change_reaches_planning_whole_and_is_taken_back_whole() {
     assert!((moved - DVec3::new(0.0, 3e-3, 0.0)).length() < 1e-12, "{moved}");
     assert_eq!(now.mesh_to_body[1], before.mesh_to_body[1]);
     for left in (0..6).rev() {
-        give(&monitor, &Command::Undo, "test").unwrap();
+        give(&monitor, &ParameterCommand::Undo, "test").unwrap();
         assert_eq!(monitor.parameters().shown().unwrap().can_undo, left > 0);
     }
     let after = reader.latest().0.clone();
     assert_eq!(ParameterVersion { version: before.version, ..after }, before);
-    assert_eq!(give(&monitor, &Command::Undo, "test").unwrap_err(), ChangeRefusal::NothingToUndo);
+    assert_eq!(give(&monitor, &ParameterCommand::Undo, "test").unwrap_err(), ChangeRefusal::NothingToUndo);
 }
 
 #[test]
@@ -64,9 +64,9 @@ fn a_drawn_slider_is_one_step_and_two_parameters_are_two() {
         set(&monitor, &format!("exposure={}", 1.0 + f64::from(k))).unwrap();
     }
     set(&monitor, "budget=1").unwrap();
-    give(&monitor, &Command::Undo, "test").unwrap();
+    give(&monitor, &ParameterCommand::Undo, "test").unwrap();
     assert_eq!(reader.latest().0.brighter, 50.0);
-    give(&monitor, &Command::Undo, "test").unwrap();
+    give(&monitor, &ParameterCommand::Undo, "test").unwrap();
     assert_eq!((reader.latest().0.brighter, reader.latest().0.version), (1.0, 52));
     assert!(!monitor.parameters().shown().unwrap().can_undo);
     // Each step was told once.
@@ -148,7 +148,7 @@ fn a_new_planning_stage_goes_on_with_what_was_changed() {
     let mut new = monitor.parameters().follow(&rig);
     assert_eq!((new.latest().0.version, new.latest().0.brighter), (1, 3.0));
     set(&monitor, "exposure=4").unwrap();
-    give(&monitor, &Command::Undo, "test").unwrap();
+    give(&monitor, &ParameterCommand::Undo, "test").unwrap();
     set(&monitor, "gaze=0,0,0").unwrap();
     assert_eq!(new.latest().0.gaze, Some(DVec3::ZERO));
     assert_eq!(old.latest().0.gaze, None, "an abandoned stage hears nothing more");
@@ -157,7 +157,7 @@ fn a_new_planning_stage_goes_on_with_what_was_changed() {
 /// Waits for files to be written.
 fn saved(monitor: &Arc<RunMonitor>) -> String {
     let begin = Instant::now();
-    let sent = give(monitor, &Command::Save, "test").unwrap();
+    let sent = give(monitor, &ParameterCommand::Save, "test").unwrap();
     loop {
         if let Some(answer) = sent.answer(Duration::ZERO, monitor.parameters()) {
             return answer.text;
@@ -171,7 +171,10 @@ fn saved(monitor: &Arc<RunMonitor>) -> String {
 fn only_what_the_files_do_not_say_is_saved_and_a_value_taken_back_is_saved_again() {
     let rig = rig(&["observer.gaze={kind=\"tracked\",target=\"venus\"}"]);
     let (monitor, _reader) = run(&rig);
-    assert!(matches!(give(&monitor, &Command::Save, "test"), Err(ChangeRefusal::NotSaved(_))), "no file");
+    assert!(
+        matches!(give(&monitor, &ParameterCommand::Save, "test"), Err(ChangeRefusal::NotSaved(_))),
+        "no file"
+    );
     let all: Arc<Mutex<Vec<ToKeep>>> = Arc::default();
     let written = all.clone();
     monitor.parameters().set_saver(Box::new(move |_, kept| {
@@ -191,7 +194,7 @@ fn only_what_the_files_do_not_say_is_saved_and_a_value_taken_back_is_saved_again
     assert_eq!(saved(&monitor), "ok: written");
     assert!(!monitor.parameters().shown().unwrap().is_unsaved);
     for _ in 0..2 {
-        give(&monitor, &Command::Undo, "test").unwrap();
+        give(&monitor, &ParameterCommand::Undo, "test").unwrap();
     }
     assert_eq!(saved(&monitor), "ok: written");
     let all = all.lock().unwrap();

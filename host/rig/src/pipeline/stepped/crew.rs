@@ -1,7 +1,7 @@
 //! Tracking, plan and pack, and the GPU between them.
 
-use super::line::Line;
-use super::{GpuWork, Machine, Part, Takes, NEVER};
+use super::line::SteppedLink;
+use super::{GpuWork, Machine, RunPart, Takes, NEVER};
 use crate::engine::error::PipelineError;
 use crate::engine::facts::{CrewFacts, Facts};
 use crate::engine::pace::Real;
@@ -91,7 +91,7 @@ struct OnGpu {
 }
 
 /// The stages that are restarted together.
-pub(super) struct Crew {
+pub(super) struct SteppedCrew {
     facts: Arc<CrewFacts>,
     tracking: TrackingStage,
     tracking_at: HostTime,
@@ -120,13 +120,13 @@ pub(super) struct Crew {
     in_flight: usize,
 }
 
-impl Crew {
+impl SteppedCrew {
     /// Starts a crew whose frames go to `line`.
     pub(super) fn new(
         facts: &Arc<Facts>,
         parts: CrewParts,
         time: LinkTime,
-        line: &mut Line,
+        line: &mut SteppedLink,
         now: HostTime,
     ) -> Self {
         let crew = Arc::new(CrewFacts::new(parts.first.wall_ns, facts.rig.rate().slot_len_ns(0)));
@@ -270,7 +270,7 @@ impl Crew {
         now: HostTime,
         facts: &Arc<Facts>,
         machine: &mut M,
-        line: &mut Line,
+        line: &mut SteppedLink,
     ) {
         if self.tracking_at <= now {
             self.track(now, facts, machine);
@@ -281,7 +281,7 @@ impl Crew {
 
     fn track<M: Machine>(&mut self, now: HostTime, facts: &Arc<Facts>, machine: &mut M) {
         self.pulses[0].beat(now, POLL_WITHIN_NS);
-        match machine.takes(Part::Tracking, facts.next_frame.load(Ordering::Relaxed), now) {
+        match machine.takes(RunPart::Tracking, facts.next_frame.load(Ordering::Relaxed), now) {
             Takes::Ns(ns) => {
                 let read_at = now.plus_ns(ns);
                 crate::pipeline::threads::read_tracker(facts, &mut self.tracking, &mut self.publisher, now);
@@ -366,7 +366,7 @@ impl Crew {
         };
         job.note.held_up_by = self.held_up_by.take();
         self.pulses[1].beat(now, STEP_NS);
-        match machine.takes(Part::Plan, latch.id, now) {
+        match machine.takes(RunPart::Plan, latch.id, now) {
             Takes::Ns(ns) => {
                 let time = *self.times.latest().0;
                 let snapshot = self.reader.latest().0;
@@ -394,7 +394,13 @@ impl Crew {
         self.packing = Packing::Waits { until: Some(now.plus_ns(limit_ns as i64)), limit_ns };
     }
 
-    fn pack<M: Machine>(&mut self, now: HostTime, facts: &Arc<Facts>, machine: &mut M, line: &mut Line) {
+    fn pack<M: Machine>(
+        &mut self,
+        now: HostTime,
+        facts: &Arc<Facts>,
+        machine: &mut M,
+        line: &mut SteppedLink,
+    ) {
         match std::mem::replace(&mut self.packing, Packing::Gone) {
             Packing::Packs { at, mut job } if at <= now => {
                 job.note.timeline.packed_at = now;
@@ -441,7 +447,7 @@ impl Crew {
             }
             crate::pack::spare(&mut job, &mut self.eyes);
         }
-        match machine.takes(Part::Pack, frame, now) {
+        match machine.takes(RunPart::Pack, frame, now) {
             Takes::Ns(ns) => self.packing = Packing::Packs { at: now.plus_ns(ns), job },
             Takes::Forever => {}
             Takes::Panics => self.panicked = Some("pack"),

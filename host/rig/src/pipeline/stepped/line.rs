@@ -1,7 +1,7 @@
 //! The link's part: sends the frames of the current crew, then ends the light.
 
-use super::crew::Crew;
-use super::{is_lit, Machine, Part, SentFrame, Takes, NEVER};
+use super::crew::SteppedCrew;
+use super::{is_lit, Machine, RunPart, SentFrame, Takes, NEVER};
 use crate::engine::error::PipelineError;
 use crate::engine::facts::Facts;
 use crate::engine::link::{LinkStage, Offer};
@@ -41,7 +41,7 @@ enum Doing {
 }
 
 /// See the module's documentation.
-pub(super) struct Line {
+pub(super) struct SteppedLink {
     pub(super) stage: LinkStage<Real>,
     pub(super) pulse: Pulse,
     jobs: VecDeque<FrameJob>,
@@ -52,7 +52,7 @@ pub(super) struct Line {
     lit: Vec<bool>,
 }
 
-impl Line {
+impl SteppedLink {
     pub(super) fn new(stage: LinkStage<Real>, notes: NoteSender, now: HostTime) -> Self {
         Self {
             stage,
@@ -98,7 +98,7 @@ impl Line {
         facts: &Facts,
         machine: &mut M,
         medium: &mut dyn Transport,
-        crew: Option<&mut Crew>,
+        crew: Option<&mut SteppedCrew>,
     ) {
         match std::mem::replace(&mut self.doing, Doing::Over) {
             Doing::Waits { .. } => self.turn(now, facts, machine, medium, crew),
@@ -117,7 +117,7 @@ impl Line {
         facts: &Facts,
         machine: &mut M,
         medium: &mut dyn Transport,
-        crew: Option<&mut Crew>,
+        crew: Option<&mut SteppedCrew>,
     ) {
         let is_finished = self.jobs.is_empty() && crew.as_ref().is_none_or(|crew| crew.is_finished());
         if facts.monitor.stop_requested() || is_finished && facts.is_complete.load(Ordering::Acquire) {
@@ -125,7 +125,7 @@ impl Line {
         }
         self.pulse.beat(now, self.stage.expected_ns(STEP_NS));
         let frame = self.jobs.front().map_or(0, |job| job.note.plan.id.0);
-        match machine.takes(Part::Link, frame, now) {
+        match machine.takes(RunPart::Link, frame, now) {
             Takes::Ns(ns) => match self.jobs.pop_front() {
                 Some(job) => self.doing = Doing::Busy { at: now.plus_ns(ns), job },
                 None => {
@@ -148,7 +148,7 @@ impl Line {
         mut job: FrameJob,
         machine: &mut M,
         medium: &mut dyn Transport,
-        crew: Option<&mut Crew>,
+        crew: Option<&mut SteppedCrew>,
     ) {
         self.pulse.beat(now, self.stage.expected_ns(STEP_NS));
         let FrameJob { note, memory } = &mut job;
@@ -182,7 +182,7 @@ impl Line {
         self.doing = Doing::Waits { at: now };
     }
 
-    fn settle(&mut self, mut job: FrameJob, now: HostTime, crew: Option<&mut Crew>) {
+    fn settle(&mut self, mut job: FrameJob, now: HostTime, crew: Option<&mut SteppedCrew>) {
         if let Some(notes) = &mut self.notes {
             job.note = notes.exchange(job.note);
         }
@@ -192,14 +192,20 @@ impl Line {
     }
 
     /// Ends the light, and then counts the frames that are still in flight.
-    fn end(&mut self, now: HostTime, last: HostTime, medium: &mut dyn Transport, crew: Option<&mut Crew>) {
+    fn end(
+        &mut self,
+        now: HostTime,
+        last: HostTime,
+        medium: &mut dyn Transport,
+        crew: Option<&mut SteppedCrew>,
+    ) {
         self.pulse.beat(now, STEP_NS);
         if let Some(at) = self.stage.end(now, last, medium) {
             self.doing = Doing::Ends { at, last };
             return;
         }
         let mut left: Vec<_> = self.jobs.drain(..).collect();
-        left.extend(crew.into_iter().flat_map(Crew::take_under_way));
+        left.extend(crew.into_iter().flat_map(SteppedCrew::take_under_way));
         for mut job in left {
             job.note.fate = Fate::Stopped;
             self.settle(job, now, None);

@@ -19,7 +19,7 @@ use crate::engine::keeper::LinkKeeper;
 use crate::engine::link::LinkStage;
 use crate::engine::options::RunOptions;
 use crate::engine::pulse::Pulse;
-use crate::engine::supervision::{Irreplaceable, Making, Remake, Supervision, Verdict};
+use crate::engine::supervision::{CrewVerdict, Irreplaceable, Making, Remake, Supervision};
 use crate::light::collector::{Collector, Inbox};
 use crate::light::notes::note_channel;
 use crate::light::recorder::light_channel;
@@ -30,14 +30,14 @@ use crate::telemetry::monitor::RunMonitor;
 use crate::telemetry::projector::ProjectorReport;
 use crate::telemetry::report::Report;
 use crate::tracks::SeenBodies;
-use crew::Crew;
+use crew::SteppedCrew;
 use dpm_device::link::HostLink;
 use dpm_device::time::{DeviceTicks, HostTime};
 use dpm_device::tracker::Tracker;
 use dpm_device::transport::Transport;
 use dpm_render::gpu::GpuError;
 use glam::DAffine3;
-use line::Line;
+use line::SteppedLink;
 pub use orders::{SteppedOrders, StoredOrder};
 use std::sync::Arc;
 
@@ -54,7 +54,7 @@ const COLLECT_WITHIN_NS: i64 = 5_000_000_000;
 
 /// The parts of a run that a [`Machine`] gives time to.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash)]
-pub enum Part {
+pub enum RunPart {
     /// From samples to tracks.
     Tracking,
     /// From tracks to the poses of a frame.
@@ -123,7 +123,7 @@ pub struct SentFrame<'a> {
 /// The machine and the devices beneath a run.
 pub trait Machine {
     /// How long the next step of `part` takes, which works on `frame` (0 where there is none).
-    fn takes(&mut self, part: Part, frame: u64, now: HostTime) -> Takes;
+    fn takes(&mut self, part: RunPart, frame: u64, now: HostTime) -> Takes;
 
     /// What the GPU does with `frame`, which it begins at `now`.
     fn renders(&mut self, frame: u64, now: HostTime) -> GpuWork;
@@ -164,7 +164,7 @@ enum Phase {
         at: HostTime,
         frame_ns: i64,
     },
-    Runs(Box<Running>),
+    Runs(Box<LinkedRun>),
     Over(Option<Box<SteppedEnd>>),
 }
 
@@ -178,16 +178,16 @@ pub struct SteppedRun<M> {
 }
 
 /// The parts of a run whose link is up.
-struct Running {
+struct LinkedRun {
     facts: Arc<Facts>,
     /// The projector's clock as the handshake found it.
     time: LinkTime,
-    crew: Option<Crew>,
+    crew: Option<SteppedCrew>,
     /// A new crew is being made: when it is ready, and what comes of it.
     making: Option<(HostTime, Result<i64, GpuError>)>,
     /// The bodies that any crew has seen.
     seen: Arc<SeenBodies>,
-    line: Line,
+    line: SteppedLink,
     mind: Supervision,
     supervised_at: HostTime,
     look_at: HostTime,
@@ -254,7 +254,7 @@ impl<M: Machine> SteppedRun<M> {
     /// What the tracker's client says of itself; empty before the link is up.
     pub fn tracker_status(&self) -> String {
         match &self.phase {
-            Phase::Runs(run) => run.crew.as_ref().map_or(String::new(), Crew::tracker_status),
+            Phase::Runs(run) => run.crew.as_ref().map_or(String::new(), SteppedCrew::tracker_status),
             _ => String::new(),
         }
     }
@@ -262,7 +262,7 @@ impl<M: Machine> SteppedRun<M> {
     /// Notes that wait between the parts: those that circulate, and frames in flight. Both are bounded.
     pub fn in_flight(&self) -> usize {
         match &self.phase {
-            Phase::Runs(run) => run.crew.as_ref().map_or(0, Crew::in_flight),
+            Phase::Runs(run) => run.crew.as_ref().map_or(0, SteppedCrew::in_flight),
             _ => 0,
         }
     }
@@ -348,12 +348,12 @@ impl<M: Machine> SteppedRun<M> {
         match connecting.step(now, &mut link, self.medium.as_mut(), &self.monitor, stop) {
             Err(e) => Self::failed(e.into()),
             Ok(None) => Phase::Connects { connecting, link, at: now.plus_ns(CONNECT_STEP_NS), frame_ns },
-            Ok(Some(time)) => Phase::Runs(Box::new(Running::new(self, *link, time, frame_ns, now))),
+            Ok(Some(time)) => Phase::Runs(Box::new(LinkedRun::new(self, *link, time, frame_ns, now))),
         }
     }
 }
 
-impl Running {
+impl LinkedRun {
     fn new<M: Machine>(
         run: &mut SteppedRun<M>,
         link: HostLink,
@@ -370,11 +370,11 @@ impl Running {
         let told = (lights_in.notes, rig.config.projector.light_delay_ns());
         let keeper = LinkKeeper::new(time, &link, rig.bodies.len(), Some(told));
         let stage = LinkStage::new(facts.clone(), link, keeper, lead);
-        let mut line = Line::new(stage, notes_in, now);
+        let mut line = SteppedLink::new(stage, notes_in, now);
         let tracker = run.machine.opens_tracker(now);
         let seen = Arc::new(SeenBodies::new(rig.tracked_count()));
         let parts = CrewParts::stepped(&rig, tracker, options.in_flight, frame_ns).remembering(&seen);
-        let crew = Crew::new(&facts, parts, time, &mut line, now);
+        let crew = SteppedCrew::new(&facts, parts, time, &mut line, now);
         Self {
             mind: Supervision::new(facts.clone(), |_| None),
             supervised_at: now,
@@ -395,7 +395,7 @@ impl Running {
     }
 
     fn due(&self) -> HostTime {
-        let crew = self.crew.as_ref().map_or(NEVER, Crew::due);
+        let crew = self.crew.as_ref().map_or(NEVER, SteppedCrew::due);
         crew.min(self.line.due()).min(self.look_at).min(self.collect_at)
     }
 
@@ -415,7 +415,7 @@ impl Running {
     }
 
     fn collect<M: Machine>(&mut self, now: HostTime, machine: &mut M) {
-        self.collect_at = match machine.takes(Part::Collector, 0, now) {
+        self.collect_at = match machine.takes(RunPart::Collector, 0, now) {
             Takes::Ns(ns) => now.plus_ns(COLLECT_NS + ns),
             Takes::Forever => NEVER,
             Takes::Panics => {
@@ -453,8 +453,8 @@ impl Running {
         let Some(crew) = &mut self.crew else { return self.remake(now, machine) };
         let Some(trouble) = crew.trouble(now, step_ns) else { return self.mind.is_well(now) };
         match self.mind.judge(trouble, now) {
-            Verdict::End => crew.ends(),
-            Verdict::Abandon { remake } => {
+            CrewVerdict::End => crew.ends(),
+            CrewVerdict::Abandon { remake } => {
                 self.line.abandoned();
                 self.crew = None;
                 self.making = remake.map(|remake| {
@@ -481,7 +481,7 @@ impl Running {
                 let parts =
                     CrewParts::stepped(&self.facts.rig, tracker, self.facts.options.in_flight, frame_ns)
                         .remembering(&self.seen);
-                self.crew = Some(Crew::new(&self.facts, parts, self.time, &mut self.line, now));
+                self.crew = Some(SteppedCrew::new(&self.facts, parts, self.time, &mut self.line, now));
                 self.mind.is_remade();
             }
         }

@@ -1,7 +1,7 @@
 //! Orders that are written down without a thread: whoever steps them says how long the disk takes.
 
 use crate::config::Restart;
-use crate::control::orders::{Desk, KeepResult, OrderOnItsWay, Ticket};
+use crate::control::orders::{KeepResult, OrderDesk, OrderOnItsWay, Ticket};
 use crate::order::Order;
 use crate::standing::{standing_in_folder, By, Identity, OrderFile, Stands, StateFolder};
 use crate::telemetry::monitor::RunMonitor;
@@ -21,7 +21,7 @@ pub enum StoredOrder {
 
 /// The orders of one process.
 pub struct SteppedOrders {
-    desk: Desk,
+    desk: OrderDesk,
     file: OrderFile,
     keeps: bool,
     writes: Option<(HostTime, OrderOnItsWay)>,
@@ -45,7 +45,7 @@ impl SteppedOrders {
             return Err(e.to_string());
         }
         monitor.hold_devices(file.by_serial_number());
-        let desk = Desk::new(monitor, stands.as_ref(), file.path());
+        let desk = OrderDesk::new(monitor, stands.as_ref(), file.path());
         Ok(Self { desk, file, keeps: true, writes: None })
     }
 

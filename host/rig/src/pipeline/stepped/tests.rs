@@ -19,7 +19,7 @@ const ALONE_NS: i64 = 280_000;
 enum Strikes {
     Nothing,
     /// A thread gets no core.
-    Thread(Part),
+    Thread(RunPart),
     /// Another program streams through memory: all stages are four times slower.
     Memory,
     /// A cable that carries a frame in seven tenths of a slot, and holds two more, moves nothing for 60 ms.
@@ -27,7 +27,7 @@ enum Strikes {
 }
 
 /// Such a cable. Replies pass it at once.
-struct Cable {
+struct SteppedCable {
     inner: Direct<EmulatedProjector>,
     frame_ns: i64,
     stops_at: HostTime,
@@ -40,7 +40,7 @@ const STOPPED_NS: i64 = 60 * MS;
 /// Frames that find room.
 const ROOM: usize = 3;
 
-impl Transport for Cable {
+impl Transport for SteppedCable {
     fn send(&mut self, now: HostTime, lane: Lane, packets: &[Packet<'_>]) -> Result<(), SendError> {
         if lane == Lane::Control {
             return self.inner.send(now, lane, packets);
@@ -119,28 +119,28 @@ impl CacheMachine {
 }
 
 impl Machine for CacheMachine {
-    fn takes(&mut self, part: Part, frame: u64, now: HostTime) -> Takes {
+    fn takes(&mut self, part: RunPart, frame: u64, now: HostTime) -> Takes {
         // A link that waits for a frame is woken by it.
-        let works = part != Part::Link || frame > 0;
+        let works = part != RunPart::Link || frame > 0;
         if self.strikes == Strikes::Thread(part) && works && !self.has_struck && now >= STRIKES_AT {
             self.has_struck = true;
             return Takes::Ns(STRUCK_NS);
         }
         Takes::Ns(match part {
-            Part::Tracking => 10_000,
-            Part::Plan => {
+            RunPart::Tracking => 10_000,
+            RunPart::Plan => {
                 self.newest[0] = frame;
                 self.planned[frame as usize % 64] = now;
                 20_000
             }
-            Part::Pack => self.stage_ns(now),
+            RunPart::Pack => self.stage_ns(now),
             // It looks for frames more often than there are any.
-            Part::Link if frame == 0 => 1_000,
-            Part::Link => {
+            RunPart::Link if frame == 0 => 1_000,
+            RunPart::Link => {
                 self.newest[1] = frame;
                 self.stage_ns(now)
             }
-            Part::Collector => self.collector_ns,
+            RunPart::Collector => self.collector_ns,
         })
     }
 
@@ -196,7 +196,7 @@ fn run_of(
     let medium: Box<dyn Transport> = match strikes {
         Strikes::Cable => {
             let frame_ns = rig.rate().slot_len_ns(0) * 7 / 10;
-            Box::new(Cable { inner, frame_ns, stops_at: STRIKES_AT, holds: VecDeque::new() })
+            Box::new(SteppedCable { inner, frame_ns, stops_at: STRIKES_AT, holds: VecDeque::new() })
         }
         _ => Box::new(inner),
     };
@@ -255,22 +255,22 @@ fn returns_after(strikes: Strikes) {
 
 #[test]
 fn the_good_state_returns_after_a_stall_of_tracking() {
-    returns_after(Strikes::Thread(Part::Tracking));
+    returns_after(Strikes::Thread(RunPart::Tracking));
 }
 
 #[test]
 fn the_good_state_returns_after_a_stall_of_planning() {
-    returns_after(Strikes::Thread(Part::Plan));
+    returns_after(Strikes::Thread(RunPart::Plan));
 }
 
 #[test]
 fn the_good_state_returns_after_a_stall_of_packing() {
-    returns_after(Strikes::Thread(Part::Pack));
+    returns_after(Strikes::Thread(RunPart::Pack));
 }
 
 #[test]
 fn the_good_state_returns_after_a_stall_of_the_link() {
-    returns_after(Strikes::Thread(Part::Link));
+    returns_after(Strikes::Thread(RunPart::Link));
 }
 
 #[test]

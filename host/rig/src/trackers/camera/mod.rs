@@ -13,7 +13,7 @@ use dpm_camera::{
     examine_source, motion_jpeg_grey, open_source, CameraDoubt, CameraLook, CameraTracker, FinderSetup,
     Markings, PictureRequest, PictureSource, TagPlace, TAGS,
 };
-use dpm_common::keys::read::{refuse, Reader};
+use dpm_common::keys::read::{refuse, KeyReader};
 use dpm_device::picture_stream::{PictureHeader, HEADER_BYTES};
 use dpm_device::planes::Raster;
 use dpm_device::time::HostClock;
@@ -61,7 +61,7 @@ impl TrackerKeys for CameraTrackerConfig {
         "does the camera see the tags or markers sharp and whole, have they the numbers of tracker.tags, and is tracker.device right?"
     }
 
-    fn check(&self, reader: &mut Reader) {
+    fn check(&self, reader: &mut KeyReader) {
         let mut seen = std::collections::BTreeSet::new();
         for (i, tag) in self.tags.iter().enumerate() {
             let key = format!("tracker.tags.{i}");

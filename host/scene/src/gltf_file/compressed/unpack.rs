@@ -27,7 +27,7 @@ pub(in super::super) fn decompress(
     cancel: &Cancel,
 ) -> Result<(), SceneError> {
     let used = buffers.iter().map(|b| b.len() as u64).sum();
-    let mut room = Room { used, limit: limits.bytes.min(largest_piece(used)) };
+    let mut room = BytesLeft { used, limit: limits.bytes.min(largest_piece(used)) };
     for (view, bytes) in meshopt_views(tree, buffers, limits, &mut room, cancel)? {
         let plain = &mut list_mut(tree, "bufferViews")[view];
         plain["buffer"] = json!(buffers.len());
@@ -42,12 +42,12 @@ pub(in super::super) fn decompress(
 }
 
 /// The bytes that may still be made.
-struct Room {
+struct BytesLeft {
     used: u64,
     limit: u64,
 }
 
-impl Room {
+impl BytesLeft {
     fn take(&mut self, bytes: u64) -> Result<(), SceneError> {
         self.used = self.used.saturating_add(bytes);
         let what = "the size of all buffers in bytes, decompressed,";
@@ -60,7 +60,7 @@ fn meshopt_views(
     tree: &Value,
     buffers: &[Vec<u8>],
     limits: &Limits,
-    room: &mut Room,
+    room: &mut BytesLeft,
     cancel: &Cancel,
 ) -> Result<Vec<(usize, Vec<u8>)>, SceneError> {
     let root = Item::new(tree, "document".into())?;
@@ -78,7 +78,7 @@ fn meshopt_views(
 }
 
 /// The plain bytes of a buffer view with the extension `item`.
-fn meshopt_bytes(item: &Item, buffers: &[Vec<u8>], room: &mut Room) -> Result<Vec<u8>, SceneError> {
+fn meshopt_bytes(item: &Item, buffers: &[Vec<u8>], room: &mut BytesLeft) -> Result<Vec<u8>, SceneError> {
     let needed = |key: &str| item.whole(key)?.ok_or_else(|| item.error(format!("has no '{key}'")));
     let source = bytes_of(item, buffers)?;
     let (count, stride) = (needed("count")?, needed("byteStride")?);
@@ -180,7 +180,7 @@ fn draco_primitives(
     tree: &Value,
     buffers: &[Vec<u8>],
     limits: &Limits,
-    room: &mut Room,
+    room: &mut BytesLeft,
     cancel: &Cancel,
 ) -> Result<Vec<Plain>, SceneError> {
     let root = Item::new(tree, "document".into())?;
@@ -213,7 +213,7 @@ type Decoded = (Vec<(String, Numbers)>, Option<Numbers>);
 
 impl Source<'_> {
     /// What the accessors of `attributes` promise, and how much the decoder may make.
-    fn contract(&self, attributes: &Item, room: &Room) -> Result<DracoPrimitiveContract, SceneError> {
+    fn contract(&self, attributes: &Item, room: &BytesLeft) -> Result<DracoPrimitiveContract, SceneError> {
         let limits = DecodeLimits::default()
             .with_max_points(3 * self.limits.triangles)
             .with_max_faces(self.limits.triangles)
@@ -228,7 +228,7 @@ impl Source<'_> {
     }
 
     /// Decodes the primitive `item`.
-    fn decode(&self, item: &Item, extension: &Item, room: &mut Room) -> Result<Decoded, SceneError> {
+    fn decode(&self, item: &Item, extension: &Item, room: &mut BytesLeft) -> Result<Decoded, SceneError> {
         let attributes = item.object("attributes")?.ok_or_else(|| item.error("has no 'attributes'"))?;
         let own = |object: &Item, key: &str| object.index(key, self.accessors.len(), "accessor");
         // A file may hold the same numbers uncompressed, for programs without Draco.

@@ -7,9 +7,9 @@ use glam::DAffine3;
 use gltf::json::mesh::Semantic;
 use gltf::json::validation::Checked;
 
-use super::super::super::deforming::{MorphTarget, Place, Skeleton, SkeletonNode};
+use super::super::super::deforming::{MorphTarget, NodePlace, Skeleton, SkeletonNode};
 use super::super::super::mesh::DropCounts;
-use super::super::super::part_motion::Track;
+use super::super::super::part_motion::ValueTrack;
 use super::super::super::{DeformingMesh, SceneError, TriangleMesh};
 use super::super::deform::{Pose, Skin};
 use super::{decomposed, local_transform, Gatherer, Group, Source};
@@ -118,9 +118,10 @@ impl Gatherer<'_> {
     }
 
     /// How much each morph target of a mesh counts at a node.
-    fn weights(&self, node: usize, mesh: usize) -> Vec<Track<f64>> {
+    fn weights(&self, node: usize, mesh: usize) -> Vec<ValueTrack<f64>> {
         let animated = self.source.animation.nodes.get(&node).and_then(|channels| channels.weights.clone());
-        let at_rest = || self.source.deformations.weights(node, mesh).iter().map(|w| Track::Constant(*w));
+        let at_rest =
+            || self.source.deformations.weights(node, mesh).iter().map(|w| ValueTrack::Constant(*w));
         animated.unwrap_or_else(|| at_rest().collect())
     }
 
@@ -153,7 +154,7 @@ impl Gatherer<'_> {
                 let body_from_world = claim.map_or(DAffine3::IDENTITY, |c| self.rest[c].inverse());
                 nodes.push(SkeletonNode {
                     above: None,
-                    place: Place::Fixed(body_from_world * self.source.world),
+                    place: NodePlace::Fixed(body_from_world * self.source.world),
                 });
                 break nodes.len() - 1;
             };
@@ -165,7 +166,7 @@ impl Gatherer<'_> {
                     return Err("a joint lies in another body");
                 }
                 let body_from_node = self.rest[c].inverse() * self.at_rest.world_from_node[at];
-                nodes.push(SkeletonNode { above: None, place: Place::Fixed(body_from_node) });
+                nodes.push(SkeletonNode { above: None, place: NodePlace::Fixed(body_from_node) });
                 known.insert(at, nodes.len() - 1);
                 break nodes.len() - 1;
             }
@@ -184,17 +185,17 @@ impl Gatherer<'_> {
     }
 
     /// Where a node lies in the one above it.
-    fn place_of(&self, index: usize) -> Place {
+    fn place_of(&self, index: usize) -> NodePlace {
         let Source { document, animation, .. } = *self.source;
-        let Some(node) = document.nodes().nth(index) else { return Place::Fixed(DAffine3::IDENTITY) };
+        let Some(node) = document.nodes().nth(index) else { return NodePlace::Fixed(DAffine3::IDENTITY) };
         let channels = animation.nodes.get(&index);
         match channels.filter(|c| c.moves() || c.resizes()).zip(decomposed(&node)) {
-            Some((channels, (translation, rotation, scale))) => Place::Moving {
-                translation: channels.translation.clone().unwrap_or(Track::Constant(translation)),
-                rotation: channels.rotation.clone().unwrap_or(Track::Constant(rotation)),
-                scale: channels.scale.clone().unwrap_or(Track::Constant(scale)),
+            Some((channels, (translation, rotation, scale))) => NodePlace::Moving {
+                translation: channels.translation.clone().unwrap_or(ValueTrack::Constant(translation)),
+                rotation: channels.rotation.clone().unwrap_or(ValueTrack::Constant(rotation)),
+                scale: channels.scale.clone().unwrap_or(ValueTrack::Constant(scale)),
             },
-            None => Place::Fixed(local_transform(&node, channels)),
+            None => NodePlace::Fixed(local_transform(&node, channels)),
         }
     }
 

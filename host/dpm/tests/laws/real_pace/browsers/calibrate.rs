@@ -5,7 +5,7 @@
 
 use crate::browser;
 use crate::browser::{Browser, PATIENCE};
-use crate::cli_common::{code, dpm, err, out, own_folder, start, Folder};
+use crate::cli_common::{code, dpm, err, out, own_folder, start, TestFolder};
 use crate::link_common::{raster, served_time, Projector, PtyProjector};
 use hil_mock::projector::MockConfig;
 use std::net::TcpListener;
@@ -16,7 +16,7 @@ const TRIAL: &str = "version = 1\n[wand]\ntip = [0.01, -0.005, 0.12]\ntip_sigma_
                      date = \"2026-03-04T05:06:07Z\"\ndevice = \"pen\"\ndata = \"900 poses\"\ncommit = \"0123456789ab\"\n";
 
 /// A rig with the projector, a tracker that does not answer, and a body whose name needs quotes in a shell.
-fn rig(folder: &Folder, projector: &PtyProjector) -> String {
+fn rig(folder: &TestFolder, projector: &PtyProjector) -> String {
     let text = format!(
         "[projector]\nwidth = {}\nheight = {}\nframe_rate = 20\nplanes = 8\nbackend = {}\n[safety]\nwatchdog_ms = 500\n\
          [tracker]\nkind = \"natnet\"\nserver = \"127.0.0.1\"\nlocal = \"127.0.0.1\"\ncommand_port = 9\n\
@@ -80,7 +80,7 @@ fn light_and_dark(browser: &mut Browser, projector: &PtyProjector) {
 }
 
 /// What is measured waits for a decision, and no step begins before it.
-fn decide(browser: &mut Browser, folder: &Folder, pictures: &Path) {
+fn decide(browser: &mut Browser, folder: &TestFolder, pictures: &Path) {
     folder.write("calibration.toml.trial", TRIAL);
     browser.wait("question", "!document.getElementById('deciding').hidden");
     assert_eq!(text_of(browser, "#proposed dd"), "new: the tip is known to 0.10 mm");
@@ -104,7 +104,7 @@ fn the_page_leads_through_a_calibration() {
     let program = &browser::installed();
     let pictures = PathBuf::from(env!("CARGO_TARGET_TMPDIR")).join("calibration");
     std::fs::create_dir_all(&pictures).unwrap();
-    let folder = Folder::new("calibration");
+    let folder = TestFolder::new("calibration");
     let projector = PtyProjector::new("calibration", MockConfig::new(raster()));
     let rig = rig(&folder, &projector);
     let address = TcpListener::bind("127.0.0.1:0").unwrap().local_addr().unwrap().to_string();

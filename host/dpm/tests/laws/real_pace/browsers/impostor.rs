@@ -11,7 +11,7 @@ use std::sync::{Arc, Mutex};
 use std::thread::JoinHandle;
 use std::time::{Duration, Instant};
 
-fn rig(address: &str) -> cli_common::Running {
+fn rig(address: &str) -> cli_common::ChildProgram {
     let page = format!("--page={address}");
     let args = ["demo", "--raster", "64x48", "--pace", "real", "--set", "run.frames=0", "--set"];
     let mut rig = start_with(&[args.as_slice(), &["output.images=false", &page]].concat(), &[]);

@@ -12,7 +12,7 @@ use std::path::PathBuf;
 use std::time::{Duration, Instant};
 
 /// A rig on software Vulkan, with its page at `address`.
-fn rig(address: &str) -> cli_common::Running {
+fn rig(address: &str) -> cli_common::ChildProgram {
     let page = format!("--page={address}");
     let args = ["demo", "--raster", "160x120", "--pace", "real", "--set", "run.frames=0", "--set"];
     start_with(&[args.as_slice(), &["output.images=false", &page]].concat(), &[])

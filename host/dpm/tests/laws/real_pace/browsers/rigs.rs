@@ -4,7 +4,7 @@
 
 use crate::browser;
 use crate::browser::{Browser, PATIENCE};
-use crate::cli_common::{code, dpm, err, own_folder, start, start_with, Running};
+use crate::cli_common::{code, dpm, err, own_folder, start, start_with, ChildProgram};
 use std::net::TcpListener;
 use std::path::PathBuf;
 
@@ -15,7 +15,7 @@ fn addresses<const N: usize>() -> [String; N] {
 }
 
 /// A rig on software Vulkan, with its page at `address` and a state folder of its own.
-fn rig(address: &str, state: &str) -> Running {
+fn rig(address: &str, state: &str) -> ChildProgram {
     let page = format!("--page={address}");
     let args = ["demo", "--raster", "64x48", "--pace", "real", "--set", "run.frames=0", "--set"];
     let state = own_folder(state);
