@@ -40,6 +40,7 @@ mod image;
 mod outline;
 mod planar;
 mod pose;
+mod several;
 mod sightings;
 mod source;
 mod sources;
@@ -62,5 +63,5 @@ pub use source::{
     SourceKind, SourceOpener,
 };
 pub use sources::{examine_source, open_source};
-pub use tracker::CameraTracker;
+pub use tracker::{CameraTracker, PlacedCamera};
 pub use v4l2::motion_jpeg_grey;

@@ -1,13 +1,17 @@
-//! A camera as a tracker: a thread of its own looks for the bodies in each picture and hands their poses on.
+//! Cameras as a tracker: a thread for each looks for the bodies in each picture and hands their poses on.
 //!
-//! The tracker's space is that of the camera: it looks along -Z with +Y up. A sample is stamped with the middle of the
-//! exposure of the picture's middle row. Nothing of this runs on the way of a frame: `poll` takes what the thread has found.
+//! The tracker's space is that of the first camera: it looks along -Z with +Y up. A sample is stamped with the middle of the
+//! exposure of the picture's middle row. Of several cameras each picture is a sample of its own, with its own covariance, and
+//! the filter joins them ([`SampleJoin`]). Nothing of this runs on the way of a frame: `poll` takes what the threads have
+//! found.
 
 use crate::body::Markings;
 use crate::finder::{sample_of, BodyFinder, FinderSetup};
+use crate::several::SampleJoin;
 use crate::source::{Picture, PictureLosses, PictureSource};
 use dpm_device::time::{HostClock, HostTime};
 use dpm_device::tracker::{SampleGate, Tracker, TrackerError, TrackerSample};
+use glam::DAffine3;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::mpsc::{sync_channel, Receiver, SyncSender, TrySendError};
 use std::sync::Arc;
@@ -42,44 +46,98 @@ struct Work {
     losses: PictureLosses,
 }
 
-/// A camera as a tracker.
-pub struct CameraTracker {
-    messages: Receiver<Message>,
-    gate: SampleGate,
+/// What is known of one camera.
+struct Eye {
     name: String,
     word: String,
     work: Work,
-    over: Arc<AtomicBool>,
     thread: Option<JoinHandle<()>>,
 }
 
+/// A camera of a tracker.
+pub struct PlacedCamera {
+    /// What it is, and what it is to find.
+    pub setup: FinderSetup,
+    /// From its own space to that of the tracker; of the first camera the identity.
+    pub pose: DAffine3,
+    /// Its pictures.
+    pub source: Box<dyn PictureSource>,
+}
+
+/// One or several cameras as a tracker.
+pub struct CameraTracker {
+    messages: Receiver<(usize, Message)>,
+    gate: SampleGate,
+    name: String,
+    eyes: Vec<Eye>,
+    join: SampleJoin,
+    over: Arc<AtomicBool>,
+}
+
 impl CameraTracker {
-    /// Starts the thread, which opens the camera and opens it again after every loss.
+    /// Starts a thread for each camera, which opens it and opens it again after every loss. All setups have the same number of
+    /// bodies.
     ///
     /// # Errors
     /// The system refuses a thread.
-    pub fn start(
-        setup: FinderSetup,
-        source: Box<dyn PictureSource>,
-        clock: Arc<dyn HostClock>,
-    ) -> Result<Self, TrackerError> {
+    pub fn start(cameras: Vec<PlacedCamera>, clock: &Arc<dyn HostClock>) -> Result<Self, TrackerError> {
         let (sender, messages) = sync_channel(MOST_WAITING);
-        let over = Arc::new(AtomicBool::new(false));
-        let (name, gate) = (format!("camera {}", source.name()), SampleGate::new(setup.bodies.len()));
-        let stop = over.clone();
-        let work = move || Watch::new(setup, clock, sender).run(source, &stop);
-        let thread = std::thread::Builder::new().name("dpm-camera".into()).spawn(work);
-        let thread = thread
-            .map_err(|source| TrackerError::Io { context: "a thread for the camera".into(), source })?;
-        let word = "no picture yet".to_owned();
-        Ok(Self { messages, gate, name, word, work: Work::default(), over, thread: Some(thread) })
+        let bodies = cameras.first().map_or(0, |camera| camera.setup.bodies.len());
+        let names: Vec<&str> = cameras.iter().map(|camera| camera.source.name()).collect();
+        let name = format!("camera {}", names.join(" and "));
+        let mut tracker = Self {
+            messages,
+            gate: SampleGate::new(bodies),
+            name,
+            eyes: Vec::new(),
+            join: SampleJoin::new(cameras.iter().map(|camera| camera.pose).collect(), bodies),
+            over: Arc::new(AtomicBool::new(false)),
+        };
+        for (index, PlacedCamera { setup, source, .. }) in cameras.into_iter().enumerate() {
+            let (name, stop) = (source.name().to_owned(), tracker.over.clone());
+            let mut watch = Watch::new(setup, clock.clone(), index, sender.clone());
+            let work = move || watch.run(source, &stop);
+            let thread = std::thread::Builder::new().name("dpm-camera".into()).spawn(work);
+            let thread = thread
+                .map_err(|source| TrackerError::Io { context: "a thread for the camera".into(), source })?;
+            let word = "no picture yet".to_owned();
+            tracker.eyes.push(Eye { name, word, work: Work::default(), thread: Some(thread) });
+        }
+        Ok(tracker)
+    }
+
+    /// A camera has looked at more pictures.
+    fn count(&mut self, camera: usize, work: Work) {
+        let Some(eye) = self.eyes.get_mut(camera) else { return };
+        let before = std::mem::replace(&mut eye.work, work);
+        let (used, damaged) = (work.pictures - before.pictures, work.losses.damaged - before.losses.damaged);
+        let packets = self.gate.packets_mut();
+        packets.received += used + damaged;
+        packets.used += used;
+        packets.malformed += damaged;
+    }
+}
+
+impl Eye {
+    /// What it does, for the operator.
+    fn told(&self) -> String {
+        let Work { pictures, ms, unread, losses } = self.work;
+        let counts = [
+            (losses.lost, "pictures lost on the way"),
+            (losses.damaged, "damaged"),
+            (losses.passed_over, "passed over for a newer one"),
+            (unread, "samples found no room"),
+        ];
+        let counts = counts.iter().filter(|(n, _)| *n > 0).map(|(n, what)| format!(", {n} {what}"));
+        let counts: String = counts.collect();
+        format!("{}; {pictures} pictures, {ms:.1} ms to look at one{counts}", self.word)
     }
 }
 
 impl Drop for CameraTracker {
     fn drop(&mut self) {
         self.over.store(true, Ordering::Relaxed);
-        if let Some(thread) = self.thread.take() {
+        for thread in self.eyes.iter_mut().filter_map(|eye| eye.thread.take()) {
             // Its panic has been printed; the tracker is gone either way.
             let _ = thread.join();
         }
@@ -91,22 +149,15 @@ impl Tracker for CameraTracker {
         let mut count = 0;
         for _ in 0..MOST_WAITING {
             match self.messages.try_recv() {
-                Ok(Message::Sample(sample)) => {
-                    if let Some(sample) = self.gate.admit(&sample) {
+                Ok((camera, Message::Sample(sample))) => {
+                    let joined = self.join.join(camera, sample);
+                    if let Some(sample) = joined.and_then(|sample| self.gate.admit(&sample)) {
                         sink(&sample);
                         count += 1;
                     }
                 }
-                Ok(Message::Word(word)) => self.word = word,
-                Ok(Message::Work(work)) => {
-                    let packets = self.gate.packets_mut();
-                    let (used, damaged) =
-                        (work.pictures - self.work.pictures, work.losses.damaged - self.work.losses.damaged);
-                    packets.received += used + damaged;
-                    packets.used += used;
-                    packets.malformed += damaged;
-                    self.work = work;
-                }
+                Ok((camera, Message::Word(word))) => self.eyes[camera].word = word,
+                Ok((camera, Message::Work(work))) => self.count(camera, work),
                 Err(_) => break,
             }
         }
@@ -118,20 +169,11 @@ impl Tracker for CameraTracker {
     }
 
     fn status(&self) -> String {
-        let Work { pictures, ms, unread, losses } = self.work;
-        let counts = [
-            (losses.lost, "pictures lost on the way"),
-            (losses.damaged, "damaged"),
-            (losses.passed_over, "passed over for a newer one"),
-            (unread, "samples found no room"),
-        ];
-        let counts = counts.iter().filter(|(n, _)| *n > 0).map(|(n, what)| format!(", {n} {what}"));
-        let counts: String = counts.collect();
-        format!(
-            "{}; {pictures} pictures, {ms:.1} ms to look at one{counts}; {}",
-            self.word,
-            self.gate.counters()
-        )
+        let told: Vec<String> = match &self.eyes[..] {
+            [eye] => vec![eye.told()],
+            eyes => eyes.iter().map(|eye| format!("{}: {}", eye.name, eye.told())).collect(),
+        };
+        format!("{}; {}", told.join("; "), self.gate.counters())
     }
 
     fn gate(&self) -> Option<&SampleGate> {
@@ -143,7 +185,9 @@ impl Tracker for CameraTracker {
 struct Watch {
     finder: BodyFinder,
     clock: Arc<dyn HostClock>,
-    sender: SyncSender<Message>,
+    /// Which of the cameras it is.
+    index: usize,
+    sender: SyncSender<(usize, Message)>,
     sequence: u32,
     pictures: u64,
     busy: Duration,
@@ -153,9 +197,24 @@ struct Watch {
 }
 
 impl Watch {
-    fn new(setup: FinderSetup, clock: Arc<dyn HostClock>, sender: SyncSender<Message>) -> Self {
+    fn new(
+        setup: FinderSetup,
+        clock: Arc<dyn HostClock>,
+        index: usize,
+        sender: SyncSender<(usize, Message)>,
+    ) -> Self {
         let finder = BodyFinder::new(setup);
-        Self { finder, clock, sender, sequence: 0, pictures: 0, busy: Duration::ZERO, lost: 0, unread: 0 }
+        Self {
+            finder,
+            clock,
+            index,
+            sender,
+            sequence: 0,
+            pictures: 0,
+            busy: Duration::ZERO,
+            lost: 0,
+            unread: 0,
+        }
     }
 
     fn run(&mut self, mut source: Box<dyn PictureSource>, over: &AtomicBool) {
@@ -213,7 +272,8 @@ impl Watch {
     }
 
     fn hand_on(&mut self, message: Message) {
-        if let Err(TrySendError::Full(Message::Sample(_))) = self.sender.try_send(message) {
+        if let Err(TrySendError::Full((_, Message::Sample(_)))) = self.sender.try_send((self.index, message))
+        {
             self.lost += 1;
         }
     }

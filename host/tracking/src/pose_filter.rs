@@ -24,6 +24,8 @@ pub(crate) const ACQUIRE_SAMPLES: usize = 3;
 /// A quaternion whose norm differs from 1 by more is refused instead of normalised.
 const QUATERNION_TOLERANCE: f64 = 1e-3;
 
+/// Samples that lie closer together are of one instant that several cameras saw, and have no interval, ns.
+const SAME_INSTANT_NS: i64 = 50_000;
 /// A sample stamped later than this after its own arrival is refused: it would make every correct one look old.
 const FUTURE_TOLERANCE_NS: i64 = 1_000_000;
 
@@ -249,6 +251,9 @@ struct SampleRate {
 impl SampleRate {
     fn push(&mut self, at: HostTime) {
         let interval = self.newest.map_or(0, |newest| at.ns_since(newest));
+        if (1..SAME_INSTANT_NS).contains(&interval) {
+            return;
+        }
         if self.newest.is_none() || interval > 0 {
             self.newest = Some(at);
         }

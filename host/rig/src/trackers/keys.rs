@@ -95,10 +95,10 @@ pub trait TrackerKeys: KeyValues {
         None
     }
 
-    /// Looks at the camera of such a tracker for a second or two; `None` for all others.
+    /// Looks at each camera of such a tracker for a second or two; nothing of all others.
     #[cfg(feature = "camera")]
-    fn examine(&self) -> Option<Result<CameraLook, CameraDoubt>> {
-        None
+    fn examine(&self) -> Vec<Result<CameraLook, CameraDoubt>> {
+        Vec::new()
     }
 
     /// What such a camera looks for on a body; `None` for all others.

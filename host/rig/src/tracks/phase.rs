@@ -16,6 +16,8 @@ const LONGEST_GAP: f64 = 500.0;
 /// Stamps that err by more than this, on average, tell no phase: nanoseconds, and the share of a period.
 const UNSTEADY_NS: f64 = 100_000.0;
 const UNSTEADY_SHARE: f64 = 0.1;
+/// Samples of several cameras that lie closer together are of one exposure, nanoseconds.
+const SAME_EXPOSURE_NS: i64 = 50_000;
 /// Step by which the time that samples take is learned, nanoseconds, and the share of samples that exceed it.
 const STEP_NS: f64 = 2_000.0;
 const BEYOND: f64 = 0.2;
@@ -75,7 +77,7 @@ impl SamplePhase {
             return;
         };
         let since = captured_at.ns_since(stamped_at);
-        if since <= 0 {
+        if since < SAME_EXPOSURE_NS {
             return;
         }
         let takes_ns = ready_at.ns_since(captured_at) as f64;

@@ -4,7 +4,9 @@ use crate::stage::{clock, path, until};
 use dpm_device::pose::Pose;
 use dpm_device::time::{FrameRate, HostClock, HostTime};
 use dpm_device::tracker::{BodyKey, Tracker, TrackerSample};
-use dpm_mock::camera::{two_tags, CameraHost, CameraOptics, MarkedBody, MockCamera, MockCameraConfig};
+use dpm_mock::camera::{
+    two_tags, CameraHost, CameraOptics, MarkedBody, MockCamera, MockCameraConfig, PrintedTag,
+};
 use dpm_mock::motion::{Motion, MotionSpec};
 use dpm_rig::config::{Overrides, RigConfig};
 use dpm_rig::trackers::TrackerPlace;
@@ -26,19 +28,33 @@ struct Stage {
     host: CameraHost,
 }
 
+/// Two tags on the front of the body and two on its back.
+fn tags() -> Vec<PrintedTag> {
+    let back = two_tags(1).map(|tag| {
+        let ([x, y, z], [_, s, _, c]) = (tag.place.position_m, tag.place.rotation_xyzw);
+        // Half a turn about y, after the tag's own turn about y.
+        let place = Pose { position_m: [-x, y, -z], rotation_xyzw: [0.0, c, 0.0, -s] };
+        PrintedTag { place, ..tag }
+    });
+    two_tags(0).into_iter().chain(back).collect()
+}
+
 fn stage(faults: &str) -> Stage {
-    let clock = clock();
+    stage_seen_from(Pose { position_m: PLACE, ..Pose::IDENTITY }, HZ, faults, clock())
+}
+
+fn stage_seen_from(pose: Pose, hz: u32, faults: &str, clock: Arc<dyn HostClock>) -> Stage {
     let motion = Motion::new(&MotionSpec::paper_translation(), Pose::IDENTITY).unwrap();
     let config = MockCameraConfig {
         optics: CameraOptics::pinhole(SIZE, 60.0),
-        pose: Pose { position_m: PLACE, ..Pose::IDENTITY },
-        rate: FrameRate::new(HZ, 1).unwrap(),
+        pose,
+        rate: FrameRate::new(hz, 1).unwrap(),
         exposure_ns: EXPOSURE_NS,
         row_ns: ROW_NS,
         faults: faults.parse().unwrap(),
         ..MockCameraConfig::default()
     };
-    let body = MarkedBody { motion: motion.clone(), tags: two_tags(0).to_vec(), markers: vec![] };
+    let body = MarkedBody { motion: motion.clone(), tags: tags(), markers: vec![] };
     let camera = MockCamera::new(config, vec![body]).unwrap();
     let host = CameraHost::start(camera, SocketAddrV4::new(Ipv4Addr::LOCALHOST, 0), clock.clone()).unwrap();
     Stage { clock, motion, host }
@@ -52,19 +68,25 @@ impl Stage {
 
     /// The tracker that a rig file with this camera opens.
     fn tracker(&self, name: &str) -> Box<dyn Tracker> {
-        let tags = two_tags(0).map(|tag| tag.as_toml("hare")).join(", ");
+        self.tracker_with(name, "").unwrap()
+    }
+
+    /// The same with more keys.
+    fn tracker_with(&self, name: &str, more: &str) -> Result<Box<dyn Tracker>, String> {
+        let tags: Vec<String> = tags().iter().map(|tag| tag.as_toml("hare")).collect();
+        let tags = tags.join(", ");
         let text = format!(
             "[real_time]\npace = \"real\"\n[tracker]\nkind = \"camera\"\ndevice = {:?}\nsize = {SIZE:?}\nrate_hz = {HZ}\n\
-             exposure_us = {}\nreadout_us = {}\nview_deg = 60\ntags = [{tags}]\n",
+             exposure_us = {}\nreadout_us = {}\nview_deg = 60\ntags = [{tags}]\n{more}\n",
             path(name).display().to_string(),
             EXPOSURE_NS / 1_000,
             ROW_NS * i64::from(SIZE[1]) / 1_000,
         );
         let config = RigConfig::parse("rig.toml", &text, Path::new(""), &Overrides::default());
-        let config = config.unwrap_or_else(|e| panic!("{e}\n{text}")).tracker;
+        let config = config.map_err(|e| e.to_string())?.tracker;
         let bodies = vec![BodyKey { name: "hare".into(), id: None }];
         let place = TrackerPlace { bodies, motions: vec![], clock: self.clock.clone(), start: HostTime(0) };
-        config.open(place).unwrap()
+        config.open(place).map_err(|e| e.to_string())
     }
 
     /// How far the body was from where a sample says, metres.
@@ -139,4 +161,40 @@ fn a_pulled_plug_and_a_lost_picture_are_told_and_survived() {
     assert!(tracker.status().starts_with("pictures come"), "{}", tracker.status());
     assert_eq!(fake.witness().opened, opened + 1);
     assert!(tracker.gate().unwrap().counters().is_conserved());
+}
+
+/// Two cameras on either side of a body, which do not expose at the same time and each see their own side: the poses of both
+/// are where the body was, in the space of the first, and one goes on where the other is gone.
+#[test]
+fn two_cameras_give_one_track() {
+    let clock = clock();
+    let front = stage_seen_from(Pose { position_m: PLACE, ..Pose::IDENTITY }, HZ, "", clock.clone());
+    let behind = Pose { position_m: [0.1, 0.0, -1.1], rotation_xyzw: [0.0, 1.0, 0.0, 0.0] };
+    // A little slower than it says, so that the two drift against each other.
+    let back = stage_seen_from(behind, HZ - 3, "", clock);
+    let _first = FakeCamera::plug_in(&front.words("front", "card=Front"));
+    let second = FakeCamera::plug_in(&back.words("back", "card=Back stamp=end"));
+    let device = path("back").display().to_string();
+    let other =
+        |place: &str| format!("others = [{{ device = {device:?}, rotation = [0, 1, 0, 0] {place} }}]");
+    let missing = front.tracker_with("front", &other("")).err().expect("a place is needed");
+    assert!(missing.contains("several cameras need their places relative to each other"), "{missing}");
+
+    let mut tracker = front.tracker_with("front", &other(", position = [0.1, 0, -2.3]")).unwrap();
+    let samples = seen(&mut *tracker, &front, 80);
+    let mut errors: Vec<f64> = samples.iter().map(|s| front.error_m(s)).collect();
+    errors.sort_by(f64::total_cmp);
+    assert!(errors[72] < 0.008, "{errors:?}");
+    // Both give their share, and each sample has a number of its own.
+    let span_s = 1e-9 * samples[79].captured_at.ns_since(samples[0].captured_at) as f64;
+    assert!(80.0 / span_s > 1.4 * f64::from(HZ), "80 samples in {span_s} s: {}", tracker.status());
+    assert!(samples.windows(2).all(|two| two[1].captured_at > two[0].captured_at));
+    assert!(tracker.gate().unwrap().counters().is_conserved());
+
+    second.unplug();
+    until("the second camera is gone", || {
+        tracker.poll(front.clock.now(), &mut |_| ()).unwrap();
+        tracker.status().contains("there is no ")
+    });
+    assert_eq!(seen(&mut *tracker, &front, 10).len(), 10, "the first goes on");
 }

@@ -55,11 +55,11 @@ pub(super) struct HeardBody {
 /// What was heard of all bodies, in their order.
 pub(super) type Heard = Vec<HeardBody>;
 
-/// What the camera of a tracker is and what speaks against it, if the tracker looks by one that says so.
+/// What each camera of a tracker is and what speaks against it, if the tracker looks by cameras that say so.
 #[cfg(feature = "camera")]
-pub(super) fn camera(config: &RigConfig) -> Option<Finding> {
+pub(super) fn cameras(config: &RigConfig) -> Vec<Finding> {
     let name = "camera";
-    Some(match config.tracker.examine()? {
+    let findings = config.tracker.examine().into_iter().map(|answer| match answer {
         Err(doubt) => Finding::new(name, Severity::Missing, doubt.found, doubt.remedy),
         Ok(look) if look.doubts.is_empty() => Finding::new(name, Severity::Ok, look.found, ""),
         Ok(look) => {
@@ -68,7 +68,8 @@ pub(super) fn camera(config: &RigConfig) -> Option<Finding> {
             let found = format!("{}; {}", doubts.join("; "), look.found);
             Finding::new(name, Severity::Warning, found, remedies.join("; "))
         }
-    })
+    });
+    findings.collect()
 }
 
 /// Which bodies the tracker reports, and how often. `rig`: the rig of `config`, if its scene could be read. With it what

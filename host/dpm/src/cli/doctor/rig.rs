@@ -43,7 +43,7 @@ pub(super) fn findings(
         Ok(rig) => all.push(scene(rig)),
     }
     #[cfg(feature = "camera")]
-    all.extend(devices::camera(config));
+    all.extend(devices::cameras(config));
     let (tracker, heard) = devices::tracker(config, rig.as_ref().ok());
     all.push(tracker);
     all.extend(devices::beat(config, heard.as_ref()));

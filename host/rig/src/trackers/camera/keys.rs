@@ -35,6 +35,32 @@ section! {
 }
 
 section! {
+    /// Another camera of the same tracker. What it has not of its own is as of the first.
+    pub struct OtherCameraConfig {
+        /// As `tracker.device`.
+        device: String = String::new(), "", NotEmpty;
+        /// Where it stands in the space of the first camera, which looks along -Z with +Y up. Must be given.
+        position: Option<[f64; 3]> = None, "m", Within(-100.0, 100.0);
+        /// Rotations about x, then y, then z, from its own axes to those of the first camera.
+        rotation_deg: [f64; 3] = [0.0; 3], "deg", Within(-360.0, 360.0);
+        /// The rotation as a quaternion x, y, z, w instead; its length does not matter.
+        rotation: Option<[f64; 4]> = None, "", Within(-1e6, 1e6);
+        /// Columns and rows of its pictures.
+        size: Option<[u32; 2]> = None, "px", Within(16, 8192);
+        /// Exposure.
+        exposure_us: Option<u32> = None, "us", Within(1, 1_000_000);
+        /// Gain.
+        gain: Option<u32> = None, "", Within(0, 1_000_000);
+        /// From the exposure of its first row to that of its last.
+        readout_us: Option<u32> = None, "us", Within(0, 1_000_000);
+        /// A calibration file of its lens; a file of the first camera is not its own.
+        calibration: Option<PathBuf> = None, "", NotEmpty;
+        /// Horizontal angle of view without a calibration file.
+        view_deg: f64 = 60.0, "deg", Within(5.0, 170.0);
+    }
+}
+
+section! {
     /// A camera.
     pub struct CameraTrackerConfig {
         /// A camera of this machine through V4L2, by `/dev/video0` or better by its name below `/dev/v4l/by-id`; or
@@ -58,6 +84,8 @@ section! {
         calibration: Option<PathBuf> = None, "", NotEmpty;
         /// Horizontal angle of view of a camera without a calibration file, whose lens then bends nothing.
         view_deg: f64 = 60.0, "deg", Within(5.0, 170.0);
+        /// More cameras that look at the same bodies, each with its place relative to the first.
+        others: Vec<OtherCameraConfig> = Vec::new(), "", Any;
         /// Tags on the bodies.
         tags: Vec<TagConfig> = Vec::new(), "", Any;
         /// Markers on the bodies: at least 4 on a body that has any.

@@ -4,14 +4,14 @@ mod keys;
 mod lens;
 mod mock;
 
-pub use keys::{CameraTrackerConfig, MarkerConfig, TagConfig};
+pub use keys::{CameraTrackerConfig, MarkerConfig, OtherCameraConfig, TagConfig};
 
 use super::keys::{SourceError, TrackerKeys, TrackerPlace};
 use super::kind::{PoseOrigin, TrackerKind};
 use super::transform::{PoseConfig, TrackerTransformConfig};
 use dpm_camera::{
     examine_source, motion_jpeg_grey, open_source, CameraDoubt, CameraLook, CameraTracker, FinderSetup,
-    Markings, PictureRequest, PictureSource, TagPlace, TAGS,
+    Markings, PictureRequest, PictureSource, PlacedCamera, TagPlace, TAGS,
 };
 use dpm_common::keys::read::{refuse, KeyReader};
 use dpm_device::picture_stream::{PictureHeader, HEADER_BYTES};
@@ -19,7 +19,7 @@ use dpm_device::planes::Raster;
 use dpm_device::time::HostClock;
 use dpm_device::tracker::Tracker;
 use dpm_scene::geometry::projector::ProjectorCamera;
-use glam::DVec3;
+use glam::{DAffine3, DVec3};
 use std::path::PathBuf;
 use std::sync::Arc;
 
@@ -54,7 +54,9 @@ impl TrackerKeys for CameraTrackerConfig {
     }
 
     fn place(&self) -> String {
-        format!("the camera {}", self.device)
+        let all: Vec<&str> =
+            std::iter::once(&*self.device).chain(self.others.iter().map(|o| &*o.device)).collect();
+        format!("the camera {}", all.join(" and "))
     }
 
     fn remedy(&self) -> &'static str {
@@ -92,6 +94,26 @@ impl TrackerKeys for CameraTrackerConfig {
                 );
             }
         }
+        for (i, other) in self.others.iter().enumerate() {
+            let key = format!("tracker.others.{i}");
+            if other.position.is_none() {
+                refuse(
+                    reader,
+                    &[&format!("{key}.position")],
+                    "is missing: several cameras need their places relative to each other".into(),
+                    "write where it stands in the space of the first camera, which looks along -Z with +Y up"
+                        .into(),
+                );
+            }
+            if other.place().is_none() {
+                refuse(
+                    reader,
+                    &[&format!("{key}.rotation")],
+                    "is zero".into(),
+                    "write a quaternion x, y, z, w".into(),
+                );
+            }
+        }
         for body in self.bodies() {
             let count = self.markers.iter().filter(|m| m.body == body).count();
             if (1..4).contains(&count) {
@@ -108,7 +130,12 @@ impl TrackerKeys for CameraTrackerConfig {
 
     fn placed(&self, place: &mut dyn FnMut(&mut PathBuf, &str)) -> Option<Arc<dyn TrackerKeys>> {
         let mut keys = self.clone();
-        place(keys.calibration.as_mut()?, "tracker.calibration");
+        if let Some(file) = &mut keys.calibration {
+            place(file, "tracker.calibration");
+        }
+        for file in keys.others.iter_mut().filter_map(|other| other.calibration.as_mut()) {
+            place(file, "tracker.others.calibration");
+        }
         Some(Arc::new(keys))
     }
 
@@ -126,8 +153,8 @@ impl TrackerKeys for CameraTrackerConfig {
         Some(view())
     }
 
-    fn examine(&self) -> Option<Result<CameraLook, CameraDoubt>> {
-        examine_source(&self.device, &self.request())
+    fn examine(&self) -> Vec<Result<CameraLook, CameraDoubt>> {
+        self.cameras().iter().filter_map(|one| examine_source(&one.device, &one.request())).collect()
     }
 
     fn seen_of(&self, body: &str) -> Option<Markings> {
@@ -157,17 +184,47 @@ impl TrackerKeys for CameraTrackerConfig {
                 ));
             }
         }
-        let setup = FinderSetup {
-            camera: lens::camera(self)?,
-            bodies: place.bodies.iter().map(|b| self.markings(&b.name)).collect(),
-            marker_level: self.marker_level,
+        let places = self.others.iter().map(|other| other.place().unwrap_or_default());
+        let places = std::iter::once(DAffine3::IDENTITY).chain(places);
+        let opened = |(one, pose): (CameraTrackerConfig, DAffine3)| {
+            let setup = FinderSetup {
+                camera: lens::camera(&one)?,
+                bodies: place.bodies.iter().map(|b| self.markings(&b.name)).collect(),
+                marker_level: self.marker_level,
+            };
+            Ok(PlacedCamera { setup, pose, source: one.source(&place.clock)? })
         };
-        let source = self.source(&place.clock)?;
-        Ok(Box::new(CameraTracker::start(setup, source, place.clock)?))
+        let cameras = self.cameras().into_iter().zip(places).map(opened);
+        let cameras = cameras.collect::<Result<_, SourceError>>()?;
+        Ok(Box::new(CameraTracker::start(cameras, &place.clock)?))
+    }
+}
+
+impl OtherCameraConfig {
+    /// Its pose in the space of the first camera; `None` if its quaternion is zero.
+    fn place(&self) -> Option<DAffine3> {
+        let position = self.position.unwrap_or_default();
+        PoseConfig { position, rotation_deg: self.rotation_deg, rotation: self.rotation }.to_affine()
     }
 }
 
 impl CameraTrackerConfig {
+    /// The keys of each camera, the first one's first.
+    fn cameras(&self) -> Vec<Self> {
+        let first = Self { others: vec![], ..self.clone() };
+        let others = self.others.iter().map(|other| Self {
+            device: other.device.clone(),
+            size: other.size.unwrap_or(self.size),
+            exposure_us: other.exposure_us.or(self.exposure_us),
+            gain: other.gain.or(self.gain),
+            readout_us: other.readout_us.unwrap_or(self.readout_us),
+            calibration: other.calibration.clone(),
+            view_deg: other.view_deg,
+            ..first.clone()
+        });
+        std::iter::once(first.clone()).chain(others).collect()
+    }
+
     fn source(&self, clock: &Arc<dyn HostClock>) -> Result<Box<dyn PictureSource>, SourceError> {
         open_source(&self.device, &self.request(), clock)
             .map_err(|e| SourceError::of_key("tracker.device", e))
