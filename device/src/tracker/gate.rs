@@ -154,7 +154,9 @@ struct BodyState {
 
 /// The gate for a fixed set of bodies. Allocates only when made.
 pub struct SampleGate {
-    bodies: Vec<BodyState>,
+    /// Of each body, source by source.
+    states: Vec<BodyState>,
+    bodies: usize,
     counters: TrackerCounters,
 }
 
@@ -175,6 +177,12 @@ impl SampleGate {
 
     /// A gate for bodies `0..bodies`.
     pub fn new(bodies: usize) -> Self {
+        Self::of_sources(bodies, 1)
+    }
+
+    /// The same for a tracker of several sources that see the same bodies, such as cameras. Order, numbers and repetitions are
+    /// judged of each source by itself: none is late because another one was faster.
+    pub fn of_sources(bodies: usize, sources: usize) -> Self {
         let fresh = BodyState {
             counters: BodyCounters::default(),
             last: None,
@@ -184,7 +192,7 @@ impl SampleGate {
             equal_run: 0,
             was_moving: false,
         };
-        Self { bodies: vec![fresh; bodies], counters: TrackerCounters::default() }
+        Self { states: vec![fresh; bodies * sources], bodies, counters: TrackerCounters::default() }
     }
 
     /// The counters so far.
@@ -192,9 +200,20 @@ impl SampleGate {
         &self.counters
     }
 
-    /// The counters of `body`; zeros for one that the gate does not have.
+    /// What is known of `body`, of each source; nothing of a body that the gate does not have.
+    fn states_of(&self, body: BodyIndex) -> impl Iterator<Item = &BodyState> {
+        let index = usize::from(body.0);
+        self.states.iter().skip(index).step_by(self.bodies.max(1)).filter(move |_| index < self.bodies)
+    }
+
+    /// The counters of `body`, of all sources together; zeros for one that the gate does not have.
     pub fn body_counters(&self, body: BodyIndex) -> BodyCounters {
-        self.bodies.get(usize::from(body.0)).map_or(BodyCounters::default(), |state| state.counters)
+        self.states_of(body).fold(BodyCounters::default(), |sum, BodyState { counters, .. }| BodyCounters {
+            used: sum.used + counters.used,
+            lost: sum.lost + counters.lost,
+            late: sum.late + counters.late,
+            duplicate: sum.duplicate + counters.duplicate,
+        })
     }
 
     /// The packet counters, for the client in front of this gate.
@@ -214,19 +233,19 @@ impl SampleGate {
         self.counters.samples.unknown_age += 1;
     }
 
-    /// The last sample passed on for `body`.
+    /// The newest sample passed on for `body`.
     pub fn last(&self, body: BodyIndex) -> Option<&TrackerSample> {
-        self.bodies.get(usize::from(body.0))?.last.as_ref()
+        self.states_of(body).filter_map(|state| state.last.as_ref()).max_by_key(|last| last.captured_at)
     }
 
     /// True while `body`, having moved, repeats one pose bit for bit ([`SampleGate::STUCK_RUN`] times or more).
     pub fn is_stuck(&self, body: BodyIndex) -> bool {
-        self.bodies.get(usize::from(body.0)).is_some_and(|b| b.was_moving && b.equal_run >= Self::STUCK_RUN)
+        self.states_of(body).any(|b| b.was_moving && b.equal_run >= Self::STUCK_RUN)
     }
 
     /// Resets order and sequence (the source was reconnected); counters stay.
     pub fn reconnect(&mut self) {
-        for body in &mut self.bodies {
+        for body in &mut self.states {
             *body = BodyState { last: None, late_run: 0, equal_run: 0, was_moving: false, ..*body };
         }
     }
@@ -235,9 +254,16 @@ impl SampleGate {
     /// length. The pose of a sample marked as not tracked is replaced by the last good one, so nobody can use it by
     /// mistake.
     pub fn admit(&mut self, sample: &TrackerSample) -> Option<TrackerSample> {
+        self.admit_from(0, sample)
+    }
+
+    /// The same for a sample of one of several sources.
+    pub fn admit_from(&mut self, source: usize, sample: &TrackerSample) -> Option<TrackerSample> {
         self.counters.samples.received += 1;
         let counters = &mut self.counters;
-        let Some(state) = self.bodies.get_mut(usize::from(sample.body.0)) else {
+        let index = Some(usize::from(sample.body.0)).filter(|body| *body < self.bodies);
+        let state = index.and_then(|body| self.states.get_mut(source * self.bodies + body));
+        let Some(state) = state else {
             counters.samples.unknown_body += 1;
             return None;
         };
@@ -394,6 +420,32 @@ mod tests {
 
     fn feed(gate: &mut SampleGate, samples: impl IntoIterator<Item = TrackerSample>) -> Vec<u32> {
         samples.into_iter().filter_map(|s| gate.admit(&s)).map(|s| s.sequence).collect()
+    }
+
+    /// Two sources see a body at the same instants, one of them is read a picture later, loses one and repeats one: each counts,
+    /// and only what is really missing or doubled is a fault.
+    #[test]
+    fn sources_are_judged_by_themselves() {
+        let mut gate = SampleGate::of_sources(2, 2);
+        let body = |k: i64| TrackerSample { body: BodyIndex(1), ..sample(k) };
+        for k in 1..=20 {
+            assert!(gate.admit_from(0, &body(k)).is_some(), "{k}");
+            assert!(gate.admit_from(1, &body(k - 1)).is_some(), "{k}");
+            if k == 9 {
+                assert!(gate.admit_from(1, &body(k - 1)).is_none());
+            }
+        }
+        assert!(gate.admit_from(1, &body(21)).is_some());
+        let counted = gate.body_counters(BodyIndex(1));
+        assert_eq!(counted, BodyCounters { used: 41, lost: 1, late: 0, duplicate: 1 });
+        assert_eq!(gate.body_counters(BodyIndex(0)), BodyCounters::default());
+        assert_eq!(gate.last(BodyIndex(1)).map(|last| last.sequence), Some(21));
+        assert!(
+            gate.admit_from(2, &body(22)).is_none()
+                && gate.admit_from(0, &TrackerSample { body: BodyIndex(2), ..sample(1) }).is_none()
+        );
+        assert_eq!(gate.counters().samples.unknown_body, 2);
+        assert!(gate.counters().is_conserved());
     }
 
     #[test]

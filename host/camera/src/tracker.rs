@@ -1,8 +1,8 @@
 //! Cameras as a tracker: a thread for each looks for the bodies in each picture and hands their poses on.
 //!
 //! The tracker's space is that of the first camera: it looks along -Z with +Y up. A sample is stamped with the middle of the
-//! exposure of the picture's middle row. Of several cameras each picture is a sample of its own, with its own covariance, and
-//! the filter joins them ([`SampleJoin`]). Nothing of this runs on the way of a frame: `poll` takes what the threads have
+//! exposure of the picture's middle row. Of several cameras each picture is a sample of its own, with its own covariance
+//! ([`SampleJoin`]), and the filter joins them. Nothing of this runs on the way of a frame: `poll` takes what the threads have
 //! found.
 
 use crate::body::Markings;
@@ -87,7 +87,7 @@ impl CameraTracker {
         let name = format!("camera {}", names.join(" and "));
         let mut tracker = Self {
             messages,
-            gate: SampleGate::new(bodies),
+            gate: SampleGate::of_sources(bodies, cameras.len()),
             name,
             eyes: Vec::new(),
             join: SampleJoin::new(cameras.iter().map(|camera| camera.pose).collect(), bodies),
@@ -150,8 +150,8 @@ impl Tracker for CameraTracker {
         for _ in 0..MOST_WAITING {
             match self.messages.try_recv() {
                 Ok((camera, Message::Sample(sample))) => {
-                    let joined = self.join.join(camera, sample);
-                    if let Some(sample) = joined.and_then(|sample| self.gate.admit(&sample)) {
+                    let admitted = self.gate.admit_from(camera, &sample);
+                    if let Some(sample) = admitted.and_then(|sample| self.join.join(camera, sample)) {
                         sink(&sample);
                         count += 1;
                     }

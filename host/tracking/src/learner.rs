@@ -220,8 +220,12 @@ impl<C: Chart> Learner<C> {
         self.base = C::moved(self.base, moved);
         self.now.rungs.iter_mut().for_each(|rung| rung.mean.offset -= moved);
         let (bank, rungs) = (self.now.bank.mean(), self.now.rungs.map(|rung| rung.mean));
-        self.past[self.next] = Some(Past { at_ns, bank, base: self.base, rungs });
-        self.next = (self.next + 1) % KEPT;
+        // Of several samples of one instant the last one is kept, which has all of them in it.
+        let newest = (self.next + KEPT - 1) % KEPT;
+        let is_same = self.past[newest].is_some_and(|past| past.at_ns == at_ns);
+        let slot = if is_same { newest } else { self.next };
+        self.past[slot] = Some(Past { at_ns, bank, base: self.base, rungs });
+        self.next = (slot + 1) % KEPT;
         nis
     }
 

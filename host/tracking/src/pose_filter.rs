@@ -6,7 +6,7 @@
 //! extrapolated across, and a burst of outliers changes nothing.
 
 use super::course::{Continuation, Course};
-use super::imm::{Kinematics, Rotations, Translations};
+use super::imm::{Chart, Covariance, Kinematics, Rotations, Translations};
 use super::learner::Learner;
 use super::noise::NoiseEstimator;
 use super::recall::Recall;
@@ -24,8 +24,6 @@ pub(crate) const ACQUIRE_SAMPLES: usize = 3;
 /// A quaternion whose norm differs from 1 by more is refused instead of normalised.
 const QUATERNION_TOLERANCE: f64 = 1e-3;
 
-/// Samples that lie closer together are of one instant that several cameras saw, and have no interval, ns.
-const SAME_INSTANT_NS: i64 = 50_000;
 /// A sample stamped later than this after its own arrival is refused: it would make every correct one look old.
 const FUTURE_TOLERANCE_NS: i64 = 1_000_000;
 
@@ -84,6 +82,9 @@ pub struct PoseFilterConfig {
     pub lost_after_ns: i64,
     /// A body that moved and then delivers this many identical poses is reported as stuck.
     pub stuck_after: u32,
+    /// Time between two samples of one of several sources that see the same body, ns; 0 for a single source. Samples of the
+    /// newest instant, and older ones by up to this, are used too: they are another source's.
+    pub source_period_ns: i64,
 }
 
 impl Default for PoseFilterConfig {
@@ -103,6 +104,7 @@ impl Default for PoseFilterConfig {
             tracked_for_ns: 10_000_000,
             lost_after_ns: 20_000_000,
             stuck_after: 5,
+            source_period_ns: 0,
         }
     }
 }
@@ -251,9 +253,6 @@ struct SampleRate {
 impl SampleRate {
     fn push(&mut self, at: HostTime) {
         let interval = self.newest.map_or(0, |newest| at.ns_since(newest));
-        if (1..SAME_INSTANT_NS).contains(&interval) {
-            return;
-        }
         if self.newest.is_none() || interval > 0 {
             self.newest = Some(at);
         }
@@ -297,11 +296,17 @@ impl PoseFilter {
     /// Longest gap between two samples that a track survives, ns. However long poses may be predicted, what was seen of an
     /// acceleration before a longer one says nothing of the motion now: the first sample would throw the light ahead.
     fn carried_for_ns(&self) -> i64 {
-        CARRIED_NS.max(HALF_PERIODS_CARRIED * self.rate.period_ns() / 2)
+        CARRIED_NS.max(HALF_PERIODS_CARRIED * self.period_ns() / 2)
+    }
+
+    /// As measured; of several sources not shorter than that of one: between them lie intervals of any length, and any of them
+    /// may see a body alone.
+    fn period_ns(&self) -> i64 {
+        self.rate.period_ns().max(self.config.source_period_ns)
     }
 
     fn tracked_for_ns(&self) -> i64 {
-        let slow = OWN_LATENCY_NS + 2 * self.rate.period_ns();
+        let slow = OWN_LATENCY_NS + 2 * self.period_ns();
         self.config.tracked_for_ns.max(slow).min(self.config.lost_after_ns)
     }
 
@@ -399,6 +404,9 @@ impl PoseFilter {
         let carried_for_ns = self.carried_for_ns();
         if let Some(track) = &mut self.track {
             let gap_ns = z.at.ns_since(track.newest.at);
+            if gap_ns <= 0 && gap_ns > -c.source_period_ns {
+                return self.take_beside(z, [rp, rr]);
+            }
             if gap_ns == 0 {
                 return Verdict::Duplicate;
             }
@@ -441,11 +449,38 @@ impl PoseFilter {
         self.acquire(z, rp, rr)
     }
 
+    /// Uses a sample of another source, no newer than the newest: as if it had been taken then, with the motion since. How badly
+    /// that is known adds to its variance, on the safe side: the errors of place and velocity may go together. The track stays
+    /// at its instant, and the noise, the past and the rate are learned of the others.
+    fn take_beside(&mut self, z: PoseReading, r: [DVec3; 2]) -> Verdict {
+        let c = self.config;
+        let Some(track) = &mut self.track else { return Verdict::OutOfOrder };
+        let (at_ns, h) = (track.newest.at.0, track.newest.at.ns_since(z.at) as f64 * 1e-9);
+        let (position, rp) = brought(&track.position, z.position, r[0], h);
+        let (rotation, rr) = brought(&track.rotation, z.rotation, r[1], h);
+        let slack = 0.25 * h * h;
+        let gate = c.gate_sigmas * c.gate_sigmas;
+        let [slack_p, slack_r] =
+            [c.max_acceleration_m_s2, c.max_angular_acceleration_rad_s2].map(|most| slack * most);
+        let inside = track.position.bank().distance_squared(position, rp, slack_p) <= gate
+            && track.rotation.bank().distance_squared(rotation, rr, slack_r) <= gate;
+        if !inside {
+            return Verdict::SetAside;
+        }
+        self.last_nis =
+            Some([track.position.update(at_ns, position, rp), track.rotation.update(at_ns, rotation, rr)]);
+        take_course(&mut track.course, &track.position, at_ns, position, rp);
+        Verdict::Accepted
+    }
+
     /// Collects samples that agree; the third in a row starts a new track.
     fn acquire(&mut self, z: PoseReading, rp: DVec3, rr: DVec3) -> Verdict {
         let c = self.config;
         if let [.., Some(last)] = self.candidates {
             let gap_ns = z.at.ns_since(last.at);
+            if gap_ns <= 0 && gap_ns > -c.source_period_ns {
+                return Verdict::SetAside;
+            }
             if gap_ns == 0 {
                 return Verdict::Duplicate;
             }
@@ -507,6 +542,17 @@ impl PoseFilter {
         let foretold = (last.position - previous.position) * (h / h0);
         (step - foretold).length() <= c.max_acceleration_m_s2 * h * (h + h0) + noise * (2.0 + 2.0 * h / h0)
     }
+}
+
+/// A sample of `h` >= 0 seconds ago with variances `r`, as it were now by what `learner` has of the motion.
+fn brought<C: Chart>(learner: &Learner<C>, z: C::Point, r: DVec3, h: f64) -> (C::Point, DVec3) {
+    let Kinematics { mean, covariance } = learner.combined();
+    let since = C::between(mean.point_after::<C>(-h), mean.point);
+    let more = covariance.map(|c| {
+        let apart = Covariance { pp: 0.0, pv: c.pv.abs(), pa: c.pa.abs(), va: c.va.abs(), ..c };
+        apart.position_variance_at(h)
+    });
+    (C::moved(z, since), r + DVec3::from_array(more))
 }
 
 /// Shows the course of a position what came, and what the filters make of it.
@@ -572,3 +618,7 @@ fn deviation(variances: DVec3) -> f64 {
 #[cfg(test)]
 #[path = "pose_filter_tests.rs"]
 mod tests;
+
+#[cfg(test)]
+#[path = "source_tests.rs"]
+mod source_tests;

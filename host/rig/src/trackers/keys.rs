@@ -66,6 +66,12 @@ pub trait TrackerKeys: KeyValues {
     /// Expected samples per second; `None` if only the recording knows.
     fn rate_hz(&self) -> Option<u32>;
 
+    /// Time between two samples of one of the tracker's sources that see the same bodies side by side, ns; 0 of a tracker with
+    /// one source.
+    fn source_period_ns(&self) -> i64 {
+        0
+    }
+
     /// From the tracker's coordinates to the world's, and by how many microseconds samples are older than they say. `None`
     /// for a tracker that knows the world.
     fn frame(&self) -> Option<(&TrackerTransformConfig, i64)>;

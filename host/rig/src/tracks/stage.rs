@@ -10,7 +10,7 @@ use crate::tracks::gauges::{AddedCounts, TrackerGauges};
 use dpm_device::time::HostTime;
 use dpm_device::tracker::{BodyIndex, Tracker, TrackerError};
 use dpm_handoff::latest::Publisher;
-use dpm_tracking::{PoseFilterBank, TrackState};
+use dpm_tracking::{PoseFilterBank, PoseFilterConfig, TrackState};
 use glam::DVec3;
 use std::sync::Arc;
 use std::time::Duration;
@@ -86,7 +86,9 @@ fn bank(rig: &Rig) -> PoseFilterBank {
     // Each frame decides how long a body is shown without samples, see [`crate::plan::frame::FramePlan::fill`]. The filter
     // only needs to know how long a track is worth keeping.
     let longest_ms = rig.config.safety.predict_ms.unwrap_or(MAX_PREDICT_MS);
-    PoseFilterBank::new(&vec![rig.config.prediction.to_filter(longest_ms); rig.tracked_count()])
+    let source_period_ns = rig.config.tracker.source_period_ns();
+    let config = PoseFilterConfig { source_period_ns, ..rig.config.prediction.to_filter(longest_ms) };
+    PoseFilterBank::new(&vec![config; rig.tracked_count()])
 }
 
 impl TrackingStage {

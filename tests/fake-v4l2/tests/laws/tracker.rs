@@ -188,8 +188,10 @@ fn two_cameras_give_one_track() {
     // Both give their share, and each sample has a number of its own.
     let span_s = 1e-9 * samples[79].captured_at.ns_since(samples[0].captured_at) as f64;
     assert!(80.0 / span_s > 1.4 * f64::from(HZ), "80 samples in {span_s} s: {}", tracker.status());
-    assert!(samples.windows(2).all(|two| two[1].captured_at > two[0].captured_at));
-    assert!(tracker.gate().unwrap().counters().is_conserved());
+    assert!(samples.windows(2).all(|two| two[1].sequence == two[0].sequence.wrapping_add(1)));
+    // That one of them was overtaken by the other is no fault of either.
+    let counters = tracker.gate().unwrap().counters();
+    assert!(counters.is_conserved() && counters.samples.late + counters.samples.duplicate == 0, "{counters}");
 
     second.unplug();
     until("the second camera is gone", || {

@@ -49,6 +49,14 @@ impl TrackerKeys for CameraTrackerConfig {
         Some(self.rate_hz)
     }
 
+    fn source_period_ns(&self) -> i64 {
+        if self.others.is_empty() {
+            0
+        } else {
+            1_000_000_000 / i64::from(self.rate_hz.max(1))
+        }
+    }
+
     fn frame(&self) -> Option<(&TrackerTransformConfig, i64)> {
         Some((&self.transform, self.latency_us))
     }
