@@ -4,12 +4,14 @@ use super::bodies::{clock_from_now, parse_body, parse_rate};
 use super::say;
 use clap::Args;
 use dpm_device::pose::Pose;
+use dpm_device::time::HostClock;
 use hil_mock::camera::{
     two_tags, BoardHold, CameraHost, CameraOptics, MarkedBody, MockCamera, MockCameraConfig,
 };
 use hil_mock::faults::FaultPlan;
 use std::error::Error;
 use std::net::{Ipv4Addr, SocketAddrV4};
+use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 /// The bodies of the scene that a rig file without one has, moved so that their tags stay in view.
@@ -33,6 +35,9 @@ pub(crate) struct CameraArguments {
     /// Place of the camera, which looks along -Z: X,Y,Z in metres
     #[arg(long, default_value = "0.15,0,1.2")]
     place: String,
+    /// Another camera on the next port: X,Y,Z in metres and its turn to the left in degrees. May be repeated
+    #[arg(long = "other", value_name = "X,Y,Z,DEG", allow_hyphen_values = true, conflicts_with = "board")]
+    others: Vec<String>,
     /// Columns and rows, as 1280x800
     #[arg(long, default_value = "1280x800")]
     size: String,
@@ -132,9 +137,11 @@ pub(super) fn run(arguments: &CameraArguments) -> Result<(), Box<dyn Error>> {
             bodies.push(MarkedBody { motion, tags: own.to_vec(), markers: vec![] });
         }
     }
+    let clock = clock_from_now();
+    let others = serve_others(arguments, &config, &bodies, &clock)?;
     let true_lens = arguments.drawn_lens.map(|_| config.optics.clone());
     let address = SocketAddrV4::new(arguments.bind, arguments.port);
-    let host = CameraHost::start(MockCamera::new(config, bodies)?, address, clock_from_now())
+    let host = CameraHost::start(MockCamera::new(config, bodies)?, address, clock)
         .map_err(|e| super::cannot_serve("a camera", address, &e, "--port"))?;
     say(format_args!("camera on {}; in the rig file:", host.address()));
     say(format_args!("[tracker]\nkind = \"camera\"\ndevice = \"tcp:{}\"", host.address()));
@@ -146,6 +153,7 @@ pub(super) fn run(arguments: &CameraArguments) -> Result<(), Box<dyn Error>> {
         }
         None => say(format_args!("view_deg = {:?}", arguments.view_deg)),
     }
+    say_others(&others);
     if !tags.is_empty() {
         say(format_args!("tags = [\n  {},\n]", tags.join(",\n  ")));
     }
@@ -157,4 +165,39 @@ pub(super) fn run(arguments: &CameraArguments) -> Result<(), Box<dyn Error>> {
         std::thread::sleep(Duration::from_millis(50));
     }
     Err("the network socket failed".into())
+}
+
+/// Serves the further cameras on the ports after the first one's, of one clock; each with its entry of `tracker.others`.
+fn serve_others(
+    arguments: &CameraArguments,
+    first: &MockCameraConfig,
+    bodies: &[MarkedBody],
+    clock: &Arc<dyn HostClock>,
+) -> Result<Vec<(CameraHost, String)>, Box<dyn Error>> {
+    let mut hosts = Vec::new();
+    for (n, text) in (1u16..).zip(&arguments.others) {
+        let [x, y, z, degrees]: [f64; 4] = numbers(text, ',', "three numbers in metres and one in degrees")?;
+        let (sin, cos) = (0.5 * degrees.to_radians()).sin_cos();
+        let pose = Pose { position_m: [x, y, z], rotation_xyzw: [0.0, sin, 0.0, cos] };
+        let config = MockCameraConfig { pose, seed: first.seed + u64::from(n), ..first.clone() };
+        let port = if arguments.port == 0 { 0 } else { arguments.port.wrapping_add(n) };
+        let address = SocketAddrV4::new(arguments.bind, port);
+        let host = CameraHost::start(MockCamera::new(config, bodies.to_vec())?, address, clock.clone())
+            .map_err(|e| super::cannot_serve("a camera", address, &e, "--port"))?;
+        let place: [f64; 3] = std::array::from_fn(|i| [x, y, z][i] - first.pose.position_m[i]);
+        let entry = format!(
+            "{{ device = \"tcp:{}\", position = {place:?}, rotation_deg = [0, {degrees:?}, 0], view_deg = {:?} }}",
+            host.address(),
+            arguments.view_deg
+        );
+        hosts.push((host, entry));
+    }
+    Ok(hosts)
+}
+
+fn say_others(others: &[(CameraHost, String)]) {
+    if !others.is_empty() {
+        let entries: Vec<&str> = others.iter().map(|(_, entry)| &**entry).collect();
+        say(format_args!("others = [\n  {},\n]", entries.join(",\n  ")));
+    }
 }

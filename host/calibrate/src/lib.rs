@@ -2,6 +2,7 @@
 //! read, crosses are shown, the operator is told what to do next, and results go into the calibration file.
 
 pub mod aim;
+pub mod beside;
 pub mod body;
 pub mod camera;
 pub mod check;

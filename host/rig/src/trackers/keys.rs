@@ -61,6 +61,9 @@ pub struct TrackerPlace {
     pub start: HostTime,
 }
 
+/// A tracker, and the device by which it looks.
+pub type DeviceTracker = (String, Box<dyn Tracker>);
+
 /// The keys of a kind of trackers. A [`section!`](dpm_common::section) implements the rest of it.
 pub trait TrackerKeys: KeyValues {
     /// Expected samples per second; `None` if only the recording knows.
@@ -105,6 +108,16 @@ pub trait TrackerKeys: KeyValues {
     #[cfg(feature = "camera")]
     fn examine(&self) -> Vec<Result<CameraLook, CameraDoubt>> {
         Vec::new()
+    }
+
+    /// Each camera of such a tracker as a tracker by itself, in its own space, with its device: the first one first. All see
+    /// the bodies that carry marks, in one order. Nothing of all others.
+    ///
+    /// # Errors
+    /// As [`Self::open`].
+    #[cfg(feature = "camera")]
+    fn cameras_alone(&self, _clock: &Arc<dyn HostClock>) -> Result<Vec<DeviceTracker>, SourceError> {
+        Ok(Vec::new())
     }
 
     /// What such a camera looks for on a body; `None` for all others.

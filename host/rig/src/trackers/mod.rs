@@ -19,7 +19,7 @@ mod vrpn;
 pub use axes::Axes;
 #[cfg(feature = "camera")]
 pub use camera::{CameraTrackerConfig, CameraView, MarkerConfig, OtherCameraConfig, TagConfig};
-pub use keys::{SampleErrors, SourceError, TrackerConfig, TrackerKeys, TrackerPlace};
+pub use keys::{DeviceTracker, SampleErrors, SourceError, TrackerConfig, TrackerKeys, TrackerPlace};
 pub use kind::{Decoder, MockScene, MockServer, PoseOrigin, TrackerKind};
 pub use mock::simulated;
 pub use transform::{PoseConfig, TrackerTransformConfig};

@@ -3,6 +3,7 @@
 use super::{form_of, seconds};
 use crate::cli::rig_args::RigArgs;
 use crate::cli::watch::print;
+use dpm_calibrate::beside;
 use dpm_calibrate::camera::{calibrate, told_of, CameraTask};
 use dpm_camera::{board_pdf, TAGS};
 use dpm_camera_files::{export, MAX_BYTES};
@@ -27,10 +28,13 @@ pub(super) struct CameraArgs {
     /// With --tags: length of a side of each tag's black border, millimetres (tracker.tags[].side_m)
     #[arg(long, value_name = "MM", default_value_t = 60.0, requires = "tags", value_parser = side_mm)]
     side_mm: f64,
+    /// Find where each of tracker.others stands beside the first camera, from bodies that both see, and print it
+    #[arg(long, conflicts_with = "print")]
+    places: bool,
     /// The paper on which the board is printed
     #[arg(long, value_enum, default_value = "a4")]
     paper: Paper,
-    /// Views of the board that are enough
+    /// Views of the board, or with --places places of a body, that are enough
     #[arg(long, value_name = "N", default_value_t = 24, value_parser = clap::value_parser!(u16).range(6..=100))]
     views: u16,
     /// Longest time, seconds
@@ -79,10 +83,29 @@ impl CameraArgs {
                 print_board(path, &board_pdf(&page, sheet))
             }
             (Some(path), _) => print_board(path, &board_pdf(&board, sheet)),
+            (None, Some(rig)) if self.places => self.find_places(rig),
             (None, Some(rig)) => self.measure(rig, board),
             // The command line asks for one of the two.
             (None, None) => Ok(()),
         }
+    }
+
+    fn find_places(&self, rig: &Path) -> Result<(), Failure> {
+        let args = RigArgs { set: self.set.clone(), ..RigArgs::default() };
+        let config = args.rig_to_calibrate(rig)?;
+        let bad = |told: String| Failure::new(FailureKind::BadInput, told);
+        let clock = dpm_calibrate::view::clock();
+        let mut cameras = config.tracker.cameras_alone(&clock).map_err(|e| bad(e.to_string()))?;
+        if cameras.len() < 2 {
+            let told = format!("{} has one camera at most: name more as tracker.others", rig.display());
+            return Err(bad(told));
+        }
+        let (places, time) = (usize::from(self.views), Duration::from_secs_f64(self.seconds));
+        let task = beside::PlaceTask { clock, places, time };
+        let found = beside::measure(&mut cameras, &task, &mut |text| print(&format!("{text}\n")))?;
+        print("for tracker.others of the rig file:\n");
+        found.iter().for_each(|one| print(&format!("{}\n", beside::told_of(one))));
+        Ok(())
     }
 
     fn measure(&self, rig: &Path, board: TagBoard) -> Result<(), Failure> {

@@ -6,7 +6,7 @@ mod mock;
 
 pub use keys::{CameraTrackerConfig, MarkerConfig, OtherCameraConfig, TagConfig};
 
-use super::keys::{SourceError, TrackerKeys, TrackerPlace};
+use super::keys::{DeviceTracker, SourceError, TrackerKeys, TrackerPlace};
 use super::kind::{PoseOrigin, TrackerKind};
 use super::transform::{PoseConfig, TrackerTransformConfig};
 use dpm_camera::{
@@ -17,7 +17,7 @@ use dpm_common::keys::read::{refuse, KeyReader};
 use dpm_device::picture_stream::{PictureHeader, HEADER_BYTES};
 use dpm_device::planes::Raster;
 use dpm_device::time::HostClock;
-use dpm_device::tracker::Tracker;
+use dpm_device::tracker::{BodyKey, Tracker};
 use dpm_scene::geometry::projector::ProjectorCamera;
 use glam::{DAffine3, DVec3};
 use std::path::PathBuf;
@@ -109,7 +109,8 @@ impl TrackerKeys for CameraTrackerConfig {
                     reader,
                     &[&format!("{key}.position")],
                     "is missing: several cameras need their places relative to each other".into(),
-                    "write where it stands in the space of the first camera, which looks along -Z with +Y up"
+                    "write where it stands in the space of the first camera, which looks along -Z with +Y up; \
+                     with [0, 0, 0] for now, dpm calibrate camera --places finds it"
                         .into(),
                 );
             }
@@ -163,6 +164,21 @@ impl TrackerKeys for CameraTrackerConfig {
 
     fn examine(&self) -> Vec<Result<CameraLook, CameraDoubt>> {
         self.cameras().iter().filter_map(|one| examine_source(&one.device, &one.request())).collect()
+    }
+
+    fn cameras_alone(&self, clock: &Arc<dyn HostClock>) -> Result<Vec<DeviceTracker>, SourceError> {
+        let bodies: Vec<BodyKey> =
+            self.bodies().into_iter().map(|name| BodyKey { name: name.to_owned(), id: None }).collect();
+        let opened = |one: Self| {
+            let place = TrackerPlace {
+                bodies: bodies.clone(),
+                motions: Vec::new(),
+                clock: clock.clone(),
+                start: clock.now(),
+            };
+            Ok((one.device.clone(), one.open(place)?))
+        };
+        self.cameras().into_iter().map(opened).collect()
     }
 
     fn seen_of(&self, body: &str) -> Option<Markings> {
