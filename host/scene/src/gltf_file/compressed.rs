@@ -40,11 +40,9 @@ pub(super) fn decompress(
 ) -> Result<(), SceneError> {
     let root = Item::new(tree, "document".into())?;
     let refused = |item: &Item, name: &str| {
-        let remedy = "build it with the feature `compressed`, or export the scene without compression";
-        Err(SceneError::unsupported(
-            format!("{}: {name}, without which this program was built", item.name),
-            remedy,
-        ))
+        let remedy =
+            "this program was built without the feature `compressed`; export the scene without compression";
+        Err(SceneError::unsupported(format!("{}: {name}", item.name), remedy))
     };
     for view in root.list("bufferViews", "bufferView", limits.objects)? {
         for name in MESHOPT {

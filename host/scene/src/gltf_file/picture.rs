@@ -130,11 +130,8 @@ fn ktx2(
 
 #[cfg(not(feature = "compressed"))]
 fn ktx2(item: &Item, _: &[u8], _: u64, _: &Limits) -> Result<TexturePicture, SceneError> {
-    let remedy = "build it with the feature `compressed`, or export PNG or JPEG textures";
-    Err(SceneError::unsupported(
-        format!("{}: an image in KTX2, without which this program was built", item.name),
-        remedy,
-    ))
+    let remedy = "this program was built without the feature `compressed`; export PNG or JPEG textures";
+    Err(SceneError::unsupported(format!("{}: an image in KTX2", item.name), remedy))
 }
 
 /// A picture by the decoders of `image`.
