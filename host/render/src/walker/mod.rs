@@ -10,7 +10,7 @@
 //!
 //! ```
 //! use bytemuck::Zeroable;
-//! use dpm_render::walker::{Kernel, Ray, WalkScene, WideTree};
+//! use dpm_render::walker::{WalkKernel, Ray, WalkScene, WideTree};
 //! use dpm_scene::{bvh::BodyBvh, shapes::sphere};
 //! use dpm_shaders::structs::{Instance, NO_HIT};
 //! use glam::Vec3;
@@ -25,7 +25,7 @@
 //!
 //! let toward = |direction| Ray { origin: [0.0, 0.0, 3.0], t_max: f32::MAX, direction, kind: Ray::CLOSEST };
 //! let mut hits = [0; 2];
-//! Kernel::best().walk(&scene, &[toward([0.0, 0.1, -1.0]), toward([0.0, 0.0, 1.0])], &mut hits);
+//! WalkKernel::best().walk(&scene, &[toward([0.0, 0.1, -1.0]), toward([0.0, 0.0, 1.0])], &mut hits);
 //! assert!(hits[0] != NO_HIT && hits[1] == NO_HIT);
 //! ```
 

@@ -47,9 +47,9 @@ section! {
         rotation: Option<[f64; 4]> = None, "", Within(-1e6, 1e6);
         /// Columns and rows of its pictures.
         size: Option<[u32; 2]> = None, "px", Within(16, 8192);
-        /// Exposure.
+        /// Exposure of its pictures; as of the first camera if left out.
         exposure_us: Option<u32> = None, "us", Within(1, 1_000_000);
-        /// Gain.
+        /// Gain, in its own units; as of the first camera if left out.
         gain: Option<u32> = None, "", Within(0, 1_000_000);
         /// From the exposure of its first row to that of its last.
         readout_us: Option<u32> = None, "us", Within(0, 1_000_000);
