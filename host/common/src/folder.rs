@@ -13,6 +13,9 @@ use std::os::unix::fs::{DirBuilderExt, MetadataExt, OpenOptionsExt, PermissionsE
 use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicU32, Ordering};
 
+/// How the names of files begin that [`Folder::replace`] has not finished. One remains where a process was killed.
+pub const UNFINISHED: &str = ".new-";
+
 /// Why a folder or a file in it is not used.
 #[derive(Debug, thiserror::Error)]
 pub enum FolderError {
@@ -225,7 +228,7 @@ impl Folder {
     ) -> Result<(), FolderError> {
         static NUMBER: AtomicU32 = AtomicU32::new(0);
         let number = NUMBER.fetch_add(1, Ordering::Relaxed);
-        let temporary = format!(".new-{}-{number}", std::process::id());
+        let temporary = format!("{UNFINISHED}{}-{number}", std::process::id());
         // The file may remain from a killed process of the same number.
         let _ = remove_at(&self.handle, &temporary);
         let write = || -> io::Result<()> {

@@ -12,7 +12,7 @@ use crate::gpu::BodyTriangles;
 use crate::walker::WideTree;
 use bytemuck::Zeroable;
 use dpm_scene::bvh::BodyBvh;
-use dpm_scene::horizon::{horizons, Horizon, CLOSED};
+use dpm_scene::horizon::{kept_horizons, Horizon, CLOSED};
 use dpm_scene::mesh::MAX_COORDINATE_M;
 use dpm_scene::{picture_at, LinearTexel, Scene, ToLinear, TriangleMesh, Wrap};
 use dpm_shaders::structs::{self as gpu, AlbedoCell, Light, Material, TextureInfo, TriangleRef, Vertex};
@@ -395,24 +395,31 @@ impl SceneData {
         })
     }
 
-    /// [`Self::triangles`] with their horizons, which take a fiftieth of a millisecond of a core for each triangle when they are first asked for.
+    /// [`Self::triangles`] with their horizons. When they are first asked for, those that are not kept on disk take a fiftieth of a millisecond of a core
+    /// for each triangle.
     pub fn triangles_with_horizons(&self) -> Vec<[u32; 4]> {
         let corner = |row: &[u32; 4]| Vec3::from_array([row[0], row[1], row[2]].map(f32::from_bits));
         let horizons = self.horizons.get_or_init(|| {
-            let deforms = |i: usize| self.deforming.iter().any(|deforming| deforming.body == i);
-            let of_body = |(i, body): (usize, BodyTriangles)| {
-                if deforms(i) {
-                    return vec![CLOSED; body.range.len()];
-                }
-                let rows = &self.triangles[3 * body.range.start as usize..3 * body.range.end as usize];
-                horizons(
-                    &rows
-                        .chunks_exact(3)
-                        .map(|t| [corner(&t[0]), corner(&t[1]), corner(&t[2])])
-                        .collect::<Vec<_>>(),
-                )
+            let mut all: Vec<Horizon> = Vec::with_capacity(self.refs.len());
+            let bodies = self.triangles_of_bodies();
+            let rows = |i: usize| {
+                let range = &bodies[i].range;
+                &self.triangles[3 * range.start as usize..3 * range.end as usize]
             };
-            self.triangles_of_bodies().into_iter().enumerate().flat_map(of_body).collect()
+            let deforms = |i: usize| self.deforming.iter().any(|deforming| deforming.body == i);
+            for (i, body) in bodies.iter().enumerate() {
+                if deforms(i) {
+                    all.extend(vec![CLOSED; body.range.len()]);
+                } else if let Some(same) = (0..i).find(|&other| !deforms(other) && rows(other) == rows(i)) {
+                    let range = &bodies[same].range;
+                    all.extend_from_within(range.start as usize..range.end as usize);
+                } else {
+                    let triangles =
+                        rows(i).chunks_exact(3).map(|t| [corner(&t[0]), corner(&t[1]), corner(&t[2])]);
+                    all.extend(kept_horizons(&triangles.collect::<Vec<_>>()));
+                }
+            }
+            all
         });
         let words = horizons.iter().flatten();
         self.triangles.iter().zip(words).map(|(row, &word)| [row[0], row[1], row[2], word]).collect()

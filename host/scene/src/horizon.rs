@@ -6,11 +6,15 @@
 //!
 //! The bound is safe and not sharp: rays that are told to leave do leave, and some that leave are not told so.
 
+mod kept;
+
 use crate::bvh::tree_of;
 use glam::{Vec3, Vec3A};
 use obvhs::aabb::Aabb;
 use obvhs::bvh2::Bvh2;
 use obvhs::triangle::Triangle;
+
+pub use kept::{folder, keep_in, kept_horizons};
 
 /// Steps of the sine of an elevation, 0 to 1. A horizon at the last step is that of a cell no ray of which surely leaves.
 pub const STEPS: u32 = 15;

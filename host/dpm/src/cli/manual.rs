@@ -93,7 +93,10 @@ const ENVIRONMENT: [(&str, &str); 4] = [
         "Sets the key a.b of the rig file; two underscores separate the levels. --set overrides it.",
     ),
     ("DPM_RUNTIME_DIR", "The folder for sockets, status and locks."),
-    ("STATE_DIRECTORY, XDG_STATE_HOME", "The folder for orders that stand and methods that were measured."),
+    (
+        "STATE_DIRECTORY, XDG_STATE_HOME",
+        "The folder for orders that stand, methods that were measured and horizons.",
+    ),
     ("NO_COLOR", "If it is set and not empty, nothing is coloured."),
 ];
 

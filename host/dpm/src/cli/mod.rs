@@ -188,6 +188,9 @@ enum CliCommand {
 pub fn main(commit: &'static str) -> ExitCode {
     dpm_common::commit::set(commit);
     crate::satellites::register();
+    if let Some(state) = dpm_rig::standing::state_folder() {
+        dpm_scene::horizon::keep_in(state.join("horizons"));
+    }
     #[cfg(feature = "manual")]
     completion::answer();
     let command = coloured(command());
