@@ -9,13 +9,13 @@ use dpm_render::gpu::Gpu;
 use dpm_render::method::{Method, SamplerKind};
 use dpm_render::scene_data::{SceneData, SceneNeeds};
 use dpm_render::warp::LEAST_MOTION_PX;
-use dpm_render::{traffic, Keep, Output, RenderError, RendererSettings, Traffic};
+use dpm_render::{traffic, Keep, Output, RayWalk, RenderError, RendererSettings, Traffic};
 use dpm_rig::config::{EffectsConfig, PlanePoses, RenderConfig, RenderMethod, RenderScale, RigConfig};
 use dpm_rig::failure::{Failure, FailureKind};
 use dpm_rig::method_choice::{self, MethodChoice};
 use dpm_rig::pipeline::{renderer_settings, PipelineError};
 use dpm_rig::rig::Rig;
-use dpm_rig::run_rig::{open_gpu, traced_raster};
+use dpm_rig::run_rig::{open_gpu, ray_walk, traced_raster};
 use dpm_scene::bvh::{BodyBvh, Refit};
 use dpm_scene::{Body, Deformed, Environment, Material, Scene, TextureRef};
 use glam::Vec3;
@@ -58,6 +58,8 @@ pub struct PlanReport {
     pub warnings: Vec<String>,
     /// What method "auto" was measured to be; `None` of another method, or without measurement.
     pub method_choice: Option<MethodChoice>,
+    /// Who finds what rays meet on the device of a run, and why; `None` where there is no device.
+    pub ray_walk: Option<RayWalk>,
 }
 
 const BY_CONSTANT: &str = "specialization constant";
@@ -432,6 +434,7 @@ pub fn scene_plan(config: &RigConfig, measure: bool) -> Result<PlanReport, Failu
         temporal_light,
         warnings,
         method_choice: None,
+        ray_walk: gpu.clone().or_else(|| open_gpu(config).ok()).and_then(|gpu| ray_walk(&rig, &gpu).ok()),
     };
     let Some(gpu) = gpu else { return Ok(report) };
     if config.render.method == RenderMethod::Auto {
@@ -453,6 +456,7 @@ pub fn scene_plan(config: &RigConfig, measure: bool) -> Result<PlanReport, Failu
 #[cfg(test)]
 mod tests {
     use super::*;
+    use dpm_render::RayWalker;
     use dpm_rig::config::Overrides;
 
     fn plan(flags: &[&str]) -> PlanReport {
@@ -464,6 +468,27 @@ mod tests {
 
     fn is_left_out(plan: &PlanReport, feature: &str) -> bool {
         plan.entries.iter().find(|e| e.feature == feature).unwrap_or_else(|| panic!("{feature}")).left_out
+    }
+
+    /// A person reads why the host does not walk, and not that it does.
+    #[test]
+    fn who_walks_the_rays_is_told_with_its_reason() {
+        let told = |tracing: &str, more: &[&str]| {
+            let key = format!("render.tracing=\"{tracing}\"");
+            let flags = [&[key.as_str()], more].concat();
+            plan(&flags).ray_walk.map(|walk| (walk.by, walk.why))
+        };
+        let Some((by, why)) = told("host", &[]) else { return };
+        if why.contains("memory of its own") || by == RayWalker::Device {
+            return;
+        }
+        assert_eq!((by, why), (RayWalker::Host, "render.tracing is \"host\""));
+        assert_eq!(told("auto", &[]), Some((RayWalker::Shaders, "render.tracing is not \"host\"")));
+        let short = told("host", &["render.depth=1"]);
+        assert!(
+            short.is_some_and(|(by, why)| by == RayWalker::Shaders && why.contains("no rays")),
+            "{short:?}"
+        );
     }
 
     #[test]

@@ -58,5 +58,7 @@ pub use read_back::{Guide, History, Surface};
 pub use renderer::Renderer;
 pub use scale::{reduced, Scale, LADDER};
 pub use scene_data::Keep;
-pub use settings::{FrameInputs, Output, Overlapping, RenderError, RendererSettings, Tracing};
+pub use settings::{
+    FrameInputs, Output, Overlapping, RayWalk, RayWalker, RenderError, RendererSettings, Tracing,
+};
 pub use slot::{FrameCost, FrameSlot};

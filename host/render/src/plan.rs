@@ -5,7 +5,7 @@ use super::optics::OpticsLayout;
 use super::passes::TABLE;
 use super::scene_data::{Keep, SceneData, SceneDataError};
 use super::scene_needs::SceneNeeds;
-use super::settings::{RendererSettings, Tracing};
+use super::settings::{RayWalk, RayWalker, RendererSettings, Tracing};
 use crate::gpu::{shared_bindings, BindingTable, ComputePipeline, DeviceSummary, Executable, Gpu, GpuError};
 use dpm_scene::Scene;
 use dpm_shaders::specialization as ids;
@@ -188,12 +188,17 @@ impl RendererPlan {
             .ok_or("paths have no rays, or more than there is room for")
     }
 
-    /// Why the host of software Vulkan does not walk the rays of this plan on this device; `None`: it does, or the device is no software.
+    /// Who finds what the rays of this plan meet on this device, and why.
     ///
     /// # Errors
     /// Ray queries are asked for, and the device has none.
-    pub fn walks_in_shaders(&self, gpu: &Gpu) -> Result<Option<&'static str>, GpuError> {
-        Ok(self.layout_apart(gpu, self.reading(gpu.summary())?).err())
+    pub fn ray_walk(&self, gpu: &Gpu) -> Result<RayWalk, GpuError> {
+        let reading = self.reading(gpu.summary())?;
+        Ok(match (reading, self.layout_apart(gpu, reading)) {
+            (Reading::Query, _) => RayWalk { by: RayWalker::Device, why: "it has ray queries" },
+            (_, Ok(_)) => RayWalk { by: RayWalker::Host, why: "render.tracing is \"host\"" },
+            (_, Err(why)) => RayWalk { by: RayWalker::Shaders, why },
+        })
     }
 
     /// The programs that a GPU whose driver does not say how large it is would be given for this plan, in the order in which they run. None of them

@@ -14,7 +14,7 @@ use super::prepared::PreparedScene;
 use super::read_back::{History, Surface};
 use super::resources::Resources;
 use super::scene_data::{rows, world_bounds, BodyData, Keep, SceneData};
-use super::settings::{FrameInputs, Overlapping, RenderError, RendererSettings};
+use super::settings::{FrameInputs, Overlapping, RayWalk, RayWalker, RenderError, RendererSettings};
 use super::slot::{FrameSlot, Sets};
 use super::tiles::TileList;
 use super::warp::Movers;
@@ -232,6 +232,16 @@ impl Renderer {
     /// Its scene and passes, for a renderer that takes over on the same device.
     pub fn prepared(&self) -> &PreparedScene {
         &self.prepared
+    }
+
+    /// Who finds what its rays meet, and why.
+    pub fn ray_walk(&self) -> Option<RayWalk> {
+        let planned = self.prepared.plan().ray_walk(&self.gpu).ok()?;
+        // Threads that could not be started walk nothing.
+        match planned.by == RayWalker::Host && self.resources.crew.is_none() {
+            true => Some(RayWalk { by: RayWalker::Shaders, why: "no thread of the host could be started" }),
+            false => Some(planned),
+        }
     }
 
     /// Whether the device finds itself what a ray meets (ray query), or the shaders do.

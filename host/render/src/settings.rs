@@ -11,6 +11,7 @@ use dpm_device::planes::{PlaneSchedule, Raster};
 use dpm_scene::geometry::projector::ProjectorCamera;
 use dpm_shaders::structs::PlaneGroup;
 use glam::{DAffine3, DVec3};
+use serde::Serialize;
 
 /// What does not change while a renderer lives.
 #[derive(Clone, Debug)]
@@ -59,7 +60,7 @@ pub enum Tracing {
     Walk,
     /// The device, software or not (ray query). One that cannot is refused.
     RayQuery,
-    /// On software Vulkan threads of the host, where they can ([`crate::RendererPlan::walks_in_shaders`] says why not); elsewhere as `Auto`.
+    /// On software Vulkan threads of the host, where they can ([`crate::RendererPlan::ray_walk`] says why not); elsewhere as `Auto`.
     Host,
 }
 
@@ -72,6 +73,39 @@ impl Tracing {
             Self::Walk => false,
             Self::RayQuery => device.ray_query,
         }
+    }
+}
+
+/// Who finds what rays meet.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
+#[serde(rename_all = "lowercase")]
+pub enum RayWalker {
+    /// The device itself (ray query).
+    Device,
+    /// The shaders.
+    Shaders,
+    /// Threads of the host.
+    Host,
+}
+
+/// The same with its reason.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
+pub struct RayWalk {
+    /// Who does.
+    pub by: RayWalker,
+    /// What follows "because".
+    pub why: &'static str,
+}
+
+impl RayWalk {
+    /// One line about it.
+    pub fn told(&self) -> String {
+        let who = match self.by {
+            RayWalker::Device => "the device finds what rays meet",
+            RayWalker::Shaders => "the shaders walk the rays, and not the host",
+            RayWalker::Host => "threads of the host walk the rays",
+        };
+        format!("{who}, because {}", self.why)
     }
 }
 

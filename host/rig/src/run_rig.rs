@@ -5,7 +5,7 @@ use crate::config::{PlaneWeights, RigConfig};
 use crate::engine::connect::ConnectError;
 use crate::failure::{Ended, Failure, FailureKind};
 use crate::method_choice;
-use crate::pipeline::{self, PipelineError, RunOptions, RunOutcome};
+use crate::pipeline::{self, renderer_settings, PipelineError, RunOptions, RunOutcome};
 use crate::presence;
 use crate::rig::{Rig, RigError};
 use crate::telemetry::monitor::RunMonitor;
@@ -16,7 +16,7 @@ use dpm_common::files::{check_folder, write_atomically};
 use dpm_device::link::LinkError;
 use dpm_device::planes::{Channel, Raster};
 use dpm_render::gpu::{validation_messages, Gpu, GpuError};
-use dpm_render::RenderError;
+use dpm_render::{Keep, RayWalk, RenderError, RendererPlan, RendererSettings};
 use glam::Vec3;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
@@ -227,6 +227,16 @@ pub fn check_output_folder(dir: &Path) -> Result<(), Failure> {
 /// There is no such GPU (exit code 4); the message says what to install.
 pub fn open_gpu(config: &RigConfig) -> Result<Arc<Gpu>, Failure> {
     Gpu::open(&presence::gpu_options(config)).map_err(|e| Failure::new(FailureKind::NoGpu, e))
+}
+
+/// Who finds what the rays of a run of `rig` meet on `gpu`, and why.
+///
+/// # Errors
+/// The scene is too large, or `gpu` cannot do what the rig file asks for.
+pub fn ray_walk(rig: &Rig, gpu: &Gpu) -> Result<RayWalk, RenderError> {
+    let raster = traced_raster(&rig.config, gpu, &mut Vec::new()).unwrap_or(rig.camera.raster);
+    let settings = RendererSettings { raster, lens: None, ..renderer_settings(rig) };
+    Ok(RendererPlan::new(&rig.scene, settings, Keep::default())?.ray_walk(gpu)?)
 }
 
 /// The smaller raster that software Vulkan traces, with a note about it.

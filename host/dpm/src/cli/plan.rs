@@ -105,6 +105,7 @@ pub(super) fn execute(args: &PlanArgs) -> Result<(), Failure> {
         text += &format!("all that is left out and can be put back, together: {}\n", saved(s));
     }
     text += &report.method_choice.as_ref().map_or(String::new(), |c| format!("method auto: {}\n", c.told()));
+    text += &report.ray_walk.map_or(String::new(), |walk| format!("rays: {}\n", walk.told()));
     text += &moved(&report.traffic);
     text += &report.temporal_light.as_ref().map_or(String::new(), |light| seen(light, args));
     print(&text);

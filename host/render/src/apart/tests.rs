@@ -2,7 +2,7 @@ use super::*;
 use crate::drive::Drive;
 use crate::gpu::GpuOptions;
 use crate::method::{Method, SamplerKind, HISTORY_CAP};
-use crate::{FrameInputs, Output, Renderer};
+use crate::{FrameInputs, Output, RayWalker, Renderer};
 use dpm_scene::geometry::projector::ProjectorCamera;
 use dpm_scene::shapes::{add, camera, diffuse, emitter, floor, image_sky, quad, scene_of, sphere};
 use dpm_scene::{Body, Scene};
@@ -72,6 +72,8 @@ fn draw(
         return None;
     }
     assert_eq!(slot.apart.is_some(), tracing == Tracing::Host);
+    let walker = if tracing == Tracing::Host { RayWalker::Host } else { RayWalker::Shaders };
+    assert_eq!(renderer.ray_walk().map(|walk| walk.by), Some(walker));
     let rest: Vec<DAffine3> = scene.bodies.iter().map(|b: &Body| b.world_from_body_rest).collect();
     let frame = |k: u32| {
         let mut poses = rest.clone();

@@ -28,7 +28,7 @@ use dpm_device::tracker::Tracker;
 use dpm_device::transport::Transport;
 use dpm_render::gpu::Gpu;
 use dpm_render::pack::{BitPlaneFrame, Kernel};
-use dpm_render::{PreparedScene, RenderError, Renderer, RendererSettings, Scale, LADDER};
+use dpm_render::{PreparedScene, RayWalk, RenderError, Renderer, RendererSettings, Scale, LADDER};
 use std::sync::Arc;
 use std::time::Duration;
 
@@ -149,6 +149,11 @@ impl CrewParts {
         let renderer = || scene.as_ref().map(Renderer::from_prepared).transpose();
         let parts = Self::drawn_by(renderer, rig, origin, options, clock)?;
         Ok(Self { budget, scale, first, budget_milli, ..parts })
+    }
+
+    /// Who finds what rays meet, if a GPU draws.
+    pub(super) fn ray_walk(&self) -> Option<RayWalk> {
+        self.renderer.as_ref().and_then(Renderer::ray_walk)
     }
 
     /// What a crew that takes over on the same device needs of this one.

@@ -71,6 +71,7 @@ pub(super) fn run_at_real_pace(
     let making = Stopwatch::start();
     let parts = crew_parts(rig, origin, options, clock, true)?.remembering(&seen);
     let (heritage, made_ns) = (parts.heritage(), making.elapsed_ns() as i64);
+    let ray_walk = parts.ray_walk();
     let (lights_in, lights) = light_channel();
     let rights = Arc::new(Rights::new(&rig.config.real_time, monitor));
     let standstill =
@@ -123,6 +124,7 @@ pub(super) fn run_at_real_pace(
         wall_s: watch.elapsed_ns() as f64 * 1e-9,
         standstills: standstill.map(StandstillMonitor::finish).unwrap_or_default(),
         warnings,
+        ray_walk,
     })
 }
 

@@ -24,6 +24,7 @@ use crate::tracks::gauges::TrackerReport;
 use dpm_common::clock::MonotonicClock;
 use dpm_common::realtime::standstill::Standstills;
 use dpm_render::gpu::Gpu;
+use dpm_render::RayWalk;
 use std::sync::atomic::Ordering;
 use std::sync::Arc;
 
@@ -141,11 +142,13 @@ pub(super) struct Ran {
     pub(super) wall_s: f64,
     pub(super) standstills: Standstills,
     pub(super) warnings: Vec<String>,
+    pub(super) ray_walk: Option<RayWalk>,
 }
 
 impl Ran {
     fn into_outcome(self, rig: &Rig, origin: &PictureOrigin) -> RunOutcome {
-        let Self { facts, mut collector, slots, recorder, carried, wall_s, standstills, warnings } = self;
+        let Self { facts, mut collector, slots, recorder, carried, wall_s, standstills, warnings, ray_walk } =
+            self;
         let config = &rig.config;
         let gpu = origin.gpu();
         let mut report = Report {
@@ -155,6 +158,7 @@ impl Ran {
             pace: config.real_time.pace.word(),
             gpu: gpu.map_or_else(|| "none".into(), |gpu| gpu.summary().name.clone()),
             software_gpu: gpu.is_some_and(|gpu| gpu.summary().software),
+            ray_walk,
             method: match origin {
                 PictureOrigin::Gpu(_) => config.render.method.word(),
                 PictureOrigin::Prepared => "prepared",

@@ -198,6 +198,7 @@ impl World {
             wall_s: wall_ns as f64 * 1e-9,
             standstills: Standstills::default(),
             warnings: self.parts.tracking.never_seen(rig).into_iter().collect(),
+            ray_walk: self.parts.ray_walk(),
             facts: self.facts,
         })
     }

@@ -8,6 +8,7 @@ use crate::gaze::GazeReport;
 use crate::plan::beat::BeatReport;
 use crate::plan::dark::DarkCause;
 use crate::tracks::gauges::TrackerReport;
+use dpm_render::RayWalk;
 use hdrhistogram::Histogram;
 use serde::ser::{Serialize, SerializeMap, Serializer};
 use std::collections::BTreeMap;
@@ -247,6 +248,8 @@ pub struct Report {
     pub gpu: String,
     /// True if that device is the CPU.
     pub software_gpu: bool,
+    /// Who found what rays met, and why; null if nothing was rendered.
+    pub ray_walk: Option<RayWalk>,
     /// The method that allocated the rays.
     pub method: &'static str,
     /// Whether poses were predicted to the time of light.
@@ -381,6 +384,7 @@ impl Default for Report {
             pace: "virtual",
             gpu: "none".into(),
             software_gpu: false,
+            ray_walk: None,
             method: "full",
             prediction: false,
             method_choice: None,

@@ -5,6 +5,7 @@ use crate::plan::dark::DarkCause;
 use crate::telemetry::light_state::LightState;
 use crate::telemetry::projector::ProjectorReport;
 use crate::telemetry::report::Percentiles;
+use dpm_render::RayWalker;
 
 impl Report {
     /// The report as one sentence and a table of at most 100 columns.
@@ -144,7 +145,11 @@ impl Report {
         let (planes, hz, pace) = (self.planes, self.frame_rate_hz, self.pace);
         table.row("raster", format!("{width} x {height}, {planes} planes, {hz:.3} frames/s ({pace} pace)"));
         let software = if self.software_gpu { " (software)" } else { "" };
-        table.row("GPU", format!("{}{software}", self.gpu));
+        let rays = match self.ray_walk.map(|walk| walk.by) {
+            Some(RayWalker::Host) => "; threads of the host walked the rays",
+            _ => "",
+        };
+        table.row("GPU", format!("{}{software}{rays}", self.gpu));
         table.row("method", self.method.to_string());
         if let Some(choice) = &self.method_choice {
             table.row("method auto", choice.clone());

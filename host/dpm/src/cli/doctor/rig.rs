@@ -13,6 +13,7 @@ use dpm_rig::config::{BodyConfig, LiveSource, PictureSource, RigConfig};
 use dpm_rig::picture_stream::look_at;
 use dpm_rig::presence;
 use dpm_rig::rig::{affine, plausible, Rig, RigError};
+use dpm_rig::run_rig::{open_gpu, ray_walk};
 use dpm_rig::standing::{standing, Identity};
 use std::net::{SocketAddr, TcpListener};
 use std::path::Path;
@@ -56,6 +57,7 @@ pub(super) fn findings(
     all.push(devices::projector(config, loads));
     all.extend(light_for_eyes(config, with));
     all.extend(gpu(config));
+    all.extend(rig.as_ref().ok().and_then(rays));
     all.extend(page(config));
     all.push(output(&config.output.dir));
     all
@@ -94,6 +96,15 @@ fn gpu(config: &RigConfig) -> Option<Finding> {
         }
         (Ok(()), None) => None,
     }
+}
+
+/// Who walks the rays on the GPU that a run would take.
+fn rays(rig: &Rig) -> Option<Finding> {
+    let gpu = open_gpu(&rig.config).ok()?;
+    Some(match ray_walk(rig, &gpu) {
+        Ok(walk) => Finding::new("rays", Severity::Info, walk.told(), ""),
+        Err(e) => Finding::new("rays", Severity::Missing, e.to_string(), ""),
+    })
 }
 
 fn scene(rig: &Rig) -> Finding {
