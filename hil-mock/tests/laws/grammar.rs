@@ -42,6 +42,7 @@ fn the_document_names_every_fault_and_says_what_it_takes() {
             // Left out, it is 1; see below.
             "probability" => ("=0.5", "=2", true),
             "metres" => ("=3", "=3ms", false),
+            "body" => ("=2", "=0", false),
             "duration" => ("=2ms", "=2", false),
             "none" => ("", "=0.5", true),
             other => panic!("{name}: an amount of {other}?"),

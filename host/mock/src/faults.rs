@@ -53,6 +53,10 @@ pub enum FaultKind {
     Unplug,
     /// The device restarts: counters at 0, state lost. Needs a start.
     Reset,
+    /// The tracker does not see one of the bodies. Amount: which, from 1 on.
+    Unseen,
+    /// The first two bodies have each other's labels. Needs a window.
+    Exchange,
 }
 
 /// Meaning of a kind's amount.
@@ -61,6 +65,7 @@ enum Amount {
     Probability,
     Metres,
     Duration,
+    Body,
     None,
 }
 
@@ -74,7 +79,7 @@ enum When {
 
 impl FaultKind {
     /// Every kind, in the order of the documentation.
-    pub const ALL: [Self; 16] = [
+    pub const ALL: [Self; 18] = [
         Self::Loss,
         Self::Corrupt,
         Self::Truncate,
@@ -91,6 +96,8 @@ impl FaultKind {
         Self::Slow,
         Self::Unplug,
         Self::Reset,
+        Self::Unseen,
+        Self::Exchange,
     ];
 
     /// The name of this kind in a plan.
@@ -112,6 +119,8 @@ impl FaultKind {
             Self::Slow => "slow",
             Self::Unplug => "unplug",
             Self::Reset => "reset",
+            Self::Unseen => "unseen",
+            Self::Exchange => "exchange",
         }
     }
 
@@ -121,10 +130,13 @@ impl FaultKind {
             Self::Reorder | Self::Nan | Self::Norm | Self::Flip | Self::Invalid => {
                 (Amount::Probability, When::Any)
             }
-            Self::Dropout | Self::Stuck | Self::Stall | Self::Unplug => (Amount::None, When::Window),
+            Self::Dropout | Self::Stuck | Self::Stall | Self::Unplug | Self::Exchange => {
+                (Amount::None, When::Window)
+            }
             Self::Jump => (Amount::Metres, When::Start),
             Self::Slow => (Amount::Duration, When::Any),
             Self::Reset => (Amount::None, When::Start),
+            Self::Unseen => (Amount::Body, When::Any),
         }
     }
 }
@@ -196,7 +208,7 @@ pub struct FaultPlan {
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
 pub enum FaultError {
     /// Not a known kind.
-    #[error("faults: unknown fault `{0}`; known are loss, corrupt, truncate, duplicate, reorder, nan, norm, flip, invalid, dropout, stuck, jump, stall, slow, unplug, reset")]
+    #[error("faults: unknown fault `{0}`; known are loss, corrupt, truncate, duplicate, reorder, nan, norm, flip, invalid, dropout, stuck, jump, stall, slow, unplug, reset, unseen, exchange")]
     UnknownKind(String),
     /// The amount is missing, unreadable or out of range.
     #[error("faults: `{token}`: {rule}")]
@@ -266,6 +278,12 @@ impl FaultPlan {
     /// of `slow`).
     pub fn amount(&self, kind: FaultKind, previous_ns: i64, t_ns: i64) -> f64 {
         self.of(kind).filter(|(_, f)| f.is_on(previous_ns, t_ns)).map(|(_, f)| f.amount).sum()
+    }
+
+    /// True if the tracker does not see the body `number`, counted from 1, in the sample at `t_ns`.
+    pub(crate) fn hides(&self, number: u16, previous_ns: i64, t_ns: i64) -> bool {
+        let number = f64::from(number);
+        self.of(FaultKind::Unseen).any(|(_, f)| f.amount == number && f.is_on(previous_ns, t_ns))
     }
 
     /// True when a window of `kind` contains `t_ns`.
@@ -360,6 +378,10 @@ fn parse_fault(token: &str) -> Result<Fault, FaultError> {
             Some(m) if m.is_finite() => m,
             _ => return Err(wrong("needs a distance in metres, as in `jump=3@1.5s`")),
         },
+        (Amount::Body, a) => match a.and_then(|a| a.parse::<u16>().ok()) {
+            Some(number) if number > 0 => f64::from(number),
+            _ => return Err(wrong("needs the number of a body, from 1 on, as in `unseen=2@1s+500ms`")),
+        },
         (Amount::Duration, a) => match a.and_then(parse_duration) {
             Some(ns) => ns as f64,
             None => return Err(wrong("needs a duration with unit, as in `slow=2ms`")),
@@ -420,7 +442,7 @@ impl fmt::Display for FaultPlan {
             match fault.kind.rules().0 {
                 Amount::None => {}
                 Amount::Duration => write!(f, "={}ns", fault.amount)?,
-                Amount::Probability | Amount::Metres => write!(f, "={}", fault.amount)?,
+                Amount::Probability | Amount::Metres | Amount::Body => write!(f, "={}", fault.amount)?,
             }
             if let Some(w) = fault.window {
                 write!(f, "@{}ns", w.start_ns)?;

@@ -106,7 +106,7 @@ pub enum NatNetServerError {
 }
 
 /// The faults that a NatNet server implements.
-pub const NATNET_FAULTS: [FaultKind; 16] = FaultKind::ALL;
+pub const NATNET_FAULTS: [FaultKind; 18] = FaultKind::ALL;
 
 #[derive(Clone, Copy)]
 struct NatNetPeer {

@@ -20,7 +20,7 @@ use std::thread::JoinHandle;
 use std::time::Duration;
 
 /// The faults that the device implements: all but `unplug` and `reset`, which concern its port.
-pub const SERIAL_FAULTS: [FaultKind; 14] = [
+pub const SERIAL_FAULTS: [FaultKind; 16] = [
     FaultKind::Loss,
     FaultKind::Corrupt,
     FaultKind::Truncate,
@@ -35,6 +35,8 @@ pub const SERIAL_FAULTS: [FaultKind; 14] = [
     FaultKind::Jump,
     FaultKind::Stall,
     FaultKind::Slow,
+    FaultKind::Unseen,
+    FaultKind::Exchange,
 ];
 
 /// Rate of the device's clock: a microsecond timer, as microcontrollers have.

@@ -76,7 +76,7 @@ pub enum MockTrackerError {
 }
 
 /// The faults that a stream of samples (not of bytes) can have.
-pub const TRACKER_FAULTS: [FaultKind; 13] = [
+pub const TRACKER_FAULTS: [FaultKind; 15] = [
     FaultKind::Loss,
     FaultKind::Duplicate,
     FaultKind::Reorder,
@@ -90,6 +90,8 @@ pub const TRACKER_FAULTS: [FaultKind; 13] = [
     FaultKind::Stall,
     FaultKind::Slow,
     FaultKind::Reset,
+    FaultKind::Unseen,
+    FaultKind::Exchange,
 ];
 
 /// The samples of a set of bodies as pure functions of their number: shared by [`MockTracker`] and the network servers.
@@ -195,7 +197,7 @@ impl SampleSource {
             Some(since) => self.number_before(since),
             None => k,
         };
-        let mut pose = self.noisy_pose(body, seen)?;
+        let mut pose = self.noisy_pose(self.labelled(body, t), seen)?;
         let jump = faults.amount(FaultKind::Jump, before, t);
         if jump != 0.0 {
             pose.position_m = add(pose.position_m, scale(jump_direction(draws), jump));
@@ -220,13 +222,20 @@ impl SampleSource {
         Some(TrackerSample {
             body,
             pose,
-            tracked: !strikes(FaultKind::Invalid),
+            tracked: !strikes(FaultKind::Invalid) && !faults.hides(body.0 + 1, before, t),
             mean_error_m: self.config.position_noise_m as f32,
             covariance: None,
             sequence: k.saturating_sub(first_since_reset) as u32,
             captured_at: self.at(t),
             received_at: self.at(t),
         })
+    }
+
+    /// Which body bears the label of `body` at `t_ns`.
+    fn labelled(&self, body: BodyIndex, t_ns: i64) -> BodyIndex {
+        let is_exchanged =
+            body.0 < 2 && self.bodies.len() > 1 && self.config.faults.is_on(FaultKind::Exchange, t_ns);
+        BodyIndex(if is_exchanged { 1 - body.0 } else { body.0 })
     }
 
     /// The passage of report `k`: when it arrives, and when a second copy does. `None` if it is lost. `stream` is the

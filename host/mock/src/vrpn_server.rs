@@ -10,7 +10,7 @@ use dpm_device::tracker::BodyIndex;
 
 /// The faults of a VRPN server. A stream loses no bytes, so a lost or overtaken report is one that was not sent, or
 /// late.
-pub const VRPN_FAULTS: [FaultKind; 16] = FaultKind::ALL;
+pub const VRPN_FAULTS: [FaultKind; 18] = FaultKind::ALL;
 
 /// Number of the pose type on our side; ping and pong follow.
 const POS_QUAT: i32 = 0;

@@ -1,6 +1,7 @@
 //! The cable between host and projector: two lanes there, one back, with a speed, a delay, and faults. Where the
 //! projector hangs on a serial line, the bytes are on [`crate::line`] instead.
 
+use crate::calls::Calls;
 use crate::dice::Dice;
 use crate::guard::{darkens, freezes, stretched};
 use crate::line::{Echo, SerialLine};
@@ -107,6 +108,8 @@ pub struct Cable {
     pub travel_ns: i64,
     /// The faults.
     pub faults: CableFaults,
+    /// The program's calls to it.
+    pub calls: Calls,
     /// Where it is a serial line.
     pub line: Option<SerialLine>,
     /// To the device.
@@ -144,6 +147,7 @@ impl Cable {
             ns_per_byte,
             travel_ns,
             faults: CableFaults::default(),
+            calls: Calls::default(),
             line: None,
             out: VecDeque::new(),
             back: VecDeque::new(),
@@ -363,7 +367,7 @@ const NAME: &str = "simulated cable";
 impl Transport for HostEnd {
     fn send(&mut self, _: HostTime, lane: Lane, packets: &[Packet<'_>]) -> Result<(), SendError> {
         let mut cable = lock(&self.cable);
-        if !cable.plugged || cable.plug != self.plug {
+        if cable.calls.fails() || !cable.plugged || cable.plug != self.plug {
             return Err(SendError::Failed(unplugged()));
         }
         if lane == Lane::Data && (cable.faults.stalled || cable.frames_queued() >= FRAMES_QUEUED) {
@@ -395,7 +399,7 @@ impl Transport for HostEnd {
         sink: &mut dyn FnMut(Lane, HostTime, &[u8]),
     ) -> Result<(), TransportError> {
         let mut cable = lock(&self.cable);
-        if !cable.plugged || cable.plug != self.plug {
+        if cable.calls.fails() || !cable.plugged || cable.plug != self.plug {
             return Err(unplugged());
         }
         while cable.back.front().is_some_and(|(at, _)| *at <= cable.now) {
@@ -412,7 +416,7 @@ impl Transport for HostEnd {
             cable.met.denied += 1;
             return Err(TransportError::InUse { device: NAME.into() });
         }
-        if !cable.plugged {
+        if cable.calls.fails() || !cable.plugged {
             return Err(TransportError::NotFound { device: NAME.into() });
         }
         self.plug = cable.plug;

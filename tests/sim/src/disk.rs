@@ -1,6 +1,7 @@
 //! The disk that keeps standing orders: in memory, with faults.
 
 use crate::cable::lock;
+use crate::calls::Calls;
 use dpm_common::folder::FolderError;
 use dpm_rig::standing::StateFolder;
 use std::collections::BTreeMap;
@@ -18,9 +19,9 @@ pub struct Disk {
     pub is_full: bool,
     /// An order was refused because the disk is full.
     pub lost_order: bool,
-    /// The call after so many more fails, once.
-    pub fails_in: Option<u32>,
-    /// How often the disk refused something, or was slow.
+    /// Calls to it.
+    pub calls: Calls,
+    /// How often the disk refused something, or was slow, but for single calls.
     pub met: u64,
     /// How much longer a write takes, nanoseconds.
     pub late_ns: i64,
@@ -29,10 +30,7 @@ pub struct Disk {
 impl Disk {
     /// A call: true if it is to fail.
     fn refuses(&mut self) -> bool {
-        let is_due = self.fails_in == Some(0);
-        self.fails_in = self.fails_in.and_then(|n| n.checked_sub(1));
-        self.met += u64::from(is_due);
-        self.refuses || is_due
+        self.calls.fails() || self.refuses
     }
 
     /// The power fails while `name` is written: old or new content remains, never half of it; with `torn` a stray file

@@ -36,6 +36,8 @@ pub enum Guard {
     Unconfirmed,
     /// What the projector latches, until somebody acknowledges it. A neighbour sends it an ARM that acknowledges nothing.
     Latch,
+    /// The eye guard. A person with glasses stands in the beam, and what the tracker reports of them is wrong or missing.
+    Eyes,
 }
 
 /// The share of lives in which a guard stands alone.
@@ -47,7 +49,7 @@ const LINK_LATE_NS: i64 = 5_000_000;
 
 impl Guard {
     /// All guards.
-    pub const ALL: [Self; 11] = [
+    pub const ALL: [Self; 12] = [
         Self::Watchdog,
         Self::DarkFrom,
         Self::Age,
@@ -59,6 +61,7 @@ impl Guard {
         Self::Limits,
         Self::Unconfirmed,
         Self::Latch,
+        Self::Eyes,
     ];
 
     /// As given on the command line.
@@ -75,6 +78,7 @@ impl Guard {
             "limits",
             "unconfirmed",
             "latch",
+            "eyes",
         ][self as usize]
     }
 
@@ -99,6 +103,21 @@ impl Guard {
             Self::Limits => &[K::X24, K::X24, K::X24, K::T2, K::U15, K::X4, K::X5, K::G7],
             Self::Unconfirmed => &[K::X22, K::X22, K::X22, K::U15, K::X4, K::T2],
             Self::Latch => &[K::X23, K::X23, K::X3, K::U12, K::X4],
+            Self::Eyes => &[
+                K::X25,
+                K::X25,
+                K::X26,
+                K::X26,
+                K::T1,
+                K::T2,
+                K::T3,
+                K::T6,
+                K::T7,
+                K::G6,
+                K::H4,
+                K::U15,
+                K::X6,
+            ],
         }
     }
 
@@ -123,6 +142,10 @@ impl Guard {
                 // Three quarters of the mean level of the pictures: the light rests again and again.
                 let level = if planes > 8 { 0.05 } else { 0.02 };
                 format!("limits = {{ mean_level = {level}, mean_window_s = 0.6 }}\n")
+            }
+            Self::Eyes => {
+                let person = "[observer]\ntracked = { name = \"glasses\", id = 2 }\n";
+                format!("eyes = {{ radius = {} }}\n{person}", crate::eyes::RADIUS_M)
             }
             _ => String::new(),
         }

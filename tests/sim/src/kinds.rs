@@ -249,6 +249,14 @@ kinds! {
     X23,
     /// An order to go dark while the light rests.
     X24,
+    /// The tracker does not see the glasses, and sees the rest.
+    X25,
+    /// The tracker exchanges the labels of the glasses and of the body.
+    X26,
+    /// One call to the tracker's socket, connection or port fails.
+    X27,
+    /// One call to the projector's cable fails.
+    X28,
 }
 
 const FILES: &str = "scenes are read only when the program starts, before any light";
@@ -256,7 +264,9 @@ const FILES: &str = "scenes are read only when the program starts, before any li
 impl Kind {
     /// It strikes the tracker or its network, and nothing else.
     pub fn is_of_tracker(self) -> bool {
-        (self as usize) <= Self::T18 as usize || self.needs_connection()
+        (self as usize) <= Self::T18 as usize
+            || self.needs_connection()
+            || matches!(self, Self::X25 | Self::X26 | Self::X27)
     }
 
     /// It strikes only where the tracker is a VRPN server.
@@ -281,6 +291,12 @@ impl Kind {
     /// It strikes only where a guard stands alone that has to answer it.
     pub fn needs_guard(self) -> bool {
         matches!(self, Self::X19 | Self::X20 | Self::X21 | Self::X22 | Self::X23 | Self::X24)
+            || matches!(self, Self::X25 | Self::X26)
+    }
+
+    /// It strikes only lives of their own, see [`crate::plan::Setup::flaky`].
+    pub fn needs_flakiness(self) -> bool {
+        matches!(self, Self::X27 | Self::X28)
     }
 
     /// It strikes only where the projector hangs on a serial line.

@@ -2,6 +2,7 @@
 //! the program they believe only which frame it sent with which planes, and what it tells the operator.
 
 use crate::cable::lock;
+use crate::eyes::EyeLaw;
 use crate::guard::Guard;
 use crate::lag::Lag;
 use crate::machine::{hash, Beneath, Sent};
@@ -203,6 +204,8 @@ pub struct Laws {
     /// Every start waits for ARM, and this one does since.
     by_hand: bool,
     awaits_arm: Option<i64>,
+    /// Where a head is guarded.
+    pub eyes: Option<EyeLaw>,
     /// Where the mean of the light is limited.
     limit: Option<Limit>,
     stopped_at: Option<i64>,
@@ -287,6 +290,7 @@ impl Laws {
             armed_since: None,
             by_hand: setup.alone == Some(Guard::Hand),
             awaits_arm: None,
+            eyes: None,
             limit: (setup.alone == Some(Guard::Limits)).then(|| Limit::new(rig)),
             stopped_at: None,
             died_at: None,
@@ -579,9 +583,11 @@ impl Laws {
         let is_calm = calm_for > 2 * S && t - self.good_at < S && t - self.disturbed_at > 3 * S;
         // The run may end when a hang is found.
         let is_whole = t > self.hidden_until + S && t > self.slow_until;
+        let has_seen = self.eyes.as_ref().is_none_or(|eyes| t > eyes.blind_until(crew_ready) + 3 * S);
         is_calm
             && is_whole
             && self.is_quick
+            && has_seen
             && self.limit.is_none()
             && t - crew_ready > 3 * S
             && t - self.started_at > 4 * S
@@ -771,6 +777,13 @@ impl Laws {
             return;
         }
         self.must_be_dark(at, "a slot is lit");
+        // While a clock jumps, several slots begin at one instant.
+        let crew_ready = lock(beneath).crew_ready_at + lag;
+        let is_known = |eyes: &&mut EyeLaw| at - self.clock_moved_at > S && at > eyes.blind_until(crew_ready);
+        let eyes = self.eyes.as_mut().filter(is_known).zip(planes);
+        if let Some(Err(told)) = eyes.map(|(eyes, planes)| eyes.see(planes, at, event.last_photon_at.0)) {
+            self.fail(at, told);
+        }
         if event.kind == LightKind::Repeated {
             return self.held_too_long(at, lag);
         }
@@ -821,6 +834,10 @@ impl Laws {
             return;
         }
         let Some(sent) = &self.showing else { return };
+        // A frame that is black because a head is lost lasts as long as it would with light.
+        if self.eyes.is_some() && sent.captured_at.is_none() {
+            return;
+        }
         if self.is_frozen() || at - self.clock_moved_at < 4 * S || at - self.thawed_at < DARK_AT_LAST_NS {
             return;
         }
@@ -1087,6 +1104,7 @@ impl Laws {
         // What the law does not count: the GPU's own time, the service manager's second, a rest after flashes.
         let begin = calm_since.max(crew_ready).max(self.rested_until + 2 * S);
         let begin = begin.max(self.started_at + BEGINS_WITHIN_NS).max(self.hidden_until);
+        let begin = self.eyes.as_ref().map_or(begin, |eyes| begin.max(eyes.blind_until(crew_ready)));
         let slow = 4 * self.stride_ns + 12 * self.slot_ns;
         let late = t - begin;
         self.slowest_return_ns = self.slowest_return_ns.max(late);

@@ -6,8 +6,10 @@
 //! judges after every event; [`guard`] has the lives in which one guard stands alone; [`life`] runs one seed, and shrinks it if a law was broken.
 
 pub mod cable;
+mod calls;
 pub mod dice;
 pub mod disk;
+pub mod eyes;
 mod far;
 pub mod follow;
 pub mod guard;

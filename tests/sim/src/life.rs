@@ -26,6 +26,8 @@ pub struct Order {
     pub tracker: Option<TrackerKind>,
     /// Whether the life is strained, if not as the seed says.
     pub strained: Option<bool>,
+    /// Whether single calls fail, if not as the seed says.
+    pub flaky: Option<bool>,
     /// The guard of the light that stands alone; the projector then has neither tracks nor a serial line.
     pub alone: Option<Guard>,
     /// The kinds of which one strikes first in every episode; empty: all in turn.
@@ -77,7 +79,8 @@ pub fn live(order: &Order) -> Result<Lived, String> {
     let setup = match order.alone {
         Some(guard) => Setup::alone(order.seed, order.rate_hz, order.tracker, guard),
         None => Setup::of(order.seed, order.rate_hz, order.follows, order.serial, order.tracker)
-            .strained(order.strained),
+            .strained(order.strained)
+            .flaky(order.flaky),
     };
     let mut world = World::new(setup.clone())?;
     world.is_loud = order.is_loud;

@@ -386,7 +386,7 @@ impl Driver {
             state.met.denied += 1;
             return Err("Device or resource busy");
         }
-        if !state.plugged {
+        if state.calls.fails() || !state.plugged {
             return Err("No such file or directory");
         }
         let plug = state.plug;
@@ -399,8 +399,10 @@ impl Driver {
     /// Works on the line, if the port is not hung up. Receives the time and the faults, too.
     fn with<R>(&self, work: impl FnOnce(&mut SerialLine, i64, &CableFaults) -> R) -> Result<R, HungUp> {
         let mut state = lock(&self.cable);
+        let has_failed = state.calls.fails();
         let Cable { plugged, plug, now, line, faults, .. } = &mut *state;
         match line {
+            _ if has_failed => Err(HungUp),
             Some(line) if *plugged && *plug == self.plug => Ok(work(line, *now, faults)),
             _ => Err(HungUp),
         }

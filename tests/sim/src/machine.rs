@@ -2,6 +2,7 @@
 
 use crate::cable::lock;
 use crate::dice::Dice;
+use crate::eyes::{GLASSES, GLASSES_NUMBER};
 use crate::net::{Net, SimSocket};
 use crate::plan::TrackerSetup;
 use crate::tracker_line::PortOpener;
@@ -239,6 +240,8 @@ pub struct SimMachine {
     pub net: Arc<Mutex<Net>>,
     /// What the tracker speaks.
     pub tracker: TrackerSetup,
+    /// Somebody with glasses is tracked, too.
+    pub has_glasses: bool,
     /// Host's clock now.
     pub clock: Arc<AtomicI64>,
     /// True time minus the host's clock.
@@ -367,7 +370,9 @@ impl Machine for SimMachine {
 
 impl SimMachine {
     fn natnet(&self, clock: Arc<dyn HostClock>) -> Box<dyn Tracker> {
-        let bodies = vec![BodyKey { name: "a".into(), id: Some(1) }];
+        let glasses = BodyKey { name: GLASSES.into(), id: Some(GLASSES_NUMBER.into()) };
+        let glasses = self.has_glasses.then_some(glasses);
+        let bodies = [BodyKey { name: "a".into(), id: Some(1) }].into_iter().chain(glasses).collect();
         let config = NatNetConfig {
             local: Ipv4Addr::new(10, 0, 0, 1),
             ..NatNetConfig::unicast(Ipv4Addr::new(10, 0, 0, 2), bodies)

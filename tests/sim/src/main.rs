@@ -23,10 +23,11 @@ dpm-sim: a simulated world around the rig, with every fault in every state
   --tracker WHAT  natnet, serial, vrpn or all: what the trackers speak; default: all, a fifth of the seeds' serial and
                   a fifth VRPN
   --kinds LIST    kinds of faults, as T18,X9; every episode begins with one of them in lives that they can strike;
-                  default: all in turn. With X17 or X18, which strike an eighth of the seeds', all lives are for them
+                  default: all in turn. With X17 or X18, which strike an eighth of the seeds', and with
+                  X27 or X28, which strike a quarter of them, all lives are for them
   --alone WHO     which guard of the light stands alone: watchdog, dark-from, age, orders, session, clock, interlock,
-                  by-hand, limits; none; or some: default, one of them in three of five seeds (none of --tracks all,
-                  --serial all and --kinds)
+                  by-hand, limits, unconfirmed, latch, eyes; none; or some: default, one of them in three of five
+                  seeds (none of --tracks all, --serial all and --kinds)
   --until EVENT   stop the (single) seed at this event and print what happened
   --without LIST  numbers of faults that do not strike, as a shrunk seed names them
   --minutes M     end after so many minutes of real time
@@ -254,6 +255,7 @@ fn run() -> Result<bool, String> {
             serial: wish.serial,
             tracker: wish.tracker,
             strained: wish.first.iter().any(|kind| kind.needs_strain()).then_some(true),
+            flaky: wish.first.iter().any(|kind| kind.needs_flakiness()).then_some(true),
             alone: match wish.alone {
                 Alone::AsDrawn => Guard::drawn(seed),
                 Alone::Of(guard) => guard,

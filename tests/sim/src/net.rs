@@ -1,7 +1,9 @@
 //! The tracker's server and the network between it and the host.
 
 use crate::cable::lock;
+use crate::calls::Calls;
 use crate::dice::Dice;
+use crate::eyes::{head_motion, GLASSES, GLASSES_NUMBER};
 use crate::plan::TrackerSetup;
 use crate::tracker_line::{LineFaults, TrackerLine};
 use crate::tracker_stream::{StreamFaults, TrackerStream};
@@ -40,6 +42,8 @@ pub struct ServerKind {
     pub millimetres: bool,
     /// How the body moves.
     pub motion: BodyMotion,
+    /// Somebody with glasses is seen, too.
+    pub has_glasses: bool,
 }
 
 /// How the network behaves at present.
@@ -96,6 +100,8 @@ pub struct Net {
     restart: Option<String>,
     /// The faults.
     pub faults: NetFaults,
+    /// The program's calls to its socket, connection or port.
+    pub calls: Calls,
     /// Arrival, and the stamp that the host's kernel gives it; sender; bytes.
     to_host: VecDeque<(i64, i64, SocketAddrV4, Vec<u8>)>,
     held: Vec<Vec<u8>>,
@@ -162,13 +168,18 @@ fn source(kind: &ServerKind, seed: u64) -> Result<SampleSource, String> {
         latency_jitter_ns: 300_000,
         ..Default::default()
     };
-    let motion = kind.motion.of(if kind.millimetres { 1000.0 } else { 1.0 })?;
-    SampleSource::new(config, vec![motion]).map_err(|e| e.to_string())
+    let scale = if kind.millimetres { 1000.0 } else { 1.0 };
+    let mut bodies = vec![kind.motion.of(scale)?];
+    if kind.has_glasses {
+        bodies.push(head_motion(scale)?);
+    }
+    SampleSource::new(config, bodies).map_err(|e| e.to_string())
 }
 
 fn natnet(kind: &ServerKind, seed: u64) -> Result<NatNetServer, String> {
+    let glasses = kind.has_glasses.then(|| (GLASSES.to_owned(), GLASSES_NUMBER));
     let config = NatNetServerConfig {
-        bodies: vec![(kind.name.clone(), kind.number)],
+        bodies: [(kind.name.clone(), kind.number)].into_iter().chain(glasses).collect(),
         version: if kind.is_old { Version::V3_0 } else { Version::V4_1 },
         streaming: Streaming::Unicast(UnicastTo::CommandSocket),
         ..NatNetServerConfig::new(&["a"])
@@ -204,6 +215,7 @@ impl Net {
             windows: Vec::new(),
             restart: None,
             faults: NetFaults::default(),
+            calls: Calls::default(),
             to_host: VecDeque::new(),
             held: Vec::new(),
             old: Vec::new(),
@@ -245,6 +257,17 @@ impl Net {
                 Ok(())
             }
         }
+    }
+
+    /// The program makes a call.
+    ///
+    /// # Errors
+    /// It is the one that fails.
+    pub(crate) fn called(&mut self) -> io::Result<()> {
+        if self.calls.fails() {
+            return Err(io::Error::other("input/output error"));
+        }
+        Ok(())
     }
 
     /// Works on the serial line, if the tracker hangs on one; `now` and its faults are handed in.
@@ -442,11 +465,15 @@ pub struct SimSocket(pub Arc<Mutex<Net>>);
 
 impl Datagrams for SimSocket {
     fn receive(&self, buffer: &mut [u8]) -> io::Result<Option<Arrival>> {
-        Ok(lock(&self.0).receive(buffer))
+        let mut net = lock(&self.0);
+        net.called()?;
+        Ok(net.receive(buffer))
     }
 
     fn send(&self, bytes: &[u8], _: SocketAddrV4) -> io::Result<()> {
-        lock(&self.0).host_sends(bytes);
+        let mut net = lock(&self.0);
+        net.called()?;
+        net.host_sends(bytes);
         Ok(())
     }
 

@@ -124,6 +124,8 @@ pub struct Setup {
     pub alone: Option<Guard>,
     /// A machine on which a queue can keep itself standing, and a cable that can be too slow for every slot.
     pub strained: bool,
+    /// Single calls to the tracker's and the projector's media fail.
+    pub flaky: bool,
 }
 
 /// The share of lives whose projector follows tracks.
@@ -140,6 +142,9 @@ const BAUDS: [u32; 6] = [115_200, 230_400, 460_800, 921_600, 3_000_000, 12_000_0
 /// way at any time.
 const STRAINED: f64 = 1.0 / 8.0;
 const STRAINED_MOST_HZ: u32 = 1_000;
+
+/// The share of lives without a guard that stands alone in which single calls fail.
+const FLAKY: f64 = 1.0 / 4.0;
 
 /// Bytes of a frame of `planes` planes on a serial line, if none of them can be compacted.
 fn frame_bytes(raster: (u32, u32), planes: u32) -> u64 {
@@ -236,6 +241,7 @@ impl Setup {
             follows,
             alone: None,
             strained: false,
+            flaky: false,
             serial,
             raster,
             motion,
@@ -265,6 +271,17 @@ impl Setup {
         Self { strained: true, predict_ms: None, render_milli: self.render_milli.min(500), ..self }
     }
 
+    /// The same rig, with single calls that fail if that is wanted or drawn. Others are what they were before there were any.
+    pub fn flaky(self, wanted: Option<bool>) -> Self {
+        let drawn = Dice::new(self.seed, 0xf1a4).happens(FLAKY);
+        Self { flaky: wanted.unwrap_or(drawn), ..self }
+    }
+
+    /// Somebody with glasses stands in the beam, and is tracked.
+    pub fn has_glasses(&self) -> bool {
+        self.alone == Some(Guard::Eyes)
+    }
+
     /// Bytes of a frame on the cable, if no plane is compacted.
     pub fn frame_bytes(&self) -> i64 {
         let plane = (self.raster.0.div_ceil(8) * self.raster.1) as usize;
@@ -280,9 +297,12 @@ impl Setup {
     /// reach of prediction that follows from the rig.
     pub fn alone(seed: u64, rate_hz: Option<u32>, tracker: Option<TrackerKind>, guard: Guard) -> Self {
         let drawn = Dice::new(seed, 0xa10e7).one_of(&ALONE_RATES);
+        // The head and the body come from one server, and the head covers a part of the picture only.
+        let tracker = if guard == Guard::Eyes { Some(TrackerKind::NatNet) } else { tracker };
         let setup = Self::of(seed, rate_hz.or(Some(drawn)), Some(false), Some(false), tracker);
+        let raster = if guard == Guard::Eyes { (96, 72) } else { setup.raster };
         let render_milli = setup.render_milli.min(700);
-        Self { alone: Some(guard), predict_ms: None, render_milli, ..setup }
+        Self { alone: Some(guard), predict_ms: None, render_milli, raster, ..setup }
     }
 }
 
@@ -342,6 +362,7 @@ impl Episodes {
             .filter(|kind| setup.follows || !kind.needs_tracks())
             .filter(|kind| setup.serial.is_some() || !kind.needs_line())
             .filter(|kind| setup.strained || !kind.needs_strain())
+            .filter(|kind| setup.flaky || !kind.needs_flakiness())
             .filter(|kind| tracker == TrackerKind::Vrpn || !kind.needs_connection())
             .filter(|kind| setup.alone.map_or(!kind.needs_guard(), |guard| guard.kinds().contains(kind)))
             .collect::<Vec<_>>();

@@ -101,7 +101,7 @@ impl World {
                 self.lasts(kind, MS, Undo::Nothing);
             }
             K::X21 => {
-                lock(&self.disk).fails_in = Some(dice.between(0, 5) as u32);
+                lock(&self.disk).calls.fail_in(dice.between(0, 5) as u32);
                 self.give(dice.one_of(&[Order::Safe, Order::Black, Order::Freeze]));
                 if dice.happens(0.3) {
                     self.plan(self.t + dice.between(1, 60) * MS, Action::Kill);
@@ -109,6 +109,15 @@ impl World {
                 let until = dice.decades(50, 500) * MS;
                 self.laws.slow_disk_until(self.t + until);
                 self.lasts(kind, until, Undo::Disk);
+            }
+            K::X25 | K::X26 => self.strike_head(kind, &mut dice),
+            K::X27 => {
+                lock(&self.net).calls.fail_in(dice.between(0, 20) as u32);
+                self.lasts(kind, 500 * MS, Undo::Calls);
+            }
+            K::X28 => {
+                lock(&self.cable).calls.fail_in(dice.between(0, 20) as u32);
+                self.lasts(kind, 500 * MS, Undo::Calls);
             }
             K::X22 => self.lose_orders(&mut dice),
             K::X23 => self.strike_latch(&mut dice),
@@ -165,6 +174,21 @@ impl World {
         if let Err(e) = struck {
             self.laws.fail(self.t, format!("mistake of the simulator: {e}"));
         }
+    }
+
+    /// What the tracker reports of the head is wrong, or missing.
+    fn strike_head(&mut self, kind: Kind, dice: &mut Dice) {
+        let lasts_us = dice.decades(10, 2_500) * 1000;
+        let fault = if kind == Kind::X25 { "unseen=2" } else { "exchange" };
+        let until = self.t + lasts_us * 1000 + 40 * MS;
+        self.strike_sample(&format!("{fault}@{}us+{lasts_us}us", self.t / 1000), until);
+        if kind == Kind::X26 {
+            // The body is said to be where the head is.
+            self.laws.lies_until(until);
+            let now = self.t;
+            self.laws.eyes.iter_mut().for_each(|eyes| eyes.exchanged(now, until));
+        }
+        self.lasts(kind, until - self.t, Undo::Nothing);
     }
 
     fn strike_server(&mut self, kind: Kind, dice: &mut Dice) {
@@ -672,7 +696,12 @@ impl World {
             }
             Undo::Disk => {
                 let mut disk = lock(&self.disk);
-                (disk.refuses, disk.is_full, disk.late_ns, disk.fails_in) = (false, false, 0, None);
+                (disk.refuses, disk.is_full, disk.late_ns) = (false, false, 0);
+                disk.calls.all_succeed();
+            }
+            Undo::Calls => {
+                lock(&self.net).calls.all_succeed();
+                lock(&self.cable).calls.all_succeed();
             }
             Undo::Orders => lock(&self.cable).loses_orders = 0,
             Undo::Queue => lock(&self.beneath).queue = None,

@@ -308,7 +308,11 @@ impl Opener for PortOpener {
     }
 
     fn outcome(&mut self) -> Option<Result<Box<dyn Stream>, String>> {
-        let opened = lock(&self.0).on_line(TrackerLine::opened)??;
+        let mut net = lock(&self.0);
+        let opened = net.on_line(TrackerLine::opened)??;
+        if net.called().is_err() {
+            return Some(Err("cannot open /dev/tracker: Input/output error".into()));
+        }
         Some(opened.map(|port| Box::new(TrackerPort(self.0.clone(), port)) as Box<dyn Stream>))
     }
 }
@@ -320,13 +324,17 @@ impl Stream for TrackerPort {}
 
 impl Read for TrackerPort {
     fn read(&mut self, into: &mut [u8]) -> io::Result<usize> {
-        lock(&self.0).on_line(|line, _, _| line.read(self.1, into)).unwrap_or(Ok(0))
+        let mut net = lock(&self.0);
+        net.called()?;
+        net.on_line(|line, _, _| line.read(self.1, into)).unwrap_or(Ok(0))
     }
 }
 
 impl Write for TrackerPort {
     fn write(&mut self, bytes: &[u8]) -> io::Result<usize> {
-        lock(&self.0).on_line(|line, now, _| line.write(self.1, bytes, now)).unwrap_or(Ok(0))
+        let mut net = lock(&self.0);
+        net.called()?;
+        net.on_line(|line, now, _| line.write(self.1, bytes, now)).unwrap_or(Ok(0))
     }
 
     fn flush(&mut self) -> io::Result<()> {

@@ -401,7 +401,11 @@ impl Opener for ServerOpener {
     }
 
     fn outcome(&mut self) -> Option<Result<Box<dyn Stream>, String>> {
-        let connected = lock(&self.0).on_stream(TrackerStream::connected)??;
+        let mut net = lock(&self.0);
+        let connected = net.on_stream(TrackerStream::connected)??;
+        if net.called().is_err() {
+            return Some(Err("cannot connect to 10.0.0.2: no buffer space available".into()));
+        }
         Some(connected.map(|number| Box::new(TrackerSocket(self.0.clone(), number)) as Box<dyn Stream>))
     }
 }
@@ -413,7 +417,9 @@ impl Stream for TrackerSocket {}
 
 impl Read for TrackerSocket {
     fn read(&mut self, into: &mut [u8]) -> io::Result<usize> {
-        lock(&self.0).on_stream(|stream, now, _| stream.read(self.1, into, now)).unwrap_or(Ok(0))
+        let mut net = lock(&self.0);
+        net.called()?;
+        net.on_stream(|stream, now, _| stream.read(self.1, into, now)).unwrap_or(Ok(0))
     }
 }
 
@@ -422,7 +428,9 @@ impl Write for TrackerSocket {
         let write = |stream: &mut TrackerStream, now, faults: &StreamFaults| {
             stream.write(self.1, bytes, now, faults.cut)
         };
-        lock(&self.0).on_stream(write).unwrap_or(Ok(0))
+        let mut net = lock(&self.0);
+        net.called()?;
+        net.on_stream(write).unwrap_or(Ok(0))
     }
 
     fn flush(&mut self) -> io::Result<()> {

@@ -3,6 +3,7 @@
 use crate::cable::{lock, Cable};
 use crate::dice::Dice;
 use crate::disk::Disk;
+use crate::eyes::EyeLaw;
 use crate::guard::{bare_arm, damage, first_packet, of_another_host, session, word_of_another_host, Guard};
 use crate::kinds::{Kind, State};
 use crate::laws::{Laws, BEGINS_WITHIN_NS};
@@ -110,6 +111,8 @@ pub enum Undo {
     Heat,
     /// The disk is as it should be.
     Disk,
+    /// All calls succeed.
+    Calls,
     /// Orders get through.
     Orders,
     /// The machine is as quick as before.
@@ -295,7 +298,8 @@ impl World {
         let stretch_ns = setup.alone.map_or(0, Guard::stretches_ns) as u64;
         cable.stretch = stretch_ns / 1000 * u64::from(DeviceClock::IDEAL.tick_hz) / 1_000_000;
         cable.line = setup.serial.map(|line| SerialLine::new(seed, line, setup.travel_ns));
-        let laws = Laws::new(&rig, &setup);
+        let mut laws = Laws::new(&rig, &setup);
+        laws.eyes = (setup.alone == Some(Guard::Eyes)).then(|| EyeLaw::new(&rig)).transpose()?;
         let tracks = setup.follows.then(|| TrackLaws::new(&rig, &setup)).transpose()?;
         let projector = projector_of(&setup, None, 0)?;
         let mut beneath = Beneath::new(seed, slot_ns * setup.render_milli / 1000);
@@ -538,7 +542,10 @@ impl World {
             K::G4 | K::G5 | K::G6 | K::G7 | K::X7 => lock(&self.beneath).met[1],
             K::H4 | K::H5 | K::X1 | K::X2 => lock(&self.beneath).met[0],
             K::H8 | K::H9 => lock(&self.beneath).slowed,
-            K::H1 | K::X21 => lock(&self.disk).met,
+            K::H1 => lock(&self.disk).met,
+            K::X21 => lock(&self.disk).calls.met,
+            K::X27 => lock(&self.net).calls.met,
+            K::X28 => lock(&self.cable).calls.met,
             K::X19 => met.contacts,
             K::X20 => met.datagrams,
             K::X22 => cable().orders,
@@ -845,6 +852,7 @@ impl World {
             beneath: self.beneath.clone(),
             net: self.net.clone(),
             tracker: self.setup.tracker,
+            has_glasses: self.setup.has_glasses(),
             clock: self.clock.clone(),
             lag: self.lag.clone(),
         };
@@ -1083,7 +1091,11 @@ impl World {
             }
             St::RePlugging => self.strike(Kind::U1, way),
             // FREEZE holds its picture beyond `dark from`: what ends it is not that guard.
-            St::FrozenOrBlack if way.is_multiple_of(2) || self.setup.alone == Some(Guard::DarkFrom) => {
+            // Where heads are guarded, FREEZE is BLACK.
+            St::FrozenOrBlack
+                if way.is_multiple_of(2)
+                    || matches!(self.setup.alone, Some(Guard::DarkFrom | Guard::Eyes)) =>
+            {
                 self.give(Order::Black);
             }
             St::FrozenOrBlack => self.give(Order::Freeze),
@@ -1165,5 +1177,6 @@ pub(crate) fn server_kind(setup: &Setup) -> ServerKind {
         is_old: false,
         millimetres: false,
         motion: setup.motion,
+        has_glasses: setup.has_glasses(),
     }
 }
