@@ -1,6 +1,6 @@
 //! How a body goes on where light lies far ahead of its newest sample, learned from forecasts that failed.
 //!
-//! An estimated acceleration is noise beyond some 20 ms, so [`Motion::point_after`] lets it last no longer. That is right for a
+//! An estimated acceleration is noise beyond some 12 ms, so [`Motion::point_after`] lets it last no longer. That is right for a
 //! body that jerks, and wrong for one that swings, behind a display of 60 frames a second: its acceleration lasts, and it is
 //! pulled back the more the faster it goes away. So forecasts of [`AHEAD_NS`] are compared with what came. Kept is the least
 //! squares of two shares, the old forecasts fading: how much of the acceleration lasts, and by how much of its velocity a body

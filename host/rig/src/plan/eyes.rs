@@ -95,7 +95,7 @@ impl Bystander {
 
 /// What is known of a head.
 #[derive(Clone, Copy, Debug, Default)]
-struct Head {
+struct HeadBelief {
     /// The newest state that it can have come to.
     believed: Option<TrackState>,
     /// That was told of it, and not of a body under whose label it goes on.
@@ -106,7 +106,7 @@ struct Head {
     calm: Calm,
 }
 
-impl Head {
+impl HeadBelief {
     /// Takes note of the speed that the filter says.
     fn watch(&mut self, state: &TrackState) {
         let has_gap = self.is_own && !self.believed.is_some_and(|known| goes_on(&known, state));
@@ -123,7 +123,7 @@ impl Head {
 #[derive(Clone, Debug)]
 pub(crate) struct HeadWatch {
     /// Those of [`Rig::heads`].
-    heads: Vec<Head>,
+    heads: Vec<HeadBelief>,
     /// All that is tracked besides, each with its index among [`Rig::tracked`].
     bystanders: Vec<(usize, Bystander)>,
 }
@@ -134,7 +134,7 @@ impl HeadWatch {
         let is_head = |i: &usize| rig.heads.iter().any(|head| head.tracked == *i);
         let others = (0..rig.tracked_count()).filter(|i| !is_head(i) && !rig.heads.is_empty());
         Self {
-            heads: vec![Head::default(); rig.heads.len()],
+            heads: vec![HeadBelief::default(); rig.heads.len()],
             bystanders: others.map(|i| (i, Bystander::default())).collect(),
         }
     }
@@ -163,7 +163,7 @@ impl HeadWatch {
 
     /// Whether `state`, told of head `i`, is that head's.
     fn is_own(&self, heads: &[GuardedHead], snapshot: &TrackSnapshot, i: usize, state: &TrackState) -> bool {
-        let Head { believed, is_own, doubted_since, .. } = self.heads[i];
+        let HeadBelief { believed, is_own, doubted_since, .. } = self.heads[i];
         if is_own && believed.is_some_and(|known| goes_on(&known, state)) {
             return true;
         }
@@ -226,7 +226,7 @@ impl HeadWatch {
                 self.heads[i].watch(&state);
                 if self.is_own(heads, snapshot, i, &state) {
                     let known = self.heads[i];
-                    self.heads[i] = Head { believed: newest, is_own: true, doubted_since: None, ..known };
+                    self.heads[i] = HeadBelief { believed: newest, is_own: true, doubted_since: None, ..known };
                 } else {
                     self.doubt(i, &state, snapshot);
                     eyes.spheres.push(swept(&state, light, head.radius_m));
