@@ -26,8 +26,8 @@ section! {
         input: VideoInput = VideoInput::Hdmi, "", Any;
         /// The controller, as BUS:ADDRESS in `lsusb`; needed if several are plugged in.
         device: Option<String> = None, "", NotEmpty;
-        /// Exposure of each pattern. If left out, nine tenths of what a frame has for it: 620 of at most 684 for 24
-        /// patterns at 60 frames/s. What is left is dark after each pattern, so that no long gap flickers.
+        /// Exposure of each pattern; the rest of its time is dark. If left out, nine tenths of that time: 620 of at
+        /// most 684 for 24 patterns at 60 frames/s.
         exposure_us: Option<u32> = None, "us", Within(24, 40_000);
     }
 }

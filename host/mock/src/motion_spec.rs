@@ -63,8 +63,8 @@ motions! {
     pub enum MotionSpec {
         /// The body stays at its rest pose.
         "still" => Still {},
-        /// Back and forth on a line: stretches of constant speed joined by turns of constant acceleration. At time 0 the body is at
-        /// rest position and moves at full speed in `direction`.
+        /// Back and forth on a line at constant speed, with turns of constant acceleration. At time 0 the body is at
+        /// its rest position and moves at full speed in `direction`.
         "translate" => Translate {
             /// Any non-zero vector; its length does not matter. Default: to the left, -x.
             #[serde(default = "left")]

@@ -12,8 +12,7 @@ section! {
     pub struct CalibrationConfig {
         /// The file that `dpm calibrate` writes. Its parts take the place of `projector.position`, `look_at`, `up`,
         /// `horizontal_fov_deg` and `calibration`; of `scene.bodies[].mesh_to_body`; of `tracker.latency_us`; of
-        /// `projector.response` and `projector.flat_field`, and of the channels' shares of `projector.max_intensity`. Its light
-        /// is refused with planes of other `projector.weights` than those that were measured.
+        /// `projector.response` and `projector.flat_field`, and of the channels' shares of `projector.max_intensity`.
         file: Option<PathBuf> = None, "", NotEmpty;
     }
 }

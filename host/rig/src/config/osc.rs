@@ -18,12 +18,11 @@ section! {
     pub struct OscConfig {
         /// Address and port on which datagrams are taken, for example `"127.0.0.1:9000"`; port 0 takes a free one.
         listen: Option<String> = None, "", NotEmpty;
-        /// Addresses of the machines that may send, for example `["192.168.1.20"]`. Without any, programs on this machine
-        /// may; with any, they may only if `"127.0.0.1"` is among them. UDP addresses can be forged, so name a network
-        /// that you trust.
+        /// Addresses of the machines that may send, for example `["192.168.1.20"]`. Without any, programs on this
+        /// machine may; with any, they may only if `"127.0.0.1"` is among them.
         from: Vec<String> = Vec::new(), "", Any;
-        /// What a message must have, as a text among its arguments or in its address, to change a parameter or to
-        /// freeze: 12 to 64 letters, digits, `-` and `_`. Without a token in the rig file OSC only makes dark.
+        /// What a message must contain to change a parameter or to freeze: 12 to 64 letters, digits, `-` and `_`.
+        /// Without a token in the rig file OSC only makes dark.
         token: Option<String> = None, "", NotEmpty;
     }
 }

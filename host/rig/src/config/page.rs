@@ -14,10 +14,10 @@ section! {
     /// The live page of a running rig, and its metrics under `/metrics`; see docs/PAGE.md. Off unless `listen` is set.
     pub struct PageConfig {
         /// Address and port on which the page is served, for example `"127.0.0.1:8947"`; port 0 takes a free one. It
-        /// must be an address of this machine alone, because the page has no encryption of its own. `--page` sets it.
+        /// must be an address of this machine alone. `--page` sets it.
         listen: Option<String> = None, "", NotEmpty;
-        /// Names under which a proxy with TLS on this machine serves the page to others, for example
-        /// `["rig.example.org"]`; with the port where it is not 443. Requests that name another host are refused.
+        /// Names under which a proxy with TLS on this machine serves the page, for example `["rig.example.org"]`;
+        /// with the port where it is not 443. Requests that name another host are refused.
         hosts: Vec<String> = Vec::new(), "", Any;
     }
 }

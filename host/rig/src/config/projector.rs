@@ -19,40 +19,34 @@ section! {
         width: u32 = 1024, "px", Within(1, Raster::MAX_SIDE);
         /// Rows of mirrors.
         height: u32 = 768, "px", Within(1, Raster::MAX_SIDE);
-        /// Frames per second, as a whole number or as a fraction in a string, for example "60000/1001". Change it to
-        /// the rate at which the projector is driven.
+        /// Frames per second, as a whole number or as a fraction in a string, for example "60000/1001". Set it to
+        /// the projector's rate.
         frame_rate: FrameRate = FrameRate::new(947, 1).expect("not zero"), "frames/s", Within(RateBound(1, 1), RateBound(100_000, 1));
         /// Bit planes in a frame: 24 are eight bits of red, green and blue; 8 are eight bits of one white channel,
-        /// which shows the green of the picture at three times the frame rate.
+        /// which shows the green of the picture.
         planes: u32 = 24, "", OneOf(&[8, 24]);
-        /// How much light the planes of a channel give: "binary" halves it from plane to plane, so that their bits are the
-        /// code value; "equal" gives every plane the same, and shows grey as a halftone of mirrors and planes. Change it
-        /// if the projector lights all planes alike: a DLPC900 that shows the bits of a video signal, or an ALP. On a
-        /// bit-plane projector equal planes together give 128 / 255 of full white. "split" shows the highest bit three
-        /// times, apart from one another, in place of the two lowest: twice the light at the same peak, less modulated,
-        /// and half the levels, of which the rest comes back over two frames. It is for bit-plane projectors that offer
-        /// planes that exceed full light (docs/PROTOCOL.md, section 17). "auto" is "split" for a run on a projector that
-        /// offers it, if the rig has no limits on light, no calibration file, no `response`, no `flat_field` and no
-        /// `plane_order` of its own; otherwise it is "binary".
+        /// How much light the planes of a channel give. "binary" halves it from plane to plane; "equal" gives every
+        /// plane the same, and shows grey as a halftone. Change it if the projector lights all planes alike, as a
+        /// DLPC900 behind a video signal or an ALP. "split" shows the highest bit three times in place of the two
+        /// lowest: twice the light, and half the levels. It needs a projector that offers it (docs/PROTOCOL.md, section
+        /// 17). "auto" is "split" where a projector offers it and the rig has no limits on light, no calibration file,
+        /// no `response`, no `flat_field` and no `plane_order` of its own; otherwise "binary".
         weights: PlaneWeights = PlaneWeights::Binary, "", Any;
-        /// The order in which a frame shows the bits of a code value, from its first plane on; red, green and blue in
-        /// turn for each bit. By default the highest bits are lit together, which smears a moving picture least. The
-        /// light of "7 6 5 4 3 2 1 0" is over soonest: its centre comes 0.12 ms earlier at 947 frames/s, and so needs
-        /// less prediction. Has no effect on planes of equal weights, or on split ones, whose order is fixed.
+        /// The order in which a frame shows the bits of a code value, in red, green and blue in turn. The default
+        /// lights the highest bits together, which smears a moving picture least; "7 6 5 4 3 2 1 0" needs the least
+        /// prediction. Has no effect on planes of equal or split weights.
         plane_order: BitOrder = BitOrder::default(), "", Any;
-        /// The instant for which each bit plane shows the bodies. "own": the planes of each bit (each plane, if all
-        /// give equal light) are shown where the bodies are while these planes are lit, so that a moving picture is not
-        /// smeared. "frame": all at the centre of the frame's light, which saves two passes.
+        /// The instant for which each bit plane shows the bodies. "own": the planes of each bit show them where they
+        /// are while these planes are lit, so that a moving picture is not smeared. "frame": all at the centre of the
+        /// frame's light, which saves two passes.
         plane_poses: PlanePoses = PlanePoses::Own, "", Any;
-        /// How far the planes of each bit go on the way from the centre of the frame's light to their own instant with
-        /// `plane_poses = "own"`: 1 shows each where the bodies are while it is lit, 0 shows all where they are at the
-        /// centre. 1 is sharpest for an eye that follows a body; less is less noisy for one that rests. At 947 frames/s
-        /// and above the value is a fraction of the way; at lower rates the planes stop the same time short of it.
-        /// Planes of equal and split weights, and those that show a whole code value, always go to their own instant.
+        /// How far the planes of each bit go from the centre of the frame's light towards their own instant with
+        /// `plane_poses = "own"`, at 947 frames/s and above; at lower rates they stop the same time short of it. 1 is
+        /// sharpest for an eye that follows a body; less is less noisy for one that rests. Planes of equal and split
+        /// weights, and those that show a whole code value, always go to their own instant.
         plane_follow: f64 = FOLLOW_SHARE, "", Within(0.0, 1.0);
         /// Whether the projector gets the places of the bodies between frames, so that it moves their light while the
-        /// planes are lit. "auto": if it offers that (the link's TRACKS), and not on a serial line. Change it to "auto"
-        /// if bodies turn sharply and the projector can; it has not been tried on real hardware.
+        /// planes are lit. "auto": if it offers that, and not on a serial line. Not tried on real hardware.
         tracks: TracksUse = TracksUse::Off, "", Any;
         /// Position of the projector's lens in the world. Measure it, or give `calibration` instead.
         position: [f64; 3] = [0.0, 0.35, 1.1], "m", Within(-1e6, 1e6);
@@ -62,43 +56,43 @@ section! {
         up: [f64; 3] = [0.0, 1.0, 0.0], "", Within(-1e6, 1e6);
         /// Full angle of view across the raster's width. Change it to match the lens.
         horizontal_fov_deg: f64 = 30.0, "deg", Within(0.1, 170.0);
-        /// A calibration file that replaces `position`, `look_at`, `up` and `horizontal_fov_deg`: OpenCV FileStorage
-        /// XML, YAML or JSON in any dialect of docs/CALIBRATION.md, or MPCDI with profile sl. If the file names a
-        /// raster, it must have this one's shape; the view is scaled. Use it for every real rig.
+        /// A calibration file that replaces `position`, `look_at`, `up` and `horizontal_fov_deg`, in any form of
+        /// docs/CALIBRATION.md. If the file names a raster, it must have this one's shape. Use it for every real
+        /// rig.
         calibration: Option<PathBuf> = None, "", NotEmpty;
         /// Unit of the lengths in the calibration file; its numbers do not show it. Required with `calibration`.
         calibration_unit: Option<CalibrationUnit> = None, "", Any;
-        /// Model of the lens in the calibration file. "auto" takes the file's word (`fisheye_model`,
-        /// `distortion_model`); four coefficients without a word are k1 k2 p1 p2. "fisheye" is OpenCV's `cv::fisheye`.
+        /// Model of the lens in the calibration file. "auto" takes the file's word; four coefficients without a word
+        /// are k1 k2 p1 p2. "fisheye" is OpenCV's `cv::fisheye`.
         calibration_lens: CalibrationLens = CalibrationLens::Auto, "", Any;
         /// The region of an MPCDI file that is this projector; needed if the file has several.
         calibration_region: Option<String> = None, "", NotEmpty;
-        /// The device of a calibration file that is this projector, by the name of its section or "projector"; needed if
-        /// the file describes several devices, for example a camera and a projector.
+        /// The device of a calibration file that is this projector, by the name of its section or "projector"; needed
+        /// if the file describes several devices.
         calibration_device: Option<String> = None, "", NotEmpty;
         /// Pose in the world of the camera that made the calibration file.
         calibration_camera: Option<CalibrationCameraConfig> = None, "", Any;
         /// Columns and rows of the raster that the calibration file refers to; the projector's own if left out. Its
-        /// view is kept if `width` and `height` differ (`--raster` sets this key).
+        /// view is kept if `width` and `height` differ.
         calibration_raster: Option<[u32; 2]> = None, "px", Within(1, Raster::MAX_SIDE);
         /// Radiant intensity of one pixel at full drive, in scene units: one number, or one for each channel. The
-        /// scene's radiance 1 needs `pi * d^2 / albedo` at distance d. Raise it if the report says that light is
-        /// clipped; lower it if the picture uses few of its levels.
+        /// scene's radiance 1 needs `pi * d^2 / albedo` at distance d. Raise it if light is clipped; lower it if
+        /// the picture uses few of its levels.
         max_intensity: PerChannel = PerChannel([8.0; 3]), "scene units/sr", Each(1e-6, 1e12);
         /// How much light a code value gives. Binary planes of calibrated LEDs are linear; a display's are not.
         response: ResponseConfig = ResponseConfig::default(), "", Any;
         /// A picture of a white field, as measured on a surface at an even distance (linear PNG with 8 or 16 bits, or
-        /// PFM, of any size). Pixels that are darker than the brightest one are driven harder; `max_intensity` is that
-        /// of the brightest.
+        /// PFM, of any size). Pixels that are darker than the brightest one, whose light `max_intensity` is, are
+        /// driven harder.
         flat_field: Option<PathBuf> = None, "", NotEmpty;
-        /// The `weights` with which `response` and `flat_field` were measured; the rig's own if left out, but never "split". A
-        /// rig whose planes are others than these is refused: what a code value gives is not known of them.
+        /// The `weights` with which `response` and `flat_field` were measured; the rig's own if left out, but never
+        /// "split". A rig with other planes is refused.
         measured_with: Option<PlaneWeights> = None, "", Any;
         /// Time by which light falls later than the projector reports. Set it if a check shows that light trails the
         /// motion whatever the tracker.
         latency_us: u32 = 0, "us", Within(0, 200_000);
         /// Bit planes that the panel can show per second; a greater `frame_rate * planes` is refused. The default is
-        /// a 1024 x 768 panel at 44.0 us per plane, which is 947 frames of 24 planes.
+        /// 44.0 us a plane, which is 947 frames of 24 planes.
         max_planes_per_second: u32 = 22_728, "planes/s", Within(1, 10_000_000);
         /// How the program reaches the projector.
         backend: ProjectorBackend = Default::default(), "", Any;
@@ -257,8 +251,8 @@ section! {
 section! {
     /// Light as measured.
     pub struct TableResponseConfig {
-        /// A text file of 256 lines with the light of each code value, from 0 on, in any unit: one number for all
-        /// channels, or red, green and blue, separated by commas or blanks. Required.
+        /// A text file of 256 lines with the light of each code value, in any unit: one number for all channels,
+        /// or red, green and blue, separated by commas or blanks. Required.
         file: PathBuf = PathBuf::new(), "", NotEmpty;
     }
 }
@@ -266,8 +260,8 @@ section! {
 section! {
     /// Pose in the world of the camera that made the calibration file: the inverse of the camera's `rvec` and `tvec`.
     pub struct CalibrationCameraConfig {
-        /// Position in the world of the camera that made the calibration file. The table `calibration_camera` is
-        /// required if the file's origin is that camera, as with procam-calibration, and refused otherwise.
+        /// Position in the world of the camera that made the calibration file. The table is required if the
+        /// file's origin is that camera, as with procam-calibration, and refused otherwise.
         position: [f64; 3] = [0.0; 3], "m", Within(-1e6, 1e6);
         /// Turns that camera's axes (x right, y down, z ahead, as in OpenCV) to the world's: rotations about the
         /// world's x, then y, then z.

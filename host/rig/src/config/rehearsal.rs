@@ -14,11 +14,9 @@ section! {
         acceleration_m_s2: f64 = 5.0, "m/s2", Within(1e-2, 1000.0);
         /// Standard deviation, along each axis, of a corner of a tag or of a marker in a camera's picture.
         corner_px: f64 = 0.1, "px", Within(0.0, 10.0);
-        /// How far the camera's lens spreads the light of a point: standard deviation along each axis. Painted pictures are so
-        /// soft.
+        /// How far the camera's lens spreads the light of a point: standard deviation along each axis.
         softness_px: f64 = 0.5, "px", Within(0.0, 10.0);
-        /// From the end of the exposure to the finished pose. If left out, the time between two samples of the tracker: a
-        /// sensor is read out for about that long.
+        /// From the end of the exposure to the finished pose. If left out, the time between two samples of the tracker.
         delivery_us: Option<u32> = None, "us", Within(0, 1_000_000);
         /// Standard deviation of the position that another tracker than a camera reports, along each axis. The mock has its
         /// own key.

@@ -19,11 +19,11 @@ section! {
         /// Closest-hit rays per path: 1 shows emission only, 2 direct light, 3 one bounce.
         depth: u32 = 3, "", Within(1, 64);
         /// Raster that is traced and projected instead of the mock projector's if only software Vulkan is available.
-        /// `--raster` sets it. Every other projector keeps the mirrors that it has.
+        /// `--raster` sets it.
         software_raster: [u32; 2] = [320, 240], "px", Within(1, Raster::MAX_SIDE);
-        /// Share of the projector's columns and rows that is traced. Each of the projector's pixels finds its own surface, and the light comes from the
-        /// traced pixels around it that show the same body, depth and normal. A quarter costs about a sixteenth of the rays.
-        /// "auto" takes the largest of 1, 0.75, 0.5, 0.35 and 0.25 whose frames fit their slots on this device; only at real pace.
+        /// Share of the projector's columns and rows that is traced (docs/RENDERING.md). A quarter costs about a
+        /// sixteenth of the rays. "auto" takes the largest of 1, 0.75, 0.5, 0.35 and 0.25 whose frames fit their slots
+        /// on this device; only at real pace.
         scale: RenderScale = RenderScale::Share(1.0), "", Within(0.25, 1.0);
         /// Factor by which radiance is multiplied before it becomes light.
         exposure: f64 = 1.0, "", Within(1e-6, 1e6);
@@ -37,8 +37,8 @@ section! {
         clamp_indirect: f64 = 0.0, "scene units", Within(0.0, 1e9);
         /// The Vulkan device: its number in `dpm doctor` or a part of its name; the fastest kind if left out.
         gpu: Option<String> = None, "", NotEmpty;
-        /// Whether a GPU with two queues begins a frame while the one before it ends. Frames that take it about a slot or
-        /// more follow each other faster then.
+        /// Whether a GPU with two queues begins a frame while the one before it ends, for frames that take about a slot
+        /// or more.
         overlap: bool = true, "", Any;
         /// Who finds what a ray meets. The pictures are the same, but for surfaces that are equally near.
         tracing: Tracing = Tracing::Auto, "", Any;
@@ -214,8 +214,8 @@ section! {
         affinity: Vec<u32> = Vec::new(), "", Any;
         /// Keep all memory resident, so that no page fault delays a frame.
         lock_memory: bool = false, "", Any;
-        /// Keep idle cores from deep sleep while the rig runs, for all programs of this machine, so that a stage that
-        /// waits starts within microseconds. It costs power. If the right is refused, the run warns once.
+        /// Keep idle cores of this machine from deep sleep while the rig runs, so that a stage that waits starts
+        /// within microseconds. It costs power.
         keep_awake: bool = true, "", Any;
         /// How stages wait for each other.
         wait: Wait = Wait::Auto, "", Any;
@@ -269,13 +269,13 @@ section! {
         /// Write a Chrome trace of every frame.
         trace: bool = false, "", Any;
         /// Record what every stage did around each missed slot, from two seconds before it: a trace `flight-NN.json`
-        /// and a page `flight-NN.txt` in `dir`, 32 of each at most. Frames are recorded beside their path.
+        /// and a page `flight-NN.txt` in `dir`, 32 of each at most.
         flight_recorder: bool = false, "", Any;
-        /// How often a run without a terminal writes its progress as one line of JSON to the standard error stream; 0 is
-        /// never. Notes are always written.
+        /// How often a run without a terminal writes its progress as one line of JSON to the standard error stream; 0
+        /// is never.
         log_every_s: f64 = 1.0, "s", Within(0.0, 86_400.0);
-        /// Time over which the images integrate light, as an eye does; at least one frame. If left out, it is 33 ms
-        /// or one frame, whichever is longer.
+        /// Time over which the images integrate light, as an eye does. If left out, it is the longer of 33 ms and
+        /// one frame.
         light_window_ms: Option<f64> = None, "ms", Within(0.01, 10_000.0);
     }
 }

@@ -15,24 +15,22 @@ section! {
     /// What happens when something fails.
     pub struct SafetyConfig {
         /// The projector goes dark by itself if it receives nothing for this long, at least two frames. If left out,
-        /// it is 50 ms or three frames, whichever is longer.
+        /// it is the longer of 50 ms and three frames.
         watchdog_ms: Option<u32> = None, "ms", Within(1, 10_000);
         /// Prediction extends a body's track for at most this long, from the tracker's newest sample to the middle of
         /// the light; then its light goes off. A frame that would be lit later than that plus one slot is not sent. A
-        /// frame that arrives late or is repeated goes dark when its poses reach this age, but never sooner than three
-        /// slots after its own. If left out: the tracker's latency, two of its samples, the time from latch to light, a
-        /// slot, and those until the next frame is due for certain (one, or as many as a slow link needs), at least 20
-        /// ms. A value in the file is binding: a rig whose frames take longer stays dark and reports it.
+        /// frame that is late or repeated goes dark at this age of its poses (docs/SAFETY.md). If left out, it follows
+        /// the need of the frames, at least 20 ms. A value in the file is binding: a rig whose frames take longer stays
+        /// dark and reports it.
         predict_ms: Option<u32> = None, "ms", Within(0, 1_000);
         /// Permitted general flashes of the whole picture per second; beyond this the projector rests in the dark for
         /// two seconds. WCAG 2.3.1 allows 3; 0 is off.
         flashes_per_second: u32 = 3, "1/s", Within(0, 1_000);
-        /// If set, the start of a run also acknowledges latched faults of heat, lamp, emergency stop and flashes.
-        /// Otherwise the run refuses to start and names them. Set it once, on the command line, when the cause is
-        /// gone.
+        /// If set, the start of a run also acknowledges latched faults of heat, lamp, emergency stop and flashes;
+        /// otherwise the run refuses to start. Set it once, on the command line, when the cause is gone.
         acknowledge_faults: bool = false, "", Any;
         /// Whether a run makes light as soon as it can, or stays dark until somebody gives ARM, at every start of the
-        /// program. The packaged service starts by hand (docs/ORDERS.md).
+        /// program (docs/ORDERS.md).
         start: Restart = Restart::ByItself, "", Any;
         /// How much light is permitted; docs/SAFETY.md says what that does for people and what it does not.
         limits: LimitsConfig = LimitsConfig::default(), "", Any;
@@ -58,17 +56,16 @@ section! {
     /// itself.
     pub struct LimitsConfig {
         /// Greatest mean level of the picture over `mean_window_s`, as a share of full white, at least 0.001; 0 is
-        /// off. The level is the mean drive of the strongest of the three colours. A picture that would exceed the
-        /// limit is not dimmed: the light goes off for a window's length.
+        /// off. A picture that would exceed the limit is not dimmed: the light goes off for a window's length
+        /// (docs/SAFETY.md).
         mean_level: f64 = 0.0, "", Within(0.0, 1.0);
         /// Length of every window over which the mean is taken.
         mean_window_s: f64 = 10.0, "s", Within(SHORTEST_S, LONGEST_S);
-        /// Longest time of full white (a level of 0.95 or more, including pauses below a tenth of a second), 0.5 to
-        /// 3600; 0 is off. Afterwards the light goes off for the same time.
+        /// Longest time of full white (a level of 0.95 or more), 0.5 to 3600; 0 is off. Afterwards the light goes
+        /// off for the same time.
         full_white_s: f64 = 0.0, "s", Within(0.0, LONGEST_S);
-        /// The `projector.weights` whose full white `mean_level` is a share of: those with which it was measured. Limits count
-        /// the light of binary planes, whatever planes are lit, so a level of planes that give less is made smaller. Planes
-        /// that give more are refused here.
+        /// The `projector.weights` with which `mean_level` was measured. The level is made smaller for planes that give
+        /// less light than binary ones; planes that give more are refused here.
         measured_with: PlaneWeights = PlaneWeights::Binary, "", Any;
     }
 }
@@ -97,11 +94,11 @@ section! {
     pub struct EyesConfig {
         /// Off lets light fall on tracked heads too. Without a tracked head it has nothing to guard.
         guard: bool = true, "", Any;
-        /// Further tracked people, each by what is tracked of the head: `["visitor"]`. The observer is guarded without being
-        /// named here. An entry is a name or a table, as in `observer.tracked`, or one of `scene.bodies[].name`.
+        /// Further tracked people, each by what is tracked of the head, for example `["visitor"]`: a name or a table as
+        /// in `observer.tracked`, or one of `scene.bodies[].name`. The observer needs no entry.
         heads: Vec<Wearable> = Vec::new(), "", Any;
-        /// Radius of the sphere about the observer's eye, or about the origin of another tracked head. It grows by what
-        /// the tracker and the prediction do not know.
+        /// Radius of the sphere about the observer's eye, or about the origin of another tracked head, before it grows
+        /// (docs/SAFETY.md).
         radius: f64 = 0.15, "m", Within(0.01, 10.0);
         /// The sphere of a head that the tracker loses grows at 2 m/s for this long; then the rig is dark until the head
         /// is seen again.
@@ -135,8 +132,8 @@ section! {
     pub struct ProcessInterlockConfig {
         /// Name of the process, as `ps -o comm` shows it. Give this or `pid_file`.
         name: Option<String> = None, "", NotEmpty;
-        /// File that contains the id of the process, as services write it; an absolute path. Only the process that
-        /// was alive when the file was first read counts, until the file is rewritten.
+        /// File that contains the id of the process; an absolute path. Only the process that was alive when the
+        /// file was first read counts, until the file is rewritten.
         pid_file: Option<PathBuf> = None, "", NotEmpty;
         /// Whether light returns when the process is back, or when somebody gives ARM after that.
         reset: Restart = Restart::ByItself, "", Any;

@@ -16,10 +16,10 @@ section! {
     pub struct ObserverConfig {
         /// Position of the eye if it is not tracked, and until the tracker has seen it.
         position: [f64; 3] = [0.25, 0.35, 1.0], "m", Within(-1e6, 1e6);
-        /// The rigid body that carries the eye, for example glasses, by the name under which the tracker reports it. It
-        /// is no entry of `scene.bodies`. A table has more: `{ name = "glasses", id = 7 }` for a tracker that has
-        /// numbers and no names, and `{ name = "glasses", motion = { kind = "sway", peak_rate_rad_s = 1,
-        /// peak_acceleration_rad_s2 = 4 } }` for the mock, with which it stands at `position` without a motion.
+        /// The rigid body that carries the eye, for example glasses, by its name in the tracker; no entry of
+        /// `scene.bodies`. A table has more: `{ name = "glasses", id = 7 }` for a tracker that has numbers and no
+        /// names, and `{ name = "glasses", motion = { kind = "sway", peak_rate_rad_s = 1, peak_acceleration_rad_s2 = 4
+        /// } }` for the mock, with which it stands at `position` without a motion.
         tracked: Option<Wearable> = None, "", Any;
         /// The same by one of `scene.bodies[].name`, whose mesh is then never lit; `tracked` needs no mesh.
         body: Option<String> = None, "", NotEmpty;
@@ -27,8 +27,8 @@ section! {
         eye_offset: [f64; 3] = [0.0, 0.0, 0.0], "m", Within(-10.0, 10.0);
         /// Where the eye looks.
         gaze: GazeConfig = GazeConfig::default(), "", Any;
-        /// A gaze whose tracked body is no longer seen, or that is measured and no longer sure, stays where it was for
-        /// this long; a measured one then follows the axis of the glasses.
+        /// A gaze whose tracked body is no longer seen, or that is no longer sure, stays for this long; a measured one
+        /// then follows the axis of the glasses.
         gaze_hold_ms: u32 = 200, "ms", Within(0, 60_000);
         /// After that, the zones of full quality around the gaze grow at this rate until it is known
         /// again.
@@ -41,8 +41,8 @@ section! {
     pub struct SceneConfig {
         /// A glTF 2.0 file (`.glb` or `.gltf`), or an OBJ, PLY or STL file; replaces `builtin`.
         file: Option<PathBuf> = None, "", NotEmpty;
-        /// Length that a unit of `file` stands for. If left out, it is 1 for glTF, and guessed from the size for OBJ,
-        /// PLY and STL, with a note.
+        /// Length that a unit of `file` stands for. If left out, it is 1 for glTF, and guessed from the size for
+        /// other formats.
         scale: Option<f64> = None, "m", Within(1e-9, 1e6);
         /// The axis of `file` that points up. If left out, it is `y` for glTF, OBJ and PLY, and `z` for STL.
         up: Option<FileAxis> = None, "", Any;
@@ -57,14 +57,13 @@ section! {
         environment: EnvironmentConfig = EnvironmentConfig::default(), "", Any;
         /// The rigid bodies that the tracker drives.
         bodies: Vec<BodyConfig> = Vec::new(), "", Any;
-        /// Nodes that exist only in the virtual world (lamps, surroundings). They appear in reflections and shadows,
-        /// but the projector's light never falls on them.
+        /// Nodes that exist only in the virtual world. They appear in reflections and shadows, but the projector's
+        /// light never falls on them.
         virtual_nodes: Vec<String> = Vec::new(), "", Any;
         /// Albedo of the real surfaces that the light falls on: one number, or one for each channel. Measure it; 0.8
         /// is matt white paint.
         surface_albedo: PerChannel = PerChannel([0.8; 3]), "", Each(0.01, 1.0);
-        /// Radiance that the real surfaces already send to the eye because of the light in the room. It is subtracted
-        /// from the picture.
+        /// Radiance of the real surfaces because of the light in the room. It is subtracted from the picture.
         ambient: [f64; 3] = [0.0, 0.0, 0.0], "scene units", Within(0.0, 1e6);
     }
 }
@@ -148,25 +147,22 @@ section! {
         /// axes are seldom those of the glTF node. `dpm calibrate body` measures it. The mock tracker reports the mesh
         /// itself and ignores it.
         mesh_to_body: PoseConfig = PoseConfig::default(), "", Any;
-        /// A picture that its mesh shows in the place of its file's colours: PNG, JPEG or KTX2, or an animated PNG,
-        /// which plays over and over. It lies over the texture coordinates that the textures of its mesh use, and
-        /// repeats. `pipe:` with the path of a named pipe, or `pipewire:` with the name or number of a node, shows what
+        /// A picture in the place of its file's colours: PNG, JPEG or KTX2, or an animated PNG, which plays over and
+        /// over. `pipe:` with the path of a named pipe, or `pipewire:` with the name or number of a node, shows what
         /// another program makes while the rig runs (docs/SCENES.md).
         texture: Option<PictureSource> = None, "", Any;
         /// Columns and rows that pictures of another program have on the body. Others are fitted to it.
         texture_size: [u32; 2] = [512, 512], "texels", Within(1, 4096);
-        /// Albedo of its real surface, if it differs from `scene.surface_albedo`: one number, or one for each channel. With
-        /// `albedo_map` it is a factor for the picture, 1 if left out.
+        /// Albedo of its real surface, if it differs from `scene.surface_albedo`: one number, or one for each channel.
+        /// It is a factor of an `albedo_map`, 1 if left out.
         albedo: Option<PerChannel> = None, "", Each(0.01, 1.0);
         /// A picture of the albedo of its real surface, for example of what is printed on it: PNG with 8 or 16 bits, or
-        /// PFM, over the texture coordinates of its mesh. Values below 0.01 count as 0.01. All pictures of a rig
-        /// together may have 8 million pixels (8388608).
+        /// PFM. Values below 0.01 count as 0.01. All pictures of a rig together may have 8388608 pixels.
         albedo_map: Option<PathBuf> = None, "", NotEmpty;
         /// What the numbers of a PNG in `albedo_map` mean; those of a PFM are linear.
         albedo_map_encoding: AlbedoEncoding = AlbedoEncoding::Srgb, "", Any;
         /// How it moves if the tracker is the mock, for example `{ kind = "translate", speed_m_s = 1.0 }` (below). If
-        /// left out, the first body moves back and forth at 1 m/s, the second rotates in place, and the others stand
-        /// still.
+        /// left out, the first body moves to and fro, the second rotates in place, and the others stand still.
         motion: MotionValue = MotionValue::default(), "", Any;
     }
 }
@@ -245,8 +241,8 @@ section! {
         noise_m: f64 = 1e-4, "m", Within(1e-9, 1.0);
         /// Standard deviation of the tracker's rotation.
         noise_rad: f64 = 1e-3, "rad", Within(1e-9, 1.0);
-        /// A sample that deviates from its prediction by more than this many standard deviations is held back until
-        /// other samples confirm it.
+        /// A sample that deviates by more standard deviations from its prediction is held back until other samples
+        /// confirm it.
         gate_sigma: f64 = 6.0, "", Within(1.0, 100.0);
     }
 }

@@ -23,8 +23,8 @@ section! {
         min_confidence: f64 = 0.6, "", Within(0.0, 1.0);
         /// Where Pupil's scene camera is, in the space of the body that carries the eye.
         camera_position: [f64; 3] = [0.0; 3], "m", Within(-1.0, 1.0);
-        /// Rotations about the body's x, then y, then z, from the camera's axes (x to the right of its picture, y down, z
-        /// forward) to the body's. The default is a camera that looks along -Z, with +Y up.
+        /// Rotations about the body's x, then y, then z, from the camera's axes (x to the right of its picture, y down,
+        /// z forward) to the body's. By default it looks along -Z, with +Y up.
         camera_rotation_deg: [f64; 3] = [180.0, 0.0, 0.0], "deg", Within(-360.0, 360.0);
         /// Time by which a sample is older than its time stamp says.
         latency_us: i64 = 0, "us", Within(-200_000, 200_000);

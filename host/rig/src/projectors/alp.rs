@@ -18,11 +18,11 @@ section! {
         library: Option<PathBuf> = None, "", NotEmpty;
         /// Serial number of the device; 0 is the first one that is found.
         device_number: u32 = 0, "", Within(0, 2_147_483_647);
-        /// How long the planes of a frame are lit: all equally long, or each as its bit weighs. With "equal" write `projector.weights` = "equal", so that grey is
-        /// made of equal planes, or dim the light source from plane to plane.
+        /// How long the planes of a frame are lit: all equally long, or each as its bit weighs. With "equal" write
+        /// `projector.weights` = "equal", or dim the light source from plane to plane.
         plane_times: AlpWeights = AlpWeights::Equal, "", Any;
-        /// Slots for which a frame is lit if the host is late with the next one. It is also the longest time of light
-        /// after the host has died.
+        /// Slots for which a frame is lit if the host is late with the next one: also the longest time of light after
+        /// the host has died.
         slots_per_sequence: u32 = 1, "slots", Within(1, 3);
         /// Frames that may wait in the device's memory; fewer, if it holds fewer.
         frames_in_flight: u32 = 4, "frames", Within(1, 60);

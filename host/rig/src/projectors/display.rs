@@ -22,21 +22,19 @@ section! {
     pub struct DisplayConfig {
         /// The connector, as `dpm display` lists them, for example "HDMI-A-1"; the only one with a display if left out.
         connector: Option<String> = None, "", NotEmpty;
-        /// A size and a rate that the display offers, or a timing of one's own, as in "138.51 1920 1968 2000 2080 1080
-        /// 1083 1088 1111 +hsync -vsync" (MHz, row, frame, pulses). `projector.width`, `height` and `frame_rate` must
-        /// be exactly the mode's; `dpm display` prints what to write.
+        /// A size and a rate that the display offers, or a timing, as in "138.51 1920 1968 2000 2080 1080 1083 1088
+        /// 1111 +hsync -vsync" (MHz, row, frame, pulses). `projector.width`, `height` and `frame_rate` must be exactly
+        /// the mode's; `dpm display` prints them.
         mode: String = "1920x1080@60".into(), "", NotEmpty;
         /// What the bits of a pixel mean.
         encoding: DisplayEncoding = DisplayEncoding::Rgb8, "", Any;
         /// The graphics card's device file; the first with such a connector if left out.
         card: Option<PathBuf> = None, "", NotEmpty;
-        /// Whether a desktop is asked to lend the connector (docs/DISPLAY.md). "auto" takes the card where no other
-        /// program drives it, and else asks the desktop of WAYLAND_DISPLAY, or else of DISPLAY. "off" asks none. "x11"
-        /// and "wayland" ask at once.
+        /// Whether a desktop is asked to lend the connector (docs/DISPLAY.md). "auto" asks where another program
+        /// drives the card, "off" never; "x11" and "wayland" ask at once.
         lease: DisplayLease = DisplayLease::Auto, "", Any;
-        /// How long before its vertical blank a frame is chosen and written. Half a frame and at most 8000 if left out.
-        /// Raise it if the report counts repeated frames although frames were there in time; each microsecond is one
-        /// of latency.
+        /// How long before its vertical blank a frame is chosen and written; half a frame and at most 8000 if left out.
+        /// Raise it if the report counts repeated frames although frames were there in time. It adds to the latency.
         commit_us: Option<u32> = None, "us", Within(100, 35_000);
         /// Properties of the connector without which bits are shown although they may be lost, for example ["Broadcast
         /// RGB"]. Name one only after you have measured that bits arrive.

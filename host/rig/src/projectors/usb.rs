@@ -18,11 +18,11 @@ section! {
         /// Serial number of the device; needed if several are plugged in.
         serial_number: Option<String> = None, "", NotEmpty;
         /// Frames queued at once. More frames bridge longer pauses of the host, and each adds a frame of latency to a
-        /// full link. Together they must fit into the kernel's `usbfs_memory_mb`.
+        /// full link. They must fit into the kernel's `usbfs_memory_mb`.
         transfers_in_flight: u32 = 2, "frames", Within(1, 64);
         /// How planes are compacted. "auto" chooses for each plane the smallest of raw, RLE, XOR with the previous
         /// frame + RLE, and LZ4, and does not send unchanged planes. A list permits only those codecs. "raw" saves the
-        /// host's time on a link that can carry every frame (`dpm link-test`).
+        /// host's time.
         compaction: Compaction = Compaction::Auto, "", Any;
     }
 }

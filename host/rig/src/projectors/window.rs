@@ -13,14 +13,14 @@ section! {
     /// A window on the desktop of this machine, for previews and for a desk without a projector. docs/DISPLAY.md says what it
     /// is good for. Closing it ends the run.
     pub struct WindowConfig {
-        /// The monitor that the window fills, by the name that a start lists, for example "HDMI-1". `projector.width` and
-        /// `height` must be the monitor's, and `frame_rate` within one percent of its rate. An ordinary window of `width` x
-        /// `height` pixels if left out.
+        /// The monitor that the window fills, by the name that a start lists, for example "HDMI-1". `projector.width`
+        /// and `height` must be the monitor's, and `frame_rate` within one percent of its rate. An ordinary window if
+        /// left out.
         monitor: Option<String> = None, "", NotEmpty;
         /// The X server, for example ":0"; the one of the environment variable DISPLAY if left out.
         server: Option<String> = None, "", NotEmpty;
-        /// How long before its vertical blank a frame is chosen and sent to the X server. Three quarters of a frame if left
-        /// out: some servers count a blank from half a frame before it on.
+        /// How long before its vertical blank a frame is chosen and sent to the X server; three quarters of a frame if
+        /// left out.
         commit_us: Option<u32> = None, "us", Within(100, 35_000);
     }
 }

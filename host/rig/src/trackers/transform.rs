@@ -40,7 +40,7 @@ section! {
         /// Length of the tracker's unit: 0.001 for millimetres.
         scale: f64 = 1.0, "m", Within(1e-6, 1e3);
         /// The tracker's axes along the world's x, y and z. A tracker whose z points up, with x to the right, has
-        /// "x z -y". An odd number of exchanges and signs mirrors, for a left-handed tracker.
+        /// "x z -y". An odd number of exchanges and signs mirrors.
         axes: Axes = Axes::default(), "", Any;
         /// Where the tracker's origin is in the world.
         position: [f64; 3] = [0.0; 3], "m", Within(-1e6, 1e6);

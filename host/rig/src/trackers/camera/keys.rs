@@ -70,9 +70,9 @@ section! {
         size: [u32; 2] = [1280, 800], "px", Within(16, 8192);
         /// Pictures per second.
         rate_hz: u32 = 60, "Hz", Within(1, 1_000);
-        /// Exposure, which the camera then leaves alone; short, so that what moves is not blurred. Without it the camera's own
-        /// setting counts, which must be by hand. Pictures of `tcp:` say theirs; `dpm rehearse` counts with this one there too,
-        /// and with 2000 us without it.
+        /// Exposure, which the camera then leaves alone; keep it short, because motion blurs. Without it the camera's
+        /// own setting counts, which must be by hand. `dpm rehearse` counts with it for `tcp:`, too, and with 2000 us
+        /// without it.
         exposure_us: Option<u32> = None, "us", Within(1, 1_000_000);
         /// Gain, in the camera's own units (`v4l2-ctl -L` lists them). Without it the camera keeps its own. Not for `tcp:`.
         gain: Option<u32> = None, "", Within(0, 1_000_000);
