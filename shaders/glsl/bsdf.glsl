@@ -186,7 +186,7 @@ vec3 film_change(Point s, float eta, float c) {
     // From within the film has the same reflectance as at the refracted direction outside.
     float outside = eta < 1.0 ? sqrt(max(1.0 - (1.0 - c * c) / (eta * eta), 0.0)) : c;
     vec3 f0 = mix(dielectric_f0(s), s.base, s.metallic);
-    return s.film * (film_reflectance(f0, material_at(s.material).film_ior, s.film_nm, outside) - fresnel_schlick(f0, outside));
+    return s.film * (film_reflectance(f0, MATERIAL_AT(s.material).film_ior, s.film_nm, outside) - fresnel_schlick(f0, outside));
 }
 
 // What the film changes of the light that facets of a width reflect toward a cosine, in its strongest channel: the mean of four facets that light
@@ -218,7 +218,7 @@ vec3 facet_reflectance(Point s, float eta, float c, out float kept) {
 float dielectric_albedo(Point s, vec3 w, float mu) {
     float alpha = table_alpha(s, w), e = directional_albedo(s.table, alpha, mu);
     if (HAS_OTHER_FACETS && (is_tinted(s) || has_film(s))) {
-        float all = directional_albedo(material_at(s.material).white_table, alpha, mu);
+        float all = directional_albedo(MATERIAL_AT(s.material).white_table, alpha, mu);
         if (is_tinted(s)) {
             float f0 = index_to_f0(s.ior, 1.0), tinted = min(f0 * max3(s.specular_color), 1.0);
             e = s.specular * (tinted * all + (1.0 - tinted) * (f0 < 1.0 ? max(e - f0 * all, 0.0) / (1.0 - f0) : 0.0));
@@ -231,7 +231,7 @@ float dielectric_albedo(Point s, vec3 w, float mu) {
 float dielectric_average_at(Point s, float alpha) {
     float e = average_albedo(s.table, alpha);
     if (is_tinted(s)) {
-        float all = average_albedo(material_at(s.material).white_table, alpha);
+        float all = average_albedo(MATERIAL_AT(s.material).white_table, alpha);
         float f0 = index_to_f0(s.ior, 1.0), tinted = min(f0 * max3(s.specular_color), 1.0);
         e = s.specular * (tinted * all + (1.0 - tinted) * (f0 < 1.0 ? max(e - f0 * all, 0.0) / (1.0 - f0) : 0.0));
     }
@@ -239,7 +239,7 @@ float dielectric_average_at(Point s, float alpha) {
         // What the film changes of it, by three nodes.
         for (int i = 0; i < 3; i++) {
             float mu = i == 0 ? 0.11270167 : i == 1 ? 0.5 : 0.88729833;
-            e += 2.0 * mu * (i == 1 ? 8.0 : 5.0) / 18.0 * directional_albedo(material_at(s.material).white_table, alpha, mu) * film_change_of(s, alpha, mu);
+            e += 2.0 * mu * (i == 1 ? 8.0 : 5.0) / 18.0 * directional_albedo(MATERIAL_AT(s.material).white_table, alpha, mu) * film_change_of(s, alpha, mu);
         }
         e = clamp(e, 0.0, 1.0);
     }
@@ -271,14 +271,14 @@ Through through_layers(Point s, Lobes q, vec3 l) {
     Through t = Through(1.0, 1.0, 1.0);
     if (HAS_CLEARCOAT && q.coat_v > 0.0) {
         float row = mirror_row(s.coat_alpha);
-        uint table = material_at(s.material).coat_table;
+        uint table = MATERIAL_AT(s.material).coat_table;
         float a = 1.0 - q.coat_v, b = 1.0 - s.coat * directional_albedo(table, row, abs(dot(s.coat_normal, l)));
         t.spread = a * b / max(1.0 - s.coat * average_albedo(table, row), 1e-4);
         t.coat = min(a, b);
     }
     float sheen = 1.0;
     if (HAS_SHEEN && q.sheen_v > 0.0)
-        sheen = min(1.0 - q.sheen_v, 1.0 - max3(s.sheen) * directional_albedo(material_at(s.material).sheen_table + 1u, s.sheen_alpha, abs(dot(s.n, l))));
+        sheen = min(1.0 - q.sheen_v, 1.0 - max3(s.sheen) * directional_albedo(MATERIAL_AT(s.material).sheen_table + 1u, s.sheen_alpha, abs(dot(s.n, l))));
     t.spread *= sheen;
     t.ahead = t.coat * sheen;
     return t;
@@ -301,7 +301,7 @@ float sheen_value(Point s, vec3 l, float nv, float nl) {
     float sine2 = clamp(dot(c, c), 1e-30, 1.0);
     float d = (2.0 + 1.0 / s.sheen_alpha) * pow(sine2, 0.5 / s.sheen_alpha) / (2.0 * PI);
     // At grazing angles the fit would send out more than it gets.
-    uint fitted = material_at(s.material).sheen_table;
+    uint fitted = MATERIAL_AT(s.material).sheen_table;
     float most = max(directional_albedo(fitted, s.sheen_alpha, nv), directional_albedo(fitted, s.sheen_alpha, nl));
     return d / (max(most, 1.0) * (1.0 + sheen_lambda(nv, s.sheen_alpha) + sheen_lambda(nl, s.sheen_alpha)) * 4.0 * nv);
 }
@@ -345,7 +345,7 @@ Lobes lobes_of(Point s) {
         diffuse *= 1.0 - s.shine;
     }
     if (HAS_SHEEN && !inside && max3(s.sheen) > 0.0) {
-        float albedo = directional_albedo(material_at(s.material).sheen_table + 1u, s.sheen_alpha, nv);
+        float albedo = directional_albedo(MATERIAL_AT(s.material).sheen_table + 1u, s.sheen_alpha, nv);
         l.sheen_v = max3(s.sheen) * albedo;
         sheen = luminance(s.sheen) * albedo;
         float under = 1.0 - l.sheen_v;
@@ -355,7 +355,7 @@ Lobes lobes_of(Point s) {
         shine *= under;
     }
     if (HAS_CLEARCOAT && !inside && s.coat > 0.0) {
-        l.coat_v = s.coat * directional_albedo(material_at(s.material).coat_table, mirror_row(s.coat_alpha), dot(s.coat_normal, s.v));
+        l.coat_v = s.coat * directional_albedo(MATERIAL_AT(s.material).coat_table, mirror_row(s.coat_alpha), dot(s.coat_normal, s.v));
         coat = l.coat_v;
         float under = 1.0 - l.coat_v;
         specular *= under;

@@ -109,10 +109,8 @@ LocalRay local_ray(vec3 origin, vec3 direction) {
 
 // A watertight triangle test. Every vertex is mapped to the plane across the ray by the same operations, and the three edge functions are exactly
 // antisymmetric in their vertices. So a ray through a shared edge is inside at least one of the two triangles.
-bool intersect_triangle(LocalRay r, uint row, float t_min, float t_max, out float t, out vec2 barycentric) {
-    vec3 p0 = TRI(row).xyz - r.origin;
-    vec3 p1 = TRI(row + 1u).xyz - r.origin;
-    vec3 p2 = TRI(row + 2u).xyz - r.origin;
+// The vertices are relative to the ray's origin.
+bool intersect_corners(LocalRay r, vec3 p0, vec3 p1, vec3 p2, float t_min, float t_max, out float t, out vec2 barycentric) {
     precise vec2 a = vec2(dot(p0, r.u), dot(p0, r.v));
     precise vec2 b = vec2(dot(p1, r.u), dot(p1, r.v));
     precise vec2 c = vec2(dot(p2, r.u), dot(p2, r.v));
@@ -131,6 +129,10 @@ bool intersect_triangle(LocalRay r, uint row, float t_min, float t_max, out floa
     t = along / r.length2;
     barycentric = vec2(w1, w2) * inverse_area;
     return !(negative && positive) && area != 0.0 && t > t_min && t < t_max;
+}
+
+bool intersect_triangle(LocalRay r, uint row, float t_min, float t_max, out float t, out vec2 barycentric) {
+    return intersect_corners(r, TRI(row).xyz - r.origin, TRI(row + 1u).xyz - r.origin, TRI(row + 2u).xyz - r.origin, t_min, t_max, t, barycentric);
 }
 
 // Slab test against the world bounds of a body.

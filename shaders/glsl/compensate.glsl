@@ -107,36 +107,42 @@ vec3 albedo_at(uint map, vec2 uv) {
 // Defined by the shader that includes this file: the radiance toward the eye that a lit pixel shows.
 vec3 light_at(uvec2 pixel, uint index);
 
+// The code values of a lit pixel at `index`.
+uint codes_of(uvec2 pixel, uint index, SurfaceHit surface, inout uint nans, inout uint clipped) {
+    uint instance = surface.id >> 24u, code = 0u;
+    TriangleRef ref = triangle_ref_at(BODY_AT(instance).triangle_offset + (surface.id & 0xffffffu));
+    vec2 b = WEIGHTS_OF(index);
+    // The real surface is smooth, so its normal is the interpolated one, without the normal map of the look.
+    float cosine = real_cosine(BODY_AT(instance).world_from_object, vertex_at(ref.vertices.x).normal, vertex_at(ref.vertices.y).normal,
+                               vertex_at(ref.vertices.z).normal, b, ray_of(pixel));
+    precise float geometry = (surface.distance * surface.distance) * (1.0 / max(cosine, 1e-3));
+    precise vec3 drive = (light_at(pixel, index) - frame.ambient) * (BODY_AT(instance).drive_gain * geometry);
+    uint map = BODY_AT(instance).albedo_map;
+    if (HAS_ALBEDO_MAPS && map != NO_ALBEDO_MAP) {
+        precise float w = (1.0 - b.x) - b.y;
+        precise vec2 uv = (vertex_at(ref.vertices.x).uv * w + vertex_at(ref.vertices.y).uv * b.x) + vertex_at(ref.vertices.z).uv * b.y;
+        precise vec3 reflected = drive * (1.0 / albedo_at(map, uv));
+        drive = reflected;
+    }
+    if (HAS_FLAT_FIELD) {
+        uint at = frame.flat_field_at + 3u * index;
+        precise vec3 even = drive * vec3(optics[at], optics[at + 1u], optics[at + 2u]);
+        drive = even;
+    }
+    if (HAS_RESPONSE) {
+        for (uint c = 0u; c < 3u; c++) code |= quantise_by_response(drive[c], c, nans, clipped) << (8u * c);
+    } else {
+        code = quantise(drive.r, nans, clipped) | (quantise(drive.g, nans, clipped) << 8u) | (quantise(drive.b, nans, clipped) << 16u);
+    }
+    return code;
+}
+
 // Writes the code values of the pixel at `index`. To be called by every invocation that has a pixel.
 void compensate(uvec2 pixel, uint index) {
     SurfaceHit surface = SURFACE_OF(index);
     uint nans = 0u, clipped = 0u, lit = 0u, code = 0u;
     if (surface.id != NO_HIT && surface.distance > 0.0) {
-        uint instance = surface.id >> 24u;
-        TriangleRef ref = triangle_ref_at(instance_at(instance).triangle_offset + (surface.id & 0xffffffu));
-        vec2 b = WEIGHTS_OF(index);
-        // The real surface is smooth, so its normal is the interpolated one, without the normal map of the look.
-        float cosine = real_cosine(instance_at(instance).world_from_object, vertex_at(ref.vertices.x).normal, vertex_at(ref.vertices.y).normal,
-                                   vertex_at(ref.vertices.z).normal, b, ray_of(pixel));
-        precise float geometry = (surface.distance * surface.distance) * (1.0 / max(cosine, 1e-3));
-        precise vec3 drive = (light_at(pixel, index) - frame.ambient) * (instance_at(instance).drive_gain * geometry);
-        uint map = instance_at(instance).albedo_map;
-        if (HAS_ALBEDO_MAPS && map != NO_ALBEDO_MAP) {
-            precise float w = (1.0 - b.x) - b.y;
-            precise vec2 uv = (vertex_at(ref.vertices.x).uv * w + vertex_at(ref.vertices.y).uv * b.x) + vertex_at(ref.vertices.z).uv * b.y;
-            precise vec3 reflected = drive * (1.0 / albedo_at(map, uv));
-            drive = reflected;
-        }
-        if (HAS_FLAT_FIELD) {
-            uint at = frame.flat_field_at + 3u * index;
-            precise vec3 even = drive * vec3(optics[at], optics[at + 1u], optics[at + 2u]);
-            drive = even;
-        }
-        if (HAS_RESPONSE) {
-            for (uint c = 0u; c < 3u; c++) code |= quantise_by_response(drive[c], c, nans, clipped) << (8u * c);
-        } else {
-            code = quantise(drive.r, nans, clipped) | (quantise(drive.g, nans, clipped) << 8u) | (quantise(drive.b, nans, clipped) << 16u);
-        }
+        code = codes_of(pixel, index, surface, nans, clipped);
         lit = 1u;
     }
     codes[index] = code;

@@ -4,6 +4,16 @@
 // Then the light becomes code values at once.
 #define COARSE_TABLES
 #include "scene.glsl"
+
+#ifdef READ_BEFORE
+// The body and the material of all pixels of this lane.
+Instance own_body;
+Material own_material;
+#undef BODY_AT
+#undef MATERIAL_AT
+#define BODY_AT(i) own_body
+#define MATERIAL_AT(i) own_material
+#endif
 #define ALPHA_TEST
 #include "bvh.glsl"
 #include "shading.glsl"
@@ -16,50 +26,36 @@ vec2 own_weights;
 #define SURFACE_OF(index) own_surface
 #define WEIGHTS_OF(index) own_weights
 #include "compensate.glsl"
+#include "cells.glsl"
 
-layout(set = 0, binding = B_COARSE_FRAME, scalar) readonly buffer CoarseFrameBlock { Frame coarse; };
-layout(set = 0, binding = B_SHOWN, scalar) writeonly buffer Shown { vec4 shown[]; };
-layout(set = 0, binding = B_SCHEDULE, scalar) buffer ScheduleBlock { Schedule schedule; };
-
-// Workgroups of the pass `edges` in a row, and pixels of each.
-const uint EDGE_GROUPS_IN_A_ROW = 32768u, EDGE_LANES = 64u;
 // Taps have normals with at least this cosine to the pixel's, and lie within so many footprints of traced pixels of its tangent plane.
 const float LIKE_NORMAL = 0.5, DEPTH = 3.0;
 // Weight of a tap beside that by its place, so that one counts that alone agrees.
 const float LEAST_WEIGHT = 1e-3;
 
-// Traced pixels around a panel pixel.
-struct Taps {
-    vec2 place;    // Of the panel pixel, in traced pixels from the centre of the first of the raster.
-    ivec2 corner;  // The upper left tap.
-    vec2 beyond;   // From its centre to the panel pixel, 0 to 1.
-    uvec4 at;      // Index of each: upper left, upper right, lower left, lower right.
-    uvec4 id;      // What each shows.
-    vec4 distance; // As in SurfaceHit.
+// What a traced pixel has besides.
+struct TapLight {
+    vec3 light;
+    vec3 normal;   // In the body's space, of any length.
+    float inverse; // Of that length.
 };
 
-uint coarse_index(ivec2 q) {
-    q = clamp(q, ivec2(0), ivec2(coarse.width, coarse.height) - 1);
-    return uint(q.y) * coarse.width + uint(q.x);
+TapLight light_of(uint at) {
+    Filtered tap = coarse_light_at(at);
+    vec3 normal = normal_direction(tap.weight_and_albedo);
+    return TapLight(tap.light, normal, inversesqrt(dot(normal, normal)));
 }
 
-Taps taps_of(uvec2 pixel) {
-    Taps t;
-    t.place = (vec2(pixel) + 0.5) * vec2(coarse.width, coarse.height) / vec2(frame.width, frame.height) - 0.5;
-    t.corner = ivec2(floor(t.place));
-    t.beyond = t.place - vec2(t.corner);
-    [[unroll]] for (int k = 0; k < 4; k++) {
-        t.at[k] = coarse_index(t.corner + ivec2(k & 1, k >> 1));
-        SurfaceHit surface = coarse_surface_at(t.at[k]);
-        t.id[k] = surface.id;
-        t.distance[k] = surface.distance;
-    }
-    return t;
-}
+#ifdef READ_BEFORE
+TapLight own_lights[4];
+#define LIGHT_OF(t, k) own_lights[k]
+#else
+#define LIGHT_OF(t, k) light_of(t.at[k])
+#endif
 
 // The smooth normal of a point of a triangle, in its body's space and of any length.
 vec3 smooth_normal(uint id, vec2 b) {
-    TriangleRef ref = triangle_ref_at(instance_at(instance_of(id)).triangle_offset + triangle_of(id));
+    TriangleRef ref = triangle_ref_at(BODY_AT(instance_of(id)).triangle_offset + triangle_of(id));
     return vertex_at(ref.vertices.x).normal * (1.0 - b.x - b.y) + vertex_at(ref.vertices.y).normal * b.x + vertex_at(ref.vertices.z).normal * b.y;
 }
 
@@ -84,6 +80,7 @@ Rays rays_of(uvec2 pixel) {
 // The surface of a pixel whose own light is wanted.
 struct Surround {
     uint body;
+    vec2 place;    // Of the pixel, in traced pixels from the centre of the first of the raster.
     vec3 normal;   // Body space, unit.
     vec3 upright;  // The same before the projector's pose.
     float along;   // Of the pixel's point, along it.
@@ -92,8 +89,8 @@ struct Surround {
 };
 
 // How far a tap lies off the tangent plane of the pixel's point.
-float off_plane(Surround g, Taps t, ivec2 q, float distance_) {
-    vec2 pixels = (vec2(q) - t.place) * vec2(frame.width, frame.height) / vec2(coarse.width, coarse.height);
+float off_plane(Surround g, ivec2 q, float distance_) {
+    vec2 pixels = (vec2(q) - g.place) * vec2(panel_size) / vec2(traced_size);
     vec2 straight = g.rays.straight + g.rays.right * pixels.x + g.rays.down * pixels.y;
     vec3 d = vec3(straight.x, -straight.y, -1.0);
     return abs(dot(d, g.upright) * inversesqrt(dot(d, d)) * abs(distance_) - g.along);
@@ -102,22 +99,22 @@ float off_plane(Surround g, Taps t, ivec2 q, float distance_) {
 Surround surround_of(uvec2 pixel, Hit hit, vec3 direction) {
     Surround g;
     g.body = instance_of(hit.id);
+    g.place = place_of(ivec2(pixel));
     vec3 n = smooth_normal(hit.id, hit.barycentric);
     float l2 = dot(n, n);
     g.normal = n * inversesqrt(max(l2, 1e-30));
-    vec3 w = l2 > 1e-12 ? transform_vector(instance_at(g.body).world_from_object, g.normal) : -direction;
+    vec3 w = l2 > 1e-12 ? transform_vector(BODY_AT(g.body).world_from_object, g.normal) : -direction;
     g.upright = frame.world_from_projector[0].xyz * w.x + frame.world_from_projector[1].xyz * w.y + frame.world_from_projector[2].xyz * w.z;
     g.along = dot(direction, w) * hit.t;
-    g.farthest = DEPTH * hit.t * coarse.pixel_size;
+    g.farthest = DEPTH * hit.t * traced_pixel_size;
     g.rays = rays_of(pixel);
     return g;
 }
 
 // How far a tap agrees with the pixel's surface, 0 to 1.
-float agreement(Surround g, Taps t, ivec2 q, uint id, float distance_, uint normal) {
-    vec3 n = normal_direction(normal);
-    float cosine = dot(n, g.normal) * inversesqrt(dot(n, n));
-    bool like = id != NO_HIT && distance_ > 0.0 && instance_of(id) == g.body && cosine >= LIKE_NORMAL && off_plane(g, t, q, distance_) <= g.farthest;
+float agreement(Surround g, ivec2 q, uint id, float distance_, TapLight tap) {
+    float cosine = dot(tap.normal, g.normal) * tap.inverse;
+    bool like = id != NO_HIT && distance_ > 0.0 && instance_of(id) == g.body && cosine >= LIKE_NORMAL && off_plane(g, q, distance_) <= g.farthest;
     float w = cosine * cosine;
     w *= w;
     return like ? w * w : 0.0;
@@ -126,11 +123,12 @@ float agreement(Surround g, Taps t, ivec2 q, uint id, float distance_, uint norm
 // The mean light of the taps that agree, and the sum of their weights; 0: none agrees. `least` is how far that one agrees which agrees least.
 vec4 mean_of(Surround g, Taps t, out float least) {
     vec4 sum = vec4(0.0);
+    vec2 beyond = g.place - vec2(t.corner);
     least = 1.0;
     [[unroll]] for (int k = 0; k < 4; k++) {
-        Filtered tap = coarse_light_at(t.at[k]);
-        vec2 share = mix(1.0 - t.beyond, t.beyond, vec2(k & 1, k >> 1));
-        float agrees = agreement(g, t, t.corner + ivec2(k & 1, k >> 1), t.id[k], t.distance[k], tap.weight_and_albedo);
+        TapLight tap = LIGHT_OF(t, k);
+        vec2 share = mix(1.0 - beyond, beyond, vec2(k & 1, k >> 1));
+        float agrees = agreement(g, t.corner + ivec2(k & 1, k >> 1), t.id[k], t.distance[k], tap);
         least = min(least, agrees);
         sum += (share.x * share.y + LEAST_WEIGHT) * agrees * vec4(tap.light, 1.0);
     }
@@ -147,12 +145,16 @@ vec3 with_texture(vec3 light, Hit hit, vec3 direction) {
 vec3 own_light;
 vec3 light_at(uvec2 pixel, uint index) { return own_light; }
 
-// Writes a pixel: what its ray meets, and its code values. To be called by every invocation that has a pixel.
-void write_pixel(uvec2 pixel, uint index, Hit hit, bool lit) {
+// Writes a pixel: what its ray meets, and its code values.
+void write_pixel(uvec2 pixel, uint index, Hit hit, bool lit, inout uint nans, inout uint clipped) {
     own_surface = SurfaceHit(hit.id, hit.id == NO_HIT ? 0.0 : lit ? hit.t : -hit.t);
     own_weights = hit.barycentric;
     set_surface(index, own_surface);
-    set_barycentric(index, Barycentric(own_weights));
-    if ((frame.flags & FRAME_SHOWS_ALL) != 0u) shown[index] = vec4(own_light, lit ? 1.0 : 0.0);
-    compensate(pixel, index);
+    if ((frame.flags & FRAME_SHOWS_ALL) != 0u) {
+        set_barycentric(index, Barycentric(own_weights));
+        shown[index] = vec4(own_light, lit ? 1.0 : 0.0);
+    }
+    uint code = 0u;
+    if (lit) code = codes_of(pixel, index, own_surface, nans, clipped);
+    codes[index] = code;
 }

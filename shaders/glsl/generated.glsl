@@ -217,6 +217,8 @@ layout(constant_id = 41) const bool HAS_DIFFUSE_TRANSMISSION = true;
 layout(constant_id = 42) const bool HAS_DISPERSION = true;
 // Bits below the parts of a halftone, which are shown once. Above 0, the pass `warp` cuts code values into levels.
 layout(constant_id = 43) const uint HALFTONE_LOW = 0u;
+// Lamps by which histories are relit. A loop over one of them is no loop.
+layout(constant_id = 44) const uint LAMPS = 2u;
 
 struct Frame {
     vec3 projector_position;
@@ -264,7 +266,6 @@ struct Frame {
     uint mover_count;
     uint group_count;
     uint body_nodes;
-    uint lamp_count;
     float mean_light;
 };
 

@@ -38,15 +38,19 @@ vec3 lobe_direction(vec3 n, vec3 v, float alpha) {
     return normalize(mix(n, reflect(-v, n), smooth_ * (sqrt(smooth_) + alpha)));
 }
 
-// A lamp as seen from a point: the unit vector to it, its irradiance on a surface that faces it, and the radius that it shows by the distance.
-struct Seen {
-    vec3 to;
-    vec3 irradiance;
-    float radius;
+// A lamp at the present pose.
+struct Lamp {
+    uint kind;
+    vec3 position;
+    vec3 direction;
+    vec3 intensity;
+    float cone_scale;
+    float cone_offset;
+    float range;
 };
 
-Seen lamp_from(vec3 p, uint index) {
-    Light lamp = light_at(index);
+Lamp lamp_at(uint i) {
+    Light lamp = light_at(frame.light_count + i);
     vec3 position = lamp.position, direction = lamp.direction;
     if (lamp.instance != NO_INSTANCE) {
         position = transform_point(instance_at(lamp.instance).world_from_object, position);
@@ -54,13 +58,35 @@ Seen lamp_from(vec3 p, uint index) {
     } else {
         position -= frame.world_origin;
     }
+    return Lamp(lamp.kind, position, direction, lamp.intensity, lamp.cone_scale, lamp.cone_offset, lamp.range);
+}
+
+#ifdef READ_BEFORE
+// The lamp of a scene that has one.
+Lamp own_lamp;
+Lamp lamp_of(uint i) {
+    if (LAMPS == 1u) return own_lamp;
+    return lamp_at(i);
+}
+#else
+#define lamp_of(i) lamp_at(i)
+#endif
+
+// A lamp as seen from a point: the unit vector to it, its irradiance on a surface that faces it, and the radius that it shows by the distance.
+struct Seen {
+    vec3 to;
+    vec3 irradiance;
+    float radius;
+};
+
+Seen seen_from(Lamp lamp, vec3 p) {
     // A sun of the sky has a radius.
-    if (lamp.kind == LIGHT_DIRECTIONAL) return Seen(-direction, lamp.intensity, lamp.cone_offset);
-    vec3 d = position - p;
+    if (lamp.kind == LIGHT_DIRECTIONAL) return Seen(-lamp.direction, lamp.intensity, lamp.cone_offset);
+    vec3 d = lamp.position - p;
     float d2 = max(dot(d, d), 1e-12);
     vec3 to = d * inversesqrt(d2);
     if (HAS_EMISSIVE && lamp.kind == LIGHT_BODY) {
-        float area = lamp.range + max(-dot(direction, to), 0.0);
+        float area = lamp.range + max(-dot(lamp.direction, to), 0.0);
         float disk = area / PI;
         // No more than a sky of its radiance sends.
         return Seen(to, lamp.intensity * (area / (d2 + disk)), sqrt(disk / d2));
@@ -71,7 +97,7 @@ Seen lamp_from(vec3 p, uint index) {
         falloff *= clamp(1.0 - x * x, 0.0, 1.0);
     }
     if (lamp.kind == LIGHT_SPOT) {
-        float c = clamp(dot(-to, direction) * lamp.cone_scale + lamp.cone_offset, 0.0, 1.0);
+        float c = clamp(dot(-to, lamp.direction) * lamp.cone_scale + lamp.cone_offset, 0.0, 1.0);
         falloff *= c * c;
     }
     return Seen(to, lamp.intensity * falloff, 0.0);
@@ -135,9 +161,11 @@ vec3 demodulation(Hit hit, vec3 toward) {
         light += sky_light(sky_over(lobe_direction(s.coat_normal, s.v, s.coat_alpha), s.coat_alpha), vec3(q.coat_v));
     // What lies behind a solid is seen through two of its surfaces at the least. It is taken to lie straight ahead.
     if (HAS_TRANSMISSION && s.transmission > 0.0) light += sky_light(sky_over(-s.v, s.alpha), s.base * (below * s.transmission));
-    if (HAS_EMISSIVE || HAS_PUNCTUAL || ENVIRONMENT_KIND == ENVIRONMENT_MAP) {
+    if (LAMPS > 0u) {
         q.transmit = 0.0;
-        for (uint i = 0u; i < frame.lamp_count; i++) light += reflected(s, q, lamp_from(s.p, frame.light_count + i));
+        uint i = 0u;
+        // It tests at its end, because software Vulkan runs a loop that tests at its start once more.
+        do light += reflected(s, q, seen_from(lamp_of(i), s.p)); while (++i < LAMPS);
     }
     return clamp(light / frame.mean_light, vec3(LEAST_DIVISOR), vec3(MOST_DIVISOR));
 }

@@ -7,6 +7,12 @@
 #include "generated.glsl"
 #include "tables.glsl"
 
+// Where the body and the material of a surface are read, unless the shader that includes this file has read them before.
+#ifndef BODY_AT
+#define BODY_AT(i) instance_at(i)
+#define MATERIAL_AT(i) material_at(i)
+#endif
+
 // A loop over a few pixels around. On software Vulkan it is written out and has no branch: there a loop keeps in memory what it carries, and an `if`
 // writes that under a mask and skips nothing. On GPUs it stays a loop, because it would take registers, and skips what does not count.
 #ifdef TEXEL_TABLES

@@ -123,6 +123,8 @@ table_shaders! {
     COMPENSATE = "compensate";
     /// What enlarging needs of each traced pixel, in one row.
     PREPARE = "prepare";
+    /// The panel's pixels by what the traced pixels around them show, into lists.
+    CELLS = "cells";
     /// The light of a reduced raster at the panel's pixels on even surface, and its code values.
     ENLARGE = "enlarge";
     /// The same at edges.

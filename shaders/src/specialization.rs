@@ -140,4 +140,6 @@ specialization_constants! {
     HAS_DISPERSION: bool = true;
     /// Bits below the parts of a halftone, which are shown once. Above 0, the pass `warp` cuts code values into levels.
     HALFTONE_LOW: uint = 0;
+    /// Lamps by which histories are relit. A loop over one of them is no loop.
+    LAMPS: uint = 2;
 }

@@ -156,8 +156,6 @@ gpu_structs! {
         group_count: u32,
         /// Nodes of the tree over the bodies, for each octant of directions.
         body_nodes: u32,
-        /// Lamps in the light table after its lights: what the light of histories is divided by.
-        lamp_count: u32,
         /// About the mean radiance of what shines on a surface, as luminance: what the light of histories is divided by is relative to it.
         mean_light: f32,
     }

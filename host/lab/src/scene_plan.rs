@@ -290,7 +290,7 @@ fn rig_entries(rig: &Rig) -> Vec<PlanEntry> {
                 RenderScale::Auto => "render.scale = \"auto\"".into(),
             }),
             "render.scale = 1",
-            "passes prepare, enlarge and edges not recorded, and no buffers for them",
+            "passes prepare, cells, enlarge and edges not recorded, and no buffers for them",
         ),
     ]
 }

@@ -74,6 +74,9 @@ pub(super) struct FrameBuffers {
     pub panel: Option<PanelBuffers>,
 }
 
+/// The lists that the passes of a reduced raster make: of pixels, and of cells.
+pub(super) const PANEL_LISTS: usize = 2;
+
 /// What the passes have of their own that work on the panel's pixels, where fewer pixels are traced than the panel has.
 pub(super) struct PanelBuffers {
     pub frame: LatchBuffer,
@@ -86,8 +89,9 @@ pub(super) struct PanelBuffers {
     pub shown: Buffer,
     /// Of each traced pixel what enlarging needs.
     lights: Buffer,
-    /// The panel's pixels on edges, and how many there are.
-    edges: Buffer,
+    /// The panel's pixels on edges and the cells with even surface, as the shaders list them.
+    lists: Buffer,
+    /// How many there are: [`PANEL_LISTS`] in a row, that of pixels first.
     pub schedule: Buffer,
     /// Code values of the traced pixels, which nobody reads.
     unread_codes: Buffer,
@@ -325,7 +329,7 @@ impl FrameBuffers {
             (_, "B_COARSE_LIGHT" | "B_COARSE_LIGHT_ROWS") => Some(&panel.lights),
             (Pixels::Traced, _) => None,
             (Pixels::Panel, "B_SCHEDULE") => Some(&panel.schedule),
-            (Pixels::Panel, "B_WORK") => Some(&panel.edges),
+            (Pixels::Panel, "B_WORK") => Some(&panel.lists),
             (Pixels::Panel, "B_FRAME") => Some(&panel.frame.device),
             (Pixels::Panel, "B_TILES") => Some(&panel.tiles),
             (Pixels::Panel, "B_COUNTERS") => Some(&panel.counters),
@@ -433,8 +437,8 @@ impl PanelBuffers {
             surfaces: table_buffer(gpu, "surfaces of the panel", panel_pixels * each.surfaces, Device)?,
             shown: size("shown radiance", if debug { panel_pixels * SHOWN_BYTES } else { 16 }, Device)?,
             lights: table_buffer(gpu, "light of traced pixels", pixels * size_of::<Filtered>(), Device)?,
-            edges: size("pixels on edges", panel_pixels * each.work, Device)?,
-            schedule: size("schedule of the panel", size_of::<Schedule>(), Device)?,
+            lists: size("pixels on edges", panel_pixels * each.work, Device)?,
+            schedule: size("schedule of the panel", PANEL_LISTS * size_of::<Schedule>(), Device)?,
             unread_codes: size("code values of traced pixels", pixels * each.codes, Device)?,
         })
     }

@@ -62,14 +62,18 @@ pub(super) enum Grid {
     Rates,
     /// Four for each listed tile on which the light of a moving body can fall.
     Moving,
-    /// As many as the pass `schedule` asked for.
+    /// As many as an earlier pass asked for: `schedule` for the traced pixels, `cells` and `enlarge` for pixels of the panel.
     Work,
+    /// For each tile of the panel as many lanes as it has cells.
+    Cells,
+    /// As many as the pass `cells` asked for.
+    EvenCells,
     /// All of the bit planes.
     Planes,
 }
 
 /// Every pass, in the order in which they run. Between two of them lies a barrier.
-pub(super) const TABLE: [Pass; 16] = [
+pub(super) const TABLE: [Pass; 17] = [
     Pass {
         name: "primary",
         code: Code::ByMethod {
@@ -288,7 +292,7 @@ pub(super) const TABLE: [Pass; 16] = [
         overlaps: true,
     },
     Pass {
-        // This pass and the next two take the place of the pass `compensate`, and of what the pass `spatial` does of it, where fewer pixels are traced
+        // This pass and the next three take the place of the pass `compensate`, and of what the pass `spatial` does of it, where fewer pixels are traced
         // than the panel has.
         name: "prepare",
         code: Code::ByMethod {
@@ -312,15 +316,29 @@ pub(super) const TABLE: [Pass; 16] = [
         overlaps: true,
     },
     Pass {
+        name: "cells",
+        code: Code::OfAll(PassKernel {
+            shader: |reading| shaders::CELLS.reading(reading),
+            reads: &["B_COARSE_SURFACES.hit", "B_SCHEDULE"],
+            writes: &["B_SURFACES.hit", "B_CODES", "B_SCHEDULE", "B_WORK"],
+            seldom: &["B_SURFACES.inside", "B_SHOWN"],
+        }),
+        when: |s, _| s.is_reduced(),
+        grid: Grid::Cells,
+        walks: false,
+        at_panel: true,
+        overlaps: true,
+    },
+    Pass {
         name: "enlarge",
         code: Code::OfAll(PassKernel {
             shader: |reading| shaders::ENLARGE.reading(reading),
-            reads: &["B_COARSE_SURFACES.hit", "B_COARSE_LIGHT", "B_COUNTERS", "B_SCHEDULE"],
-            writes: &["B_SURFACES.hit", "B_SURFACES.inside", "B_CODES", "B_COUNTERS", "B_SCHEDULE", "B_WORK"],
-            seldom: &["B_SHOWN"],
+            reads: &["B_COARSE_SURFACES.hit", "B_COARSE_LIGHT", "B_COUNTERS", "B_SCHEDULE", "B_WORK"],
+            writes: &["B_SURFACES.hit", "B_CODES", "B_COUNTERS", "B_SCHEDULE", "B_WORK"],
+            seldom: &["B_SURFACES.inside", "B_SHOWN"],
         }),
         when: |s, _| s.is_reduced(),
-        grid: Grid::Tiles,
+        grid: Grid::EvenCells,
         walks: false,
         at_panel: true,
         overlaps: true,
@@ -330,8 +348,8 @@ pub(super) const TABLE: [Pass; 16] = [
         code: Code::OfAll(PassKernel {
             shader: |reading| shaders::EDGES.reading(reading),
             reads: &["B_COARSE_SURFACES.hit", "B_COARSE_LIGHT", "B_COUNTERS", "B_SCHEDULE", "B_WORK"],
-            writes: &["B_SURFACES.hit", "B_SURFACES.inside", "B_CODES", "B_COUNTERS"],
-            seldom: &["B_SHOWN"],
+            writes: &["B_SURFACES.hit", "B_CODES", "B_COUNTERS"],
+            seldom: &["B_SURFACES.inside", "B_SHOWN"],
         }),
         when: |s, _| s.is_reduced(),
         grid: Grid::Work,

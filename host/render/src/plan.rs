@@ -112,6 +112,7 @@ impl RendererPlan {
         constants.extend(self.settings.method.constants());
         constants.extend(optics.constants());
         constants.push((ids::TRACE_GROUPS, groups));
+        constants.push((ids::LAMPS, self.data.lamps.len() as u32));
         // A level's group waits while the next level is open, so the deepest one never does.
         constants.push((ids::WALK_STACK, self.data.levels.saturating_sub(1).max(1)));
         constants

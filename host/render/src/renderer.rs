@@ -3,7 +3,7 @@
 use super::apart::{ApartLists, Side, WalkCrew};
 use super::body_tree::BodyTree;
 use super::fill;
-use super::frame_buffers::{FrameBuffers, Pixels};
+use super::frame_buffers::{FrameBuffers, Pixels, PANEL_LISTS};
 use super::last_frame::{LastFrame, Turn};
 use super::live_textures::{LiveTextures, Piece};
 use super::memory::{SharedBuffers, SHOWN_BYTES};
@@ -13,6 +13,7 @@ use super::plan::RendererPlan;
 use super::prepared::PreparedScene;
 use super::read_back::{History, Surface};
 use super::resources::Resources;
+use super::scale::cells_of_tiles;
 use super::scene_data::{rows, world_bounds, BodyData, Keep, SceneData};
 use super::settings::{FrameInputs, Overlapping, RayWalk, RayWalker, RenderError, RendererSettings};
 use super::slot::{FrameSlot, Sets};
@@ -40,6 +41,10 @@ use std::sync::Arc;
 const PER_TILE_QUARTER: u64 = 0;
 const PER_TILE_RATES: u64 = 16;
 const PER_MOVING_QUARTER: u64 = 32;
+/// In the panel's arguments, of as many workgroups as have a lane for each cell of a tile. It decides no rates.
+const PER_CELLS: u64 = PER_TILE_RATES;
+/// Lanes of a workgroup of the pass `cells`.
+const LANES: u32 = 64;
 /// Where the pass `trace` stands, which has parts where the host walks rays.
 const TRACE: usize = {
     let mut i = 0;
@@ -190,8 +195,9 @@ impl Renderer {
         let overlap = overlaps.then(|| Overlap::new(gpu)).transpose()?;
         let last = LastFrame::none(tracked.len());
         let rungs = Rung::all(&settings);
-        let panel_tiles =
-            settings.is_reduced().then(|| TileList::new(settings.raster, settings.lens.as_ref()));
+        let panel_tiles = settings
+            .is_reduced()
+            .then(|| TileList::of_panel(settings.raster, settings.lens.as_ref(), &settings.scale));
         let rated = vec![false; rungs[0].tile_list.len()];
         let movers = Movers::new(data.bodies.len(), &settings.plane_groups, !settings.shows_halftones());
         let live = LiveTextures::new(&data.live, settings.most_live_texels);
@@ -360,7 +366,10 @@ impl Renderer {
         r.clear(&b.counters);
         if let Some(panel) = &b.panel {
             r.clear(&panel.counters);
-            r.copy(&self.resources.shared.schedule_start, &panel.schedule, size_of::<Schedule>());
+            for list in 0..PANEL_LISTS {
+                let to = (&panel.schedule, list * size_of::<Schedule>());
+                r.copy_part((&self.resources.shared.schedule_start, 0), to, size_of::<Schedule>());
+            }
             r.copy(&panel.frame.host, &panel.frame.device, panel.frame.len_bytes);
         }
         r.copy(&self.resources.shared.schedule_start, &b.schedule, size_of::<Schedule>());
@@ -421,6 +430,10 @@ impl Renderer {
                     Grid::Tiles => r.dispatch_indirect(pipeline, set, arguments, PER_TILE_QUARTER),
                     Grid::Rates => r.dispatch_indirect(pipeline, set, arguments, PER_TILE_RATES),
                     Grid::Work => r.dispatch_indirect(pipeline, set, schedule, 0),
+                    Grid::Cells => r.dispatch_indirect(pipeline, set, arguments, PER_CELLS),
+                    Grid::EvenCells => {
+                        r.dispatch_indirect(pipeline, set, schedule, size_of::<Schedule>() as u64);
+                    }
                     Grid::Moving => r.dispatch_indirect(pipeline, set, arguments, PER_MOVING_QUARTER),
                     Grid::Planes => r.dispatch(pipeline, set, pack::gpu::workgroups(raster)),
                 }
@@ -564,7 +577,8 @@ impl Renderer {
         slot.buffers.frame.host.write(&[Frame { flags: constants.flags | shows_light, ..constants }]);
         let (Some(tiles), Some(panel)) = (&slot.panel_tiles, &mut slot.buffers.panel) else { return };
         let (tile_count, moving) = tiles.write(&[], bytemuck::cast_slice_mut(panel.tiles.bytes_mut()));
-        panel.arguments.write(&[tile_count * 4, 0, moving * 4].map(|groups| [groups, 1u32, 1, 0]));
+        let cells = cells_of_tiles(tile_count, slot.traced, c.raster).div_ceil(LANES);
+        panel.arguments.write(&[tile_count * 4, cells, moving * 4].map(|groups| [groups, 1u32, 1, 0]));
         let mut frame = Frame {
             intrinsics: [c.fx as f32, c.fy as f32, c.cx as f32, c.cy as f32],
             width: c.raster.width(),
@@ -722,7 +736,6 @@ impl Renderer {
             clamp_indirect: self.settings.clamp_indirect.unwrap_or(f32::MAX),
             ambient: self.settings.drive.ambient,
             light_count: self.data.lights.len() as u32,
-            lamp_count: self.data.lamps.len() as u32,
             mean_light: self.data.mean_light,
             flags: method.flags()
                 | if self.settings.camera_is_eye { gpu_structs::FRAME_CAMERA_IS_EYE } else { 0 }

@@ -1,5 +1,6 @@
 //! The share of the panel's raster that is traced. A smaller one costs less; the pass `enlarge` brings its light to the panel's pixels.
 
+use super::tiles::TILE;
 use dpm_device::planes::Raster;
 
 /// Shares among which a run chooses by its frame times, the largest first. Each step saves about half of the work.
@@ -36,6 +37,21 @@ impl Scale {
 pub fn reduced(panel: Raster, share: f64) -> Raster {
     let side = |n: u32| ((f64::from(n) * share).ceil() as u32).clamp(1, n);
     Raster::new(side(panel.width()), side(panel.height())).expect("sides within those of a raster")
+}
+
+/// Cells of so many tiles of the panel, at most, and those before its first column and row. A cell is the square between the centres of four traced pixels,
+/// and belongs to the tile of its first pixel (`cells.comp`).
+pub(super) fn cells_of_tiles(tiles: u32, traced: Raster, panel: Raster) -> u32 {
+    let side = |traced: u32, panel: u32| (TILE * traced).div_ceil(panel);
+    let each = side(traced.width(), panel.width()) * side(traced.height(), panel.height());
+    tiles * each + traced.width() + traced.height() + 1
+}
+
+/// How many pixels of a panel the cells of its smallest traced raster reach beyond a pixel of theirs, at most.
+pub(super) fn reach_of_cells(scale: &Scale, panel: Raster) -> u32 {
+    let most =
+        |traced: Raster| panel.width().div_ceil(traced.width()).max(panel.height().div_ceil(traced.height()));
+    scale.rasters(panel).map(most).max().unwrap_or(1)
 }
 
 #[cfg(test)]

@@ -1,5 +1,6 @@
 //! Poses into the tiles to trace: those that the bounds of a body may touch.
 
+use super::scale::{reach_of_cells, Scale};
 use super::scene_data::{world_bounds, BodyData};
 use dpm_device::planes::Raster;
 use dpm_scene::geometry::projector::ProjectorCamera;
@@ -23,6 +24,8 @@ pub(crate) struct TileList {
     moving: Vec<bool>,
     /// With a lens: bounds of the straight rays of each tile.
     straight: Option<Arc<Vec<Bounds>>>,
+    /// So many pixels around a body its tiles count.
+    margin: f64,
 }
 
 /// A rectangle: lower and upper corner.
@@ -59,6 +62,12 @@ enum Reach {
 impl TileList {
     /// A list for a raster. `lens`: the projector, if its lens bends rays.
     pub(crate) fn new(raster: Raster, lens: Option<&ProjectorCamera>) -> Self {
+        // One pixel for rounding.
+        Self::around(raster, lens, 1)
+    }
+
+    /// The same with so many pixels around bodies.
+    fn around(raster: Raster, lens: Option<&ProjectorCamera>, margin: u32) -> Self {
         let (width, height) = (raster.width(), raster.height());
         let (tiles_x, tiles_y) = (width.div_ceil(TILE), height.div_ceil(TILE));
         let n = (tiles_x * tiles_y) as usize;
@@ -68,7 +77,8 @@ impl TileList {
         }
         let order = (0..n).map(|i| ((i * step) % n) as u32).collect();
         let straight = lens.filter(|camera| !camera.lens.is_pinhole()).map(|camera| {
-            let of = |tile: usize| straight_bounds(camera, tile as u32 % tiles_x, tile as u32 / tiles_x);
+            let of =
+                |tile: usize| straight_bounds(camera, [tile as u32 % tiles_x, tile as u32 / tiles_x], margin);
             Arc::new((0..n).map(of).collect())
         });
         Self {
@@ -79,7 +89,14 @@ impl TileList {
             previous: vec![false; n],
             moving: vec![false; n],
             straight,
+            margin: f64::from(margin),
         }
+    }
+
+    /// The list of a panel of which fewer pixels are traced. A cell is worked on with the tile of its first pixel, so tiles count that are as far from
+    /// a body as a cell reaches.
+    pub(crate) fn of_panel(raster: Raster, lens: Option<&ProjectorCamera>, scale: &Scale) -> Self {
+        Self::around(raster, lens, 1 + reach_of_cells(scale, raster))
     }
 
     /// Number of tiles of the raster.
@@ -193,8 +210,8 @@ impl TileList {
             }
             return;
         }
-        // One pixel of margin for rounding.
-        let [x, y] = self.tile_ranges((camera.pixel_of_bent(from) - 1.0, camera.pixel_of_bent(to) + 1.0));
+        let pixels = (camera.pixel_of_bent(from) - self.margin, camera.pixel_of_bent(to) + self.margin);
+        let [x, y] = self.tile_ranges(pixels);
         for y in y.0..y.1 {
             for x in x.0..x.1 {
                 self.active[y as usize * self.tiles_x as usize + x as usize] = true;
@@ -228,13 +245,13 @@ impl TileList {
     }
 }
 
-/// Bounds of the straight rays of a tile and one pixel around it, from positions on its edge, because the rays of an area lie between
+/// Bounds of the straight rays of a tile and so many pixels around it, from positions on its edge, because the rays of an area lie between
 /// those of its edge.
-fn straight_bounds(camera: &ProjectorCamera, tile_x: u32, tile_y: u32) -> Bounds {
-    let (x0, y0) = (f64::from(tile_x * TILE) - 1.0, f64::from(tile_y * TILE) - 1.0);
-    let side = f64::from(TILE + 2);
+fn straight_bounds(camera: &ProjectorCamera, tile: [u32; 2], margin: u32) -> Bounds {
+    let [x0, y0] = tile.map(|t| f64::from(t * TILE) - f64::from(margin));
+    let side = f64::from(TILE + 2 * margin);
     let (mut lower, mut upper) = (DVec2::INFINITY, DVec2::NEG_INFINITY);
-    for i in 0..=TILE + 2 {
+    for i in 0..=TILE + 2 * margin {
         let t = f64::from(i);
         for (x, y) in [(t, 0.0), (t, side), (0.0, t), (side, t)] {
             match camera.straight_of_pixel(DVec2::new(x0 + x, y0 + y)) {

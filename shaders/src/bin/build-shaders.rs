@@ -20,6 +20,7 @@ const WITH_TABLES: &[&str] = &[
     "spatial_disk",
     "compensate",
     "prepare",
+    "cells",
     "enlarge",
     "edges",
     "halftone",

@@ -4,7 +4,7 @@ use dpm_render::albedo_map::AlbedoMap;
 use dpm_render::drive::Response;
 use dpm_render::pack::Halftone;
 use dpm_render::scene_data::SceneNeeds;
-use dpm_render::{Keep, Output, RendererPlan, RendererSettings};
+use dpm_render::{Keep, Output, RendererPlan, RendererSettings, Scale};
 use dpm_rig::config::{Overrides, RenderMethod, RigConfig};
 use dpm_rig::pipeline::renderer_settings;
 use dpm_rig::rig::Rig;
@@ -36,6 +36,8 @@ fn bunny_venus() -> Scene {
 pub const EVERY_LOBE: &str = "every lobe";
 /// Name of the case that has the commonest of them alone.
 pub const COAT: &str = "demo with a clear coat";
+/// Name of the case of which fewer pixels are traced than the panel has.
+pub const REDUCED: &str = "demo at half the raster";
 
 /// Code of the tracer for every kind of material but the lobes of glTF's extensions.
 fn all_but_lobes() -> SceneNeeds {
@@ -70,7 +72,7 @@ fn with_everything(settings: RendererSettings, camera: ProjectorCamera) -> Resul
     })
 }
 
-/// All cases: the demo, bunny-venus and everything by method `dpm`, and two of them by the paper's, whose passes are others; then the demo with
+/// All cases: the demo, the demo at half the raster, bunny-venus and everything by method `dpm`, and two of them by the paper's, whose passes are others; then the demo with
 /// a clear coat, and everything with every lobe.
 ///
 /// # Errors
@@ -88,6 +90,7 @@ pub fn all() -> Result<Vec<Case>, String> {
         ("demo", demo, none, RenderMethod::Dpm),
         ("demo, paper", demo, none, RenderMethod::Paper),
         ("bunny-venus", bunny_venus, none, RenderMethod::Dpm),
+        (REDUCED, demo, none, RenderMethod::Dpm),
         ("everything", &full, all_but_lobes(), RenderMethod::Dpm),
         ("everything, paper", &full, all_but_lobes(), RenderMethod::Paper),
         (COAT, demo, coat, RenderMethod::Dpm),
@@ -101,6 +104,9 @@ pub fn all() -> Result<Vec<Case>, String> {
             output: Output::Planes(rig.schedule),
             ..renderer_settings(&rig)
         };
+        if name == REDUCED {
+            settings.scale = Scale::Share(0.5);
+        }
         if std::ptr::eq(scene, &full) {
             settings = with_everything(settings, rig.camera)?;
         }
