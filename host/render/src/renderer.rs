@@ -13,7 +13,7 @@ use super::plan::RendererPlan;
 use super::prepared::PreparedScene;
 use super::read_back::{History, Surface};
 use super::resources::Resources;
-use super::scale::cells_of_tiles;
+use super::scale::{cells_of_tiles, reach_of_cells};
 use super::scene_data::{rows, world_bounds, BodyData, Keep, SceneData};
 use super::settings::{FrameInputs, Overlapping, RayWalk, RayWalker, RenderError, RendererSettings};
 use super::slot::{FrameSlot, Sets};
@@ -195,9 +195,9 @@ impl Renderer {
         let overlap = overlaps.then(|| Overlap::new(gpu)).transpose()?;
         let last = LastFrame::none(tracked.len());
         let rungs = Rung::all(&settings);
-        let panel_tiles = settings
-            .is_reduced()
-            .then(|| TileList::of_panel(settings.raster, settings.lens.as_ref(), &settings.scale));
+        let reach = reach_of_cells(&settings.scale, settings.raster);
+        let panel_tiles =
+            settings.is_reduced().then(|| TileList::of_panel(settings.raster, settings.lens.as_ref(), reach));
         let rated = vec![false; rungs[0].tile_list.len()];
         let movers = Movers::new(data.bodies.len(), &settings.plane_groups, !settings.shows_halftones());
         let live = LiveTextures::new(&data.live, settings.most_live_texels);

@@ -1,6 +1,5 @@
 //! Poses into the tiles to trace: those that the bounds of a body may touch.
 
-use super::scale::{reach_of_cells, Scale};
 use super::scene_data::{world_bounds, BodyData};
 use dpm_device::planes::Raster;
 use dpm_scene::geometry::projector::ProjectorCamera;
@@ -94,9 +93,9 @@ impl TileList {
     }
 
     /// The list of a panel of which fewer pixels are traced. A cell is worked on with the tile of its first pixel, so tiles count that are as far from
-    /// a body as a cell reaches.
-    pub(crate) fn of_panel(raster: Raster, lens: Option<&ProjectorCamera>, scale: &Scale) -> Self {
-        Self::around(raster, lens, 1 + reach_of_cells(scale, raster))
+    /// a body as a cell reaches: `reach` pixels.
+    pub(crate) fn of_panel(raster: Raster, lens: Option<&ProjectorCamera>, reach: u32) -> Self {
+        Self::around(raster, lens, 1 + reach)
     }
 
     /// Number of tiles of the raster.

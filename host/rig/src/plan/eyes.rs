@@ -226,7 +226,8 @@ impl HeadWatch {
                 self.heads[i].watch(&state);
                 if self.is_own(heads, snapshot, i, &state) {
                     let known = self.heads[i];
-                    self.heads[i] = HeadBelief { believed: newest, is_own: true, doubted_since: None, ..known };
+                    self.heads[i] =
+                        HeadBelief { believed: newest, is_own: true, doubted_since: None, ..known };
                 } else {
                     self.doubt(i, &state, snapshot);
                     eyes.spheres.push(swept(&state, light, head.radius_m));
